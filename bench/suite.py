@@ -5,6 +5,7 @@
     python -m bench.suite renderer=custom renderer._target_=mypkg.Mine label=Mine       your own
     python -m bench.suite suite=core hydra/launcher=slurm       the large size, on a cluster
     python -m bench.suite set=pose,complete                     some sets of problems
+    python -m bench.suite setting=tuned renderer=newton         at its own setting of conf/tuned.yaml, as a second row
     python -m bench.suite plan=true                             what would run, and for how long
     python -m bench.suite verify=3                              three of the results, drawn anew: which agree
 
@@ -18,14 +19,17 @@ import tempfile
 from collections.abc import Sequence
 from math import log
 from pathlib import Path
+from typing import Any
 
 from bench.records.format import number, plural
 from bench.records.read import RESULTS, read_records
 from bench.records.record import read_record
 from bench.report.suite.attempts import (
+    BY_ITSELF,
     EXPERIMENT,
     GIVEN,
     STATED,
+    TUNED,
     Attempt,
     attempts_of,
     place,
@@ -38,10 +42,12 @@ from bench.report.suite.standing import Standing
 from bench.report.write import paper
 from bench.report.write.html import page_lock
 from bench.report.write.table import percent
-from bench.tables import nearest
+from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 
 PAGE = "suite"  # its name in the folder `paper`
 GOES_ON = (0, 1)  # exit statuses of a sweep that has ended, though runs may have failed
+LABEL = f"label='${{renderer._label_}}{BY_ITSELF}'"
+SETTINGS = ("stated", "tuned")  # that of the set for all renderers, or the renderer's own
 AGREE = 0.05  # of the logarithms of a curve's errors and costs: what rounding on another processor may change
 
 
@@ -55,9 +61,9 @@ def main(arguments: Sequence[str]) -> int:
         results_dir = Path(dict(text.split("=", 1) for text in passed).get("results_dir", RESULTS))
         if "verify" in own:
             return verify(results_dir, int(own["verify"]))
-        for name in own["set"].split(","):
-            code = _sweep(name, suite().sizes[own["suite"]], passed)
-            if code not in GOES_ON:
+        for said, keys in _sweeps(own, passed):
+            print(said, flush=True)
+            if (code := _sweep(keys)) not in GOES_ON:
                 return code
         return 0 if "plan=true" in map(str.lower, passed) else show(results_dir)
     except (ValueError, OSError) as error:
@@ -69,12 +75,12 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """The keys of this command, with their defaults, and what is passed on.
 
     Raises:
-        ValueError: for an unknown size or set, or a number that is none.
+        ValueError: for an unknown size, set or setting, or a number that is none.
     """
-    own, passed = {"suite": "quick", "set": ",".join(suite().errors)}, list[str]()
+    own, passed = {"suite": "quick", "set": ",".join(suite().errors), "setting": "stated"}, list[str]()
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key in ("suite", "set", "verify"):
+        if key in ("suite", "set", "setting", "verify"):
             own[key] = value
         elif key.lstrip("+~").partition(".")[0] in (*STATED, "sizes") and key not in [
             given for given, _ in GIVEN.values()
@@ -84,19 +90,66 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
             passed.append(argument)
         else:
             raise ValueError(f"{argument!r} is no KEY=VALUE: python -m bench.suite --help has examples")
-    for known, given in ((suite().sizes, [own["suite"]]), (suite().errors, own["set"].split(","))):
-        for word in given:
+    for key, known in (("suite", suite().sizes), ("set", suite().errors), ("setting", SETTINGS)):
+        for word in own[key].split(",") if key == "set" else [own[key]]:
             if word not in known:
-                raise ValueError(
-                    f"unknown {'suite' if known is suite().sizes else 'set'} {word!r}{nearest(word, [*known])}"
-                )
+                raise ValueError(f"unknown {key} {word!r}{nearest(word, [*known])}")
     if not own.get("verify", "1").isdecimal() or own.get("verify") == "0":
         raise ValueError(f"verify must be a number of results, such as verify=3, not {own['verify']!r}")
     return own, passed
 
 
-def _sweep(name: str, size: str, passed: list[str]) -> int:
-    command = [sys.executable, "-m", "bench", "-m", f"+experiment={EXPERIMENT}{name}", f"sizes.chosen={size}", *passed]
+def _sweeps(own: dict[str, str], passed: list[str]) -> list[tuple[str, list[str]]]:
+    """What is said before each sweep, and its keys: a sweep a set; of tuned settings one for each of them.
+
+    Raises:
+        ValueError: where there is no tuned setting for any set.
+    """
+    sets, found = own["set"].split(","), list[tuple[str, list[str]]]()
+    renderers = [name for text in passed if text.startswith("renderer=") for name in text[9:].split(",")]
+    rest = [text for text in passed if not text.startswith("renderer=")]
+    for nth, name in enumerate(sets, 1):
+        said = f"set {nth} of {len(sets)}: {name}"
+        keys = [f"+experiment={EXPERIMENT}{name}", f"sizes.chosen={suite().sizes[own['suite']]}"]
+        if own["setting"] == "stated":
+            found.append((said, [*keys, *passed]))
+            continue
+        tuned = _tuned(name, renderers)
+        found += [(f"{said}, {method}", [*keys, *choices, *rest]) for method, choices in tuned.items()]
+        if not tuned:
+            print(f"{said}: left out, since conf/tuned.yaml has no setting for it")
+    if not found:
+        of = ", ".join(renderers) or "a renderer"
+        raise ValueError(f"conf/tuned.yaml has no setting of {of} for {own['set']}: leave out setting=tuned")
+    return found
+
+
+def _tuned(of_set: str, renderers: list[str]) -> dict[str, list[str]]:
+    """The methods with a tuned setting for a set, of these renderers or of all, and what chooses them.
+
+    A tuned setting goes with the loss of the mask that it was tuned with.
+    """
+    task, found = _chosen(read_yaml(CONF / "experiment" / f"{EXPERIMENT}{of_set}.yaml"))["task"], {}
+    for method in (f"{TUNED}{name}" for name in names(f"{METHOD}/tuned")):
+        chosen = _chosen(choice(METHOD, method))
+        if chosen.get("task") == task and (not renderers or chosen["renderer"] in renderers):
+            found[method] = [f"+method={method}", f"silhouette={chosen.get('silhouette', 'own')}", LABEL]
+    return found
+
+
+def _chosen(node: dict[str, Any]) -> dict[str, str]:
+    """What an experiment or a method, with what it builds on, chooses of each group."""
+    found = dict[str, str]()
+    for base in node.get("defaults", ()):
+        if isinstance(base, dict):
+            found |= {key.removeprefix("override /"): value for key, value in base.items()}
+        elif (name := base.removeprefix(f"/{METHOD}/")) in names(METHOD):
+            found |= _chosen(choice(METHOD, name))
+    return found
+
+
+def _sweep(keys: list[str]) -> int:
+    command = [sys.executable, "-m", "bench", "-m", *keys]
     with subprocess.Popen(command) as sweep:
         try:
             return sweep.wait()
@@ -117,7 +170,7 @@ def show(results_dir: Path) -> int:
     own = {(*one.key, one.started) for one in kept}
     stand = sum((*one.key, one.started) in own for one in standing.attempts)
     print(f"{plural(len(kept), 'run')} of {results_dir}, of which {stand} stand in this table, beside shipped ones.")
-    if any(map(standing.lacking, standing.rows)):
+    if any(map(standing.not_run, standing.rows)):
         print("A row that lacks runs has no rank: its shares are of fewer problems. suite=quick makes them.")
     print(f"rank {'renderer':<24} share of targets reached; in each set; field values")
     for row in standing.rows:
@@ -127,7 +180,7 @@ def show(results_dir: Path) -> int:
         ratio = standing.ratio(row)
         parts += [f"{number(ratio.value)} of DIST's field values"] if ratio else []
         parts += [f"{count} {status}" for status, count in standing.failures(row).most_common()]
-        parts += [f"{lacking} not run"] if (lacking := standing.lacking(row)) else []
+        parts += [f"{lacking} not run"] if (lacking := standing.not_run(row)) else []
         rank = str(standing.ranks.get(row, "-"))
         print(f"{rank:>3}  {row:<24} {percent(standing.share(row).value):>5}  {', '.join(parts)}")
     print(*(path.with_suffix(".png") for path in written), sep="\n")

@@ -5,7 +5,7 @@ from typing import Any
 
 from bench.report.data.runs import together
 from bench.report.study import Result, Runs, Selection, chart, format, table
-from bench.report.suite.attempts import EXPERIMENT, GIVEN, attempts_of, place, read_attempts, suite
+from bench.report.suite.attempts import BY_ITSELF, EXPERIMENT, GIVEN, attempts_of, place, read_attempts, suite
 from bench.report.suite.standing import SECONDS, Standing
 from bench.report.write import paper
 
@@ -54,12 +54,13 @@ def make(*several: Runs | None) -> Result:
 
 
 def _line(standing: Standing, row: str) -> dict[str, Any]:
-    failures, lacking, seconds = standing.failures(row), standing.lacking(row), standing.ratio(row, SECONDS)
+    failures, lacking, seconds = standing.failures(row), standing.not_run(row), standing.ratio(row, SECONDS)
     failed = ", ".join(f"{count} {status}" for status, count in failures.most_common())
     return {
         **{"rank": standing.ranks.get(row), "row": row, "preset": standing.preset(row), "share": standing.share(row)},
         **{name: standing.share(row, name).value for name in standing.sets},
         **{"at_dist": standing.share_at(row, 1.0), "wrong": standing.wrong(row), "ratio": standing.ratio(row)},
+        "gain": standing.gain(row),
         "seconds": seconds if seconds and seconds.known else None,
         "failed": ", ".join(filter(None, [failed, f"{lacking} not run" if lacking else ""])),
     }
@@ -88,6 +89,11 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
             table.Column(name, f"{name}, {format.plural(standing.scenes(name), 'scene')}", show=table.percent)
             for name in standing.sets
         ),
+        *(
+            [table.Column("gain", "Gain by tuning", lambda line: line["gain"] and line["gain"].value, words=_points)]
+            if known("gain")
+            else []
+        ),
         table.Column("at_dist", "At DIST's cost", show=table.percent),
         ratio("ratio", "Field values over DIST's"),
         *([ratio("seconds", "Seconds over DIST's")] if known("seconds") else []),
@@ -97,16 +103,33 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
     ]
 
 
+def _points(line: Any) -> str:
+    gain = line["gain"]
+    return "" if gain is None else f"{100 * gain.value:+.0f} {gain.ends(100)}"
+
+
 def _percent(share: float | None) -> str:
     return format.MISSING if share is None else f"{format.number(100 * share)} %"
+
+
+def _better(standing: Standing, row: str, of_set: str | None) -> str:
+    """Of a renderer's rows, at the set's setting and tuned, that which reaches more of all problems."""
+    stated = row.removesuffix(BY_ITSELF)
+    runs = {name: len(standing.of(name, of_set)) for name in (stated, stated + BY_ITSELF)}
+    whole = [name for name, count in runs.items() if count == max(runs.values())]
+    return max(whole, key=lambda name: standing.share(name, of_set).value)
 
 
 def _panel(standing: Standing, of_set: str | None) -> chart.Panel:
     found = {row: standing.profile(row, of_set) for row in standing.rows}
     lines = [
-        chart.curve(row, standing.preset(row), costs, shares, step=True)
+        chart.curve(
+            row, standing.preset(row), costs, shares, step=True, **{"dash": ":"} if row.endswith(BY_ITSELF) else {}
+        )
         for row, (costs, shares) in found.items()
-        if costs and costs[-1] > 0  # of a row whose runs ended before they cost anything there is no line
+        if costs
+        and costs[-1] > 0  # of a row whose runs ended before they cost anything there is no line
+        and row == _better(standing, row, of_set)
     ]
     name = f"{of_set or 'all sets'}, {format.plural(standing.scenes(of_set), 'scene')}"
     panel = chart.panel_data(name, "field values over DIST's run", "share reached", lines)
@@ -144,6 +167,7 @@ def _doubts(standing: Standing) -> list[str]:
     """Notes on what may not be trusted: several codes or settings, attempts that are not judged."""
     alike = {one.key for one in standing.alike}
     other = sorted({one.row for one in standing.everything if one.key not in alike})
+    tuned = [row for row in standing.rows if row.endswith(BY_ITSELF)]
     alone = len(standing.alike) - len(standing.attempts)
     versions = len({one.code for one in standing.attempts})
     machines = len({one.machine for one in standing.attempts})
@@ -151,6 +175,11 @@ def _doubts(standing: Standing) -> list[str]:
     return [
         f"Not shown, since their set has other settings: runs of {', '.join(other)}." if other else "",
         f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have." if alone else "",
+        "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes; a set without "
+        "one is left out, so there is no rank. Gain: points over its row at the set's setting. The chart of a set has "
+        "the better of the two, tuned ones dotted; that of all sets has none."
+        if tuned
+        else "",
         f"Runs of {versions} versions of the code." if versions > 1 else "",
         f"Runs of {machines} machines: seconds are compared with DIST's on the same one alone." if machines > 1 else "",
         f"Seconds of {loaded} of {len(standing.attempts)} runs are left out: the machine was loaded." if loaded else "",

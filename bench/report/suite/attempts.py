@@ -30,6 +30,9 @@ GIVEN = {  # the setting in which the problems of a scene differ, and its name
     **{"reconstruct": ("task.images.texture", "{}"), "render": ("task.size", "{} pixels")},
 }
 APART = ("render",)  # sets without a course of error over cost
+TUNED = "tuned/"  # in front of the name of a method with its tuned setting
+BY_ITSELF = ", tuned"  # behind the name of the row of a renderer at its own setting
+FREE = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"  # what such a setting may set
 STATED = ("task", "view", "evaluation", "silhouette", "field", "prior", "split")  # by a set, for all renderers
 
 
@@ -123,6 +126,11 @@ class Attempt:
         return self.status == "ok"
 
     @property
+    def tuned(self) -> bool:
+        """Whether it is at the renderer's own setting, not at the one of the set."""
+        return self.row.endswith(BY_ITSELF)
+
+    @property
     def timed(self) -> bool:
         """Whether its seconds count; those on a loaded machine do not."""
         return self.waited is None or self.waited <= WAITED
@@ -171,12 +179,13 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     named = [text.format(setting(config, *given.split(".")))] if given else []
     final, start = (_finite(record[part].get(error)) for part in ("metrics", "metrics_start"))
     curve = _curve(record, folder, final if ok else None)
+    tuned = str(record.get("method") or "").startswith(TUNED)
     asked = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
     changed = [text.removeprefix("renderer.") for text in asked if re.match(r"renderer\.[^_]", text)]
     return Attempt(
         **{"set": of_set, "problem": ", ".join([scene, *named]), "scene": scene, "seed": record["seed"]},
         row=", ".join([renderer_name(config, record["renderer"]), *changed]),  # without the loss, which is the set's
-        preset=record.get("method") or record["renderer"],
+        preset=record["renderer"] if tuned else record.get("method") or record["renderer"],
         status=str(record["status"]),
         reason=record["reason"],
         start=start,
@@ -187,7 +196,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         waited=said.get("waited_share"),
         **{name: said.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
         threads=said.get("threads"),
-        **{"started": record["started"], "code": record.get("code", ""), "settings": _settings(config, given)},
+        **{"started": record["started"], "code": record.get("code", ""), "settings": _settings(config, given, tuned)},
         curve=curve,
         overrides=portable(record.get("overrides", ())),
     )
@@ -204,10 +213,11 @@ def portable(overrides: Iterable[str]) -> list[str]:
     return [text for text in overrides if not text.lstrip("+~").startswith(("results_dir=", "hydra", "-"))]
 
 
-def _settings(config: dict[str, Any], given: str) -> str:
-    """A hash of what a set states for all renderers, without what its problems differ in."""
+def _settings(config: dict[str, Any], given: str, tuned: bool) -> str:
+    """A hash of what a set states for all renderers, without what its problems, or tuned settings, differ in."""
     known = flat({part: config.get(part) for part in STATED})
-    return digest({key: str(value) for key, value in known.items() if key != given})
+    left = [key for key in known if key == given or (tuned and re.match(FREE, key))]
+    return digest({key: str(value) for key, value in known.items() if key not in left})
 
 
 def _curve(record: Record, folder: Path, final: float | None) -> list[list[float]]:

@@ -19,7 +19,7 @@ import numpy as np
 from bench.report.data import statistics
 from bench.report.data.records import grouped
 from bench.report.data.statistics import Interval
-from bench.report.suite.attempts import APART, Attempt, joined, problems_of, suite
+from bench.report.suite.attempts import APART, BY_ITSELF, Attempt, joined, problems_of, suite
 from bench.tables import choice
 
 REFERENCE = "dist"  # the preset of the row by whose costs others are divided
@@ -61,10 +61,10 @@ class Standing:
     def alike(self) -> list[Attempt]:
         """The attempts under the settings that most attempts of their set have."""
         settings = {
-            of_set: max(Counter(one.settings for one in own).items(), key=lambda found: (found[1], found[0]))[0]
-            for of_set, own in grouped(self.everything, lambda one: one.set).items()
+            part: max(Counter(one.settings for one in own).items(), key=lambda found: (found[1], found[0]))[0]
+            for part, own in grouped(self.everything, lambda one: (one.set, one.tuned)).items()
         }
-        return [one for one in self.everything if one.settings == settings[one.set]]
+        return [one for one in self.everything if one.settings == settings[one.set, one.tuned]]
 
     @cached_property
     def _known(self) -> dict[str, set[tuple[Any, ...]]]:
@@ -90,6 +90,11 @@ class Standing:
         """How many of the problems and seeds that it must have a row has no attempt at."""
         return len(self._needed - self._known[row])
 
+    def not_run(self, row: str) -> int:
+        """As `lacking`, but for sets that a row at tuned settings has none of."""
+        sets = {key[0] for key in self._known[row] if row.endswith(BY_ITSELF)}
+        return sum(not sets or key[0] in sets for key in self._needed - self._known[row])
+
     @cached_property
     def attempts(self) -> list[Attempt]:
         """The attempts at the problems and seeds at which rows are compared."""
@@ -97,9 +102,15 @@ class Standing:
 
     @cached_property
     def rows(self) -> list[str]:
-        """The rows, the one that reaches the most first; of those that lack a problem, last."""
+        """The rows, the one that reaches the most first; those that lack problems last, tuned ones behind theirs."""
         found = dict.fromkeys(one.row for one in self.attempts)
-        return sorted(found, key=lambda row: (self.lacking(row), -np.nan_to_num(self.share(row).value), row))
+
+        def place(row: str) -> tuple[Any, ...]:
+            stated = row.removesuffix(BY_ITSELF)
+            of = stated if stated in found else row
+            return self.lacking(of), -np.nan_to_num(self.share(of).value), stated, row
+
+        return sorted(found, key=place)
 
     @cached_property
     def sets(self) -> list[str]:
@@ -108,12 +119,13 @@ class Standing:
 
     @cached_property
     def references(self) -> dict[tuple[str, str], float]:
-        """The reference error of each set and problem: the suite's, or else the least final error of any row."""
+        """The reference error of each set and problem: the suite's, or else the least final error at its setting."""
         found = {}
         for (of_set, problem), own in grouped(self.attempts, lambda one: (one.set, one.problem)).items():
             known = suite().references.get(of_set, {})
             stated = known.get(problem, known.get(own[0].scene, known.get("all")))
-            found[of_set, problem] = min(one.final for one in own) if stated is None else stated
+            least = min((one.final for one in own if not one.tuned), default=inf)
+            found[of_set, problem] = least if stated is None else stated
         return found
 
     @cached_property
@@ -176,11 +188,19 @@ class Standing:
 
     def share(self, row: str, of_set: str | None = None) -> Interval:
         """The share of targets that a row reaches, the mean of its sets', with its interval over scenes."""
-        return _over_scenes(*self._solved(row, of_set))
+        return _over_scenes(*self._solved(self.of(row, of_set)))
 
-    def _solved(self, row: str, of_set: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The numbers of targets that a row reaches, and of all [scenes, sets]."""
-        own = self.of(row, of_set)
+    def gain(self, row: str) -> Interval | None:
+        """The share that a row at tuned settings reaches, less its renderer's at the set's, at the same problems."""
+        own, other = ({one.key[:3]: one for one in self.of(name)} for name in (row, row.removesuffix(BY_ITSELF)))
+        both = own.keys() & other.keys()
+        if not row.endswith(BY_ITSELF) or not both:
+            return None
+        (tuned, every), (stated, _) = (self._solved([of[key] for key in both]) for of in (own, other))
+        return _over_scenes(tuned - stated, every)
+
+    def _solved(self, own: list[Attempt]) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers of targets that attempts reach, and of all [scenes, sets]."""
         scenes, sets = (sorted({part(one) for one in own}) for part in (lambda one: one.scene, lambda one: one.set))
         reached, every = np.zeros((2, len(scenes), len(sets)))
         for one in own:
@@ -260,8 +280,8 @@ class Standing:
 
     def _chance(self, first: str, second: str) -> float:
         """The probability of as large a difference of shares where each scene's has either sign (permutation test)."""
-        reached, every = self._solved(first)
-        apart = (reached - self._solved(second)[0]) / every.sum(axis=0)
+        reached, every = self._solved(self.of(first))
+        apart = (reached - self._solved(self.of(second))[0]) / every.sum(axis=0)
         by_scene = apart.sum(axis=1)
         if len(by_scene) <= FLIPS:
             signs = np.array([*product((1, -1), repeat=len(by_scene))])
@@ -278,8 +298,8 @@ class Standing:
     def resolution(self) -> float | None:
         """The difference of shares that so many scenes show in four cases of five, in the median of rows."""
         first, *others = self.ranked or [""]
-        one = self._solved(first)
-        found = [_over_scenes(one[0] - self._solved(row)[0], one[1]) for row in others]
+        one = self._solved(self.of(first))
+        found = [_over_scenes(one[0] - self._solved(self.of(row))[0], one[1]) for row in others]
         known = [each.high - each.low for each in found if each.known]
         return POWERFUL * float(np.median(known)) / 2 if known else None
 
