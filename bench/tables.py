@@ -174,7 +174,7 @@ def _rows_of(path: Path, group: str, text: str) -> list[tuple[str, str, Node]]:
         found.append((group, name, {group: None} if row is None else _node(group, row)))
         if row and "space" in row:
             bases = [f"/{METHOD}/{name}", f"/{METHOD}/_drawn", "_self_"]
-            found.append((SPACE, name, {"defaults": bases} | _nested(row["space"])))
+            found.append((SPACE, name, {"defaults": bases} | nested(row["space"])))
     return found
 
 
@@ -203,11 +203,11 @@ def _node(group: str, row: Node) -> Node:
     chosen = [key for key in CHOICES if group.startswith(METHOD) and isinstance(row.get(key), str)]
     base = [row["base"]] if "base" in row else []
     defaults = [*base, *({f"override /{key}": row[key]} for key in chosen)]
-    node = _nested({key: value for key, value in row.items() if key not in (*chosen, *DROPPED)})
+    node = nested({key: value for key, value in row.items() if key not in (*chosen, *DROPPED)})
     return ({"defaults": [*defaults, "_self_"]} if defaults else {}) | node
 
 
-def _nested(row: Node) -> Node:
+def nested(row: Node) -> Node:
     """Dotted keys as nodes in nodes."""
     found: Node = {}
     for key, value in row.items():

@@ -8,7 +8,7 @@ from bench.report.data.frame import write_csv
 from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
-from bench.report.write.paper import write_paper, write_readme
+from bench.report.write.paper import ship, write_paper, write_readme
 
 USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [ship=PATH]
   results_dir   the folder with the runs; `{RESULTS}` unless given
@@ -34,10 +34,10 @@ def main(arguments: list[str]) -> int:
 
 def _report(given: dict[str, str]) -> int:
     results_dir, meshes = Path(given.get("results_dir", RESULTS)), _meshes(given.get("meshes", str(MOST_MESHES)))
-    if ship := given.get("ship"):
+    if into := given.get("ship"):
         records, _ = read_records(results_dir)
-        rows = write_attempts([*attempts_of(records, results_dir), *read_attempts(results_dir)[0]], Path(ship))
-        print(*rows, *write_paper(records, results_dir, Path(ship)), write_readme(Path(ship)), sep="\n")
+        rows = write_attempts([*attempts_of(records, results_dir), *read_attempts(results_dir)[0]], Path(into))
+        print(*rows, *ship(records, results_dir, Path(into)), write_readme(Path(into)), sep="\n")
         return 0
     check_results(results_dir)
     with page_lock(results_dir):

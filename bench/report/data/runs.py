@@ -13,6 +13,7 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import requested, row_name, started
 from bench.report.data.frame import to_frame
+from bench.report.data.kept import KEPT
 from bench.report.data.records import SCALE, Record, Row, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
@@ -34,6 +35,10 @@ class Selection:
     conditions: tuple[str, ...] = ()
     setup: tuple[str, ...] = ("scenes", "pixels", "network", "machine")
     alike: tuple[str, ...] = ()
+
+
+class NoFolder(LookupError):
+    """A page needs more of a run than its record, such as its curve, and the run folder is gone."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,13 @@ class Runs:
         return choose(self.everything, selection, self.results_dir)
 
     def folder(self, record: Record) -> Path:
-        """The record's run folder."""
+        """The record's run folder.
+
+        Raises:
+            NoFolder: where it is gone, and the record is a row of a shipped table.
+        """
+        if KEPT in record:
+            raise NoFolder(record["folder"])
         return self.results_dir / "runs" / record["folder"]
 
     def requested(self) -> dict[str, Any]:

@@ -19,10 +19,10 @@ from typing import Any
 from bench.records.names import flat
 from bench.records.read import curve_lines
 from bench.records.record import WAITED, RunStatus, as_number, decoded, digest, plain, renderer_name, write_text
+from bench.report.data.kept import NO_ATTEMPTS
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
 
-NO_ATTEMPTS = ("not_run", "killed", "refused")  # statuses of runs that say nothing of a renderer
 FOLDER = "suite"  # of a results folder, with a folder a version in it
 EXPERIMENT = "core_"  # in front of the name of a set
 GIVEN = {  # the setting in which the problems of a scene differ, and its name

@@ -14,7 +14,8 @@ from urllib.parse import quote
 
 from bench.records.read import PLAN
 from bench.records.record import leads_out, write_text
-from bench.report.data.runs import Runs, Selection, choose
+from bench.report.data.kept import KEPT, SUFFIX, join, read_rows, write_rows
+from bench.report.data.runs import NoFolder, Runs, Selection, choose
 from bench.report.write.caption import SMOKE
 from bench.report.write.result import Result, Shown, as_markdown, markdown, read_shown, write
 
@@ -55,13 +56,22 @@ class Study:
     keeps: Callable[[Path], Path] | None = None
 
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
-        """The result of each page; none where there is no run of it, and no row is kept."""
+        """The result of each page; none where there is no run of it, and no row is kept.
+
+        A page that needs run folders is made of the runs that have theirs.
+        """
         chosen: list[Runs | None] = [choose(records, selection, results_dir) for selection in self.reads]
         if not any(runs is not None for runs in chosen):
             if self.keeps is None or not self.keeps(results_dir).is_dir():
                 return {}
             chosen = [Runs(selection, results_dir, []) for selection in self.reads]
-        return {name: make(*chosen) for name, make in self.pages.items()}
+        found = {}
+        for name, make in self.pages.items():
+            try:
+                found[name] = make(*chosen)
+            except NoFolder:
+                found |= replace(self, pages={name: make}).results([r for r in records if KEPT not in r], results_dir)
+        return found
 
 
 @cache
@@ -145,7 +155,8 @@ def _in(results_dir: Path) -> list[Found]:
     """The tables and figures of a results folder in their order; those that no study made stand last."""
     folder = results_dir / FOLDER
     kinds = (*SUFFIXES, ".png", ".json")
-    seen = {path.stem for path in folder.glob("[!.]*") if path.suffix in kinds and path.is_file()}
+    files = (path for path in folder.glob("[!.]*") if path.suffix in kinds and not path.name.endswith(SUFFIX))
+    seen = {path.stem for path in files if path.is_file()}
     found = [found_at(folder / name, results_dir) for name in seen]
     known = [one for one in found if one.files or one.picture or one.shown.title]
     return sorted(known, key=lambda one: (one.shown.place or 10**6, one.name))
@@ -183,6 +194,17 @@ def _beside(found: Found, results_dir: Path) -> list[list[str]]:
     shipped = found_at(SHIPPED / FOLDER / found.name, SHIPPED).shown
     same = shipped.columns and shipped.columns == found.shown.columns
     return [[BESIDE + row[0], *row[1:]] for row in shipped.rows] if same else []
+
+
+def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[Path]:
+    """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
+
+    Raises:
+        ValueError: where rows that are there cannot be read, and would be lost.
+    """
+    every = join(records, read_rows(into / FOLDER))
+    read = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
+    return [*write_rows(every, read, into / FOLDER), *write_paper(every, results_dir, into)]
 
 
 def write_readme(results_dir: Path) -> Path | None:

@@ -1,0 +1,96 @@
+"""The rows that a shipped table is drawn from: `paper/EXPERIMENT.runs.csv`, a line a run, which outlives its folder.
+
+A line is a record without what its folder alone has (curves, pictures). A column is a field by its dotted name, a cell
+its value as JSON. An empty cell is that of the first line, and `-` says that the run has no such field.
+"""
+
+import csv
+import json
+from collections.abc import Iterable, Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from bench.records.record import decoded, plain, started, write_text
+from bench.report.data.records import Record, grouped
+from bench.tables import nested
+
+SUFFIX = ".runs.csv"
+KEPT = "kept"  # marks a record that was read here
+NO_ATTEMPTS = ("not_run", "killed", "refused")  # statuses of runs that say nothing of what they were to measure
+HERE = ("log", "overrides", "environment.diff", "environment.platform", KEPT)
+HERE += ("config.results_dir", "config.priors_dir")  # what is of the machine, or can be looked up
+SAME, NONE = "", "-"
+
+
+def join(records: Iterable[Record], kept: Iterable[Record]) -> list[Record]:
+    """One record of each run: the newest that measured something; of the same the one that has its folder."""
+    found: dict[str, Record] = {}
+
+    def rank(record: Record) -> Any:
+        return record["status"] not in NO_ATTEMPTS, started(record)
+
+    for record in [*kept, *records]:
+        other = found.setdefault(record["id"], record)
+        found[record["id"]] = record if rank(record) >= rank(other) else other
+    return sorted(found.values(), key=started, reverse=True)
+
+
+def write_rows(records: Iterable[Record], experiments: Iterable[str], folder: Path) -> list[Path]:
+    """Writes the runs of each experiment to a folder, but planned ones and those of scale=smoke; gives the files."""
+    of = grouped((one for one in records if _counts(one)), lambda record: record["config"].get("experiment"))
+    return [_write(folder / f"{name}{SUFFIX}", of[name]) for name in dict.fromkeys(experiments) if name in of]
+
+
+def read_rows(folder: Path) -> list[Record]:
+    """The records of all such files of a folder.
+
+    Raises:
+        ValueError: where one cannot be read, with its name.
+    """
+    found = list[Record]()
+    for path in sorted(folder.glob(f"[!.]*{SUFFIX}")):
+        try:
+            with path.open(encoding="utf-8", newline="") as file:
+                found += _read(csv.DictReader(file))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
+            raise ValueError(f"{path} cannot be read, mend it or move it away: {error!r}") from error
+    return found
+
+
+def _counts(record: Record) -> bool:
+    return record["status"] not in NO_ATTEMPTS and (record["config"].get("scale") or {}).get("name") != "smoke"
+
+
+def _cells(value: Any, name: str = "") -> dict[str, str]:
+    if isinstance(value, dict) and value and not any("." in key for key in value):
+        inner = [_cells(one, f"{name}.{key}".lstrip(".")) for key, one in value.items()]
+        return {key: cell for cells in inner for key, cell in cells.items()}
+    if isinstance(value, str) and name.startswith("config.") and value.startswith("/"):
+        value = Path(value).name  # of a folder of data
+    return {} if name in HERE else {name: json.dumps(plain(value))}
+
+
+def _write(path: Path, records: list[Record]) -> Path:
+    lines = [_cells(record) for record in sorted(records, key=lambda record: (started(record), record["id"]))]
+    columns = list(dict.fromkeys(name for line in lines for name in line))
+    first = {name: lines[0].get(name, NONE) for name in columns}
+    text = StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerows([columns, list(first.values())])
+    for line in lines[1:]:
+        cells = {name: line.get(name, NONE) for name in columns}
+        table.writerow([SAME if cell == first[name] else cell for name, cell in cells.items()])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, text.getvalue())
+    return path
+
+
+def _read(lines: Iterable[dict[str, str]]) -> Iterator[Record]:
+    first: dict[str, str] = {}
+    for line in lines:
+        first = first or line
+        cells = {name: cell if cell != SAME else first[name] for name, cell in line.items()}
+        record: Record = nested({name: decoded(json.loads(cell)) for name, cell in cells.items() if cell != NONE})
+        started(record), record["id"], record["status"], record["config"]  # what it cannot do without
+        yield record | {KEPT: True, "log": []}

@@ -1,0 +1,102 @@
+"""Shipped tables are drawn anew from their rows, without run folders, and grow by later runs."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bench.records.read import read_record, read_records
+from bench.report.__main__ import main
+from bench.report.data.kept import HERE, KEPT, join, read_rows, write_rows
+from bench.report.write import paper
+from tests.report.test_report_paper import DYNAMIC, NAIVE, PARALLEL, bands, costs, write_curve, write_run
+
+
+def ship(results: Path, into: Path) -> dict[str, str]:
+    """The shipped tables, after the runs of a results folder were added and the folder was deleted."""
+    results.mkdir(exist_ok=True)
+    assert main([f"results_dir={results}", f"ship={into}"]) == 0
+    shutil.rmtree(results)
+    return {path.name: path.read_text() for path in sorted((into / "paper").glob("*.[cjm]*"))}
+
+
+def test_a_table_is_drawn_anew_without_its_runs_and_grows_by_later_ones(tmp_path):
+    own, into = tmp_path / "own", tmp_path / "shipped"
+    for label in (PARALLEL, DYNAMIC, NAIVE):
+        write_run(own, "table1", label, metrics=costs())
+    failed = {"status": "oom", "reason": 'said "no", twice', "minute": 5}
+    write_run(own, "table1", "DIST with mask", id="a", **failed)
+    first = ship(own, into)
+    assert first["table1.runs.csv"].count("\n") == 5 and str(tmp_path) not in "".join(first.values())
+    assert {name for name in first if name.startswith("table1")} == {
+        f"table1.{kind}" for kind in ("csv", "json", "md", "runs.csv")
+    }
+    (into / "paper" / "table1.csv").unlink()
+    assert ship(own, into) == first  # nothing but the rows
+
+    write_run(own, "table1", "DIST with mask", id="a", metrics=costs(), minute=6)  # that failed at first
+    for number in range(2):
+        write_run(own, "table1", f"Mine {number}", id=f"mine{number}", metrics=costs(), minute=10 + number)
+    grown = ship(own, into)["table1.csv"]
+    assert grown.count("\n") == first["table1.csv"].count("\n") + 2 and "oom" not in grown
+    assert "n = 6 runs" in (into / "README.md").read_text()
+
+
+def test_a_page_that_needs_run_folders_stays_until_there_are_some(tmp_path):
+    own, into = tmp_path / "own", tmp_path / "shipped"
+    write_curve(write_run(own, "fig5", PARALLEL, id="a"), [4, 3, 2, 1], {0: 0.4, 2: 0.1})
+    first = ship(own, into)
+    assert ship(own, into) == first
+    write_curve(write_run(own, "fig5", DYNAMIC, id="b", minute=5), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
+    later = ship(own, into)
+    assert PARALLEL in later["fig5.runs.csv"] and PARALLEL not in later["fig5.csv"] and DYNAMIC in later["fig5.csv"]
+
+
+def test_rows_are_the_records_but_for_what_is_of_the_machine(tmp_path):
+    settings = {"dataset": {"path": "/home/me/chair.obj"}, "stress": None, "ranges": {"a": [1, 2.5]}, "empty": {}}
+    write_run(tmp_path, "gradients", None, id="a", metrics=bands() | {"error": "inf"}, settings=settings)
+    write_run(tmp_path, "gradients", None, id="b", settings={"stress": {"name": "dent"}}, notes=["a", "b"])
+    write_run(tmp_path, "gradients", None, id="c", status="killed")
+    before = read_records(tmp_path)[0]
+    write_rows(before, ["gradients", "table1"], tmp_path / "paper")
+    after = read_rows(tmp_path / "paper")
+    assert [path.name for path in (tmp_path / "paper").iterdir()] == ["gradients.runs.csv"]
+    assert [one["id"] for one in after] == ["a", "b"] and after[0]["config"]["dataset"]["path"] == "chair.obj"
+    for record in after:
+        (other,) = (one for one in before if one["id"] == record["id"])
+        assert record.keys() - {KEPT} == other.keys() | {"log"}
+        for part in record.keys() - {*HERE, "config"}:
+            assert record[part] == other[part], part
+        own = {key: value for key, value in other["config"].items() if key not in ("results_dir", "dataset")}
+        assert {key: record["config"][key] for key in own} == own
+
+
+def test_of_the_records_of_a_run_the_newest_that_measured_counts(tmp_path):
+    def record(status: str, minute: int, **more):
+        folder = write_run(tmp_path, "table1", None, id="a", status=status, minute=minute)
+        return read_record(folder) | more
+
+    kept, planned, newer = record("ok", 5) | {KEPT: True}, record("killed", 7), record("oom", 6)
+    assert join([planned], [kept]) == [kept] and join([newer, planned], [kept]) == [newer]
+    own = {key: value for key, value in kept.items() if key != KEPT}
+    assert join([own], [kept]) == [own]  # with its folder
+    assert join([planned], []) == [planned]
+
+
+@pytest.mark.parametrize("text", ["id,started\n1\n", 'id\n"""a"""\n', 'id,started\n"""a""","""today"""\n'])
+def test_rows_that_cannot_be_read_are_told_and_not_lost(tmp_path, capsys, text):
+    path = tmp_path / "paper" / "table1.runs.csv"
+    path.parent.mkdir()
+    path.write_text(text)
+    write_run(tmp_path / "own", "table1", NAIVE, metrics=costs())
+    assert main([f"results_dir={tmp_path / 'own'}", f"ship={tmp_path}"]) == 2
+    assert "table1.runs.csv cannot be read, mend it or move it away" in capsys.readouterr().err
+    assert path.read_text() == text and not (tmp_path / "paper" / "table1.csv").exists()
+
+
+def test_rows_are_no_page(tmp_path):
+    write_run(tmp_path, "table1", NAIVE, metrics=costs())
+    paper.ship(read_records(tmp_path)[0], tmp_path, tmp_path)
+    assert [found.name for found in paper.find_paper(tmp_path) if not found.shipped] == ["table1"]
+    assert json.loads((tmp_path / "paper" / "table1.json").read_text())
