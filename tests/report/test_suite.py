@@ -14,7 +14,7 @@ from bench.records.read import read_records
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
 from bench.report.suite.standing import SECONDS, Standing
 from bench.studies.suite import _panel
-from bench.suite import main, parsed, show
+from bench.suite import _sweeps, main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.report.test_report_paper import write_run
 
@@ -258,7 +258,8 @@ def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, m
 
 @pytest.mark.parametrize(
     ("argument", "said"),
-    [("suite=large", "unknown suite 'large'"), ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
+    [("suite=large", "unknown suite 'large'"), ("setting=tunde", "did you mean tuned"),
+     ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
      ("verify=0", "verify must be"), ("task.optimiser.budget=1e9", "is stated by the suite")],
 )  # fmt: skip
 def test_a_wrong_argument_is_told(argument, said, capsys):
@@ -275,6 +276,64 @@ def test_every_set_is_an_experiment_with_each_size():
     for name in suite().errors:
         sizes = read_yaml(Path("conf") / "experiment" / f"core_{name}.yaml")["sizes"]
         assert {*sizes} - {"chosen"} == {*suite().sizes.values()}
+
+
+def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_rank(monkeypatch):
+    rows = [("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Lost", 0.5, 1.0)]
+    for_all = field(rows).everything
+    for_all += [replace(one, set="pose") for one in for_all]
+    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda _: {one.key[:3] for one in for_all})
+    tuned = [
+        attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings="own", preset=row.lower())
+        for row, final in (("Dist", 0.01), ("B", 0.5), ("Lost", 0.5))
+        for scene in SCENES
+    ]
+    before, standing = Standing(for_all), Standing(for_all + tuned[:-1])
+    assert standing.rows == ["B", "B, tuned", "Dist", "Dist, tuned", "Lost", "Lost, tuned"]
+    assert standing.ranks == before.ranks and standing.told == before.told and standing.resolution == before.resolution
+    assert standing.references == before.references and standing.not_run("Lost, tuned") == 1
+    assert standing.lacking("Dist, tuned") == len(SCENES) and standing.not_run("Dist, tuned") == 0
+    gains = [standing.gain(row) for row in standing.rows[:4]]
+    assert gains[0] is None and [gain and round(gain.value, 9) for gain in gains[1:]] == [-1.0, None, 0.2]
+    assert {line["name"] for line in _panel(standing, None)["series"]} == {"B", "Dist", "Lost"}
+    lines = {line["name"]: line["dash"] for line in _panel(standing, "complete")["series"]}
+    assert lines.keys() == {"B", "Dist, tuned", "Lost"} and [row for row in lines if lines[row] == ":"] == [
+        "Dist, tuned"
+    ]
+
+
+def test_a_tuned_setting_is_free_in_its_weights_and_rate_alone(tmp_path):
+    found = {}
+    for name, task in {
+        "one": {"optimiser": {"learning_rate": 0.1, "budget": 9}, "silhouette_weight": 2.0},
+        "two": {"optimiser": {"learning_rate": 0.2, "budget": 9}, "silhouette_weight": 3.0, "losses": {"eikonal": 1}},
+        "more": {"optimiser": {"learning_rate": 0.1, "budget": 99}, "silhouette_weight": 2.0},
+    }.items():
+        for method in ("", "tuned/dist_mask"):
+            own = {"task": {"points": "20"} | task, "label": "Mine, tuned" if method else None}
+            write_completion(tmp_path / name / method, [0.8, 0.2], settings=own, method=method, renderer="dist")
+            (found[name, method],) = attempts_of(read_records(tmp_path / name / method)[0], tmp_path / name / method)
+    stated, tuned = (
+        {name: one for (name, of), one in found.items() if of == method} for method in ("", "tuned/dist_mask")
+    )
+    assert len({one.settings for one in stated.values()}) == 3 and not stated["one"].tuned
+    assert tuned["one"].settings == tuned["two"].settings != tuned["more"].settings
+    assert (tuned["one"].row, tuned["one"].preset, tuned["one"].tuned) == ("Mine, tuned", "dist", True)
+
+
+def test_tuned_settings_are_a_sweep_each_and_sets_without_one_are_left_out(capsys):
+    own, passed = parsed(["setting=tuned", "renderer=newton,mesh_proxy_48", "set=pose,reconstruct,complete", "seed=0"])
+    found = _sweeps(own, passed)
+    assert [said for said, _ in found] == [
+        "set 2 of 3: reconstruct, tuned/rgb_newton",
+        "set 3 of 3: complete, tuned/newton_mask",
+    ]
+    assert {"silhouette=cross_entropy_sharp", "+method=tuned/rgb_newton", "seed=0"} < {*found[0][1]}
+    assert "silhouette=own" in found[1][1] and not any(key.startswith("renderer=") for key in found[1][1])
+    assert capsys.readouterr().out == "set 1 of 3: pose: left out, since conf/tuned.yaml has no setting for it\n"
+    assert [said for said, _ in _sweeps(*parsed(["set=pose,render"]))] == ["set 1 of 2: pose", "set 2 of 2: render"]
+    assert main(["setting=tuned", "renderer=mesh_proxy_48"]) == 2
+    assert "no setting of mesh_proxy_48 for complete," in capsys.readouterr().err
 
 
 MINE = '''
