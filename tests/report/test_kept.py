@@ -55,6 +55,7 @@ def test_a_page_that_needs_run_folders_stays_until_there_are_some(tmp_path):
 
 def test_rows_are_the_records_but_for_what_is_of_the_machine(tmp_path):
     settings = {"dataset": {"path": "/home/me/chair.obj"}, "stress": None, "ranges": {"a": [1, 2.5]}, "empty": {}}
+    settings |= {"label": "-", "name": "", "points": "20", "of": 'a "b", c', "field": "NaN"}
     write_run(tmp_path, "gradients", None, id="a", metrics=bands() | {"error": "inf"}, settings=settings)
     write_run(tmp_path, "gradients", None, id="b", settings={"stress": {"name": "dent"}}, notes=["a", "b"])
     write_run(tmp_path, "gradients", None, id="c", status="killed")

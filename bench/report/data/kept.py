@@ -1,7 +1,8 @@
 """The rows that a shipped table is drawn from: `paper/EXPERIMENT.runs.csv`, a line a run, which outlives its folder.
 
 A line is a record without what its folder alone has (curves, pictures). A column is a field by its dotted name, a cell
-its value as JSON. An empty cell is that of the first line, and `-` says that the run has no such field.
+its value as JSON, or as it is where that is no JSON. An empty cell is that of the first line, and `-` says that the run
+has no such field.
 """
 
 import csv
@@ -68,7 +69,15 @@ def _cells(value: Any, name: str = "") -> dict[str, str]:
         return {key: cell for cells in inner for key, cell in cells.items()}
     if isinstance(value, str) and name.startswith("config.") and value.startswith("/"):
         value = Path(value).name  # of a folder of data
-    return {} if name in HERE else {name: json.dumps(plain(value))}
+    bare = isinstance(value, str) and value not in (SAME, NONE) and _value(value) == value
+    return {} if name in HERE else {name: str(value) if bare else json.dumps(plain(value))}
+
+
+def _value(cell: str) -> Any:
+    try:
+        return decoded(json.loads(cell))
+    except ValueError:
+        return cell
 
 
 def _write(path: Path, records: list[Record]) -> Path:
@@ -91,6 +100,8 @@ def _read(lines: Iterable[dict[str, str]]) -> Iterator[Record]:
     for line in lines:
         first = first or line
         cells = {name: cell if cell != SAME else first[name] for name, cell in line.items()}
-        record: Record = nested({name: decoded(json.loads(cell)) for name, cell in cells.items() if cell != NONE})
-        started(record), record["id"], record["status"], record["config"]  # what it cannot do without
+        record: Record = nested({name: _value(cell) for name, cell in cells.items() if cell != NONE})
+        if lacking := {"id", "status", "config"} - record.keys():
+            raise ValueError(f"a line has no {', '.join(sorted(lacking))}")
+        started(record)
         yield record | {KEPT: True, "log": []}
