@@ -10,6 +10,7 @@ from bench.records import format
 from bench.records.metrics import HIGHER, LOWER, SHOWN, Metric, better
 from bench.records.names import differences
 from bench.records.read import Plan, not_run, read_plans, read_run
+from bench.records.record import NOT_RUN, RunStatus
 from bench.report.data import records
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
 from bench.report.data.runs import Runs, Selection
@@ -25,19 +26,24 @@ MOST_VALUES = 6  # of a swept key that the caption lists
 MOST_DATASETS = 8  # with a column and a panel of their own
 MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
 FAILURE = (
-    "A run that did not end ok, or was not run, is counted as failed, and has the worst value of each metric: an "
-    "infinite error, or 0 of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
+    "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
+    "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
+NOT_ENDED = (NOT_RUN, RunStatus.KILLED)  # they say nothing of a row
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The runs of a sweep, one per planned cell, each with the name of its row; `swept` are keys with their values."""
+    """The runs of a sweep, one per planned cell, each with the name of its row; `swept` are keys with their values.
+
+    Cells that are `missing` were not run or killed, and have no run here, unless all are.
+    """
 
     name: str
     swept: dict[str, list[str]]
     runs: Runs
+    missing: int
 
     @property
     def metrics(self) -> list[str]:
@@ -96,7 +102,8 @@ def of_plan(plan: Plan, known: dict[str, Record]) -> Sweep:
     names = differences(runs, apart=_apart, asked=[{k: one[k] for k in one if k in swept} for one in asked])
     named = [run | {"row": name} for run, name in zip(runs, names, strict=True)]
     selection = Selection(plan.cells[0].config.get("experiment") or "", setup=("scenes", "pixels", "machine"))
-    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, named))
+    ended = [run for run in named if run["status"] not in NOT_ENDED]
+    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or named), len(named) - len(ended))
 
 
 def lines(sweep: Sweep) -> list[dict[str, Any]]:
@@ -187,6 +194,7 @@ def table_of(sweep: Sweep) -> Result:
         chart={"panels": panels} if panels else None,
         remarks=(
             FAILURE,
+            f"Left out: {sweep.missing} that were not run, killed or not to be read; the same command runs them." if sweep.missing else "",
             UNDIRECTED if any(not better(name) for name in headings) else "",
             f"The CSV also has {', '.join(more)}." if more else "",
             *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),

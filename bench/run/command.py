@@ -221,13 +221,16 @@ def _explain(error: Exception) -> str:
             nested = missing.startswith("hydra/") or "/" not in missing
             group, _, name = missing.rpartition("/") if nested else missing.partition("/")
             if group == "hydra/launcher" and (extra := EXTRAS.get(name.split("_")[0])):
-                return f"hydra/launcher={name} needs a plugin: {install(extra)}"
+                return f"this launcher needs a plugin: {install(extra)}"
             what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
             options = cause.options or names(group)  # Hydra has none for what a row builds on
             known = [option for option in options if not option.startswith("_")]  # others build on these
             own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
             return what + nearest(name, known) + (own if "/" in name or "." in name else "")
     message = " ".join(str(error).split())
+    if found := re.search(r"In '(experiment|method)/([^']+)'.* full_key: \1\b|@(experiment|method)\.", message):
+        file = f"{found[1]}/{found[2]}.yaml" if found[1] else f"a YAML of {found[3]}"
+        return f"{file} must begin with the line # @package _global_: its keys are those of the top level"
     if found := re.search(r"Key '([^']+)' not in", message):  # of a row or a file
         return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
     if found := re.match(r"Ambiguous value for argument '(.*?)=(.*)' 1\.", message):

@@ -1,4 +1,4 @@
-"""Any sweep has a table: a row for what varies, with failed and missing cells counted."""
+"""Any sweep has a table: a row for what varies, with failed cells counted and missing ones named."""
 
 import math
 import re
@@ -107,7 +107,7 @@ def test_a_sweep_that_has_ended_has_its_table_at_once(tmp_path):
         ran(tmp_path, one, 0.001)
     assert write_sweep(plan) == tmp_path / "sweeps" / "completion-1" / "table.md"
     at_once = (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()
-    assert list(table(tmp_path)["failed"]) == [0, 1]
+    assert list(table(tmp_path)["failed"]) == [0, 0] and list(table(tmp_path)["runs"]) == [2, 1]
     assert at_once == (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()  # as the report makes it
     experiment = [replace(one, config=one.config | {"experiment": "table2"}) for one in cells]
     assert write_sweep(Plan("table2-1", tmp_path, experiment)) is None  # a page shows it
@@ -129,17 +129,17 @@ def test_six_shapes_have_an_interval(tmp_path):
     assert "95 % bootstrap intervals over shapes" in text
 
 
-def test_cells_that_failed_or_were_not_run_count_in_their_rows(tmp_path):
+def test_cells_that_failed_count_in_their_rows_and_those_that_were_not_run_do_not(tmp_path):
     cells = [cell(r, seed=s) for r in ("dist", "dvr") for s in (0, 1, 2)]
     swept(tmp_path, cells)
     for one, chamfer in zip(cells[:5], (0.001, 0.002, 0.003, 0.002, None), strict=True):
         ran(tmp_path, one, chamfer)
     found = table(tmp_path)
-    assert list(found["failed"]) == [0, 2] and list(found["runs"]) == [3, 3]
-    assert math.isinf(found.loc["DVR", "chamfer_l2"]) and found.loc["DVR", "fscore"] == 0
+    assert list(found["failed"]) == [0, 1] and list(found["runs"]) == [3, 2]
+    assert "Left out: 1 that were not run" in (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
+    assert math.isinf(found.loc["DVR", "chamfer_l2"]) and found.loc["DVR", "fscore"] == pytest.approx(0.499)
     assert found.loc["DVR", "steps_taken"] == 9  # neither direction is better
-    assert found.loc["DVR", "reasons"].startswith("crashed: as planned; not_run: planned by sweep completion-1")
-    assert math.isinf(found.loc["DVR", "ratio"])
+    assert found.loc["DVR", "reasons"] == "crashed: as planned" and math.isnan(found.loc["DVR", "ratio"])
 
 
 def test_settings_and_classes_are_told_apart(tmp_path):
@@ -191,13 +191,14 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     assert "swept over renderer (dist, dvr)." in found.shown.caption and "All 2 runs ended ok." in found.shown.caption
 
 
-def test_a_cell_whose_record_is_damaged_stays_in_its_row(tmp_path):
+def test_a_cell_whose_record_is_damaged_is_missing(tmp_path):
     cells = [cell("dist", seed=s) for s in (0, 1)]
     swept(tmp_path, cells)
     ran(tmp_path, cells[0], 0.001)
     write_run(tmp_path, "{", cells[1].id)
     (plan,), known = read_plans(tmp_path)[0], {one["folder"]: one for one in read_records(tmp_path)[0]}
-    assert [(row["row"], row["runs"], row["failed"]) for row in lines(of_plan(plan, known))] == [("DIST", 2, 1)]
+    sweep = of_plan(plan, known)
+    assert sweep.missing == 1 and [(row["row"], row["runs"], row["failed"]) for row in lines(sweep)] == [("DIST", 1, 0)]
 
 
 def test_a_sweep_with_an_odd_record_costs_no_other_table(tmp_path, capsys):

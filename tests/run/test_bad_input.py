@@ -123,6 +123,15 @@ def test_a_mistyped_key_in_a_row_of_the_users_names_its_file(bench, tmp_path, no
         assert_one_line(err, f"{words} It is in {table}")
 
 
+@pytest.mark.parametrize("text", ["task: {points: 20}", "defaults: [override /task: completion]"])
+def test_an_experiment_without_its_first_line_is_told_what_it_is(bench, tmp_path, text):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(text)
+    code, _, err = bench("--config-dir", str(tmp_path), "+experiment=mine")
+    assert code == 2
+    assert_one_line(err, "must begin with the line # @package _global_")
+
+
 @pytest.mark.parametrize("word", ["list", "help", "--help"])
 def test_a_word_lists_what_there_is(bench, word):
     code, out, err = bench(word)
