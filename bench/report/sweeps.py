@@ -194,7 +194,7 @@ def table_of(sweep: Sweep) -> Result:
         chart={"panels": panels} if panels else None,
         remarks=(
             FAILURE,
-            f"Left out: {sweep.missing} that were not run, killed or not to be read; the same command runs them." if sweep.missing else "",
+            f"Left out: {sweep.missing} that were not run; the same command runs them." if sweep.missing else "",
             UNDIRECTED if any(not better(name) for name in headings) else "",
             f"The CSV also has {', '.join(more)}." if more else "",
             *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),
