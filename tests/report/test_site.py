@@ -323,17 +323,22 @@ def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
     solved = attempt("Dist", "car test 0", {0: 0.8, 500: 0.0115, 600: 0.001}, preset="dist")
     mine = replace(solved, row="Mine", preset="custom", status="nan", reason="lost", overrides=[
         *solved.overrides, "renderer=custom", "+renderer.steps=7", "label=My own"])  # fmt: skip
-    for name, one in (("a", solved), ("b", mine)):
+    asked = ["+experiment=core_complete", "+method=tuned/dist_mask", "silhouette=own", "label='Dist, tuned'"]
+    tuned = replace(solved, row="Dist, tuned", overrides=asked)
+    for name, one in (("a", solved), ("b", mine), ("a", tuned)):
         write_attempts([one], tmp_path / name)
     merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
     assert main([f"results_dir={tmp_path / 'both'}"]) == 0
     page = Page(tmp_path / "both")
     shown = page.paper("suite")
-    assert [row[1] for row in shown["rows"]] == ["Dist", "Mine"] and shown["chart"]["panels"]
+    assert [row[1] for row in shown["rows"]] == ["Dist", "Dist, tuned", "Mine"] and shown["chart"]["panels"]
     assert "n = 1 problem" in shown["caption"] and "The run ended" not in shown["caption"]
     found = page.read("list", "renderers")
     assert found["problems"] == [["complete", "car test 0, 20 points", 0]] and found["targets"] == 5
-    dist, own = found["rows"]
+    dist, by_itself, own = found["rows"]
+    assert by_itself["command"] == "python -m bench.suite setting=tuned renderer=dist"
+    assert ["task.optimiser.learning_rate: tuned/dist_mask", "0.0215"] in by_itself["settings"]
+    assert len(by_itself["settings"]) == len(dist["settings"]) + 5  # weights, rate, and two of the renderer
     assert (dist["reached"], dist["failed"], dist["runs"]) == ([5], [], [None])
     assert (own["reached"], own["failed"]) == ([0], [[0, "nan", "lost"]])
     assert own["command"] == "python -m bench.suite renderer=custom +renderer.steps=7 'label=My own'"

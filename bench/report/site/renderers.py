@@ -3,16 +3,18 @@
 import inspect
 import re
 import shlex
+from collections.abc import Iterable
 from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from bench.records.names import flat
 from bench.report.data.records import OURS, Record
-from bench.report.suite.attempts import Attempt, attempts_of, read_attempts, suite
+from bench.report.suite.attempts import TUNED, Attempt, attempts_of, read_attempts, suite
 from bench.report.suite.standing import COST, Standing
 from bench.report.write import paper
-from bench.tables import choice
+from bench.tables import METHOD, choice, names
 
 SET_BY_SUITE = ("index=", "dataset=", "seed=", "task.", "sizes.", "experiment=")  # overrides that say which problem
 
@@ -44,7 +46,7 @@ def _row(standing: Standing, row: str, problems: list[Any], folders: dict[Any, s
     attempts = {one.key[:3]: one for one in standing.attempts if one.row == row}
     found = [attempts.get(problem) for problem in problems]
     first = next(iter(attempts.values()))
-    settings = _node(first.preset) | _asked(first)
+    settings = _node(first.preset) | _asked(first) | _tuned(attempts.values())
     file, source = _source(str(settings.get("_target_", "")))
     return {
         "row": row,
@@ -52,7 +54,9 @@ def _row(standing: Standing, row: str, problems: list[Any], folders: dict[Any, s
         "failed": [[place, one.status, one.reason] for place, one in enumerate(found) if one and not one.ok],
         "runs": [folders.get((*one.key, one.started)) if one else None for one in found],
         "settings": [
-            [key, str(value)] for key, value in settings.items() if not key.startswith("_") and key != "defaults"
+            [key, str(value)]
+            for key, value in settings.items()
+            if not key.startswith("_") and key.partition(":")[0] not in ("defaults", "label")
         ],
         "file": file,
         "source": source,
@@ -62,6 +66,8 @@ def _row(standing: Standing, row: str, problems: list[Any], folders: dict[Any, s
 
 def _own(attempt: Attempt) -> list[str]:
     """The overrides that say which renderer it is."""
+    if attempt.tuned:
+        return ["setting=tuned", f"renderer={attempt.preset}"]
     return [text for text in attempt.overrides if not text.lstrip("+").startswith(SET_BY_SUITE)]
 
 
@@ -69,6 +75,14 @@ def _asked(attempt: Attempt) -> dict[str, Any]:
     """The settings of the renderer that the command line gave."""
     pairs = [text.lstrip("+").partition("=") for text in _own(attempt)]
     return {key.removeprefix("renderer."): value for key, _, value in pairs if key.startswith("renderer.")}
+
+
+def _tuned(attempts: Iterable[Attempt]) -> dict[str, Any]:
+    """The keys of tuned settings that attempts are at, each with its method, one a set."""
+    overrides = {text.lstrip("+") for one in attempts if one.tuned for text in one.overrides}
+    ours = {text.removeprefix(f"method={TUNED}") for text in overrides} & {*names(f"{METHOD}/tuned")}
+    known = {name: choice(METHOD, f"{TUNED}{name}") for name in sorted(ours)}
+    return {f"{key}: {TUNED}{name}": value for name, node in known.items() for key, value in flat(node).items()}
 
 
 def _node(preset: str) -> dict[str, Any]:
