@@ -3,7 +3,7 @@
 import base64
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,7 +112,7 @@ class Scene:
             return np.stack([np.full(max(len(corners) - 2, 0), corners[:1]), corners[1:-1], corners[2:]], axis=1)
         return corners.reshape(-1, 3)
 
-    def _shape(self, primitive: dict[str, Any], weights: list[float]) -> Float[np.ndarray, "v 3"]:
+    def _shape(self, primitive: dict[str, Any], weights: Sequence[float]) -> Float[np.ndarray, "v 3"]:
         """Positions, with the morph targets that are not at zero."""
         vertices = self._numbers(primitive["attributes"]["POSITION"]).astype(np.float64)
         for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
@@ -183,7 +183,7 @@ class Scene:
             return base64.b64decode(uri.partition(",")[2])
         if i == 0 and not uri:
             return self.binary
-        raise BadInput(f"must hold its numbers, but buffer {i} is elsewhere {uri} {self._extensions}")
+        raise BadInput(f"must hold its numbers, but buffer {i} is elsewhere, '{uri[:40]}' {self._extensions}")
 
     @property
     def _extensions(self) -> str:

@@ -20,6 +20,7 @@ MISTAKEN = {  # how other files begin, in lower case: what they are, and the rem
     b"<!doctype html": "is a web page; download the file itself",
     b"<html": "is a web page; download the file itself",
 }
+WIDE = b"\xff\xfe", b"\xfe\xff"  # how a text of UTF-16 begins
 BROKEN_LINE = re.compile(r"^[ \t]*[vf][ \t](?:[^\\\n]|\\[ \t]*\n)*", re.MULTILINE)  # \ at the end: the next one goes on
 
 
@@ -33,7 +34,7 @@ def read_obj(content: bytes) -> Polygons:
     if "\\" in text:
         text = BROKEN_LINE.sub(lambda line: re.sub(r"\\[ \t]*\n", " ", line[0]), text)
     vertices, colours, counts, corners = [], [], [], []
-    for line in text.splitlines():
+    for line in text.split("\n"):
         key, *words = line.split() or [""]
         try:
             if key == "v":
@@ -64,12 +65,13 @@ def read_off(content: bytes) -> Polygons:
         raise ValueError(f"must be text and begin with OFF, COFF, NOFF or STOFF, found '{found}'; export it as .ply")
     letters = header[1] or ""
     shade = 6 if "N" in letters else 3  # where a vertex's colour begins
-    lines = [line.split() for line in text[header.end() :].splitlines() if line.strip()]
+    width = shade + 4 * ("C" in letters) + 2 * header[0].startswith("ST")
+    lines = [line.split() for line in text[header.end() :].split("\n") if line.strip()]
     try:
         vertex_count, face_count = (int(word) for word in lines[0][:2])
         rows = lines[1:]
         if len(rows) != vertex_count + face_count:
-            rows = _in_rows(lines, vertex_count, face_count) or rows
+            rows = _in_rows(lines, vertex_count, face_count, width) or rows
         faces = [[int(number) for number in row[: 1 + int(row[0])]] for row in rows[vertex_count:]]
         vertices = [_three(row) for row in rows[:vertex_count] if len(row) >= 3]
         colours = [_three(row[shade:]) for row in rows[:vertex_count] if "C" in letters and len(row) >= shade + 3]
@@ -92,7 +94,7 @@ def read_stl(content: bytes) -> Polygons:
     Raises:
         ValueError: where it is not whole, or has a word for a number.
     """
-    if b"\0" in content[:84]:
+    if b"\0" in content[:84] and not content.startswith(WIDE):
         count = int.from_bytes(content[80:84], "little")
         if len(content) != 84 + 50 * count:
             raise ValueError(
@@ -108,11 +110,13 @@ def read_stl(content: bytes) -> Polygons:
                 f"must be a whole .stl file, from 'solid' to 'endsolid', found '{first}' to '{last}'; "
                 "export or copy it again"
             )
-        corners = [re.findall(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", loop) for loop in text.split("endloop")]
+        loops = [facet.rpartition("loop")[2].split("vertex")[1:] for facet in text.split("endloop")[:-1]]
         try:
-            vertices, counts = [_three(words) for loop in corners for words in loop], [*map(len, corners)]
+            vertices, counts = [_three(place.split()) for loop in loops for place in loop], [*map(len, loops)]
         except ValueError as error:
             raise ValueError(f"must have lines 'vertex x y z' ({error}); export it again") from None
+        if min(counts, default=3) < 3:
+            raise ValueError(f"must have 3 corners or more in a facet, found {min(counts)}; export or copy it again")
     return _polygons(vertices, counts, np.arange(len(vertices)), [])
 
 
@@ -125,17 +129,20 @@ def mistaken(path: Path) -> str:
 
 def decoded(content: bytes) -> str:
     """The text of a file with plain ends of lines, without comments and the mark that some editors write first."""
-    wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    text = content.decode("utf-16" if wide else "utf-8-sig", "replace").replace("\r\n", "\n").replace("\r", "\n")
+    text = (
+        content.decode("utf-16" if content.startswith(WIDE) else "utf-8-sig", "replace")
+        .replace("\r\n", "\n")
+        .replace("\r", "\n")
+    )
     return re.sub(r"#[^\n]*", "", text)
 
 
-def _in_rows(lines: list[list[str]], vertex_count: int, face_count: int) -> list[list[str]]:
+def _in_rows(lines: list[list[str]], vertex_count: int, face_count: int, width: int) -> list[list[str]]:
     """The words of each vertex and face of an .off file that breaks its lines elsewhere; none if it is not whole."""
-    if min(vertex_count, face_count) < 0 or 3 * vertex_count + face_count > sum(map(len, lines)):
+    if min(vertex_count, face_count) < 0 or width * vertex_count + face_count > sum(map(len, lines)):
         return []
     rest = islice((word for line in lines for word in line), 3, None)
-    rows = [[*islice(rest, 3)] for _ in range(vertex_count)]
+    rows = [[*islice(rest, width)] for _ in range(vertex_count)]
     rows += [[count, *islice(rest, int(count))] for count in rest if count.isdigit()]
     whole = len(rows) == vertex_count + face_count and (not face_count or len(rows[-1]) == 1 + int(rows[-1][0]))
     return rows if whole else []

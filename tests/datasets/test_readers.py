@@ -1,4 +1,4 @@
-"""What .obj, .off and .ply files hold, in every way to write it: prisms over random polygons, of known volume."""
+"""What .obj, .off, .ply and .stl files hold, in every way to write it: of known volume."""
 
 import struct
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from datasets.mesh import Mesh
 from datasets.readers.ply import read_ply
 from datasets.readers.polygons import Polygons, ears
-from datasets.readers.text import read_obj, read_off
+from datasets.readers.text import read_obj, read_off, read_stl
 from tests.looped import each
 
 FEW = settings(max_examples=30, deadline=None)
@@ -185,10 +185,17 @@ V, F = "".join(f"v {place}\n" for place in PLACES), "f 1 3 2\nf 1 2 4\nf 2 3 4\n
 ROWS = "\n".join([*PLACES, *(f"3 {face}" for face in FACES)])
 HEAD = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
 STRIPS = f"{HEAD}element tristrips 1\nproperty list int int vertex_indices\nend_header\n" + "\n".join(PLACES)
+CORNERS = [[PLACES[int(i)] for i in face.split()] for face in FACES]
+LOOPS = [" outer loop\n" + "".join(f"  vertex {place}\n" for place in corners) + " endloop\n" for corners in CORNERS]
+SOLID = "solid A #1\n" + "".join(f"facet normal nan 0 0\n{loop}endfacet\n" for loop in LOOPS) + "endsolid A\n"
+TRIANGLES = np.array([[place.split() for place in corners] for corners in CORNERS], np.float32)
+BINARY = b"".join(struct.pack("<12fH", 0, 0, 0, *corners.ravel(), 0) for corners in TRIANGLES)
 TETRAHEDRA = {
     "faces before their vertices": (read_obj, F + V),
     "relative after half of the vertices": (read_obj, V[:16] + "f 1 3 -1\n" + V[16:] + F[8:]),
     "a folder's name that ends in a backslash": (read_obj, "mtllib C:\\made\\\n" + V + F),
+    "a mark of another line in a name": (read_obj, "o a\u2028f 1 2 3\x0bf 1 2 3\n" + V + F),
+    "corners twice": (read_obj, V + F.replace("1 3 2", "1 3 2 2").replace("1 2 4", "1 2 4 4 4")),
     "lines and points beside": (read_obj, V + F + "l 1 2\np 3\nf 1 2\n"),
     "weights": (read_obj, V.replace("\n", " 1.0\n") + F),
     "utf-16": (read_obj, (V + F).encode("utf-16")),
@@ -197,6 +204,16 @@ TETRAHEDRA = {
     "two counts": (read_off, "off\n4 4\n" + ROWS),
     "no header": (read_off, "4 4 6\n" + ROWS),
     "one line": (read_off, " ".join(f"OFF 4 4 6 {ROWS}".split())),
+    "normals, in one line": (read_off, " ".join(f"NOFF 4 4 6 {' 0 0 1 '.join(PLACES)} 0 0 1 {ROWS[23:]}".split())),
+    "a binary .stl named solid": (read_stl, b"solid facet normal".ljust(80) + struct.pack("<I", 4) + BINARY),
+    "a text of .stl": (read_stl, SOLID),
+    "two solids, in one line of capitals": (
+        read_stl,
+        (SOLID[: SOLID.index(LOOPS[2])] + LOOPS[2] + "endfacet endsolid A solid B " + SOLID[-140:])
+        .replace("\n", " ")
+        .upper(),
+    ),
+    "a wide text of .stl": (read_stl, SOLID.encode("utf-16")),
     "a text with more in a line than its header says": (
         read_ply,
         HEAD + "element face 4\nproperty list uchar int vertex_indices\nend_header\n" + ROWS.replace("\n", " 9 8 x\n"),
@@ -210,11 +227,20 @@ TETRAHEDRA = {
 def test_a_tetrahedron_is_read_in_unusual_spellings(name):
     reader, content = TETRAHEDRA[name]
     read = reader(content if isinstance(content, bytes) else content.encode())
-    mesh = Mesh(read.vertices, read.triangles()[0])
+    welded, vertex = np.unique(read.vertices, axis=0, return_inverse=True)
+    mesh = Mesh(welded, vertex.ravel()[read.triangles()[0]])
     assert mesh.watertight and mesh.volume == pytest.approx(1 / 6)
 
 
 REFUSED = {
+    "a longer .stl": (
+        read_stl,
+        "x".ljust(80) + "\4\0\0\0" + "\0" * 201,
+        "284 bytes for the 4 faces that it claims, found 285",
+    ),
+    "no end of an .stl": (read_stl, SOLID[:-11], "from 'solid' to 'endsolid', found 'solid a facet norma' to "),
+    "an .stl of commas": (read_stl, SOLID.replace("1 0 0", "1,0 0 0"), "'vertex x y z' .*'1,0'"),
+    "two corners": (read_stl, SOLID.replace("  vertex 1 0 0\n", "", 1), "3 corners or more in a facet, found 2"),
     "comma": (read_obj, "v 0,5 0 0\n", r"'v x y z', found 'v 0,5 0 0'"),
     "zero": (read_obj, V + "f 0 1 2\n", "found 'f 0 1 2'"),
     "too far back": (read_obj, V + "f -5 1 2\n", "from -4 to -1, found 'f -5 1 2'"),
