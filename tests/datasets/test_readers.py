@@ -209,9 +209,7 @@ TETRAHEDRA = {
     "a text of .stl": (read_stl, SOLID),
     "two solids, in one line of capitals": (
         read_stl,
-        (SOLID[: SOLID.index(LOOPS[2])] + LOOPS[2] + "endfacet endsolid A solid B " + SOLID[-140:])
-        .replace("\n", " ")
-        .upper(),
+        " ".join(f"solid {one}{two} endsolid" for one, two in (LOOPS[:2], LOOPS[2:])).upper().replace("\n", " "),
     ),
     "a wide text of .stl": (read_stl, SOLID.encode("utf-16")),
     "a text with more in a line than its header says": (
