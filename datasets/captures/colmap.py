@@ -1,5 +1,6 @@
 """COLMAP's sparse reconstructions."""
 
+from collections.abc import Sequence
 from os.path import relpath
 from pathlib import Path
 from typing import Any
@@ -13,21 +14,19 @@ from datasets.captures.pairing import images_in, located, masks_of, without_came
 from datasets.extras import install
 from renderers.checks import BadInput
 
-ROOTS = ("sparse", "colmap/sparse", "distorted/sparse", ".")
 IMAGES = ("images", "images_2", "images_4", "images_8", "input", "image", ".")
 MOST = 0.9  # of the points lie in the sphere: others may be far away
 
 
-def colmap(folder: Path, masked: bool, images: str | None = None) -> Layout | None:
+def colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None = None) -> Layout:
     """The model with the most images, read by pycolmap; its points lie about the object, or about all that is seen.
 
     Args:
+        files: the images.bin or images.txt of the models: several where COLMAP could not join all images.
         masked: whether masks are looked for.
         images: the folder of images; None for the usual ones.
     """
-    places = _models(folder)
-    if not places:
-        return None
+    places = [*dict.fromkeys(file.parent for file in files)]
     try:
         import pycolmap
     except ImportError as error:
@@ -42,33 +41,17 @@ def colmap(folder: Path, masked: bool, images: str | None = None) -> Layout | No
     base, found, how = max(tried, key=lambda one: len(one[1]))
     short = {name: Path(relpath(file, base)).as_posix() for name, file in sorted(found.items())}
     there = {short[name]: file for name, file in found.items()}
-    masks, masked = masks_of(folder, there if masked else {})
+    masks, paired = masks_of(folder, there if masked else {})
     frames = [
         Frame(found[name], *cameras[name][:2], masks.get(path), *cameras[name][2:]) for name, path in short.items()
     ]
     notes = [*_chosen(folder, place, {one: len(model.images) for one, model in models.items()})]
-    notes += [*([how] if how else []), *masked, *without_image([name for name in cameras if name not in found])]
+    notes += [*([how] if how else []), *paired, *without_image([name for name in cameras if name not in found])]
     if base != folder:
         notes += without_camera(name for name in images_in(base, deep=True) if name not in there)
     points = np.array([point.xyz for point in models[place].points3D.values()])
     around = _about(points) if len(points) else None
     return Layout("COLMAP", tuple(frames), None, tuple(notes), around, missing=next(iter(cameras), ""))
-
-
-def _models(folder: Path) -> list[Path]:
-    """The folders of models: several where COLMAP could not join all images."""
-    roots = [folder / name for name in ROOTS]
-    places = [place for root in roots if root.is_dir() for place in (*_numbered(root), root)]
-    return [place for place in places if _has(place, "cameras") and _has(place, "images")]
-
-
-def _numbered(root: Path) -> list[Path]:
-    """The folders 0, 1 and so on."""
-    return sorted((one for one in root.iterdir() if one.is_dir() and one.name.isdigit()), key=lambda one: int(one.name))
-
-
-def _has(place: Path, name: str) -> bool:
-    return any((place / f"{name}{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
 def _chosen(folder: Path, place: Path, counts: dict[Path, int]) -> list[str]:

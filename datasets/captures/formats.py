@@ -1,6 +1,6 @@
 """Which format of photographs with cameras a folder has, and what is said where it has none that can be used."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -8,8 +8,9 @@ from zipfile import BadZipFile
 
 from datasets.captures.colmap import colmap
 from datasets.captures.frames import Layout
-from datasets.captures.matrices import dvr, idr
+from datasets.captures.matrices import matrices
 from datasets.captures.nerf import transforms
+from datasets.captures.pairing import natural
 from datasets.captures.rows import blended_mvs, choy, llff, middlebury
 from datasets.readers.text import mistaken
 from renderers.checks import BadInput
@@ -20,13 +21,23 @@ KNOWN = (
     "(BlendedMVS), rendering_metadata.txt (Choy)"
 )
 
+MODELS = ("sparse", "colmap/sparse", "distorted/sparse", ".")  # where COLMAP's are
+FORMATS = {  # the readers, and the files of cameras that they take
+    "IDR, NeuS or DVR": (matrices, ("cameras_sphere.npz", "cameras.npz")),
+    "NeRF": (transforms, ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")),
+    "Middlebury": (middlebury, ("*_par.txt",)),
+    "LLFF": (llff, ("poses_bounds.npy",)),
+    "COLMAP": (colmap, [f"{root}/{inner}images.[bt][ix][nt]" for root in MODELS for inner in ("[0-9]*/", "")]),
+    "BlendedMVS": (blended_mvs, ("cams/*_cam.txt",)),
+    "Choy": (choy, ("rendering_metadata.txt", "rendering/rendering_metadata.txt")),
+}
 FAULTS = (  # of a file of cameras that is broken
     *(OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, MemoryError, BadZipFile, RuntimeError),
 )
 
 
 def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) -> Layout:
-    """The photographs of a folder, in the first known format that it has.
+    """The photographs of a folder, in the first known format that has cameras and images there.
 
     Args:
         images: where COLMAP's images are, in the folder or elsewhere; None for the usual places.
@@ -38,41 +49,32 @@ def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) 
     if not folder.is_dir():
         what = f"{folder} is a file" if folder.exists() else f"there is no folder {folder}"
         raise BadInput(f"{what}: name the folder that has the photographs and their cameras")
-    readers: dict[str, Callable[[Path, bool], Layout | None]] = {
-        "DVR": dvr,
-        "IDR/NeuS": idr,
-        "NeRF": transforms,
-        "Middlebury": middlebury,
-        "LLFF": llff,
-        "COLMAP": lambda folder, masks: colmap(folder, masks, images),
-        "BlendedMVS": blended_mvs,
-        "Choy": choy,
-    }
-    found, unread = list[Layout](), list[str]()
-    for name, read in readers.items():
-        try:
-            layout = _read(name, partial(read, folder, masks), folder)
-        except BadInput:
-            if not any(one.frames for one in found):
-                raise
-            unread.append(name)  # beside cameras that are read
-        else:
-            found += [layout] if layout else []
-    if not found:
+    there = {name: files for name, (_, patterns) in FORMATS.items() if (files := _files(folder, patterns))}
+    if not there:
         inner = next((one for one in sorted(folder.glob("*/")) if any(one.glob("cameras*.npz"))), None)
         other = f"; name one of its folders, such as {inner}" if inner else ""
         raise BadInput(f"{folder} has no cameras that are known: {KNOWN}{other}")
-    usable = [layout for layout in found if layout.frames]
-    if not usable:
-        raise BadInput(_no_images(folder, found))
-    if images is not None and usable[0].format != "COLMAP":
-        raise BadInput(f"dataset.images={images} is for COLMAP, and {folder} has {usable[0].format}: leave it out")
-    others = ", ".join([*(layout.format for layout in found if layout is not usable[0]), *unread])
-    notes = (*usable[0].notes, f"other cameras in the folder are not used: {others}") if others else usable[0].notes
-    return replace(usable[0], notes=notes)
+    bare = list[Layout]()
+    for name, files in there.items():
+        more = {"images": images} if name == "COLMAP" else {}
+        layout = _read(name, partial(FORMATS[name][0], folder, files, masks, **more), folder)
+        if layout.frames:
+            if images is not None and name != "COLMAP":
+                raise BadInput(f"dataset.images={images} is for COLMAP, and {folder} has {layout.format}: leave it out")
+            others = ", ".join(str(there[other][0].relative_to(folder)) for other in there if other != name)
+            told = (f"other cameras in the folder are not used: {others}",) if others else ()
+            return replace(layout, notes=(*layout.notes, *told))
+        bare.append(layout)
+    raise BadInput(_no_images(folder, bare))
 
 
-def _read(name: str, read: Callable[[], Layout | None], folder: Path) -> Layout | None:
+def _files(folder: Path, patterns: Sequence[str]) -> list[Path]:
+    """The files of a folder by these patterns, in this order, number 10 after 9; none that is hidden."""
+    found = [sorted(folder.glob(pattern), key=lambda file: natural(str(file))) for pattern in patterns]
+    return [file for some in found for file in some if file.is_file() and not file.name.startswith(".")]
+
+
+def _read(name: str, read: Callable[[], Layout], folder: Path) -> Layout:
     """What a format's reader finds; where a file of it is broken, an error that names the format.
 
     Raises:

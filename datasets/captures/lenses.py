@@ -29,8 +29,14 @@ FISHEYE = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 UNDERSTOOD = ", ".join([*PLAIN, *FISHEYE])
-OTHER = re.compile(r"k[7-9]|k\d\d|p[3-9]|[sb]\d|tau_?[xy]|ftheta_\w+")  # numbers of models that are not understood
-SHAPES = ("equirectangular", "latlong", "orthographic", "orthophoto", "is_equirectangular", "is_orthographic")
+READ = {*RADIAL, *TANGENTIAL, "camera_model", "is_fisheye", "distortion_params"}
+PINHOLE = {"", "NONE", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE"}
+SPEAKS = re.compile(  # of a lens, or of a shutter
+    r"(.*\.)?([kpsb]\d+|tau_?[xy]|lens(_?(model|type|params))?|(camera|model)_?(model|type|params)"
+    r"|projection(_?(model|type))?|(ftheta|radial|tangential|transform_matrix_).*"
+    r"|(is_)?(equirect|latlong|ortho(graphic|photo)|panoram|spherical|omni).*|.*(distort|fish_?eye|shutter).*)",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
@@ -101,24 +107,20 @@ def colmap_lens(model: str, numbers: list[float], where: str) -> Lens:
     return _lens(dict(zip(names, numbers[len(numbers) - len(names) :], strict=True)), fisheye=model in FISHEYE)
 
 
-def nerf_lens(known: Mapping[str, Any], where: str) -> Lens:
+def nerf_lens(known: dict[str, Any], where: str) -> Lens:
     """The lens of a frame of transforms.json.
 
     Raises:
         BadInput: for models that are not understood, by name.
     """
+    refuse_other_lenses(known, where)
     model = str(known.get("camera_model") or "").upper()
-    flags = [name for name in SHAPES if known.get(name)]
-    if (model and model not in {*PLAIN, *FISHEYE, "PERSPECTIVE"}) or flags:
-        named = f"camera_model {model}" if not flags else flags[0]
-        raise BadInput(f"{where}: {named} is not understood ({UNDERSTOOD} are): undistort the images, and export again")
-    if others := [name for name, value in known.items() if OTHER.fullmatch(name) and np.any(value)]:
+    if model not in {*PLAIN, *FISHEYE, *PINHOLE}:
         raise BadInput(
-            f"{where}: the lens has {', '.join(others)}, which is not understood ({', '.join((*RADIAL, *TANGENTIAL))} "
-            "are): undistort the images, and export again"
+            f"{where}: camera_model {model} is not understood ({UNDERSTOOD} are): undistort the images, export again"
         )
     fisheye = model in FISHEYE or bool(known.get("is_fisheye"))
-    if fisheye and model in PLAIN:
+    if fisheye and model in {*PLAIN, "PERSPECTIVE"}:
         raise BadInput(f"{where}: is_fisheye does not fit camera_model {model}: leave one of them out")
     listed = known.get("distortion_params") or ()
     if len(listed) not in (0, len(NERFSTUDIO)) and not (fisheye and len(listed) == 4):
@@ -126,8 +128,11 @@ def nerf_lens(known: Mapping[str, Any], where: str) -> Lens:
             f"{where}: distortion_params must be {', '.join(NERFSTUDIO)}, or k1 to k4 of a fisheye, not "
             f"{len(listed)} numbers: give them by name"
         )
-    stated = dict(zip(NERFSTUDIO, listed, strict=False))
-    bent = {name: float(known.get(name) or stated.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
+    named = {name: float(known.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
+    stated = {name: float(value) for name, value in zip(NERFSTUDIO, listed, strict=False)}
+    if any(named.values()) and any(named[name] != value for name, value in stated.items()):
+        raise BadInput(f"{where}: distortion_params and the numbers by name differ: leave one of them out")
+    bent = named | stated
     if fisheye and any(bent[name] for name in ("k5", "k6", "p1", "p2")):
         raise BadInput(f"{where}: a fisheye has k1 to k4, and this one k5, k6, p1 or p2 too: export it again")
     if not fisheye and bent["k4"] and model != "FULL_OPENCV" and not {"k5", "k6"} & set(known):
@@ -136,6 +141,27 @@ def nerf_lens(known: Mapping[str, Any], where: str) -> Lens:
             "camera_model to FULL_OPENCV"
         )
     return _lens(bent, fisheye=fisheye)
+
+
+def refuse_other_lenses(known: dict[str, Any], where: str) -> None:
+    """Raises BadInput for keys that speak of a lens, that are not read, and whose values are not those of a pinhole."""
+    tables = {key: value for key, value in known.items() if isinstance(value, Mapping)}
+    inner = {f"{key}.{name}": value for key, table in tables.items() for name, value in table.items()}
+    unread = {name: value for name, value in (known | inner).items() if name not in READ and SPEAKS.fullmatch(name)}
+    if others := [name for name, value in unread.items() if _bends(value)]:
+        raise BadInput(
+            f"{where}: the lens has {', '.join(others)}, which is not understood ({', '.join(sorted(READ))} are, so "
+            "written): undistort the images, and export again, or remove what says nothing of distortion"
+        )
+
+
+def _bends(value: Any) -> bool:
+    """Whether a value says more than that there is no distortion."""
+    if isinstance(value, str):
+        return value.upper() not in PINHOLE
+    if isinstance(value, Mapping | list):
+        return any(map(_bends, value.values() if isinstance(value, Mapping) else value))
+    return bool(np.any(value))
 
 
 def _lens(bent: Mapping[str, float], *, fisheye: bool) -> Lens:

@@ -1,12 +1,13 @@
 """Cameras as matrices in one `.npz` file: IDR and NeuS, and DVR."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from datasets.captures.frames import Frame, Layout, decomposed, image_size, need
+from datasets.captures.lenses import refuse_other_lenses
 from datasets.captures.pairing import by_order, first_images, made, masks_of, paired
 from renderers.checks import BadInput
 
@@ -15,25 +16,16 @@ SIMILAR = 1e-4  # most by which scale_mat may differ from a similarity, and from
 CUBE = 0.75**0.5  # radius of the sphere about DVR's cube from -1/2 to 1/2
 
 
-def idr(folder: Path, masked: bool) -> Layout | None:
-    """IDR and NeuS: projections world_mat_i, and scale_mat_i from the unit sphere; i counts the sorted names."""
-    return _layout(folder, masked, "IDR/NeuS", ("cameras_sphere.npz", "cameras.npz"), 1.0)
+def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+    """IDR and NeuS: projections world_mat_i, and scale_mat_i from the unit sphere; i counts the sorted names.
 
-
-def dvr(folder: Path, masked: bool) -> Layout | None:
-    """DVR: camera_mat_i onto an image from -1 to 1, world_mat_i, scale_mat_i from a cube of side 1; and depths."""
-    return _layout(folder, masked, "DVR", ("cameras.npz",), CUBE)
-
-
-def _layout(folder: Path, masked: bool, name: str, files: tuple[str, ...], radius: float) -> Layout | None:
-    """What a folder has in either format; `radius` is that of the sphere about the object, before scale_mat."""
-    file = next((file for one in files if (file := folder / one).is_file()), None)
-    if file is None:
-        return None
+    DVR: camera_mat_i onto an image from -1 to 1, world_mat_i, scale_mat_i from a cube of side 1; and depths.
+    """
+    file = files[0]
     with np.load(file) as stored:
-        known = {key: np.asarray(stored[key], dtype=np.float64) for key in stored if "_mat_" in key}
-    if _is_dvr(known) != (name == "DVR"):
-        return None
+        every = {key: stored[key] for key in stored}
+    refuse_other_lenses(every, str(file))
+    known = {key: np.asarray(value, dtype=np.float64) for key, value in every.items() if "_mat_" in key}
     count = sum(key.startswith("world_mat_") and key[10:].isdigit() for key in known)
     if count == 0:
         raise BadInput(f"{file} has no world_mat_0: export it again, with world_mat_0, world_mat_1 and so on")
@@ -43,14 +35,15 @@ def _layout(folder: Path, masked: bool, name: str, files: tuple[str, ...], radiu
     answers = by_order([*images], count, file.name)
     scale, notes = _scale(known, count, str(file))
     masks, how = masks_of(folder, images if masked else {}, sorted_too=True)
-    make = _dvr_frames(file, known, scale, images) if name == "DVR" else _idr_frames(file, known, scale)
+    apart = _is_dvr(known)
+    make = _dvr_frames(file, known, scale, images) if apart else _idr_frames(file, known, scale)
 
     def frame(i: int, name: str) -> Frame:
         return make(i, images[name], masks.get(name))
 
     frames, rival, found = made(answers, count, frame)
-    sphere = (np.zeros(3), radius) if any(key.startswith("scale_mat_") for key in known) else None
-    notes = (*notes, *found, *how)
+    sphere = (np.zeros(3), CUBE if apart else 1.0) if any(key.startswith("scale_mat_") for key in known) else None
+    name, notes = "DVR" if apart else "IDR/NeuS", (*notes, *found, *how)
     return Layout(name, frames, sphere, notes, world=scale, rival=rival, missing="image/*")
 
 

@@ -1,7 +1,7 @@
 """Cameras in the JSON of NeRF, instant-ngp, nerfstudio and NeuS2."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import pi, radians, tan
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,12 @@ from datasets.captures.lenses import nerf_lens
 from datasets.captures.pairing import located, masks_of, natural, without_image
 from renderers.checks import BadInput
 
-FILES = ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")
+AXES = {"from_na": np.eye(4), "from_mitsuba": np.diag([-1.0, -1.0, 1.0, 1.0])}  # flags of NeuS2 and instant-ngp
+SAME = 0.02  # most by which two of them may differ, as a share
 
 
-def transforms(folder: Path, masked: bool) -> Layout | None:
-    """camera_to_world in OpenGL's axes (in OpenCV's where `from_na` is true); fields of view, or intrinsics; a lens."""
-    files = [file for name in FILES if (file := folder / name).is_file()]
-    if not files:
-        return None
+def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+    """camera_to_world in OpenGL's axes, or as `AXES` has them; fields of view, or intrinsics; a lens."""
     try:
         stored = json.loads(files[0].read_text(encoding="utf-8-sig"))
     except ValueError as error:
@@ -29,7 +27,7 @@ def transforms(folder: Path, masked: bool) -> Layout | None:
     every = need(stored, "frames", str(files[0]))
     if not isinstance(every, list) or not all(isinstance(frame, dict) for frame in every):
         raise BadInput(f"{files[0]}: frames must be a list with a table for each image: export it again")
-    known = {str(need(frame, "file_path", f"{files[0]}: a frame")): stored | frame for frame in every}
+    known = {str(need(frame, "file_path", f"{files[0]}: a frame")): _merged(stored, frame) for frame in every}
     if len(known) < len(every):
         paths = [str(frame["file_path"]) for frame in every]
         twice = next(path for path in paths if paths.count(path) > 1)
@@ -59,26 +57,38 @@ def _masks(
     return {path: masks[mask] for path, mask in named.items()}, ()
 
 
+def _merged(stored: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """What the file says of a frame: what it says of all does not count where the frame says the same otherwise."""
+    own = {axis for axis in "xy" for key in _focal_keys(axis) if key in frame}
+    lost = {key for axis in ("xy" if "intrinsic_matrix" in frame else own) for key in _focal_keys(axis)}
+    lost |= {"intrinsic_matrix"} if own else set()
+    return {key: value for key, value in stored.items() if key not in lost} | frame
+
+
+def _focal_keys(axis: str) -> tuple[str, str, str]:
+    return f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov"
+
+
 def _frame(known: dict[str, Any], image: Path, mask: Path | None, where: str) -> Frame:
     """The frame of one image from what the file says of all and of it."""
     lens = nerf_lens(known, where)
-    stated = (int(known["h"]), int(known["w"])) if {"w", "h"} <= set(known) else None
+    stated = (int(need(known, "h", where)), int(need(known, "w", where))) if {"w", "h"} & set(known) else None
     width, height = image_size(image) if stated is None else stated[::-1]
     matrix = np.asarray(need(known, "transform_matrix", where), dtype=np.float64)
-    axes = np.eye(4) if known.get("from_na") else OPENGL
-    motion = np.linalg.inv(axes) @ inverse(matrix, f"{where}: transform_matrix")
+    axes = next((axes for flag, axes in AXES.items() if known.get(flag)), OPENGL)
+    motion = axes @ inverse(matrix, f"{where}: transform_matrix")
     return Frame(image, _intrinsics(known, width, height, where), motion, mask, stated, lens)
 
 
 def _intrinsics(known: Mapping[str, Any], width: int, height: int, where: str) -> Float[np.ndarray, "3 3"]:
     """Intrinsics from a matrix, from focal lengths, or from fields of view."""
-    if (matrix := known.get("intrinsic_matrix")) is not None:
-        found = np.asarray(matrix, dtype=np.float64)
-        if found.shape not in ((3, 3), (3, 4), (4, 4)):
-            raise BadInput(f"{where}: intrinsic_matrix must be 3 x 3, not of shape {list(found.shape)}")
-        return found[:3, :3]
-    across = _focal(known, "x", width, where)
-    down = _focal(known, "y", height, where)
+    matrix = None if (stated := known.get("intrinsic_matrix")) is None else np.asarray(stated, dtype=np.float64)
+    if matrix is not None and matrix.shape not in ((3, 3), (3, 4), (4, 4)):
+        raise BadInput(f"{where}: intrinsic_matrix must be 3 x 3, not of shape {list(matrix.shape)}")
+    lengths = (None, None) if matrix is None else (matrix[0, 0], matrix[1, 1])
+    across, down = _focal(known, "x", width, lengths[0], where), _focal(known, "y", height, lengths[1], where)
+    if matrix is not None:
+        return matrix[:3, :3]
     if across is None and down is None:
         raise BadInput(
             f"{where} has no focal length: give fl_x, or camera_angle_x in radians, or intrinsic_matrix in each frame"
@@ -88,15 +98,22 @@ def _intrinsics(known: Mapping[str, Any], width: int, height: int, where: str) -
     return np.array([[across, 0, middle[0]], [0, down, middle[1]], [0, 0, 1.0]])
 
 
-def _focal(known: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:
-    """The focal length along an axis, in pixels; None where the file does not say."""
-    if known.get(f"fl_{axis}") is not None:
-        return float(known[f"fl_{axis}"])
-    for key, angle in ((f"camera_angle_{axis}", float), (f"{axis}_fov", radians)):
+def _focal(known: Mapping[str, Any], axis: str, pixels: int, length: float | None, where: str) -> float | None:
+    """The focal length along an axis, in pixels, `length` by intrinsic_matrix; None where the file does not say.
+
+    Raises:
+        BadInput: where it is given twice, and differs.
+    """
+    first, *angles = _focal_keys(axis)
+    stated = {"intrinsic_matrix": length, first: known.get(first)}
+    found = {key: float(value) for key, value in stated.items() if value is not None}
+    for key, angle, unit in zip(angles, (float, radians), ("radians", "degrees"), strict=True):
         if known.get(key) is not None:
             value = angle(float(known[key]))
             if not 0 < value < pi:
-                unit = "radians" if angle is float else "degrees"
                 raise BadInput(f"{where}: {key} must lie between 0 and pi, not {known[key]}: it is in {unit}")
-            return pixels / 2 / tan(value / 2)
-    return None
+            found[key] = pixels / 2 / tan(value / 2)
+    if found and max(found.values()) > (1 + SAME) * min(found.values()):
+        told = ", ".join(f"{value:.6g} pixels by {key}" for key, value in found.items())
+        raise BadInput(f"{where}: focal lengths differ, {told} of {pixels} pixels: leave the wrong one out")
+    return next(iter(found.values()), None)

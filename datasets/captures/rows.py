@@ -1,5 +1,6 @@
 """Cameras in rows of numbers, one an image: Middlebury, LLFF, BlendedMVS, and Choy's renderings of ShapeNet."""
 
+from collections.abc import Sequence
 from math import cos, radians, sin
 from pathlib import Path
 
@@ -11,11 +12,8 @@ from datasets.captures.pairing import by_order, first_images, images_in, located
 from renderers.checks import BadInput
 
 
-def middlebury(folder: Path, masked: bool) -> Layout | None:
+def middlebury(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """Middlebury: a line for each image: its name, K, R and t, row by row."""
-    files = [file for file in sorted(folder.glob("*_par.txt")) if not file.name.startswith(".")]
-    if not files:
-        return None
     cameras = {}
     for line in files[0].read_text().splitlines()[1:]:
         if not line.strip():
@@ -29,18 +27,16 @@ def middlebury(folder: Path, masked: bool) -> Layout | None:
     there = {file.name: file for file in found.values()}
     if lost := [name for name in images_in(folder) if name not in there]:
         raise BadInput(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
-    masks, masked = masks_of(folder, there if masked else {})
+    masks, told = masks_of(folder, there if masked else {})
     frames = tuple(Frame(file, *cameras[name], masks.get(file.name)) for name, file in found.items())
     missing = [name for name in cameras if name not in found]
-    notes = (*([how] if how else []), *masked, *without_image(missing))
+    notes = (*([how] if how else []), *told, *without_image(missing))
     return Layout("Middlebury", frames, None, notes, missing=missing[0] if missing else "")
 
 
-def llff(folder: Path, masked: bool) -> Layout | None:
+def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """LLFF: a row an image, by sorted names: camera_to_world with axes down, right, backward; size; focal; depths."""
-    file = folder / "poses_bounds.npy"
-    if not file.is_file():
-        return None
+    file = files[0]
     rows, images = np.load(file), first_images(folder, "images", "images_2", "images_4", "images_8")
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInput(f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)}")
@@ -59,19 +55,17 @@ def llff(folder: Path, masked: bool) -> Layout | None:
     return Layout("LLFF", frames, None, (*notes, *how), rival=rival, missing="images/*")
 
 
-def blended_mvs(folder: Path, masked: bool) -> Layout | None:
+def blended_mvs(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """BlendedMVS and MVSNet: a file for each image: world_to_camera, K, and the range of depths."""
-    files = {file.name[: -len("_cam.txt")]: file for file in sorted(folder.glob("cams/[!.]*_cam.txt"))}
-    if not files:
-        return None
+    cameras = {file.name[: -len("_cam.txt")]: file for file in files}
     images = first_images(folder, "blended_images", "images")
     images = {name: file for name, file in images.items() if not file.stem.endswith("_masked")}
-    pairs, _ = paired([*files], [*images])
+    pairs, _ = paired([*cameras], [*images])
     if lost := [name for name in images if name not in pairs.values()]:
         raise BadInput(f"{images[lost[0]]} has no camera: there is no cams/{Path(lost[0]).stem}_cam.txt")
     masks, how = masks_of(folder, images if masked else {})
-    frames = [_mvs_frame(files[name], images[image], masks.get(image)) for name, image in pairs.items()]
-    missing = [name for name in files if name not in pairs]
+    frames = [_mvs_frame(cameras[name], images[image], masks.get(image)) for name, image in pairs.items()]
+    missing = [name for name in cameras if name not in pairs]
     notes = (*how, *without_image(missing))
     return Layout("BlendedMVS", tuple(frames), None, notes, missing=missing[0] if missing else "")
 
@@ -89,11 +83,8 @@ def _mvs_frame(file: Path, image: Path, mask: Path | None) -> Frame:
 FOCAL, SENSOR, FARTHEST = 35.0, 32.0, 1.75  # of Choy's camera in Blender: millimetres; the unit of its distances
 
 
-def choy(folder: Path, masked: bool) -> Layout | None:
+def choy(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """Choy's renderings: a line for each image: azimuth, elevation, roll, distance, field of view."""
-    files = [file for name in (".", "rendering") if (file := folder / name / "rendering_metadata.txt").is_file()]
-    if not files:
-        return None
     rows = np.loadtxt(files[0], ndmin=2)
     if rows.shape[1] < 4 or rows[:, 2].any():
         raise BadInput(f"{files[0]} must have azimuth, elevation, a roll of 0, and distance in each line")
@@ -103,7 +94,7 @@ def choy(folder: Path, masked: bool) -> Layout | None:
         width, height = image_size(images[name])
         focal = FOCAL / SENSOR * width
         intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-        return Frame(images[name], intrinsics, _from_angles(*rows[i, :2], rows[i, 3] * FARTHEST), None)
+        return Frame(images[name], intrinsics, _from_angles(rows[i, 0], rows[i, 1], rows[i, 3] * FARTHEST), None)
 
     frames, rival, notes = made(by_order([*images], len(rows), files[0].name), len(rows), frame)
     return Layout("Choy", frames, None, notes, rival=rival, missing="*.png")

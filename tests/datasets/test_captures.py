@@ -274,7 +274,7 @@ def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
 def test_a_folder_of_another_format_too_and_broken_ones_are_told(tmp_path):
     nerf(tmp_path)
     np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))
-    assert find_layout(tmp_path).notes == ("other cameras in the folder are not used: IDR/NeuS",)
+    assert find_layout(tmp_path).notes == ("other cameras in the folder are not used: cameras.npz",)
     stored = json.loads((tmp_path / "transforms.json").read_text())
     angle = {name: value for name, value in stored.items() if name != "fl_x"} | {"camera_angle_x": 39.6}
     flat = stored | {"frames": [frame | {"transform_matrix": [[1.0, 0.0], [0.0, 1.0]]} for frame in stored["frames"]]}

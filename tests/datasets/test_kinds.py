@@ -375,7 +375,7 @@ def test_broken_cameras_beside_others_do_not_matter(tmp_path):
     nerf(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))
     capture = read_capture(tmp_path, READ)
-    assert capture.format == "NeRF" and "other cameras in the folder are not used: LLFF" in capture.notes
+    assert capture.format == "NeRF" and "other cameras in the folder are not used: poses_bounds.npy" in capture.notes
 
 
 def test_an_image_of_floats_is_from_black_to_white(tmp_path):

@@ -68,7 +68,17 @@ def test_each_model_of_colmap_is_read_as_colmap_has_it_or_refused(data):
         ({"is_fisheye": True, "k1": 0.1, "p1": 0.01}, "a fisheye has k1 to k4"),
         ({"s1": 0.1}, "the lens has s1"),
         ({"ftheta_p0": 0.1}, "the lens has ftheta_p0"),
-        ({"equirectangular": True}, "equirectangular is not understood"),
+        ({"equirectangular": True}, "the lens has equirectangular, which is not understood"),
+        ({"distortion": [0.1, 0.0]}, "the lens has distortion"),
+        ({"distortion": {"radial": [0.0, 0.1]}}, "the lens has distortion"),
+        ({"camera": {"k1": 0.1}}, r"the lens has camera\.k1"),
+        ({"K1": 0.1, "P2": 0.1}, "the lens has K1, P2"),
+        ({"camera_type": "fisheye"}, "the lens has camera_type"),
+        ({"lens": {"type": "opencv"}}, "the lens has lens"),
+        ({"projection": "cylindrical", "model_type": "UNIFIED"}, "the lens has projection, model_type"),
+        ({"rolling_shutter": [0.0, 0.0, 0.01, 0.0]}, "the lens has rolling_shutter"),
+        ({"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.2}, "distortion_params and the numbers by name differ"),
+        ({"camera_model": "PERSPECTIVE", "is_fisheye": True}, "is_fisheye does not fit"),
     ],
 )
 def test_other_lenses_are_refused_by_name(known, words):
@@ -89,5 +99,14 @@ def test_a_list_of_another_length_is_refused(known):
     assert nerf_lens({"distortion_params": [0.1, 0, 0, 0], "is_fisheye": True}, "file").fisheye
 
 
-def test_numbers_that_are_zero_are_no_lens():
-    assert not nerf_lens({"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False}, "file").bends
+@pytest.mark.parametrize(
+    "known",
+    [
+        {"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False},
+        {"distortion": [0, 0], "distortion_params": [0] * 6, "K1": None, "camera_type": "perspective", "lens": {}},
+        {"rolling_shutter": [0.0] * 4, "equirectangular": False, "projection": "Pinhole", "camera": {"name": "mine"}},
+        {"applied_scale": 2.0, "aabb_scale": 16, "offset": [0.5] * 3, "sharpness": 30.1, "k": 5, "camera_angle_x": 0.7},
+    ],
+)
+def test_what_says_nothing_of_a_lens_is_none(known):
+    assert not nerf_lens(known, "file").bends
