@@ -23,6 +23,7 @@ FEWEST = 3  # photographs
 HULL_SAMPLES = 64  # per axis, of the hull that is compared with masks
 GOOD, DOUBTFUL, WRONG = 0.9, 0.8, 0.5  # overlap of hull and masks: cameras are right; hardly; photographs are refused
 LOOK = "python -m bench.photos shows it"
+ONE_PLACE = 1e-9  # most by which places of cameras may differ to be one, as a share of their coordinates
 CLEARLY = 0.1  # by which a way of pairing must fit better than another
 
 
@@ -214,11 +215,23 @@ def _capture(layout: Layout, reading: Reading) -> Capture:
 
 
 def _centred(frames: Sequence[Frame], axes: Float[np.ndarray, "4 4"]) -> tuple[list[Frame], Float[np.ndarray, "3"]]:
-    """Frames with the origin among the cameras, since digits would be lost in a far world; and where that was."""
-    turned = [replace(frame, world_to_camera=axes @ nearest_motion(frame.world_to_camera)) for frame in frames]
-    middle = -np.mean([frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in turned], axis=0)
-    moved = motion(np.eye(3), middle)
-    return [replace(frame, world_to_camera=frame.world_to_camera @ moved) for frame in turned], middle
+    """Frames with the origin among the cameras, since digits would be lost in a far world; and where that was.
+
+    Raises:
+        BadInput: where all cameras are at one place.
+    """
+    motions = [axes @ nearest_motion(frame.world_to_camera) for frame in frames]
+    places = -np.stack([np.linalg.solve(one[:3, :3], one[:3, 3]) for one in motions])
+    middle = places.mean(axis=0)
+    if np.abs(places - middle).max() <= ONE_PLACE * np.abs(middle).max():
+        raise BadInput(
+            f"all {len(frames)} cameras, of {frames[0].image.name} to {frames[-1].image.name}, are at one place, "
+            f"({', '.join(f'{value:.6g}' for value in middle)}): photographs from several places are needed; check the "
+            "translations in the file of cameras"
+        )
+    shift = motion(np.eye(3), middle)
+    moved = [replace(frame, world_to_camera=one @ shift) for frame, one in zip(frames, motions, strict=True)]
+    return moved, middle
 
 
 def _all_masked(shots: Sequence[Shot]) -> bool:

@@ -21,6 +21,7 @@ from renderers.checks import BadInput
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
 HALF = 0.5  # pixels: where the first pixel's centre is at whole numbers, the principal point moves by this
 UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)  # what Pillow says of a broken image
+LAST = (0.0, 0.0, 0.0, 1.0)  # row of a matrix
 RIGID = 5e-3  # most by which a rotation's axes may differ from unit and orthogonal ones
 ROUNDED = 1e-5  # those that differ more are replaced by the nearest rotation: the file has few digits
 
@@ -122,11 +123,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def decomposed(projection: Float[np.ndarray, "3 4"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "4 4"]]:
-    """Intrinsics and world_to_camera of a projection whose first pixel's centre is at whole numbers."""
-    if projection.shape != (3, 4) or not np.isfinite(projection).all():
-        raise ValueError("a projection must have 3 x 4 finite numbers")
-    if np.linalg.matrix_rank(projection[:, :3]) < 3:
-        raise ValueError("the left 3 x 3 numbers of a projection must be invertible")
+    """Intrinsics and world_to_camera of an invertible projection whose first pixel's centre is at whole numbers."""
     projection = projection * np.sign(np.linalg.det(projection[:, :3]))
     upper, rotation = rq(projection[:, :3])
     signs = np.diag(np.sign(np.diag(upper)))
@@ -150,15 +147,20 @@ def nearest_motion(moved: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     return motion(left @ right, left @ right @ np.linalg.solve(rotation, moved[:3, 3]))
 
 
-def inverse(camera_to_world: Float[np.ndarray, "4 4"], where: str) -> Float[np.ndarray, "4 4"]:
-    """world_to_camera of its inverse; raises BadInput that names where it stands."""
-    if camera_to_world.shape not in ((4, 4), (3, 4)):
-        shape = " x ".join(map(str, camera_to_world.shape))
+def whole(matrix: Float[np.ndarray, "rows columns"], where: str) -> Float[np.ndarray, "4 4"]:
+    """A matrix that can be inverted, whose fourth row is 0 0 0 1 or missing; else BadInput that names where it is."""
+    if matrix.shape not in ((4, 4), (3, 4)):
+        shape = " x ".join(map(str, matrix.shape))
         raise BadInput(f"{where} must be 4 x 4, not {shape}: export it again")
-    whole = np.vstack([camera_to_world[:3], [0.0, 0.0, 0.0, 1.0]])
-    if not np.isfinite(whole).all() or np.linalg.matrix_rank(whole[:3, :3]) < 3:
-        raise BadInput(f"{where} is no rigid motion, since it cannot be inverted: export it again")
-    return np.linalg.inv(whole)
+    if not np.isfinite(matrix).all():
+        raise BadInput(f"{where} must have finite numbers: export it again")
+    if np.linalg.matrix_rank(matrix[:3, :3]) < 3:
+        raise BadInput(f"{where} must be invertible, in its left 3 x 3 numbers: export it again")
+    if np.abs(matrix[3:] - LAST).max(initial=0) > ROUNDED:
+        found = " ".join(f"{value:.6g}" for value in matrix[3])
+        transposed = "it may be transposed; " if matrix[3, :3].any() and not matrix[:3, 3].any() else ""
+        raise BadInput(f"{where} must have 0 0 0 1 as its fourth row, not {found}: {transposed}export it again")
+    return np.vstack([matrix[:3], LAST])
 
 
 def centred(intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

@@ -1,12 +1,13 @@
 """Cameras as matrices in one `.npz` file: IDR and NeuS, and DVR."""
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from datasets.captures.frames import Frame, Layout, decomposed, image_size, need
+from datasets.captures.frames import Frame, Layout, decomposed, image_size, need, whole
 from datasets.captures.lenses import refuse_other_lenses
 from datasets.captures.pairing import by_order, first_images, made, masks_of, paired
 from renderers.checks import BadInput
@@ -25,8 +26,9 @@ def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     with np.load(file) as stored:
         every = {key: stored[key] for key in stored}
     refuse_other_lenses(every, str(file))
-    known = {key: np.asarray(value, dtype=np.float64) for key, value in every.items() if "_mat_" in key}
-    count = sum(key.startswith("world_mat_") and key[10:].isdigit() for key in known)
+    wanted = [key for key in every if re.fullmatch(r"(world|scale|camera)_mat_\d+", key)]
+    known = {key: whole(np.asarray(every[key], dtype=np.float64), f"{file}, {key}") for key in wanted}
+    count = sum(key.startswith("world_mat_") for key in known)
     if count == 0:
         raise BadInput(f"{file} has no world_mat_0: export it again, with world_mat_0, world_mat_1 and so on")
     for i in range(count):
@@ -36,7 +38,7 @@ def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     scale, notes = _scale(known, count, str(file))
     masks, how = masks_of(folder, images if masked else {}, sorted_too=True)
     apart = _is_dvr(known)
-    make = _dvr_frames(file, known, scale, images) if apart else _idr_frames(file, known, scale)
+    make = _dvr_frames(file, known, scale, images) if apart else _idr_frames(known, scale)
 
     def frame(i: int, name: str) -> Frame:
         return make(i, images[name], masks.get(name))
@@ -55,16 +57,11 @@ def _is_dvr(known: Matrices) -> bool:
     return bool(lengths.max() <= 1.01 * lengths.min())
 
 
-def _idr_frames(
-    file: Path, known: Matrices, scale: Float[np.ndarray, "4 4"]
-) -> Callable[[int, Path, Path | None], Frame]:
+def _idr_frames(known: Matrices, scale: Float[np.ndarray, "4 4"]) -> Callable[[int, Path, Path | None], Frame]:
     """What makes the frame of camera i."""
 
     def frame(i: int, image: Path, mask: Path | None) -> Frame:
-        try:
-            return Frame(image, *decomposed((known[f"world_mat_{i}"] @ scale)[:3]), mask)
-        except ValueError as error:
-            raise BadInput(f"{file}, world_mat_{i}: {error}; export it again") from None
+        return Frame(image, *decomposed((known[f"world_mat_{i}"] @ scale)[:3]), mask)
 
     return frame
 
@@ -80,10 +77,7 @@ def _dvr_frames(
         half = (np.array(image_size(image)) - 1) / 2
         pixels = np.array([[half[0], 0, half[0], 0], [0, half[1], half[1], 0], [0, 0, 1.0, 0]])
         seen = need(known, f"camera_mat_{i}", str(file)) @ known[f"world_mat_{i}"] @ scale
-        try:
-            intrinsics, motion = decomposed(pixels @ seen)
-        except ValueError as error:
-            raise BadInput(f"{file}, camera_mat_{i} and world_mat_{i}: {error}; export them again") from None
+        intrinsics, motion = decomposed(pixels @ seen)
         unit = 1 / float(seen[2, :3] @ motion[2, :3])  # a depth is the third number of a projected point
         depth = (depths[image], unit) if image in depths else None
         return Frame(image, intrinsics, motion, mask, depth=depth)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datasets.captures.frames import OPENGL, Frame, Layout, image_size, inverse, need
+from datasets.captures.frames import OPENGL, Frame, Layout, image_size, need, whole
 from datasets.captures.lenses import nerf_lens
 from datasets.captures.pairing import located, masks_of, natural, without_image
 from renderers.checks import BadInput
@@ -76,7 +76,7 @@ def _frame(known: dict[str, Any], image: Path, mask: Path | None, where: str) ->
     width, height = image_size(image) if stated is None else stated[::-1]
     matrix = np.asarray(need(known, "transform_matrix", where), dtype=np.float64)
     axes = next((axes for flag, axes in AXES.items() if known.get(flag)), OPENGL)
-    motion = axes @ inverse(matrix, f"{where}: transform_matrix")
+    motion = axes @ np.linalg.inv(whole(matrix, f"{where}: transform_matrix"))
     return Frame(image, _intrinsics(known, width, height, where), motion, mask, stated, lens)
 
 

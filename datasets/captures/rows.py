@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from datasets.captures.frames import OPENGL, Frame, Layout, centred, image_size, motion
+from datasets.captures.frames import OPENGL, Frame, Layout, centred, image_size, motion, whole
 from datasets.captures.pairing import by_order, first_images, images_in, located, made, masks_of, paired, without_image
 from renderers.checks import BadInput
 
@@ -40,6 +40,8 @@ def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     rows, images = np.load(file), first_images(folder, "images", "images_2", "images_4", "images_8")
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInput(f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)}")
+    if len(broken := np.flatnonzero(~np.isfinite(rows[:, :15]).all(axis=1))):
+        raise BadInput(f"{file}: row {broken[0]} must have finite numbers: export it again")
     answers = by_order([*images], len(rows), file.name)
     masks, how = masks_of(folder, images if masked else {})
 
@@ -75,9 +77,10 @@ def _mvs_frame(file: Path, image: Path, mask: Path | None) -> Frame:
     if len(words) < 29 or words[0] != "extrinsic" or words[17] != "intrinsic":
         raise BadInput(f"{file} must have `extrinsic`, 16 numbers, `intrinsic`, 9 numbers and depths: copy it again")
     extrinsics, intrinsics = (np.array(some, dtype=np.float64) for some in (words[1:17], words[18:27]))
+    moved = whole(extrinsics.reshape(4, 4), f"{file}, extrinsic")
     near, step, *rest = map(float, words[27:])
     far = rest[1] if len(rest) > 1 else near + step * (rest[0] if rest else 192)
-    return Frame(image, intrinsics.reshape(3, 3), extrinsics.reshape(4, 4), mask, span=(near, far))
+    return Frame(image, intrinsics.reshape(3, 3), moved, mask, span=(near, far))
 
 
 FOCAL, SENSOR, FARTHEST = 35.0, 32.0, 1.75  # of Choy's camera in Blender: millimetres; the unit of its distances

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
+from datasets import own_photographs
 from datasets.captures.frames import OPENGL
+from datasets.captures.hull import fit_of
 from datasets.captures.rows import _from_angles
 from datasets.captures.take import _alike, read_image
 from datasets.own_photographs import Capture, Reading, read_capture
@@ -79,7 +82,7 @@ def test_names_without_zeros_are_paired_in_string_order(tmp_path, format, folder
 
 
 @each("lost", [0, 9])
-def test_where_names_do_not_tell_what_is_missing_masks_do(tmp_path, lost):
+def test_where_names_do_not_tell_what_is_missing_masks_do(tmp_path, monkeypatch, lost):
     """Of 000 to 009, or of 001 to 010, 001 to 009 are left, and a small ball is not where the cameras look."""
     tmp_path = tmp_path / str(lost)
     tmp_path.mkdir()
@@ -100,6 +103,10 @@ def test_where_names_do_not_tell_what_is_missing_masks_do(tmp_path, lost):
         np.testing.assert_allclose(shot.camera.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-4)
     with pytest.raises(BadInput, match="do not tell which, nor do masks"):
         read_capture(tmp_path, PLAIN)
+    with monkeypatch.context() as patch:
+        patch.setattr(own_photographs, "fit_of", lambda *given: replace(fit_of(*given), shown=(0.4,)))
+        with pytest.raises(BadInput, match=r"the photographs show 40% of the object"):
+            read_capture(tmp_path, READ)
 
 
 def test_without_masks_nothing_is_said_of_them(tmp_path):
@@ -159,12 +166,21 @@ def test_each_frame_has_its_own_camera(tmp_path):
     nerf(tmp_path)
     own = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     changed(tmp_path, lambda stored: [frame.update({key: stored[key] for key in own}) for frame in stored["frames"]])
-    changed(tmp_path, lambda stored: stored.update(fl_x=1.0, fl_y=1.0, cx=0.0, cy=0.0))
+    top = {"fl_x": 1.0, "fl_y": 1.0, "camera_angle_x": 1.0, "y_fov": 9.0, "intrinsic_matrix": np.eye(3).tolist()}
+    changed(tmp_path, lambda stored: stored.update(top, cx=0.0, cy=0.0))
     assert off(read_capture(tmp_path, PLAIN)) < 0.01
+    changed(tmp_path, lambda stored: stored["frames"][2].update(camera_angle_x=0.5))
+    with pytest.raises(
+        BadInput, match=r"r_2: focal lengths differ, 60 pixels by fl_x, 93\.9\d* pixels by camera_angle_x"
+    ):
+        read_capture(tmp_path, PLAIN)
 
 
-@each("axes, flag", [(np.eye(4), {}), (OPENGL, {"from_na": True})])
-def test_neus2_has_other_axes(tmp_path, axes, flag):
+MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])  # x left, y up, z forward
+
+
+@each("axes, flag", [(np.eye(4), {}), (OPENGL, {"from_na": True}), (MITSUBA, {"from_mitsuba": True})])
+def test_flags_tell_of_other_axes(tmp_path, axes, flag):
     nerf(tmp_path)
 
     def change(stored) -> None:
@@ -195,7 +211,17 @@ BROKEN = {
     "path": (lambda stored: stored["frames"][3].pop("file_path"), "a frame has no file_path"),
     "zeros": (
         lambda stored: stored["frames"][3].update(transform_matrix=np.zeros((4, 4)).tolist()),
-        "r_3: .* inverted",
+        "r_3: transform_matrix must be invertible",
+    ),
+    "turned": (
+        lambda stored: [
+            one.update(transform_matrix=np.transpose(one["transform_matrix"]).tolist()) for one in stored["frames"]
+        ],
+        "r_0: transform_matrix must have 0 0 0 1 as its fourth row, not .*: it may be transposed; export it again",
+    ),
+    "one place": (
+        lambda stored: [row.__setitem__(3, 2.0) for one in stored["frames"] for row in one["transform_matrix"][:3]],
+        r"all 10 cameras, of r_0.png to r_9.png, are at one place, \(2, 2, 2\)",
     ),
     "twice": (lambda stored: stored["frames"].append(stored["frames"][0]), "has ./train/r_0 twice"),
     "mirror": (
@@ -320,9 +346,9 @@ def test_parallel_cameras_without_masks_need_depths(tmp_path):
     capture = read_capture(tmp_path, Reading(48, masks=False))
     assert abs(capture.sphere.centre[2] - 3.0) < 1e-6 and 0.5 <= capture.sphere.radius < 2
     assert "the depths that the format states" in capture.summary
-    frames = [
-        {"file_path": f"images_4/{i:03d}.png", "transform_matrix": np.diag([1.0, 1, 1, 1]).tolist()} for i in range(10)
-    ]
+    frames = [{"file_path": f"images_4/{i:03d}.png", "transform_matrix": np.eye(4).tolist()} for i in range(10)]
+    for i, frame in enumerate(frames):
+        frame["transform_matrix"][0][3] = 0.1 * i
     (tmp_path / "poses_bounds.npy").unlink()
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 60.0, "frames": frames}))
     with pytest.raises(BadInput, match="the cameras look in parallel"):
