@@ -151,14 +151,22 @@ class BoundDecoder:
         return tuple(tensor for layer in (*self.hidden, self.last) for tensor in layer)
 
     @cached_property
+    def _copies(self) -> dict[int, CompiledDecoder | None]:
+        return {}
+
     def _compiled(self) -> CompiledDecoder | None:
-        one = self._frozen and self.hidden[0][1].dim() == 1
-        return compiled(self.hidden, self.last, self.skip) if one else None
+        """The compiled network, which has copies of the weights: made anew where these have changed meanwhile."""
+        state = sum(0 if tensor.is_inference() else tensor._version for tensor in self._tensors)
+        if state not in self._copies:
+            self._copies.clear()
+            self._copies[state] = compiled(self.hidden, self.last, self.skip)
+        return self._copies[state]
 
     def _quickest(self, points: Tensor) -> Values:
         """The values without a graph: by compiled code where there is some, which is that of one thread."""
         suits = points.dtype == torch.float32 and points.device.type == "cpu" and torch.get_num_threads() == 1
-        return self._forward if not suits or self._compiled is None else self._compiled.values
+        network = self._compiled() if suits else None
+        return self._forward if network is None else network.values
 
     def _forward(self, points: Tensor, gates: tuple[Tensor, ...] = ()) -> Tensor:
         """The values; fills `gates`, where given, with True where a ReLU is open."""

@@ -66,7 +66,7 @@ def test_values_are_those_of_torch(name, count):
     field = make(name).at(torch.linspace(-1, 1, 4))
     points = 2 * torch.rand(count, 3) - 1
     with using_threads(1):
-        assert field._quickest(points) == field._compiled.values
+        assert field._quickest(points) == field._compiled().values
         torch.testing.assert_close(field(points), field._forward(points), rtol=1e-6, atol=1e-6)
         if count > 5:
             points[2], points[4] = torch.nan, torch.inf
@@ -76,7 +76,7 @@ def test_values_are_those_of_torch(name, count):
 @with_compiler
 def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatch):
     monkeypatch.setattr(environment, "kernels", lambda: THERE)
-    monkeypatch.setattr(BoundDecoder, "_compiled", property(lambda self: pytest.fail("compiled code was asked")))
+    monkeypatch.setattr(BoundDecoder, "_compiled", lambda self: pytest.fail("compiled code was asked"))
     points, code = torch.rand(5, 3), torch.zeros(4)
     with using_threads(1):
         assert make("skip").at(code.clone().requires_grad_())(points).requires_grad
@@ -86,9 +86,20 @@ def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatc
     with using_threads(2), torch.no_grad():
         make("skip").at(code)(points)
         assert environment.describe(torch.device("cpu"))["kernels"] == "torch: compiled code is for one thread of a CPU"
-    monkeypatch.undo()
-    with using_threads(1), torch.no_grad():  # weights that may change meanwhile are not copied
-        assert make("skip").requires_grad_(True).at(code)._compiled is None
+
+
+@with_compiler
+def test_values_follow_weights_that_are_being_learnt():
+    decoder, points = make("skip").requires_grad_(True), torch.rand(5, 3)
+    field = decoder.at(torch.zeros(4))
+    with using_threads(1), torch.no_grad():
+        before = field(points)
+        assert field._compiled() is field._compiled()
+        decoder.last.weight.mul_(2)
+        assert not torch.allclose(field(points), before)
+        torch.testing.assert_close(field(points), field._forward(points), rtol=1e-6, atol=1e-6)
+    with using_threads(1), torch.inference_mode():
+        torch.testing.assert_close(make("skip").at(torch.zeros(4))(points), make("skip").at(torch.zeros(4))(points))
 
 
 def ball() -> BoundDecoder:
