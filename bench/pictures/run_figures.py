@@ -96,8 +96,9 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
         for name in dict.fromkeys(name for line in curve for name in line if name not in (*NO_TERMS, *ERRORS)):
             known = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
             if known:
-                axis.semilogy(*zip(*known, strict=True), label=name, lw=1.4)
+                axis.plot(*zip(*known, strict=True), label=name, lw=1.4)
         axis.set_xlabel(label)
+    style.log_axis(axes[0], "y", [value for line in axes[0].lines for value in line.get_ydata()])
     axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_ylabel("weighted loss")
     if axes[0].lines:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -32,7 +33,7 @@ CAMERA = camera_of(16)
 def drawn(monkeypatch) -> list[Figure]:
     """The figures that are saved, in place of their files."""
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", lambda canvas, *_, **__: figures.append(canvas.figure))
     return figures
 
 
