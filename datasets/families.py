@@ -58,7 +58,7 @@ class Family:
 
     def formula(self, split: Split, index: int) -> Shape:
         """The same shape as a field: the formula that its mesh was made from, divided by its slope to be a bound."""
-        centre, factor = fit_in_sphere(self._raw_mesh(split, index), self.radius)
+        centre, factor = fit_in_sphere(self._raw_mesh(split, index).used, self.radius)
         return bounded(self._raw_shape(split, index)).translate(tuple(-centre)).scale(factor)
 
     def _raw_shape(self, split: Split, index: int) -> Shape:

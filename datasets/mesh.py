@@ -82,7 +82,12 @@ class Mesh:
     @property
     def diagonal(self) -> float:
         """Length of the bounding box's diagonal, over the vertices that faces use."""
-        return float(np.linalg.norm(np.ptp(self.vertices[np.unique(self.faces)], axis=0)))
+        return float(np.linalg.norm(np.ptp(self.used, axis=0)))
+
+    @property
+    def used(self) -> Float[np.ndarray, "n 3"]:
+        """The vertices that faces use."""
+        return self.vertices[np.unique(self.faces)]
 
     @property
     def open_faces(self) -> Bool[np.ndarray, " f"]:
@@ -129,6 +134,15 @@ class Mesh:
         colours = None if self.colours is None else self.colours[used]
         return replace(self, vertices=self.vertices[used], faces=faces.reshape(-1, 3), colours=colours)
 
+    def moved(self, motion: Float[np.ndarray, "4 4"]) -> "Mesh":
+        """The mesh in another world, by an affine map."""
+        return replace(self, vertices=self.vertices @ motion[:3, :3].T + motion[:3, 3])
+
+    def cut_off(self) -> "Mesh | None":
+        """The part within the unit sphere, as fields are cut off there; None where there is none."""
+        faces = self.faces[(np.linalg.norm(self.vertices, axis=1) <= 1)[self.faces].all(axis=1)]
+        return replace(self, faces=faces).compact() if len(faces) else None
+
     def save(self, path: str | Path) -> None:
         """Writes a binary .ply file."""
         path = Path(path)
@@ -158,17 +172,16 @@ def normalise(mesh: Mesh, radius: float) -> Mesh:
         mesh: any mesh; unused vertices are moved along but not measured.
         radius: positive, scene units.
     """
-    centre, factor = fit_in_sphere(mesh, radius)
+    centre, factor = fit_in_sphere(mesh.used, radius)
     return replace(mesh, vertices=(mesh.vertices - centre) * factor)
 
 
-def fit_in_sphere(mesh: Mesh, radius: float) -> tuple[Float[np.ndarray, "3"], float]:
+def fit_in_sphere(points: Float[np.ndarray, "n 3"], radius: float) -> tuple[Float[np.ndarray, "3"], float]:
     """The point that `normalise` moves to the origin, and the factor by which it then scales."""
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius: must be positive, found {radius}; the scenes use a little less than 1")
-    used = mesh.vertices[np.unique(mesh.faces)]
-    centre = (used.min(axis=0) + used.max(axis=0)) / 2
-    farthest = np.linalg.norm(used - centre, axis=1).max()
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    farthest = np.linalg.norm(points - centre, axis=1).max()
     if farthest == 0:
         raise ValueError("mesh: must have an extent, found all vertices at one place; export the mesh again")
     return centre, radius / farthest

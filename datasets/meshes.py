@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from datasets.mesh import Mesh
 from datasets.readers.glb import read_glb
 from datasets.readers.ply import read_ply
+from datasets.readers.polygons import Polygons
 from datasets.readers.text import mistaken, read_obj, read_off, read_stl
 from datasets.repair import repair
 from renderers.checks import BadInput
@@ -83,14 +85,38 @@ def read_mesh(path: str | Path) -> Mesh:
         raise BadInput(f"mesh file '{path}': {error}") from None
 
 
-def _read(path: Path) -> Mesh:
-    content, suffix = path.read_bytes(), path.suffix.lower()
+def read_points(path: str | Path) -> Float[np.ndarray, "n 3"] | None:
+    """The vertices of a file without faces, a cloud of points; None of one that has faces.
+
+    Raises:
+        ValueError: the file is missing, empty, truncated or broken, or has no points, or some that are not finite.
+    """
+    (path,) = find_meshes(path)
+    try:
+        polygons = _polygons(path)
+        points = polygons.vertices
+        if len(polygons.counts):
+            return None
+        if not len(points) or not np.isfinite(points).all():
+            raise ValueError(f"must hold points that are finite, found {len(points)}; export or copy it again")
+    except ValueError as error:
+        raise BadInput(f"file of points '{path}': {error}") from None
+    return points
+
+
+def _polygons(path: Path) -> Polygons:
+    content = path.read_bytes()
     if not content:
         raise ValueError("must hold a mesh, found 0 bytes; export or copy it again")
     if what := mistaken(path):
         raise ValueError(what)
+    with np.errstate(all="ignore"):  # of numbers that are refused later
+        return READERS[path.suffix.lower()](content)
+
+
+def _read(path: Path) -> Mesh:
+    polygons, suffix = _polygons(path), path.suffix.lower()
     with np.errstate(all="ignore"):  # of numbers that Mesh refuses
-        polygons = READERS[suffix](content)
         triangles, owner = polygons.triangles()
     if not len(triangles):
         count = len(polygons.vertices)

@@ -1,5 +1,6 @@
 """One's own photographs as a dataset: one object, moved into the unit sphere, whose true shape is not known."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -69,7 +70,18 @@ class Capture:
 
 @runtime_checkable
 class Photographed(Protocol):
-    """A dataset of one object that is known from photographs alone."""
+    """A dataset of one object that is known from photographs, and perhaps from a file of its surface.
+
+    Args:
+        truth: see `OwnPhotographs`, as `dtu_scan`.
+    """
+
+    truth: str | None
+
+    @property
+    def dtu_scan(self) -> int | None:
+        """The number of DTU's scan."""
+        ...
 
     def capture(self, longest: int, held_out: int) -> Capture:
         """The photographs, with at most `longest` pixels along their longer sides.
@@ -89,6 +101,8 @@ class OwnPhotographs:
         axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
         images: the folder of COLMAP's images; None for the usual ones in `path`.
         unchecked: whether photographs are used although cameras hardly fit masks or sizes.
+        truth: a mesh or a cloud of points in the cameras' world, or DTU's folder; None where nothing is known.
+        scan: number of the scan of DTU's folder; None takes the number at the end of the photographs' folder.
     """
 
     path: str
@@ -96,11 +110,31 @@ class OwnPhotographs:
     axes: str
     images: str | None
     unchecked: bool
+    truth: str | None = None
+    scan: int | None = None
 
     def __post_init__(self) -> None:
         check_choice("dataset.axes", self.axes, tuple(AXES))
         if not Path(self.path).is_dir():
             raise ValueError(f"dataset.path={self.path} is no folder: give the folder that has the photographs")
+        if self.truth is not None and not Path(self.truth).exists():
+            raise ValueError(
+                f"dataset.truth={self.truth} is not there: give a mesh, a cloud of points, or DTU's folder"
+            )
+
+    @property
+    def dtu_scan(self) -> int | None:
+        """The number of the scan of DTU whose folder is the truth; None where the truth is none of DTU's.
+
+        Raises:
+            BadInput: where neither `scan` nor the folder's name says it.
+        """
+        if self.truth is None or not Path(self.truth).is_dir():
+            return None
+        found = re.search(r"(\d+)\D*$", self.name) if self.scan is None else None
+        if self.scan is None and found is None:
+            raise BadInput(f"{self.path} does not end in the number of a scan of DTU: set dataset.scan=65")
+        return self.scan if found is None else int(found[1])
 
     @property
     def name(self) -> str:

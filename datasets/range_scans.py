@@ -139,7 +139,7 @@ class RangeScans:
 
     def seen(self, index: int) -> Mesh:
         """See `Scanned`."""
-        centre, factor = fit_in_sphere(self._read, self.radius)
+        centre, factor = fit_in_sphere(self._read.used, self.radius)
         surface = self._scan(index).surface()
         return replace(surface, vertices=(surface.vertices - centre) * factor)
 

@@ -43,6 +43,16 @@ class Shot:
             if part is not None and tuple(part.shape[:2]) != size:
                 raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(part.shape[:2])}")
 
+    def allows(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """Which points of the world its mask does not exclude: those in the mask, and those that are not shown."""
+        allowed = torch.ones(len(points), dtype=torch.bool)
+        if self.mask is not None:
+            points = points.to(self.camera.intrinsics.dtype)
+            shown, (height, width) = self.camera.shows(points), self.mask.shape
+            columns, rows = self.camera.project(points[shown])[0].long().unbind(-1)
+            allowed[shown] = self.mask[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
+        return allowed
+
     def within(self, centre: Float[np.ndarray, "3"], radius: float) -> "Shot":
         """The same photograph, in single precision, in a world where the sphere about `centre` is the unit sphere."""
         motion = self.camera.world_to_camera.double().clone()

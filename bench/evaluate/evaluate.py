@@ -100,6 +100,18 @@ def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: flo
     }
 
 
+def cloud_metrics(predicted: Surface | None, points: Float[np.ndarray, "n 3"], *, threshold: float) -> dict[str, float]:
+    """Those of `surface_metrics` that need no normals, where the truth is a cloud of points."""
+    found = surface_metrics(predicted, Surface(points, np.zeros_like(points)), threshold=threshold)
+    del found["normal_consistency"]
+    return found
+
+
+def drawn(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
+    """At most so many points of a cloud, drawn at random."""
+    return points if len(points) <= count else np.random.default_rng(seed).choice(points, count, replace=False)
+
+
 def image_metrics(
     predicted_depth: Float[np.ndarray, "h w"],
     predicted_mask: Bool[np.ndarray, "h w"],

@@ -102,7 +102,7 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
         arrays["given"] = subject.given[0].colours
     if subject.truth is not None:
         behind = turned(at_size(shot.camera, inputs.evaluation.picture), np.pi)
-        true = normals_image(see(Truth(subject.truth), behind))
+        true = normals_image(see(Truth(subject.truth, closed=False), behind))
         arrays |= _seen_arrays(seen, behind, "back_") | {"back_truth": torch.from_numpy(true)}
     if inputs.evaluation.gallery is not None:
         arrays |= _rendered_again(seen, shot.camera, inputs.evaluation.gallery)

@@ -144,8 +144,5 @@ def _within(shots: Sequence[Shot], points: Float[np.ndarray, "n 3"]) -> Bool[np.
     """Points in the unit sphere that no mask excludes."""
     places, inside = torch.from_numpy(points).float(), torch.from_numpy(np.linalg.norm(points, axis=1) < 1)
     for shot in shots:
-        if shot.mask is not None:
-            shown, (height, width) = shot.camera.shows(places), shot.mask.shape
-            columns, rows = shot.camera.project(places[shown])[0].long().unbind(-1)
-            inside[shown] &= shot.mask[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
+        inside &= shot.allows(places)
     return inside.numpy()

@@ -7,12 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float
 
+from bench.evaluate.dtu import DEFINITIONS as DTU_DEFINITIONS
+from bench.evaluate.dtu import DtuScan, dtu_metrics, published, read_scan
+from bench.evaluate.evaluate import cloud_metrics, drawn
 from bench.setup.inputs import RunContext, RunInputs
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
+from datasets.meshes import read_mesh, read_points
+from datasets.own_photographs import Photographed
 from datasets.photographs import Photography
 from datasets.scene import Surface, Truth, sample_surface, see
 from datasets.shot import Shot
@@ -66,6 +70,7 @@ class Subject:
         truth: the true surface, where it is known.
         found: what there is, in words.
         to_world: from the unit sphere's world into that of the file; None of a scene.
+        points: that the final mesh is judged by: a scan of DTU in the file's world, or a cloud in the unit sphere.
     """
 
     given: tuple[Shot, ...]
@@ -73,21 +78,35 @@ class Subject:
     truth: Mesh | None
     found: str
     to_world: Float[np.ndarray, "4 4"] | None = None
+    points: DtuScan | Float[np.ndarray, "n 3"] | None = None
     known: dict[tuple[int, int], tuple[Surface, Bool[np.ndarray, " n"]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
-    def save_world(self, folder: Path) -> None:
-        """Writes `to_world.txt`, a 4 x 4 matrix, and `mesh_world.ply`, in the file's world; all digits of both."""
+    def finish(self, run: RunContext) -> None:
+        """Writes `to_world.txt`, a 4 x 4 matrix, and `mesh_world.ply`, in the file's world; all digits of both.
+
+        The mesh is judged by the points, where there are some.
+        """
         if self.to_world is None:
             return
-        np.savetxt(folder / "to_world.txt", self.to_world, fmt="%.17g")
-        if (folder / "mesh.ply").is_file():
-            found = trimesh.load_mesh(folder / "mesh.ply", process=False)
-            vertices = found.vertices @ self.to_world[:3, :3].T + self.to_world[:3, 3]
-            coloured = found.visual.kind == "vertex"
-            colours = found.visual.vertex_colors[:, :3] / 255 if coloured else None
-            Mesh(vertices, np.asarray(found.faces), colours=colours).save(folder / "mesh_world.ply")
+        np.savetxt(run.folder / "to_world.txt", self.to_world, fmt="%.17g")
+        mesh = None
+        if (run.folder / "mesh.ply").is_file():
+            mesh = read_mesh(run.folder / "mesh.ply")
+            mesh.moved(self.to_world).save(run.folder / "mesh_world.ply")
+        if self.points is not None:
+            with run.off_clock():
+                run.record.metrics |= self.judged(mesh, run.inputs)
+            run.record.definitions |= DTU_DEFINITIONS if isinstance(self.points, DtuScan) else {}
+
+    def judged(self, mesh: Mesh | None, inputs: RunInputs) -> dict[str, float]:
+        """The metrics of a mesh in the unit sphere against the points."""
+        if isinstance(self.points, DtuScan):
+            return dtu_metrics(mesh and mesh.moved(self.to_world), self.points, seed=inputs.seed)
+        count, threshold = inputs.evaluation.points, inputs.evaluation.fscore_threshold
+        found = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
+        return cloud_metrics(found, drawn(self.points, count, inputs.seed), threshold=threshold)
 
     def true_surface(self, count: int, seed: int) -> tuple[Surface, Bool[np.ndarray, " n"]]:
         """Samples of the true surface, and which of them a given photograph sees; drawn once."""
@@ -151,12 +170,13 @@ class PhotographTask(ABC):
         """
         if inputs.photographed is not None:
             capture = inputs.photographed.capture(self.longest, self.held_out)
-            shots, truth, seed, to_world = capture.shots, None, inputs.seed, capture.to_world
-            found = "; ".join([capture.summary, *capture.notes])
+            shots, seed, to_world = capture.shots, inputs.seed, capture.to_world
+            truth, points, told = truth_of(inputs.photographed, to_world)
+            found = "; ".join([capture.summary, *capture.notes, *told])
         else:
             scene = inputs.scene
             camera = scene.view.camera.resized(self.longest, self.longest)
-            seed, truth, to_world = scene.seed(inputs.seed), scene.mesh, None
+            seed, truth, to_world, points = scene.seed(inputs.seed), scene.mesh, None, None
             shots = tuple(self.images.take(Truth(truth), camera, seed=seed))
             found = f"{len(shots)} rendered photographs of {self.longest} x {self.longest} pixels"
         every = self.held_out
@@ -166,7 +186,38 @@ class PhotographTask(ABC):
         given = tuple(self.depths.of(shot, (seed, place)) for place, shot in enumerate(given))
         given = given if self.masks else tuple(replace(shot, mask=None) for shot in given)
         found += f"; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
-        return Subject(given, held_out, truth, found, to_world)
+        return Subject(given, held_out, truth, found, to_world, points)
+
+
+def truth_of(
+    dataset: Photographed, to_world: Float[np.ndarray, "4 4"]
+) -> tuple[Mesh | None, DtuScan | Float[np.ndarray, "n 3"] | None, list[str]]:
+    """The surface in the unit sphere, or the points, that the file or folder `dataset.truth` has; and notes.
+
+    Raises:
+        BadInput: where it cannot be read, or nothing of it lies in the unit sphere.
+    """
+    if dataset.truth is None:
+        return None, None, []
+    if (number := dataset.dtu_scan) is not None:
+        return None, read_scan(Path(dataset.truth), number), published(number)
+    to_sphere = np.linalg.inv(to_world)
+    points = read_points(dataset.truth)
+    if points is None:
+        whole = read_mesh(dataset.truth).moved(to_sphere)
+        mesh = whole.cut_off()
+        share = mesh.area / whole.area if mesh else 0.0
+    else:
+        mesh, points = None, points @ to_sphere[:3, :3].T + to_sphere[:3, 3]
+        inside = np.linalg.norm(points, axis=1) <= 1
+        points, share = points[inside], float(inside.mean())
+    if not share:
+        raise BadInput(
+            f"nothing of dataset.truth={dataset.truth} lies in the unit sphere of the photographs: it must be in the "
+            "world of their cameras"
+        )
+    told = f"{share:.0%} of {dataset.truth} lies in the unit sphere, and is the truth"
+    return mesh, points, [told] if share < 1 else []
 
 
 def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:

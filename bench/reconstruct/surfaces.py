@@ -73,14 +73,6 @@ def poisson(
     return Mesh(made.vertex_matrix(), faces).compact() if len(faces) else None
 
 
-def cut_off(mesh: Mesh | None) -> Mesh | None:
-    """The part of a mesh within the unit sphere, as fields are cut off there; None where there is none."""
-    if mesh is None:
-        return None
-    faces = mesh.faces[(np.linalg.norm(mesh.vertices, axis=1) <= 1)[mesh.faces].all(axis=1)]
-    return replace(mesh, faces=faces).compact() if len(faces) else None
-
-
 def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
     """The mesh with the mean colours of the photographs that see a vertex, those that face it before all others."""
     scene = Truth(mesh, closed=False)

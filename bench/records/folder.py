@@ -27,13 +27,13 @@ PASSIVE = (
         "bench/trackers",
         "bench/progress.py",
     ),
-    *(f"bench/{name}.py" for name in ("merge", "suite", "tune", "train", "photos", "turntable")),
+    *(f"bench/{name}.py" for name in ("judge", "merge", "suite", "tune", "train", "photos", "turntable")),
     *(f"bench/run/{name}.py" for name in ("compose", "library", "pack", "plan", "summary", "sweep")),
     *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"
-FILE_KEYS = ("path", "image_path", "mask_path")  # of files that a run reads
+FILE_KEYS = ("path", "image_path", "mask_path", "truth")  # of files that a run reads
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVE = 64 * 1024  # bytes kept free, so that the record can still be written when the disk has become full
 RESERVED = ".reserve"

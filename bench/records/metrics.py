@@ -31,6 +31,7 @@ SHOWN = {  # in the order of tables
     "fitted_mask_iou": Metric("mask IoU from the best view", better=HIGHER),
     "depth_mae": Metric("depth error (x1000)", 1000.0, LOWER),
     "mask_iou": Metric("mask IoU", better=HIGHER),
+    "dtu_overall": Metric("DTU overall (mm)", better=LOWER),
     "psnr": Metric("PSNR (dB)", better=HIGHER),
     "psnr_image": Metric("PSNR of whole images (dB)", better=HIGHER),
     "ssim": Metric("SSIM", better=HIGHER),
@@ -52,7 +53,17 @@ MEASURED = {  # of tasks that optimise nothing
 FURTHER = {  # that tables do not show, but whose direction is known
     **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred"), LOWER),
     **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
+    **dict.fromkeys(("dtu_accuracy", "dtu_completeness"), LOWER),
     "mask_iou_least": HIGHER,
+}
+# DVR (Niemeyer et al. 2020), Table 2: accuracy, completeness and Chamfer-L1, means over three scans of DTU, in mm.
+DVR_SCANS = (65, 106, 118)
+DVR_TABLE2 = {
+    "Colmap + sPSR, trim 0": (1.881, 0.726, 1.303),
+    "Colmap + sPSR, trim 5": (1.400, 0.782, 1.091),
+    "Colmap + sPSR, trim 7": (0.446, 1.020, 0.733),
+    "DVR (RGB)": (1.054, 0.760, 0.907),
+    "DVR (RGB and depth)": (0.789, 0.775, 0.782),
 }
 # The metric that a task's runs are sorted by; of a task that is not here the first of these that its runs have.
 FIRST = {

@@ -4,20 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.records.metrics import DVR_TABLE2
 from bench.report.data.records import SCALE, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
 from bench.report.tuning import TUNED
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
-# DVR (Niemeyer et al. 2020), Table 2: accuracy, completeness and Chamfer-L1 on DTU's scans 65, 106 and 118, in mm.
-PUBLISHED = {
-    "Colmap + sPSR, trim 0": (1.881, 0.726, 1.303),
-    "Colmap + sPSR, trim 5": (1.400, 0.782, 1.091),
-    "Colmap + sPSR, trim 7": (0.446, 1.020, 0.733),
-    "DVR (RGB)": (1.054, 0.760, 0.907),
-    "DVR (RGB and depth)": (0.789, 0.775, 0.782),
-}
 NAMES = ("seen_accuracy", "seen_completeness", "seen_chamfer_l1", "chamfer_l1", "psnr", "ssim", "mask_iou")
 NOTES = (
     "“Seen” is what a given photograph sees of either surface, as none sees the underside; distances are in scene "
@@ -75,7 +68,7 @@ def make(runs: Runs) -> Result:
     lines, scenes = medians.medians(runs, NAMES), format.plural(len(grouped(runs.records, medians.scene_of)), "scene")
     published = [
         {"method": f"published: {name}", **dict(zip(NAMES, (value / SCALE for value in values), strict=False))}
-        for name, values in PUBLISHED.items()
+        for name, values in DVR_TABLE2.items()
     ]
     panels = {
         "Chamfer-L1, seen × 1000 (scene units)": SCALE * medians.scored(runs, "seen_chamfer_l1"),

@@ -77,14 +77,14 @@ class Reconstruction(PhotographTask):
         run.record.notes = [*run.record.notes, subject.found, *self.doubts(subject)]
         if name != AUTO:
             solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
-            subject.save_world(run.folder)
+            subject.finish(run)
             return
         with torch.random.fork_rng():  # so that the run is that of the field which it ends on
             sizes = {name: sum(one.numel() for one in model.parameters()) for name, model in models.items()}
             choice = self.auto.choose(lambda n, part: self.problem(n, part, run), sizes, subject, self.optimiser, run)
         run.record.notes.append(choice.note)
         solve(lambda: self.problem(choice.kept.candidate, subject, run), self.optimiser, run, definitions)
-        subject.save_world(run.folder)
+        subject.finish(run)
         seconds = run.record.seconds
         run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
         seconds["trials"] = choice.seconds

@@ -8,7 +8,7 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
-from bench.reconstruct.surfaces import cut_off, fused, given_clouds, poisson, with_colours
+from bench.reconstruct.surfaces import fused, given_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COSTS
 from datasets.captures.hull import hull_mesh
@@ -31,12 +31,13 @@ class _Surface(PhotographTask):
         subject = self.subject(run.inputs)
         record.notes = [*record.notes, subject.found, "no renderer took part"]
         with run.on_clock():
-            mesh = cut_off(self.surface(subject))
+            surface = self.surface(subject)
+            mesh = None if surface is None else surface.cut_off()
             mesh = None if mesh is None else with_colours(mesh, subject.given)
         record.evaluations = {"value": 0, "gradient": 0}
         with run.off_clock():
             note_surface(run, mesh, subject, {})
-            subject.save_world(run.folder)
+        subject.finish(run)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from bench.config import load
+from bench.evaluate.dtu import NAMES, dtu_metrics, read_scan
 from bench.reconstruct.choice import Appearance, AutoField
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.losses import Losses
@@ -21,13 +22,16 @@ from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import Unsupported
 from bench.tasks.reconstruction import Reconstruction
 from datasets.mesh import Mesh
+from datasets.meshes import read_mesh
 from datasets.own_photographs import OwnPhotographs
-from datasets.scene import Scene, Truth, see
+from datasets.scene import Scene, Truth, sample_surface, see
 from renderers.checks import BadInput
 from renderers.silhouette import Own
-from tests.datasets.test_captures import nerf
+from tests.datasets.test_captures import CENTRE, RADIUS, nerf
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
+from tests.made_dtu import CENTRE as DTU_CENTRE
+from tests.made_dtu import ball, on_ball, write_dtu
 from tests.run.driving import command, record_of
 from tests.tiny import Blind, altered, ball_prior, camera_of, run_of
 
@@ -63,7 +67,8 @@ def run_in(folder: Path, scene: Scene | None, *, renderer: str = "idr", field: s
     """A run under way, of a scene or of photographs on disk, which are written first."""
     if scene is None:
         nerf(folder)
-        more |= {"dataset": OwnPhotographs(str(folder), more.pop("stored_masks", True), "stated", None, False)}
+        truth = {"truth": more.pop("truth", None), "scan": more.pop("scan", None)}
+        more |= {"dataset": OwnPhotographs(str(folder), more.pop("stored_masks", True), "stated", None, False, **truth)}
     else:
         more |= {"make_scene": lambda: scene}
     more |= {"field": FieldChoice(field, None)}
@@ -181,6 +186,44 @@ def test_candidates_that_cannot_be_are_refused_before_photographs_are_taken(scen
     monkeypatch.setattr(Reconstruction, "subject", lambda *_: pytest.fail("photographs were taken"))
     with pytest.raises((BadInput, Unsupported), match=r"has no colours|needs a distance"):
         executed(run_in(tmp_path, scene, renderer="newton", field="auto"), **{"auto.candidates": candidates})
+
+
+@pytest.mark.parametrize("kind", ["mesh", "cloud", "dtu"])
+def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
+    points = (on_ball(20_000, RADIUS) - DTU_CENTRE) + CENTRE
+    truth = tmp_path / f"{kind}.ply"
+    ball(RADIUS, CENTRE).save(truth) if kind == "mesh" else trimesh.PointCloud(points).export(truth)
+    if kind == "dtu":
+        write_dtu(truth.with_suffix(""), points, plane=(0, 0, 1, 0), centre=CENTRE)
+    truth = truth if kind != "dtu" else truth.with_suffix("")
+    run = without_pictures(run_in(folder(tmp_path, "run"), None, truth=str(truth), scan=65))
+    evaluation = replace(run.inputs.evaluation, points=20_000)
+    record = executed(replace(run, inputs=replace(run.inputs, evaluation=evaluation)))
+    assert record.status == "ok", record.reason
+    mesh = read_mesh(tmp_path / "run" / "mesh_world.ply")
+    away = np.abs(np.linalg.norm(sample_surface(mesh, 4000, 0).points - CENTRE, axis=1) - RADIUS).mean()
+    metrics = record.metrics
+    if kind == "dtu":
+        assert {name: metrics[name] for name in NAMES} == dtu_metrics(mesh, read_scan(truth, 65), seed=0)
+        assert metrics["dtu_accuracy"] == pytest.approx(away, abs=0.02 * RADIUS)
+        assert set(NAMES) < set(record.definitions) and any("DVR (RGB) 0.907" in note for note in record.notes)
+        return
+    unit = np.linalg.norm(np.loadtxt(tmp_path / "run" / "to_world.txt")[:3, 0])
+    assert metrics["accuracy"] * unit == pytest.approx(away, abs=0.01 * RADIUS)
+    assert ("seen_chamfer_l1" in metrics) == ("normal_consistency" in metrics) == (kind == "mesh")
+
+
+def test_a_truth_elsewhere_and_a_scan_without_a_number_are_refused(tmp_path):
+    ball(RADIUS, CENTRE + 9).save(tmp_path / "far.ply")
+    with pytest.raises(BadInput, match=r"nothing of dataset.truth=.*far.ply lies in the unit sphere"):
+        executed(run_in(folder(tmp_path, "one"), None, truth=str(tmp_path / "far.ply")))
+    with pytest.raises(BadInput, match=r"two does not end in the number of a scan of DTU: set dataset.scan=65"):
+        executed(run_in(folder(tmp_path, "two"), None, truth=str(tmp_path)))
+    with pytest.raises(ValueError, match=r"dataset.truth=gone.ply is not there"):
+        OwnPhotographs(str(tmp_path), True, "stated", None, False, "gone.ply")
+    for name, number in (("scan24", 24), ("dtu_scan106_small", 106)):
+        path = str(folder(tmp_path, name))
+        assert OwnPhotographs(path, True, "stated", None, False, str(tmp_path)).dtu_scan == number
 
 
 def folder(parent: Path, name: str) -> Path:
