@@ -120,12 +120,9 @@ def _read(path: Path) -> Mesh:
         triangles, owner = polygons.triangles()
     if not len(triangles):
         count = len(polygons.vertices)
-        held = (
-            f"it holds {count} vertices, as points or lines"
-            if count
-            else f"it has no vertex either, as {suffix} writes them"
-        )
-        raise ValueError(f"must have faces, found none: {held}; export it as a surface")
+        held = f"{count} vertices, as points or lines" if count else f"at most points or lines, as {suffix} writes them"
+        remedy = "reconstruct a surface from them (Poisson), or export it as one" if count else "export it as a surface"
+        raise ValueError(f"must have faces, found none: it holds {held}; {remedy}")
     mesh = Mesh(polygons.vertices, triangles, colours=polygons.shaded(triangles, owner))
     if mesh.area <= FLAT * mesh.diagonal**2:
         raise ValueError(

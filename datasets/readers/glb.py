@@ -17,8 +17,8 @@ from renderers.checks import BadInput
 CODES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes; those below are points and lines
-READ = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "KHR_materials_", "KHR_texture_", "EXT_texture_")
-READ += ("KHR_lights_", "KHR_animation_", "KHR_xmp")  # of these, most do not change the shape
+READ = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing")
+READ += ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_", "KHR_xmp")  # not of shape
 GREY = 0.7  # of parts without colours, beside parts that have some
 Part = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"], Float[np.ndarray, "v 3"] | None]
 
@@ -88,14 +88,15 @@ class Scene:
                     continue
                 attributes = primitive["attributes"]
                 vertices = self._shape(primitive, node.get("weights") or mesh.get("weights") or ())
-                colours = self._numbers(attributes["COLOR_0"], shares=True)[:, :3] if "COLOR_0" in attributes else None
-                matrices = (
-                    [self._bent(node["skin"], attributes, world)] if "skin" in node else self._copies(node, matrix)
-                )
-                for place in matrices:
+                colours = None
+                if "COLOR_0" in attributes:
+                    colours = self._numbers(attributes["COLOR_0"], shares=True)[:, :3].clip(0, 1)
+                    colours = np.broadcast_to(colours, vertices.shape)
+                skin = "skin" in node
+                for place in [self._bent(node["skin"], attributes, world)] if skin else self._copies(node, matrix):
                     turn = place[..., :3, :3]
                     moved = (turn @ vertices[..., None])[..., 0] + place[..., :3, 3]
-                    yield moved, triangles[:, :: -1 if np.linalg.det(turn).mean() < 0 else 1], colours
+                    yield moved, triangles[:, :: -1 if np.linalg.det(turn).sum() < 0 else 1], colours
 
     def _triangles(self, primitive: dict[str, Any]) -> Int[np.ndarray, "t 3"] | None:
         """None for points and lines."""
@@ -198,8 +199,7 @@ def _matrix(given: dict[str, Any]) -> Float[np.ndarray, "*n 4 4"]:
     move, scale = (
         np.asarray(given.get(key, (x,) * 3), dtype=np.float64) for key, x in (("translation", 0), ("scale", 1))
     )
-    turn = Rotation.from_quat(given.get("rotation", (0, 0, 0, 1))).as_matrix()
-    turn, move = turn * scale[..., None, :], move[..., None]
-    rows = np.concatenate([turn, np.broadcast_to(move, (*turn.shape[:-1], 1))], axis=-1)
-    last = np.broadcast_to([0.0, 0, 0, 1], (*rows.shape[:-2], 1, 4))
-    return np.concatenate([rows, last], axis=-2)
+    turn = Rotation.from_quat(given.get("rotation", (0, 0, 0, 1))).as_matrix() * scale[..., None, :]
+    matrix = np.zeros((*np.broadcast_shapes(turn.shape[:-2], move.shape[:-1]), 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = turn, move, 1
+    return matrix

@@ -4,7 +4,6 @@ import re
 import struct
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,41 +22,40 @@ BANDS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blu
 
 
 @dataclass(frozen=True)
-class Lists:
-    """A column of lists: how long each is, and all their numbers."""
-
-    counts: Int[np.ndarray, " n"]
-    numbers: Int[np.ndarray, " m"]
-
-
-@dataclass(frozen=True)
 class Element:
     """A table of the file.
 
     Args:
         count: of its rows.
         codes: of each column that of its numbers, and that of its lists' lengths or "".
-        columns: filled when the body is read.
+        columns: the numbers of each, those of its lists one after the other; filled when the body is read.
+        lengths: of the lists of each column that has some.
     """
 
     name: str
     count: int
     codes: dict[str, tuple[str, str]] = field(default_factory=dict)
-    columns: dict[str, Any] = field(default_factory=dict)
-
-    def put(self, name: str, numbers: np.ndarray, counts: Any) -> None:
-        """Fills a column; `counts` are the lengths of its lists, if it has some."""
-        code = self.codes[name][0]
-        self.columns[name] = numbers.astype(code) if counts is None else _lists(counts, numbers)
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
+    lengths: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def colours(self) -> Float[np.ndarray, "n 3"] | None:
         """RGB of each row, from 0 to 1."""
         for names in BANDS:
             if all(name in self.columns for name in names):
-                rgb = np.stack([np.asarray(self.columns[name], dtype=np.float64) for name in names], axis=1)
-                return shades(rgb, FULL.get(self.codes[names[0]][0]))
+                rgb = np.stack([self.columns[name] for name in names], axis=1)
+                return shades(rgb.astype(np.float64), FULL.get(self.codes[names[0]][0]))
         return None
+
+    def indices(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " m"]]:
+        """How many vertices each row names, and which."""
+        for name, lengths in self.lengths.items():
+            if name.startswith("vertex_ind"):
+                return lengths.astype(np.int64), self.columns[name].astype(np.int64)
+        if self.count:
+            found = ", ".join(self.codes) or "nothing"
+            raise ValueError(f"must have lists vertex_indices in its '{self.name}', found {found}; export it again")
+        return np.empty(0, np.int64), np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -173,11 +171,11 @@ def _fill(element: Element, body: Body, at: int) -> int:
     if not element.count or at + element.count * row.itemsize > len(body.content):
         return _fill_by_rows(element, body, at)
     rows = np.frombuffer(body.content, row, element.count, at)
-    lists = {name: rows[f"{name} count"] for name, (_, length) in element.codes.items() if length}
-    if any((counts != counts[0]).any() for counts in lists.values()):
+    lengths = {name: rows[f"{name} count"] for name, (_, length) in element.codes.items() if length}
+    if any((counts != counts[0]).any() for counts in lengths.values()):
         return _fill_by_rows(element, body, at)
-    for name in element.codes:
-        element.put(name, rows[name].ravel(), lists.get(name))
+    element.columns.update({name: rows[name].ravel() for name in element.codes})
+    element.lengths.update(lengths)
     return at + rows.nbytes
 
 
@@ -193,33 +191,23 @@ def _fill_by_rows(element: Element, body: Body, at: int) -> int:
                 counts[name].append(size := int(size))
             numbers, at = body.take(code, size, at)
             columns[name] += numbers
-    for name, numbers in columns.items():
-        element.put(name, np.array(numbers), counts.get(name))
+    element.columns.update({name: np.array(numbers) for name, numbers in columns.items()})
+    element.lengths.update({name: np.array(lengths) for name, lengths in counts.items()})
     return at
 
 
-def _lists(counts: Any, numbers: Any) -> Lists:
-    return Lists(np.asarray(counts).astype(np.int64), np.asarray(numbers).astype(np.int64))
-
-
 def _polygons(elements: dict[str, Element]) -> Polygons:
-    vertex, face = elements.get("vertex"), elements.get("face", Element("face", 0))
-    if vertex is None or not {"x", "y", "z"} <= {*vertex.columns}:
+    vertex, face, strips = (elements.get(name, Element(name, 0)) for name in ("vertex", "face", "tristrips"))
+    if not {"x", "y", "z"} <= {*vertex.columns}:
         raise ValueError("must have an element 'vertex' with x, y and z; export it again")
-    vertices = np.stack([np.asarray(vertex.columns[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    faces, strips = _indices(face), _indices(elements.get("tristrips", Element("tristrips", 0)))
-    cut = cut_strips(strips.numbers, strips.counts)
-    counts = np.concatenate([faces.counts, np.full(len(cut), 3)])
-    shade = None if len(cut) else face.colours
-    return Polygons(vertices, counts, np.concatenate([faces.numbers, cut.ravel()]), vertex.colours, shade)
-
-
-def _indices(element: Element) -> Lists:
-    """The vertices that each row of an element names."""
-    for name, column in element.columns.items():
-        if name.startswith("vertex_ind") and isinstance(column, Lists):
-            return column
-    if element.count:
-        found = ", ".join(element.codes) or "nothing"
-        raise ValueError(f"must have lists vertex_indices in its '{element.name}', found {found}; export it again")
-    return _lists([], [])
+    places = [vertex.columns[axis].astype(vertex.codes[axis][0]) for axis in "xyz"]  # a text's are doubles
+    counts, corners = face.indices()
+    lengths, strip = strips.indices()
+    cut = cut_strips(strip, lengths)
+    return Polygons(
+        np.stack(places, axis=1).astype(np.float64),
+        np.concatenate([counts, np.full(len(cut), 3)]),
+        np.concatenate([corners, cut.ravel()]),
+        vertex.colours,
+        None if len(cut) else face.colours,
+    )

@@ -73,7 +73,7 @@ class Polygons:
 
 def shades(colours: Float[np.ndarray, "n 3"], full: float | None = None) -> Float[np.ndarray, "n 3"]:
     """Colours from 0 to 1. Where the brightest, `full`, is not known, it is 255 if a number is above 1, and else 1."""
-    return colours / (full or (255 if (colours > 1).any() else 1))
+    return (colours / (full or (255 if (colours > 1).any() else 1))).clip(0, 1)
 
 
 def fan(count: int) -> Int[np.ndarray, "t 3"]:

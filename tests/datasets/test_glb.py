@@ -65,6 +65,7 @@ PLACES = VERTICES @ MATRIX[:3, :3].T + MATRIX[:3, 3]
 PARENT = [{"children": [1], **MOVED}, {"mesh": 0}]
 TARGET = ({"targets": [{"POSITION": 2}]},)
 INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 2, "ROTATION": 3}}}
+SHIFTED = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 2}}}
 AT = np.float32([(0, 0, 0), (9, 0, 0)]), np.array([(0, 0, 0, 1), TURN.as_quat()], np.float32)
 BIND = np.stack([np.eye(4), np.eye(4)]).astype(np.float32)
 BIND[1, 3, :3] = -1, 0, 0  # a column
@@ -100,6 +101,10 @@ READ = {  # a file, and the vertices of its tetrahedra
         glb(VERTICES, CORNERS, *AT, nodes=[{"mesh": 0, "extensions": INSTANCES}], extensionsRequired=[*INSTANCES]),
         VERTICES,
         TURN.apply(VERTICES) + AT[0][1],
+    ),
+    "instances without a turn": (
+        glb(VERTICES, CORNERS, AT[0], nodes=[{"mesh": 0, "extensions": SHIFTED}]),
+        *(VERTICES + at for at in AT[0]),
     ),
     "a morph target": (
         glb(VERTICES, CORNERS, VERTICES, nodes=[{"mesh": 0, "weights": [0.5]}], parts=TARGET),

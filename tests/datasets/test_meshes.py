@@ -124,7 +124,7 @@ BROKEN = {
     "packed.obj": (b"\x1f\x8b\x08\x00", "is compressed by gzip; unpack it"),
     "other.obj": (
         trimesh.creation.box().export(file_type="off").encode(),
-        "it has no vertex either, as .obj writes them",
+        "it holds at most points or lines, as .obj writes them",
     ),
     "page.stl": (b"\n<!DOCTYPE html>\n", "is a web page"),
 }
