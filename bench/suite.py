@@ -177,7 +177,8 @@ def show(results_dir: Path) -> int:
         parts = [
             f"{name} {percent(standing.share(row, name).value)}" for name in standing.sets if standing.of(row, name)
         ]
-        ratio = standing.ratio(row)
+        ratio, gain = standing.ratio(row), standing.gain(row)
+        parts += [f"{100 * gain.value:+.0f} points by tuning"] if gain else []
         parts += [f"{number(ratio.value)} of DIST's field values"] if ratio else []
         parts += [f"{count} {status}" for status, count in standing.failures(row).most_common()]
         parts += [f"{lacking} not run"] if (lacking := standing.not_run(row)) else []

@@ -35,6 +35,7 @@ def table() -> str:
     return HEAD + "\n".join(
         f"| {row['row']} | {_percent(row['share'])} | {_percent(row['at_dist'])} | {_ratio(row['ratio'])} |"
         for row in rows
+        if not row.get("gain")  # of tuned rows, which have other sets
     )
 
 

@@ -1,6 +1,7 @@
 """The suite: the share of problems and targets that each renderer reaches over its cost, and the standing."""
 
 from dataclasses import replace
+from math import nan
 from typing import Any
 
 from bench.report.data.runs import together
@@ -59,8 +60,13 @@ def _line(standing: Standing, row: str) -> dict[str, Any]:
     return {
         **{"rank": standing.ranks.get(row), "row": row, "preset": standing.preset(row), "share": standing.share(row)},
         **{name: standing.share(row, name).value for name in standing.sets},
-        **{"at_dist": standing.share_at(row, 1.0), "wrong": standing.wrong(row), "ratio": standing.ratio(row)},
+        **{
+            "at_dist": nan if row.endswith(BY_ITSELF) else standing.share_at(row, 1.0),
+            "wrong": standing.wrong(row),
+            "ratio": standing.ratio(row),
+        },
         "gain": standing.gain(row),
+        "problems": len(standing.of(row)),
         "seconds": seconds if seconds and seconds.known else None,
         "failed": ", ".join(filter(None, [failed, f"{lacking} not run" if lacking else ""])),
     }
@@ -83,7 +89,7 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
             "share",
             "Reached",
             lambda line: line["share"].value,
-            words=lambda line: f"{table.percent(line['share'].value)} {line['share'].ends(100)}".strip(),
+            words=_share,
         ),
         *(
             table.Column(name, f"{name}, {format.plural(standing.scenes(name), 'scene')}", show=table.percent)
@@ -103,9 +109,16 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
     ]
 
 
+def _share(line: Any) -> str:
+    """What a row reaches with its interval; nothing of one at tuned settings, which has other sets than the others."""
+    share = line["share"]
+    return format.MISSING if line["gain"] else f"{table.percent(share.value)} {share.ends(100)}".strip()
+
+
 def _points(line: Any) -> str:
     gain = line["gain"]
-    return "" if gain is None else f"{100 * gain.value:+.0f} {gain.ends(100)}"
+    told = gain and f"{100 * gain.value:+.0f} {gain.ends(100)}, {format.plural(line['problems'], 'problem')}"
+    return told or format.MISSING
 
 
 def _percent(share: float | None) -> str:
@@ -176,8 +189,8 @@ def _doubts(standing: Standing) -> list[str]:
         f"Not shown, since their set has other settings: runs of {', '.join(other)}." if other else "",
         f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have." if alone else "",
         "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes; a set without "
-        "one is left out, so there is no rank. Gain: points over its row at the set's setting. The chart of a set has "
-        "the better of the two, tuned ones dotted; that of all sets has none."
+        "one is left out, so there is no rank. Gain: points over its row at the set's setting, at the same problems. A "
+        "set's chart has the better of two rows that have all its problems, a tuned one dotted; that of all sets none."
         if tuned
         else "",
         f"Runs of {versions} versions of the code." if versions > 1 else "",
