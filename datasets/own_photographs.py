@@ -131,10 +131,7 @@ class OwnPhotographs:
         """
         if self.truth is None or not Path(self.truth).is_dir():
             return None
-        found = re.search(r"(\d+)\D*$", self.name) if self.scan is None else None
-        if self.scan is None and found is None:
-            raise BadInput(f"{self.path} does not end in the number of a scan of DTU: set dataset.scan=65")
-        return self.scan if found is None else int(found[1])
+        return scan_number(self.name) if self.scan is None else self.scan
 
     @property
     def name(self) -> str:
@@ -154,6 +151,18 @@ class OwnPhotographs:
         """The folder; runs are told apart by the contents of its files."""
         more = {} if self.images is None else {"images": self.images}
         return {"name": "photos", "path": self.path, "masks": self.masks, "axes": self.axes} | more
+
+
+def scan_number(name: str) -> int:
+    """The number of a scan of DTU that ends a name, as in `dtu_scan65`.
+
+    Raises:
+        BadInput: where there is none.
+    """
+    found = re.search(r"(\d+)\D*$", name)
+    if found is None:
+        raise BadInput(f"'{name}' does not end in the number of a scan of DTU: set dataset.scan=65, or --scan 65")
+    return int(found[1])
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ ROOMS = (
     "run", "report", "studies",
 )  # fmt: skip
 COMMANDS = (
-    "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune", "bench.turntable",
+    "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune",
+    "bench.turntable",
 )  # fmt: skip
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts

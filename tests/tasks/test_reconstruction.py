@@ -217,7 +217,7 @@ def test_a_truth_elsewhere_and_a_scan_without_a_number_are_refused(tmp_path):
     ball(RADIUS, CENTRE + 9).save(tmp_path / "far.ply")
     with pytest.raises(BadInput, match=r"nothing of dataset.truth=.*far.ply lies in the unit sphere"):
         executed(run_in(folder(tmp_path, "one"), None, truth=str(tmp_path / "far.ply")))
-    with pytest.raises(BadInput, match=r"two does not end in the number of a scan of DTU: set dataset.scan=65"):
+    with pytest.raises(BadInput, match=r"'two' does not end in the number of a scan of DTU: set dataset.scan=65"):
         executed(run_in(folder(tmp_path, "two"), None, truth=str(tmp_path)))
     with pytest.raises(ValueError, match=r"dataset.truth=gone.ply is not there"):
         OwnPhotographs(str(tmp_path), True, "stated", None, False, "gone.ply")

@@ -1,0 +1,199 @@
+"""The command bench.judge: closed forms, pairs of files, worlds and masks of photographs, rows, and its errors."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import bench
+from bench.evaluate.dtu import NAMES, dtu_metrics, read_scan
+from bench.judge import main
+from bench.merge import merge
+from bench.records.record import Record, read_record
+from datasets.mesh import Mesh
+from datasets.meshes import read_mesh
+from datasets.own_photographs import Reading, read_capture
+from tests.datasets.test_captures import CENTRE as PHOTOGRAPHED
+from tests.datasets.test_captures import RADIUS, idr
+from tests.made_dtu import CENTRE, ball, on_ball, write_dtu
+
+FEW = ("--points", "4000")
+
+
+def judged(capsys, *arguments, code: int = 0) -> dict[str, dict[str, float]]:
+    """The printed metrics of each mesh; `notes` has the other lines as keys."""
+    assert main([*map(str, arguments)]) == code
+    names, units, *lines = capsys.readouterr().out.splitlines()
+    names, rows = names.split(), {"notes": {}}
+    assert len(units) == len(lines[0])
+    for line in lines:
+        name, *values = line.split()
+        if len(values) == len(names) and re.fullmatch(r"[\d.e+-]+|inf|nan", values[0]):
+            rows[name] = dict(zip(names, map(float, values), strict=True))
+        else:
+            rows["notes"][line] = 0.0
+    return rows
+
+
+def refused(capsys, *arguments) -> str:
+    assert main([*map(str, arguments)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    return error
+
+
+def plate(height: float) -> Mesh:
+    corners = np.array([[0.0, 0, height], [10, 0, height], [10, 10, height], [0, 10, height]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.fixture
+def files(tmp_path) -> Path:
+    """Spheres of two sizes beside larger ones, and a plate beside a shifted one."""
+    for folder, more, height in (("truth", 0.0, 0.0), ("found", 0.2, 1.0)):
+        (tmp_path / folder).mkdir()
+        ball(2.0 + more).save(tmp_path / folder / "small.ply")
+        ball(4.0 + more).save(tmp_path / folder / "large.ply")
+        plate(height).save(tmp_path / folder / "plate.ply")
+    return tmp_path
+
+
+def test_spheres_and_plates_are_as_far_apart_as_they_were_made(files, capsys):
+    # A point's nearest one lies beside its nearest place, by about half the spacing of 4,000 points: 0.06 of 4 pi 2^2.
+    for name, apart, beside in (("small", 0.2, 0.06), ("plate", 1.0, 0.08)):
+        found = judged(capsys, files / f"found/{name}.ply", "--truth", files / f"truth/{name}.ply", *FEW)[name]
+        most = (apart**2 + 2 * beside**2) ** 0.5
+        for metric in ("accuracy", "completeness", "chamfer_l1"):
+            assert 0.99 * apart < found[metric] < most
+        assert 0.98 * apart**2 < found["chamfer_gt_to_pred"] < most**2 and found["normal_consistency"] > 0.99
+        assert found["chamfer_l2"] == pytest.approx(2 * found["chamfer_gt_to_pred"], rel=0.1)
+
+
+def test_the_threshold_is_in_units_or_per_cent_of_the_truths_extent(files, capsys):
+    pair = (files / "found/plate.ply", "--truth", files / "truth/plate.ply", *FEW, "--threshold")
+    assert judged(capsys, *pair, "0.999")["plate"]["fscore"] == 0  # no point is nearer than 1
+    assert judged(capsys, *pair, "1.1")["plate"]["fscore"] > 0.99
+    some, same = (judged(capsys, *pair, text)["plate"]["fscore"] for text in ("1.005", f"{100.5 / 200**0.5}%"))
+    assert 0.2 < some == same < 0.95
+    for text in ("0", "-1", "x", "1%%"):
+        assert "--threshold must be a positive number, or one with %" in refused(
+            capsys, *pair[:-1], f"--threshold={text}"
+        )
+
+
+def test_a_cloud_is_a_truth_and_has_no_normals(files, capsys):
+    trimesh.PointCloud(on_ball(6000, 2.0)).export(files / "cloud.ply")
+    found = judged(capsys, files / "found/small.ply", "--truth", files / "cloud.ply", *FEW)["small"]
+    assert "normal_consistency" not in found and found["chamfer_l1"] == pytest.approx(0.2, abs=0.02)
+
+
+def test_in_the_unit_sphere_the_size_of_the_files_does_not_count(files, capsys):
+    made = [read_mesh(files / name / "small.ply") for name in ("truth", "found")]
+    for mesh, name in zip(made, ("a", "small"), strict=True):
+        mesh.moved(np.array([[7.0, 0, 0, 50], [0, 7, 0, 1], [0, 0, 7, -9], [0, 0, 0, 1]])).save(files / f"{name}.ply")
+    first = judged(capsys, files / "found/small.ply", "--truth", files / "truth/small.ply", *FEW, "--unit-sphere")
+    second = judged(capsys, files / "small.ply", "--truth", files / "a.ply", *FEW, "--unit-sphere")
+    assert second["small"] == pytest.approx(first["small"], rel=1e-3)
+    assert first["small"]["accuracy"] == pytest.approx(0.97 * 0.2 / 2, abs=0.007)
+
+
+def test_other_units_are_told_as_a_likely_mistake(files, capsys):
+    ball(2000.0, (0, 0, 0)).save(files / "mm.ply")
+    told = judged(capsys, files / "mm.ply", "--truth", files / "truth/small.ply", *FEW)["notes"]
+    assert "warning: the mesh is 1e+03 times as large as the truth: are both in the same units?" in told
+
+
+def test_a_folder_has_a_row_for_each_truth_and_medians(files, capsys):
+    (files / "found/large.ply").unlink()
+    (files / "found/plate.ply").write_bytes(b"")
+    found = judged(capsys, files / "found", "--truth", files / "truth", *FEW, code=1)
+    assert list(found) == ["notes", "large", "plate", "small", "median"]
+    assert found["large"]["chamfer_l1"] == found["plate"]["chamfer_l1"] == found["median"]["chamfer_l1"] == np.inf
+    assert found["large"]["fscore"] == 0 < found["small"]["normal_consistency"]
+    plate(0.0).save(files / "found/stray.ply")
+    assert "stray.ply has no truth: name it as a file of" in refused(
+        capsys, files / "found", "--truth", files / "truth"
+    )
+
+
+def test_what_is_no_mesh_is_refused_by_its_cause(files, capsys):
+    truth = files / "truth/small.ply"
+    trimesh.PointCloud(on_ball(50)).export(files / "points.ply")
+    (files / "empty.ply").write_bytes(b"")
+    (files / "broken.ply").write_bytes(truth.read_bytes()[:500])
+    for name, words in (
+        ("points", "must have faces, found none: it holds 50 vertices"),
+        ("empty", "must hold a mesh, found 0 bytes"),
+        ("broken", "must be a whole .ply file, but it is truncated"),
+        ("gone", "found nothing at"),
+    ):
+        assert words in refused(capsys, files / f"{name}.ply", "--truth", truth)
+        assert name == "points" or words in refused(capsys, truth, "--truth", files / f"{name}.ply")
+    assert "is a folder and --truth" in refused(capsys, files / "found", "--truth", truth)
+    assert "is a folder, and" in refused(capsys, truth, "--truth", files / "truth")
+    assert "--points must be at least 1" in refused(capsys, truth, "--truth", truth, "--points", 0)
+    assert "add --method NAME" in refused(capsys, truth, "--truth", truth, "--into", files / "results")
+    assert "does not end in the number of a scan" in refused(capsys, truth, "--dtu", files)
+
+
+def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    idr(tmp_path / "photos")
+    write_dtu(tmp_path / "dtu", on_ball(4000, RADIUS) - CENTRE + PHOTOGRAPHED, plane=(0, 0, 1, 0), centre=PHOTOGRAPHED)
+    there = ball(1.03 * RADIUS, PHOTOGRAPHED)
+    there.save(tmp_path / "there65.ply")
+    capture = read_capture(tmp_path / "photos", Reading(800))
+    there.moved(np.linalg.inv(capture.to_world)).save(tmp_path / "scan65.ply")
+    away = ball(0.1 * RADIUS, PHOTOGRAPHED + np.array([0, 0, 1.6 * RADIUS]))
+    both = (
+        np.concatenate([there.vertices, away.vertices]),
+        np.concatenate([there.faces, away.faces + len(there.vertices)]),
+    )
+    Mesh(*both).save(tmp_path / "both65.ply")
+    expected = dtu_metrics(there, read_scan(tmp_path / "dtu", 65), seed=0)
+    where = ("--dtu", tmp_path / "dtu")
+    first = judged(capsys, tmp_path / "there65.ply", *where)
+    assert first["there65"] == pytest.approx(expected, rel=1e-3) and tuple(first["there65"]) == NAMES
+    assert any("DVR (RGB) 0.907" in note for note in first["notes"])
+    moved = judged(capsys, tmp_path / "scan65.ply", *where, "--to-world", tmp_path / "photos")
+    assert moved["scan65"] == pytest.approx(expected, rel=1e-3)
+    plain = judged(capsys, tmp_path / "both65.ply", *where)["both65"]
+    culled = judged(capsys, tmp_path / "both65.ply", *where, "--cull", tmp_path / "photos")["both65"]
+    assert plain["dtu_accuracy"] > 1.1 * culled["dtu_accuracy"] and culled == pytest.approx(expected, rel=0.05)
+    away.save(tmp_path / "away65.ply")
+    error = refused(capsys, tmp_path / "away65.ply", *where, "--cull", tmp_path / "photos")
+    assert "leave nothing of the mesh" in error
+    ball(1.0, PHOTOGRAPHED + 500).save(tmp_path / "far65.ply")
+    assert "nothing of the mesh lies within 20 mm of scan 65" in refused(capsys, tmp_path / "far65.ply", *where)
+
+
+def test_rows_stand_beside_runs_and_are_merged(files, capsys):
+    (files / "found/large.ply").unlink()
+    results, common = files / "results", ("--truth", files / "truth", *FEW, "--method", "My net")
+    for _ in range(2):  # the second time they are replaced
+        assert main([*map(str, (files / "found", *common, "--into", results))]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == str(results / "index.html")
+    assert merge([results], files / "all") == []
+    runs = bench.load(files / "all").set_index("scene")
+    assert set(runs.name) == {"My net"} and set(runs.index) == {"small", "large", "plate"}
+    assert runs.status.to_dict() == {"small": "ok", "plate": "ok", "large": "empty"}
+    assert runs.chamfer_l1["large"] == np.inf and "no mesh is named 'large'" in runs.reason["large"]
+    assert "My net" in "".join(file.read_text() for file in (results / "page" / "data" / "list").rglob("*.js"))
+
+
+def test_a_row_may_answer_the_problem_of_a_run(files, capsys):
+    config = {"dataset": {"path": "photos"}, "index": 0, "task": {"longest": 96}, "renderer": {"_label_": "Newton"}}
+    run = Record("run", "reconstruction", "newton", "photos", 3, config, scene="scan65")
+    (files / "run").mkdir()
+    run.write(files / "run")
+    mesh, more = files / "found/small.ply", ("--like", files / "run", "--method", "NeuS", "--into", files / "results")
+    judged(capsys, mesh, "--truth", files / "truth/small.ply", *FEW, *more)
+    (folder,) = (files / "results/runs").iterdir()
+    row = Record.of(read_record(folder))
+    assert (row.name, row.task, row.dataset, row.seed, row.scene) == ("NeuS", "reconstruction", "photos", 3, "scan65")
+    assert row.config["task"] == {"longest": 96} and "units of the truth's file" in row.definitions["accuracy"]
+    assert (folder / "mesh.ply").is_file()
+    error = refused(capsys, files / "found", "--truth", files / "truth", *more)
+    assert "--like names the problem of one run" in error
