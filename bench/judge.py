@@ -232,7 +232,7 @@ def write_row(verdict: Verdict, item: Item, place: int, judge: Judge, given: arg
         where = str(given.truth or given.dtu)
         config = {"task": {"points": judge.points}, "dataset": {"path": where}, "index": place, "split": "test"}
         fields = {"task": TASK, "dataset": TASK, "seed": judge.seed, "scene": item.name, "config": config}
-    fields["config"] |= {"label": given.method, "renderer": {}, "results_dir": str(given.into)}
+    fields["config"] |= {"label": given.method, "renderer": {}, "silhouette": None, "results_dir": str(given.into)}
     key = digest([words, fields["task"], fields["config"], fields["seed"], item.name])
     record = Record(f"{fields['task']}-{words}-{key}", renderer=words, **fields)
     record.status, record.reason = (RunStatus.EMPTY, verdict.failure) if verdict.failure else (RunStatus.OK, "")

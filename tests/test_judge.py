@@ -156,7 +156,7 @@ def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path,
     where = ("--dtu", tmp_path / "dtu")
     first = judged(capsys, tmp_path / "there65.ply", *where)
     assert first["there65"] == pytest.approx(expected, rel=1e-3) and tuple(first["there65"]) == NAMES
-    assert any("DVR (RGB) 0.907" in note for note in first["notes"])
+    assert any("DVR (RGB): 0.907" in note for note in first["notes"])
     moved = judged(capsys, tmp_path / "scan65.ply", *where, "--to-world", tmp_path / "photos")
     assert moved["scan65"] == pytest.approx(expected, rel=1e-3)
     plain = judged(capsys, tmp_path / "both65.ply", *where)["both65"]
@@ -185,6 +185,7 @@ def test_rows_stand_beside_runs_and_are_merged(files, capsys):
 
 def test_a_row_may_answer_the_problem_of_a_run(files, capsys):
     config = {"dataset": {"path": "photos"}, "index": 0, "task": {"longest": 96}, "renderer": {"_label_": "Newton"}}
+    config |= {"silhouette": {"_label_": "hinge"}}
     run = Record("run", "reconstruction", "newton", "photos", 3, config, scene="scan65")
     (files / "run").mkdir()
     run.write(files / "run")

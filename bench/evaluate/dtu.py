@@ -114,7 +114,7 @@ def read_scan(folder: Path, number: int) -> DtuScan:
 
 def published(number: int) -> list[str]:
     """What DVR's Table 2 has, in words, where it has the scan."""
-    rows = ", ".join(f"{name} {values[-1]:.3f}" for name, values in DVR_TABLE2.items())
+    rows = "; ".join(f"{name}: {values[-1]:.3f}" for name, values in DVR_TABLE2.items())
     told = f"published, DVR, Table 2, dtu_overall in mm, mean of scans {_SCANS}: {rows}"
     return [told] if number in DVR_SCANS else []
 

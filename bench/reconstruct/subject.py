@@ -172,11 +172,11 @@ class PhotographTask(ABC):
             capture = inputs.photographed.capture(self.longest, self.held_out)
             shots, seed, to_world = capture.shots, inputs.seed, capture.to_world
             truth, points, told = truth_of(inputs.photographed, to_world)
-            found = "; ".join([capture.summary, *capture.notes, *told])
+            found = "; ".join([capture.summary, *capture.notes])
         else:
             scene = inputs.scene
             camera = scene.view.camera.resized(self.longest, self.longest)
-            seed, truth, to_world, points = scene.seed(inputs.seed), scene.mesh, None, None
+            seed, truth, to_world, points, told = scene.seed(inputs.seed), scene.mesh, None, None, []
             shots = tuple(self.images.take(Truth(truth), camera, seed=seed))
             found = f"{len(shots)} rendered photographs of {self.longest} x {self.longest} pixels"
         every = self.held_out
@@ -186,6 +186,7 @@ class PhotographTask(ABC):
         given = tuple(self.depths.of(shot, (seed, place)) for place, shot in enumerate(given))
         given = given if self.masks else tuple(replace(shot, mask=None) for shot in given)
         found += f"; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
+        found = "; ".join([found, *told])
         return Subject(given, held_out, truth, found, to_world, points)
 
 

@@ -22,8 +22,8 @@ def show(folder: Path, record: Record) -> None:
     for heading in ("", "before", "after", "better"):
         table.add_column(heading, justify="left" if heading in ("", "better") else "right")
     for name, metric in SHOWN.items():
-        if name in record.metrics_start:
-            before, after = record.metrics_start[name], record.metrics.get(name)
+        if record.metrics_start and name in {*record.metrics_start, *record.metrics}:
+            before, after = record.metrics_start.get(name), record.metrics.get(name)
             table.add_row(metric.label, number(before, metric.factor), number(after, metric.factor), metric.better)
     if table.row_count:
         console.print(table)

@@ -138,4 +138,4 @@ def test_files_may_lie_as_the_archives_have_them_and_broken_ones_are_named(folde
 
 
 def test_published_numbers_are_of_the_scans_that_dvr_has():
-    assert published(24) == [] and "DVR (RGB) 0.907" in published(65)[0]
+    assert published(24) == [] and "DVR (RGB): 0.907" in published(65)[0]

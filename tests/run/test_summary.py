@@ -37,6 +37,14 @@ def test_a_run_ends_with_its_picture_and_the_command_for_page_and_tables(tmp_pat
     assert all(letter.isprintable() for line in table for letter in line)
 
 
+def test_a_metric_of_the_end_alone_is_shown_too(tmp_path, capsys):
+    record = ended(tmp_path, "a")
+    record.metrics["dtu_overall"] = 0.7
+    show(tmp_path / "runs" / "a", record)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "DTU overall (mm)" in line]
+    assert line.split()[-3:] == ["–", "0.700", "lower"]
+
+
 def test_a_run_without_a_picture_in_the_usual_folder_has_shorter_lines(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     record = ended(Path(RESULTS), "a")

@@ -206,7 +206,7 @@ def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
     if kind == "dtu":
         assert {name: metrics[name] for name in NAMES} == dtu_metrics(mesh, read_scan(truth, 65), seed=0)
         assert metrics["dtu_accuracy"] == pytest.approx(away, abs=0.02 * RADIUS)
-        assert set(NAMES) < set(record.definitions) and any("DVR (RGB) 0.907" in note for note in record.notes)
+        assert set(NAMES) < set(record.definitions) and any("DVR (RGB): 0.907" in note for note in record.notes)
         return
     unit = np.linalg.norm(np.loadtxt(tmp_path / "run" / "to_world.txt")[:3, 0])
     assert metrics["accuracy"] * unit == pytest.approx(away, abs=0.01 * RADIUS)
