@@ -136,9 +136,7 @@ def _better(standing: Standing, row: str, of_set: str | None) -> str:
 def _panel(standing: Standing, of_set: str | None) -> chart.Panel:
     found = {row: standing.profile(row, of_set) for row in standing.rows}
     lines = [
-        chart.curve(
-            row, standing.preset(row), costs, shares, step=True, **{"dash": ":"} if row.endswith(BY_ITSELF) else {}
-        )
+        chart.curve(row, standing.preset(row), costs, shares, step=True)
         for row, (costs, shares) in found.items()
         if costs
         and costs[-1] > 0  # of a row whose runs ended before they cost anything there is no line
@@ -181,6 +179,12 @@ def _doubts(standing: Standing) -> list[str]:
     alike = {one.key for one in standing.alike}
     other = sorted({one.row for one in standing.everything if one.key not in alike})
     tuned = [row for row in standing.rows if row.endswith(BY_ITSELF)]
+    drawn = [
+        f"{name} of {row.removesuffix(BY_ITSELF)}"
+        for row in tuned
+        for name in standing.sets
+        if standing.of(row, name) and row == _better(standing, row, name)
+    ]
     alone = len(standing.alike) - len(standing.attempts)
     versions = len({one.code for one in standing.attempts})
     machines = len({one.machine for one in standing.attempts})
@@ -190,7 +194,7 @@ def _doubts(standing: Standing) -> list[str]:
         f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have." if alone else "",
         "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes; a set without "
         "one is left out, so there is no rank. Gain: points over its row at the set's setting, at the same problems. A "
-        "set's chart has the better of two rows that have all its problems, a tuned one dotted; that of all sets none."
+        f"set's chart has the better of two rows that have all its problems, tuned: {', '.join(drawn) or 'none'}."
         if tuned
         else "",
         f"Runs of {versions} versions of the code." if versions > 1 else "",

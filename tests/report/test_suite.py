@@ -13,7 +13,7 @@ from bench import merge
 from bench.records.read import read_records
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
 from bench.report.suite.standing import SECONDS, Standing
-from bench.studies.suite import _panel
+from bench.studies.suite import _doubts, _panel
 from bench.suite import _sweeps, main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.report.test_report_paper import write_run
@@ -296,10 +296,8 @@ def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_rank(monkeypatch
     gains = [standing.gain(row) for row in standing.rows[:4]]
     assert gains[0] is None and [gain and round(gain.value, 9) for gain in gains[1:]] == [-1.0, None, 0.2]
     assert {line["name"] for line in _panel(standing, None)["series"]} == {"B", "Dist", "Lost"}
-    lines = {line["name"]: line["dash"] for line in _panel(standing, "complete")["series"]}
-    assert lines.keys() == {"B", "Dist, tuned", "Lost"} and [row for row in lines if lines[row] == ":"] == [
-        "Dist, tuned"
-    ]
+    assert {line["name"] for line in _panel(standing, "complete")["series"]} == {"B", "Dist, tuned", "Lost"}
+    assert "tuned: complete of Dist." in "".join(_doubts(standing))
 
 
 def test_a_tuned_setting_is_free_in_its_weights_and_rate_alone(tmp_path):
