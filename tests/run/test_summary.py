@@ -39,7 +39,7 @@ def test_a_run_ends_with_its_picture_and_the_command_for_page_and_tables(tmp_pat
 
 def test_a_metric_of_the_end_alone_is_shown_too(tmp_path, capsys):
     record = ended(tmp_path, "a")
-    record.metrics["dtu_overall"] = 0.7
+    record.metrics = {**record.metrics, "dtu_overall": 0.7}
     show(tmp_path / "runs" / "a", record)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "DTU overall (mm)" in line]
     assert line.split()[-3:] == ["–", "0.700", "lower"]
