@@ -284,6 +284,8 @@ def _all_masked(shots: Sequence[Shot]) -> bool:
         raise BadInput(f"{lacking[0]} has no mask, and others have one: add it, or use no masks")
     if blank := [shot.name for shot in shots if shot.mask is not None and not bool(shot.mask.any())]:
         raise BadInput(f"the mask of {blank[0]} is empty: remove the image, or use no masks")
+    if not lacking and all(bool(shot.mask.all()) for shot in shots if shot.mask is not None):
+        raise BadInput("the masks are white everywhere, and say nothing of the object: give others, or use no masks")
     return not lacking
 
 

@@ -56,6 +56,8 @@ class Frame:
             raise BadInput(
                 f"the camera of {self.image} must have finite numbers and positive focal lengths: export it again"
             )
+        if self.size is not None and min(self.size) < 1:
+            raise BadInput(f"the camera of {self.image} must be of one pixel or more, not {self.size}: export it again")
         if np.abs(self.intrinsics[2] - (0, 0, 1)).max() > RIGID or abs(self.intrinsics[1, 0]) > RIGID:
             raise BadInput(
                 f"the intrinsics of {self.image} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], not "

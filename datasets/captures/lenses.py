@@ -32,7 +32,7 @@ UNDERSTOOD = ", ".join([*PLAIN, *FISHEYE])
 READ = {*RADIAL, *TANGENTIAL, "camera_model", "is_fisheye", "distortion_params"}
 PINHOLE = {"", "NONE", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE"}
 SPEAKS = re.compile(  # of a lens, or of a shutter
-    r"(.*\.)?([kpsb]\d+|tau_?[xy]|lens(_?(model|type|params))?|(camera|model)_?(model|type|params)"
+    r"(.*\.)?([kpsb]\d+|tau_?[xy]|dist(_?(\d+|coeff\w*|params))?|lens(_?(model|type|params))?|(camera|model)_?(model|type|params)"
     r"|projection(_?(model|type))?|(ftheta|radial|tangential|transform_matrix_).*"
     r"|(is_)?(equirect|latlong|ortho(graphic|photo)|panoram|spherical|omni).*|.*(distort|fish_?eye|shutter).*)",
     re.IGNORECASE,

@@ -1,6 +1,7 @@
 """Cameras in the JSON of NeRF, instant-ngp, nerfstudio and NeuS2."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from math import pi, radians, tan
 from pathlib import Path
@@ -27,6 +28,8 @@ def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     every = need(stored, "frames", str(files[0]))
     if not isinstance(every, list) or not all(isinstance(frame, dict) for frame in every):
         raise BadInput(f"{files[0]}: frames must be a list with a table for each image: export it again")
+    every = [{key: value for key, value in frame.items() if value is not None} for frame in every]
+    stored = {key: value for key, value in stored.items() if value is not None}
     known = {str(need(frame, "file_path", f"{files[0]}: a frame")): _merged(stored, frame) for frame in every}
     if len(known) < len(every):
         paths = [str(frame["file_path"]) for frame in every]
@@ -36,7 +39,11 @@ def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     masks, told = _masks(folder, known, found) if masked else ({}, ())
     frames = [_frame(known[path], image, masks.get(path), f"{files[0]}, {path}") for path, image in found.items()]
     missing = [path for path in known if path not in found]
-    notes = (*([how] if how else []), *told, *without_image(missing))
+    unsized = [
+        path for path in found if not {"w", "h", *_focal_keys("x")[1:], *_focal_keys("y")[1:]} & set(known[path])
+    ]
+    guessed = (f"{files[0].name} states no w and h: focal lengths are taken for the size of the images",)
+    notes = (*([how] if how else []), *told, *without_image(missing), *(guessed if unsized else ()))
     frames = sorted(frames, key=lambda frame: natural(frame.image.name))
     return Layout("NeRF", tuple(frames), None, notes, missing=missing[0] if missing else "")
 
@@ -51,6 +58,10 @@ def _masks(
         own, notes = masks_of(folder, files) if len(files) == len(found) else ({}, ())
         told = "the folder of masks is used, though transforms.json does not name it"
         return {path: own[file.name] for path, file in found.items() if own}, (told, *notes) if own else ()
+    if twice := [mask for mask, times in Counter(named.values()).items() if times > 1]:
+        raise BadInput(
+            f"{twice[0]} is the mask of several images in transforms.json: name the own mask of each, or none"
+        )
     masks, _ = located(named.values(), folder)
     if lost := [mask for mask in named.values() if mask not in masks]:
         raise BadInput(f"the mask {lost[0]} that transforms.json names is not in {folder}: add it, or use no masks")
@@ -82,7 +93,7 @@ def _frame(known: dict[str, Any], image: Path, mask: Path | None, where: str) ->
 
 def _intrinsics(known: Mapping[str, Any], width: int, height: int, where: str) -> Float[np.ndarray, "3 3"]:
     """Intrinsics from a matrix, from focal lengths, or from fields of view."""
-    matrix = None if (stated := known.get("intrinsic_matrix")) is None else np.asarray(stated, dtype=np.float64)
+    matrix = np.asarray(known["intrinsic_matrix"], dtype=np.float64) if "intrinsic_matrix" in known else None
     if matrix is not None and matrix.shape not in ((3, 3), (3, 4), (4, 4)):
         raise BadInput(f"{where}: intrinsic_matrix must be 3 x 3, not of shape {list(matrix.shape)}")
     lengths = (None, None) if matrix is None else (matrix[0, 0], matrix[1, 1])
@@ -108,12 +119,12 @@ def _focal(known: Mapping[str, Any], axis: str, pixels: int, length: float | Non
     stated = {"intrinsic_matrix": length, first: known.get(first)}
     found = {key: float(value) for key, value in stated.items() if value is not None}
     for key, angle, unit in zip(angles, (float, radians), ("radians", "degrees"), strict=True):
-        if known.get(key) is not None:
+        if key in known:
             value = angle(float(known[key]))
             if not 0 < value < pi:
                 raise BadInput(f"{where}: {key} must lie between 0 and pi, not {known[key]}: it is in {unit}")
             found[key] = pixels / 2 / tan(value / 2)
-    if found and max(found.values()) > (1 + SAME) * min(found.values()):
+    if found and max(found.values()) > (1 + SAME) * min(found.values()) > 0:
         told = ", ".join(f"{value:.6g} pixels by {key}" for key, value in found.items())
         raise BadInput(f"{where}: focal lengths differ, {told} of {pixels} pixels: leave the wrong one out")
     return next(iter(found.values()), None)

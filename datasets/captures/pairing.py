@@ -6,6 +6,7 @@ from itertools import pairwise, product, takewhile
 from os.path import normpath
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
+from unicodedata import normalize
 
 from renderers.checks import BadInput
 
@@ -249,11 +250,16 @@ def _existing(file: Path, listed: dict[Path, dict[str, Path]]) -> Path | None:
         listed[file.parent] = images_in(file.parent)
     there = listed[file.parent]
     stem = _stem(file.name) if file.suffix.lower() in IMAGES else file.name
-    for same in ((lambda name: _stem(name) == stem), (lambda name: _stem(name).lower() == stem.lower())):
+    for same in ((lambda name: _stem(name) == stem), (lambda name: _plain(_stem(name)) == _plain(stem))):
         found = [path for name, path in there.items() if same(name)]
         if found and (len(found) == 1 or stem == file.name):  # of a name without suffix the first kind
             return min(found, key=lambda path: IMAGES.index(path.suffix.lower()))
     return None
+
+
+def _plain(name: str) -> str:
+    """A name in lower case, with accents as Linux writes them: a Mac parts them from their letters."""
+    return normalize("NFC", name).lower()
 
 
 def without_image(names: Sequence[str]) -> tuple[str, ...]:

@@ -59,9 +59,11 @@ def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:
 
 def doubt_of(shots: Sequence[Shot]) -> str:
     """What may be wrong with photographs that do not fit: the size of their images, or inverted masks; "" else."""
-    sides = [side for shot in shots if shot.mask is not None for side in _border(shot.mask)]
-    if sides and np.mean([bool(side.float().mean() > 0.5) for side in sides]) > 0.5:
-        return "the masks are white along the border, as inverted ones: make the object white, and the rest black"
+    masked = [(shot.name, shot.mask) for shot in shots if shot.mask is not None]
+    white = [name for name, mask in masked if all(bool(side.float().mean() > 0.5) for side in _border(mask))]
+    if white:
+        which = f"{len(white)} of the masks, such as that of {white[0]}, are"
+        return f"{which} white along the border, as inverted ones: make the object white, and the rest black"
     return _size_doubt([shot.camera for shot in shots])
 
 

@@ -130,6 +130,9 @@ def test_masks_that_transforms_json_does_not_name_are_used(tmp_path):
     own = read_capture(tmp_path, READ)
     assert any("does not name it" in note for note in own.notes)
     assert all(shot.mask.float().mean() > 0.9 for shot in own.shots)
+    changed(tmp_path, lambda stored: [one.update(mask_path="masks/r_0.png") for one in stored["frames"]])
+    with pytest.raises(BadInput, match=r"masks/r_0\.png is the mask of several images"):
+        read_capture(tmp_path, READ)
 
 
 def test_files_of_a_mac_are_no_images(tmp_path):
@@ -158,6 +161,10 @@ def test_fields_of_view_and_matrices_give_focal_lengths(tmp_path):
         )
         assert off(read_capture(tmp_path, PLAIN)) < 0.01
         changed(tmp_path, lambda stored, way=way: [stored.pop(key) for key in way])
+    changed(tmp_path, lambda stored: (stored.update(fl_x=FOCAL, fl_y=None), [stored.pop(key) for key in "wh"]))
+    guessed = read_capture(tmp_path, PLAIN)
+    assert off(guessed) < 0.01 and "transforms.json states no w and h" in guessed.notes[0]
+    changed(tmp_path, lambda stored: stored.pop("fl_x"))
     with pytest.raises(BadInput, match="r_0 has no focal length: give fl_x"):
         read_capture(tmp_path, PLAIN)
 
@@ -223,6 +230,9 @@ BROKEN = {
         lambda stored: [row.__setitem__(3, 2.0) for one in stored["frames"] for row in one["transform_matrix"][:3]],
         r"all 10 cameras, of r_0.png to r_9.png, are at one place, \(2, 2, 2\)",
     ),
+    "null": (lambda stored: stored["frames"][3].update(file_path=None), "a frame has no file_path"),
+    "no size": (lambda stored: stored.update(w=0, h=0), r"r_0\.png must be of one pixel or more, not \(0, 0\)"),
+    "width": (lambda stored: stored.pop("h"), "r_0 has no h"),
     "twice": (lambda stored: stored["frames"].append(stored["frames"][0]), "has ./train/r_0 twice"),
     "mirror": (
         lambda stored: stored["frames"][3].update(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()),
@@ -304,9 +314,18 @@ def test_a_mask_is_all_that_is_not_background(tmp_path, colours, alpha):
 
 def test_inverted_masks_and_broken_files_are_told(tmp_path):
     idr(tmp_path)
-    for file in (tmp_path / "mask").iterdir():
-        Image.fromarray(255 - np.asarray(Image.open(file))).save(file)
-    with pytest.raises(BadInput, match="the masks are white along the border, as inverted ones"):
+    files = sorted((tmp_path / "mask").iterdir())
+    for some, told in (
+        (files[4:5], "1 of the masks, such as that of 000004.png"),
+        (files[:4] + files[5:], "10 of the masks"),
+    ):
+        for file in some:
+            Image.fromarray(255 - np.asarray(Image.open(file))).save(file)
+        with pytest.raises(BadInput, match=f"{told}.* are white along the border, as inverted ones"):
+            read_capture(tmp_path, READ)
+    for file in files:
+        Image.fromarray(np.full(SIZE, 255, np.uint8)).save(file)
+    with pytest.raises(BadInput, match="the masks are white everywhere"):
         read_capture(tmp_path, READ)
     file = tmp_path / "image" / "000003.png"
     file.write_bytes(file.read_bytes()[:100])

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from unicodedata import normalize
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -108,6 +109,13 @@ def test_images_are_found_by_paths_of_other_machines(tmp_path, before, windows, 
         path: f"{name}.png" for path, name in asked.items()
     } or (suffix == "" and len(found) < 3)
     assert ("without" in note) == (before[:1] in ("C", "/")) or suffix == ""
+
+
+@pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
+def test_accents_of_a_mac_are_those_of_others(tmp_path, forms):
+    there, asked = (normalize(form, "\u00e9 1.png") for form in forms)
+    write(tmp_path, there, "e 1.png")
+    assert located([asked], tmp_path)[0] == {asked: tmp_path / there}
 
 
 def test_two_paths_to_one_file_are_refused(tmp_path):
