@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from datasets.captures.frames import Frame, Layout, motion
 from datasets.captures.lenses import colmap_lens
@@ -67,9 +68,11 @@ def _cameras(model: Any, place: Path) -> dict[str, tuple[Any, ...]]:
     for seen in (one for one in model.images.values() if one.has_pose):
         camera = model.cameras[seen.camera_id]
         lens = colmap_lens(camera.model.name, list(camera.params), str(place))
-        matrix = seen.cam_from_world().matrix()
-        moved = motion(matrix[:, :3], matrix[:, 3])
         name = names.get(seen.image_id, seen.name)
+        rigid = seen.cam_from_world()
+        if not np.any(rigid.rotation.quat):
+            raise BadInput(f"{place}: the quaternion of {name} is 0 0 0 0, and no rotation: export it again")
+        moved = motion(Rotation.from_quat(rigid.rotation.quat).as_matrix(), rigid.translation)
         found[name] = camera.calibration_matrix(), moved, (camera.height, camera.width), lens
     return {name: found[name] for name in sorted(found)}
 
@@ -84,7 +87,11 @@ def _written_names(place: Path) -> dict[int, str]:
         if line.strip() and not line.startswith("#"):
             number, *rest = line.split(maxsplit=9)
             names[int(number)] = rest[-1].strip()
-            next(lines, "")  # its points
+            points = next(lines, "").split()  # x, y and number of each
+            if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
+                raise BadInput(
+                    f"{file}: after {rest[-1]} there must be a line of its points, or a blank one: add these"
+                )
     return names
 
 

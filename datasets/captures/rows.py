@@ -15,12 +15,14 @@ from renderers.checks import BadInput
 def middlebury(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """Middlebury: a line for each image: its name, K, R and t, row by row."""
     cameras = {}
-    for line in files[0].read_text().splitlines()[1:]:
-        if not line.strip():
+    for line in filter(str.strip, files[0].read_text().splitlines()):
+        if line.strip().isdecimal():  # the number of images
             continue
         name, *numbers = line.rsplit(maxsplit=21)
         if len(numbers) != 21:
             raise BadInput(f"{files[0]}: the line of {name} must have 21 numbers, not {len(numbers)}: copy it again")
+        if name in cameras:
+            raise BadInput(f"{files[0]} has {name} twice: name each image once")
         values = np.array(numbers, dtype=np.float64)
         cameras[name] = centred(values[:9].reshape(3, 3)), motion(values[9:18].reshape(3, 3), values[18:])
     found, how = located([*cameras], folder)

@@ -20,7 +20,20 @@ from datasets.captures.rows import _from_angles
 from datasets.captures.take import _alike, read_image
 from datasets.own_photographs import Capture, Reading, read_capture
 from renderers.checks import BadInput
-from tests.datasets.test_captures import CENTRE, FOCAL, MIDDLE, RADIUS, SIZE, cameras, colmap, idr, image, llff, nerf
+from tests.datasets.test_captures import (
+    CENTRE,
+    FOCAL,
+    MIDDLE,
+    RADIUS,
+    SIZE,
+    cameras,
+    colmap,
+    idr,
+    image,
+    llff,
+    middlebury,
+    nerf,
+)
 from tests.datasets.test_captures import write_images as write
 from tests.looped import each
 
@@ -564,3 +577,33 @@ def test_a_pointer_of_git_lfs_is_told_as_such(tmp_path, format, name):
     file.write_bytes(POINTER)
     with pytest.raises(BadInput, match=r"is a Git LFS pointer; fetch it with 'git lfs pull'"):
         read_capture(folder, READ)
+
+
+def test_lines_without_points_and_quaternions_of_any_length(tmp_path):
+    colmap(tmp_path)
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    text = file.read_text()
+    longer = re.sub(
+        r"(?m)^(\d+) (\S+ \S+ \S+ \S+)", lambda m: f"{m[1]} {' '.join(str(2 * float(v)) for v in m[2].split())}", text
+    )
+    for good in (longer, text.replace("png\n\n", "png\n1.5 2.5 -1 3e1 4.5 -1\n"), text.replace("\n", "\r\n")):
+        file.write_text(good)
+        assert off(read_capture(tmp_path, PLAIN)) < 0.01
+    for bad, words in (
+        (text.replace("\n\n", "\n"), r"images.txt: after 000.png there must be a line of its points"),
+        (re.sub(r"(?m)^4 \S+ \S+ \S+ \S+", "4 0 0 0 0", text), "the quaternion of 003.png is 0 0 0 0"),
+    ):
+        file.write_text(bad)
+        with pytest.raises(BadInput, match=words):
+            read_capture(tmp_path, PLAIN)
+
+
+def test_middlebury_needs_no_count_and_has_each_name_once(tmp_path):
+    middlebury(tmp_path)
+    file = tmp_path / "ball_par.txt"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(lines[1:]))
+    assert off(read_capture(tmp_path, PLAIN)) < 0.01
+    file.write_text("\n".join([*lines, lines[3]]))
+    with pytest.raises(BadInput, match=r"ball_par.txt has ball0002.png twice"):
+        read_capture(tmp_path, PLAIN)
