@@ -82,6 +82,8 @@ class Judge:
     cull: Path | None
 
     def __post_init__(self) -> None:
+        if self.folder is not None and self.unit_sphere:
+            raise ValueError("--unit-sphere is for --truth, and DTU's distances are in mm: leave it out")
         if self.points < 1:
             raise ValueError(f"--points must be at least 1, found {self.points}")
         if not re.fullmatch(r"[\d.eE+-]+%?", self.threshold) or not float(self.threshold.rstrip("%")) > 0:
