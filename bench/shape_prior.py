@@ -25,6 +25,7 @@ from datasets.mesh import Mesh
 from datasets.scene import Dataset, Split, Truth, sample_surface
 from renderers.checks import check_at_least, check_positive
 from renderers.fields.mlp import Decoder
+from renderers.fields.network import Published
 
 SHIPPED = Path(__file__).resolve().parents[1] / "datasets" / "priors"
 VERSION = 1  # raise it when training changes, so that no prior of the old training is used for a new one
@@ -90,7 +91,7 @@ class PriorSettings:
 class Prior:
     """A decoder whose codes are shapes, and the codes of its training shapes. Code zero is the mean shape."""
 
-    decoder: Decoder
+    decoder: Decoder | Published
     codes: Float[Tensor, "shapes code_length"]
 
 

@@ -23,6 +23,7 @@ from bench.config import CONF, build, check_names, register
 from bench.report.__main__ import main as report
 from bench.report.write import paper
 from bench.run import library
+from bench.run.command import with_network
 from bench.run.pack import register_slurm
 from tests import composing, documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
@@ -110,7 +111,7 @@ def test_every_command_composes(made):
         arguments = filled(command, made)
         if "+experiment=sofa" in arguments:  # stands for any, which the tests of conf compose
             continue
-        config = composed(arguments)
+        config = composed(with_network(list(arguments)))
         check_names(config)
         OmegaConf.resolve(config)
         for part in ("renderer", "task"):  # of others, the tests of conf build every choice

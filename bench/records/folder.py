@@ -33,7 +33,8 @@ PASSIVE = (
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"
-FILE_KEYS = ("path", "image_path", "mask_path", "truth")  # of files that a run reads
+FILE_KEYS = ("path", "image_path", "mask_path", "truth", "codes")  # of files that a run reads
+IN_FOLDERS = ("*", "ModelParameters/*", "LatentCodes/*")  # and of a folder those of DeepSDF
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVE = 64 * 1024  # bytes kept free, so that the record can still be written when the disk has become full
 RESERVED = ".reserve"
@@ -230,7 +231,8 @@ def _content(path: Path) -> str:
     """Hash of a file's name and bytes, or of all files of a folder; empty where there is none."""
     try:
         if path.is_dir():
-            return digest([_content(child) for child in sorted(path.iterdir()) if child.is_file()])
+            found = [child for part in IN_FOLDERS for child in sorted(path.glob(part)) if child.is_file()]
+            return digest([_content(child) for child in found])
         return digest([path.name, hashlib.sha256(path.read_bytes()).hexdigest()])
     except OSError:
         return ""

@@ -79,7 +79,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     Sweep.runs = runs
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
-        sys.argv[1:] = options_first(sys.argv[1:])
+        sys.argv[1:] = with_network(options_first(sys.argv[1:]))
         register(*own_folders(sys.argv[1:]))
         register_slurm()
         with mode_of_options(sys.argv[1:]):
@@ -146,6 +146,23 @@ def options_first(arguments: list[str]) -> list[str]:
     for override in given.overrides:
         options.remove(override)
     return [*options, *given.overrides]
+
+
+def with_network(arguments: list[str]) -> list[str]:
+    """The arguments with `field=file field_path=PATH`, a network as the scene's field, as the dataset that it is.
+
+    Raises:
+        ValueError: for one of the two without the other, or beside another dataset.
+    """
+    keys = [argument.partition("=")[0] for argument in arguments]
+    if "field=file" not in arguments and "field_path" not in keys:
+        return arguments
+    if "field=file" not in arguments or "field_path" not in keys:
+        raise ValueError("a network's file is the scene's field by field=file field_path=PATH: type both")
+    if "dataset" in keys:
+        raise ValueError("with field=file the network's own surface is the shape: remove dataset")
+    places = {"field=file": "dataset=network"}
+    return [places.get(argument, re.sub("^field_path=", "dataset.path=", argument)) for argument in arguments]
 
 
 def own_folders(arguments: list[str]) -> list[Path]:

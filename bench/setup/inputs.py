@@ -20,6 +20,7 @@ from bench.records.record import Record
 from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
 from bench.shape_prior import Prior, PriorSettings, prior_for
+from datasets.network_files import Networked
 from datasets.own_photographs import Photographed
 from datasets.scene import SPLIT_STRIDE, Dataset, Scene, Split, Surface, make_scene, sample_surface, scene_name
 from datasets.views import ViewSampler
@@ -48,7 +49,7 @@ class RunInputs:
     field: FieldChoice  # what an unknown shape is made of
     dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
-    trained: int | None = None  # number of the scene's shape in the prior's training; None where it was not in it
+    trained: int | None = None  # number of the scene's shape among the prior's codes; None where it is not of these
 
     @property
     def photographed(self) -> Photographed | None:
@@ -84,7 +85,10 @@ class RunInputs:
             BadInput: where the prior was not trained on that shape.
         """
         if self.trained is None:
-            raise BadInput("the task renders a network at the shape that it was fitted to: add +experiment=fitted")
+            raise BadInput(
+                "the task renders a network at the shape that it was fitted to: add +experiment=fitted, or set "
+                "dataset=network dataset.path=FILE for a network of yours"
+            )
         return self.trained
 
     def fitted(self) -> Prior:
@@ -153,17 +157,19 @@ class Cell:
 
     Args:
         prior: how the prior is trained, where it has to be.
+        width: of the prior's network, in neurons per layer.
         threads: of the CPU; None leaves it to `threads_for`.
     """
 
     task: Task
     inputs: RunInputs
     prior: PriorSettings
+    width: int
     threads: int | None
 
     def start(self) -> None:
         """Gives this process the run's threads and seed."""
-        torch.set_num_threads(self.threads or threads_for(self.prior.network.width))
+        torch.set_num_threads(self.threads or threads_for(self.width))
         torch.manual_seed(self.inputs.seed)
 
 
@@ -200,7 +206,11 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     split, index, threads = *_place(config["split"], config["index"]), config["threads"]
     device, cache = pick_device(config["device"]), Path(config["priors_dir"])
 
+    known = dataset.network(index) if isinstance(dataset, Networked) else None
+
     def make_prior() -> Prior:
+        if known is not None:
+            return Prior(known.decoder, known.codes)
         with using_threads(threads or ALL_THREADS):  # training pays with more of them
             return prior_for(dataset, prior, cache, device, progress)
 
@@ -217,11 +227,11 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         cache=cache,
         field=FieldChoice(config["field"], models),
         dataset=dataset,
-        notes=tuple(notes),
-        trained=index if split == Split.TRAIN and index < prior.shapes else None,
+        notes=(*notes, *(known.notes if known else ())),
+        trained=index if known or (split == Split.TRAIN and index < prior.shapes) else None,
     )
     _check(task, inputs, index)
-    return Cell(task, inputs, prior, threads)
+    return Cell(task, inputs, prior, known.decoder.width if known else prior.network.width, threads)
 
 
 def _place(split: str, index: int) -> tuple[Split, int]:

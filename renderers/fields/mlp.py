@@ -63,6 +63,8 @@ class Decoder(nn.Module):
                 f"width must exceed code_length + 3 = {again} for a narrowed skip, not {width}: set narrow=false"
             )
         self.code_length, self.skip, self.width = code_length, skip, width
+        self.kind: Kind = Kind.DISTANCE
+        self.lipschitz: float | None = None
         inputs, outputs = [again] + [width] * (layers - 1), [width] * layers
         if skip and narrow:
             outputs[skip - 1] -= again
@@ -89,7 +91,29 @@ class Decoder(nn.Module):
                 bias = bias + code @ weight[:, before : before + self.code_length].T
                 weight = torch.cat([weight[:, :before], weight[:, -3:]], dim=1)
             layers.append((weight, bias))
-        return BoundDecoder(tuple(layers), (self.last.weight, self.last.bias), self.skip)
+        return BoundDecoder(tuple(layers), (self.last.weight, self.last.bias), self.skip, self.kind, self.lipschitz)
+
+    @staticmethod
+    def of(layers: Sequence[Layer], *, code_length: int, skip: int) -> "Decoder":
+        """The decoder with these weights and biases, of which the last is the output's; widths may differ.
+
+        Without a code, its code is the place of the shape: three numbers by which it is moved.
+        """
+        *hidden, last = layers
+        made = Decoder(layers=len(hidden), width=1, code_length=code_length or 3, skip=skip, narrow=False)
+        made.width = max(len(bias) for _, bias in hidden)
+        for index, (weight, bias) in enumerate(hidden):
+            if not code_length and index in (0, skip):
+                weight = torch.cat([weight[:, :-3], -weight[:, -3:], weight[:, -3:]], dim=1)
+            made.hidden[index] = _linear(weight, bias)
+        made.last = _linear(*last)
+        return made
+
+
+def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+    layer = nn.Linear(weight.shape[1], len(weight), dtype=weight.dtype)
+    layer.weight, layer.bias = nn.Parameter(weight.clone()), nn.Parameter(bias.clone())
+    return layer
 
 
 @dataclass(frozen=True)

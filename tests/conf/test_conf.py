@@ -75,7 +75,8 @@ def paths(tmp_path_factory) -> dict[str, str]:
     """What the datasets of files need as `dataset.path`."""
     mesh, scans = tmp_path_factory.mktemp("mesh") / "box.obj", tmp_path_factory.mktemp("scans")
     trimesh.creation.box().export(mesh)
-    return {"mesh": str(mesh), "photos": str(mesh.parent), "scans": str(write_scans(scans))}
+    photos = network = str(mesh.parent)  # whose content is not read to build it
+    return {"mesh": str(mesh), "photos": photos, "scans": str(write_scans(scans)), "network": network}
 
 
 @cache

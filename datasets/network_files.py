@@ -1,0 +1,290 @@
+"""Networks that others trained, as scenes: a file or a folder holds the field, and its surface is the true shape.
+
+Only weights are read: nothing in a file is run.
+"""
+
+import hashlib
+import json
+import pickle
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from math import isfinite
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from datasets.mesh import Mesh, extract
+from datasets.scene import Split
+from renderers.checks import BadInput, check_at_least, check_choice, check_positive
+from renderers.field import STEEPEST_MARGIN, Kind
+from renderers.fields.analytic import Shape, sphere
+from renderers.fields.mlp import Decoder
+from renderers.fields.network import Facts, Published, enlarged, measured, sampled, settled
+from renderers.fields.published import deepsdf, implicit, occupancy, plain
+
+VERSION = 1  # raise it when reading or measuring changes the fields
+REACH = 1.05  # scene units: half the side of the cube in which the surface within the unit sphere is extracted
+AUTO, INSIDE = "auto", ("auto", "negative", "positive")
+PARTS = ("ModelParameters", "LatentCodes")  # of a DeepSDF folder, in each of which `latest.pth` is read
+LATEST = "latest.pth"
+TENSORS = {
+    "deepsdf": "a folder with specs.json",
+    "implicit": "IDR, NeuS, VolSDF",
+    "occupancy": "occupancy networks, DVR",
+}
+SCALARS = [  # of numpy, in which some checkpoints hold their best loss; plain numbers
+    *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
+    *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
+]
+
+
+@dataclass(frozen=True)
+class Known:
+    """The network of a scene, its codes, and what was measured at the scene's own.
+
+    Args:
+        decoder: `at(code)` is a field, negative inside.
+        codes: of all its shapes.
+        facts: of the field as it is in the file, turned so that it is negative inside, at its level and scale.
+        notes: what was measured and done, in words.
+    """
+
+    decoder: Decoder | Published
+    codes: Float[Tensor, "shapes code_length"]
+    facts: Facts
+    notes: tuple[str, ...]
+
+
+@runtime_checkable
+class Networked(Protocol):
+    """A dataset whose shapes a network holds: it is the field of its scenes, and its codes are their prior."""
+
+    def network(self, index: int) -> Known:
+        """The network, and what was measured at code number `index`."""
+        ...
+
+
+@dataclass(frozen=True)
+class NetworkFile:
+    """Shapes that a network holds, each the zero set of its field at one code, within the unit sphere.
+
+    Every split has all of its codes. A network without a code has one shape, whose code is its place.
+
+    Args:
+        path: a DeepSDF folder, with specs.json; a checkpoint of IDR, NeuS, VolSDF, an occupancy network or DVR; or an
+            `.npz` of neural-implicit-queries.
+        scale: makes the shapes so many times as large: the unit sphere is what renderers see.
+        inside: which values are inside, "negative" or "positive"; "auto" takes those that are rarer on the unit sphere.
+        level: of the surface; None takes 0.5 for values that lie between 0 and 1, else 0.
+        kind: what values mean: "distance", "bound" or "level"; "auto" measures it. Of a bound, values are divided by
+            their steepest slope.
+        codes: a file of codes, `.npy` or `.pth` [shapes, length], in place of the network's own.
+        tanh: how many follow the last layer of a DeepSDF network; None: as its code has it.
+        resolution: samples along an axis of the marching cubes that give the true mesh.
+    """
+
+    path: str
+    scale: float
+    inside: str
+    level: float | None
+    kind: str
+    codes: str | None
+    tanh: int | None
+    resolution: int
+
+    def __post_init__(self) -> None:
+        check_positive("dataset.scale", self.scale, "1 leaves the network's own units")
+        check_choice("dataset.inside", self.inside, INSIDE)
+        check_choice("dataset.kind", self.kind, (AUTO, *(kind.value for kind in Kind)))
+        check_at_least("dataset.resolution", self.resolution, 16, "128 keeps thin parts")
+        if self.tanh is not None:
+            check_at_least("dataset.tanh", self.tanh, 0, "1 is as in DeepSDF's code of 2019")
+        if self.level is not None and not isfinite(self.level):
+            raise ValueError(f"dataset.level must be finite, not {self.level}: 0 for distances and logits")
+        if not Path(self.path).exists():
+            raise ValueError(f"dataset.path: there is nothing at '{self.path}': name a network's file or folder")
+
+    @property
+    def name(self) -> str:
+        """The file's or the folder's name, without suffix."""
+        return Path(self.path).resolve().stem
+
+    def mesh(self, split: Split, index: int) -> Mesh:
+        """The surface of a shape within the unit sphere, closed where it leaves it."""
+        known = self.network(index)
+        field = known.decoder.at(known.codes[index])
+        found = extract(Shape(field, field.kind) & sphere(1.0), grid=self.resolution, reach=REACH)
+        if found is None:
+            raise BadInput(f"{self.path}, code {index}: the marching cubes find no surface: set dataset.resolution=256")
+        return found
+
+    def network(self, index: int) -> Known:
+        """The network, whose values mean what was measured at code number `index`.
+
+        Raises:
+            BadInput: where it cannot be read, has no such code, or no surface in the unit sphere.
+        """
+        return _known(self, index, _content(self.files))
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read."""
+        path = Path(self.path)
+        parts = [path / "specs.json", *(path / part / LATEST for part in PARTS)] if path.is_dir() else [path]
+        return [file for file in (*parts, *([Path(self.codes)] if self.codes else [])) if file.is_file()]
+
+    def identity(self) -> dict[str, Any]:
+        """Plain data that determines the shapes: the files' contents, not their paths."""
+        settings = {key: value for key, value in asdict(self).items() if key not in ("path", "codes")}
+        return {"name": "network", "version": VERSION, "contents": _content(self.files), **settings}
+
+
+@lru_cache(maxsize=4)
+def _known(file: NetworkFile, index: int, content: str) -> Known:
+    """The network at one code, read again when a file has changed."""
+    try:
+        network, codes = _read(file)
+        enlarged(network.inner, file.scale)
+        if index >= len(codes):
+            raise BadInput(
+                f"it has {len(codes)} codes, and index={index} is none of them: set index=0 to {len(codes) - 1}"
+            )
+        return _measured(file, network, codes, index, content)
+    except BadInput as error:
+        raise BadInput(f"the network {file.path}: {error}") from error
+
+
+def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> Known:
+    """The network with a field that is negative inside and of the kind that was measured."""
+    raw = network.at(codes[index])
+    values, around = sampled(raw, codes)
+    least, most = float(values.min()), float(values.max())
+    level = file.level if file.level is not None else 0.5 if least >= 0 and most <= 1 else 0.0
+    if not least < level < most:
+        raise BadInput(
+            f"its values in the unit sphere lie between {least:.3g} and {most:.3g}, and the surface at the level "
+            f"{level:g} is not among them: set dataset.level, or dataset.scale"
+        )
+    outside = 1.0 if float((around > level).double().mean()) >= 0.5 else -1.0
+    sign = {"negative": 1.0, "positive": -1.0, AUTO: outside}[file.inside]
+    factor = sign * file.scale
+    facts = measured(Shape(lambda points: factor * (raw(points) - level)), codes)
+    kind = facts.kind if file.kind == AUTO else Kind(file.kind)
+    divided = ""
+    if kind is Kind.BOUND or (file.kind == AUTO and kind is Kind.LEVEL):
+        steepest, kind = STEEPEST_MARGIN * facts.steepest, Kind.BOUND
+        factor, divided = factor / steepest, f", by values divided by {steepest:.3g}"
+    lipschitz = 1.0 if kind is Kind.BOUND else None
+    network.register_buffer("content", torch.frombuffer(bytearray.fromhex(content), dtype=torch.uint8))
+    decoder = settled(network, factor=factor, level=level, kind=kind, lipschitz=lipschitz).requires_grad_(False)
+    inside = "negative" if sign > 0 else "positive"
+    side = f"values are {inside} inside, at the level {level:g}"
+    return Known(decoder, codes, facts, (f"{file.name}: {side}; {facts.in_words}; taken as a {kind.value}{divided}",))
+
+
+def _read(file: NetworkFile) -> tuple[Published, Tensor]:
+    """The network of a file or a folder, and its codes."""
+    path = Path(file.path)
+    if path.is_dir():
+        network, codes = _read_folder(path, file.tanh)
+    elif path.suffix == ".npz":
+        network, codes = plain(_arrays(path)), None
+    else:
+        network, codes = _of_names(_tensors(path)), None
+    if file.codes is not None:
+        codes = _codes(Path(file.codes))
+    length = network.code_length
+    if codes is None:
+        codes = torch.zeros(1, length)
+    if codes.dim() != 2 or codes.shape[1] != length:
+        raise BadInput(f"its codes must be [shapes, {length}], not {list(codes.shape)}")
+    return network, codes
+
+
+def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | None]:
+    """A DeepSDF folder's network and codes; None where it has none."""
+    try:
+        specs = json.loads((path / "specs.json").read_text("utf-8"))
+        _ = specs["NetworkSpecs"]["dims"], specs["CodeLength"]
+    except OSError:
+        raise BadInput("the folder has no specs.json: name a DeepSDF folder, or a file") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInput(f"specs.json must have NetworkSpecs with dims, and CodeLength: {error!r}") from error
+    weights, latent = (path / part / LATEST for part in PARTS)
+    if not weights.is_file():
+        raise BadInput(f"the folder has no {PARTS[0]}/{LATEST}")
+    network = deepsdf(_tensors(weights), specs, squash=squash)
+    return network, _codes(latent) if latent.is_file() and specs["CodeLength"] else None
+
+
+def _of_names(tensors: dict[str, Tensor]) -> Published:
+    """The network of a checkpoint whose format its names tell."""
+    if any(".lin0." in f".{name}" for name in tensors):
+        return implicit(tensors)
+    if any(f".{first}_p." in f".{name}" for name in tensors for first in ("fc", "conv")):
+        return occupancy(tensors)
+    known = "; ".join(f"{name} ({what})" for name, what in TENSORS.items())
+    names = ", ".join([*tensors][:6]) or "no tensors"
+    raise BadInput(f"it is of no format that is read, which are {known}, and .npz: it has {names}")
+
+
+def _codes(path: Path) -> Tensor:
+    """The codes of a file: a tensor, alone or under `latent_codes`, or the weights of an embedding."""
+    if path.suffix == ".npy":
+        try:
+            return torch.from_numpy(np.load(path, allow_pickle=False)).float()
+        except (OSError, ValueError, EOFError) as error:
+            raise BadInput(f"{path.name} cannot be read: {error}") from error
+    found = [tensor for tensor in _tensors(path).values() if tensor.dim() > 1]
+    if len(found) != 1:
+        raise BadInput(f"{path.name} must hold one table of codes, not {len(found)}")
+    return found[0].float().squeeze(1) if found[0].dim() == 3 else found[0].float()
+
+
+def _arrays(path: Path) -> dict[str, Tensor]:
+    """The arrays of an `.npz` by name."""
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+            return {name: torch.from_numpy(np.asarray(arrays[name], dtype=np.float32)) for name in arrays.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise BadInput(f"it cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors of a checkpoint by their dotted names, on the CPU; whatever else it holds is left out."""
+    try:
+        with torch.serialization.safe_globals(SCALARS):
+            return dict(_flat(torch.load(path, weights_only=True, map_location="cpu")))
+    except pickle.UnpicklingError as error:
+        blocked = re.search(r"GLOBAL (\S+)", str(error))
+        what = blocked[1] if blocked else "no weights"
+        raise BadInput(
+            f"{path.name} is broken, or holds more than weights, which is not run ({what}): save its state_dict() alone"
+        ) from error
+    except (OSError, RuntimeError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise BadInput(
+            f"{path.name} cannot be read, it may be cut short: {' '.join(str(error).split())[:160]}"
+        ) from error
+
+
+def _flat(found: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
+    if isinstance(found, Tensor):
+        yield prefix.removesuffix(".") or "tensor", found
+    elif isinstance(found, Mapping):
+        for key, value in found.items():
+            yield from _flat(value, f"{prefix}{key}.")
+
+
+def _content(files: list[Path]) -> str:
+    """A hash of files."""
+    whole = hashlib.sha256()
+    for file in files:
+        whole.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return whole.hexdigest()

@@ -1,0 +1,284 @@
+"""A field of any network: points and perhaps a code to values, of which it is measured what they mean."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from renderers.checks import BadInput
+from renderers.field import (
+    STEEPEST_MARGIN,
+    Bounds,
+    Coarse,
+    Field,
+    Flops,
+    Kind,
+    Values,
+    autograd_gradients,
+    bounds_of,
+    coarse_of,
+    points_in_sphere,
+)
+from renderers.fields.analytic import Shape
+from renderers.fields.mlp import Decoder, passes
+
+DRAWN = 2**14  # points in the unit sphere at which values and slopes are measured
+AROUND = 4096  # points on the unit sphere
+NEAR = 0.1  # share of the points, those of least magnitude, whose slopes say whether values are distances
+EVEN = 0.25  # near its surface a distance has a slope of 1, up to this, at four of five points
+ANY_SLOPE = (
+    1.5  # and in the sphere no steeper one, but for one point of a hundred; trained priors of ours are within both
+)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the values of a field are like in the unit sphere, at points drawn there.
+
+    Args:
+        least, most: of the values.
+        inside: share of the sphere that is inside, where values are negative.
+        extent: of what is inside, along each axis.
+        leaves: share of the unit sphere's surface that is inside.
+        flattest, steepest: slopes, the lengths of the gradient.
+        near: 10th, 50th and 90th percentile of the slope near the surface.
+        nearly_all: 99th percentile of the slope.
+    """
+
+    least: float
+    most: float
+    inside: float
+    extent: tuple[float, float, float]
+    leaves: float
+    flattest: float
+    steepest: float
+    near: tuple[float, float, float]
+    nearly_all: float
+
+    @property
+    def kind(self) -> Kind:
+        """DISTANCE where slopes near the surface are nearly 1 and none is much steeper, else LEVEL."""
+        low, _, high = self.near
+        even = low >= 1 - EVEN and high <= 1 + EVEN and self.nearly_all <= ANY_SLOPE
+        return Kind.DISTANCE if even else Kind.LEVEL
+
+    @property
+    def in_words(self) -> str:
+        """The facts in one line."""
+        low, middle, high = self.near
+        lies = (
+            f"{self.leaves:.1%} of the unit sphere's surface is inside" if self.leaves else "it lies in the unit sphere"
+        )
+        return (
+            f"slopes from {self.flattest:.3g} to {self.steepest:.3g}, near the surface {middle:.3g} "
+            f"({low:.3g} to {high:.3g}); {self.inside:.1%} of the sphere is inside, "
+            f"{' x '.join(f'{side:.2f}' for side in self.extent)} in extent; {lies}"
+        )
+
+
+def measured(field: Values, like: Tensor | None = None) -> Facts:
+    """The facts of a field, negative inside.
+
+    Args:
+        like: a tensor of the dtype and device at which it is evaluated; None for float64 on the CPU.
+
+    Raises:
+        BadInput: where values are not finite.
+    """
+    points = points_in_sphere(DRAWN, like)
+    values, around = sampled(field, like)
+    gradients = torch.cat([autograd_gradients(cast(Field, field), some) for some in points.split(AROUND)])
+    slopes = torch.linalg.vector_norm(gradients, dim=-1).double()
+    near = slopes[values.abs() <= values.abs().quantile(NEAR)].quantile(slopes.new_tensor([0.1, 0.5, 0.9]))
+    low, middle, high = near.tolist()
+    inside = points[values < 0]
+    x, y, z = (inside.amax(0) - inside.amin(0)).tolist() if len(inside) else (0.0, 0.0, 0.0)
+    return Facts(
+        least=float(values.min()),
+        most=float(values.max()),
+        inside=float((values < 0).double().mean()),
+        extent=(x, y, z),
+        leaves=float((around < 0).double().mean()),
+        flattest=float(slopes.min()),
+        steepest=float(slopes.max()),
+        near=(low, middle, high),
+        nearly_all=float(slopes.quantile(0.99)),
+    )
+
+
+@torch.no_grad()
+def sampled(field: Values, like: Tensor | None = None) -> tuple[Float[Tensor, " drawn"], Float[Tensor, " around"]]:
+    """The values of a field, in float64, at points drawn in the unit sphere and at points on it; as `measured`."""
+    points = points_in_sphere(DRAWN, like)
+    values = torch.cat([field(some) for some in points.split(AROUND)]).double()
+    if unknown := int((~values.isfinite()).sum()):
+        raise BadInput(f"its value is not finite at {unknown} of {DRAWN} points of the unit sphere: check its weights")
+    return values, field(nn.functional.normalize(points[:AROUND], dim=-1)).double()
+
+
+def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None, like: Tensor | None = None) -> Shape:
+    """A field of a network that takes points [n, 3] and gives values [n] or [n, 1], negative inside.
+
+    >>> field = from_module(nn.Sequential(nn.Linear(3, 32), nn.Softplus(100), nn.Linear(32, 1)))
+
+    Args:
+        network: an nn.Module, or any such function.
+        kind: what its values mean; None measures it. What is no distance is divided by its steepest slope in the unit
+            sphere, with a margin of 20 %, and is a bound as far as no slope between the points is steeper.
+        like: a tensor of the dtype and device at which the network works; None takes its first parameter, or float32.
+    """
+    parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
+    like = (parameters or [torch.zeros(())])[0] if like is None else like
+
+    def values(points: Tensor) -> Tensor:
+        return network(points.reshape(-1, 3)).reshape(points.shape[:-1])
+
+    field = Shape(values, kind or Kind.LEVEL, None, flops_of(network) if isinstance(network, nn.Module) else None)
+    if kind is not None:
+        return field
+    facts = measured(field, like)
+    if facts.kind is Kind.DISTANCE:
+        return replace(field, kind=Kind.DISTANCE)
+    steepest = STEEPEST_MARGIN * facts.steepest
+    return replace(field, function=lambda points: values(points) / steepest, kind=Kind.BOUND, lipschitz=1.0)
+
+
+def flops_of(network: nn.Module) -> Flops:
+    """A multiplication and an addition per weight of matrices; as much again towards points, twice with weights."""
+    value = 2 * sum(weight.numel() for weight in network.parameters() if weight.dim() > 1)
+    trained = any(weight.requires_grad for weight in network.parameters())
+    return Flops(value, 2 * value if trained else value)
+
+
+class Coded(nn.Module):
+    """A network `body(points [n, 3], code [length]) -> values [n]`, bound to one code before rendering.
+
+    Args:
+        body: the network; with `code_length` 0 it gets a code without numbers.
+        code_length: of its code. Without one, the code is the place of the shape: three numbers by which it is moved.
+        width: neurons per layer.
+    """
+
+    scale: Tensor
+
+    def __init__(self, body: nn.Module, *, code_length: int, width: int) -> None:
+        super().__init__()
+        self.body, self.placed, self.width = body, code_length == 0, width
+        self.code_length = code_length or 3
+        self.register_buffer("scale", torch.ones(()))
+
+    def at(self, code: Float[Tensor, " code_length"]) -> Shape:
+        """The values at one code, as a field."""
+        if code.shape != (self.code_length,):
+            raise ValueError(f"code must have {self.code_length} numbers, not the shape {list(code.shape)}")
+
+        def values(points: Tensor) -> Tensor:
+            flat = points.reshape(-1, 3)
+            flat = (flat - code if self.placed else flat) / self.scale
+            given = code[:0] if self.placed else code
+            found = [self.body(some, given) for some in passes(flat, self.width)]
+            return torch.cat(found).view(points.shape[:-1])
+
+        return Shape(values, Kind.LEVEL, None, flops_of(self.body))
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """A field `factor * (tanh(inner) - level)`, with `squash` times tanh; it offers what the inner one does."""
+
+    inner: Field
+    squash: int
+    factor: Float[Tensor, ""]
+    level: Float[Tensor, ""]
+    kind: Kind
+    lipschitz: float | None
+
+    @property
+    def flops(self) -> Flops | None:
+        return self.inner.flops
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self._of(self.inner(points))
+
+    @property
+    def coarse(self) -> Coarse | None:
+        """The inner field's coarse values; a tanh has no slope above 1."""
+        offered = coarse_of(self.inner)
+        if offered is None:
+            return None
+        return Coarse(lambda points: self._of(offered.values(points)), float(self.factor.abs()) * offered.error)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The inner field's bounds; the values rise or fall with its own."""
+        offered = bounds_of(self.inner)
+        if offered is None:
+            return None
+
+        def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+            low, high = map(self._of, offered(middle, half))
+            return torch.minimum(low, high), torch.maximum(low, high)
+
+        return bounds
+
+    def _of(self, values: Tensor) -> Tensor:
+        for _ in range(self.squash):
+            values = values.tanh()
+        return self.factor * (values - self.level)
+
+
+class Published(nn.Module):
+    """A network at whose codes fields are `Adjusted`."""
+
+    factor: Tensor
+    level: Tensor
+    kind: Kind
+    lipschitz: float | None
+
+    def __init__(self, inner: Decoder | Coded, squash: int) -> None:
+        super().__init__()
+        self.inner, self.squash, self.kind, self.lipschitz = inner, squash, Kind.LEVEL, None
+        self.code_length, self.width = inner.code_length, inner.width
+        self.register_buffer("factor", torch.ones(()))
+        self.register_buffer("level", torch.zeros(()))
+
+    def at(self, code: Float[Tensor, " code_length"]) -> Adjusted:
+        """The field of one code."""
+        return Adjusted(
+            cast(Field, self.inner.at(code)), self.squash, self.factor, self.level, self.kind, self.lipschitz
+        )
+
+
+def settled(
+    network: Published, *, factor: float, level: float, kind: Kind, lipschitz: float | None
+) -> Decoder | Published:
+    """The network with fields `factor * (value - level)` of a kind; changed in place.
+
+    A decoder without a tanh takes them into its last layer, and stays a decoder, with all that it offers.
+    """
+    inner = network.inner
+    if isinstance(inner, Decoder) and not network.squash:
+        with torch.no_grad():
+            inner.last.weight.mul_(factor)
+            inner.last.bias.sub_(level).mul_(factor)
+        inner.kind, inner.lipschitz = kind, lipschitz
+        return inner
+    network.factor.fill_(factor)
+    network.level.fill_(level)
+    network.kind, network.lipschitz = kind, lipschitz
+    return network
+
+
+@torch.no_grad()
+def enlarged(network: Decoder | Coded, scale: float) -> None:
+    """Makes the shapes of a network `scale` times as large, without a change of its values."""
+    if isinstance(network, Coded):
+        network.scale.mul_(scale)
+        return
+    for index, layer in enumerate(network.hidden):
+        assert isinstance(layer, nn.Linear)
+        if index in (0, network.skip):
+            layer.weight[:, -3:].div_(scale)

@@ -1,0 +1,292 @@
+"""A network's file as a dataset: what is measured of it, and what is refused; the files are made here."""
+
+import json
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from torch import Tensor
+
+from bench.config import CONF, load, register
+from bench.run.command import with_network
+from datasets.network_files import NetworkFile
+from datasets.scene import Split
+from renderers.checks import BadInput
+from renderers.field import Kind, points_in_sphere
+from renderers.fields.network import from_module
+from tests.documentation import code_of
+from tests.looped import each
+from tests.tiny import camera_of, cell_from
+
+POINTS = points_in_sphere(64, torch.zeros(()))
+RADIUS = 0.5  # of the octahedron's faces about the origin
+
+
+def arrays(factor: float = 1.0, level: float = 0.0) -> dict[str, Any]:
+    """An octahedron, exactly: (|x| + |y| + |z|) / sqrt(3) - RADIUS, times a factor, and a level."""
+    axes = np.eye(3, dtype=np.float32)
+    return {
+        **{"0000.dense.A": np.concatenate([axes, -axes], axis=1), "0000.dense.b": np.zeros(6, np.float32)},
+        "0001.relu._": np.zeros(0, np.float32),
+        "0002.dense.A": np.full((6, 1), factor / np.sqrt(3), np.float32),
+        "0002.dense.b": np.array([level - factor * RADIUS], np.float32),
+    }
+
+
+def octahedron(points: Tensor) -> Tensor:
+    return points.abs().sum(-1) / np.sqrt(3) - RADIUS
+
+
+def npz(folder: Path, found: dict[str, Any]) -> NetworkFile:
+    np.savez(folder / "shape.npz", **found)
+    return load("dataset", "network", path=str(folder / "shape.npz"))
+
+
+def checkpoint(folder: Path, state: Any, name: str = "shape.pth") -> NetworkFile:
+    torch.save(state, folder / name)
+    return load("dataset", "network", path=str(folder / name))
+
+
+def deepsdf_folder(folder: Path, codes: Any, dtype: torch.dtype = torch.float32) -> NetworkFile:
+    """A DeepSDF folder whose code is added to the octahedron's values."""
+    weight = torch.cat([torch.tensor([[1.0], [-1.0]]).repeat(3, 1), torch.zeros(6, 3)], dim=1)
+    weight[:, 1:] = torch.tensor(arrays()["0000.dense.A"]).T
+    ends = torch.zeros(2, 4)  # of the code alone: relu(c) - relu(-c)
+    ends[:, 0] = torch.tensor([1.0, -1.0])
+    weight[:, 0] = 0.0
+    last = torch.cat([torch.full((1, 6), 1 / np.sqrt(3)), torch.tensor([[1.0, -1.0]])], dim=1)
+    state = {"module.lin0.weight": torch.cat([weight, ends]), "module.lin0.bias": torch.zeros(8)}
+    state |= {"module.lin1.weight": last.float(), "module.lin1.bias": torch.tensor([-RADIUS])}
+    specs = {"NetworkSpecs": {"dims": [8], "geom_dimension": 3, "weight_norm": False}, "CodeLength": 1}
+    stored = {"model_state_dict": {name: value.to(dtype) for name, value in state.items()}, "epoch": 3}
+    for part, content in (("ModelParameters", stored), ("LatentCodes", {"latent_codes": codes})):
+        (folder / part).mkdir()
+        torch.save(content, folder / part / "latest.pth")
+    (folder / "specs.json").write_text(json.dumps(specs))
+    return load("dataset", "network", path=str(folder))
+
+
+def test_a_distance_is_found_to_be_one_and_its_values_stay(tmp_path):
+    file = npz(tmp_path, arrays())
+    known = file.network(0)
+    field = known.decoder.at(known.codes[0])
+    assert (field.kind, field.lipschitz) == (Kind.DISTANCE, None)
+    torch.testing.assert_close(field(POINTS), octahedron(POINTS), rtol=0, atol=1e-6)
+    facts = known.facts
+    assert facts.leaves == 0 and 0.99 < facts.flattest <= facts.steepest < 1.01
+    assert facts.inside == pytest.approx(2 * 3**0.5 * RADIUS**3 * 2 / (4 / 3 * np.pi), abs=0.02)
+    assert list(facts.extent) == pytest.approx([2 * 3**0.5 * RADIUS] * 3, abs=0.3)
+    (note,) = known.notes
+    for word in ("shape: values are negative inside", "level 0", "slopes from 1 to 1", "taken as a distance"):
+        assert word in note
+
+
+@each("factor, level, inside, kind, divided", [
+    (-1.0, 0.0, "positive", Kind.DISTANCE, 1.0),
+    (20.0, 0.0, "negative", Kind.BOUND, 24.0),
+    (-20.0, 0.0, "positive", Kind.BOUND, 24.0),
+    (-0.4, 0.4, "positive", Kind.BOUND, 0.48),
+])  # fmt: skip
+def test_sign_level_and_slope_are_measured(tmp_path, factor, level, inside, kind, divided):
+    file = npz(tmp_path, arrays(factor, level))
+    file = replace(file, level=level or None)
+    known = file.network(0)
+    field = known.decoder.at(known.codes[0])
+    assert field.kind is kind and f"values are {inside} inside" in known.notes[0]
+    torch.testing.assert_close(field(POINTS) * divided, abs(factor) * octahedron(POINTS), rtol=0, atol=1e-4)
+
+
+def test_probabilities_have_their_level_at_a_half(tmp_path):
+    found = {"lin0.weight": 0.4 * torch.eye(3)[:1], "lin0.bias": torch.tensor([0.45])}  # a plane
+    assert "at the level 0.5" in checkpoint(tmp_path, found).network(0).notes[0]
+
+
+def test_what_is_said_of_a_network_goes_before_what_is_measured(tmp_path):
+    file = replace(npz(tmp_path, arrays(20.0)), kind="level", inside="positive", scale=0.5)
+    known = file.network(0)
+    field = known.decoder.at(known.codes[0])
+    assert field.kind is Kind.LEVEL
+    torch.testing.assert_close(field(0.5 * POINTS), -10 * octahedron(POINTS), rtol=0, atol=1e-4)
+
+
+def test_the_surface_is_the_true_mesh_closed_where_it_leaves_the_sphere(tmp_path):
+    file = replace(npz(tmp_path, arrays()), resolution=48)
+    mesh = file.mesh(Split.TEST, 0)
+    assert mesh.watertight and octahedron(torch.from_numpy(mesh.vertices.copy())).abs().max() < 0.02
+    large = replace(file, scale=1.4)
+    mesh, known = large.mesh(Split.TRAIN, 0), large.network(0)
+    assert mesh.watertight and np.linalg.norm(mesh.vertices, axis=1).max() < 1.01
+    assert 0 < known.facts.leaves < 0.5 and "of the unit sphere's surface is inside" in known.notes[0]
+
+
+@each(
+    "codes",
+    [torch.tensor([[0.1], [-0.2]]), {"weight": torch.tensor([[0.1], [-0.2]])}, torch.tensor([[[0.1]], [[-0.2]]])],
+)
+def test_a_deepsdf_folder_has_a_shape_for_each_code(tmp_path_factory, codes):
+    file = deepsdf_folder(tmp_path_factory.mktemp("folder"), codes)
+    for index, code in enumerate((0.1, -0.2)):
+        known = file.network(index)
+        values = known.decoder.at(known.codes[index])(POINTS)
+        torch.testing.assert_close(values, octahedron(POINTS) + code, rtol=0, atol=1e-6)
+    with pytest.raises(BadInput, match="it has 2 codes, and index=2 is none of them: set index=0 to 1"):
+        file.network(2)
+
+
+def test_half_floats_are_converted_and_other_codes_are_read(tmp_path):
+    file = deepsdf_folder(tmp_path, torch.zeros(1, 1), torch.float16)
+    np.save(tmp_path / "mine.npy", np.array([[0.0], [0.125]]))
+    known = replace(file, codes=str(tmp_path / "mine.npy")).network(1)
+    values = known.decoder.at(known.codes[1])(POINTS)
+    assert values.dtype == torch.float32
+    torch.testing.assert_close(values, octahedron(POINTS) + 0.125, rtol=0, atol=1e-3)
+
+
+def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):
+    file = npz(tmp_path, arrays())
+    before = file.network(0).facts.steepest, file.identity()
+    npz(tmp_path, arrays(3.0))
+    assert file.network(0).facts.steepest == pytest.approx(3 * before[0])
+    assert file.identity() != before[1]
+
+
+class Command:
+    """A pickle of it would run a command."""
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, ("was_run",)
+
+
+def cut(path: str) -> None:
+    content = Path(path).read_bytes()
+    Path(path).write_bytes(content[: len(content) // 2])
+
+
+@each("make, words", [
+    (lambda d: checkpoint(d, {"model": Command()}), ("shape.pth", "more than weights, which is not run", "mkdir")),
+    (lambda d: checkpoint(d, {"a.weight": torch.ones(2)}), ("no format that is read", "implicit (IDR", "a.weight")),
+    (lambda d: checkpoint(d, {"epoch": 3}), ("no format that is read", "no tensors")),
+    (lambda d: npz(d, arrays() | {"0001.relu._": np.array([object()])}), ("cannot be read", "allow_pickle")),
+    (lambda d: npz(d, arrays(level=9.0)), ("between 8.5", "and the surface at the level 0", "dataset.level")),
+    (lambda d: npz(d, arrays() | {"0002.dense.b": np.array([np.nan])}), ("not finite at 16384 of 16384",)),
+])  # fmt: skip
+def test_a_file_that_will_not_do_is_refused_with_the_cause(tmp_path_factory, monkeypatch, make, words):
+    folder = tmp_path_factory.mktemp("wrong")
+    monkeypatch.chdir(folder)
+    file = make(folder)
+    with pytest.raises(BadInput) as error:
+        file.network(0)
+    for word in (file.path, *words):
+        assert word in str(error.value)
+    assert not (folder / "was_run").exists()
+
+
+@each("make", [lambda d: npz(d, arrays()), lambda d: checkpoint(d, {"lin0.weight": torch.ones(99, 99)})])
+def test_a_truncated_file_is_refused(tmp_path_factory, make):
+    file = make(tmp_path_factory.mktemp("cut"))
+    cut(file.path)
+    with pytest.raises(BadInput, match=r"cannot be read|is broken"):
+        file.network(0)
+
+
+def test_an_old_pickle_that_would_run_a_command_does_not(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "shape.pth").write_bytes(pickle.dumps(Command(), protocol=2))
+    with pytest.raises(BadInput, match="not run"):
+        load("dataset", "network", path="shape.pth").network(0)
+    assert not (tmp_path / "was_run").exists()
+
+
+@each("lost, words", [
+    ("specs.json", ("the folder has no specs.json",)),
+    ("ModelParameters/latest.pth", ("the folder has no ModelParameters/latest.pth",)),
+])  # fmt: skip
+def test_a_folder_that_lacks_a_file_is_refused(tmp_path_factory, lost, words):
+    folder = tmp_path_factory.mktemp("folder")
+    file = deepsdf_folder(folder, torch.zeros(1, 1))
+    (folder / lost).unlink()
+    with pytest.raises(BadInput) as error:
+        file.network(0)
+    assert all(word in str(error.value) for word in words)
+
+
+@each("settings, words", [
+    ({"path": "nowhere.npz"}, "there is nothing at 'nowhere.npz'"),
+    ({"scale": 0.0}, "dataset.scale must be positive"),
+    ({"inside": "left"}, "dataset.inside must be one of auto, negative, positive"),
+    ({"kind": "exact"}, "dataset.kind must be one of auto, distance, bound, level"),
+])  # fmt: skip
+def test_settings_are_checked(tmp_path_factory, settings, words):
+    file = npz(tmp_path_factory.mktemp("file"), arrays())
+    with pytest.raises(ValueError, match=words):
+        replace(file, **settings)
+
+
+RENDERERS = ("dist", "dvr", "idr", "mesh_proxy", "naive", "neus", "newton", "range_analysis", "unisurf", "volsdf")
+
+
+@each("name", [*RENDERERS, "relaxed_boundary"])
+def test_every_renderer_takes_a_plain_module_of_the_users(name):
+    class Ball(torch.nn.Module):
+        def forward(self, points: Tensor) -> Tensor:
+            return points.norm(dim=-1, keepdim=True) - RADIUS
+
+    rays = camera_of(16).rays()
+    field = from_module(Ball())
+    assert field.kind is Kind.DISTANCE
+    hit = load("renderer", name).render(field, rays).hit
+    closest = torch.linalg.vector_norm(torch.linalg.cross(rays.origins, rays.directions), dim=-1)
+    assert (hit == (closest < RADIUS)).float().mean() > 0.97
+
+
+def test_a_module_that_is_no_distance_becomes_a_bound_by_its_slope():
+    module = torch.nn.Linear(3, 1)
+    field = from_module(module)
+    steepest = 1.2 * module.weight.norm()
+    assert (field.kind, field.lipschitz) == (Kind.BOUND, 1.0)
+    torch.testing.assert_close(field(POINTS), module(POINTS)[:, 0] / steepest)
+    assert from_module(module, kind=Kind.LEVEL).kind is Kind.LEVEL
+
+
+@each("given, composed", [
+    (["field=file", "field_path=a.npz", "index=3"], ["dataset=network", "dataset.path=a.npz", "index=3"]),
+    (["-m", "field=sphere", "dataset=sofa"], ["-m", "field=sphere", "dataset=sofa"]),
+])  # fmt: skip
+def test_a_file_as_the_field_is_a_dataset(given, composed):
+    assert with_network(given) == composed
+
+
+@each("given, words", [
+    (["field=file"], "field=file field_path=PATH"),
+    (["field_path=a.npz"], "field=file field_path=PATH"),
+    (["field=file", "field_path=a.npz", "dataset=sofa"], "remove dataset"),
+])  # fmt: skip
+def test_half_of_the_two_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        with_network(given)
+
+
+def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
+    file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
+    settings = ["task=ablation", "dataset=network", f"dataset.path={file.path}", "index=1", "scale=smoke"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        register()
+        inputs = cell_from(compose("config", settings)).inputs
+    fitted = inputs.fitted()
+    assert len(inputs.prior.codes) == 2 and inputs.notes[-1] == file.network(1).notes[0]
+    values = fitted.decoder.at(fitted.codes[0])(POINTS)
+    torch.testing.assert_close(values, octahedron(POINTS) - 0.2, rtol=0, atol=1e-6)
+
+
+def test_a_network_of_ones_own_is_trained_and_read_as_the_page_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = code_of("datasets/README.md", "python")
+    exec(compile(code, "datasets/README.md", "exec"), {})
+    mesh = replace(load("dataset", "network", path="mine.npz"), resolution=48).mesh(Split.TEST, 0)
+    assert mesh.watertight and mesh.vertices.max(axis=0) == pytest.approx([0.6] * 3, abs=0.1)
