@@ -247,6 +247,7 @@ def test_every_renderer_takes_a_plain_module_of_the_users(name):
 
 def test_a_module_that_is_no_distance_becomes_a_bound_by_its_slope():
     module = torch.nn.Linear(3, 1)
+    torch.nn.init.constant_(module.weight, 2.0)  # a slope of 2 sqrt(3), which no distance has
     field = from_module(module)
     steepest = 1.2 * module.weight.norm()
     assert (field.kind, field.lipschitz) == (Kind.BOUND, 1.0)
