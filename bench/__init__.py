@@ -1,6 +1,7 @@
 """The benchmark: tasks, the runner, records and reports.
 
-From Python, `bench.load()` gives all runs as a pandas table, and `bench.run(task="completion")` makes one.
+From Python, `bench.load()` gives all runs as a pandas table, and `bench.run(task="completion")` makes one;
+`bench.load_field(RUN)` gives the field that it ended on.
 """
 
 import os
@@ -19,16 +20,18 @@ os.environ.setdefault("GOMP_SPINCOUNT", "0")
 # Open3D imports dash and plotly for drawings in a browser, which nothing here makes: a quarter of a second a process.
 DRAWINGS = "open3d.visualization.draw_plotly"
 
-__all__ = ["load", "run"]
+__all__ = ["load", "load_field", "run"]
 
 BESIDE = ("conf", "datasets", "renderers")  # our other packages; `datasets` is also the name of Hugging Face's
 OURS = "implicit-bench"  # stands in the first line of each
 
 
 def __getattr__(name: str) -> Any:
-    """`load` and `run`, which are imported when they are first asked for: pandas alone takes half a second."""
+    """What `__all__` names, imported when first asked for: pandas alone takes half a second."""
     if name == "load":
         return import_module("bench.report.data.frame").load
+    if name == "load_field":
+        return import_module("datasets.field_files").load_field
     if name == "run":
         return import_module("bench.run")
     raise AttributeError(f"module 'bench' has no attribute {name!r}")

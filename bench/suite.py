@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from math import log
+from math import isclose
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +42,13 @@ from bench.report.suite.standing import Standing
 from bench.report.write import paper
 from bench.report.write.html import page_lock
 from bench.report.write.table import percent
+from bench.run.library import AGREE, run_again
 from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 
 PAGE = "suite"  # its name in the folder `paper`
 GOES_ON = (0, 1)  # exit statuses of a sweep that has ended, though runs may have failed
 LABEL = f"label='${{renderer._label_}}{BY_ITSELF}'"
 SETTINGS = ("stated", "tuned")  # that of the set for all renderers, or the renderer's own
-AGREE = 0.05  # of the logarithms of a curve's errors and costs: what rounding on another processor may change
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -208,26 +208,24 @@ def verify(results_dir: Path, count: int) -> int:
 def _agrees(attempt: Attempt) -> bool:
     """Whether an attempt gives the same errors and costs once more; prints a line about it."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "bench", *portable(attempt.overrides), f"results_dir={folder}"]
-        said = subprocess.run(command, check=False, capture_output=True, text=True)
-        runs = [*(Path(folder) / "runs").glob("*/record.json")]
-        again = attempts_of(map(read_record, (path.parent for path in runs)), Path(folder))
+        folders, said = run_again(portable(attempt.overrides), Path(folder))
+        again = attempts_of(map(read_record, folders), Path(folder))
     name = f"{attempt.set}: {attempt.problem}, seed {attempt.seed}, {attempt.row}"
     if not again:
-        print(f"not run again: {name}: {' '.join(said.stderr.split())[-300:]}")
+        print(f"not run again: {name}: {said}")
         return False
     (found,) = again
     first, second = ([number for cost, _, error in one.curve for number in (cost, error)] for one in (attempt, found))
-    same = found.ok and len(first) == len(second) and all(map(_close, first, second))
+    same = (
+        found.ok
+        and len(first) == len(second)
+        and all(isclose(*pair, rel_tol=AGREE) for pair in zip(first, second, strict=True))
+    )
     pairs = (attempt.final, found.final), (attempt.cost, found.cost)
     told = ", ".join(f"{number(a)} and {number(b)}" for a, b in pairs)
     ended = "" if found.ok else f"; {found.status}: {found.reason}"
     print(f"{'agrees' if same else 'differs'}: {name}: error and field values {told}{ended}")
     return same
-
-
-def _close(first: float, second: float) -> bool:
-    return first == second or (min(first, second) > 0 and abs(log(first / second)) <= AGREE)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from datasets.field_files import FIELD, load_network
 from datasets.mesh import Mesh, extract
 from datasets.scene import Split
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
@@ -78,8 +79,8 @@ class NetworkFile:
     Every split has all of its codes. A network without a code has one shape, whose code is its place.
 
     Args:
-        path: a DeepSDF folder, with specs.json; a checkpoint of IDR, NeuS, VolSDF, an occupancy network or DVR; or an
-            `.npz` of neural-implicit-queries.
+        path: a DeepSDF folder, with specs.json; a checkpoint of IDR, NeuS, VolSDF, an occupancy network or DVR; an
+            `.npz` of neural-implicit-queries; or the folder of a run that left its field.
         scale: makes the shapes so many times as large: the unit sphere is what renderers see.
         inside: which values are inside, "negative" or "positive"; "auto" takes those that are rarer on the unit sphere.
         level: of the surface; None takes 0.5 for values that lie between 0 and 1, else 0.
@@ -137,7 +138,9 @@ class NetworkFile:
     def files(self) -> list[Path]:
         """The files that are read."""
         path = Path(self.path)
-        parts = [path / "specs.json", *(path / part / LATEST for part in PARTS)] if path.is_dir() else [path]
+        parts = (
+            [path / "specs.json", path / FIELD, *(path / part / LATEST for part in PARTS)] if path.is_dir() else [path]
+        )
         return [file for file in (*parts, *([Path(self.codes)] if self.codes else [])) if file.is_file()]
 
     def identity(self) -> dict[str, Any]:
@@ -192,7 +195,9 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
 def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     """The network of a file or a folder, and its codes."""
     path = Path(file.path)
-    if path.is_dir():
+    if (path / FIELD).is_file() or (path / "record.json").is_file():
+        network, codes = load_network(path), None
+    elif path.is_dir():
         network, codes = _read_folder(path, file.tanh)
     elif path.suffix == ".npz":
         network, codes = plain(_arrays(path)), None

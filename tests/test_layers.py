@@ -30,7 +30,7 @@ ROOMS = (
 )  # fmt: skip
 COMMANDS = (
     "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune",
-    "bench.turntable",
+    "bench.turntable", "bench.verify",
 )  # fmt: skip
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts

@@ -141,12 +141,14 @@ class Evaluation:
         mesh: of the field; None where it has no surface, or none was extracted.
         failure: status and reason, where the state is not a valid result; else None.
         notes: for the user.
+        field: that was judged; None of what has no field of its own.
     """
 
     metrics: dict[str, Any]
     mesh: Mesh | None = None
     failure: tuple[RunStatus, str] | None = None
     notes: tuple[str, ...] = ()
+    field: Field | None = None
 
 
 def evaluate(state: State) -> Evaluation:
@@ -159,7 +161,7 @@ def evaluate(state: State) -> Evaluation:
     own = render_view(state.field, truth.camera, state.inputs)
     metrics = _surface_scores(state) | view_metrics(state.seen(truth.camera), truth) | view_metrics(own, truth, OWN)
     failure = (RunStatus.EMPTY, "the field has no surface in the unit sphere") if state.mesh is None else None
-    return Evaluation(metrics, state.mesh, failure, unrendered(state, [own]))
+    return Evaluation(metrics, state.mesh, failure, unrendered(state, [own]), state.field)
 
 
 def unrendered(state: State, own: Sequence[View]) -> tuple[str, ...]:

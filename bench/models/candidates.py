@@ -4,7 +4,7 @@ Every part has a pose; sizes are logarithms.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,13 +15,12 @@ from bench.evaluate.state import REACH
 from bench.models.model import FLOAT, Candidate, Model, Seen
 from bench.setup.fields import FREE, parsed
 from bench.shape_prior import initialise_to_sphere
-from renderers.camera import rigid
 from renderers.checks import BadInput
-from renderers.field import Flops, Kind
-from renderers.fields.analytic import Shape, sphere, superquadric
-from renderers.fields.analytic import box as exact_box
+from renderers.field import Flops
+from renderers.fields.analytic import Shape
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.fields.parts import formula
 
 LEARNING_RATE = 0.01  # of Adam: what one step may change, in scene units, radians or shares of a size
 MIN_HALF_SIZE = 0.01  # scene units: least half size of a part at its start
@@ -29,7 +28,6 @@ MAX_POINTS, MAX_CLUSTER_POINTS = 3000, 200  # most points that are clustered, an
 CLUSTERINGS = 6  # each is a start of a union
 MISSED_QUANTILE = 0.75  # of the errors of a smaller union: new parts begin at the points above it
 ROUND_LOGIT, EDGED_LOGIT = 0.0, -1.5  # initial rounding of a box: logit of radius over least half size
-EXPONENTS = (1.0, 20.0)  # of a superquadric: 1 is an octahedron, 20 nearly a box
 DEEP = 8  # layers from which on a skip connection feeds the points in again half-way, as in DeepSDF
 MAX_RATE, RATE_OF_WIDTH = 2e-3, 0.4  # Adam's rate: at most 2e-3, inversely as the width (Yang et al. 2021)
 START_RADIUS = 0.5  # of the sphere that a network is initialised to, in scene units
@@ -37,50 +35,24 @@ BAND = 2.0  # cells to both sides of the surface whose samples are fitted
 GRID_RATE = 2e-3  # scene units
 
 
-def union(parameters: Float[Tensor, "parts 10"]) -> Shape:
-    """A union of rounded boxes, computed as one batch: a loop over them takes as many times as long.
-
-    Each has its pose, see `_placed`, the logarithms of its half sizes, and the logit of its edges' radius over the
-    least of these; at 1 it is a capsule.
-    """
-    sizes = parameters[:, 6:9].exp()
-    radii = torch.sigmoid(parameters[:, 9]) * sizes.amin(-1)
-    turns = _turn(parameters)
-    cores = exact_box(sizes - radii[:, None])
-
-    def bound(points: Tensor) -> Tensor:
-        local = torch.einsum("...pi,pij->...pj", points[..., None, :] - parameters[:, :3], turns)
-        return (cores(local) - radii).amin(-1)
-
-    return Shape(bound, Kind.DISTANCE if len(parameters) == 1 else Kind.BOUND)
-
-
-def quadric(parameters: Float[Tensor, "11"]) -> Shape:
-    """A superquadric: as an ellipsoid, then the logits of two exponents between `EXPONENTS`, on a logarithmic scale."""
-    low, high = EXPONENTS
-    powers = low * (high / low) ** torch.sigmoid(parameters[9:11])
-    return _placed(superquadric(parameters[6:9].exp(), powers), parameters)
-
-
 @dataclass(frozen=True)
 class Part:
-    """A shape with a formula.
+    """A shape with a formula, see `renderers.fields.parts`.
 
-    Its field, its initial parameters after pose and sizes, how many parameters it has, and its operations per value.
+    Its initial parameters after pose and sizes, how many parameters it has, and its operations per value.
     """
 
-    shape: Callable[[Tensor], Shape]
     extra: tuple[float, ...]
     size: int
     flops: int
 
 
-PARTS = {  # all but a sphere begin with their pose, see `_placed`, and the logarithms of three half sizes
-    "sphere": Part(lambda p: sphere(p[3].exp(), p[:3]), (), 4, 10),  # centre, logarithm of the radius
-    "ellipsoid": Part(lambda p: _placed(sphere(1.0).stretch(p[6:9].exp()), p), (), 9, 50),
-    "box": Part(lambda p: _placed(exact_box(p[6:9].exp()), p), (), 9, 50),
-    "rounded_box": Part(lambda p: union(p[None]), (ROUND_LOGIT,), 10, 55),
-    "superquadric": Part(quadric, (0.0, 0.0), 11, 110),
+PARTS = {
+    "sphere": Part((), 4, 10),
+    "ellipsoid": Part((), 9, 50),
+    "box": Part((), 9, 50),
+    "rounded_box": Part((ROUND_LOGIT,), 10, 55),
+    "superquadric": Part((0.0, 0.0), 11, 110),
 }
 
 
@@ -96,7 +68,7 @@ def one_part(name: str) -> Candidate:
             parameters = torch.cat([middle, radius.log()[None]])
         else:
             parameters = torch.cat([_fitting_box(around), torch.tensor(part.extra)])
-        return [_model(name, parameters, part.shape, part.flops, seen)]
+        return [_model(name, parameters, name, part.flops, seen)]
 
     return Candidate(name, part.size, part.flops, starts)
 
@@ -118,7 +90,7 @@ def union_of(name: str, count: int) -> Candidate:
             error = seen.previous_values(points).abs()
             missed = points[error >= error.quantile(MISSED_QUANTILE)]
             choices.append([*kept, *_cluster_boxes(missed, count - len(kept), seen.seed)])
-        return [_model(name, torch.stack(parts), union, flops, seen) for parts in choices]
+        return [_model(name, torch.stack(parts), "union", flops, seen) for parts in choices]
 
     return Candidate(name, count * PARTS["rounded_box"].size, flops, starts, tries=CLUSTERINGS + 1)
 
@@ -205,22 +177,11 @@ def by_size(names: tuple[str, ...], measure: str) -> list[Candidate]:
     return listed if measure == FREE else sorted(listed, key=lambda one: one.stored)
 
 
-def _model(name: str, parameters: Tensor, shape: Callable[[Tensor], Shape], flops: int, seen: Seen) -> Model:
+def _model(name: str, parameters: Tensor, of: str, flops: int, seen: Seen) -> Model:
     def field(free: list[Tensor]) -> Shape:
-        return replace(shape(free[0]), flops=Flops(flops, 2 * flops))
+        return formula(of, free[0], Flops(flops, 2 * flops))
 
     return Model(name, [parameters.float().to(seen.device).requires_grad_()], field, LEARNING_RATE, metric=True)
-
-
-def _placed(shape: Shape, parameters: Float[Tensor, " n"]) -> Shape:
-    """The shape turned by the rotation vector, parameters 3 to 5, and moved by the translation, the first three."""
-    return shape.rotate(_turn(parameters)).translate(parameters[:3])
-
-
-def _turn(parameters: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
-    """Rotation matrices of the rotation vectors, parameters 3 to 5."""
-    vector = parameters[..., 3:6]
-    return rigid(torch.cat([torch.zeros_like(vector), vector], dim=-1))[..., :3, :3]
 
 
 def _subsampled(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:

@@ -64,7 +64,7 @@ def solve_by_growth(observations: RayObservations, given: Given, run: RunContext
         first, last = State(growth.first, inputs), State(growth.fitted.model.frozen(), inputs)
         record.metrics_start, after = evaluate(first).metrics, evaluate(last)
         metrics, notes = after.metrics | ended(growth), (*growth.summary(choice.name), *after.notes)
-        note_result(run, Evaluation(metrics, after.mesh, failure_of(growth, after), notes))
+        note_result(run, replace(after, metrics=metrics, failure=failure_of(growth, after), notes=notes))
         curve = rendered(lines, growth.fitted.evidence.candidate)
         filmstrip = Filmstrip(inputs, "by candidate")
         for name, field in growth.fields.items():

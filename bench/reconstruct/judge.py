@@ -72,9 +72,10 @@ def judge(state: State, subject: Subject) -> Evaluation:
     scores = image_scores(views, [image for _, image in own], shots)
     metrics |= {OWN + name: value for name, value in scores.items()}
     if state.mesh is None:
-        return Evaluation(metrics, None, (RunStatus.EMPTY, "the field has no surface in the unit sphere"))
+        failure = RunStatus.EMPTY, "the field has no surface in the unit sphere"
+        return Evaluation(metrics, None, failure, field=field)
     coloured = replace(state.mesh, colours=vertex_colours(field, state.mesh, inputs.device))
-    return Evaluation(metrics, coloured, notes=unrendered(state, views))
+    return Evaluation(metrics, coloured, notes=unrendered(state, views), field=field)
 
 
 def judge_mesh(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> Evaluation:

@@ -26,6 +26,7 @@ from datasets.photographs import turned
 from datasets.scene import Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import Camera
+from renderers.field import Field
 
 MOST_HELD_OUT, MOST_GIVEN = 3, 12  # photographs in a picture
 ERRORS = colormaps["magma_r"].with_extremes(bad="0.85")  # grey where nothing is judged
@@ -52,7 +53,12 @@ def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: lis
 
 
 def note_surface(
-    run: RunContext, mesh: Mesh | None, subject: Subject, scores: dict[str, float], history: History | None = None
+    run: RunContext,
+    mesh: Mesh | None,
+    subject: Subject,
+    scores: dict[str, float],
+    history: History | None = None,
+    field: Field | None = None,
 ) -> None:
     """Judges a mesh with colours, notes the result, and writes summary.png, input.png and images.npz.
 
@@ -61,10 +67,11 @@ def note_surface(
         mesh: None where no surface was found.
         subject: that it is judged by.
         history: of the loop that found it, where there was one.
+        field: whose surface it is, where it is that of one.
     """
     after = judge_mesh(mesh, subject, run.inputs)
     failure = after.failure if history is None else failure_of(history, after)
-    note_result(run, replace(after, metrics=after.metrics | scores, failure=failure))
+    note_result(run, replace(after, metrics=after.metrics | scores, failure=failure, field=field))
     if run.inputs.evaluation.picture is not None and mesh is not None:
         _save(run.folder, painter(mesh), run.inputs, subject, run.record.outcome)
 

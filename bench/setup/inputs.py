@@ -25,6 +25,7 @@ from datasets.own_photographs import Photographed
 from datasets.scene import SPLIT_STRIDE, Dataset, Scene, Split, Surface, make_scene, sample_surface, scene_name
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
+from renderers.field import Field
 from renderers.rendering import Renderer, final_notes
 
 WIDE = 256  # neurons per layer: a narrower network is evaluated by one thread
@@ -148,6 +149,15 @@ class Checks(Protocol):
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput for inputs that the task cannot use."""
+        ...
+
+
+@runtime_checkable
+class Judges(Protocol):
+    """A task that judges a final field otherwise than `bench.evaluate.evaluate.evaluate` does."""
+
+    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+        """The metrics of a field that a run of the task ended on."""
         ...
 
 

@@ -19,6 +19,7 @@ from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
 from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
+from datasets.field_files import FIELD, save_field
 from datasets.scene import Scene
 from renderers.camera import Camera
 from renderers.field import Counts, Field
@@ -182,11 +183,12 @@ def solve_task(task: InverseTask, run: RunContext) -> State:
 
 
 def note_result(run: RunContext, after: Evaluation) -> None:
-    """Notes the result in the record, and writes its mesh."""
+    """Notes the result in the record, and writes its mesh and its field."""
     record = run.record
     record.metrics = after.metrics
     record.status, record.reason = after.failure or (RunStatus.OK, "")
-    record.notes = [*record.notes, *after.notes]
+    lost = None if after.field is None else save_field(after.field, run.folder / FIELD)
+    record.notes = [*record.notes, *([lost] if lost else []), *after.notes]
     if after.mesh is not None:
         record.notes += after.mesh.repairs
         after.mesh.save(run.folder / "mesh.ply")

@@ -5,8 +5,9 @@ from typing import ClassVar
 
 import torch
 
+from bench.evaluate.state import State
 from bench.reconstruct.choice import DEFINITIONS, Appearance, AutoField
-from bench.reconstruct.judge import COLOURED_DEFINITIONS
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.pixels import Stack
 from bench.reconstruct.problem import ReconstructionProblem
@@ -24,6 +25,7 @@ from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import check_field_gradient, check_kind, solve
 from renderers.checks import check_at_least, check_choice
+from renderers.field import Field
 
 UNCOUNTED = {
     "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "
@@ -88,6 +90,12 @@ class Reconstruction(PhotographTask):
         seconds = run.record.seconds
         run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
         seconds["trials"] = choice.seconds
+
+    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+        """The metrics of a field that a run ended on; see `bench.setup.inputs.Judges`."""
+        subject = self.subject(run.inputs)
+        found = judge(State(field, run.inputs), subject)
+        return found.metrics | (subject.judged(found.mesh, run.inputs) if subject.points is not None else {})
 
     def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
         """The problem of photographs with the field of a name."""

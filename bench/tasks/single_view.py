@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.evaluate.evaluate import OWN, Evaluation
 from bench.evaluate.state import State, vertex_colours
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge, judge_mesh
 from bench.reconstruct.pictures import draw_picture, draw_reconstruction, note_surface
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import with_colours
@@ -29,6 +29,7 @@ from datasets.photographs import Photography
 from datasets.scene import Split, Truth
 from datasets.views import check_elevation
 from renderers.checks import BadInput, check_at_least, check_choice
+from renderers.field import Field
 
 NETWORK, CODE, MEAN, NEAREST, BEST = "network", "code", "mean", "nearest", "best"
 DEFINITIONS = COLOURED_DEFINITIONS | {
@@ -150,14 +151,30 @@ class OneImage:
             self._see(run, recipe, Path(self.image_path))
             return
         record.definitions = DEFINITIONS | COSTS | TRAINING
-        images = recipe.imaging.of_shape(recipe.dataset, Split(record.config["split"]), record.config["index"])
-        subject = subject_of(images, self.given, inputs)
+        images, subject = self._images(run, recipe)
         if self.method == NETWORK:
             self._infer(run, recipe, images, subject)
         elif self.method == CODE:
             self._search(run, images, subject)
         else:
             self._look_up(run, recipe, images, subject)
+
+    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+        """The metrics of a field that a run ended on; none for a picture of one's own, whose camera is not known."""
+        if self.image_path is not None:
+            return {}
+        images, subject = self._images(run, self.recipe(run.inputs, run.record.config))
+        state = State(field, run.inputs)
+        if self.method == NETWORK:
+            return self._judged(state, images, subject).metrics
+        mesh = None if state.mesh is None else with_colours(state.mesh, subject.given)
+        return judge_mesh(mesh, subject, run.inputs).metrics | {"iou": overlap(field, images, run.inputs.device)}
+
+    def _images(self, run: RunContext, recipe: Recipe) -> tuple[ImagesOf, Subject]:
+        """The images of the scene's shape, and as photographs, of which one is given."""
+        config = run.record.config
+        images = recipe.imaging.of_shape(recipe.dataset, Split(config["split"]), config["index"])
+        return images, subject_of(images, self.given, run.inputs)
 
     def _infer(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """The shape that the network gives; before, that of the mean code."""
@@ -215,7 +232,7 @@ class OneImage:
                 mesh = replace(mesh, colours=vertex_colours(state.field, mesh, inputs.device))
             cameras = [recipe.imaging.sampler.draw(place) for place in range(TRIED)]
             camera, overlapping = best_view(mesh, cameras, picture[3] > 0.5, trained["filled"])
-            note_result(run, Evaluation({FITTED: overlapping}, mesh))
+            note_result(run, Evaluation({FITTED: overlapping}, mesh, field=state.field))
             record.notes.append("it knows shapes of the dataset alone, whatever a picture shows")
             if inputs.evaluation.picture is not None:
                 draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, record.outcome)
@@ -239,7 +256,7 @@ class OneImage:
             mesh = State(problem.field(), inputs).mesh
             mesh = None if mesh is None else with_colours(mesh, subject.given)
             scores = {"iou": overlap(problem.field(), images, inputs.device)}
-            note_surface(run, mesh, subject, scores, history)
+            note_surface(run, mesh, subject, scores, history, problem.field())
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""

@@ -174,15 +174,26 @@ class Coded(nn.Module):
         """The values at one code, as a field."""
         if code.shape != (self.code_length,):
             raise ValueError(f"code must have {self.code_length} numbers, not the shape {list(code.shape)}")
+        values = AtCode(self.body, code, self.scale, self.width, self.placed)
+        return Shape(values, Kind.LEVEL, None, getattr(self.body, "flops", None) or flops_of(self.body))
 
-        def values(points: Tensor) -> Tensor:
-            flat = points.reshape(-1, 3)
-            flat = (flat - code if self.placed else flat) / self.scale
-            given = code[:0] if self.placed else code
-            found = [self.body(some, given) for some in passes(flat, self.width)]
-            return torch.cat(found).view(points.shape[:-1])
 
-        return Shape(values, Kind.LEVEL, None, flops_of(self.body))
+@dataclass(frozen=True)
+class AtCode:
+    """The values of a `Coded` at one code; see there."""
+
+    body: nn.Module
+    code: Float[Tensor, " code_length"]
+    scale: Float[Tensor, ""]
+    width: int
+    placed: bool
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        flat = points.reshape(-1, 3)
+        flat = (flat - self.code if self.placed else flat) / self.scale
+        given = self.code[:0] if self.placed else self.code
+        found = [self.body(some, given) for some in passes(flat, self.width)]
+        return torch.cat(found).view(points.shape[:-1])
 
 
 @dataclass(frozen=True)

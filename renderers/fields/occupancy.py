@@ -35,7 +35,7 @@ class OccupancyNetwork(nn.Module):
         self.first = nn.Linear(3, width)
         takes_code = range(BLOCKS if code_length else 0)
         self.shifts = nn.ModuleList(nn.Linear(code_length, width, bias=False) for _ in takes_code)
-        self.blocks = nn.ModuleList(_Block(width) for _ in range(BLOCKS))
+        self.blocks = nn.ModuleList(Block(width) for _ in range(BLOCKS))
         self.occupancy_head = nn.Linear(width, 1)
         self.texture_head = nn.Linear(width, 3)
 
@@ -87,7 +87,7 @@ class BoundOccupancy:
         return features.relu_()
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
     """Two layers with a skip connection around them."""
 
     def __init__(self, width: int) -> None:

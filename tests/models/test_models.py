@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.models import candidates as formulas
 from bench.models.candidates import PAPERS, REACH, by_size, candidate
 from bench.models.field import rendered
 from bench.models.fit import SCREENING, Fitter, _slope_error, scattered
@@ -27,6 +26,7 @@ from datasets.scene import Truth, see
 from datasets.views import ViewSampler
 from renderers import Capabilities, Kind
 from renderers.fields.analytic import Shape, box, capsule, sphere, superquadric
+from renderers.fields.parts import FORMULAS
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.tiny import CPU
@@ -123,7 +123,7 @@ def test_a_rounded_box_can_be_a_box_and_a_capsule():
     logs = [*np.log([0.2, 0.5, 0.2]), 40.0]
     numbers = torch.tensor([0.0] * 6 + logs, dtype=torch.float64)
     as_capsule = capsule((0.0, -0.3, 0.0), (0.0, 0.3, 0.0), 0.2)
-    rounded = formulas.PARTS["rounded_box"].shape
+    rounded = FORMULAS["rounded_box"]
     assert torch.allclose(rounded(numbers)(points()), as_capsule(points()), atol=1e-9)
     numbers[9] = -40.0
     assert torch.allclose(rounded(numbers)(points()), box((0.2, 0.5, 0.2))(points()), atol=1e-9)
@@ -134,8 +134,8 @@ def test_parts_are_turned_and_moved_and_united():
     second = torch.tensor([-0.4, 0.0, 0.0, 0.0, 0.0, 0.0, *np.log([0.2, 0.2, 0.2]), 40.0], dtype=torch.float64)
     turned = box((0.4, 0.1, 0.2)).translate((0.3, 0.1, -0.2))  # by a right angle about z
     whole = turned | sphere(0.2, (-0.4, 0.0, 0.0))
-    assert torch.allclose(formulas.union(torch.stack([first, second]))(points()), whole(points()), atol=1e-6)
-    assert torch.allclose(formulas.PARTS["box"].shape(first[:9])(points()), turned(points()), atol=1e-6)
+    assert torch.allclose(FORMULAS["union"](torch.stack([first, second]))(points()), whole(points()), atol=1e-6)
+    assert torch.allclose(FORMULAS["box"](first[:9])(points()), turned(points()), atol=1e-6)
 
 
 @each("powers", [(1.0, 1.0), (1.0, 4.0), (2.0, 2.0), (20.0, 20.0)])
@@ -166,7 +166,7 @@ def test_a_grids_free_samples_lie_near_the_surface_and_the_rest_stays():
 
 def test_a_union_keeps_the_parts_of_a_smaller_one():
     old = torch.tensor([[0.0] * 6 + [-1.0] * 3 + [0.0], [0.5] + [0.0] * 5 + [-2.0] * 3 + [0.0]], requires_grad=True)
-    smaller = Model("union_2", [old], lambda free: formulas.union(free[0]), 0.1, metric=True)
+    smaller = Model("union_2", [old], lambda free: FORMULAS["union"](free[0]), 0.1, metric=True)
     *_, kept = candidate("union_3").starts(Seen(points(400).float(), smaller, 0, CPU))
     assert torch.equal(kept.parameters[0][:2], old)
     assert len(candidate("union_3").starts(Seen(points(400).float(), None, 0, CPU))) == candidate("union_3").tries - 1

@@ -1,0 +1,153 @@
+"""`python -m bench.verify RUN...`: computes the metrics of runs again from the fields that they left, and compares.
+
+    python -m bench.verify results/local/runs/NAME              a run, or several
+    python -m bench.verify results/local                        all runs of a results folder
+    python -m bench.verify results/local --rerun 3              three of them are run again, drawn anew each time, too
+
+The exit status is 0 where all agree. A record's configuration is trusted, as `python -m bench` trusts one.
+"""
+
+import argparse
+import random
+import re
+import sys
+import tempfile
+from collections.abc import Sequence
+from math import isclose, isnan
+from pathlib import Path
+from typing import Any
+
+from bench.evaluate.evaluate import evaluate
+from bench.evaluate.state import State
+from bench.machine.environment import describe, flushing_denormals
+from bench.records.folder import Identity
+from bench.records.format import number, plural
+from bench.records.read import run_folders
+from bench.records.record import Record, RunStatus, link_out, read_record
+from bench.report.suite.attempts import portable
+from bench.run.library import AGREE, run_again
+from bench.setup.inputs import Judges, RunContext, cell_of
+from datasets.field_files import FIELD, load_field
+from renderers.checks import BadInput
+
+SAME = 1e-4  # relative difference of a metric that the same field may have elsewhere: sums are rounded in other orders
+MACHINE = ("cpu", "device", "torch", "numpy", "python", "threads", "kernels")  # of a record's environment
+TIMES = re.compile(r"\.|seconds|overhead|saved")  # metrics of several fits, and those that a clock decides
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Prints a line per run; gives the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m bench.verify", description=__doc__.splitlines()[0].split(": ")[1])
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run's folder, or a results folder")
+    parser.add_argument("--rerun", type=int, default=0, metavar="N", help="run so many of them again, drawn at random")
+    given = parser.parse_args(arguments)
+    try:
+        if given.rerun < 0:
+            raise ValueError(f"--rerun must be 0 or more, not {given.rerun}")
+        folders = [folder for path in given.runs for folder in _folders(path)]
+        agree = [_told(folder, "from its field", _from_field, SAME) for folder in folders]
+        for folder in random.sample(folders, min(given.rerun, len(folders))):
+            agree.append(_told(folder, "run again", _from_rerun, AGREE))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{sum(agree)} of {len(agree)} agree")
+    return 0 if all(agree) else 1
+
+
+def _folders(path: Path) -> list[Path]:
+    """The folder of a run, or those of all runs of a results folder.
+
+    Raises:
+        ValueError: where there is none.
+    """
+    found = [path] if (path / "record.json").is_file() else run_folders(path)
+    if not found:
+        raise ValueError(f"{path} has no record.json, and no runs: name a run's folder, or a results folder")
+    return found
+
+
+def _told(folder: Path, how: str, compute: Any, most: float) -> bool:
+    """Whether the metrics of a run, computed once more, are those of its record; prints a line about it."""
+    try:
+        if link := link_out(folder, folder.parent):
+            raise BadInput(f"{link} is a link out of the folder")
+        record = Record.of(read_record(folder))
+        found, environment = compute(folder, record)
+    except (ValueError, OSError) as error:
+        print(f"not compared: {folder.name}, {how}: {error}")
+        return False
+    numbers = {name: x for name, x in record.metrics.items() if isinstance(x, int | float) and not TIMES.search(name)}
+    shared = [name for name in numbers if name in found]
+    wrong = [name for name in shared if not _equal(numbers[name], found[name], most)]
+    if shared and not wrong:
+        widest = max(_apart(numbers[name], found[name]) for name in shared)
+        rest = f"; {len(numbers) - len(shared)} others are not of the field" if len(shared) < len(numbers) else ""
+        print(f"agrees: {folder.name}, {how}: {plural(len(shared), 'metric')}, at most {widest:.1g} apart{rest}")
+        return True
+    told = [f"{name} is {number(numbers[name])} in the record, now {number(found[name])}" for name in wrong]
+    why = "; ".join(_reasons(record, environment)) or "code and machine are the same: was the record edited?"
+    print(f"differs: {folder.name}, {how}: {'; '.join(told) or 'there is nothing to compare'}. {why}")
+    return False
+
+
+@flushing_denormals()
+def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The metrics of the field that a run left, and the environment here.
+
+    Raises:
+        BadInput: where it left none, or its configuration cannot be used.
+    """
+    if not (folder / FIELD).is_file():
+        notes = [note for note in record.notes if FIELD in note]
+        ended = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
+        raise BadInput(notes[0] if notes else f"it left no {FIELD}: no field was found or looked for{ended}")
+    cell = cell_of(record.config)
+    cell.start()
+    field = load_field(folder, cell.inputs.device)
+    run = RunContext(cell.inputs, folder, record, lambda *_: None)
+    judged = cell.task.judged(field, run) if isinstance(cell.task, Judges) else None
+    found = evaluate(State(field, cell.inputs)).metrics if judged is None else judged
+    return found, describe(cell.inputs.device)
+
+
+def _from_rerun(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The metrics of the same run once more, and the environment here.
+
+    Raises:
+        BadInput: where it could not be run.
+    """
+    with tempfile.TemporaryDirectory() as results_dir:
+        folders, said = run_again(portable(record.overrides), Path(results_dir))
+        if not folders:
+            raise BadInput(said)
+        again = read_record(folders[0])
+    if again["config_hash"] != record.config_hash:
+        raise BadInput("its overrides give another configuration today: a default or a file has changed")
+    if again["status"] != record.status:
+        raise BadInput(f"it ended {record.status}, and now {again['status']}: {again.get('reason', '')}")
+    return again["metrics"], again["environment"]
+
+
+def _equal(first: float, second: float, most: float) -> bool:
+    return isclose(first, second, rel_tol=most) or (isnan(first) and isnan(second))
+
+
+def _apart(first: float, second: float) -> float:
+    """The relative difference of two numbers that agree."""
+    return 0.0 if first == second or isnan(first) else abs(first - second) / max(abs(first), abs(second))
+
+
+def _reasons(record: Record, environment: dict[str, Any]) -> list[str]:
+    """In what code and machine of a record and of this process differ."""
+    code = Identity({}, record.config).code
+    told = [f"the code differs: {record.code[:12]} then, {code[:12]} now"] if code != record.code else []
+    for name in MACHINE:
+        then, now = record.environment.get(name), environment.get(name)
+        if then != now:
+            told.append(f"{name} differs: {then} then, {now} now")
+    return told
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

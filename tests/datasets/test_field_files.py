@@ -1,0 +1,127 @@
+"""The field that a run leaves is the same when it is read, and nothing else in its file has an effect."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+import bench
+from datasets import field_files
+from datasets.field_files import FIELD, load_field, load_network, save_field
+from renderers.checks import BadInput
+from renderers.field import Field, Flops, Kind, Moved
+from renderers.fields.analytic import sphere
+from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy, ScaledOccupancyOf
+from renderers.fields.grid import Grid
+from renderers.fields.mlp import Decoder
+from renderers.fields.network import Coded, Published
+from renderers.fields.occupancy import OccupancyNetwork
+from renderers.fields.parts import FORMULAS, formula
+from renderers.fields.published import Layered
+
+POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+def numbers(*shape: int) -> torch.Tensor:
+    return 0.3 * torch.randn(*shape, generator=torch.Generator().manual_seed(1))
+
+
+def decoder() -> Field:
+    network = Decoder(layers=3, width=16, code_length=4, skip=2, narrow=False)
+    network.kind, network.lipschitz = Kind.BOUND, 1.0
+    return network.at(numbers(4).requires_grad_())
+
+
+def published() -> Field:
+    layers = [(numbers(8, 9), numbers(8)), (numbers(8, 17), numbers(8)), (numbers(1, 8), numbers(1))]
+    body = Layered(layers, activation="softplus", again={1: True}, frequencies=1, norms={0: (numbers(8), numbers(8))})
+    return Published(Coded(body, code_length=0, width=8), 2).at(numbers(3))
+
+
+FIELDS = {
+    "decoder": decoder,
+    "moved": lambda: Moved(decoder(), numbers(7)),
+    "published": published,
+    "grid": lambda: Grid(numbers(6, 6, 6).permute(2, 1, 0), 1.05),
+    "coloured": lambda: ColouredDistance(layers=2, width=8, octaves=1, radius=0.5, directional=True),
+    "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
+    "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,
+    "occupancy_at_code": lambda: ScaledOccupancyOf(OccupancyNetwork(width=8, code_length=3).at(numbers(3))),
+    **{name: lambda n=name: formula(n, numbers(11), Flops(1, 2)) for name in FORMULAS if name != "union"},
+    "union": lambda: formula("union", numbers(3, 10), Flops(3, 6)),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_field_that_is_read_has_the_same_values_and_says_the_same_of_itself(name, tmp_path):
+    field = FIELDS[name]()
+    assert save_field(field, tmp_path / FIELD) is None
+    found = bench.load_field(tmp_path)
+    assert type(found) is type(field)
+    torch.testing.assert_close(found(POINTS), field(POINTS).detach(), rtol=0, atol=1e-6)
+    assert (found.kind, found.lipschitz) == (field.kind, field.lipschitz) and not found(POINTS).requires_grad
+    if hasattr(field, "colours"):
+        given = POINTS, nn.functional.normalize(POINTS, dim=-1), nn.functional.normalize(POINTS, dim=-1)
+        torch.testing.assert_close(found.colours(*given), field.colours(*given).detach(), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["decoder", "coloured", "union"])
+def test_it_is_a_network_whose_code_is_its_place(name, tmp_path):
+    field = FIELDS[name]()
+    save_field(field, tmp_path / FIELD)
+    network = load_network(tmp_path)
+    place = torch.tensor([0.1, 0.0, -0.1])
+    torch.testing.assert_close(network.at(place)(POINTS), field(POINTS - place).detach(), rtol=0, atol=1e-5)
+
+
+class Own(nn.Module):
+    kind, lipschitz, flops = Kind.DISTANCE, 1.0, None
+
+    def forward(self, points):
+        return points.norm(dim=-1) - 0.5
+
+
+@pytest.mark.parametrize(
+    "field, words",
+    [(Own(), "test_field_files.Own is no class"), (sphere(0.5), "function is no class")],
+)
+def test_a_class_of_the_users_is_told_and_left_out(field, words, tmp_path):
+    assert words in (save_field(field, tmp_path / FIELD) or "")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_field_that_is_too_large_is_told_and_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(field_files, "MOST", 1000)
+    assert "0 MB are the most" in (save_field(FIELDS["coloured"](), tmp_path / FIELD) or "")
+    assert not [*tmp_path.iterdir()]
+
+
+def changed(path: Path, old: str, new: str) -> None:
+    """The file with another text in its description of the field."""
+    tree = json.dumps(field_files._read(path)[0])
+    assert old in tree
+    save_file(load_file(path), path, {"version": field_files.VERSION, "field": tree.replace(old, new)})
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda path: path.write_bytes(path.read_bytes()[:-100]), "may be cut short"),
+        (lambda path: path.write_bytes(b""), "may be cut short"),
+        (Path.unlink, f"has no {FIELD}"),
+        (lambda path: save_file(load_file(path), path), "version None of fields"),
+        (lambda path: changed(path, "Linear", "Popen"), "'Popen', which is none of ours"),
+        (lambda path: changed(path, '"octaves"', '"forward"'), "no attribute 'forward' that a file may set"),
+        (lambda path: changed(path, '"octaves"', '"_forward_hooks"'), "no attribute '_forward_hooks'"),
+        (lambda path: changed(path, '"octaves": 1', '"octaves": 2'), "its parts do not fit"),
+        (lambda path: changed(path, '"t0"', '"t99"'), "its parts do not fit"),
+    ],
+)
+def test_a_file_that_will_not_do_is_refused_with_the_cause(spoil, words, tmp_path):
+    save_field(FIELDS["coloured"](), tmp_path / FIELD)
+    spoil(tmp_path / FIELD)
+    with pytest.raises(BadInput, match=words):
+        load_field(tmp_path)

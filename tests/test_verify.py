@@ -1,0 +1,106 @@
+"""A run's metrics are computed again from the field that it left."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import bench
+from bench.verify import main
+from datasets.field_files import FIELD
+from tests.composing import composed
+from tests.run.driving import command
+from tests.tiny import cell_from
+
+SMALL = (
+    "renderer=dist", "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200",
+    "evaluation.every=null", "evaluation.picture=null", "view.resolution=16", "task.optimiser.iterations=3",
+)  # fmt: skip
+PHOTOGRAPHS = ("task.images.views=6", "task.longest=16", "task.held_out=3", "task.rays=64")
+RUNS = {
+    "a code of the prior": ("task=completion", "task.points=20"),
+    "a box": ("task=completion", "task.points=20", "field=box", "models.fit.warm_iterations=2"),
+    "photographs": ("task=reconstruction", "field=grid_8", *PHOTOGRAPHS),
+    "similarity": ("task=multiview", "task.similarity=true", "task.starts=1"),
+}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> dict[str, Path]:
+    """The folders of small runs by the kind of their field."""
+    folder, found = tmp_path_factory.mktemp("results"), {}
+    for name, chosen in RUNS.items():
+        done = command(*chosen, *SMALL, f"results_dir={folder}")
+        found[name] = Path(done.out.splitlines()[-1])
+        assert (found[name] / FIELD).is_file(), done.err + str(json.loads((found[name] / "record.json").read_text()))
+    return found
+
+
+@pytest.fixture
+def copied(runs, tmp_path) -> Path:
+    """A copy of one run, which may be changed."""
+    return Path(shutil.copytree(runs["a code of the prior"], tmp_path / "runs" / "copy"))
+
+
+def edit(folder: Path, **changed) -> None:
+    """Changes values of a record."""
+    record = json.loads((folder / "record.json").read_text())
+    record["metrics"] |= changed.pop("metrics", {})
+    (folder / "record.json").write_text(json.dumps(record | changed))
+
+
+def test_runs_that_nobody_touched_agree(runs, capsys):
+    assert main([str(next(iter(runs.values())).parents[1])]) == 0
+    out = capsys.readouterr().out
+    assert out.count("agrees: ") == len(RUNS) and f"{len(RUNS)} of {len(RUNS)} agree" in out
+
+
+@pytest.mark.parametrize(
+    "changed, words",
+    [
+        ({"metrics": {"chamfer_l1": 0.001}}, ["chamfer_l1 is 0.00100 in the record, now", "was the record edited?"]),
+        ({"metrics": {"fscore": 0.5}, "code": "f" * 40}, ["fscore is 0.500", "the code differs: ffffffffffff then"]),
+        ({"metrics": {"fscore": 0.5}, "environment": {}}, ["fscore is 0.500", "cpu differs: None then"]),
+    ],
+)
+def test_an_edited_metric_is_found_and_the_cause_told(copied, capsys, changed, words):
+    edit(copied, **changed)
+    assert main([str(copied)]) == 1
+    out = capsys.readouterr().out
+    assert out.startswith("differs: copy") and all(word in out for word in words), out
+
+
+def test_a_code_that_differs_is_no_difference_where_metrics_agree(copied):
+    edit(copied, code="f" * 40)
+    assert main([str(copied)]) == 0
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda folder: (folder / FIELD).unlink(), f"left no {FIELD}"),
+        (lambda folder: (folder / FIELD).write_bytes((folder / FIELD).read_bytes()[:999]), "may be cut short"),
+        (lambda folder: (folder / "record.json").write_text("{"), "record.json is not JSON"),
+    ],
+)
+def test_what_cannot_be_compared_is_told(copied, capsys, spoil, words):
+    spoil(copied)
+    assert main([str(copied)]) == 1
+    assert words in capsys.readouterr().out
+
+
+def test_a_folder_without_runs_is_an_error(tmp_path, capsys):
+    assert main([str(tmp_path)]) == 2
+    assert "name a run's folder, or a results folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_field_of_a_run_is_that_of_a_scene(runs, name):
+    folder = runs[name]
+    inputs = cell_from(composed("task=ablation", "dataset=network", f"dataset.path={folder}")).inputs
+    fitted, field = inputs.fitted(), bench.load_field(folder)
+    points = torch.rand(100, 3) - 0.5
+    values, own = fitted.decoder.at(fitted.codes[0])(points), field(points)
+    torch.testing.assert_close(values * (own.sum() / values.sum()), own, rtol=0, atol=1e-5)  # a bound is divided
