@@ -170,8 +170,9 @@ def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
     Raises:
         ValueError: where the two do not fit.
     """
+    name = mesh.stem
     if (mesh / "record.json").is_file():
-        mesh = mesh / (WORLD if (mesh / WORLD).is_file() else "mesh.ply")
+        name, mesh = mesh.name, mesh / (WORLD if (mesh / WORLD).is_file() else "mesh.ply")
     if mesh.is_dir():
         meshes = {file.stem: file for file in find_meshes(mesh)}
         if truth is None:
@@ -183,10 +184,10 @@ def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
             raise ValueError(f"{meshes[unknown[0]]} has no truth: name it as a file of {truth}, such as {min(truths)}")
         return [Item(name, meshes.get(name), file) for name, file in truths.items()]
     if truth is None:
-        return [Item(mesh.stem, mesh, scan_number(mesh.stem) if scan is None else scan)]
+        return [Item(name, mesh, scan_number(mesh.stem) if scan is None else scan)]
     if truth.is_dir():
         raise ValueError(f"--truth {truth} is a folder, and {mesh} is one mesh: name the file")
-    return [Item(mesh.stem, mesh, truth)]
+    return [Item(name, mesh, truth)]
 
 
 def units(judge: Judge) -> dict[str, str]:
