@@ -105,6 +105,6 @@ def test_a_record_that_cannot_be_read_is_told(results):
 
 
 def test_the_module_says_what_it_has():
-    assert sys.modules["bench"].__all__ == ["load", "run"]
+    assert sys.modules["bench"].__all__ == ["load", "load_field", "run"]
     with pytest.raises(AttributeError, match="no attribute 'lode'"):
         _ = bench.lode
