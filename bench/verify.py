@@ -4,7 +4,7 @@
     python -m bench.verify results/local                        all runs of a results folder
     python -m bench.verify results/local --rerun 3              three of them are run again, drawn anew each time, too
 
-The exit status is 0 where all agree. A record's configuration is trusted, as `python -m bench` trusts one.
+The exit status is 0 where all that left a field agree. A configuration is trusted, as `python -m bench` trusts one.
 """
 
 import argparse
@@ -32,7 +32,11 @@ from renderers.checks import BadInput
 
 SAME = 1e-4  # relative difference of a metric that the same field may have elsewhere: sums are rounded in other orders
 MACHINE = ("cpu", "device", "torch", "numpy", "python", "threads", "kernels")  # of a record's environment
-TIMES = re.compile(r"\.|seconds|overhead|saved")  # metrics of several fits, and those that a clock decides
+TIMES = re.compile(r"\.|seconds|overhead|saved|gemm")  # metrics of several fits, and those that a clock decides
+
+
+class LeftOut(Exception):
+    """A run has nothing to compare; the message says why."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -51,8 +55,10 @@ def main(arguments: Sequence[str]) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"{sum(agree)} of {len(agree)} agree")
-    return 0 if all(agree) else 1
+    compared = [one for one in agree if one is not None]
+    left_out = f"; {len(agree) - len(compared)} left out" if len(compared) < len(agree) else ""
+    print(f"{sum(compared)} of {len(compared)} agree{left_out}")
+    return 0 if compared and all(compared) else 1
 
 
 def _folders(path: Path) -> list[Path]:
@@ -67,27 +73,36 @@ def _folders(path: Path) -> list[Path]:
     return found
 
 
-def _told(folder: Path, how: str, compute: Any, most: float) -> bool:
-    """Whether the metrics of a run, computed once more, are those of its record; prints a line about it."""
+def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
+    """Whether the metrics of a run, computed once more, are those of its record; prints a line about it.
+
+    None where there is nothing to compare.
+    """
     try:
         if link := link_out(folder, folder.parent):
             raise BadInput(f"{link} is a link out of the folder")
         record = Record.of(read_record(folder))
         found, environment = compute(folder, record)
+    except LeftOut as reason:
+        print(f"left out: {folder.name}, {how}: {reason}")
+        return None
     except (ValueError, OSError) as error:
         print(f"not compared: {folder.name}, {how}: {error}")
         return False
     numbers = {name: x for name, x in record.metrics.items() if isinstance(x, int | float) and not TIMES.search(name)}
     shared = [name for name in numbers if name in found]
+    if not shared:
+        print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")
+        return None
     wrong = [name for name in shared if not _equal(numbers[name], found[name], most)]
-    if shared and not wrong:
+    if not wrong:
         widest = max(_apart(numbers[name], found[name]) for name in shared)
         rest = f"; {len(numbers) - len(shared)} others are not of the field" if len(shared) < len(numbers) else ""
         print(f"agrees: {folder.name}, {how}: {plural(len(shared), 'metric')}, at most {widest:.1g} apart{rest}")
         return True
     told = [f"{name} is {number(numbers[name])} in the record, now {number(found[name])}" for name in wrong]
     why = "; ".join(_reasons(record, environment)) or "code and machine are the same: was the record edited?"
-    print(f"differs: {folder.name}, {how}: {'; '.join(told) or 'there is nothing to compare'}. {why}")
+    print(f"differs: {folder.name}, {how}: {'; '.join(told)}. {why}")
     return False
 
 
@@ -96,12 +111,13 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str,
     """The metrics of the field that a run left, and the environment here.
 
     Raises:
-        BadInput: where it left none, or its configuration cannot be used.
+        LeftOut: where it left none.
+        BadInput: where its field or its configuration cannot be used.
     """
     if not (folder / FIELD).is_file():
         notes = [note for note in record.notes if FIELD in note]
         ended = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
-        raise BadInput(notes[0] if notes else f"it left no {FIELD}: no field was found or looked for{ended}")
+        raise LeftOut(notes[0] if notes else f"it has no {FIELD}: no field was found or looked for{ended}")
     cell = cell_of(record.config)
     cell.start()
     field = load_field(folder, cell.inputs.device)

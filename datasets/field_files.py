@@ -24,7 +24,7 @@ from renderers.fields.parts import Formula
 
 FIELD = "field.safetensors"  # in a run's folder
 VERSION = "1"  # raise it when a class of these changes what it holds
-MOST = 2**24  # bytes of a field that is stored
+MOST = 16_000_000  # bytes of a field that is stored
 CLASSES: dict[str, type] = {
     one.__name__: one
     for one in (

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 import bench
+from bench import verify
+from bench.records.folder import Identity
 from bench.verify import main
 from datasets.field_files import FIELD
 from tests.composing import composed
@@ -80,7 +82,7 @@ def test_a_code_that_differs_is_no_difference_where_metrics_agree(copied):
 @pytest.mark.parametrize(
     "spoil, words",
     [
-        (lambda folder: (folder / FIELD).unlink(), f"left no {FIELD}"),
+        (lambda folder: (folder / FIELD).unlink(), f"left out: copy, from its field: it has no {FIELD}"),
         (lambda folder: (folder / FIELD).write_bytes((folder / FIELD).read_bytes()[:999]), "may be cut short"),
         (lambda folder: (folder / "record.json").write_text("{"), "record.json is not JSON"),
     ],
@@ -89,6 +91,42 @@ def test_what_cannot_be_compared_is_told(copied, capsys, spoil, words):
     spoil(copied)
     assert main([str(copied)]) == 1
     assert words in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "changed, code, words",
+    [
+        ({}, 0, "agrees: copy, run again"),
+        ({"metrics": {"fscore": 0.5}}, 1, "fscore is 0.500 in the record, now"),
+        ({"config_hash": "other"}, 1, "its overrides give another configuration today"),
+        ({"status": "nan"}, 1, "it ended nan, and now"),
+    ],
+)
+def test_a_run_that_is_made_again_is_compared_also_without_its_field(
+    runs, copied, monkeypatch, capsys, changed, code, words
+):
+    asked = []
+
+    def again(keys, results_dir):
+        asked.append(keys)
+        return [runs["a code of the prior"]], ""
+
+    monkeypatch.setattr(verify, "run_again", again)
+    edit(copied, **changed)
+    (copied / FIELD).unlink()
+    assert verify.main([str(copied), "--rerun", "1"]) == code
+    out = capsys.readouterr().out
+    assert words in out and "; 1 left out" in out
+    assert "task=completion" in asked[0] and not any(key.startswith("results_dir") for key in asked[0])
+
+
+def test_of_a_run_whose_field_is_read_the_field_alone_decides_what_is_run_again(copied):
+    config = {"dataset": {"path": str(copied)}}
+    first = Identity({}, config).code
+    edit(copied, asked="later")
+    assert Identity({}, config).code == first
+    (copied / FIELD).write_bytes(b"other")
+    assert Identity({}, config).code != first
 
 
 def test_a_folder_without_runs_is_an_error(tmp_path, capsys):

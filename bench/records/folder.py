@@ -35,6 +35,7 @@ PASSIVE = (
 NO_STRESS = "none"
 FILE_KEYS = ("path", "image_path", "mask_path", "truth", "codes")  # of files that a run reads
 IN_FOLDERS = ("*", "ModelParameters/*", "LatentCodes/*")  # and of a folder those of DeepSDF
+FIELD = "field.safetensors"  # of a run's folder, which alone is read of it; see `datasets.field_files`
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVE = 64 * 1024  # bytes kept free, so that the record can still be written when the disk has become full
 RESERVED = ".reserve"
@@ -228,8 +229,10 @@ def _package(name: str) -> str:
 
 
 def _content(path: Path) -> str:
-    """Hash of a file's name and bytes, or of all files of a folder; empty where there is none."""
+    """Hash of a file's name and bytes, of a run's field, or of all files of a folder; empty where there is none."""
     try:
+        if (path / FIELD).is_file():
+            return _content(path / FIELD)
         if path.is_dir():
             found = [child for part in IN_FOLDERS for child in sorted(path.glob(part)) if child.is_file()]
             return digest([_content(child) for child in found])
