@@ -172,7 +172,7 @@ def show(results_dir: Path) -> int:
     print(f"{plural(len(kept), 'run')} of {results_dir}, of which {stand} stand in this table, beside shipped ones.")
     if any(map(standing.not_run, standing.rows)):
         print("A row that lacks runs has no rank: its shares are of fewer problems. suite=quick makes them.")
-    print(f"rank {'renderer':<24} share of targets reached; in each set; field values")
+    print(f"rank {'renderer':<31} share of targets reached; in each set; field values")
     for row in standing.rows:
         parts = [
             f"{name} {percent(standing.share(row, name).value)}" for name in standing.sets if standing.of(row, name)
@@ -183,7 +183,8 @@ def show(results_dir: Path) -> int:
         parts += [f"{count} {status}" for status, count in standing.failures(row).most_common()]
         parts += [f"{lacking} not run"] if (lacking := standing.not_run(row)) else []
         rank = str(standing.ranks.get(row, "-"))
-        print(f"{rank:>3}  {row:<24} {percent(standing.share(row).value):>5}  {', '.join(parts)}")
+        share = "" if gain else percent(standing.share(row).value)  # a tuned row lacks sets
+        print(f"{rank:>3}  {row:<31} {share:>5}  {', '.join(parts)}")
     print(*(path.with_suffix(".png") for path in written), sep="\n")
     return 0
 
