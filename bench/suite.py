@@ -40,7 +40,7 @@ from bench.report.suite.attempts import (
 )
 from bench.report.suite.standing import Standing
 from bench.report.write import paper
-from bench.report.write.html import page_lock
+from bench.report.write.html import MOST_MESHES, page_lock, write_page
 from bench.report.write.table import percent
 from bench.run.library import AGREE, run_again
 from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
@@ -160,9 +160,10 @@ def _sweep(keys: list[str]) -> int:
 def show(results_dir: Path) -> int:
     """Keeps the attempts of a results folder, writes the suite's page, and prints a line a row."""
     with page_lock(results_dir):
-        records, _ = read_records(results_dir)
+        records, unread = read_records(results_dir)
         write_attempts(attempts_of(records, results_dir), results_dir)
         written = paper.write_paper(records, results_dir, only=PAGE)
+        index = write_page(records, unread, results_dir, MOST_MESHES)
     kept, problems = read_attempts(results_dir)
     standing = Standing.of_all([*read_attempts(paper.SHIPPED)[0], *kept])
     for problem in problems:
@@ -185,7 +186,7 @@ def show(results_dir: Path) -> int:
         rank = str(standing.ranks.get(row, "-"))
         share = "" if gain else percent(standing.share(row).value)  # a tuned row lacks sets
         print(f"{rank:>3}  {row:<31} {share:>5}  {', '.join(parts)}")
-    print(*(path.with_suffix(".png") for path in written), sep="\n")
+    print(*(path.with_suffix(".png") for path in written), index, sep="\n")
     return 0
 
 
