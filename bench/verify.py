@@ -90,7 +90,7 @@ def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
         print(f"not compared: {folder.name}, {how}: {error}")
         return False
     numbers = {name: x for name, x in record.metrics.items() if isinstance(x, int | float) and not TIMES.search(name)}
-    shared = [name for name in numbers if name in found]
+    shared = [name for name in numbers if isinstance(found.get(name), int | float)]
     if not shared:
         print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")
         return None
@@ -146,7 +146,7 @@ def _from_rerun(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str,
 
 
 def _equal(first: float, second: float, most: float) -> bool:
-    return isclose(first, second, rel_tol=most) or (isnan(first) and isnan(second))
+    return isclose(first, second, rel_tol=most, abs_tol=1e-9) or (isnan(first) and isnan(second))
 
 
 def _apart(first: float, second: float) -> float:

@@ -261,6 +261,8 @@ def occupancy(tensors: Mapping[str, Tensor]) -> Published:
 
     The code is the one that an encoder gives, `c`; of an occupancy network's latent `z`, zeros are taken.
     """
+    if any("encoder.unet" in name or "encoder.fc_pos" in name for name in tensors):
+        raise BadInput("it is a convolutional occupancy network, whose code differs from point to point: not read")
     weights = Weights(
         tensors, prefix=prefix_of(tensors, rf"(?:{OUTER}|.*\.decoder\.)(?=(?:fc|conv)_p\.)"), whose="the decoder"
     )
