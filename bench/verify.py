@@ -12,8 +12,8 @@ import random
 import re
 import sys
 import tempfile
-from collections.abc import Sequence
-from math import isclose, isnan
+from collections.abc import Callable, Sequence
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,10 @@ from datasets.field_files import FIELD, load_field
 from renderers.checks import BadInput
 
 SAME = 1e-4  # relative difference of a metric that the same field may have elsewhere: sums are rounded in other orders
+NEAR = 1e-9  # difference, in the metric's own unit, that is none
 MACHINE = ("cpu", "device", "torch", "numpy", "python", "threads", "kernels")  # of a record's environment
 TIMES = re.compile(r"\.|seconds|overhead|saved|gemm")  # metrics of several fits, and those that a clock decides
+Again = tuple[dict[str, Any], Callable[[], dict[str, Any]]]  # metrics; the environment, asked for where they differ
 
 
 class LeftOut(Exception):
@@ -94,20 +96,21 @@ def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
     if not shared:
         print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")
         return None
-    wrong = [name for name in shared if not _equal(numbers[name], found[name], most)]
+    apart = {name: _apart(numbers[name], found[name]) for name in shared}
+    wrong = [name for name, gap in apart.items() if not gap <= most]  # nor is one that is not a number
     if not wrong:
-        widest = max(_apart(numbers[name], found[name]) for name in shared)
+        widest = max(apart.values())
         rest = f"; {len(numbers) - len(shared)} others are not of the field" if len(shared) < len(numbers) else ""
         print(f"agrees: {folder.name}, {how}: {plural(len(shared), 'metric')}, at most {widest:.1g} apart{rest}")
         return True
     told = [f"{name} is {number(numbers[name])} in the record, now {number(found[name])}" for name in wrong]
-    why = "; ".join(_reasons(record, environment)) or "code and machine are the same: was the record edited?"
+    why = "; ".join(_reasons(record, environment())) or "code and machine are the same: was the record edited?"
     print(f"differs: {folder.name}, {how}: {'; '.join(told)}. {why}")
     return False
 
 
 @flushing_denormals()
-def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str, Any]]:
+def _from_field(folder: Path, record: Record) -> Again:
     """The metrics of the field that a run left, and the environment here.
 
     Raises:
@@ -124,10 +127,10 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str,
     run = RunContext(cell.inputs, folder, record, lambda *_: None)
     judged = cell.task.judged(field, run) if isinstance(cell.task, Judges) else None
     found = evaluate(State(field, cell.inputs)).metrics if judged is None else judged
-    return found, describe(cell.inputs.device)
+    return found, lambda: describe(cell.inputs.device)
 
 
-def _from_rerun(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str, Any]]:
+def _from_rerun(folder: Path, record: Record) -> Again:
     """The metrics of the same run once more, and the environment here.
 
     Raises:
@@ -142,16 +145,14 @@ def _from_rerun(folder: Path, record: Record) -> tuple[dict[str, Any], dict[str,
         raise BadInput("its overrides give another configuration today: a default or a file has changed")
     if again["status"] != record.status:
         raise BadInput(f"it ended {record.status}, and now {again['status']}: {again.get('reason', '')}")
-    return again["metrics"], again["environment"]
-
-
-def _equal(first: float, second: float, most: float) -> bool:
-    return isclose(first, second, rel_tol=most, abs_tol=1e-9) or (isnan(first) and isnan(second))
+    return again["metrics"], lambda: again["environment"]
 
 
 def _apart(first: float, second: float) -> float:
-    """The relative difference of two numbers that agree."""
-    return 0.0 if first == second or isnan(first) else abs(first - second) / max(abs(first), abs(second))
+    """The relative difference of two numbers; 0 of two that are nearer than `NEAR`, or that both are none."""
+    if first == second or (isnan(first) and isnan(second)) or abs(first - second) <= NEAR:
+        return 0.0
+    return abs(first - second) / max(abs(first), abs(second))
 
 
 def _reasons(record: Record, environment: dict[str, Any]) -> list[str]:
