@@ -82,7 +82,7 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         key, _, value = argument.partition("=")
         if key in ("suite", "set", "setting", "verify"):
             own[key] = value
-        elif key.lstrip("+~").partition(".")[0] in (*STATED, "sizes") and key not in [
+        elif key.lstrip("+~").partition(".")[0] in (*STATED, "sizes", "scale") and key not in [
             given for given, _ in GIVEN.values()
         ]:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
@@ -164,16 +164,16 @@ def show(results_dir: Path) -> int:
         write_attempts(attempts_of(records, results_dir), results_dir)
         written = paper.write_paper(records, results_dir, only=PAGE)
         index = write_page(records, unread, results_dir, MOST_MESHES)
-    kept, problems = read_attempts(results_dir)
-    standing = Standing.of_all([*read_attempts(paper.SHIPPED)[0], *kept])
+    (kept, _), (attempts, problems) = read_attempts(results_dir), read_attempts(paper.SHIPPED, results_dir)
+    standing = Standing(attempts)
     for problem in problems:
         print(f"not read: {problem}", file=sys.stderr)
     own = {(*one.key, one.started) for one in kept}
     stand = sum((*one.key, one.started) in own for one in standing.attempts)
     print(f"{plural(len(kept), 'run')} of {results_dir}, of which {stand} stand in this table, beside shipped ones.")
     if any(map(standing.not_run, standing.rows)):
-        print("A row that lacks runs has no rank: its shares are of fewer problems. suite=quick makes them.")
-    print(f"rank {'renderer':<31} share of targets reached; in each set; field values")
+        print("A row that lacks runs is not compared: its shares are of fewer problems. suite=quick makes them.")
+    print(f"{'renderer':<32} share of targets reached, against the first; in each set; field values")
     for row in standing.rows:
         parts = [
             f"{name} {percent(standing.share(row, name).value)}" for name in standing.sets if standing.of(row, name)
@@ -183,9 +183,8 @@ def show(results_dir: Path) -> int:
         parts += [f"{number(ratio.value)} of DIST's field values"] if ratio else []
         parts += [f"{count} {status}" for status, count in standing.failures(row).most_common()]
         parts += [f"{lacking} not run"] if (lacking := standing.not_run(row)) else []
-        rank = str(standing.ranks.get(row, "-"))
         share = "" if gain else percent(standing.share(row).value)  # a tuned row lacks sets
-        print(f"{rank:>3}  {row:<31} {share:>5}  {', '.join(parts)}")
+        print(f"{row:<32} {share:>5}  {standing.against(row):<8}  {', '.join(parts)}")
     print(*(path.with_suffix(".png") for path in written), index, sep="\n")
     return 0
 

@@ -36,7 +36,10 @@ def _report(given: dict[str, str]) -> int:
     results_dir, meshes = Path(given.get("results_dir", RESULTS)), _meshes(given.get("meshes", str(MOST_MESHES)))
     if into := given.get("ship"):
         records, _ = read_records(results_dir)
-        rows = write_attempts([*attempts_of(records, results_dir), *read_attempts(results_dir)[0]], Path(into))
+        kept, problems = read_attempts(results_dir)
+        if problems:
+            raise ValueError(f"{results_dir} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
+        rows = write_attempts([*attempts_of(records, results_dir), *kept], Path(into))
         print(*rows, *ship(records, results_dir, Path(into)), write_readme(Path(into)), sep="\n")
         return 0
     check_results(results_dir)

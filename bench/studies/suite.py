@@ -20,8 +20,8 @@ NOTES = (
     "checkpoint from which the error stays there to the end of the run. Each set weighs the same.",
     "A run ends after the iterations of its set, or at the set's budget of field values; thin lines begin where the "
     "row's runs have ended. A run that did not end ok reaches nothing. A set has one setting and one loss for all.",
-    "Ratios: over the targets that both rows reach, the median over scenes of the geometric mean. Rank 1: not told "
-    "from the first row by flipped signs over scenes, with Holm's correction.",
+    "Ratios: over the targets that both rows reach, the median over scenes of the geometric mean. Less, or not told: "
+    "than the first row, by flipped signs over scenes with Holm's correction at 5 % in all.",
     "Wrong pixels: of the prior's own networks, over the object's; missed, spurious, or .02 scene units off in depth. "
     "They do not count in what is reached.",
 )
@@ -30,9 +30,8 @@ NOTES = (
 def make(*several: Runs | None) -> Result:
     """The chart of all sets and of each, and a line per row."""
     runs = together(*several)
-    kept, problems = read_attempts(runs.results_dir)
-    shipped, _ = read_attempts(paper.SHIPPED)
-    standing = Standing.of_all([*shipped, *kept, *attempts_of(runs.records, runs.results_dir)])
+    attempts, problems = read_attempts(paper.SHIPPED, runs.results_dir)
+    standing = Standing([*attempts, *attempts_of(runs.records, runs.results_dir)])
     lines = [_line(standing, row) for row in standing.rows]
     panels = [_panel(standing, None), *(_panel(standing, name) for name in standing.sets)]
     figure = chart.draw_lead(panels, 5.4)
@@ -58,7 +57,7 @@ def _line(standing: Standing, row: str) -> dict[str, Any]:
     failures, lacking, seconds = standing.failures(row), standing.not_run(row), standing.ratio(row, SECONDS)
     failed = ", ".join(f"{count} {status}" for status, count in failures.most_common())
     return {
-        **{"rank": standing.ranks.get(row), "row": row, "preset": standing.preset(row), "share": standing.share(row)},
+        **{"against": standing.against(row), "row": row, "preset": standing.preset(row), "share": standing.share(row)},
         **{name: standing.share(row, name).value for name in standing.sets},
         **{
             "at_dist": nan if row.endswith(BY_ITSELF) else standing.share_at(row, 1.0),
@@ -83,7 +82,6 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
         return any(line[name] is not None for line in lines)
 
     return [
-        table.Column("rank", "Rank", show=table.whole),
         table.text("row", "Renderer"),
         table.Column(
             "share",
@@ -91,6 +89,7 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
             lambda line: line["share"].value,
             words=_share,
         ),
+        table.text("against", "Against the first"),
         *(
             table.Column(name, f"{name}, {format.plural(standing.scenes(name), 'scene')}", show=table.percent)
             for name in standing.sets
@@ -162,11 +161,13 @@ def _verdict(standing: Standing) -> str:
     if len(standing.ranked) < 2 or not standing.share(standing.ranked[0]).value:
         return ""
     first, *others = standing.ranked
-    told = f"{len(standing.told)} of {len(others)} others" if standing.told else "no other row"
-    said = [f"{first} reaches *{table.percent(standing.share(first).value)}*; {told} can be told from it."]
-    if standing.resolution is not None:
-        scenes = format.plural(standing.scenes(), "scene")
-        said.append(f"{scenes} show differences of {100 * standing.resolution:.0f} points.")
+    scenes, less = format.plural(standing.scenes(), "scene"), len(standing.told)
+    said = [f"{first} reaches *{table.percent(standing.share(first).value)}*."]
+    if standing.resolution is None:
+        said.append(f"{scenes} are too few to tell any row from it.")
+    else:
+        said.append(f"{less or 'None'} of the {len(others)} others can be told to reach less.")
+        said.append(f"{scenes} tell differences of some {100 * standing.resolution:.0f} points.")
     at = sorted(((standing.share_at(row, 1.0), row) for row in standing.ranked), reverse=True)[:3]
     if standing.reference in standing.ranked:
         listed = ", ".join(f"{row} *{table.percent(share)}*" for share, row in at)
@@ -192,9 +193,9 @@ def _doubts(standing: Standing) -> list[str]:
     return [
         f"Not shown, since their set has other settings: runs of {', '.join(other)}." if other else "",
         f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have." if alone else "",
-        "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes; a set without "
-        "one is left out, so there is no rank. Gain: points over its row at the set's setting, at the same problems. A "
-        f"set's chart has the better of two rows that have all its problems, tuned: {', '.join(drawn) or 'none'}."
+        "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes, where there is "
+        "one for a set. Gain: points over its row at the set's setting, at the same problems. A set's chart has the "
+        f"better of two rows that have all its problems, tuned: {', '.join(drawn) or 'none'}."
         if tuned
         else "",
         f"Runs of {versions} versions of the code." if versions > 1 else "",

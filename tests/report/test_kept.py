@@ -9,6 +9,7 @@ import pytest
 from bench.records.read import read_record, read_records
 from bench.report.__main__ import main
 from bench.report.data.kept import HERE, KEPT, join, read_rows, write_rows
+from bench.report.data.records import family
 from bench.report.write import paper
 from tests.report.test_report_paper import DYNAMIC, NAIVE, PARALLEL, bands, costs, write_curve, write_run
 
@@ -48,9 +49,13 @@ def test_a_page_that_needs_run_folders_stays_until_there_are_some(tmp_path):
     write_curve(write_run(own, "fig5", PARALLEL, id="a"), [4, 3, 2, 1], {0: 0.4, 2: 0.1})
     first = ship(own, into)
     assert ship(own, into) == first
-    write_curve(write_run(own, "fig5", DYNAMIC, id="b", minute=5), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
+    for run, minute in (("b", 5), ("c", 6), ("d", 7)):
+        write_curve(write_run(own, "fig5", DYNAMIC, id=run, minute=minute), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
     later = ship(own, into)
     assert PARALLEL in later["fig5.runs.csv"] and PARALLEL not in later["fig5.csv"] and DYNAMIC in later["fig5.csv"]
+    write_curve(write_run(own, "fig5", NAIVE, id="e", minute=9), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
+    last = ship(own, into)  # one run says less than those that the page shows
+    assert NAIVE in last["fig5.runs.csv"] and last["fig5.csv"] == later["fig5.csv"]
 
 
 def test_rows_are_the_records_but_for_what_is_of_the_machine(tmp_path):
@@ -63,7 +68,8 @@ def test_rows_are_the_records_but_for_what_is_of_the_machine(tmp_path):
     write_rows(before, ["gradients", "table1"], tmp_path / "paper")
     after = read_rows(tmp_path / "paper")
     assert [path.name for path in (tmp_path / "paper").iterdir()] == ["gradients.runs.csv"]
-    assert [one["id"] for one in after] == ["a", "b"] and after[0]["config"]["dataset"]["path"] == "chair.obj"
+    assert [one["id"] for one in after] == ["a", "b"] and family(after[0]) == family(before[-1]) == "me/chair.obj"
+    assert str(tmp_path) not in (tmp_path / "paper" / "gradients.runs.csv").read_text()
     for record in after:
         (other,) = (one for one in before if one["id"] == record["id"])
         assert record.keys() - {KEPT} == other.keys() | {"log"}

@@ -331,7 +331,7 @@ def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
     assert main([f"results_dir={tmp_path / 'both'}"]) == 0
     page = Page(tmp_path / "both")
     shown = page.paper("suite")
-    assert [row[1] for row in shown["rows"]] == ["Dist", "Dist, tuned", "Mine"] and shown["chart"]["panels"]
+    assert [row[0] for row in shown["rows"]] == ["Dist", "Dist, tuned", "Mine"] and shown["chart"]["panels"]
     assert "n = 1 problem" in shown["caption"] and "The run ended" not in shown["caption"]
     found = page.read("list", "renderers")
     assert found["problems"] == [["complete", "car test 0, 20 points", 0]] and found["targets"] == 5

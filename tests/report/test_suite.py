@@ -7,12 +7,13 @@ from itertools import permutations
 from math import inf
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bench import merge
 from bench.records.read import read_records
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
-from bench.report.suite.standing import SECONDS, Standing
+from bench.report.suite.standing import SECONDS, Standing, _over_scenes
 from bench.studies.suite import _doubts, _panel
 from bench.suite import _sweeps, main, parsed, show
 from bench.tables import choice, read_yaml
@@ -94,7 +95,7 @@ def test_rows_are_compared_where_all_that_have_the_least_size_have_an_attempt(mo
     whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)]).everything
     mine = [one for one in whole if one.row not in ("Mine", "Part") or one.key[:3] in least]
     standing = Standing([one for one in mine if one.row != "Part" or one.scene == SCENES[0]])
-    assert standing.compared == {*least} and standing.ranks.keys() == {"B", "Dist", "Mine"}
+    assert standing.compared == {*least} and {*standing.ranked} == {"B", "Dist", "Mine"}
     assert standing.lacking("Part") == 5 and standing.rows[-1] == "Part"
     assert len(Standing([one for one in standing.everything if one.row in ("B", "Dist")]).compared) == len(SCENES)
 
@@ -112,7 +113,37 @@ def test_the_chance_of_a_difference_is_that_of_flipped_signs_over_scenes():
     standing = field([("Dist", 0.01, 100.0), ("Lost", 0.5, 1.0)])
     assert standing._chance("Dist", "Lost") == 2 / 2 ** len(SCENES)  # all scenes one way, or all the other way
     assert standing._chance("Dist", "Dist") == 1 and standing.told == {"Lost"}
-    assert field([("Dist", 0.01, 100.0), *((f"L{n}", 0.5, 1.0) for n in range(7))]).told == set()  # Holm: 7 x .0078
+    many = field([("Dist", 0.01, 100.0), *((f"L{n}", 0.5, 1.0) for n in range(7))])
+    assert many.told == set() and many.resolution is None  # Holm: 7 x .0078
+    more = [attempt(row, f"{n}", {0: 1.0, 9: final}) for row, final in (("A", 0.01), ("B", 0.5)) for n in range(40)]
+    assert Standing(more)._chance("A", "B") == 1 / 2**12  # of random signs what was found is one
+
+
+def test_the_resolution_is_what_is_told_in_four_cases_of_five(monkeypatch):
+    standing = Standing([attempt(row, f"{n}", {0: 1.0, 9: 0.1}) for row in "AB" for n in range(12)])
+    drawn = np.random.default_rng(0).normal(size=(400, 12))
+    monkeypatch.setattr(Standing, "_apart", lambda *_: drawn[0] / drawn[0].std(ddof=1))
+    shift, told = standing.resolution / 12, 0
+    for noise in drawn:
+        monkeypatch.setattr(Standing, "_apart", lambda *_, noise=noise: noise + shift)
+        told += standing._chance("A", "B") <= 0.05
+    assert 0.75 < told / len(drawn) < 0.85
+
+
+def test_a_draw_without_a_scene_of_a_set_has_the_share_of_all():
+    reached, every = np.array([[0, 5], *[[0, 0]] * 7]), np.array([[5, 5], *[[5, 0]] * 7])
+    found = _over_scenes(reached, every)
+    assert (found.low, found.value, found.high) == (0.5, 0.5, 0.5)
+
+
+def test_a_run_under_other_settings_takes_no_place_and_a_tuned_one_is_named(tmp_path):
+    runs = [attempt("A", scene, {0: 1.0, 9: 0.01}) for scene in SCENES]
+    other = replace(runs[0], settings="x", started="2027-01-01T00:00:00+00:00", status="oom", final=inf, curve=[])
+    assert Standing([*runs, other]).share("A").value == 1
+    write_attempts([*runs, other], tmp_path)
+    assert len(read_attempts(tmp_path)[0]) == len(runs) + 1
+    write_completion(tmp_path, [0.8, 0.2], method="tuned/dist_mask", settings={"label": "Mine"}, renderer="dist")
+    assert [one.row for one in attempts_of(read_records(tmp_path)[0], tmp_path)] == ["Mine, tuned"]
 
 
 def test_an_error_is_reached_where_it_stays_reached():
@@ -126,8 +157,8 @@ def test_an_error_is_reached_where_it_stays_reached():
 def test_targets_are_shares_of_the_logarithm_between_start_and_reference():
     standing = Standing([attempt("Dist", "s", {0: 100, 7: 10, 9: 1}), attempt("B", "s", {0: 100, 3: 10.5})])
     assert standing.references == {("complete", "s, 20 points"): 1}
-    assert standing.reached["complete", "s, 20 points", 0, "Dist"] == [(7, 0.007), *[(9, 0.009)] * 4]
-    assert standing.reached["complete", "s, 20 points", 0, "B"] == [(inf, inf)] * 5  # 10.5 is above the root of 100
+    assert standing.reached["complete", "s, 20 points", 0, "Dist", ""] == [(7, 0.007), *[(9, 0.009)] * 4]
+    assert standing.reached["complete", "s, 20 points", 0, "B", ""] == [(inf, inf)] * 5  # 10.5 is above the root of 100
 
 
 def test_the_shipped_references_are_used_where_there_are_any():
@@ -137,11 +168,11 @@ def test_the_shipped_references_are_used_where_there_are_any():
     assert all(0 < error < 0.1 for error in known.values())
 
 
-def test_rows_stand_by_what_they_reach_and_have_a_rank_where_they_are_told_from_the_first():
+def test_rows_stand_by_what_they_reach_and_are_told_from_the_first():
     standing = field([("Dist", 0.011, 100.0), ("Exact", 0.01, 300.0), ("Same", 0.011, 100.0), ("Lost", 0.5, 1.0)])
     assert standing.rows == ["Exact", "Dist", "Same", "Lost"]
     assert [standing.share(row).value for row in standing.rows] == [1.0, 0.8, 0.8, 0.0]
-    assert standing.ranks == {"Exact": 1, "Dist": 2, "Same": 3, "Lost": 4} and standing.told == {"Dist", "Same", "Lost"}
+    assert [standing.against(row) for row in standing.rows] == ["first", *["less"] * 3]
     assert standing.ratio("Exact").value == pytest.approx(3) and standing.ratio("Dist") is None
     assert standing.ratio("Lost") is None  # no target that both reach
     assert {*standing.units.values()} == {200}  # of a whole run of Dist
@@ -166,17 +197,18 @@ def test_a_row_that_cost_nothing_has_no_line_and_leaves_the_axis_logarithmic():
     assert [line["name"] for line in panel["series"]] == ["Dist"] and panel["x"]["log"]
 
 
-def test_a_row_without_a_problem_has_no_rank_and_a_failure_reaches_nothing():
+def test_a_row_without_a_problem_is_not_compared_and_a_failure_reaches_nothing():
     whole = field([("Dist", 0.01, 100.0), ("Part", 0.01, 100.0)]).attempts
     standing = Standing([replace(one, status="unsupported") if one.row == "Dist" else one for one in whole[:-1]])
-    assert standing.ranks == {"Dist": 1} and standing.lacking("Part") == 1
+    assert standing.ranked == ["Dist"] and standing.lacking("Part") == 1 and standing.against("Part") == ""
     assert standing.share("Dist").value == 0 and standing.failures("Dist") == {"unsupported": len(SCENES)}
 
 
 def test_problems_that_the_reference_row_lacks_are_not_judged():
     whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]).attempts
-    standing = Standing([*whole, replace(whole[-1], problem="another", scene="another")])
-    assert standing.ranks.keys() == {"Dist", "B"} and len(standing.attempts) == len(whole)
+    of_b = next(one for one in whole if one.row == "B")
+    standing = Standing([*whole, replace(of_b, problem="another", scene="another")])
+    assert {*standing.ranked} == {"Dist", "B"} and len(standing.attempts) == len(whole)
     tweaked = [replace(one, row="A tweak") for one in whole if one.row == "Dist"]
     named = [replace(one, row=DIST) if one.row == "Dist" else one for one in whole]
     assert Standing([*tweaked, *named]).reference == DIST
@@ -198,10 +230,11 @@ def test_seconds_are_compared_on_the_same_machine_alone():
     assert Standing(moved).ratio("Mine", SECONDS) is None and Standing(moved).ratio("Mine").value == pytest.approx(2)
     slow = [[cost, 4 * seconds, error] for cost, seconds, error in whole[0].curve]
     there = [replace(one, cpu="another", curve=slow) for one in whole if one.row == "Dist"]
-    assert Standing(moved, there).ratio("Mine", SECONDS).value == pytest.approx(0.5)
     loaded = [replace(one, waited=0.2) for one in there]
-    assert Standing(moved, loaded).ratio("Mine", SECONDS) is None
-    assert Standing.of_all([*moved, *there]).ratio("Mine", SECONDS).value == pytest.approx(0.5)
+    assert Standing([*moved, *loaded]).ratio("Mine", SECONDS) is None
+    assert Standing([*moved, *there]).ratio("Mine", SECONDS).value == pytest.approx(0.5)
+    others = [replace(one, settings="x", started="2027", curve=[[0, 0, 1.0], [1, 1e-9, 0.01]]) for one in there[1:]]
+    assert Standing([*moved, *there, *others]).ratio("Mine", SECONDS).value == pytest.approx(0.5)
 
 
 def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
@@ -212,7 +245,7 @@ def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
     older = replace(good, started="2026-01-01T00:00:00+00:00")
     other = replace(good, row="A-b")  # whose file has the same name
     for order in permutations([good, failed, older, other]):
-        assert joined(order) == {good.key: failed, other.key: other}
+        assert {one.key: one for one in joined(order)} == {good.key: failed, other.key: other}
     write_attempts([failed, other], tmp_path)
     assert {*map(repr, read_attempts(tmp_path)[0])} == {repr(failed), repr(other)}
     write_attempts([latest := replace(good, started="2026-01-04T00:00:00+00:00")], tmp_path)
@@ -225,7 +258,8 @@ def test_two_halves_merged_are_the_whole(tmp_path):
     write_attempts(whole[:5], tmp_path / "one")
     write_attempts(whole[5:], tmp_path / "two")
     merge.merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
-    assert joined(read_attempts(tmp_path / "both")[0]) == joined(whole)
+    by_key = [sorted(joined(of), key=lambda one: one.key) for of in (read_attempts(tmp_path / "both")[0], whole)]
+    assert by_key[0] == by_key[1]
 
 
 def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
@@ -250,7 +284,7 @@ def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, m
     assert show(tmp_path / "own") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("1 run of ") and "which 1 stand" in said[0]
-    assert said[2].split()[:2] == ["1", "Dist"] and "Mine" in said[3] and Path(said[-2]).is_file()
+    assert said[2].split()[:3] == ["Dist", "100", "%"] and "Mine" in said[3] and Path(said[-2]).is_file()
     data = "".join(path.read_text() for path in (Path(said[-1]).parent / "page" / "data").rglob("*.js"))
     assert "Mine" in data and "Dist" in data  # the page, too, is of the table that was written
     table = (tmp_path / "own" / "paper" / "suite.md").read_text()
@@ -262,7 +296,8 @@ def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, m
     ("argument", "said"),
     [("suite=large", "unknown suite 'large'"), ("setting=tunde", "did you mean tuned"),
      ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
-     ("verify=0", "verify must be"), ("task.optimiser.budget=1e9", "is stated by the suite")],
+     ("verify=0", "verify must be"), ("task.optimiser.budget=1e9", "is stated by the suite"),
+     ("scale=smoke", "is stated by the suite")],
 )  # fmt: skip
 def test_a_wrong_argument_is_told(argument, said, capsys):
     assert main([argument]) == 2
@@ -280,7 +315,7 @@ def test_every_set_is_an_experiment_with_each_size():
         assert {*sizes} - {"chosen"} == {*suite().sizes.values()}
 
 
-def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_rank(monkeypatch):
+def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_comparison(monkeypatch):
     rows = [("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Lost", 0.5, 1.0)]
     for_all = field(rows).everything
     for_all += [replace(one, set="pose") for one in for_all]
@@ -292,7 +327,8 @@ def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_rank(monkeypatch
     ]
     before, standing = Standing(for_all), Standing(for_all + tuned[:-1])
     assert standing.rows == ["B", "B, tuned", "Dist", "Dist, tuned", "Lost", "Lost, tuned"]
-    assert standing.ranks == before.ranks and standing.told == before.told and standing.resolution == before.resolution
+    assert standing.ranked == before.ranked and standing.told == before.told
+    assert standing.resolution == before.resolution
     assert standing.references == before.references and standing.not_run("Lost, tuned") == 1
     assert standing.lacking("Dist, tuned") == len(SCENES) and standing.not_run("Dist, tuned") == 0
     gains = [standing.gain(row) for row in standing.rows[:4]]

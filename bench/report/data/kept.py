@@ -26,15 +26,8 @@ SAME, NONE = "", "-"
 
 def join(records: Iterable[Record], kept: Iterable[Record]) -> list[Record]:
     """One record of each run: the newest that measured something; of the same the one that has its folder."""
-    found: dict[str, Record] = {}
-
-    def rank(record: Record) -> Any:
-        return record["status"] not in NO_ATTEMPTS, started(record)
-
-    for record in [*kept, *records]:
-        other = found.setdefault(record["id"], record)
-        found[record["id"]] = record if rank(record) >= rank(other) else other
-    return sorted(found.values(), key=started, reverse=True)
+    ordered = sorted([*kept, *records], key=lambda record: (record["status"] not in NO_ATTEMPTS, started(record)))
+    return sorted({record["id"]: record for record in ordered}.values(), key=started, reverse=True)
 
 
 def write_rows(records: Iterable[Record], experiments: Iterable[str], folder: Path) -> list[Path]:
@@ -68,7 +61,7 @@ def _cells(value: Any, name: str = "") -> dict[str, str]:
         inner = [_cells(one, f"{name}.{key}".lstrip(".")) for key, one in value.items()]
         return {key: cell for cells in inner for key, cell in cells.items()}
     if isinstance(value, str) and name.startswith("config.") and value.startswith("/"):
-        value = Path(value).name  # of a folder of data
+        value = "/".join(["", *Path(value).parts[-2:]])  # which name the family of a folder of data
     bare = isinstance(value, str) and value not in (SAME, NONE) and _value(value) == value
     return {} if name in HERE else {name: str(value) if bare else json.dumps(plain(value))}
 

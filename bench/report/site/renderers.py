@@ -5,7 +5,6 @@ import re
 import shlex
 from collections.abc import Iterable
 from functools import cache
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +31,7 @@ def renderers(records: list[Record], results_dir: Path) -> dict[str, Any]:
 
 def _found(records: list[Record], results_dir: Path) -> dict[str, Any]:
     own = [(one, record["folder"]) for record in records for one in attempts_of([record], results_dir)]
-    kept = [read_attempts(folder)[0] for folder in (paper.SHIPPED, results_dir)]
-    standing = Standing.of_all([*chain(*kept), *(one for one, _ in own)])
+    standing = Standing([*read_attempts(paper.SHIPPED, results_dir)[0], *(one for one, _ in own)])
     order = [*suite().errors]
     problems = sorted({one.key[:3] for one in standing.judged}, key=lambda key: (order.index(key[0]), *key[1:]))
     folders = {(*one.key, one.started): folder for one, folder in own}

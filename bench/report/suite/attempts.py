@@ -117,8 +117,8 @@ class Attempt:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What there is one attempt of."""
-        return self.set, self.problem, self.seed, self.row
+        """What there is one attempt of: its set, problem, seed, row and settings."""
+        return self.set, self.problem, self.seed, self.row, self.settings
 
     @property
     def ok(self) -> bool:
@@ -158,14 +158,9 @@ def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
     return [one for record in records if (one := _attempt(record, results_dir / "runs" / record["folder"]))]
 
 
-def joined(*several: Iterable[Attempt]) -> dict[tuple[Any, ...], Attempt]:
-    """One attempt of each key: of several the last one, in whatever order."""
-    found: dict[tuple[Any, ...], Attempt] = {}
-    for attempt in (one for attempts in several for one in attempts):
-        other = found.setdefault(attempt.key, attempt)
-        if (attempt.started, repr(attempt)) > (other.started, repr(other)):
-            found[attempt.key] = attempt
-    return found
+def joined(attempts: Iterable[Attempt]) -> list[Attempt]:
+    """One attempt of each key: of several the newest, in whatever order they come."""
+    return [*{one.key: one for one in sorted(attempts, key=lambda one: (one.started, repr(one)))}.values()]
 
 
 def _attempt(record: Record, folder: Path) -> Attempt | None:
@@ -182,9 +177,10 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     tuned = str(record.get("method") or "").startswith(TUNED)
     asked = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
     changed = [text.removeprefix("renderer.") for text in asked if re.match(r"renderer\.[^_]", text)]
+    row = ", ".join([renderer_name(config, record["renderer"]), *changed])  # without the loss, which is the set's
     return Attempt(
         **{"set": of_set, "problem": ", ".join([scene, *named]), "scene": scene, "seed": record["seed"]},
-        row=", ".join([renderer_name(config, record["renderer"]), *changed]),  # without the loss, which is the set's
+        row=row.removesuffix(BY_ITSELF) + BY_ITSELF if tuned else row,
         preset=record["renderer"] if tuned else record.get("method") or record["renderer"],
         status=str(record["status"]),
         reason=record["reason"],
@@ -249,7 +245,7 @@ def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]
     if problems:
         raise ValueError(f"{folder} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
     files = grouped(
-        joined(attempts, kept).values(), lambda one: re.sub(r"[^a-z0-9]+", "_", one.row.lower()).strip("_") or "row"
+        joined([*kept, *attempts]), lambda one: re.sub(r"[^a-z0-9]+", "_", one.row.lower()).strip("_") or "row"
     )
     folder.mkdir(parents=True, exist_ok=True)
     return [_write(folder / f"{name}.csv", own) for name, own in sorted(files.items())]
@@ -269,10 +265,10 @@ def _cell(value: Any) -> Any:
     return value if isinstance(value, str) else json.dumps(plain(value))
 
 
-def read_attempts(results_dir: Path) -> tuple[list[Attempt], list[str]]:
-    """The attempts that a results folder keeps, and a message for each file that cannot be read."""
+def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
+    """The attempts that results folders keep, and a message for each file that cannot be read."""
     found, problems = list[Attempt](), list[str]()
-    for path in sorted(place(results_dir).glob("[!.]*.csv")):
+    for path in (path for folder in folders for path in sorted(place(folder).glob("[!.]*.csv"))):
         try:
             with path.open(encoding="utf-8", newline="") as file:
                 found += [_read(line) for line in csv.DictReader(file)]

@@ -7,14 +7,14 @@ set of problems weighs the same. Renderings, which have no course, stand apart: 
 """
 
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from math import inf, isfinite, nan
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from bench.report.data import statistics
 from bench.report.data.records import grouped
@@ -26,29 +26,22 @@ REFERENCE = "dist"  # the preset of the row by whose costs others are divided
 LEAST_SIZE = "quick"  # a row that has its problems is judged
 COST, SECONDS = 0, 1  # places in what a target was reached at
 FLIPS = 12  # most scenes of which all signs are tried; of more, as many random ones as there are of these
-POWERFUL = 1.43  # over half of a 95 % interval: a difference that is found in four cases of five
+POWER = 0.8  # the share of cases in which a difference of the resolution is found
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Attempts of several rows, one of each at a problem and seed.
+    """The newest attempts of several rows at problems and seeds.
 
     Rows are compared at the problems that all of them have, but for rows that lack some of the least size: these are
     `lacking`. Attempts under other settings than most of the set's are not judged.
 
     Args:
-        everything: those at problems that the reference row has no attempt at are not judged.
-        clocks: attempts of the reference row on other machines too, by whose seconds those of other rows are divided.
+        everything: in any order, also several of a key. Those at problems that the reference row has no attempt at are
+            not judged. Seconds are divided by those of the reference row on the same machine, of whatever age.
     """
 
     everything: list[Attempt]
-    clocks: list[Attempt] = field(default_factory=list)
-
-    @classmethod
-    def of_all(cls, attempts: Iterable[Attempt]) -> "Standing":
-        """Of attempts that may have several at a key."""
-        every = [*attempts]
-        return cls([*joined(every).values()], every)
 
     @cached_property
     def reference(self) -> str | None:
@@ -58,13 +51,20 @@ class Standing:
         return label if label in rows else next(iter(rows), None)
 
     @cached_property
-    def alike(self) -> list[Attempt]:
-        """The attempts under the settings that most attempts of their set have."""
-        settings = {
+    def _settings(self) -> dict[tuple[str, bool], str]:
+        """Of each set, and of its tuned rows, the settings that most attempts have."""
+        return {
             part: max(Counter(one.settings for one in own).items(), key=lambda found: (found[1], found[0]))[0]
-            for part, own in grouped(self.everything, lambda one: (one.set, one.tuned)).items()
+            for part, own in grouped(joined(self.everything), lambda one: (one.set, one.tuned)).items()
         }
-        return [one for one in self.everything if one.settings == settings[one.set, one.tuned]]
+
+    def _is_alike(self, one: Attempt) -> bool:
+        return one.settings == self._settings[one.set, one.tuned]
+
+    @cached_property
+    def alike(self) -> list[Attempt]:
+        """The newest attempt of each row at each problem and seed, under the settings that most of its set have."""
+        return joined(filter(self._is_alike, self.everything))
 
     @cached_property
     def _known(self) -> dict[str, set[tuple[Any, ...]]]:
@@ -249,13 +249,13 @@ class Standing:
         """
         if self.reference in (None, row):
             return None
-        known = [*self.clocks, *self.everything] if of == SECONDS else self.everything
 
         def place(one: Attempt) -> tuple[Any, ...]:
             return (*one.key[:3], one.machine if of == SECONDS else "")
 
-        counts = [one for one in known if of == COST or one.timed]
-        others = {place(one): one for one in counts if one.row == self.reference}
+        timed = [one for one in self.everything if one.timed and self._is_alike(one)]
+        known = sorted(timed, key=lambda one: one.started) if of == SECONDS else self.alike
+        others = {place(one): one for one in known if one.row == self.reference}
         scenes: dict[str, list[tuple[float, float]]] = {}
         for one in self.of(row):
             if (other := others.get(place(one))) is None or (of == SECONDS and not one.timed):
@@ -278,30 +278,45 @@ class Standing:
         found = statistics.holm([self._chance(first, row) for row in others])
         return {row for row, is_told in zip(others, found, strict=True) if is_told}
 
+    def against(self, row: str) -> str:
+        """What is known of a row's share beside the first's; nothing of a row that lacks problems."""
+        if row not in self.ranked:
+            return ""
+        return "first" if row == self.ranked[0] else "less" if row in self.told else "not told"
+
     def _chance(self, first: str, second: str) -> float:
         """The probability of as large a difference of shares where each scene's has either sign (permutation test)."""
-        reached, every = self._solved(self.of(first))
-        apart = (reached - self._solved(self.of(second))[0]) / every.sum(axis=0)
-        by_scene = apart.sum(axis=1)
+        by_scene = self._apart(first, second)
         if len(by_scene) <= FLIPS:
             signs = np.array([*product((1, -1), repeat=len(by_scene))])
         else:
             signs = np.random.default_rng(0).choice((1, -1), (2**FLIPS, len(by_scene)))
+            signs[0] = 1  # what was found is one of them
         return float(np.mean(np.abs(signs @ by_scene) >= abs(by_scene.sum()) - 1e-12))
 
+    def _apart(self, first: str, second: str) -> np.ndarray:
+        """What each scene [scenes] adds to the difference of two rows' shares."""
+        reached, every = self._solved(self.of(first))
+        apart = (reached - self._solved(self.of(second))[0]) / every.sum(axis=0)
+        return apart.mean(axis=1)
+
     @cached_property
-    def ranks(self) -> dict[str, int]:
-        """The rank of each ranked row: 1 where it is not told from the first, else its place."""
-        return {row: place if row in self.told else 1 for place, row in enumerate(self.ranked, 1)}
+    def _level(self) -> float:
+        """The chance below which the first row of Holm's steps is told."""
+        return (1 - statistics.LEVEL) / max(len(self.ranked) - 1, 1)
 
     @cached_property
     def resolution(self) -> float | None:
-        """The difference of shares that so many scenes show in four cases of five, in the median of rows."""
+        """The difference of shares at which a row is told in four cases of five, in the median of rows.
+
+        As by a t-test over scenes at the level of Holm's first step. None where there are too few scenes
+        to tell any row from the first, however far it is behind.
+        """
         first, *others = self.ranked or [""]
-        one = self._solved(self.of(first))
-        found = [_over_scenes(one[0] - self._solved(self.of(row))[0], one[1]) for row in others]
-        known = [each.high - each.low for each in found if each.known]
-        return POWERFUL * float(np.median(known)) / 2 if known else None
+        if not others or 2 / 2 ** self.scenes() > self._level:
+            return None
+        spreads = [float(np.std(self._apart(first, row), ddof=1)) * self.scenes() ** 0.5 for row in others]
+        return float(sum(stdtrit(self.scenes() - 1, (1 - self._level / 2, POWER))) * np.median(spreads))
 
 
 def _over_scenes(reached: np.ndarray, every: np.ndarray) -> Interval:
@@ -312,8 +327,7 @@ def _over_scenes(reached: np.ndarray, every: np.ndarray) -> Interval:
     def mean(drawn: Any) -> Any:  # of numbers of scenes [..., n]
         places = np.asarray(drawn, dtype=int)
         of = reached[places].sum(axis=-2), every[places].sum(axis=-2)
-        known = of[1] > 0
-        shares = np.divide(of[0], of[1], out=np.zeros_like(of[0]), where=known)
-        return shares.sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
+        shares = np.tile(reached.sum(axis=0) / every.sum(axis=0), (*of[0].shape[:-1], 1))  # of a set not drawn
+        return np.divide(*of, out=shares, where=of[1] > 0).mean(axis=-1)
 
     return statistics.bootstrap([np.array([place]) for place in range(len(every))], mean, seed=0)

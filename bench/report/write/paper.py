@@ -59,7 +59,7 @@ class Study:
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
         """The result of each page; none where there is no run of it, and no row is kept.
 
-        A page that needs run folders is made of the runs that have theirs.
+        A page that needs run folders is made of the runs that have theirs; it is left out where these are the fewer.
         """
         chosen: list[Runs | None] = [choose(records, selection, results_dir) for selection in self.reads]
         if not any(runs is not None for runs in chosen):
@@ -71,8 +71,13 @@ class Study:
             try:
                 found[name] = make(*chosen)
             except NoFolder:
-                found |= replace(self, pages={name: make}).results([r for r in records if KEPT not in r], results_dir)
+                own = [record for record in records if KEPT not in record]
+                if 2 * self._count(own, results_dir) >= self._count(records, results_dir):
+                    found |= replace(self, pages={name: make}).results(own, results_dir)
         return found
+
+    def _count(self, records: list[dict[str, Any]], results_dir: Path) -> int:
+        return sum(len(runs.records) for one in self.reads if (runs := choose(records, one, results_dir)))
 
 
 @cache
