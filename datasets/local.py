@@ -62,13 +62,7 @@ class LocalMeshes:
     def files(self, split: Split) -> list[Path]:
         """The files of a split; splits share none, unless there are fewer than three."""
         files = find_meshes(self.path)
-        order = [files[i] for i in np.random.default_rng(0).permutation(len(files))]
-        if len(files) == 1:
-            return order
-        held = max(1, round(HELD_OUT * len(files)))
-        test, rest = order[:held], order[held:]
-        validation, train = (rest[:held], rest[held:]) if len(rest) > held else (rest, rest)
-        return {Split.TEST: test, Split.VALIDATION: validation, Split.TRAIN: train}[split]
+        return files if len(files) == 1 else deal(files)[split]
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: the files' contents, not their paths."""
@@ -80,6 +74,15 @@ class LocalMeshes:
             "radius": self.radius,
             "strength": self.strength,
         }
+
+
+def deal(files: list[Path]) -> dict[Split, list[Path]]:
+    """Distributes files over the splits; those of validation and of training are the same where there are too few."""
+    order = [files[i] for i in np.random.default_rng(0).permutation(len(files))]
+    held = max(1, round(HELD_OUT * len(files)))
+    test, rest = order[:held], order[held:]
+    validation, train = (rest[:held], rest[held:]) if len(rest) > held else (rest, rest)
+    return {Split.TEST: test, Split.VALIDATION: validation, Split.TRAIN: train}
 
 
 @lru_cache(maxsize=64)

@@ -10,6 +10,7 @@ from jaxtyping import Int
 from datasets.mesh import Mesh
 from datasets.scene import Truth, sample_surface
 
+WRAPPED = "wrapped"  # begins the note of a mesh whose inside is what a closed surface around it encloses
 WELD = 1e-6  # of the diagonal: vertices closer than this, about ten float32 steps, are merged
 THIN = 2e-6  # of the diagonal: a closed part of less mean thickness encloses nothing
 WRAP_ALPHAS = (8.0, 4.0, 2.0, 1.0)  # % of the diagonal: gaps up to this width are closed by a wrap; coarse to fine
@@ -184,7 +185,7 @@ def _wrap(mesh: Mesh, reason: str) -> Mesh:
                 break
         wrapped, used = finer, alpha
     how = f"a closed surface shrunk around it, {WRAP_OFFSET:g} % of the diagonal outside, over gaps up to {used:g} %"
-    return with_note(wrapped, f"wrapped: {how}, since {reason}")
+    return with_note(wrapped, f"{WRAPPED}: {how}, since {reason}")
 
 
 def _wrap_flat(mesh: Mesh) -> Mesh:

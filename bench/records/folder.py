@@ -35,6 +35,7 @@ PASSIVE = (
 NO_STRESS = "none"
 FILE_KEYS = ("path", "image_path", "mask_path", "truth", "codes")  # of files that a run reads
 IN_FOLDERS = ("*", "ModelParameters/*", "LatentCodes/*")  # and of a folder those of DeepSDF
+ARCHIVES = (".zip", ".tar", ".gz")  # which are left out of it: gigabytes that no run reads
 FIELD = "field.safetensors"  # of a run's folder, which alone is read of it; see `datasets.field_files`
 LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVE = 64 * 1024  # bytes kept free, so that the record can still be written when the disk has become full
@@ -74,7 +75,11 @@ class Identity:
         named = [str(package) for package in self.config.get("packages") or []]
         named += [target.split(".")[0] for target in _values(self.config, "_target_")]
         users = tuple(sorted(set(named) - set(OURS)))
-        files = [_content(Path(path)) for key in FILE_KEYS for path in _values(self.config, key)]
+        dataset = self.config.get("dataset") or {}
+        read = [path for key in FILE_KEYS for path in _values(self.config, key)]
+        read += _values(dataset, "split")  # a list of shapes; that of a run is a word
+        files = [_content(Path(path)) for path in read]
+        files += [_classes(str(dataset["path"]))] if "synset" in dataset else []
         return digest([_our_code(), *(_package(name) for name in users), *files])
 
 
@@ -235,10 +240,16 @@ def _content(path: Path) -> str:
             return _content(path / FIELD)
         if path.is_dir():
             found = [child for part in IN_FOLDERS for child in sorted(path.glob(part)) if child.is_file()]
-            return digest([_content(child) for child in found])
+            return digest([_content(child) for child in found if child.suffix not in ARCHIVES])
         return digest([path.name, hashlib.sha256(path.read_bytes()).hexdigest()])
     except OSError:
         return ""
+
+
+@lru_cache
+def _classes(path: str) -> str:
+    """Hash of how many shapes each class of a folder has: whether more of ShapeNet was unpacked."""
+    return digest([f"{folder.name} {len([*folder.iterdir()])}" for folder in sorted(Path(path).glob("*/"))])
 
 
 def _values(node: Any, name: str) -> list[str]:

@@ -14,7 +14,7 @@ from bench.pictures import style
 from bench.records import format
 from bench.records.read import read_plans
 from bench.report.data import statistics
-from bench.report.data.records import SCALE, RunKey, by_shape, error, setting, shape
+from bench.report.data.records import SCALE, SHAPENET, RunKey, by_shape, error, setting, shape
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, geometric_mean
 from bench.report.write import chart
@@ -240,7 +240,8 @@ class Compared:
             ]
             found += [line for line in self.lines if line["family"] == name]
             found += [
-                empty | {"row": f"published: {row}"} | numbers for row, numbers in published.get(name, {}).items()
+                empty | {"row": f"published: {row}"} | numbers
+                for row, numbers in published.get(name.removeprefix(SHAPENET), {}).items()
             ]
         return found
 

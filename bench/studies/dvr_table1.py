@@ -1,6 +1,6 @@
 """Table 1 and Figs. 4 and 5 of DVR: shape from one image, by what the training may know."""
 
-from bench.report.data.records import Record, Row, error, grouped, row_of
+from bench.report.data.records import SHAPENET, Record, Row, error, grouped, row_of
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, single_view, table
 
 PLACE = 41
@@ -41,7 +41,7 @@ def make(runs: Runs) -> Result:
     of_family = {name: single_view.lines_of(runs, name, single_view.BASELINES) for name in runs.families()}
     lines = []
     for name, own in of_family.items():
-        published = PUBLISHED.get(name.partition("/")[0], {}).items()
+        published = PUBLISHED.get(name.removeprefix(SHAPENET), {}).items()
         lines += own
         lines += [{"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published]
     return Result(

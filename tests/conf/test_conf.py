@@ -20,6 +20,7 @@ from renderers import DIST, Naive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 from tests.composing import composed
+from tests.datasets.test_shapenet import write_shapenet
 from tests.looped import each
 from tests.made_scans import write_scans
 
@@ -76,7 +77,8 @@ def paths(tmp_path_factory) -> dict[str, str]:
     mesh, scans = tmp_path_factory.mktemp("mesh") / "box.obj", tmp_path_factory.mktemp("scans")
     trimesh.creation.box().export(mesh)
     photos = network = str(mesh.parent)  # whose content is not read to build it
-    return {"mesh": str(mesh), "photos": photos, "scans": str(write_scans(scans)), "network": network}
+    found = {"mesh": str(mesh), "photos": photos, "scans": str(write_scans(scans)), "network": network}
+    return found | {"shapenet": str(write_shapenet(tmp_path_factory.mktemp("shapenet")))}
 
 
 @cache

@@ -110,6 +110,16 @@ def test_families_and_both_tasks_share_a_table(tmp_path):
     ]
 
 
+def test_a_class_of_shapenet_has_the_published_numbers_of_its_family(tmp_path):
+    settings = {"task": {"points": "20", "_target_": "completion"}, "index": 0}
+    settings["dataset"] = {"path": "/some/where/ShapeNetCore.v2", "synset": "sofa"}
+    run = {"task": "completion", "dataset": "shapenet", "metrics": {"chamfer_l2": 0.005}, "settings": settings}
+    write_run(tmp_path, "table2", REFERENCE, **run)
+    result = page_of(tmp_path, "table2")
+    assert cell(result, REFERENCE, "20 pts") == "5.00" and set(result.table["Family"]) == {"shapenet_sofa"}
+    assert cell(result, "published: DIST with mask", "20 pts") == "4.94"
+
+
 def test_captions_name_what_varies_and_a_try_at_smoke(tmp_path):
     def caption():
         return page_of(tmp_path, "table2").caption

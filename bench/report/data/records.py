@@ -12,6 +12,7 @@ from bench.records.record import as_number, row_name
 
 SCALE = 1000.0  # of Chamfer distances, in tables and figures
 ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
+SHAPENET = "shapenet_"  # beginning of the families of `dataset=shapenet`; the class follows
 OURS = "renderers."  # beginning of the targets of this project's renderers
 Record = dict[str, Any]
 RunKey = tuple[Any, ...]  # solid, view, seed, and further conditions, such as the number of points
@@ -46,8 +47,10 @@ def base_renderer(record: Record) -> str:
 
 
 def family(record: Record) -> str:
-    """The name of the record's dataset: the family, or the end of the path of a mesh file or folder."""
-    path = setting(record["config"], "dataset", "path")
+    """The name of the record's dataset: the family, a class of ShapeNet, or the end of the path of meshes."""
+    path, synset = (setting(record["config"], "dataset", key) for key in ("path", "synset"))
+    if synset:
+        return f"{SHAPENET}{synset}"
     return "/".join(Path(str(path)).absolute().parts[-2:]) if path else record["dataset"]
 
 

@@ -1,0 +1,179 @@
+"""ShapeNetCore in its own layout, with the lists of DeepSDF, Choy and PMO."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from bench.records.folder import Identity, _classes
+from bench.report.data.records import family
+from datasets import repair
+from datasets.scene import Split
+from datasets.shapenet import ShapeNet
+from tests.run.driving import command, record_of
+
+SOFA, TABLE = "04256520", "04379243"
+IDS = [f"{number:02x}a9" for number in (11, 3, 7, 12, 5, 10)]  # on disk; in no order
+TINY = (
+    "scale=smoke", "isolation=off", "threads=1", "field=box", "view.resolution=12", "task.points=20",
+    "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null", "evaluation.picture=null",
+    "task.optimiser.iterations=2",
+)  # fmt: skip
+
+
+def write_shape(
+    folder: Path, synset: str, name: str, version: int = 2, *, shape: trimesh.Trimesh | None = None
+) -> None:
+    """A shape as v1 or v2 of ShapeNetCore has it; a box whose second side is longer the larger its id."""
+    place = folder / synset / name / ("models" if version == 2 else "")
+    place.mkdir(parents=True)
+    box = trimesh.creation.box((1.0, 0.3 + int(name[:2], 16) / 40, 0.4)).apply_translation((0.2, 0.1, -0.3))
+    (box if shape is None else shape).export(place / ("model_normalized.obj" if version == 2 else "model.obj"))
+
+
+def write_shapenet(folder: Path, version: int = 2) -> Path:
+    for name in IDS:
+        write_shape(folder, SOFA, name, version)
+    write_shape(folder, TABLE, "01ff", version)
+    (folder / "taxonomy.json").write_text("[]")
+    return folder
+
+
+def write_split(file: Path, names: list[str], synset: str = SOFA) -> Path:
+    file.write_text(json.dumps({"ShapeNetV2": {synset: names}}))
+    return file
+
+
+def shapenet(folder: Path, split: Path | None = None, **changes: str) -> ShapeNet:
+    given = {"path": str(folder), "synset": "sofa", "split": split and str(split), "normalised": "deepsdf"}
+    return ShapeNet(**given | changes)
+
+
+def ids(dataset: ShapeNet, split: Split) -> list[str]:
+    return [file.relative_to(dataset.folder).parts[0] for file in dataset.files[split]]
+
+
+@pytest.fixture(scope="module")
+def v2(tmp_path_factory) -> Path:
+    return write_shapenet(tmp_path_factory.mktemp("ShapeNetCore.v2"))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_both_releases_are_found_and_all_shapes_dealt_out(tmp_path, version):
+    dataset = shapenet(write_shapenet(tmp_path, version))
+    dealt = {split: ids(dataset, split) for split in Split}
+    assert sorted(name for names in dealt.values() for name in names) == sorted(IDS) and all(dealt.values())
+    assert dataset.name == shapenet(tmp_path, synset=SOFA).name == "shapenet_sofa"
+    mesh = dataset.mesh(Split.TEST, 0)
+    assert mesh.watertight and mesh.repairs[0] == f"the shape is {dealt[Split.TEST][0]}"
+
+
+def test_shapes_are_placed_as_by_deepsdf_or_onet(v2, tmp_path):
+    split = write_split(tmp_path / "split.json", IDS[:1])
+    ball = shapenet(v2, split).mesh(Split.TEST, 0)
+    assert np.linalg.norm(ball.vertices, axis=1).max() == pytest.approx(1 / 1.03, abs=1e-6)
+    cube = shapenet(v2, split, normalised="onet").mesh(Split.TEST, 0)
+    for mesh in (ball, cube):
+        assert mesh.vertices.min(axis=0) == pytest.approx(-mesh.vertices.max(axis=0), abs=1e-6)
+        assert np.ptp(mesh.vertices, axis=0)[[1, 2]] / np.ptp(mesh.vertices[:, 0]) == pytest.approx([0.575, 0.4])
+    assert np.ptp(cube.vertices, axis=0).max() == pytest.approx(1)
+
+
+def test_a_shape_without_an_inside_has_a_warning_and_is_placed_by_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(repair, "WRAP_ALPHAS", (8.0,))
+    walls = trimesh.creation.box((1.0, 1.0, 1.0))
+    walls.update_faces([0, 1, 2, 3, 6, 7, 9])  # which do not close
+    write_shape(tmp_path, SOFA, "01aa", shape=walls)
+    write_shape(tmp_path, SOFA, "02aa")
+    dataset = shapenet(tmp_path, write_split(tmp_path / "split.json", ["01aa", "02aa"]))
+    wrapped, box = (dataset.mesh(Split.TEST, index) for index in (0, 1))
+    told = [" ".join(mesh.repairs) for mesh in (wrapped, box)]
+    assert ["warning: the file does not say what is inside" in notes for notes in told] == [True, False]
+    assert 1 / 1.03 + 1e-3 < np.linalg.norm(wrapped.vertices, axis=1).max() < 1 / 1.03 + 1e-2  # a wrap lies outside
+
+
+def test_the_split_of_deepsdf_gives_the_order_and_its_training_list_the_others(v2, tmp_path):
+    test = write_split(tmp_path / "sv2_sofas_test.json", [IDS[2], IDS[0]])
+    alone = shapenet(v2, test)
+    assert ids(alone, Split.TEST) == [IDS[2], IDS[0]]
+    others = [*ids(alone, Split.TRAIN), *ids(alone, Split.VALIDATION)]
+    assert len({*others} - {IDS[2], IDS[0]}) == len(others) == 3
+    train = write_split(tmp_path / "sv2_sofas_train.json", IDS[3:])
+    for file in (test, train):
+        both = shapenet(v2, file)
+        assert ids(both, Split.TEST) == [IDS[2], IDS[0]]
+        assert sorted([*ids(both, Split.TRAIN), *ids(both, Split.VALIDATION)]) == sorted(IDS[3:])
+    assert both.identity() != alone.identity()
+
+
+def test_a_prior_may_take_a_shape_twice_and_a_test_may_not(v2):
+    dataset = shapenet(v2)
+    first, again = (dataset.mesh(Split.TRAIN, index) for index in (0, len(dataset.files[Split.TRAIN])))
+    assert first.repairs == again.repairs
+    with pytest.raises(ValueError, match=r"shapenet_sofa has 1 test shapes in .*, and none of number 1: set a smaller"):
+        dataset.mesh(Split.TEST, 1)
+    with pytest.raises(ValueError, match="shapenet_table has 0 train shapes"):
+        shapenet(v2, synset="table").mesh(Split.TRAIN, 0)
+
+
+@pytest.mark.parametrize("line", ["{id}", "04256520 {id}", "04256520/{id}"], ids=["choy", "pmo", "path"])
+def test_lists_have_a_line_for_each_id(v2, tmp_path, line):
+    other = [] if line == "{id}" else [line.format(id="01ff").replace(SOFA, TABLE)]
+    (tmp_path / "test.lst").write_text("\n".join([*other, *(line.format(id=name) for name in IDS[:3])]) + "\n")
+    assert ids(shapenet(v2, tmp_path / "test.lst"), Split.TEST) == IDS[:3]
+
+
+def test_shapes_that_are_not_on_disk_are_counted_and_left_out(v2, tmp_path):
+    split = write_split(tmp_path / "split.json", ["0dead", IDS[1], "0bad", IDS[4]])
+    dataset = shapenet(v2, split)
+    assert ids(dataset, Split.TEST) == [IDS[1], IDS[4]]
+    assert "2 shapes of the list are not on disk, and left out, such as 0bad" in dataset.mesh(Split.TEST, 1).repairs[1]
+    assert not any("left out" in note for note in dataset.mesh(Split.TRAIN, 0).repairs)
+
+
+@pytest.mark.parametrize(("given", "told"), [
+    ({"synset": "sofas"}, "dataset.synset must be one of plane, .* sofa"),
+    ({"synset": "car"}, "02958343' has no ID/models/model_normalized.obj .*: give the folder of ShapeNetCore"),
+    ({"path": "nowhere"}, "'nowhere/04256520' has no ID/models"),
+    ({"normalised": "atlasnet"}, "dataset.normalised must be one of deepsdf, onet"),
+    ({"split": "nowhere.lst"}, "there is no file 'nowhere.lst': give a split of DeepSDF"),
+    ({"split": "tables.json"}, "has nothing of sofa, but table: set dataset.synset to it"),
+    ({"split": "broken.json"}, "broken.json' cannot be read as a split of DeepSDF or a list"),
+    ({"split": "other.lst"}, "none of the 2 test shapes is in .*04256520', such as 0bad: unpack them there"),
+    ({"split": "empty.lst"}, "has nothing of sofa, but nothing"),
+], ids=lambda value: " ".join(value.values()) if isinstance(value, dict) else "")  # fmt: skip
+def test_what_is_missing_is_named_with_a_remedy(v2, tmp_path, monkeypatch, given, told):
+    monkeypatch.chdir(tmp_path)
+    write_split(tmp_path / "tables.json", ["01ff"], TABLE)
+    for name, text in {"broken.json": '{"ShapeNetV2": {', "other.lst": "0bad\n0dead\n", "empty.lst": "\n"}.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=told):
+        shapenet(v2, **given)
+
+
+def test_a_run_completes_a_shape_and_says_which(v2, tmp_path):
+    write_split(tmp_path / "sofas_test.json", IDS[:2])
+    named = (f"dataset.path={v2}", f"dataset.split={tmp_path}/${{dataset.synset}}s_test.json", "index=1")
+    record = record_of(command("dataset=shapenet", *named, f"results_dir={tmp_path / 'r'}", *TINY).out)
+    assert record["status"] == "ok" and record["scene"] == "shapenet_sofa test 1"
+    assert family(record) == "shapenet_sofa" and f"the shape is {IDS[1]}" in record["notes"]
+
+
+def test_a_run_is_another_one_where_the_list_or_the_shapes_on_disk_are_others(tmp_path):
+    folder = write_shapenet(tmp_path / "ShapeNetCore.v2")
+    split = write_split(tmp_path / "test.json", IDS[:2])
+
+    def code() -> str:
+        _classes.cache_clear()  # which is that of one command
+        dataset = {"path": str(folder), "synset": "sofa", "split": str(split)}
+        return Identity(dict.fromkeys(("task", "renderer", "dataset"), "x"), {"dataset": dataset}).code
+
+    first = code()
+    (folder / "02958343.zip").write_bytes(b"packed")
+    assert code() == first  # gigabytes that are not read
+    write_shape(folder, SOFA, "14a9")
+    second = code()
+    write_split(split, IDS[1:3])
+    assert len({first, second, code()}) == 3
