@@ -9,6 +9,7 @@ import trimesh
 from PIL import Image
 
 from tests.datasets.test_captures import idr
+from tests.datasets.test_shapenet import IDS, write_shapenet, write_split
 from tests.made_scans import write_scans
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,7 +78,8 @@ def anchors(text: str) -> set[str]:
 
 def make_files(folder: Path) -> dict[str, str]:
     """Makes what the words of commands stand for, in a folder; gives the path of each word."""
-    for name in ("captures", "scans", "chairs", "mine/conf/renderer", "mine/conf/task", "mine/conf/experiment"):
+    mine = (f"mine/conf/{group}" for group in ("renderer", "task", "experiment", "dataset"))
+    for name in ("captures", "scans", "chairs", *mine):
         (folder / name).mkdir(parents=True)
     idr(folder / "captures")
     write_scans(folder / "scans")
@@ -91,12 +93,16 @@ def make_files(folder: Path) -> dict[str, str]:
     named = dict.fromkeys(("YOURS.obj", "cow.obj", "spot.obj"), folder / "one.obj")
     named |= {"FOLDER": folder / "captures", "chairs/": folder / "chairs", "my_conf": folder / "mine" / "conf"}
     named |= {"FILE": folder / "picture.png", "MASK": folder / "mask.png"}
+    shapenet = write_shapenet(folder / "ShapeNetCore.v2")
+    named |= {shapenet.name: shapenet, "SPLIT": write_split(folder / "sofas_test.json", IDS[:2])}
     (folder / "mine" / "my_package.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
     (folder / "mine" / "mypkg.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
     (folder / "mine" / "mytask.py").write_text(code_of("CONTRIBUTING.md", "python")[1])
-    yaml = dict(zip(("task", "experiment"), code_of("CONTRIBUTING.md", "yaml"), strict=True))
+    (folder / "mine" / "mydata.py").write_text(code_of("CONTRIBUTING.md", "python")[3])
+    yaml = dict(zip(("task", "experiment", "dataset"), code_of("CONTRIBUTING.md", "yaml"), strict=True))
     for group, text in yaml.items():
-        (folder / "mine" / "conf" / group / "coverage.yaml").write_text(text)
+        name = "rings" if group == "dataset" else "coverage"
+        (folder / "mine" / "conf" / group / f"{name}.yaml").write_text(text)
     mine = "_target_: my_package.Mine\n_label_: Mine\nsteps: 40\n"
     (folder / "mine" / "conf" / "renderer" / "mine.yaml").write_text(mine)
     return {word: str(path) for word, path in named.items()} | {"SCANS": str(folder / "scans")}

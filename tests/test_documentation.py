@@ -172,6 +172,14 @@ def test_the_task_of_contributing_counts_what_it_says(own_task):
     assert list(runs.status) == ["ok"] * 2 and (runs.hits > 100).all()
 
 
+def test_the_dataset_of_contributing_is_completed(made, tmp_path):
+    (command,) = [command for command in COMMANDS if "dataset=rings" in command.words]
+    done = typed(*filled(command, made), *SMALL, "field=box", f"results_dir={tmp_path}")
+    assert done.out, done.err
+    record = bench.load(tmp_path).iloc[0]
+    assert record.scene == "rings test 0" and record.status in ENDED
+
+
 def test_the_study_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
     (tmp_path / "coverage.py").write_text(code_of("CONTRIBUTING.md", "python")[2])
     monkeypatch.setattr(paper, "STUDIES", tmp_path)
