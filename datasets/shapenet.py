@@ -8,11 +8,16 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from datasets.captures.formats import find_layout
+from datasets.captures.take import take
 from datasets.local import VERSION, deal
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.meshes import load_mesh, read_mesh
 from datasets.repair import WRAPPED
 from datasets.scene import Split
+from datasets.shot import Shot
 from renderers.checks import BadInput, check_choice
 
 SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
@@ -40,12 +45,14 @@ class ShapeNet:
         synset: a name of `SYNSETS`, or a number.
         split: a list of ids; see `_lists`. None: all shapes are dealt out.
         normalised: "deepsdf", into the unit sphere, or "onet", into a cube of side 1.
+        renders: a folder with `SYNSET/ID` of DVR's data or of NMR's as DVR has it, for `task=single_view`.
     """
 
     path: str
     synset: str
     split: str | None
     normalised: str
+    renders: str | None = None
 
     def __post_init__(self) -> None:
         check_choice("dataset.normalised", self.normalised, NORMALISED)
@@ -65,17 +72,27 @@ class ShapeNet:
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """A shape as a closed mesh; its `repairs` say which one it is, what its list lacks, and what was repaired."""
+        file = self._file(split, index)
+        mesh, told = _load(file, self.normalised), [f"the shape is {_id(file)}"]
+        if lost := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
+            told.append(f"warning: {len(lost)} shapes of the list are not on disk, and left out, such as {min(lost)}")
+        return replace(mesh, repairs=(*told, *mesh.repairs))
+
+    def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
+        """See `Pictured`."""
+        if self.renders is None:
+            return None
+        folder = Path(self.renders) / self.folder.name / _id(self._file(split, index))
+        return tuple(take(frame, longest).within(np.zeros(3), 1.0) for frame in find_layout(folder).frames)
+
+    def _file(self, split: Split, index: int) -> Path:
         files = self.files[split]
         if not files or (index >= len(files) and split is Split.TEST):
             raise BadInput(
                 f"{self.name} has {len(files)} {split} shapes in '{self.folder}', and none of number {index}: set a "
                 "smaller index, or unpack more shapes, or give another dataset.split"
             )
-        file = files[index % len(files)]
-        mesh, told = _load(file, self.normalised), [f"the shape is {_id(file)}"]
-        if lost := {*self.lists.get(split, ())}.difference(map(_id, files)):
-            told.append(f"warning: {len(lost)} shapes of the list are not on disk, and left out, such as {min(lost)}")
-        return replace(mesh, repairs=(*told, *mesh.repairs))
+        return files[index % len(files)]
 
     @cached_property
     def files(self) -> dict[Split, list[Path]]:
@@ -108,7 +125,8 @@ class ShapeNet:
         """Plain data that determines the shapes: which these are, as a release of ShapeNet does not change."""
         names = {split: [str(file.relative_to(self.folder)) for file in files] for split, files in self.files.items()}
         shapes = hashlib.sha256(json.dumps(names).encode()).hexdigest()
-        return {"name": self.name, "version": VERSION, "shapes": shapes, "normalised": self.normalised}
+        more = {} if self.renders is None else {"renders": self.renders}
+        return {"name": self.name, "version": VERSION, "shapes": shapes, "normalised": self.normalised} | more
 
 
 def _id(file: Path) -> str:

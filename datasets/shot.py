@@ -1,12 +1,14 @@
 """A photograph with its camera, rendered or real."""
 
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from datasets.scene import Split
 from renderers.camera import Camera
 
 
@@ -60,3 +62,12 @@ class Shot:
         depth = None if self.depth is None else self.depth / radius
         camera = replace(self.camera, intrinsics=self.camera.intrinsics.float(), world_to_camera=motion.float())
         return replace(self, camera=camera, depth=depth)
+
+
+@runtime_checkable
+class Pictured(Protocol):
+    """A dataset with images of its shapes that others rendered."""
+
+    def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
+        """The images of a shape, with cameras in the world of its mesh and at most so many pixels; None without any."""
+        ...

@@ -1,5 +1,6 @@
 """Images of many shapes from random views, with masks and depths: made once for a dataset, then read from a file."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,16 +17,19 @@ from bench.shape_prior import kept
 from datasets.captures.hull import carve
 from datasets.mesh import Mesh
 from datasets.photographs import GREY, Photography
-from datasets.scene import Dataset, Split, Truth, sample_surface, seed_of
-from datasets.shot import Shot
+from datasets.scene import Dataset, Split, Truth, sample_surface, scene_name, see, seed_of
+from datasets.shot import Pictured, Shot, mask_iou
 from datasets.views import ViewSampler
 from renderers.camera import Camera, sphere_span
+from renderers.checks import BadInput
 
 VERSION = 1  # raise it when the images or points change, so that no file of the old ones is used
 POINTS = 8192  # of known occupancy per shape: half in the cube, half near the surface
 NEAR = 0.05  # scene units: standard deviation of the latter from the surface
 NEAR_HULL = 0.07  # the same, from points in the visual hull
 CUBE = 1.0  # half the side of the cube
+SHOWN = 0.5  # least overlap of masks and mesh, the median over a shape's images
+ALIKE = 1e-2  # pixels by which intrinsics may differ
 OF_VIEWS = ("motions", "colours", "masks", "depths")
 PARTS = (*OF_VIEWS, "points", "inside")  # of `ImagesOf`, stacked over shapes in a file
 
@@ -132,6 +136,7 @@ class Imaging:
             for index in range(count):
                 progress("rendering images", index, count)
                 made.append(self.of_shape(dataset, split, index))
+            _check_alike([one.intrinsics for one in made], dataset.name)
             progress("rendering images", count, count)
             parts = {name: torch.stack([getattr(one, name) for one in made]) for name in PARTS}
             return parts | {"intrinsics": made[0].intrinsics}
@@ -141,21 +146,55 @@ class Imaging:
         return [ImagesOf(tensors["intrinsics"], *one) for one in parts]
 
     def of_shape(self, dataset: Dataset, split: Split, index: int) -> ImagesOf:
-        """The images of one shape, from cameras and with a texture of its own."""
+        """The images of one shape that its dataset has, or else from cameras and with a texture of its own."""
         mesh, seed = dataset.mesh(split, index), seed_of(split, index)
-        truth = Truth(mesh)
-        cameras = [self.sampler.draw(seed * self.photography.views + view) for view in range(self.photography.views)]
-        shots = self.photography.take_from(truth, cameras, seed=seed)
+        truth, pixels = Truth(mesh), self.sampler.resolution
+        shots = dataset.shots(split, index, pixels) if isinstance(dataset, Pictured) else None
+        if shots is None:
+            places = [seed * self.photography.views + view for view in range(self.photography.views)]
+            shots = self.photography.take_from(truth, [self.sampler.draw(place) for place in places], seed=seed)
+        else:
+            shots = self._checked(shots, truth, scene_name(dataset, split, index))
         points = _points(mesh, seed)
         return ImagesOf(
-            cameras[0].intrinsics,
-            torch.stack([camera.world_to_camera for camera in cameras]),
+            shots[0].camera.intrinsics,
+            torch.stack([shot.camera.world_to_camera for shot in shots]),
             torch.stack([(255 * shot.colours).round().to(torch.uint8) for shot in shots]),
             torch.stack([shot.mask for shot in shots if shot.mask is not None]),
             torch.stack([shot.depth for shot in shots if shot.depth is not None]),
             torch.from_numpy(points).float(),
             torch.from_numpy(truth.signed_distance(points) < 0),
         )
+
+    def _checked(self, shots: Sequence[Shot], truth: Truth, name: str) -> list[Shot]:
+        """The first images of a dataset's own, with the mesh's depths where they have none.
+
+        Raises:
+            BadInput: where they are too few or of another size, or do not show the mesh.
+        """
+        views, pixels = self.photography.views, self.sampler.resolution
+        camera, shots = shots[0].camera, shots[:views]
+        masks = [shot.mask for shot in shots if shot.mask is not None and shot.mask.shape == (pixels, pixels)]
+        if len(masks) < views:
+            raise BadInput(
+                f"{name} has {len(shots)} images, the first of {camera.width} x {camera.height} pixels, not {views} of "
+                f"{pixels} x {pixels} with masks: set task.images.views, task.views, task.image_pixels to what it has"
+            )
+        _check_alike([shot.camera.intrinsics for shot in shots], name)
+        seen = [see(truth, shot.camera) for shot in shots]
+        overlap = np.median([mask_iou(m.numpy(), view.mask.numpy()) for m, view in zip(masks, seen, strict=True)])
+        if overlap < SHOWN:
+            raise BadInput(
+                f"the images of {name} do not show its mesh: masks overlap by {overlap:.0%}; those of DVR and NMR show "
+                "ShapeNetCore v1 with dataset.normalised=onet"
+            )
+        pairs = zip(shots, seen, strict=True)
+        return [replace(shot, depth=view.depth) if shot.depth is None else shot for shot, view in pairs]
+
+
+def _check_alike(intrinsics: Sequence[Float[Tensor, "3 3"]], name: str) -> None:
+    if any((one - intrinsics[0]).abs().max() > ALIKE for one in intrinsics):
+        raise BadInput(f"the images of {name} must have one focal length: leave those with another out")
 
 
 def _points(mesh: Mesh, seed: int) -> Float[np.ndarray, "points 3"]:

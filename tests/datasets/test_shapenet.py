@@ -1,17 +1,24 @@
 """ShapeNetCore in its own layout, with the lists of DeepSDF, Choy and PMO."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from PIL import Image
 
 from bench.records.folder import Identity, _classes
 from bench.report.data.records import family
+from bench.single_view.images import Imaging
 from datasets import repair
-from datasets.scene import Split
+from datasets.scene import Split, Truth, see
 from datasets.shapenet import ShapeNet
+from datasets.views import ViewSampler
+from renderers.checks import BadInput
+from tests.datasets.test_photographs import PLAINLY
 from tests.run.driving import command, record_of
 
 SOFA, TABLE = "04256520", "04379243"
@@ -44,6 +51,26 @@ def write_shapenet(folder: Path, version: int = 2) -> Path:
 def write_split(file: Path, names: list[str], synset: str = SOFA) -> Path:
     file.write_text(json.dumps({"ShapeNetV2": {synset: names}}))
     return file
+
+
+def write_renders(folder: Path, dataset: ShapeNet, sampler: ViewSampler, views: int = 3) -> Path:
+    """What NMR and DVR have of each shape: images, masks, and cameras onto an image from -1 to 1."""
+    half = (sampler.resolution - 1) / 2
+    for split, index in ((one, index) for one in Split for index in range(len(dataset.files[one]))):
+        truth, place, stored = Truth(dataset.mesh(split, index)), folder / SOFA / ids(dataset, split)[index], {}
+        for view in range(views):
+            camera = sampler.draw(view)
+            intrinsics = np.eye(4)
+            intrinsics[[0, 1], [0, 1]] = camera.intrinsics.numpy()[[0, 1], [0, 1]] / half
+            motion = camera.world_to_camera.double().numpy()
+            stored |= {f"camera_mat_{view}": intrinsics, f"world_mat_{view}": motion}
+            stored |= {f"world_mat_inv_{view}": np.linalg.inv(motion)}
+            for name, value in {"mask": 255, "image": 80 + 40 * view}.items():
+                (place / name).mkdir(parents=True, exist_ok=True)
+                pixels = (see(truth, camera).mask.numpy() * value).astype(np.uint8)
+                Image.fromarray(pixels).save(place / name / f"{view:04d}.png")
+        np.savez(place / "cameras.npz", **stored)
+    return folder
 
 
 def shapenet(folder: Path, split: Path | None = None, **changes: str) -> ShapeNet:
@@ -177,3 +204,37 @@ def test_a_run_is_another_one_where_the_list_or_the_shapes_on_disk_are_others(tm
     second = code()
     write_split(split, IDS[1:3])
     assert len({first, second, code()}) == 3
+
+
+SAMPLER = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(10.0, 40.0), resolution=24)
+IMAGING = Imaging(replace(PLAINLY, views=3), SAMPLER)
+
+
+@pytest.fixture(scope="module")
+def renders(v2, tmp_path_factory) -> Path:
+    return write_renders(tmp_path_factory.mktemp("NMR"), shapenet(v2, normalised="onet"), SAMPLER)
+
+
+def test_images_of_others_take_the_place_of_rendered_ones(v2, renders, tmp_path):
+    dataset = shapenet(v2, normalised="onet", renders=str(renders))
+    assert dataset.identity() != shapenet(v2, normalised="onet").identity()
+    (first, *_) = IMAGING.images(dataset, Split.TRAIN, 2, tmp_path, lambda *_: None)
+    truth = Truth(dataset.mesh(Split.TRAIN, 0))
+    for view, camera in enumerate(first.cameras):
+        torch.testing.assert_close(camera.world_to_camera, SAMPLER.draw(view).world_to_camera)
+        torch.testing.assert_close(camera.intrinsics, SAMPLER.draw(view).intrinsics)
+        assert torch.equal(first.masks[view], see(truth, SAMPLER.draw(view)).mask)
+        torch.testing.assert_close(first.depths[view], see(truth, camera).depth)
+        assert (first.colours[view][first.masks[view]] == 80 + 40 * view).all()
+
+
+@pytest.mark.parametrize(("changes", "imaging", "told"), [
+    ({"normalised": "deepsdf"}, IMAGING, "do not show its mesh: masks overlap by .*dataset.normalised=onet"),
+    ({}, replace(IMAGING, photography=replace(PLAINLY, views=4)), "has 3 images, .* not 4 of 24 x 24 with masks: set"),
+    ({}, replace(IMAGING, sampler=replace(SAMPLER, resolution=32)), "24 x 24 pixels, not 3 of 32 x 32 with masks: set"),
+    ({"renders": "nowhere"}, IMAGING, "there is no folder nowhere/04256520/"),
+], ids=["another place", "few", "small", "none"])  # fmt: skip
+def test_images_that_do_not_fit_are_refused(v2, renders, changes, imaging, told):
+    dataset = shapenet(v2, **{"normalised": "onet", "renders": str(renders)} | changes)
+    with pytest.raises(BadInput, match=told):
+        imaging.of_shape(dataset, Split.TRAIN, 0)
