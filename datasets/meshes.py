@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
@@ -86,22 +87,36 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"] | None:
-    """The vertices of a file without faces, a cloud of points; None of one that has faces.
+    """The points of a cloud: a file without faces, or the `pointcloud.npz` of DVR's data; None of one that has faces.
 
     Raises:
         ValueError: the file is missing, empty, truncated or broken, or has no points, or some that are not finite.
     """
-    (path,) = find_meshes(path)
+    (path,) = [Path(path)] if Path(path).suffix == ".npz" else find_meshes(path)
     try:
-        polygons = _polygons(path)
-        points = polygons.vertices
-        if len(polygons.counts):
-            return None
+        if path.suffix == ".npz":
+            points = _stored_points(path)
+        else:
+            polygons = _polygons(path)
+            points = polygons.vertices
+            if len(polygons.counts):
+                return None
         if not len(points) or not np.isfinite(points).all():
             raise ValueError(f"must hold points that are finite, found {len(points)}; export or copy it again")
     except ValueError as error:
         raise BadInput(f"file of points '{path}': {error}") from None
     return points
+
+
+def _stored_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    try:
+        with path.open("rb") as file, np.load(file) as stored:
+            if "points" in stored and "occupancies" not in stored:
+                return stored["points"].reshape(-1, 3).astype(np.float64)
+            what = f"found {', '.join(stored)}"
+    except (OSError, EOFError, TypeError, ValueError, BadZipFile) as error:
+        what = f"but it cannot be read ({error})"
+    raise ValueError(f"must have `points` on the surface, {what}; take `pointcloud.npz` beside it, or copy it again")
 
 
 def _polygons(path: Path) -> Polygons:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from datasets.mesh import Mesh
-from datasets.meshes import find_meshes, load_mesh, repair
+from datasets.meshes import find_meshes, load_mesh, read_points, repair
 from datasets.scene import Truth, sample_surface
 from tests.looped import each
 
@@ -268,3 +268,14 @@ def test_a_repair_that_changes_area_or_volume_much_says_by_how_much():
     assert numbers[1] == pytest.approx(half.area + np.pi, rel=0.02)  # the disc that closes it
     assert numbers[2] == pytest.approx(100 * (numbers[1] / numbers[0] - 1), abs=1)
     assert numbers[4] == pytest.approx(2 / 3 * np.pi, rel=0.03)
+
+
+def test_the_clouds_of_dvrs_data_are_points_and_its_occupancies_are_not(tmp_path):
+    points = np.arange(12).reshape(4, 3) / 16
+    np.savez(tmp_path / "pointcloud.npz", points=points.astype(np.float16), normals=points)
+    assert np.array_equal(read_points(tmp_path / "pointcloud.npz"), points)
+    np.savez(tmp_path / "points.npz", points=points, occupancies=np.zeros(1, np.uint8))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "points.npz").read_bytes()[:100])
+    for name, found in {"points": "found points, occupancies; take `pointcloud.npz`", "cut": "cannot be read"}.items():
+        with pytest.raises(ValueError, match=rf"{name}.npz': must have `points` on the surface, .*{found}"):
+            read_points(tmp_path / f"{name}.npz")
