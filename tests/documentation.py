@@ -8,10 +8,10 @@ from pathlib import Path
 import trimesh
 from PIL import Image
 
-from datasets.shapenet import ShapeNet
+from datasets.shapenet import SYNSETS, ShapeNet
 from datasets.views import ViewSampler
 from tests.datasets.test_captures import idr
-from tests.datasets.test_shapenet import IDS, write_renders, write_shapenet, write_split
+from tests.datasets.test_shapenet import IDS, write_renders, write_shape, write_shapenet, write_split
 from tests.made_scans import write_scans
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -96,6 +96,8 @@ def make_files(folder: Path) -> dict[str, str]:
     named |= {"FOLDER": folder / "captures", "chairs/": folder / "chairs", "my_conf": folder / "mine" / "conf"}
     named |= {"FILE": folder / "picture.png", "MASK": folder / "mask.png"}
     shapenet = write_shapenet(folder / "ShapeNetCore.v2")
+    for name in IDS:
+        write_shape(shapenet, SYNSETS["car"], name)
     boxes = ShapeNet(str(shapenet), "sofa", None, "onet")
     sampler = ViewSampler(2.5, 50.0, (0, 360), (15, 35), resolution=32)  # pixels of single_view at smoke
     named["NMR"] = write_renders(folder / "NMR", boxes, sampler, views=24)
