@@ -1,13 +1,19 @@
 """Local mesh files as a dataset: deformations of a single mesh, or the meshes of a folder in three splits."""
 
 import hashlib
+import os
+import tempfile
+import time
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
+from datasets import repair
 from datasets.deform import deform
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
@@ -15,6 +21,7 @@ from datasets.scene import Split, seed_of
 from renderers.checks import check_at_least, check_share
 
 VERSION = 4  # raise it when reading, repair or deformation changes the shapes
+SLOW = 2.0  # seconds from which on a repaired mesh is kept
 HELD_OUT = 0.2  # share of a folder's meshes in the validation split, and in the test split
 
 
@@ -88,4 +95,24 @@ def deal(files: list[Path]) -> dict[Split, list[Path]]:
 @lru_cache(maxsize=64)
 def _load(path: Path, changed: int, radius: float) -> Mesh:
     """The mesh of a file, read again when the file has changed."""
-    return normalise(load_mesh(path), radius)
+    return normalise(repaired(path), radius)
+
+
+def repaired(path: Path) -> Mesh:
+    """As `load_mesh`, but what took long is kept in the user's cache, since each run loads its mesh again."""
+    made_of = b"\0".join([str(VERSION).encode(), Path(repair.__file__).read_bytes(), path.read_bytes()])
+    cached = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    kept = Path(cached, "implicit-bench", "meshes", f"{hashlib.sha256(made_of).hexdigest()[:16]}.npz")
+    with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), kept.open("rb") as file, np.load(file) as parts:
+        return Mesh(parts["vertices"], parts["faces"], tuple(map(str, parts["repairs"])))
+    started = time.perf_counter()
+    mesh = load_mesh(path)
+    if time.perf_counter() - started > SLOW:
+        with suppress(OSError):  # a cache that cannot be written to
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=kept.parent) as folder:  # another process may do the same
+                np.savez(
+                    made := Path(folder, kept.name), vertices=mesh.vertices, faces=mesh.faces, repairs=mesh.repairs
+                )
+                made.replace(kept)
+    return mesh

@@ -12,9 +12,9 @@ import numpy as np
 
 from datasets.captures.formats import find_layout
 from datasets.captures.take import take
-from datasets.local import VERSION, deal
+from datasets.local import VERSION, deal, repaired
 from datasets.mesh import Mesh, fit_in_sphere
-from datasets.meshes import load_mesh, read_mesh
+from datasets.meshes import read_mesh
 from datasets.repair import WRAPPED
 from datasets.scene import Split
 from datasets.shot import Shot
@@ -103,10 +103,11 @@ class ShapeNet:
         """
         here = _shapes(self.folder)
         listed = {split: [here[name] for name in names if name in here] for split, names in self.lists.items()}
-        if lost := [split for split, files in listed.items() if not files]:
+        if listed and not any(listed.values()):
+            names = [name for names in self.lists.values() for name in names]
             raise ValueError(
-                f"dataset.split: none of the {len(self.lists[lost[0]])} {lost[0]} shapes is in '{self.folder}', such "
-                f"as {self.lists[lost[0]][0]}: unpack them there, or give the split of the shapes that are"
+                f"dataset.split: none of its {len(names)} shapes is in '{self.folder}', such as {names[0]}: unpack "
+                "them there, or give the split of the shapes that are"
             )
         rest = {*here.values()}.difference(*listed.values())
         files = deal(listed.get(Split.TRAIN, sorted(rest))) | listed
@@ -186,6 +187,6 @@ def _load(path: Path, normalised: str) -> Mesh:
     centre, factor = fit_in_sphere(points, 1 / BUFFER)
     if normalised == "onet":
         factor = 1 / float((points.max(axis=0) - points.min(axis=0)).max())
-    mesh = load_mesh(path)
+    mesh = repaired(path)
     sign = (UNKNOWN,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
     return replace(mesh, vertices=(mesh.vertices - centre) * factor, repairs=(*sign, *mesh.repairs))

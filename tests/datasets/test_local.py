@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from datasets import local as module
 from datasets.local import LocalMeshes
+from datasets.meshes import load_mesh
 from datasets.scene import Split
 
 ODD_NAME = "two words ünïcode 50% #1?"
@@ -135,3 +137,24 @@ def test_invalid_settings_are_errors_at_once(tmp_path):
         local(path, strength=-1.0)
     with pytest.raises(ValueError, match=r"dataset.radius must be above 0 and at most 1, not 0"):
         LocalMeshes(str(path), radius=0.0, strength=1.0)
+
+
+def test_a_mesh_that_took_long_to_repair_is_kept_until_its_file_changes(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "load_mesh", lambda path: asked.append(path) or load_mesh(path))
+    path = write_box(tmp_path / "box.ply")
+    module.repaired(path)
+    assert not (tmp_path / "cache").exists()  # as that was quick
+    monkeypatch.setattr(module, "SLOW", -1.0)
+    half = trimesh.creation.box((1.0, 0.6, 0.4))
+    half.update_faces(range(10))
+    half.export(path)
+    first, again = module.repaired(path), module.repaired(path)
+    assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
+    assert first.repairs == again.repairs != () and len(asked) == 2
+    (kept,) = (tmp_path / "cache").rglob("*.npz")
+    kept.write_bytes(kept.read_bytes()[:200])
+    assert np.array_equal(module.repaired(path).faces, first.faces) and len(asked) == 3
+    write_box(path)
+    assert module.repaired(path).repairs == () and len(asked) == 4

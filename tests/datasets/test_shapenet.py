@@ -133,6 +133,10 @@ def test_the_split_of_deepsdf_gives_the_order_and_its_training_list_the_others(v
         assert ids(both, Split.TEST) == [IDS[2], IDS[0]]
         assert sorted([*ids(both, Split.TRAIN), *ids(both, Split.VALIDATION)]) == sorted(IDS[3:])
     assert both.identity() != alone.identity()
+    write_split(train, ["0dead"])  # of which none is on disk
+    assert ids(shapenet(v2, test), Split.TEST) == [IDS[2], IDS[0]]
+    with pytest.raises(BadInput, match="shapenet_sofa has 0 train shapes"):
+        shapenet(v2, test).mesh(Split.TRAIN, 0)
 
 
 def test_a_prior_may_take_a_shape_twice_and_a_test_may_not(v2):
@@ -168,7 +172,7 @@ def test_shapes_that_are_not_on_disk_are_counted_and_left_out(v2, tmp_path):
     ({"split": "nowhere.lst"}, "there is no file 'nowhere.lst': give a split of DeepSDF"),
     ({"split": "tables.json"}, "has nothing of sofa, but table: set dataset.synset to it"),
     ({"split": "broken.json"}, "broken.json' cannot be read as a split of DeepSDF or a list"),
-    ({"split": "other.lst"}, "none of the 2 test shapes is in .*04256520', such as 0bad: unpack them there"),
+    ({"split": "other.lst"}, "none of its 2 shapes is in .*04256520', such as 0bad: unpack them there"),
     ({"split": "empty.lst"}, "has nothing of sofa, but nothing"),
 ], ids=lambda value: " ".join(value.values()) if isinstance(value, dict) else "")  # fmt: skip
 def test_what_is_missing_is_named_with_a_remedy(v2, tmp_path, monkeypatch, given, told):
