@@ -101,7 +101,11 @@ def make_files(folder: Path) -> dict[str, str]:
     boxes = ShapeNet(str(shapenet), "sofa", None, "onet")
     sampler = ViewSampler(2.5, 50.0, (0, 360), (15, 35), resolution=32)  # pixels of single_view at smoke
     named["NMR"] = write_renders(folder / "NMR", boxes, sampler, views=24)
-    named |= {shapenet.name: shapenet, "SPLIT": write_split(folder / "sofas_test.json", IDS[:2])}
+    named |= {
+        "ShapeNetCore.v1": shapenet,
+        "ShapeNetCore.v2": shapenet,
+        "SPLIT": write_split(folder / "sofas_test.json", IDS[:2]),
+    }
     (folder / "mine" / "my_package.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
     (folder / "mine" / "mypkg.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
     (folder / "mine" / "mytask.py").write_text(code_of("CONTRIBUTING.md", "python")[1])
