@@ -25,15 +25,15 @@ COLUMNS = (
     *(
         table.Column("seconds", "Loop", show=format.seconds),
         table.Column("spearman", "ρ"),
-        table.Column("n", "of", show=table.whole),
     ),
 )
+HIGH = 0.7  # a correlation that is called high
 NOTES = (
     "Chamfer distance is chamfer_l2, in squared scene units, times 1000; it is measured during the optimisation, but "
     "not used by it.",
     "A line is the median over a row's runs; after its end a failed run counts as infinite.",
-    "ρ is Spearman's rank correlation of loss and Chamfer over the iterations of a row's runs that have both: points "
-    "of one run are not independent, so it is no test.",
+    "ρ is Spearman's rank correlation of loss and Chamfer over the iterations of a run that have both, in the median "
+    "of a row's runs: points of one run are not independent, so it is no test.",
 )
 Medians = dict[str, pd.DataFrame]  # of each quantity
 
@@ -48,8 +48,9 @@ def make(runs: Runs) -> Result:
         own = [read[record["folder"]][0] for record in records]
         failed = [record["status"] != "ok" for record in records]
         medians[row] = {name: curves.median(own, failed, name) for name in QUANTITIES}
-        points = pd.concat(own, ignore_index=True).dropna(subset=[*QUANTITIES])
-        correlation = {"spearman": curves.spearman(points, *QUANTITIES), "n": len(points)}
+        found = [curves.spearman(curve.dropna(subset=[*QUANTITIES]), *QUANTITIES) for curve in own]
+        known = [value for value in found if value is not None]  # each of one run: losses of shapes do not compare
+        correlation = {"spearman": float(np.median(known)) if known else None, "n": len(known)}
         seconds = medians[row]["chamfer_l2"]["seconds"]
         about = {"row": row.name, "runs": len(records), "seconds": seconds.iloc[-1] if len(seconds) else None}
         lines.append({**about, **_end(own, failed), **correlation})
@@ -57,18 +58,31 @@ def make(runs: Runs) -> Result:
         runs,
         "Loss and Chamfer distance as shapes are completed.",
         "Loss and Chamfer distance over iterations and seconds.",
-        question="What is gained in each iteration?",
-        verdict=format.ends(
-            "Median error at the end (Chamfer × 1000)",
-            {line["row"]: line.get("end") for line in lines},
-            f"{format.plural(min(line['runs'] for line in lines), 'run')} a row",
-            show=table.thousandfold,
-        ),
+        question="Does the error fall with the loss?",
+        verdict=f"{_verdict(lines)} {_ends(lines)}".strip(),
         remarks=(*unread, _loss(runs), *NOTES),
         data=_data(runs, {folder: found for folder, (found, _) in read.items()}, medians, lines),
         columns=COLUMNS,
         lines=lines,
         figure=draw(medians),
+    )
+
+
+def _verdict(lines: list[dict[str, Any]]) -> str:
+    """In which rows loss and error fall together; the paper says that they are highly correlated."""
+    known = {line["row"]: line["spearman"] for line in lines if line["spearman"] is not None}
+    apart = [f"{row} (*{value:.2f}*)" for row, value in known.items() if value < HIGH]
+    alike = f"{len(known) - len(apart)} of {format.plural(len(known), 'row')} (ρ of {HIGH} or more)"
+    said = f"not in {', '.join(apart)}, against the paper" if apart else "as in the paper"
+    return f"Loss and error fall together in {alike}; {said}." if known else ""
+
+
+def _ends(lines: list[dict[str, Any]]) -> str:
+    return format.ends(
+        "Median error at the end (Chamfer × 1000)",
+        {line["row"]: line.get("end") for line in lines},
+        f"{format.plural(min(line['runs'] for line in lines), 'run')} a row",
+        show=table.thousandfold,
     )
 
 

@@ -292,7 +292,10 @@ def test_fig5_data_holds_runs_medians_and_correlation(completions):
     assert list(medians["total"]) == [6, 6, 4, 2]  # the diverged run counts as infinite from its third iteration on
     assert list(medians["n"]) == [3] * 4
     rho = data[data["kind"] == "correlation"].set_index("row")
-    assert rho.loc[PARALLEL, "spearman"] == pytest.approx(0.5) and rho.loc[PARALLEL, "n"] == 3
+    assert rho.loc[PARALLEL, "spearman"] == pytest.approx(0.5) and rho.loc[PARALLEL, "n"] == 1
+    assert rho.loc[DYNAMIC, "spearman"] == pytest.approx(1) and rho.loc[DYNAMIC, "n"] == 2  # runs, each by itself
+    said = page_of(completions, "fig5").verdict
+    assert "in 1 of 2 rows (ρ of 0.7 or more); not in + parallel (*0.50*), against the paper." in said
     assert rho.loc["+ aggressive", "spearman"] is None and rho.loc["+ aggressive", "n"] == 0
 
 
@@ -307,7 +310,7 @@ def test_fig5_plots_the_numbers_of_its_csv(completions):
     assert list(axes[2].lines[0].get_ydata()) == pytest.approx([1000 * x for x in chamfer["chamfer_l2"]])
     assert "× 1000" in axes[2].get_ylabel()
     line = made.table.set_index("Method").loc[PARALLEL]
-    assert (line["End"], line["ρ"], line["of"]) == ("200", "0.500", "3")
+    assert (line["End"], line["ρ"]) == ("200", "0.500")
     assert_labelled(made.figure)
     for words in ("no curve.jsonl", "infinite"):
         assert words in told(made)

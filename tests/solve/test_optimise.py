@@ -206,6 +206,8 @@ def test_a_cosine_falls_from_the_rate_to_nearly_zero():
     assert rates == sorted(rates, reverse=True)
     assert 0 < rates[-1] < 0.01
     assert {OptimiserSettings(10, 0.2, "constant").rate(iteration) for iteration in range(10)} == {0.2}
+    steps = [OptimiserSettings(10, 0.2, "steps").rate(iteration) for iteration in range(10)]
+    assert steps == pytest.approx([0.2] * 6 + [0.04] * 2 + [0.008] * 2)
 
 
 def play(count: int, trial: int, iterations: int, loss) -> list[tuple[int, int]]:
