@@ -312,6 +312,8 @@ class Compared:
         """
         panels = []
         for cost, label in COSTS.items():
+            if cost == "seconds" and not self.runs.timed:
+                continue
             points = [
                 chart.series(
                     *(line["row"], line["preset"], [line[cost]], [line["error"]]),

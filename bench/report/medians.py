@@ -55,6 +55,11 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
     return lines
 
 
+def cost(runs: Runs) -> dict[str, pd.Series]:
+    """The seconds of each run under the label of an axis; its field values where times are doubtful."""
+    return {"seconds in the loop": runs.frame.loop} if runs.timed else {"field values of the run": runs.frame["values"]}
+
+
 def whole(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
     """A median of the rows with as many runs as any, by row: those of fewer are not of the same shapes."""
     most = max((line["runs"] for line in lines), default=0)

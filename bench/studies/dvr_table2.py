@@ -73,7 +73,7 @@ def make(runs: Runs) -> Result:
     ]
     panels = {
         "Chamfer-L1, seen × 1000 (scene units)": SCALE * medians.scored(runs, "seen_chamfer_l1"),
-        "seconds in the loop": runs.frame.loop,
+        **medians.cost(runs),
     }
     return Result(
         runs,

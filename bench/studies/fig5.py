@@ -64,7 +64,7 @@ def make(runs: Runs) -> Result:
         data=_data(runs, {folder: found for folder, (found, _) in read.items()}, medians, lines),
         columns=COLUMNS,
         lines=lines,
-        figure=draw(medians),
+        figure=draw(medians, [along for along in ALONG if along != "seconds" or runs.timed]),
     )
 
 
@@ -108,16 +108,16 @@ def _loss(runs: Runs) -> str:
     return f"The loss has {terms}; {'it is the same for every row' if shared_loss(runs.records) else own}."
 
 
-def draw(medians: dict[Row, Medians]) -> Figure:
+def draw(medians: dict[Row, Medians], over: list[str]) -> Figure:
     """Draws loss above and Chamfer below, over iterations and seconds, a line per row."""
     panels = []
-    for (name, (label, scale)), (along, words) in product(QUANTITIES.items(), ALONG.items()):
+    for (name, (label, scale)), along in product(QUANTITIES.items(), over):
         lines = [
             chart.curve(row.name, row.preset, style.finite(own[name][along]), style.finite(scale * own[name]["median"]))
             for row, own in medians.items()
         ]
-        panels.append(chart.panel_data("", words, label, lines))
-    return chart.draw(panels, 4.6, 2)
+        panels.append(chart.panel_data("", ALONG[along], label, lines))
+    return chart.draw(panels, 4.6, len(QUANTITIES))
 
 
 def _data(runs: Runs, read: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list[Any]) -> pd.DataFrame:

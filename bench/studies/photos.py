@@ -31,9 +31,7 @@ def make(runs: Runs) -> Result:
         columns=COLUMNS,
         lines=lines,
         run_columns=RUNS,
-        figure=medians.draw_runs(
-            runs, {"PSNR (dB)": medians.scored(runs, "psnr"), "seconds in the loop": runs.frame.loop}
-        ),
+        figure=medians.draw_runs(runs, {"PSNR (dB)": medians.scored(runs, "psnr"), **medians.cost(runs)}),
     )
 
 

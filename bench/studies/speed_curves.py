@@ -35,7 +35,7 @@ def make(runs: Runs) -> Result:
         for line in lines
         for record, history in zip(line["records"], line["histories"], strict=True)
     ]
-    panels = [_panel(lines, along) for along in ALONG]
+    panels = [_panel(lines, along) for along in ALONG if along != "seconds" or runs.timed]
     return Result(
         runs,
         "Error over time and over field values.",

@@ -27,6 +27,7 @@ def completed(results, label, errors, **changed):
         seconds={"forward": 0.75 * steps, "backward": 0.25 * steps},
         evaluations={"value": 100 * steps},
         settings={"index": index, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "test"},
+        notes=changed.get("notes", []),
     )
     lines = [
         {
@@ -192,3 +193,12 @@ def test_a_run_that_left_no_curve_is_a_row_all_the_same(tmp_path):
     (folder / "curve.jsonl").unlink()
     for name in ("speed_front", "speed_curves"):
         assert "idr" in page_of(tmp_path, name).table.to_string()
+
+
+@pytest.mark.parametrize(("loaded", "axes"), [(5, ["time (seconds)", "field values"]), (6, ["field values"])])
+def test_where_half_of_the_times_are_doubtful_a_chart_shows_field_values_alone(three, loaded, axes):
+    for folder in sorted((three / "runs").iterdir())[:loaded]:  # of twelve
+        record = json.loads((folder / "record.json").read_text())
+        (folder / "record.json").write_text(json.dumps(record | {"notes": ["loaded machine: it waited"]}))
+    panels = page_of(three, "speed_curves").chart["panels"]
+    assert [panel["x"]["title"] for panel in panels] == axes

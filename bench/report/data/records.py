@@ -60,6 +60,14 @@ def iterations_of(record: Record) -> int | None:
     return setting(config, "task", "optimiser", "iterations") or setting(config, "task", "iterations")
 
 
+DOUBTFUL = ("loaded machine", "shared device", "missing synchronisation")  # beginnings of notes
+
+
+def doubtful(record: Record) -> bool:
+    """Whether other work on the machine or device, or a missing synchronisation, makes the run's times doubtful."""
+    return any(note.startswith(DOUBTFUL) for note in record["notes"])
+
+
 def index(record: Record) -> Any:
     """The number of the shape in its family."""
     return record["config"].get("index")

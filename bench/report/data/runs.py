@@ -14,7 +14,7 @@ from bench.records.names import flat
 from bench.records.record import requested, row_name, started
 from bench.report.data.frame import to_frame
 from bench.report.data.kept import KEPT
-from bench.report.data.records import SCALE, Record, Row, family, grouped, index, row_of, setting, solid, view
+from bench.report.data.records import SCALE, Record, Row, doubtful, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
 COMPILED = "compiled"  # kernels, as a record of the environment has it; others say torch, and why
@@ -86,6 +86,11 @@ class Runs:
         """A column as floats, nan where it is missing or no number."""
         values = self.frame[column] if column in self.frame else pd.Series(np.nan, self.frame.index)
         return pd.to_numeric(values.astype(object).where(values.notna(), np.nan), errors="coerce").astype(float)
+
+    @property
+    def timed(self) -> bool:
+        """Whether the times of most runs can be relied on; where not, charts show field values alone."""
+        return 2 * sum(map(doubtful, self.records)) < len(self.records)
 
     def setting(self, key: str) -> pd.Series:
         """A setting of each run as text, such as task.points; empty where it is missing."""

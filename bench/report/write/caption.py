@@ -8,7 +8,7 @@ from operator import itemgetter
 from typing import Any
 
 from bench.records.format import plural
-from bench.report.data.records import Record, setting, solid, view
+from bench.report.data.records import Record, doubtful, setting, solid, view
 from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
 
@@ -141,9 +141,8 @@ def _compared(runs: Runs) -> str:
 
 
 def _loaded(runs: Runs) -> str:
-    """A warning where other work on the machine or device, or a missing synchronisation, makes times doubtful."""
-    doubtful = ("loaded machine", "shared device", "missing synchronisation")
-    names = [r["name"] for r in runs.named() if any(note.startswith(doubtful) for note in r["notes"])]
+    """A warning where times are doubtful."""
+    names = [record["name"] for record in runs.named() if doubtful(record)]
     few = _listed(names) if len(names) <= FEWEST_COUNTED else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
     return f"Doubtful times, see the notes of the run: {rows}." if names else ""
