@@ -41,7 +41,7 @@ lint: .venv/ready-dev ## ruff (lint and format), pyright, README's length
 
 setup: .venv/ready-dev
 
-.venv/ready: pyproject.toml .ci/setup  # what the command needs
+.venv/ready: pyproject.toml .ci/setup .ci/constraints.txt  # what the command needs
 	@PYTHON="$(PYTHON)" .ci/setup command
 
 .venv/ready-dev: .venv/ready  # what tests and lint need on top

@@ -299,6 +299,9 @@ def multiplies_faster(device: torch.device) -> bool:
     """Whether a device multiplies bfloat16 matrices by instructions of its own."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
+    if not hasattr(torch.cpu, "get_capabilities"):  # PyTorch before 2.11
+        able = (getattr(torch.cpu, f"_is_{name}_supported")() for name in ("amx_tile", "avx512_bf16"))
+        return device.type == "cpu" and any(able)
     able = torch.cpu.get_capabilities()
     return device.type == "cpu" and any(able.get(name, False) for name in ("amx_bf16", "avx512_bf16"))
 
