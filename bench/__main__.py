@@ -2,7 +2,10 @@
 
 from __future__ import annotations  # of a run's process, which imports this module again, nothing else is loaded
 
+import os
+import re
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -31,6 +34,32 @@ def main() -> int:
         table = write_sweep(plan)
         statuses = show_sweep(plan, write_index(plan.results_dir), table)
     return code or (FAILED if any(status != "ok" for status in statuses) else 0)
+
+
+def console() -> int:
+    """`implicit-bench WORD ...` is `python -m bench.WORD ...`, and with the word run it is `python -m bench ...`."""
+    word, *more = sys.argv[1:] or ["--help"]
+    known = _words()
+    if word in ("-h", "--help"):
+        print("usage: implicit-bench WORD ...", *known.values(), sep="\n  ")
+        return 0
+    if word not in known:
+        from bench.tables import nearest
+
+        print(f"error: unknown word {word!r}{nearest(word, [*known])}", file=sys.stderr)
+        return 2
+    os.execv(sys.executable, [sys.executable, "-m", "bench" if word == "run" else f"bench.{word}", *more])
+
+
+def _words() -> dict[str, str]:
+    """The words of `implicit-bench`, which are the modules that `python -m` runs, with the first lines of these."""
+    here, found = Path(__file__).parent, {}
+    for file in sorted([*here.glob("*.py"), *here.glob("*/__main__.py")]):
+        first = file.read_text(encoding="utf-8").partition("\n")[0].strip('"').replace("`", "")
+        if first.startswith("python -m bench"):
+            word = file.stem if file.stem != "__main__" else "run" if file.parent == here else file.parent.name
+            found[word] = re.sub(r"python -m bench[.\w]*", f"implicit-bench {word}", first)
+    return found
 
 
 if __name__ == "__main__":

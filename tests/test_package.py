@@ -15,9 +15,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from bench.__main__ import console
 from bench.records.read import RESULTS
 from bench.run.command import EXTRAS
 from datasets.extras import install
+from tests.test_layers import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "conf", "datasets", "renderers")
@@ -104,6 +106,24 @@ def test_a_conf_of_ones_own_does_no_harm(tmp_path):
     assert started(tmp_path, "-c", "import bench") == (0, "")
 
 
+def test_the_command_has_a_word_for_every_module_that_runs(monkeypatch, capsys):
+    started = []
+    monkeypatch.setattr(os, "execv", lambda program, arguments: started.append(arguments[1:]))
+
+    def typed(*words: str) -> tuple[int | None, str]:
+        monkeypatch.setattr(sys, "argv", ["implicit-bench", *words])
+        code, (out, err) = console(), capsys.readouterr()
+        return code, out + err
+
+    code, told = typed("--help")
+    assert code == 0 and typed() == (0, told)
+    words = re.findall(r"^  implicit-bench (\w+) ?[^:]*: \w", told, re.MULTILINE)
+    assert {*words} == {"run", "report", *(name.removeprefix("bench.") for name in COMMANDS)}
+    assert typed("verfy", "RUN") == (2, "error: unknown word 'verfy': did you mean verify?\n") and not started
+    assert typed("run", "-m", "seed=0,1")[1] == typed("judge", "--help")[1] == ""
+    assert started == [["-m", "bench", "-m", "seed=0,1"], ["-m", "bench.judge", "--help"]]
+
+
 def test_results_are_not_of_the_checkout():
     assert yaml.safe_load((ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"))["results_dir"] == RESULTS
     ignored = subprocess.run(["git", "check-ignore", "-q", f"{RESULTS}/runs"], cwd=ROOT, check=False)
@@ -180,6 +200,7 @@ def test_the_wheel_runs_from_an_empty_folder(built, tmp_path):
     assert {"record.json", "mesh.ply"} <= {path.name for path in folder.iterdir()}
     assert [path.name for path in empty.iterdir()] == ["results"]
     assert run("-m", "bench.report").splitlines()[-1] == "results/local/index.html"
+    assert run(python.with_name("implicit-bench"), "report").splitlines()[-1] == "results/local/index.html"
     said = run(
         "-c", "import bench; r = bench.load(); print(r.status[0], r['commit'].isna()[0] or r['commit'][0] == '')"
     )
