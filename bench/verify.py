@@ -13,7 +13,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from math import isnan
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
@@ -91,22 +91,29 @@ def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
     except (ValueError, OSError) as error:
         print(f"not compared: {folder.name}, {how}: {error}")
         return False
-    numbers = {name: x for name, x in record.metrics.items() if isinstance(x, int | float) and not TIMES.search(name)}
-    shared = [name for name in numbers if isinstance(found.get(name), int | float)]
-    if not shared:
+    numbers, again = _numbers(record.metrics), _numbers(found)
+    if not again:
         print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")
         return None
-    apart = {name: _apart(numbers[name], found[name]) for name in shared}
+    apart = {name: _apart(numbers[name], again[name]) if name in numbers else inf for name in again}
     wrong = [name for name, gap in apart.items() if not gap <= most]  # nor is one that is not a number
     if not wrong:
-        widest = max(apart.values())
-        rest = f"; {len(numbers) - len(shared)} others are not of the field" if len(shared) < len(numbers) else ""
-        print(f"agrees: {folder.name}, {how}: {plural(len(shared), 'metric')}, at most {widest:.1g} apart{rest}")
+        widest, others = max(apart.values()), len(numbers.keys() - again.keys())
+        rest = f"; {others} others are not of the field" if others else ""
+        print(f"agrees: {folder.name}, {how}: {plural(len(again), 'metric')}, at most {widest:.1g} apart{rest}")
         return True
-    told = [f"{name} is {number(numbers[name])} in the record, now {number(found[name])}" for name in wrong]
+    told = [
+        f"{name} is {number(numbers[name]) if name in numbers else 'not'} in the record, now {number(again[name])}"
+        for name in wrong
+    ]
     why = "; ".join(_reasons(record, environment())) or "code and machine are the same: was the record edited?"
     print(f"differs: {folder.name}, {how}: {'; '.join(told)}. {why}")
     return False
+
+
+def _numbers(metrics: dict[str, Any]) -> dict[str, float]:
+    """The metrics that are compared."""
+    return {name: x for name, x in metrics.items() if isinstance(x, int | float) and not TIMES.search(name)}
 
 
 @flushing_denormals()

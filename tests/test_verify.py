@@ -20,6 +20,7 @@ SMALL = (
     "renderer=dist", "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200",
     "evaluation.every=null", "evaluation.picture=null", "view.resolution=16", "task.optimiser.iterations=3",
 )  # fmt: skip
+GONE = "gone"  # of a metric that is deleted
 PHOTOGRAPHS = ("task.images.views=6", "task.longest=16", "task.held_out=3", "task.rays=64")
 RUNS = {
     "a code of the prior": ("task=completion", "task.points=20"),
@@ -49,7 +50,8 @@ def copied(runs, tmp_path) -> Path:
 def edit(folder: Path, **changed) -> None:
     """Changes values of a record."""
     record = json.loads((folder / "record.json").read_text())
-    record["metrics"] |= changed.pop("metrics", {})
+    metrics = record["metrics"] | changed.pop("metrics", {})
+    record["metrics"] = {name: value for name, value in metrics.items() if value != GONE}
     (folder / "record.json").write_text(json.dumps(record | changed))
 
 
@@ -64,6 +66,7 @@ def test_runs_that_nobody_touched_agree(runs, capsys):
     [
         ({"metrics": {"chamfer_l1": 0.001}}, ["chamfer_l1 is 0.00100 in the record, now", "was the record edited?"]),
         ({"metrics": {"fscore": 0.5}, "code": "f" * 40}, ["fscore is 0.500", "the code differs: ffffffffffff then"]),
+        ({"metrics": {"fscore": GONE}}, ["fscore is not in the record, now", "was the record edited?"]),
         ({"metrics": {"fscore": 0.5}, "environment": {}}, ["fscore is 0.500", "cpu differs: None then"]),
     ],
 )
