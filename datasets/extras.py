@@ -1,9 +1,18 @@
-"""How the extras of this project are installed, which bring libraries that not everybody needs."""
+"""Libraries that not everybody needs: whether they are installed, and how extras of this project are."""
 
 import shlex
+from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def version(library: str) -> str | None:
+    """The version of a library; None where it is not installed, as PyMeshLab may not be."""
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def install(extra: str, root: Path = ROOT) -> str:

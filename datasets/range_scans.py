@@ -16,7 +16,7 @@ from datasets.mesh import Mesh, fit_in_sphere, normalise
 from datasets.meshes import load_mesh
 from datasets.readers.ply import read_ply
 from datasets.readers.text import mistaken
-from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, with_note
+from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, meshlab, with_note
 from datasets.scene import Split, Truth, sample_surface
 from renderers.checks import BadInput, check_share
 
@@ -174,9 +174,11 @@ def _scan(conf: Path, number: int, words: list[str]) -> Scan:
 def smoothed(mesh: Mesh) -> Mesh | None:
     """The screened Poisson reconstruction of a mesh (Kazhdan and Hoppe 2013), for scans with holes and tangled faces.
 
-    None where either surface has more than `OUTSIDE_SHARE` farther than `OUTSIDE_BY` from the other, as where faces are
-    not wound consistently or a hole is wide.
+    None without PyMeshLab, and where either surface has more than `OUTSIDE_SHARE` farther than `OUTSIDE_BY` from the
+    other, as where faces are not wound consistently or a hole is wide.
     """
+    if meshlab() is None:
+        return None
     wound = apply(mesh, ("meshing_re_orient_faces_coherently", {}))
     meshes = mesh_set(wound if wound.volume > 0 else replace(wound, faces=wound.faces[:, ::-1]))
     meshes.generate_surface_reconstruction_screened_poisson(depth=OCTREE, preclean=True, threads=1)

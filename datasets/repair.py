@@ -1,14 +1,19 @@
-"""Repairs triangle meshes: makes them closed solids, and notes every change."""
+"""Repairs triangle meshes: makes them closed solids, and notes every change.
+
+PyMeshLab does it. Where it is not installed, Open3D closes holes and manifold3d merges parts; a wrap is refused.
+"""
 
 import contextlib
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Int
 
 from datasets.mesh import Mesh
 from datasets.scene import Truth, sample_surface
+from renderers.checks import BadInput
 
 WRAPPED = "wrapped"  # begins the note of a mesh whose inside is what a closed surface around it encloses
 WELD = 1e-6  # of the diagonal: vertices closer than this, about ten float32 steps, are merged
@@ -20,6 +25,8 @@ HOLLOW_SIZE = 0.005  # unless it loses less than this share of the cubed diagona
 OUTSIDE_BY = 0.005  # of the diagonal: surface farther outside the repaired solid than this was cut away
 CHANGED = 0.25  # of area or volume: more gives a warning. Closing a box that lacks one of six sides adds 20 and 23 %
 SHEET = 0.003  # of the diagonal: a wrap of less mean thickness is that of a sheet, two offsets thick
+UNSEEN = "without PyMeshLab, faces of a part that cut through others were not looked for"
+WIDEST = 10.0  # diagonals: every hole is narrower
 OUTSIDE_SHARE = 0.01  # of the area: more cut away than this is not accepted
 
 
@@ -54,10 +61,9 @@ def _tidy(mesh: Mesh) -> Mesh:
 
     Two faces back to back cancel, unless their whole part is double-sided: then one side is kept.
     """
-    import pymeshlab
-
     mesh = mesh.compact()
-    mesh = apply(mesh, ("meshing_merge_close_vertices", {"threshold": pymeshlab.PercentageValue(100 * WELD)}))
+    weld = {"threshold": lab.PercentageValue(100 * WELD)} if (lab := meshlab()) else {}
+    mesh = apply(mesh, ("meshing_merge_close_vertices", weld))
     faces = mesh.faces
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     rolled = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
@@ -139,8 +145,9 @@ def _turn_outward(mesh: Mesh) -> Mesh:
 
 def _merge(mesh: Mesh) -> Mesh | None:
     """Merges overlapping parts, so that surfaces inside the solid vanish; None where that fails."""
-    import pymeshlab
-
+    lab = meshlab()
+    if lab is None:
+        return with_note(_united(mesh), UNSEEN)
     count = mesh.parts.max() + 1
     meshes = mesh_set(mesh)
     meshes.compute_selection_by_self_intersections_per_face()
@@ -149,7 +156,7 @@ def _merge(mesh: Mesh) -> Mesh | None:
         return mesh
     try:
         meshes.generate_boolean_union(first_mesh=0, second_mesh=0)
-    except pymeshlab.PyMeshLabException:
+    except lab.PyMeshLabException:
         return None
     if meshes.current_mesh().face_number() == 0:
         return None
@@ -162,6 +169,31 @@ def _merge(mesh: Mesh) -> Mesh | None:
     return with_note(merged, f"{_count(crossing, 'face')} that cut through others merged") if crossing else mesh
 
 
+def _united(mesh: Mesh) -> Mesh:
+    """What `_merge` does, by manifold3d; parts that do not overlap stay as they are.
+
+    Raises:
+        BadInput: where it is not installed, or cannot merge them.
+    """
+    import trimesh
+
+    parts = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).split(only_watertight=False)
+    touching = mesh.parts.max() == 0 and not all(part.is_watertight for part in parts)  # along edges of four faces
+    if len(parts) == 1 or touching:
+        return mesh
+    whole = [part for part in parts if part.volume > 0]  # others are cavities
+    try:
+        made = trimesh.boolean.union(whole, engine="manifold")
+    except (ImportError, ValueError) as error:
+        raise BadInput("its parts may overlap, to merge them: pip install manifold3d, or pymeshlab (GPL-3)") from error
+    if made.volume > (1 - WELD) * sum(part.volume for part in whole):
+        return mesh
+    if len(whole) < len(parts):
+        needed_meshlab("a mesh with cavities and overlapping parts")
+    merged = replace(mesh, vertices=made.vertices, faces=made.faces)
+    return with_note(merged, f"{len(whole)} overlapping parts merged into {merged.parts.max() + 1}")
+
+
 def _covers(solid: Mesh, mesh: Mesh) -> bool:
     """True where at most `OUTSIDE_SHARE` of the mesh's surface lies outside the solid."""
     points = sample_surface(mesh, 5000, seed=0).points
@@ -171,12 +203,11 @@ def _covers(solid: Mesh, mesh: Mesh) -> bool:
 
 def _wrap(mesh: Mesh, reason: str) -> Mesh:
     """Shrinks a closed surface around the mesh, as fine as possible without entering its inside."""
-    import pymeshlab
-
+    lab = needed_meshlab(f"the mesh must be wrapped, since {reason}, which")
     wrapped = None
     for alpha in WRAP_ALPHAS:
         meshes = mesh_set(mesh)
-        percentages = {"alpha": pymeshlab.PercentageValue(alpha), "offset": pymeshlab.PercentageValue(WRAP_OFFSET)}
+        percentages = {"alpha": lab.PercentageValue(alpha), "offset": lab.PercentageValue(WRAP_OFFSET)}
         meshes.generate_alpha_wrap(**percentages)
         finer = current(meshes, mesh)
         if wrapped is not None:
@@ -247,12 +278,27 @@ def _winding(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.
     return np.arctan2(top, bottom).sum(axis=1) / (2 * np.pi)
 
 
+def meshlab() -> ModuleType | None:
+    """PyMeshLab; None where it is not installed, as where its licence, GPL-3, is not wanted."""
+    try:
+        import pymeshlab
+    except ImportError:
+        return None
+    return pymeshlab
+
+
+def needed_meshlab(by: str) -> ModuleType:
+    """PyMeshLab; raises BadInput where it is not installed."""
+    if (found := meshlab()) is None:
+        raise BadInput(f"{by} needs PyMeshLab (GPL-3), which is not installed: pip install pymeshlab")
+    return found
+
+
 def mesh_set(mesh: Mesh):
     """The mesh for filters of pymeshlab."""
-    import pymeshlab
-
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
+    lab = needed_meshlab("this filter")
+    meshes = lab.MeshSet()
+    meshes.add_mesh(lab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
     return meshes
 
 
@@ -264,13 +310,34 @@ def current(meshes, before: Mesh) -> Mesh:
 
 def apply(mesh: Mesh, *filters: tuple[str, dict]) -> Mesh:
     """Runs filters of pymeshlab; one that fails leaves the mesh unchanged, which the caller checks."""
-    import pymeshlab
-
+    lab = meshlab()
+    if lab is None:
+        for name, _ in filters:
+            mesh = _by_open3d(mesh, name)
+        return mesh
     meshes = mesh_set(mesh)
     for name, options in filters:
-        with contextlib.suppress(pymeshlab.PyMeshLabException):
+        with contextlib.suppress(lab.PyMeshLabException):
             meshes.apply_filter(name, **options)
     return current(meshes, mesh)
+
+
+def _by_open3d(mesh: Mesh, name: str) -> Mesh:
+    """What a filter of pymeshlab does; the mesh itself where Open3D has no such filter."""
+    import open3d
+
+    vectors = open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces)
+    made = open3d.geometry.TriangleMesh(*vectors)
+    if name == "meshing_merge_close_vertices":
+        made.merge_close_vertices(WELD * mesh.diagonal)
+    elif name == "meshing_re_orient_faces_coherently":
+        made.orient_triangles()
+    elif name == "meshing_repair_non_manifold_edges":
+        made.remove_non_manifold_edges()
+    elif name == "meshing_close_holes":
+        there = open3d.t.geometry.TriangleMesh.from_legacy(made, vertex_dtype=open3d.core.float64)
+        made = there.fill_holes(WIDEST * mesh.diagonal).to_legacy()
+    return replace(mesh, vertices=np.array(made.vertices), faces=np.array(made.triangles))
 
 
 def with_note(mesh: Mesh, repair: str) -> Mesh:

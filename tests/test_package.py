@@ -18,7 +18,7 @@ import yaml
 from bench.__main__ import console
 from bench.records.read import RESULTS
 from bench.run.command import EXTRAS
-from datasets.extras import install
+from datasets.extras import install, version
 from tests.test_layers import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,6 +63,10 @@ def test_an_extra_is_installed_into_the_checkout_or_beside_the_installed_package
     monkeypatch.chdir(tmp_path)
     assert install("ray") == f"pip install -e '{ROOT}[ray]'"
     assert install("ray", tmp_path) == "pip install 'implicit-bench[ray]'"
+
+
+def test_a_library_that_is_not_installed_has_no_version():
+    assert version("no-such-library") is None and version("torch")
 
 
 def test_every_extra_that_a_message_names_is_there():

@@ -9,13 +9,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from bench.records.record import BESIDE, WAITED, Record
+from datasets.extras import version
 from renderers.fields.mlp import multiplies_faster
 from renderers.kernels.library import kernels
 
@@ -45,7 +45,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "commit": _git("rev-parse", "HEAD"),
         "dirty": bool(_git("status", "--porcelain", "--untracked-files=no", *CODE)),
         "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD", *CODE)) else "",
-        "implicit_bench": _own_version(),
+        "implicit_bench": version("implicit-bench") or "",
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
         "torch": str(torch.__version__),  # with its build; as its own class, it would load torch in the driver
@@ -254,14 +254,6 @@ def _resident() -> dict[str, int]:
     """The bytes of this process's resident set: now, by kind, and at most since the last reset (`VmHWM`)."""
     lines = (line.split() for line in Path("/proc/self/status").read_text().splitlines())
     return {words[0].rstrip(":"): int(words[1]) * 1024 for words in lines if words[0].startswith(("Rss", "VmHWM"))}
-
-
-def _own_version() -> str:
-    """The version of this package, of the checkout that was installed last; empty where none was installed."""
-    try:
-        return version("implicit-bench")
-    except PackageNotFoundError:
-        return ""
 
 
 def _git(*arguments: str) -> str:

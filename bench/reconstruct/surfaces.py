@@ -12,6 +12,7 @@ from bench.evaluate.state import GREY, painted
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import visible
 from datasets.mesh import Mesh
+from datasets.repair import needed_meshlab
 from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import Camera
@@ -59,12 +60,11 @@ def poisson(
         depth: of the octree.
         trim: least depth of the octree's leaf whose points support a vertex; 0 keeps all. DVR's Table 2 has 0, 5 and 7.
     """
-    import pymeshlab
-
+    lab = needed_meshlab("screened Poisson reconstruction")
     if len(points) < NEIGHBOURS:
         return None
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
+    meshes = lab.MeshSet()
+    meshes.add_mesh(lab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
     made = meshes.current_mesh()
     faces = made.face_matrix()

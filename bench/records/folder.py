@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import OURS, Rerun, check, check_draw
 from bench.records.record import NEUTRAL_KEYS, RunStatus, digest, file_lock, leads_out, link_out, read_record, to_json
 from bench.tables import own_row
+from datasets.extras import version
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (

@@ -1,14 +1,17 @@
 """Local mesh files: what is found, read, refused and repaired."""
 
 import re
+import sys
 
 import numpy as np
 import pytest
 import trimesh
 
+from bench.reconstruct.surfaces import poisson
 from datasets.mesh import Mesh
 from datasets.meshes import find_meshes, load_mesh, read_points, repair
 from datasets.scene import Truth, sample_surface
+from renderers.checks import BadInput
 from tests.looped import each
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -201,6 +204,25 @@ def test_a_repair_gives_the_solid_that_was_meant_and_a_note(name):
     repaired = repair(mesh)
     assert repaired.watertight and repaired.volume == pytest.approx(volume)
     assert repaired.repairs == notes
+
+
+@each("name", REPAIRED)
+def test_without_pymeshlab_open3d_and_manifold3d_give_the_same_solids(name, monkeypatch):
+    pytest.importorskip("manifold3d")
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    mesh, volume, notes = REPAIRED[name]
+    repaired = repair(mesh)
+    assert repaired.watertight and repaired.volume == pytest.approx(volume)
+    assert {note for note in notes if "outward" not in note} < {*repaired.repairs}  # Open3D may turn the other side
+    assert repaired.repairs[-1].startswith("without PyMeshLab, faces ")
+
+
+def test_what_pymeshlab_alone_does_names_it_where_it_is_not_installed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    for ask in (lambda: repair(sheet(np.sin)), lambda: poisson(points, points, depth=3, trim=0)):
+        with pytest.raises(BadInput, match=r"needs PyMeshLab \(GPL-3\).*: pip install pymeshlab"):
+            ask()
 
 
 @each("inverted", [False, True])
