@@ -1,6 +1,8 @@
 """`python -m bench.judge MESH --truth TRUTH`, or `--dtu FOLDER --scan 65`: judges a mesh that anything made.
 
-The metrics are those of runs, in the units of the files; bench/README.md defines them under "Which Chamfer is it?".
+Meshes are compared as they stand: nothing is aligned or scaled, but with --unit-sphere or --to-world. Results are in
+the units of the truth's file, with --unit-sphere in scene units, with --dtu in mm. The metrics are those of runs;
+bench/README.md defines them under "Which Chamfer is it?".
 """
 
 import argparse

@@ -7,7 +7,7 @@ from pathlib import Path
 from bench.records.record import PICTURES, leads_out
 from bench.report.write.paper import key_of, link
 
-FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
+FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply", "field.safetensors")
 SUFFIXES = (".png", ".gif", ".webp")  # of pictures
 ALT = {  # what the pictures of a run show
     "summary.png": "Depth, normals, errors of the silhouette and the shape from behind: before, after, truth",

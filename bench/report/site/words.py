@@ -117,15 +117,16 @@ def command(record: Record, results_dir: Path) -> str:
 
 
 def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
-    """The lines that open the run in Python: its values of the table of all runs, its curve and its mesh."""
+    """The lines that open the run in Python: its values of the table of all runs, its curve, its mesh and its field."""
     results, name = _quoted(folder.parents[1].as_posix()), _quoted(folder.name)
     shown = ["status", *[metric for metric in metrics.SHOWN if metric in record["metrics"]][:MOST_SHOWN]]
     opened = {
         "curve.jsonl": ("import pandas as pd", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)'),
         "mesh.ply": ("import trimesh", 'mesh = trimesh.load(folder / "mesh.ply")'),
+        "field.safetensors": ("", "field = bench.load_field(folder)"),
     }
     others = [lines for file, lines in opened.items() if file in files]
-    imports = ["import bench", *(first for first, _ in others)]
+    imports = ["import bench", *(first for first, _ in others if first)]
     lines = [
         f"runs = bench.load({results})",
         f"run = runs[runs.folder == {name}].iloc[0]",
