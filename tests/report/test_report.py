@@ -66,7 +66,7 @@ def crashed(name: str, **changed) -> dict:
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
     results = tmp_path / "results of a sweep"
-    files = ("summary.png", "curve.png", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply")
+    files = ("summary.png", "curve.png", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply", "field.safetensors")
     write_run(results, record("plain", notes=["3 holes closed"]), "plain", files)
     write_run(results, record(ODD_NAME, started="2025-03-04T10:00:00+00:00"), ODD_NAME, files)
     write_run(results, crashed("broken", reason=HOSTILE, started="2025-03-03T10:00:00"), "broken", ("log.txt",))
