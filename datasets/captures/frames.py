@@ -160,7 +160,8 @@ def whole(matrix: Float[np.ndarray, "rows columns"], where: str) -> Float[np.nda
         raise BadInput(f"{where} must be invertible, in its left 3 x 3 numbers: export it again")
     if np.abs(matrix[3:] - LAST).max(initial=0) > ROUNDED:
         found = " ".join(f"{value:.6g}" for value in matrix[3])
-        transposed = "it may be transposed; " if matrix[3, :3].any() and not matrix[:3, 3].any() else ""
+        row, column = (np.abs(part).max() > ROUNDED for part in (matrix[3, :3], matrix[:3, 3]))
+        transposed = "it may be transposed; " if row and not column else ""
         raise BadInput(f"{where} must have 0 0 0 1 as its fourth row, not {found}: {transposed}export it again")
     return np.vstack([matrix[:3], LAST])
 
