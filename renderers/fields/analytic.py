@@ -96,7 +96,7 @@ def box(half_sizes: Numbers) -> Shape:
 
     def distance(points: Tensor) -> Tensor:
         beyond = points.abs() - _like(half_sizes, points)
-        return _norm(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
+        return _around(beyond)
 
     return Shape(distance)
 
@@ -161,7 +161,7 @@ def cylinder(radius: Numbers, half_height: Numbers) -> Shape:
             ],
             -1,
         )
-        return _norm(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
+        return _around(beyond)
 
     return Shape(distance)
 
@@ -183,6 +183,14 @@ def _length(parts: Float[Tensor, "*batch 2"], power: Tensor) -> Float[Tensor, "*
     largest = parts.amax(-1, keepdim=True).clamp_min(torch.finfo(parts.dtype).tiny)
     shares = (parts / largest).clamp_min(LEAST_SHARE)  # a power of 0 has no gradient towards its exponent
     return largest.squeeze(-1) * (shares**power).sum(-1) ** (1 / power)
+
+
+def _around(beyond: Tensor) -> Tensor:
+    """The distance of a box from how far points lie beyond its sides; on a side it has the inside's gradient."""
+    nearest = beyond.amax(-1)
+    return _norm(beyond.clamp_min(0)) + (
+        nearest - nearest.relu()
+    )  # at 0 clamp_max has no gradient from PyTorch 2.14 on
 
 
 def _norm(vectors: Tensor) -> Tensor:
