@@ -16,9 +16,11 @@ from renderers.checks import BadInput
 from renderers.fields.mlp import Decoder
 from renderers.fields.network import Coded, Published
 
+SIGNED = r"(?:implicit_network|sdf_network\w*)"  # the name of IDR's, NeuS's and VolSDF's network
 LAYERS = r"lin(\d+)\."  # and what follows: weight, bias
 OUTER = r"(?:(?:module|model|model_state_dict|state_dict|decoder)\.)*"  # what may stand before a network's own names
 NORMALISED = (("weight_g", "weight_v"), ("parametrizations.weight.original0", "parametrizations.weight.original1"))
+MOST_FREQUENCIES = 12  # of an encoding; IDR, NeuS and VolSDF have 6
 SHARPNESS = 100  # of the softplus of IDR, NeuS and VolSDF
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     **{"relu": torch.relu, "elu": nn.functional.elu, "tanh": torch.tanh, "sin": torch.sin, "cos": torch.cos},
@@ -199,11 +201,9 @@ def deepsdf(tensors: Mapping[str, Tensor], specs: Mapping[str, Any], *, squash: 
         squash: how many tanh follow the last layer; None: one for `use_tanh`, and the one that the code of 2019 always
             has. Code that states `geom_dimension` has not.
     """
-    network, code_length = specs["NetworkSpecs"], int(specs["CodeLength"])
-    if (dimension := network.get("geom_dimension", 3)) != 3:
-        raise BadInput(f"specs.json: the network takes points of {dimension} numbers (geom_dimension): it must take 3")
+    network, code_length, dims = _checked(specs)
     weights = Weights(tensors, prefix=prefix_of(tensors, f"{OUTER}(?={LAYERS})"), whose="ModelParameters")
-    dims, again, given = list(network["dims"]), {}, code_length + 3
+    again, given = {}, code_length + 3
     latent_in, everywhere = network.get("latent_in") or (), bool(network.get("xyz_in_all"))
     normed = set(network.get("norm_layers") or ()) if not network.get("weight_norm") else set()
     layers, norms, widths = [], {}, [given, *dims, 1]
@@ -212,7 +212,7 @@ def deepsdf(tensors: Mapping[str, Tensor], specs: Mapping[str, Any], *, squash: 
         if index and (index in latent_in or everywhere):
             again[index] = index in latent_in
         less = given if index + 1 in latent_in else 3 if everywhere and not last else 0
-        layers.append(weights.layer(f"lin{index}", inputs, widths[index + 1] - less))
+        layers.append(weights.layer(f"lin{index}", inputs, max(widths[index + 1] - less, 0)))
         if index in normed:
             norms[index] = tuple(weights.take(f"bn{index}.{part}", len(layers[-1][1])) for part in ("weight", "bias"))
     weights.finish()
@@ -224,13 +224,39 @@ def deepsdf(tensors: Mapping[str, Tensor], specs: Mapping[str, Any], *, squash: 
     return Published(Coded(body, code_length=code_length, width=max(dims)), squash)
 
 
+def _checked(specs: Any) -> tuple[Mapping[str, Any], int, list[int]]:
+    """The `NetworkSpecs` of a specs.json, its `CodeLength` and `dims`; raises BadInput where they are not."""
+    network = specs.get("NetworkSpecs") if isinstance(specs, dict) else None
+    if not isinstance(network, dict):
+        raise BadInput(f"specs.json must have NetworkSpecs, an object, not {network!r}: take that of the training")
+    numbers = {key: network.get(key) or [] for key in ("dims", "latent_in", "norm_layers")}
+    numbers |= {"CodeLength": [specs.get("CodeLength")], "geom_dimension": [network.get("geom_dimension", 3)]}
+    wrong = [key for key, found in numbers.items() if not isinstance(found, list) or not all(map(_counts, found))]
+    wrong += [] if numbers["dims"] else ["dims"]
+    wrong += [key for key in ("xyz_in_all", "use_tanh", "weight_norm") if type(network.get(key) or False) is not bool]
+    if wrong:
+        named = ", ".join(f"{key} {(specs if key == 'CodeLength' else network).get(key)!r}" for key in wrong)
+        raise BadInput(
+            f"specs.json has {named}: dims, latent_in and norm_layers must be lists of whole numbers, CodeLength and "
+            "geom_dimension whole numbers, the others true or false"
+        )
+    if (dimension := numbers["geom_dimension"][0]) != 3:
+        raise BadInput(f"specs.json: the network takes points of {dimension} numbers (geom_dimension): it must take 3")
+    return network, specs["CodeLength"], network["dims"]
+
+
+def _counts(found: Any) -> bool:
+    """Whether it is a whole number, 0 or more."""
+    return type(found) is int and found >= 0
+
+
 def implicit(tensors: Mapping[str, Tensor]) -> Published:
     """The network of IDR, NeuS and VolSDF: softplus layers of encoded points, of whose outputs the first is the value.
 
     Its encoding, and the layers that take it again, follow from the widths. NeuS's `scale`, which a checkpoint does not
     hold, is left out; so is VolSDF's outer sphere, which is the scene's background.
     """
-    prefix = prefix_of(tensors, rf"(?:.*\.)?(?:implicit_network|sdf_network\w*)\.(?={LAYERS})", f"{OUTER}(?={LAYERS})")
+    prefix = prefix_of(tensors, rf"(?:.*\.)?{SIGNED}\.(?={LAYERS})")
     weights = Weights(tensors, prefix=prefix, whose="the network")
     layers: list[Layer] = []
     again: dict[int, bool] = {}
@@ -247,19 +273,22 @@ def implicit(tensors: Mapping[str, Tensor]) -> Published:
         layers.append((weight, bias))
     weights.finish()
     inputs = layers[0][0].shape[1]
-    if inputs < 3 or (inputs - 3) % 6:
+    frequencies, rest = divmod(inputs - 3, 6)
+    if rest or not 0 <= frequencies <= MOST_FREQUENCIES:
         raise BadInput(
-            f"{prefix}lin0 takes {inputs} numbers: it must be 3, the point, and 6 for each frequency of an encoding"
+            f"{prefix}lin0 takes {inputs} numbers: it must be 3, the point, and 6 for each of at most "
+            f"{MOST_FREQUENCIES} frequencies of an encoding"
         )
     layers[-1] = (layers[-1][0][:1], layers[-1][1][:1])
-    body = Layered(layers, activation="softplus", again=again, frequencies=(inputs - 3) // 6, shrink=sqrt(0.5))
+    body = Layered(layers, activation="softplus", again=again, frequencies=frequencies, shrink=sqrt(0.5))
     return Published(Coded(body, code_length=0, width=max(len(bias) for _, bias in layers)), 0)
 
 
 def occupancy(tensors: Mapping[str, Tensor]) -> Published:
     """The decoder of occupancy networks (Mescheder et al. 2019) and DVR (Niemeyer et al. 2020): a logit.
 
-    The code is the one that an encoder gives, `c`; of an occupancy network's latent `z`, zeros are taken.
+    The code is the one that an encoder gives, `c`; of an occupancy network's latent `z`, zeros are taken. `fc_z` is
+    added to the features of the points, but in the decoder with `conv_p`, their second with CBN, to the code.
     """
     if any("encoder.unet" in name or "encoder.fc_pos" in name for name in tensors):
         raise BadInput("it is a convolutional occupancy network, whose code differs from point to point: not read")
@@ -272,7 +301,7 @@ def occupancy(tensors: Mapping[str, Tensor]) -> Published:
     listed = weights.has("blocks")
     count = weights.count(r"blocks\.(\d+)\." if listed else r"block(\d+)\.")
     names = [f"blocks.{at}" if listed else f"block{at}" for at in range(count)]
-    if weights.has("fc_z") and weights.left["fc_z.bias"].shape == first[1].shape:
+    if weights.has("fc_z") and kind == "fc":
         first = (first[0], first[1] + weights.layer("fc_z", outputs=width)[1])
     shifts: dict[int, Layer] = {}
     if weights.has("fc_c.0"):
@@ -288,6 +317,11 @@ def occupancy(tensors: Mapping[str, Tensor]) -> Published:
         code_length = weights.left[gamma].shape[1]
         places = [f"{name}.bn_{at}" for name in names for at in (0, 1)]
         norms = [Norm(weights, place, code_length) for place in (*places, "bn")]
+        if weights.has("fc_z"):
+            moved = weights.layer("fc_z", outputs=code_length)[1]
+            with torch.no_grad():
+                for layer in (one for norm in norms for one in (norm.gamma, norm.beta)):
+                    layer.bias.copy_(layer(moved))
     blocks = [(weights.layer(f"{name}.fc_0", width), weights.layer(f"{name}.fc_1", outputs=width)) for name in names]
     last = weights.layer(f"{kind}_out", width)
     weights.finish()

@@ -125,7 +125,6 @@ def implicit(prefix: str, frequencies: int, written: Any) -> tuple[State, Tensor
     ("implicit_network.", 3, as_of_today),
     ("sdf_network_fine.", 6, as_of_2019),
     ("model.sdf_network.", 2, directly),
-    ("module.", 0, as_of_2019),
 ])  # fmt: skip
 def test_a_network_of_idr_neus_or_volsdf_has_the_values_of_its_own_code(prefix, frequencies, written):
     torch.manual_seed(0)
@@ -136,8 +135,9 @@ def test_a_network_of_idr_neus_or_volsdf_has_the_values_of_its_own_code(prefix, 
 
 
 def occupancy(kind: str) -> tuple[State, Tensor]:
-    """The state of an occupancy network of two blocks of 8, and its logits at the code: `dvr`, `shift` or `cbn`."""
+    """The state of an occupancy network of two blocks of 8, and its logits at the code: dvr, shift, cbn or cbn2."""
     state, width, name = {}, 8, "decoder."
+    cbn, code = kind in ("cbn", "cbn2"), CODE
 
     def layer(key: str, outputs: int, inputs: int, *rest: int) -> tuple[Tensor, Tensor]:
         weight, bias = drawn(outputs, inputs), drawn(outputs)
@@ -145,32 +145,34 @@ def occupancy(kind: str) -> tuple[State, Tensor]:
         return weight, bias
 
     def normed(key: str, x: Tensor) -> Tensor:
-        gamma, beta = (linear(CODE, *layer(f"{key}.conv_{one}", width, 2, 1)) for one in ("gamma", "beta"))
+        gamma, beta = (linear(code, *layer(f"{key}.conv_{one}", width, 2, 1)) for one in ("gamma", "beta"))
         mean, variance = drawn(width), torch.rand(width)
         stored = {"running_mean": mean, "running_var": variance, "num_batches_tracked": torch.tensor(7)}
         state.update({f"{name}{key}.bn.{part}": value for part, value in stored.items()})
         return gamma * batch_norm(x, mean, variance) + beta
 
-    one = (1,) if kind == "cbn" else ()
-    x = linear(POINTS, *layer("fc_p", width, 3, *one))
-    if kind != "dvr":
+    one, letters = (1,) if cbn else (), "conv" if kind == "cbn2" else "fc"
+    x = linear(POINTS, *layer(f"{letters}_p", width, 3, *one))
+    if kind == "cbn2":
+        code = CODE + layer("fc_z", 2, 4)[1]
+    elif kind != "dvr":
         x = x + layer("fc_z", width, 4)[1]
     if kind == "shift":
         x = x + linear(CODE, *layer("fc_c", width, 2))
     for n in range(2):
-        block = f"blocks.{n}" if kind == "dvr" else f"block{n}"
+        block = f"blocks.{n}" if kind in ("dvr", "cbn2") else f"block{n}"
         if kind == "dvr":
             x = x + linear(CODE, *layer(f"fc_c.{n}", width, 2))
-        inner = normed(f"{block}.bn_0", x) if kind == "cbn" else x
+        inner = normed(f"{block}.bn_0", x) if cbn else x
         inner = linear(inner.relu(), *layer(f"{block}.fc_0", width, width, *one))
-        inner = normed(f"{block}.bn_1", inner) if kind == "cbn" else inner
+        inner = normed(f"{block}.bn_1", inner) if cbn else inner
         x = x + linear(inner.relu(), *layer(f"{block}.fc_1", width, width, *one))
-    x = normed("bn", x) if kind == "cbn" else x
-    x = linear(x.relu(), *layer("fc_out", 4 if kind == "dvr" else 1, width, *one))
+    x = normed("bn", x) if cbn else x
+    x = linear(x.relu(), *layer(f"{letters}_out", 4 if kind == "dvr" else 1, width, *one))
     return state, x[:, 0]
 
 
-@each("kind", ["dvr", "shift", "cbn"])
+@each("kind", ["dvr", "shift", "cbn", "cbn2"])
 def test_an_occupancy_network_has_the_logits_of_its_own_code(kind):
     torch.manual_seed(0)
     state, logits = occupancy(kind)
@@ -219,6 +221,12 @@ def deepsdf_with(state: Any, **changed: Any) -> Any:
     return published.deepsdf(state(found), settings | {"NetworkSpecs": SPECS | changed})
 
 
+def implicit_with(changed: State) -> Any:
+    return published.implicit(
+        implicit("sdf_network.", 0, directly)[0] | {f"sdf_network.{key}": one for key, one in changed.items()}
+    )
+
+
 def cbn_with(state: Any) -> Any:
     return published.occupancy(state(occupancy("cbn")[0]))
 
@@ -232,9 +240,17 @@ def plain_with(state: Any) -> Any:
     (lambda: deepsdf_with(lambda s: s | {"lin1.weight_v": drawn(9, 16)}), ("lin1.weight_v must be 7 x 16", "9 x 16")),
     (lambda: deepsdf_with(lambda s: s | {"lin9.bias": drawn(2)}), ("weights of another network: lin9.bias",)),
     (lambda: deepsdf_with(lambda s: s, geom_dimension=2), ("points of 2 numbers",)),
+    (lambda: deepsdf_with(lambda s: s, dims="16"), ("dims '16'", "lists of whole numbers")),
+    (lambda: deepsdf_with(lambda s: s, latent_in=2), ("latent_in 2",)),
+    (lambda: deepsdf_with(lambda s: s, norm_layers=[0, "1"]), ("norm_layers [0, '1']",)),
+    (lambda: deepsdf_with(lambda s: s, use_tanh="false"), ("use_tanh 'false'", "true or false")),
+    (lambda: published.deepsdf({}, {"NetworkSpecs": SPECS, "CodeLength": "2"}), ("CodeLength '2'",)),
+    (lambda: published.deepsdf({}, {"NetworkSpecs": [3]}), ("must have NetworkSpecs, an object, not [3]",)),
     (lambda: deepsdf_with(lambda _: {"conv.weight": drawn(2, 2)}), ("no layers of this format", "conv.weight")),
-    (lambda: published.implicit({"lin0.weight": drawn(8, 2), "lin0.bias": drawn(8)}), ("lin0 takes 2", "must be 3")),
-    (lambda: published.implicit(implicit("", 0, directly)[0] | {"lin2.weight": drawn(40, 39)}), ("lin2 takes 39",)),
+    (lambda: implicit_with({"lin0.weight": drawn(40, 2), "lin2.weight": drawn(40, 39)}), ("lin0 takes 2", "be 3")),
+    (lambda: implicit_with({"lin0.weight": drawn(40, 81), "lin2.weight": drawn(40, 118)}), ("takes 81", "at most 12")),
+    (lambda: implicit_with({"lin2.weight": drawn(40, 39)}), ("lin2 takes 39",)),
+    (lambda: published.implicit(implicit("module.", 0, directly)[0]), ("no layers of this format", "module.lin0")),
     (lambda: cbn_with(lambda s: s | {"decoder.fc_p.weight": drawn(8, 2, 1)}), ("fc_p.weight must be any x 3",)),
     (lambda: cbn_with(lambda s: without(s, "decoder.bn.bn.running_var")), ("lacks decoder.bn.bn.running_var",)),
     (lambda: plain_with(lambda s: s | {"0000.dense.A": drawn(2, 8)}), ("0000.dense.A must be 3 x any", "2 x 8")),
