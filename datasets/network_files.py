@@ -24,22 +24,23 @@ from datasets.field_files import FIELD, load_network
 from datasets.mesh import Mesh, extract
 from datasets.scene import Split
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
-from renderers.field import STEEPEST_MARGIN, Kind
+from renderers.field import Kind
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
-from renderers.fields.network import Facts, Published, enlarged, measured, sampled, settled
-from renderers.fields.published import deepsdf, implicit, occupancy, plain
+from renderers.fields.network import Coded, Facts, Published, enlarged, measured, settled
+from renderers.fields.published import LAYERS, SIGNED, Residual, deepsdf, implicit, occupancy, plain
 
 VERSION = 1  # raise it when reading or measuring changes the fields
 REACH = 1.05  # scene units: half the side of the cube in which the surface within the unit sphere is extracted
-AUTO, INSIDE = "auto", ("auto", "negative", "positive")
+AUTO = "auto"
+INSIDE = {AUTO: None, "negative": 1.0, "positive": -1.0}  # signs; see `Meaning`
+OWN_LEVEL = "occupancy networks' own meshes are at 0.2, dataset.level=-1.386"
 PARTS = ("ModelParameters", "LatentCodes")  # of a DeepSDF folder, in each of which `latest.pth` is read
 LATEST = "latest.pth"
-TENSORS = {
-    "deepsdf": "a folder with specs.json",
-    "implicit": "IDR, NeuS, VolSDF",
-    "occupancy": "occupancy networks, DVR",
-}
+TENSORS = (
+    "DeepSDF (name the folder with its specs.json); IDR, NeuS, VolSDF (implicit_network.lin0, sdf_network.lin0); "
+    "occupancy networks, DVR (fc_p, conv_p)"
+)
 SCALARS = [  # of numpy, in which some checkpoints hold their best loss; plain numbers
     *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
     *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
@@ -83,7 +84,7 @@ class NetworkFile:
             `.npz` of neural-implicit-queries; or the folder of a run that left its field.
         scale: makes the shapes so many times as large: the unit sphere is what renderers see.
         inside: which values are inside, "negative" or "positive"; "auto" takes those that are rarer on the unit sphere.
-        level: of the surface; None takes 0.5 for values that lie between 0 and 1, else 0.
+        level: of the surface, among the network's values.
         kind: what values mean: "distance", "bound" or "level"; "auto" measures it. Of a bound, values are divided by
             their steepest slope.
         codes: a file of codes, `.npy` or `.pth` [shapes, length], in place of the network's own.
@@ -94,7 +95,7 @@ class NetworkFile:
     path: str
     scale: float
     inside: str
-    level: float | None
+    level: float
     kind: str
     codes: str | None
     tanh: int | None
@@ -102,13 +103,15 @@ class NetworkFile:
 
     def __post_init__(self) -> None:
         check_positive("dataset.scale", self.scale, "1 leaves the network's own units")
-        check_choice("dataset.inside", self.inside, INSIDE)
+        check_choice("dataset.inside", self.inside, tuple(INSIDE))
         check_choice("dataset.kind", self.kind, (AUTO, *(kind.value for kind in Kind)))
         check_at_least("dataset.resolution", self.resolution, 16, "128 keeps thin parts")
         if self.tanh is not None:
             check_at_least("dataset.tanh", self.tanh, 0, "1 is as in DeepSDF's code of 2019")
-        if self.level is not None and not isfinite(self.level):
-            raise ValueError(f"dataset.level must be finite, not {self.level}: 0 for distances and logits")
+        if not isfinite(self.level):
+            raise ValueError(
+                f"dataset.level must be finite, not {self.level}: 0 for distances and logits, 0.5 for probabilities"
+            )
         if not Path(self.path).exists():
             raise ValueError(f"dataset.path: there is nothing at '{self.path}': name a network's file or folder")
 
@@ -166,29 +169,27 @@ def _known(file: NetworkFile, index: int, content: str) -> Known:
 
 def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> Known:
     """The network with a field that is negative inside and of the kind that was measured."""
-    raw = network.at(codes[index])
-    values, around = sampled(raw, codes)
-    least, most = float(values.min()), float(values.max())
-    level = file.level if file.level is not None else 0.5 if least >= 0 and most <= 1 else 0.0
-    if not least < level < most:
+    meaning = measured(
+        network.at(codes[index]),
+        codes,
+        kind=None if file.kind == AUTO else Kind(file.kind),
+        sign=INSIDE[file.inside],
+        level=file.level,
+        scale=file.scale,
+    )
+    facts, kind = meaning.facts, meaning.kind
+    if not facts.least < 0 < facts.most:
+        ends = sorted(file.level + value / (meaning.factor * meaning.divisor) for value in (facts.least, facts.most))
         raise BadInput(
-            f"its values in the unit sphere lie between {least:.3g} and {most:.3g}, and the surface at the level "
-            f"{level:g} is not among them: set dataset.level, or dataset.scale"
+            f"its values in the unit sphere lie between {ends[0]:.3g} and {ends[1]:.3g}, and the surface at the level "
+            f"{file.level:g} is not among them: set dataset.level (0.5 where they are probabilities), or dataset.scale"
         )
-    outside = 1.0 if float((around > level).double().mean()) >= 0.5 else -1.0
-    sign = {"negative": 1.0, "positive": -1.0, AUTO: outside}[file.inside]
-    factor = sign * file.scale
-    facts = measured(Shape(lambda points: factor * (raw(points) - level)), codes)
-    kind = facts.kind if file.kind == AUTO else Kind(file.kind)
-    divided = ""
-    if kind is Kind.BOUND or (file.kind == AUTO and kind is Kind.LEVEL):
-        steepest, kind = STEEPEST_MARGIN * facts.steepest, Kind.BOUND
-        factor, divided = factor / steepest, f", by values divided by {steepest:.3g}"
-    lipschitz = 1.0 if kind is Kind.BOUND else None
     network.register_buffer("content", torch.frombuffer(bytearray.fromhex(content), dtype=torch.uint8))
-    decoder = settled(network, factor=factor, level=level, kind=kind, lipschitz=lipschitz).requires_grad_(False)
-    inside = "negative" if sign > 0 else "positive"
-    side = f"values are {inside} inside, at the level {level:g}"
+    decoder = settled(network, meaning, level=file.level).requires_grad_(False)
+    side = f"values are {'negative' if meaning.factor > 0 else 'positive'} inside, at the level {file.level:g}"
+    if isinstance(network.inner, Coded) and isinstance(network.inner.body, Residual):
+        side += f" of the logits, a probability of {torch.tensor(file.level).sigmoid():.2g} ({OWN_LEVEL})"
+    divided = f", by values divided by {meaning.divisor:.3g}" if kind is Kind.BOUND else ""
     return Known(decoder, codes, facts, (f"{file.name}: {side}; {facts.in_words}; taken as a {kind.value}{divided}",))
 
 
@@ -206,6 +207,11 @@ def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     if file.codes is not None:
         codes = _codes(Path(file.codes))
     length = network.code_length
+    if codes is None and not network.placed:
+        raise BadInput(
+            f"its values depend on a code of {length} numbers, which it does not hold: set dataset.codes=FILE, an .npy "
+            f"or .pth of [shapes, {length}], such as an encoder's output"
+        )
     if codes is None:
         codes = torch.zeros(1, length)
     if codes.dim() != 2 or codes.shape[1] != length:
@@ -217,27 +223,25 @@ def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | No
     """A DeepSDF folder's network and codes; None where it has none."""
     try:
         specs = json.loads((path / "specs.json").read_text("utf-8"))
-        _ = specs["NetworkSpecs"]["dims"], specs["CodeLength"]
     except OSError:
         raise BadInput("the folder has no specs.json: name a DeepSDF folder, or a file") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise BadInput(f"specs.json must have NetworkSpecs with dims, and CodeLength: {error!r}") from error
+    except ValueError as error:
+        raise BadInput(f"specs.json must be JSON: {error}") from error
     weights, latent = (path / part / LATEST for part in PARTS)
     if not weights.is_file():
         raise BadInput(f"the folder has no {PARTS[0]}/{LATEST}")
     network = deepsdf(_tensors(weights), specs, squash=squash)
-    return network, _codes(latent) if latent.is_file() and specs["CodeLength"] else None
+    return network, _codes(latent) if latent.is_file() and not network.placed else None
 
 
 def _of_names(tensors: dict[str, Tensor]) -> Published:
     """The network of a checkpoint whose format its names tell."""
-    if any(".lin0." in f".{name}" for name in tensors):
+    if any(re.search(rf"(?:^|\.){SIGNED}\.{LAYERS}", name) for name in tensors):
         return implicit(tensors)
     if any(f".{first}_p." in f".{name}" for name in tensors for first in ("fc", "conv")):
         return occupancy(tensors)
-    known = "; ".join(f"{name} ({what})" for name, what in TENSORS.items())
     names = ", ".join([*tensors][:6]) or "no tensors"
-    raise BadInput(f"it is of no format that is read, which are {known}, and .npz: it has {names}")
+    raise BadInput(f"it is of no format that is read, which are {TENSORS}; and .npz: it has {names}")
 
 
 def _codes(path: Path) -> Tensor:

@@ -62,7 +62,7 @@ class Decoder(nn.Module):
             raise ValueError(
                 f"width must exceed code_length + 3 = {again} for a narrowed skip, not {width}: set narrow=false"
             )
-        self.code_length, self.skip, self.width = code_length, skip, width
+        self.code_length, self.skip, self.width, self.placed = code_length, skip, width, False
         self.kind: Kind = Kind.DISTANCE
         self.lipschitz: float | None = None
         inputs, outputs = [again] + [width] * (layers - 1), [width] * layers
@@ -101,7 +101,7 @@ class Decoder(nn.Module):
         """
         *hidden, last = layers
         made = Decoder(layers=len(hidden), width=1, code_length=code_length or 3, skip=skip, narrow=False)
-        made.width = max(len(bias) for _, bias in hidden)
+        made.width, made.placed = max(len(bias) for _, bias in hidden), code_length == 0
         for index, (weight, bias) in enumerate(hidden):
             if not code_length and index in (0, skip):
                 weight = torch.cat([weight[:, :-3], -weight[:, -3:], weight[:, -3:]], dim=1)

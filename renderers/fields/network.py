@@ -1,7 +1,7 @@
 """A field of any network: points and perhaps a code to values, of which it is measured what they mean."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import cast
 
 import torch
@@ -60,10 +60,10 @@ class Facts:
 
     @property
     def kind(self) -> Kind:
-        """DISTANCE where slopes near the surface are nearly 1 and none is much steeper, else LEVEL."""
+        """DISTANCE where slopes near the surface are nearly 1 and none is much steeper; others can be made a BOUND."""
         low, _, high = self.near
         even = low >= 1 - EVEN and high <= 1 + EVEN and self.nearly_all <= ANY_SLOPE
-        return Kind.DISTANCE if even else Kind.LEVEL
+        return Kind.DISTANCE if even else Kind.BOUND
 
     @property
     def in_words(self) -> str:
@@ -79,19 +79,69 @@ class Facts:
         )
 
 
-def measured(field: Values, like: Tensor | None = None) -> Facts:
-    """The facts of a field, negative inside.
+@dataclass(frozen=True)
+class Meaning:
+    """What values mean: `factor * (value - level)` is negative inside, and of a kind.
+
+    Args:
+        facts: of values that are negative inside, before a bound is divided.
+        kind: of the field.
+        divisor: by which a bound is divided; 1 of others.
+        factor: the scale over the divisor; negative where values above the level are inside.
+    """
+
+    facts: Facts
+    kind: Kind
+    divisor: float
+    factor: float
+
+    @property
+    def lipschitz(self) -> float | None:
+        """The bound of the slope: 1 of a bound; a distance is not known to be one exactly."""
+        return 1.0 if self.kind is Kind.BOUND else None
+
+
+def measured(
+    field: Values,
+    like: Tensor | None = None,
+    *,
+    kind: Kind | None = None,
+    sign: float | None = None,
+    level: float = 0.0,
+    scale: float = 1.0,
+) -> Meaning:
+    """What the values of a field mean, by values and slopes in the unit sphere.
 
     Args:
         like: a tensor of the dtype and device at which it is evaluated; None for float64 on the CPU.
+        kind: what is said of it; None measures it. A bound is divided by its steepest slope with a margin of 20 %, and
+            so is what is no distance: it is a bound as far as no slope between the points is steeper.
+        sign: 1 where values below the level are inside, -1 where those above it are; None takes those that are rarer
+            on the unit sphere.
+        level: of the surface.
+        scale: what values are multiplied by.
 
     Raises:
         BadInput: where values are not finite.
     """
     points = points_in_sphere(DRAWN, like)
-    values, around = sampled(field, like)
+    with torch.no_grad():
+        values = torch.cat([field(some) for some in points.split(AROUND)]).double() - level
+        around = field(nn.functional.normalize(points[:AROUND], dim=-1)).double() - level
+    if unknown := int((~values.isfinite()).sum()):
+        raise BadInput(f"its value is not finite at {unknown} of {DRAWN} points of the unit sphere: check its weights")
     gradients = torch.cat([autograd_gradients(cast(Field, field), some) for some in points.split(AROUND)])
-    slopes = torch.linalg.vector_norm(gradients, dim=-1).double()
+    slopes = scale * torch.linalg.vector_norm(gradients, dim=-1).double()
+    if sign is None:
+        sign = 1.0 if float((around > 0).double().mean()) >= 0.5 else -1.0
+    facts = _facts(points, sign * scale * values, sign * around, slopes)
+    kind = kind or facts.kind
+    divisor = STEEPEST_MARGIN * facts.steepest if kind is Kind.BOUND else 1.0
+    return Meaning(facts, kind, divisor, sign * scale / divisor)
+
+
+def _facts(points: Tensor, values: Tensor, around: Tensor, slopes: Tensor) -> Facts:
+    """The facts of values and slopes at points, and of values on the unit sphere; negative inside."""
     near = slopes[values.abs() <= values.abs().quantile(NEAR)].quantile(slopes.new_tensor([0.1, 0.5, 0.9]))
     low, middle, high = near.tolist()
     inside = points[values < 0]
@@ -109,16 +159,6 @@ def measured(field: Values, like: Tensor | None = None) -> Facts:
     )
 
 
-@torch.no_grad()
-def sampled(field: Values, like: Tensor | None = None) -> tuple[Float[Tensor, " drawn"], Float[Tensor, " around"]]:
-    """The values of a field, in float64, at points drawn in the unit sphere and at points on it; as `measured`."""
-    points = points_in_sphere(DRAWN, like)
-    values = torch.cat([field(some) for some in points.split(AROUND)]).double()
-    if unknown := int((~values.isfinite()).sum()):
-        raise BadInput(f"its value is not finite at {unknown} of {DRAWN} points of the unit sphere: check its weights")
-    return values, field(nn.functional.normalize(points[:AROUND], dim=-1)).double()
-
-
 def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None, like: Tensor | None = None) -> Shape:
     """A field of a network that takes points [n, 3] and gives values [n] or [n, 1], negative inside.
 
@@ -126,9 +166,11 @@ def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None
 
     Args:
         network: an nn.Module, or any such function.
-        kind: what its values mean; None measures it. What is no distance is divided by its steepest slope in the unit
-            sphere, with a margin of 20 %, and is a bound as far as no slope between the points is steeper.
+        kind: what its values mean; None measures it; see `measured`.
         like: a tensor of the dtype and device at which the network works; None takes its first parameter, or float32.
+
+    Raises:
+        BadInput: where values are not finite.
     """
     parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
     like = (parameters or [torch.zeros(())])[0] if like is None else like
@@ -136,14 +178,13 @@ def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None
     def values(points: Tensor) -> Tensor:
         return network(points.reshape(-1, 3)).reshape(points.shape[:-1])
 
-    field = Shape(values, kind or Kind.LEVEL, None, flops_of(network) if isinstance(network, nn.Module) else None)
-    if kind is not None:
-        return field
-    facts = measured(field, like)
-    if facts.kind is Kind.DISTANCE:
-        return replace(field, kind=Kind.DISTANCE)
-    steepest = STEEPEST_MARGIN * facts.steepest
-    return replace(field, function=lambda points: values(points) / steepest, kind=Kind.BOUND, lipschitz=1.0)
+    meaning = measured(values, like, kind=kind, sign=1.0)
+    return Shape(
+        lambda points: meaning.factor * values(points),
+        meaning.kind,
+        meaning.lipschitz,
+        flops_of(network) if isinstance(network, nn.Module) else None,
+    )
 
 
 def flops_of(network: nn.Module) -> Flops:
@@ -252,7 +293,7 @@ class Published(nn.Module):
     def __init__(self, inner: Decoder | Coded, squash: int) -> None:
         super().__init__()
         self.inner, self.squash, self.kind, self.lipschitz = inner, squash, Kind.LEVEL, None
-        self.code_length, self.width = inner.code_length, inner.width
+        self.code_length, self.width, self.placed = inner.code_length, inner.width, inner.placed
         self.register_buffer("factor", torch.ones(()))
         self.register_buffer("level", torch.zeros(()))
 
@@ -263,23 +304,21 @@ class Published(nn.Module):
         )
 
 
-def settled(
-    network: Published, *, factor: float, level: float, kind: Kind, lipschitz: float | None
-) -> Decoder | Published:
-    """The network with fields `factor * (value - level)` of a kind; changed in place.
+def settled(network: Published, meaning: Meaning, *, level: float) -> Decoder | Published:
+    """The network with the fields that were measured to be meant; changed in place.
 
     A decoder without a tanh takes them into its last layer, and stays a decoder, with all that it offers.
     """
-    inner = network.inner
+    inner, factor = network.inner, meaning.factor
     if isinstance(inner, Decoder) and not network.squash:
         with torch.no_grad():
             inner.last.weight.mul_(factor)
             inner.last.bias.sub_(level).mul_(factor)
-        inner.kind, inner.lipschitz = kind, lipschitz
+        inner.kind, inner.lipschitz = meaning.kind, meaning.lipschitz
         return inner
     network.factor.fill_(factor)
     network.level.fill_(level)
-    network.kind, network.lipschitz = kind, lipschitz
+    network.kind, network.lipschitz = meaning.kind, meaning.lipschitz
     return network
 
 

@@ -22,6 +22,7 @@ from renderers.field import Kind, points_in_sphere
 from renderers.fields.network import from_module
 from tests.documentation import code_of
 from tests.looped import each
+from tests.renderers.test_published import CODE, occupancy
 from tests.tiny import camera_of, cell_from
 
 POINTS = points_in_sphere(64, torch.zeros(()))
@@ -95,16 +96,38 @@ def test_a_distance_is_found_to_be_one_and_its_values_stay(tmp_path):
 ])  # fmt: skip
 def test_sign_level_and_slope_are_measured(tmp_path, factor, level, inside, kind, divided):
     file = npz(tmp_path, arrays(factor, level))
-    file = replace(file, level=level or None)
+    file = replace(file, level=level)
     known = file.network(0)
     field = known.decoder.at(known.codes[0])
     assert field.kind is kind and f"values are {inside} inside" in known.notes[0]
     torch.testing.assert_close(field(POINTS) * divided, abs(factor) * octahedron(POINTS), rtol=0, atol=1e-4)
 
 
-def test_probabilities_have_their_level_at_a_half(tmp_path):
-    found = {"lin0.weight": 0.4 * torch.eye(3)[:1], "lin0.bias": torch.tensor([0.45])}  # a plane
-    assert "at the level 0.5" in checkpoint(tmp_path, found).network(0).notes[0]
+def test_values_between_0_and_1_are_probabilities_only_where_that_is_said(tmp_path):
+    file = npz(tmp_path, arrays(0.2, 0.3))  # from 0.2 to 0.3 and a little
+    with pytest.raises(BadInput, match=r"level 0 is not among them: set dataset.level \(0.5 where they are prob"):
+        file.network(0)
+    known = replace(file, level=0.3).network(0)
+    values = known.decoder.at(known.codes[0])(POINTS)
+    assert torch.equal(values < 0, octahedron(POINTS) < 0) and "at the level 0.3" in known.notes[0]
+
+
+def test_a_network_of_a_code_is_not_read_without_one_and_its_level_is_told(tmp_path):
+    torch.manual_seed(0)
+    path = tmp_path / "code.npy"
+    state, logits = occupancy("shift")
+    for name, moved in (("weight", 0.0), ("bias", logits.median())):  # so that logits are about 0
+        state[f"decoder.fc_out.{name}"] = 4 * (state[f"decoder.fc_out.{name}"] - moved)
+    file = checkpoint(tmp_path, state)
+    with pytest.raises(BadInput, match=r"a code of 2 numbers, which it does not hold: set dataset.codes=FILE"):
+        file.network(0)
+    np.save(path, CODE.numpy()[None])
+    note = replace(file, codes=str(path)).network(0).notes[0]
+    assert "level 0 of the logits, a probability of 0.5 (" in note and "dataset.level=-1.386" in note
+    assert (
+        "level -1.386 of the logits, a probability of 0.2 ("
+        in replace(file, codes=str(path), level=-1.386).network(0).notes[0]
+    )
 
 
 def test_what_is_said_of_a_network_goes_before_what_is_measured(tmp_path):
@@ -170,7 +193,8 @@ def cut(path: str) -> None:
 
 @each("make, words", [
     (lambda d: checkpoint(d, {"model": Command()}), ("shape.pth", "more than weights, which is not run", "mkdir")),
-    (lambda d: checkpoint(d, {"a.weight": torch.ones(2)}), ("no format that is read", "implicit (IDR", "a.weight")),
+    (lambda d: checkpoint(d, {"a.weight": torch.ones(2)}), ("no format that is read", "IDR, NeuS", "a.weight")),
+    (lambda d: checkpoint(d, {"module.lin0.bias": torch.ones(2)}), ("DeepSDF (name the folder with its specs.json)",)),
     (lambda d: checkpoint(d, {"epoch": 3}), ("no format that is read", "no tensors")),
     (lambda d: npz(d, arrays() | {"0001.relu._": np.array([object()])}), ("cannot be read", "allow_pickle")),
     (lambda d: npz(d, arrays(level=9.0)), ("between 8.5", "and the surface at the level 0", "dataset.level")),
