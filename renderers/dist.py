@@ -12,7 +12,7 @@ from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, steepest, values_to_march_on
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
-from renderers.rendering import OF_LENGTHS, Capabilities, Rendering
+from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, check_kind
 from renderers.silhouette import Hinge
 
 
@@ -86,6 +86,7 @@ class DIST:
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches without a graph, then evaluates again the samples that carry the gradient."""
+        check_kind(self, field)
         with torch.no_grad():
             front = self._trace(field, rays)
         return approximate_front(field, rays, front, alpha=self.alpha, radius=self.sphere_radius)

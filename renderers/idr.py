@@ -9,7 +9,7 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, values_to_march_on
 from renderers.gradients import implicit_front
 from renderers.march import Front, Stepping, march
-from renderers.rendering import Rendering
+from renderers.rendering import Rendering, check_kind
 from renderers.silhouette import SurfaceRenderer
 
 
@@ -42,6 +42,7 @@ class IDR(SurfaceRenderer):
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches without a graph, then attaches the implicit gradient to the hits."""
+        check_kind(self, field)
         flat = rays.flat()
         with torch.no_grad():
             front = Front.on_sphere(flat, radius=self.sphere_radius, samples=1)

@@ -12,7 +12,7 @@ from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march
-from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, Status, assemble
+from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, Status, assemble, check_kind
 from renderers.silhouette import Hinge
 
 
@@ -64,6 +64,7 @@ class Naive:
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches all rays through all steps."""
+        check_kind(self, field)
         flat = rays.flat()
         render = self._unrolled if self.gradient == "unrolled" else self._approximate
         if not self.serial or flat.shape.numel() == 0:

@@ -9,7 +9,7 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.checks import check_choice, check_positive
 from renderers.field import Field
-from renderers.rendering import OF_LENGTHS, Capabilities, Rendering
+from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, check_kind
 from renderers.silhouette import Hinge
 from renderers.tracer import Tracer
 from renderers.warm import Memory, warm_trace
@@ -83,6 +83,7 @@ class Newton:
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches and searches without a graph; the Newton steps carry the gradient."""
+        check_kind(self, field)
         if self.remembers:
             return warm_trace(self.tracer, self.memory, field, rays)
         return self.tracer.render_anew(field, rays)

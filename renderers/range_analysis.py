@@ -11,7 +11,7 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Bounds, Field, bounds_of
 from renderers.gradients import fixed_samples, implicit
-from renderers.rendering import Rendering, Status, assemble
+from renderers.rendering import Rendering, Status, assemble, check_kind
 from renderers.silhouette import SurfaceRenderer
 
 GROWTH = 2.0  # of the next segment after an empty one
@@ -50,6 +50,7 @@ class RangeAnalysis(SurfaceRenderer):
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Finds the first crossings without a graph, then attaches the implicit gradient to the hits."""
+        check_kind(self, field)
         flat = rays.flat()
         with torch.no_grad():
             cast = self._cast(field, flat)

@@ -11,7 +11,7 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
 from renderers.gradients import fixed_samples, implicit_front
 from renderers.march import Front, Stepping, march
-from renderers.rendering import Rendering, Status, Volume
+from renderers.rendering import Rendering, Status, Volume, check_kind
 from renderers.silhouette import SurfaceRenderer
 
 # Of the band: a lower sample is looked at closely; of a distance it is at most 1.16 times the least value.
@@ -63,6 +63,7 @@ class RelaxedBoundary(SurfaceRenderer):
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches without a graph, then attaches the gradients of hits and of what rays pass by."""
+        check_kind(self, field)
         flat = rays.flat()
         with torch.no_grad():
             front, passed, least = self._march(field, flat)

@@ -110,6 +110,10 @@ OF_LENGTHS = Capabilities(needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True
 OF_LEVELS = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
 
 
+class Unsupported(Exception):
+    """A renderer lacks what is asked of it; the message says what."""
+
+
 @dataclass(frozen=True)
 class Observed:
     """What is observed of rays: a mask, and distances where they are given.
@@ -138,7 +142,7 @@ class Renderer(Protocol):
     capabilities: Capabilities
 
     def render(self, field: Field, rays: Rays) -> Rendering:
-        """The rendering of the field along the rays."""
+        """The rendering of the field along the rays; calls `check_kind` first."""
         ...
 
     def silhouette_loss(
@@ -146,6 +150,17 @@ class Renderer(Protocol):
     ) -> Float[Tensor, ""]:
         """The method's own loss between its rendering and a binary mask, true on the foreground."""
         ...
+
+
+def check_kind(renderer: Renderer, field: Field) -> None:
+    """Raises Unsupported where a field is not of a kind that the renderer is meant for."""
+    needs = renderer.capabilities.needs
+    if field.kind not in needs:
+        names = " or ".join(need.value for need in needs)
+        raise Unsupported(
+            f"{type(renderer).__name__} needs a {names} field, not a {field.kind.value} field: take another renderer, "
+            "or values that are one, which from_module of renderers.fields.network makes"
+        )
 
 
 @runtime_checkable

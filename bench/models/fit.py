@@ -19,9 +19,8 @@ from bench.setup.fields import FitSettings
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
 from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
-from bench.solve.solve import Unsupported, check_kind
 from renderers.field import Counts, Field, Meter
-from renderers.rendering import Renderer, fresh
+from renderers.rendering import Renderer, Unsupported, check_kind, fresh
 
 EIKONAL_POINTS = 512
 SPENT = ("seconds", "evaluations", "gradients", "flops")  # the costs in an Evidence

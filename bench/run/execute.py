@@ -18,8 +18,8 @@ from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus, now
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import Cell, RunContext, cell_of
-from bench.solve.solve import Unsupported
 from renderers.checks import BadInput
+from renderers.rendering import Unsupported
 
 INTERVAL = 0.05  # least seconds between two messages on progress
 

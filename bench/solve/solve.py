@@ -23,7 +23,7 @@ from datasets.field_files import FIELD, save_field
 from datasets.scene import Scene
 from renderers.camera import Camera
 from renderers.field import Counts, Field
-from renderers.rendering import Renderer
+from renderers.rendering import Renderer, Unsupported, check_kind
 
 COSTS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
@@ -46,10 +46,6 @@ COSTS = {
     "gemm_fraction": "seconds that the flops take at the machine's best rate of a matrix product, in float32 or, of "
     "coarse values, in bfloat16, over the loop's seconds",
 }
-
-
-class Unsupported(Exception):
-    """A renderer lacks what a task needs; the message says what."""
 
 
 @runtime_checkable
@@ -107,14 +103,6 @@ class InverseTask(Protocol):
             Unsupported: where the renderer has no gradient that the task needs.
         """
         ...
-
-
-def check_kind(renderer: Renderer, field: Field) -> None:
-    """Raises Unsupported where a field is not of a kind that the renderer is meant for."""
-    needs = renderer.capabilities.needs
-    if field.kind not in needs:
-        names = " or ".join(need.value for need in needs)
-        raise Unsupported(f"{type(renderer).__name__} needs a {names} field, not a {field.kind.value} field")
 
 
 def check_field_gradient(renderer: Renderer) -> None:

@@ -10,13 +10,12 @@ import torch
 
 from bench.machine.limits import LimitReached
 from bench.records.record import RunStatus
-from bench.solve.solve import Unsupported
 from bench.stress.fit import FITS, judge_fit
 from bench.stress.judge import judge_gradient, judge_rendering
 from bench.stress.trial import Conditions, Failure, Outcome
 from datasets.stress.scenes import SCENES
 from renderers.checks import check_choice
-from renderers.rendering import Renderer
+from renderers.rendering import Renderer, Unsupported
 
 GROUPS = ("geometry", "viewing", "field", "observation", "optimisation")
 MEASURES = ("rendering", "gradient", "fit")

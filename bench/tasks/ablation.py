@@ -22,13 +22,13 @@ from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.solve import check_field_gradient, check_kind, counted
+from bench.solve.solve import check_field_gradient, counted
 from datasets.scene import View
 from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
-from renderers.rendering import Observed, Renderer, Rendering
+from renderers.rendering import Observed, Renderer, Rendering, check_kind
 
 BASE = "base"  # the run's renderer, where others are timed beside it
 SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached

@@ -19,13 +19,13 @@ from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_fo
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import slopes_at
-from bench.solve.solve import check_field_gradient, check_kind
+from bench.solve.solve import check_field_gradient
 from renderers.boundary import check_gradients, rendered
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, steepest
 from renderers.fields.mlp import Decoder
-from renderers.rendering import Blurred, Renderer, Rendering
+from renderers.rendering import Blurred, Renderer, Rendering, check_kind
 
 BANDS = {"frontal": (0.0, 30.0), "oblique": (30.0, 70.0), "grazing": (70.0, 90.0)}  # degrees of incidence
 NEAR = 0.01  # scene units within which a hit is on the true hit's surface

@@ -16,14 +16,14 @@ from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings
-from bench.solve.solve import Unsupported, solve
+from bench.solve.solve import solve
 from datasets.scene import Scene, View, see
 from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
-from renderers.rendering import Observed, Renderer, at_iteration
+from renderers.rendering import Observed, Renderer, Unsupported, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 DEFINITIONS = {

@@ -23,9 +23,10 @@ from bench.reconstruct.subject import (
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings
-from bench.solve.solve import check_field_gradient, check_kind, solve
+from bench.solve.solve import check_field_gradient, solve
 from renderers.checks import check_at_least, check_choice
 from renderers.field import Field
+from renderers.rendering import check_kind
 
 UNCOUNTED = {
     "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "

@@ -24,12 +24,13 @@ from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import best_view, read_picture
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
-from bench.solve.solve import COSTS, check_field_gradient, check_kind, descend, note_result
+from bench.solve.solve import COSTS, check_field_gradient, descend, note_result
 from datasets.photographs import Photography
 from datasets.scene import Split, Truth
 from datasets.views import check_elevation
 from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.field import Field
+from renderers.rendering import check_kind
 
 NETWORK, CODE, MEAN, NEAREST, BEST = "network", "code", "mean", "nearest", "best"
 DEFINITIONS = COLOURED_DEFINITIONS | {

@@ -10,13 +10,12 @@ from bench.pictures.run_figures import draw_failure
 from bench.pictures.style import PIXEL_NAMES
 from bench.records.record import RunStatus, curve_file
 from bench.setup.inputs import RunContext
-from bench.solve.solve import Unsupported
 from bench.stress import fit, judge
 from bench.stress.axes import Stress
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from renderers.checks import check_at_least
-from renderers.rendering import Renderer
+from renderers.rendering import Renderer, Unsupported
 
 DEFINITIONS = {
     "breakdown": "severity at which half of the trials succeed, in the unit of task.stress.sweep: the median of the "

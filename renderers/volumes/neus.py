@@ -9,7 +9,7 @@ from torch.nn.functional import logsigmoid
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
-from renderers.rendering import Rendering
+from renderers.rendering import Rendering, check_kind
 from renderers.volumes.integrate import (
     Samples,
     VolumeRenderer,
@@ -74,6 +74,7 @@ class NeuS(VolumeRenderer):
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Samples where the sigmoid falls, then sums with a graph."""
+        check_kind(self, field)
         return render_volume(field, rays, self._search, self._passing, radius=self.sphere_radius)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:

@@ -10,7 +10,7 @@ from renderers.bracket import first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, occupancy_logits
-from renderers.rendering import Rendering
+from renderers.rendering import Rendering, check_kind
 from renderers.volumes.integrate import Samples, VolumeRenderer, evenly, render_volume, scheduled
 
 
@@ -79,6 +79,7 @@ class UNISURF(VolumeRenderer):
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Searches the surface, samples about it, then sums with a graph."""
+        check_kind(self, field)
 
         def passing(value: Tensor, distance: Tensor) -> Tensor:
             return logsigmoid(-occupancy_logits(field, value, width=self.occupancy_width))

@@ -12,7 +12,7 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind
-from renderers.rendering import Capabilities, Rendering
+from renderers.rendering import Capabilities, Rendering, check_kind
 from renderers.volumes.integrate import (
     Samples,
     VolumeRenderer,
@@ -84,6 +84,7 @@ class VolSDF(VolumeRenderer):
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Samples until the opacity's error is bounded, then sums with a graph."""
+        check_kind(self, field)
         return render_volume(field, rays, self._search, self._passing, radius=self.sphere_radius)
 
     def bounded(

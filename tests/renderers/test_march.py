@@ -252,7 +252,7 @@ def test_closest_is_the_value_of_least_magnitude_with_its_sign(renderer):
     rod, signs = capsule((0.2, -1, 0), (0.2, 1, 0), 0.1), set()
     for function, ray in ((rod.function, beam((0, 0.01, -2))), *((bumpy, beam((x / 10, 0, -2))) for x in range(5))):
         recorded = []
-        recording = Shape(lambda p, f=function, to=recorded: to.append(f(p)) or to[-1], Kind.LEVEL)
+        recording = Shape(lambda p, f=function, to=recorded: to.append(f(p)) or to[-1], Kind.BOUND)
         closest = renderer.render(recording, ray).closest.item()
         assert closest == pytest.approx(min(torch.cat(recorded).tolist(), key=abs))
         signs.add(closest > 0)

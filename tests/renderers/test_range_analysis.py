@@ -97,7 +97,7 @@ def test_a_thin_plate_is_found():
 def test_a_plate_in_values_that_are_no_lengths_is_found_where_they_state_their_bound(share):
     """Half of the least segment is as deep in them as the plate, or the other way around."""
     thickness = 0.02
-    plate = Shape(lambda p: share * box((0.5, 0.5, thickness / 2))(p), Kind.LEVEL, share)
+    plate = Shape(lambda p: share * box((0.5, 0.5, thickness / 2))(p), Kind.BOUND, share)
     rays = around(400)
     truth = RENDERER.render(box((0.5, 0.5, thickness / 2)), rays)
     found = RENDERER.render(plate, rays)

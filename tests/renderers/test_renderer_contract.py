@@ -20,7 +20,7 @@ from renderers.boundary import PARTS
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
-from renderers.rendering import Blurred, Renderer, Rendering, Status, closest_values
+from renderers.rendering import Blurred, Renderer, Rendering, Status, Unsupported, closest_values
 from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 
 # Those with code of their own; the others have other numbers.
@@ -132,6 +132,14 @@ def test_hits_are_those_of_the_closed_forms(renderer):
                 near = tolerance(renderer, case.cosine, dtype)
                 assert rendering.distance.item() == pytest.approx(case.distance, abs=near), case.name
                 assert rendering.residual.abs().item() <= getattr(renderer, "epsilon", torch.inf)
+
+
+def test_a_field_of_a_kind_that_it_is_not_meant_for_is_refused(renderer):
+    """Not of a renderer of the user's, whose kind the tasks check."""
+    for kind in {*Kind} - {*renderer.capabilities.needs}:
+        if type(renderer).__module__.startswith("renderers."):
+            with pytest.raises(Unsupported, match=f"field, not a {kind.value} field"):
+                renderer.render(stated(sphere(0.5), kind), mixed(4))
 
 
 def test_images_are_those_of_the_closed_forms(renderer):

@@ -195,7 +195,7 @@ def test_hits_lie_on_a_surface_where_a_ray_passes_another_one(renderer):
 def test_in_one_solid_the_mean_is_of_all_that_is_seen_also_behind_a_ridge_within(renderer):
     """Between two balls that overlap a value rises and falls again, below 0: that is no second surface."""
     rays = Rays(vector((0.01, 0.02, -2))[None], vector((0, 0, 1))[None])
-    pair = sphere(0.3, (0.0, 0.0, -0.2)) | sphere(0.3, (0.0, 0.0, 0.2))
+    pair = replace(sphere(0.3, (0.0, 0.0, -0.2)) | sphere(0.3, (0.0, 0.0, 0.2)), kind=sphere(0.3).kind)
     rendering = renderer.with_blur(0.3).render(pair, rays)
     seen = rendering.volume
     assert rendering.hit.item()

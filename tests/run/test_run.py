@@ -24,8 +24,8 @@ from bench.setup import inputs as inputs_module
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve import solve
 from bench.solve.optimise import History, OptimiserSettings
-from bench.solve.solve import Unsupported
 from datasets.scene import Scene
+from renderers.rendering import Unsupported
 from tests.report.page_data import Page
 from tests.run.driving import PATIENCE, ROOT, Outcome
 from tests.solve.test_optimise import POINTS, Toy

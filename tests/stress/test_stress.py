@@ -11,7 +11,6 @@ from bench.config import build, load
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.solve.optimise import History
-from bench.solve.solve import Unsupported
 from bench.stress import fit
 from bench.stress.axes import Stress, Sweep
 from bench.stress.fit import FITS, _failure, judge_fit
@@ -23,7 +22,7 @@ from datasets.stress.scenes import DISTANCE, SCENES
 from datasets.stress.solids import box, half_space, rod, sphere_solid
 from renderers import reference
 from renderers.camera import Rays
-from renderers.rendering import Status
+from renderers.rendering import Status, Unsupported
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.tiny import Blind, camera_of

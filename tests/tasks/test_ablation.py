@@ -16,12 +16,11 @@ from bench.evaluate.reference import Reference
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus, to_json
 from bench.setup.inputs import RunContext
-from bench.solve.solve import Unsupported
 from bench.tasks import ablation
 from bench.tasks.ablation import BASE, DEFINITIONS, SMALLER, WARM_UP, Ablation, Clocked
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
-from renderers.rendering import Capabilities, Renderer, Rendering, Status
+from renderers.rendering import Capabilities, Renderer, Rendering, Status, Unsupported
 from tests.looped import each
 from tests.tiny import PEAK, Blind, ball_prior, camera_of, run_of
 

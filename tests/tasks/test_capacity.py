@@ -19,8 +19,8 @@ from bench.run.execute import execute
 from bench.run.process import Job
 from bench.run.summary import show
 from bench.setup.fields import FieldChoice, ModelSettings
-from bench.solve.solve import Unsupported
 from bench.tasks.capacity import Capacity, saved
+from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of
 from tests.tiny import Blind, ball_prior, camera_of, plain, run_of, silent

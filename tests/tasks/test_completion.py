@@ -11,14 +11,13 @@ from bench.config import load
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, OptimiserSettings, optimise
-from bench.solve.solve import Unsupported, check_kind
 from bench.tasks.completion import Completion
 from datasets.mesh import Mesh
 from datasets.scene import Scene, View
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
-from renderers.rendering import Capabilities, Rendering, Status
+from renderers.rendering import Capabilities, Rendering, Status, Unsupported, check_kind
 from renderers.silhouette import Own
 from tests.looped import each
 

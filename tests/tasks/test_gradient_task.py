@@ -12,11 +12,10 @@ from bench.evaluate.reference import Reference, in_float64
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
-from bench.solve.solve import Unsupported
 from bench.tasks.gradients import BANDS, DEFINITIONS, NEAR, Gradients, Subject, _bands, _draw, _outline
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind
-from renderers.rendering import Capabilities, Renderer, Rendering
+from renderers.rendering import Capabilities, Renderer, Rendering, Unsupported
 from tests.looped import each
 from tests.tiny import ball_prior, camera_of, plane_decoder, run_of
 

@@ -12,11 +12,11 @@ import trimesh
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import History, OptimiserSettings, optimise
-from bench.solve.solve import Unsupported
 from bench.tasks.pose import Pose, PoseProblem, known_shape, pose_error
 from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.scene import Scene
 from renderers.fields.analytic import box
+from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.tiny import CPU, Blind, ball_prior, camera_of, run_of, scene_of

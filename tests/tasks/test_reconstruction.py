@@ -19,13 +19,13 @@ from bench.reconstruct.symptoms import WEIGHT
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings
-from bench.solve.solve import Unsupported
 from bench.tasks.reconstruction import Reconstruction
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
 from datasets.own_photographs import OwnPhotographs
 from datasets.scene import Scene, Truth, sample_surface, see
 from renderers.checks import BadInput
+from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.datasets.test_captures import CENTRE, RADIUS, nerf
 from tests.datasets.test_photographs import PLAINLY

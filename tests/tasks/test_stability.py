@@ -10,11 +10,11 @@ import pytest
 from bench.config import load
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
-from bench.solve.solve import Unsupported
 from bench.stress.search import SearchSettings
 from bench.tasks.stability import Stability
 from renderers import IDR
 from renderers.march import Stepping
+from renderers.rendering import Unsupported
 from tests.stress.test_stress import CRITERIA, FIT, stress_named
 from tests.tiny import ball_prior, camera_of, run_of
 
