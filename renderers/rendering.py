@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
@@ -139,7 +139,7 @@ class Observed:
 class Renderer(Protocol):
     """Finds surfaces along rays. It never times, logs, draws or synchronises, and knows no task."""
 
-    capabilities: Capabilities
+    capabilities: ClassVar[Capabilities]
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """The rendering of the field along the rays; calls `check_kind` first."""
