@@ -34,7 +34,7 @@ POSITIVE = {  # where they are not null: with what to type
     "memory_limit": "8 is 8 GiB, null all but a tenth",
 }
 DOUBLING = "doubling"
-SELF = "_self_"  # of a list of defaults: the file itself
+SELF, HERE = "_self_", "@_here_"  # of a list of defaults: the file itself; where one of another group goes
 OURS = ("renderers", "datasets", "bench")  # packages that a `_target_` may always name
 PACKAGE = "_package_"  # of the node `renderer`: one more, that of the class typed for renderer=custom
 RESERVED = ("_target_", PACKAGE, "_prior_", "_field_", LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
@@ -44,6 +44,7 @@ ROLES = {  # what the class of a node of the top level must be
     "dataset": "datasets.scene.Dataset",
     "silhouette": "renderers.silhouette.SilhouetteLoss",
     "tracker": "bench.trackers.Tracker",
+    "prior": "datasets.network_files.Networked",
     "supervision": "bench.single_view.training.Supervision",
 }
 TARGETS = {  # classes of nodes without a _target_
@@ -228,7 +229,8 @@ def build(
         node: the node. Of the renderer, its key `_package_` names one more package that its `_target_` may name.
         name: what it is called in the configuration, for errors, and for what its class must be; see `ROLES`.
         packages: packages of the user's that a `_target_` may name, besides ours.
-        target: the class of a node that has no `_target_`; that of one that has must be this class or extend it.
+        target: the class of a node that has no `_target_`; that of one that has must be this class or extend it, or
+            be what `ROLES` has for the name.
         role: what the class must be, where the name does not say it.
 
     Raises:
@@ -236,7 +238,7 @@ def build(
     """
     if isinstance(node, DictConfig):
         node = cast(dict[Any, Any], OmegaConf.to_container(node, resolve=True, throw_on_missing=False))
-    if role is None and target:
+    if role is None and target and not ("_target_" in node and name in ROLES):
         role = find_class(target, name, packages, object)
     for key in ("_target_", *node):
         if node.get(key) == MISSING:
@@ -342,10 +344,13 @@ def load(group: str, name: str, **arguments: Any) -> Any:
 
 
 def _with_defaults(group: str, name: str) -> DictConfig:
-    """What a choice holds, over those of its own group that its `defaults` name, in their order, as Hydra has it."""
+    """What a choice holds, over those that its `defaults` name, in their order, as Hydra has it."""
     node = OmegaConf.create(choice(group, name))
     bases = [str(base) for base in node.pop("defaults", [SELF])]
-    return cast(DictConfig, OmegaConf.merge(*(node if base == SELF else _with_defaults(group, base) for base in bases)))
+    places = [
+        base.removeprefix("/").removesuffix(HERE).split("/") if base[0] == "/" else [group, base] for base in bases
+    ]
+    return cast(DictConfig, OmegaConf.merge(*(node if at[1] == SELF else _with_defaults(*at) for at in places)))
 
 
 def _typed(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[str]) -> Any:

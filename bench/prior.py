@@ -13,15 +13,13 @@ def main() -> int:
         from bench.machine.environment import flushing_denormals
         from bench.progress import run_progress
         from bench.setup.inputs import cell_of
-        from bench.shape_prior import find, make_prior
+        from bench.shape_prior import PriorSettings, find, make_prior
         from datasets.network_files import Networked
 
         cell = cell_of(run.config)
         dataset, settings, folder = cell.inputs.dataset, cell.prior, cell.inputs.cache
-        if isinstance(dataset, Networked):
-            raise ValueError(
-                f"{dataset.name} is a network already, whose codes are its prior: there is nothing to train"
-            )
+        if isinstance(dataset, Networked) or not isinstance(settings, PriorSettings):
+            raise ValueError("the codes of a network are the prior already: there is nothing to train")
         path = find(dataset, settings, folder)
         if path is None:
             with flushing_denormals(), run_progress("prior") as progress:

@@ -166,14 +166,14 @@ class Cell:
     """A task and what it works with, built and checked; nothing slow was done.
 
     Args:
-        prior: how the prior is trained, where it has to be.
+        prior: how the prior is trained, where it has to be; or the network whose codes it is.
         width: of the prior's network, in neurons per layer.
         threads: of the CPU; None leaves it to `threads_for`.
     """
 
     task: Task
     inputs: RunInputs
-    prior: PriorSettings
+    prior: PriorSettings | Networked
     width: int
     threads: int | None
 
@@ -216,7 +216,8 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     split, index, threads = *_place(config["split"], config["index"]), config["threads"]
     device, cache = pick_device(config["device"]), Path(config["priors_dir"])
 
-    known = dataset.network(index) if isinstance(dataset, Networked) else None
+    shown = dataset.network(index) if isinstance(dataset, Networked) else None
+    known = shown if isinstance(prior, PriorSettings) else prior.network(0)
 
     def make_prior() -> Prior:
         if known is not None:
@@ -238,7 +239,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         field=FieldChoice(config["field"], models),
         dataset=dataset,
         notes=(*notes, *(known.notes if known else ())),
-        trained=index if known or (split == Split.TRAIN and index < prior.shapes) else None,
+        trained=index if known is shown and (shown or (split == Split.TRAIN and index < prior.shapes)) else None,
     )
     _check(task, inputs, index)
     return Cell(task, inputs, prior, known.decoder.width if known else prior.network.width, threads)

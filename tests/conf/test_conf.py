@@ -133,6 +133,7 @@ def test_every_choice_is_in_a_composition():
 def test_every_choice_composes_and_builds(paths, row):
     needed = [f"dataset.path={path}" for name, path in paths.items() if name == row["dataset"]]
     needed += CUSTOM if row["renderer"] == "custom" else ()
+    needed += [f"prior.path={paths['network']}"] if row["prior"] == "deepsdf" else []
     config = composed(*(f"{group}={name}" for group, name in row.items()), *needed)
     builds(config)
     if row["stress"] != "none":

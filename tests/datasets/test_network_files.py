@@ -309,6 +309,17 @@ def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
     torch.testing.assert_close(values, octahedron(POINTS) - 0.2, rtol=0, atol=1e-6)
 
 
+def test_its_codes_are_the_prior_of_another_shape(tmp_path):
+    """An octahedron by code 0.15, of a folder whose codes begin with another, is found by its depth."""
+    file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
+    settings = ["dataset=network", f"dataset.path={file.path}", "dataset.level=-0.15", "dataset.kind=distance"]
+    settings += ["prior=deepsdf", f"prior.path={file.path}", "task.code.weight=0", "scale=smoke"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        register()
+        inputs = cell_from(compose("config", settings)).inputs
+    assert inputs.trained is None and inputs.prior.decoder.code_length == 1
+
+
 def test_a_network_of_ones_own_is_trained_and_read_as_the_page_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (code,) = code_of("datasets/README.md", "python")

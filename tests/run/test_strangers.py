@@ -66,7 +66,9 @@ def test_a_class_of_a_package_that_is_named_must_be_what_its_place_asks_for(comp
     for wrong, words in (("Other", "no Renderer: it lacks render, silhouette_loss"), ("call", "which is no class")):
         with pytest.raises(ValueError, match=words):
             find_class(f"{stranger}.{wrong}", "renderer", [stranger], None)
-    with pytest.raises(ValueError, match=r"no PriorSettings: name a class that extends bench\.shape_prior"):
+    with pytest.raises(ValueError, match=r"no ViewSampler: name a class that extends datasets\.views"):
+        build({"_target_": f"{stranger}.Other"}, "view", [stranger], PARTS["view"])
+    with pytest.raises(ValueError, match=r"no Networked: it lacks network"):
         build({"_target_": f"{stranger}.Other"}, "prior", [stranger], PARTS["prior"])
 
 
