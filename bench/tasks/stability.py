@@ -9,12 +9,13 @@ from bench.machine.limits import Limits
 from bench.pictures.run_figures import draw_failure
 from bench.pictures.style import PIXEL_NAMES
 from bench.records.record import RunStatus, curve_file
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.stress import fit, judge
 from bench.stress.axes import Stress
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
-from renderers.checks import check_at_least
+from datasets.network_files import Networked
+from renderers.checks import BadInput, check_at_least
 from renderers.rendering import Renderer, Unsupported
 
 DEFINITIONS = {
@@ -63,6 +64,11 @@ class Stability:
         if self.stress is None:
             raise ValueError("task=stability needs a stress: set stress=thin_plate, or another of conf/stresses.yaml")
         check_at_least("task.resolution", self.resolution, 8, "64 resolves thin parts")
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput for a network, which has no part in the scenes of the stress."""
+        if isinstance(inputs.dataset, Networked):
+            raise BadInput("task=stability has scenes of its own, and renders no network: remove field=file")
 
     def execute(self, run: RunContext) -> None:
         """Searches; fills the record, writes a line per trial to curve.jsonl, and draws the mildest failure."""

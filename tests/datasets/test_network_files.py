@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bench.config import CONF, load, register
 from bench.run.command import with_network
+from bench.setup.inputs import RunInputs
 from datasets.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
@@ -297,27 +298,33 @@ def test_half_of_the_two_is_refused(given, words):
         with_network(given)
 
 
-def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
-    file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
-    settings = ["task=ablation", "dataset=network", f"dataset.path={file.path}", "index=1", "scale=smoke"]
+def composed_inputs(*overrides: str) -> RunInputs:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         register()
-        inputs = cell_from(compose("config", settings)).inputs
+        return cell_from(compose("config", [*overrides, "scale=smoke"])).inputs
+
+
+def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
+    file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
+    inputs = composed_inputs("task=ablation", "dataset=network", f"dataset.path={file.path}", "index=1")
     fitted = inputs.fitted()
     assert len(inputs.prior.codes) == 2 and inputs.notes[-1] == file.network(1).notes[0]
     values = fitted.decoder.at(fitted.codes[0])(POINTS)
     torch.testing.assert_close(values, octahedron(POINTS) - 0.2, rtol=0, atol=1e-6)
 
 
-def test_its_codes_are_the_prior_of_another_shape(tmp_path):
-    """An octahedron by code 0.15, of a folder whose codes begin with another, is found by its depth."""
+def test_its_codes_are_the_prior_of_another_dataset(tmp_path):
     file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
-    settings = ["dataset=network", f"dataset.path={file.path}", "dataset.level=-0.15", "dataset.kind=distance"]
-    settings += ["prior=deepsdf", f"prior.path={file.path}", "task.code.weight=0", "scale=smoke"]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        register()
-        inputs = cell_from(compose("config", settings)).inputs
-    assert inputs.trained is None and inputs.prior.decoder.code_length == 1
+    inputs = composed_inputs("dataset=sphere", "prior=deepsdf", f"prior.path={file.path}", "split=train")
+    assert inputs.prior.codes.tolist() == file.network(0).codes.tolist() and inputs.trained is None
+    values = inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS)
+    torch.testing.assert_close(values, octahedron(POINTS) + 0.3, rtol=0, atol=1e-6)
+
+
+def test_scenes_of_a_stress_are_of_no_network(tmp_path):
+    path = npz(tmp_path, arrays()).path
+    with pytest.raises(BadInput, match="has scenes of its own, and renders no network: remove field=file"):
+        composed_inputs("task=stability", "stress=gap", "dataset=network", f"dataset.path={path}")
 
 
 def test_a_network_of_ones_own_is_trained_and_read_as_the_page_says(tmp_path, monkeypatch):
