@@ -7,20 +7,22 @@ import hashlib
 import json
 import pickle
 import re
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from math import isfinite
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from datasets.field_files import FIELD, load_network
+from datasets.field_files import FIELD, WIDTH, load_network
 from datasets.mesh import Mesh, extract
 from datasets.scene import Split
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
@@ -148,8 +150,55 @@ class NetworkFile:
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: the files' contents, not their paths."""
-        settings = {key: value for key, value in asdict(self).items() if key not in ("path", "codes")}
+        settings = {key: value for key, value in asdict(self).items() if key not in ("path", "codes", "module")}
         return {"name": "network", "version": VERSION, "contents": _content(self.files), **settings}
+
+
+class Module(Protocol):
+    """A network of the user's, an nn.Module: points [n, 3] to values [n] or [n, 1]."""
+
+    def __call__(self, points: Tensor) -> Tensor: ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
+
+
+@dataclass(frozen=True)
+class ModuleFile(NetworkFile):
+    """A network of a class of the user's, whose weights a file holds.
+
+    Args:
+        module: the network, whose weights are not read yet.
+    """
+
+    module: Module
+
+    def identity(self) -> dict[str, Any]:
+        """See `NetworkFile`; the network is told by what it prints."""
+        return super().identity() | {"module": repr(self.module)}
+
+    def read(self) -> Published:
+        """The network with the weights of the file, whatever prefix their names have there."""
+        tensors, module = _tensors(Path(self.path)), deepcopy(cast(nn.Module, self.module))
+        names = [*module.state_dict()]
+        prefix = next((name.removesuffix(names[0]) for name in tensors if f".{name}".endswith(f".{names[0]}")), "")
+        try:
+            module.load_state_dict({name: tensors[prefix + name] for name in names if prefix + name in tensors})
+        except RuntimeError as error:
+            raise BadInput(
+                f"its weights are not those of {type(module).__name__}: {' '.join(str(error).split())}"
+            ) from error
+        return Published(Coded(_Body(module), code_length=0, width=WIDTH), 0)
+
+
+class _Body(nn.Module):
+    """A module as the body of a `Coded`."""
+
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(self, points: Float[Tensor, "n 3"], code: Tensor) -> Float[Tensor, " n"]:
+        return self.inner(points).reshape(len(points))
 
 
 @lru_cache(maxsize=4)
@@ -196,7 +245,9 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
 def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     """The network of a file or a folder, and its codes."""
     path = Path(file.path)
-    if (path / FIELD).is_file() or (path / "record.json").is_file():
+    if isinstance(file, ModuleFile):
+        network, codes = file.read(), None
+    elif (path / FIELD).is_file() or (path / "record.json").is_file():
         network, codes = load_network(path), None
     elif path.is_dir():
         network, codes = _read_folder(path, file.tanh)
@@ -269,7 +320,7 @@ def _arrays(path: Path) -> dict[str, Tensor]:
 def _tensors(path: Path) -> dict[str, Tensor]:
     """The tensors of a checkpoint by their dotted names, on the CPU; whatever else it holds is left out."""
     try:
-        with torch.serialization.safe_globals(SCALARS):
+        with torch.serialization.safe_globals(SCALARS), warnings.catch_warnings(action="ignore"):
             return dict(_flat(torch.load(path, weights_only=True, map_location="cpu")))
     except pickle.UnpicklingError as error:
         blocked = re.search(r"GLOBAL (\S+)", str(error))
@@ -278,6 +329,11 @@ def _tensors(path: Path) -> dict[str, Tensor]:
             f"{path.name} is broken, or holds more than weights, which is not run ({what}): save its state_dict() alone"
         ) from error
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        if "TorchScript" in str(error):
+            raise BadInput(
+                f"{path.name} is TorchScript, a program, which is not run: save its state_dict(), and name its class "
+                "by field._target_=PACKAGE.CLASS"
+            ) from error
         raise BadInput(
             f"{path.name} cannot be read, it may be cut short: {' '.join(str(error).split())[:160]}"
         ) from error

@@ -151,6 +151,8 @@ def options_first(arguments: list[str]) -> list[str]:
 def with_network(arguments: list[str]) -> list[str]:
     """The arguments with `field=file field_path=PATH`, a network as the scene's field, as the dataset that it is.
 
+    With `field._target_=PACKAGE.CLASS` it is of that class; other keys of `field` are its arguments.
+
     Raises:
         ValueError: for one of the two without the other, or beside another dataset.
     """
@@ -161,8 +163,12 @@ def with_network(arguments: list[str]) -> list[str]:
         raise ValueError("a network's file is the scene's field by field=file field_path=PATH: type both")
     if "dataset" in keys:
         raise ValueError("with field=file the network's own surface is the shape: remove dataset")
-    places = {"field=file": "dataset=network"}
-    return [places.get(argument, re.sub("^field_path=", "dataset.path=", argument)) for argument in arguments]
+    own = "field._target_" in keys
+    places = {"^field=file$": f"dataset={'module' if own else 'network'}", "^field_path=": "dataset.path="}
+    places |= {r"^field\._target_=": "dataset.module._target_=", r"^field\.": "+dataset.module."} if own else {}
+    for pattern, text in places.items():
+        arguments = [re.sub(pattern, text, argument) for argument in arguments]
+    return arguments
 
 
 def own_folders(arguments: list[str]) -> list[Path]:

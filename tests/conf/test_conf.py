@@ -44,6 +44,11 @@ COMPARING = {"table1": 24, "fig4": 7, "fig5": 8, "stability": 21, "gradients": 1
 COMPARING |= {"crossing": 5, "core": 11}
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
+LINEAR = [
+    "packages=[torch]",
+    "dataset.module._target_=torch.nn.Linear",
+    "+dataset.module={in_features:3,out_features:1}",
+]
 CUSTOM = ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))
 
 
@@ -76,8 +81,8 @@ def paths(tmp_path_factory) -> dict[str, str]:
     """What the datasets of files need as `dataset.path`."""
     mesh, scans = tmp_path_factory.mktemp("mesh") / "box.obj", tmp_path_factory.mktemp("scans")
     trimesh.creation.box().export(mesh)
-    photos = network = str(mesh.parent)  # whose content is not read to build it
-    found = {"mesh": str(mesh), "photos": photos, "scans": str(write_scans(scans)), "network": network}
+    unread = dict.fromkeys(("photos", "network", "module"), str(mesh.parent))  # whose content is not read to build it
+    found = unread | {"mesh": str(mesh), "scans": str(write_scans(scans))}
     return found | {"shapenet": str(write_shapenet(tmp_path_factory.mktemp("shapenet")))}
 
 
@@ -133,6 +138,7 @@ def test_every_choice_is_in_a_composition():
 def test_every_choice_composes_and_builds(paths, row):
     needed = [f"dataset.path={path}" for name, path in paths.items() if name == row["dataset"]]
     needed += CUSTOM if row["renderer"] == "custom" else ()
+    needed += LINEAR if row["dataset"] == "module" else []
     needed += [f"prior.path={paths['network']}"] if row["prior"] == "deepsdf" else []
     config = composed(*(f"{group}={name}" for group, name in row.items()), *needed)
     builds(config)

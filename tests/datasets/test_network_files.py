@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,17 @@ from tests.looped import each
 from tests.renderers.test_published import CODE, occupancy
 from tests.tiny import camera_of, cell_from
 
+NET = """
+import torch
+
+class Net(torch.nn.Module):
+    def __init__(self, scale):
+        super().__init__()
+        self.inner, self.scale = torch.nn.Linear(3, 1), scale
+
+    def forward(self, points):
+        return self.inner(points) * self.scale / 2
+"""
 POINTS = points_in_sphere(64, torch.zeros(()))
 RADIUS = 0.5  # of the octahedron's faces about the origin
 
@@ -187,6 +199,12 @@ class Command:
         return os.mkdir, ("was_run",)
 
 
+def scripted(folder: Path) -> NetworkFile:
+    with warnings.catch_warnings(action="ignore"):  # newer versions say that it is old
+        torch.jit.script(torch.nn.Linear(3, 1)).save(folder / "shape.pt")
+    return load("dataset", "network", path=str(folder / "shape.pt"))
+
+
 def cut(path: str) -> None:
     content = Path(path).read_bytes()
     Path(path).write_bytes(content[: len(content) // 2])
@@ -196,6 +214,7 @@ def cut(path: str) -> None:
     (lambda d: checkpoint(d, {"model": Command()}), ("shape.pth", "more than weights, which is not run", "mkdir")),
     (lambda d: checkpoint(d, {"a.weight": torch.ones(2)}), ("no format that is read", "IDR, NeuS", "a.weight")),
     (lambda d: checkpoint(d, {"module.lin0.bias": torch.ones(2)}), ("DeepSDF (name the folder with its specs.json)",)),
+    (lambda d: scripted(d), ("TorchScript, a program, which is not run: save its state_dict()",)),
     (lambda d: checkpoint(d, {"epoch": 3}), ("no format that is read", "no tensors")),
     (lambda d: npz(d, arrays() | {"0001.relu._": np.array([object()])}), ("cannot be read", "allow_pickle")),
     (lambda d: npz(d, arrays(level=9.0)), ("between 8.5", "and the surface at the level 0", "dataset.level")),
@@ -319,6 +338,22 @@ def test_its_codes_are_the_prior_of_another_dataset(tmp_path):
     assert inputs.prior.codes.tolist() == file.network(0).codes.tolist() and inputs.trained is None
     values = inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS)
     torch.testing.assert_close(values, octahedron(POINTS) + 0.3, rtol=0, atol=1e-6)
+
+
+def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkeypatch):
+    (tmp_path / "mynet.py").write_text(NET)
+    monkeypatch.syspath_prepend(tmp_path)
+    state = {"weight": torch.tensor([[0.6, 0.0, 0.8]]), "bias": torch.tensor([0.25])}
+    torch.save({"model": {f"net.inner.{key}": value for key, value in state.items()}, "step": 3}, tmp_path / "a.pth")
+    given = with_network(["field=file", f"field_path={tmp_path}/a.pth", "field._target_=mynet.Net", "field.scale=2"])
+    inputs = composed_inputs(*given, "task=ablation", "packages=[mynet]")
+    field = inputs.prior.decoder.at(inputs.prior.codes[0])
+    torch.testing.assert_close(field(POINTS), POINTS @ state["weight"][0] + 0.25, rtol=0, atol=1e-6)
+    torch.save({"net.inner.bias": state["bias"]}, tmp_path / "b.pth")
+    with pytest.raises(BadInput, match=r"not those of Net: .* Missing key.*inner\.weight"):
+        composed_inputs(*(text.replace("a.pth", "b.pth") for text in given), "task=ablation", "packages=[mynet]")
+    with pytest.raises(ValueError, match=r"type packages=\[mynet\] if you trust it"):
+        composed_inputs(*given, "task=ablation")
 
 
 def test_scenes_of_a_stress_are_of_no_network(tmp_path):
