@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,7 +10,8 @@ from torch import Tensor
 
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Field, autograd_gradients
-from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.fields.mlp import Decoder
+from renderers.fields.network import Published
 from renderers.reference import trace
 
 NEURONS = 16  # of the paint
@@ -61,7 +62,7 @@ class Differences:
 
 
 def differences(
-    decoder: Decoder,
+    decoder: Decoder | Published,
     code: Float[Tensor, " code_length"],
     directions: Float[Tensor, "code_length directions"],
     *,
@@ -80,10 +81,10 @@ def differences(
         distance: to the hits.
         paint: of the surface, whose colours move and turn with the code and the camera; None for distances.
     """
-    rays, still = camera.rays().flat()[pixels], decoder.at(code[None])
-    moved = decoder.at(code + STEP * torch.cat([directions.T, -directions.T]))
+    rays, still = camera.rays().flat()[pixels], _Row((decoder.at(code),))
+    moved = _Row(tuple(map(decoder.at, code + STEP * torch.cat([directions.T, -directions.T]))))
 
-    def seen(field: BoundDecoder, rays: Rays, distance: Float[Tensor, "codes m"]) -> Float[Tensor, "codes m seen"]:
+    def seen(field: _Row, rays: Rays, distance: Float[Tensor, "codes m"]) -> Float[Tensor, "codes m seen"]:
         return distance[..., None] if paint is None else paint(*_hits(field, rays, distance))
 
     def smooth(ahead: Float[Tensor, "codes m seen"], behind: Float[Tensor, "codes m seen"]) -> Bool[Tensor, " m"]:
@@ -191,14 +192,23 @@ def subrays(camera: Camera, pixels: Int[Tensor, " m"], count: int) -> Rays:
     return Rays(fine.origins[down, across], fine.directions[down, across])
 
 
-def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, " m"]) -> tuple[Tensor, Tensor]:
+@dataclass(frozen=True)
+class _Row:
+    """Fields of several codes, of points [codes, m, 3] a row each; not all networks take codes by the batch."""
+
+    fields: tuple[Field, ...]
+
+    def __call__(self, points: Float[Tensor, "codes m 3"]) -> Float[Tensor, "codes m"]:
+        return torch.stack([field(some) for field, some in zip(self.fields, points, strict=True)])
+
+
+def _roots(field: _Row, rays: Rays, start: Float[Tensor, " m"]) -> tuple[Tensor, Tensor]:
     """Roots of a batch of fields, a row each, along m rays near known roots; and which of them were found."""
 
     def values(distance: Tensor) -> Tensor:
         return field(rays.origins + distance[..., None] * rays.directions)
 
-    codes = len(field.hidden[0][1])
-    first = start.expand(codes, -1)
+    first = start.expand(len(field.fields), -1)
     second = first + 10 * STEP
     first_value, second_value = values(first), values(second)
     for _ in range(ROOT_STEPS):
@@ -211,11 +221,11 @@ def _roots(field: BoundDecoder, rays: Rays, start: Float[Tensor, " m"]) -> tuple
 
 
 def _hits(
-    field: BoundDecoder, rays: Rays, distance: Float[Tensor, "codes m"]
+    field: _Row, rays: Rays, distance: Float[Tensor, "codes m"]
 ) -> tuple[Float[Tensor, "codes m 3"], Float[Tensor, "codes m 3"]]:
     """The points at distances along m rays, and the gradients there of a batch of fields."""
     points = rays.origins + distance[..., None] * rays.directions
-    return points.detach(), autograd_gradients(field, points)
+    return points.detach(), autograd_gradients(cast(Field, field), points)
 
 
 def _by_weight(
@@ -229,7 +239,7 @@ def _by_weight(
     return torch.stack(columns, dim=-1)
 
 
-def _clear(field: BoundDecoder, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:
+def _clear(field: Field, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:
     """Whether the field stays above a margin along the ray up to the hit."""
     entry, _, _ = sphere_span(rays)
     shares = torch.linspace(0, 1, BEFORE, dtype=distance.dtype)

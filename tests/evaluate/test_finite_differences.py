@@ -9,6 +9,8 @@ from bench.evaluate.finite_differences import _clear, differences, image_differe
 from renderers.camera import Camera, Rays
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder
+from renderers.fields.network import Coded, Published
+from renderers.fields.published import Layered
 from renderers.reference import trace
 from tests.looped import each
 from tests.tiny import camera_of, plane_decoder
@@ -28,6 +30,12 @@ def plane(normal: tuple[float, float, float], scale: float = 1.0) -> Decoder:
     return plane_decoder([scale * x for x in normal], scale * CODE_WEIGHTS, scale * OFFSET)
 
 
+def published_plane(normal: torch.Tensor) -> Coded:
+    """The same as a network that takes one code at a time."""
+    layer = torch.cat([CODE_WEIGHTS, normal])[None], torch.tensor([-OFFSET], dtype=torch.float64)
+    return Coded(Layered([layer], activation="relu"), code_length=3, width=1).double()
+
+
 def distance_to_plane(normal: torch.Tensor, rays: Rays, code: torch.Tensor) -> torch.Tensor:
     level = OFFSET - CODE_WEIGHTS @ code
     return (level - rays.origins @ normal) / (rays.directions @ normal)
@@ -43,12 +51,11 @@ def test_differences_are_the_derivatives_of_a_plane(angle, scale):
     slope = camera().rays().flat()[pixels].directions @ normal
     directions = torch.linalg.qr(torch.randn(3, 2, generator=torch.Generator().manual_seed(0)).double()).Q
 
-    found = differences(
-        plane(NORMALS[angle], scale), CODE, directions, camera=camera(), pixels=pixels, distance=distance.detach()
-    )
-    assert found.valid.all()
-    assert torch.allclose(found.code[:, 0], -(CODE_WEIGHTS @ directions) / slope[:, None], rtol=1e-7, atol=1e-8)
-    assert torch.allclose(found.camera[:, 0], by_camera, rtol=1e-7, atol=1e-7)
+    for network in (plane(NORMALS[angle], scale), Published(published_plane(normal), 0)):
+        found = differences(network, CODE, directions, camera=camera(), pixels=pixels, distance=distance.detach())
+        assert found.valid.all()
+        assert torch.allclose(found.code[:, 0], -(CODE_WEIGHTS @ directions) / slope[:, None], rtol=1e-7, atol=1e-8)
+        assert torch.allclose(found.camera[:, 0], by_camera, rtol=1e-7, atol=1e-7)
 
 
 def union_decoder(one: tuple[torch.Tensor, float], other: tuple[torch.Tensor, float]) -> Decoder:
