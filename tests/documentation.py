@@ -10,8 +10,8 @@ from PIL import Image
 
 from datasets.shapenet import SYNSETS, ShapeNet
 from datasets.views import ViewSampler
-from tests.datasets.test_captures import idr
 from tests.datasets.test_shapenet import IDS, write_renders, write_shape, write_shapenet, write_split
+from tests.made_photographs import idr
 from tests.made_scans import write_scans
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,9 +15,9 @@ from bench.records.record import Record, read_record
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
 from datasets.own_photographs import Reading, read_capture
-from tests.datasets.test_captures import CENTRE as PHOTOGRAPHED
-from tests.datasets.test_captures import RADIUS, idr
 from tests.made_dtu import CENTRE, ball, on_ball, write_dtu
+from tests.made_photographs import CENTRE as PHOTOGRAPHED
+from tests.made_photographs import RADIUS, idr
 
 FEW = ("--points", "4000")
 

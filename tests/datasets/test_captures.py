@@ -1,160 +1,75 @@
-"""Photographs of a ball, written in each format: the ball is found where it is, and what does not fit is told."""
+"""Photographs of a ball, written in each format: the ball is found where it is, however people write it."""
 
 import json
+import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import ExifTags, Image
 
 from bench.photos import main
 from datasets.captures.formats import find_layout
 from datasets.captures.frames import OPENGL
 from datasets.captures.hull import carve, hull_mesh, hull_views
-from datasets.captures.take import take
+from datasets.captures.rows import _from_angles
+from datasets.captures.take import _alike, read_image, take
 from datasets.own_photographs import Reading, read_capture
 from datasets.shot import Shot
-from datasets.views import look_at
-from renderers.camera import Camera
+from renderers.checks import BadInput
 from tests.looped import each
+from tests.made_photographs import (
+    CENTRE,
+    FOCAL,
+    FORMATS,
+    MIDDLE,
+    PLAIN,
+    RADIUS,
+    READ,
+    SIZE,
+    cameras,
+    changed,
+    colmap,
+    idr,
+    image,
+    llff,
+    middlebury,
+    moved,
+    nerf,
+    off,
+    repainted,
+    rewritten,
+)
 from tests.tiny import camera_of
 
-CENTRE, RADIUS = np.array([0.4, -1.1, 2.0]), 0.35  # of the ball, in the world of the files
-SIZE = 40, 48  # height and width
-FOCAL, MIDDLE = 60.0, (25.0, 19.0)  # pixels; the principal point is not in the middle
-
-
-def cameras(count: int = 10) -> list[Camera]:
-    """Cameras all around the ball, two thirds of them from above."""
-    intrinsics = torch.tensor([[FOCAL, 0, MIDDLE[0]], [0, FOCAL, MIDDLE[1]], [0, 0, 1]])
-    centre, found = torch.from_numpy(CENTRE).float(), []
-    for i in range(count):
-        across, up = 2.4 * i, (0.7, -0.5, 0.1)[i % 3]
-        toward = [np.cos(up) * np.sin(across), np.sin(up), np.cos(up) * np.cos(across)]
-        eye = centre + 1.5 * torch.tensor(toward, dtype=torch.float32)
-        found.append(Camera(intrinsics, look_at(eye, centre), *SIZE))
-    return found
-
-
-def image(camera: Camera, *, alpha: bool = False) -> tuple[Image.Image, Image.Image]:
-    """The ball in a colour for each side, before grey; and its mask."""
-    rays = camera.rays().flat()
-    towards = torch.from_numpy(CENTRE).float() - rays.origins
-    closest = (towards * rays.directions).sum(-1)
-    hit = (rays.at(closest) - torch.from_numpy(CENTRE).float()).norm(dim=-1) < RADIUS
-    colours = torch.where(hit[:, None], torch.tensor([200.0, 80.0, 40.0]), 128.0).view(*SIZE, 3)
-    mask = (255 * hit.view(*SIZE)).to(torch.uint8).numpy()
-    pixels = colours.to(torch.uint8).numpy()
-    picture = Image.fromarray(np.dstack([pixels, mask]) if alpha else pixels)
-    return picture, Image.fromarray(mask)
-
-
-def whole(camera: Camera) -> np.ndarray:
-    """Intrinsics with the first pixel's centre at (0, 0)."""
-    matrix = camera.intrinsics.double().numpy().copy()
-    matrix[:2, 2] -= 0.5
-    return matrix
-
-
-def write_images(folder: Path, images: str, *, masks: bool = True, alpha: bool = False, names: str = "{:03d}.png"):
-    """Writes the images, and the masks into a folder of their own."""
-    (folder / images).mkdir(parents=True, exist_ok=True)
-    for i, camera in enumerate(cameras()):
-        picture, mask = image(camera, alpha=alpha)
-        picture.save(folder / images / names.format(i))
-        if masks:
-            (folder / "mask").mkdir(exist_ok=True)
-            mask.save(folder / "mask" / f"{i:03d}.png")
-
-
-def idr(folder: Path) -> None:
-    write_images(folder, "image", names="{:06d}.png")
-    scale = np.diag([0.5, 0.5, 0.5, 1.0])
-    scale[:3, 3] = CENTRE + 0.05
-    stored = {}
-    for i, camera in enumerate(cameras()):
-        projection = np.eye(4)
-        projection[:3] = -3.0 * whole(camera) @ camera.world_to_camera.double().numpy()[:3]  # of any scale and sign
-        stored |= {f"world_mat_{i}": projection, f"scale_mat_{i}": scale}
-    np.savez(folder / "cameras_sphere.npz", **stored)
-
-
-def nerf(folder: Path) -> None:
-    write_images(folder, "train", masks=False, alpha=True, names="r_{}.png")
-    frames = [
-        {
-            "file_path": f"./train/r_{i}",
-            "transform_matrix": (camera.camera_to_world.double().numpy() @ OPENGL).tolist(),
-        }
-        for i, camera in enumerate(cameras())
-    ]
-    stored = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": MIDDLE[0], "cy": MIDDLE[1], "w": SIZE[1], "h": SIZE[0]}
-    (folder / "transforms.json").write_text(json.dumps({**stored, "frames": frames}))
-
-
-def middlebury(folder: Path) -> None:
-    write_images(folder, ".", names="ball{:04d}.png")
-    lines = ["10"]
-    for i, camera in enumerate(cameras()):
-        motion = camera.world_to_camera.double().numpy()
-        numbers = [*whole(camera).flatten(), *motion[:3, :3].flatten(), *motion[:3, 3]]
-        lines.append(f"ball{i:04d}.png " + " ".join(map(str, numbers)))
-    (folder / "ball_par.txt").write_text("\n".join(lines) + "\n")
-
-
-def colmap(folder: Path) -> None:
-    """COLMAP's text files; pycolmap is an extra."""
-    pytest.importorskip("pycolmap", reason="pycolmap is an extra: pip install -e '.[colmap]'")
-    from scipy.spatial.transform import Rotation
-
-    write_images(folder, "images")
-    (folder / "sparse" / "0").mkdir(parents=True)
-    camera_line = f"1 PINHOLE {SIZE[1]} {SIZE[0]} {FOCAL} {FOCAL} {MIDDLE[0]} {MIDDLE[1]}\n"
-    lines = []
-    for i, camera in enumerate(cameras()):
-        motion = camera.world_to_camera.double().numpy()
-        x, y, z, w = Rotation.from_matrix(motion[:3, :3]).as_quat()
-        lines += [f"{i + 1} {w} {x} {y} {z} {' '.join(map(str, motion[:3, 3]))} 1 {i:03d}.png", ""]
-    for name, text in (("cameras", camera_line), ("images", "\n".join(lines) + "\n"), ("points3D", "")):
-        (folder / "sparse" / "0" / f"{name}.txt").write_text(text)
-
-
-def llff(folder: Path) -> None:
-    """Cameras of images four times as large, whose principal point is in the middle."""
-    write_images(folder, "images_4")
-    rows = []
-    for camera in cameras():
-        right, down, forward, centre = camera.camera_to_world.double().numpy()[:3].T
-        pose = np.stack([down, right, -forward, centre, 4 * np.array([*SIZE, FOCAL])], axis=1)
-        rows.append([*pose.flatten(), 0.5, 3.0])
-    np.save(folder / "poses_bounds.npy", np.array(rows))
-
-
-FORMATS = {"IDR/NeuS": idr, "NeRF": nerf, "Middlebury": middlebury, "COLMAP": colmap, "LLFF": llff}
+FEW = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=5, deadline=None)
+SPHERES = {"IDR/NeuS": (CENTRE + 0.05, 0.5), "DVR": (CENTRE, 0.9 * 0.75**0.5)}  # of their scale_mat
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_cameras_are_those_that_were_written(tmp_path, name):
     FORMATS[name](tmp_path)
-    capture = read_capture(tmp_path, Reading(48))
-    assert (capture.format, len(capture.shots)) == (name, 10)
+    capture = read_capture(tmp_path, READ)
+    middle = (SIZE[1] / 2, SIZE[0] / 2) if name == "LLFF" else MIDDLE
+    assert (capture.format, len(capture.shots)) == (name, 10) and off(capture, middle) < 0.01
     assert capture.notes == (("10 images; 10 masks by a common prefix or suffix",) if name == "Middlebury" else ())
     assert name in capture.summary and "48 x 40 pixels, masks from" in capture.summary
-    for shot, camera in zip(capture.shots, cameras(), strict=True):
-        intrinsics = camera.intrinsics.clone()
-        if name == "LLFF":
-            intrinsics[:2, 2] = torch.tensor([SIZE[1] / 2, SIZE[0] / 2])
-        torch.testing.assert_close(shot.camera.intrinsics, intrinsics, rtol=0, atol=1e-3)
-        if name != "IDR/NeuS":  # whose scale_mat is part of its cameras
-            moved = shot.within(-capture.sphere.centre / capture.sphere.radius, 1 / capture.sphere.radius)
-            torch.testing.assert_close(moved.camera.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-4)
+    expected = torch.tensor([[FOCAL, 0, middle[0]], [0, FOCAL, middle[1]], [0, 0, 1]])
+    for shot in capture.shots:
+        torch.testing.assert_close(shot.camera.intrinsics, expected, rtol=0, atol=1e-3)
+    if name in SPHERES:
+        centre, radius = SPHERES[name]
+        assert [*capture.sphere.centre, capture.sphere.radius] == pytest.approx([*centre, radius])
+    if name == "DVR":
+        assert capture.shots[2].depth.unique().tolist() == pytest.approx([1.25 / capture.sphere.radius])
 
 
 def test_the_ball_is_where_it_is_and_its_hull_no_smaller(tmp_path):
     nerf(tmp_path)
-    capture = read_capture(tmp_path, Reading(48))
+    capture = read_capture(tmp_path, READ)
     hull = hull_mesh(capture.shots, 64)
     assert hull is not None and hull.watertight
     vertices = hull.vertices * capture.sphere.radius + capture.sphere.centre - CENTRE
@@ -166,13 +81,59 @@ def test_the_ball_is_where_it_is_and_its_hull_no_smaller(tmp_path):
         assert (seen & shot.mask).sum() > 0.9 * shot.mask.sum()
 
 
-def test_the_unit_sphere_of_idr_is_that_of_its_scale_mat(tmp_path):
-    idr(tmp_path)
-    hull = hull_mesh(read_capture(tmp_path, Reading(48)).shots, 64)
-    assert hull is not None
-    middle = (hull.vertices.min(axis=0) + hull.vertices.max(axis=0)) / 2
-    np.testing.assert_allclose(middle, -0.05 / 0.5, atol=0.02)
-    np.testing.assert_allclose(np.ptp(hull.vertices, axis=0), 2 * RADIUS / 0.5, atol=0.1)
+@each("share", [0.005, 0.3, 0.7])
+def test_the_hull_is_half_less_the_least_mask_between_pixels(share):
+    """Four photographs from one place show one half; a point lies between the last column of it and the next."""
+    camera = camera_of(16)
+    mask = torch.arange(16).expand(16, 16) < 8
+    shots = [Shot(str(place), camera, torch.zeros(16, 16, 3), mask) for place in range(4)]
+    focal, middle = camera.intrinsics[0, 0], camera.intrinsics[0, 2]
+    across = (8.5 - share - middle) / focal  # of a point at depth 1
+    seen = torch.tensor([across, 0.0, 1.0])
+    point = camera.camera_to_world[:3, :3] @ seen + camera.camera_to_world[:3, 3]
+    assert carve(shots, point[None]).item() == pytest.approx(0.5 - share, abs=1e-5)
+
+
+def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):
+    middlebury(tmp_path)
+    capture = read_capture(tmp_path, PLAIN)
+    assert all(shot.mask is None for shot in capture.shots) and capture.masks == "" and "no masks" in capture.summary
+    np.testing.assert_allclose(capture.sphere.centre, CENTRE, atol=1e-3)
+    assert capture.sphere.radius == pytest.approx(1.5 * 20 / FOCAL, rel=1e-3)
+
+
+def test_cameras_in_parallel_have_their_sphere_in_the_range_of_depths(tmp_path):
+    llff(tmp_path)
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    for i, row in enumerate(rows):
+        pose = row[:15].reshape(3, 5)
+        pose[:, :3] = np.stack([[0, -1, 0], [1, 0, 0], [0, 0, 1]], axis=1)  # along -z
+        pose[:, 3] = [0.1 * (i % 4), 0.1 * (i // 4), 7.0]
+    rows[:, 15:] = 3.5, 4.5
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    capture = read_capture(tmp_path, PLAIN)
+    assert abs(capture.sphere.centre[2] - 3.0) < 1e-6 and 0.5 <= capture.sphere.radius < 2
+    assert "the depths that the format states" in capture.summary
+
+
+def shifted(away: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = away
+    return matrix
+
+
+@FEW
+@given(st.floats(-7e6, 7e6))
+def test_a_far_world_is_read_as_exactly_and_led_back_to(tmp_path, away):
+    nerf(tmp_path)
+    moved(tmp_path, lambda matrix: shifted(away) @ matrix)
+    capture = read_capture(tmp_path, READ if abs(away) > 1e6 else PLAIN)
+    assert off(capture, away=away) < 0.01
+    assert np.abs(capture.to_world[:3, 3] - away - CENTRE).max() < 0.1
+    assert ", ".join(str(float(value)) for value in capture.sphere.centre) in capture.summary
+
+
+# Pictures
 
 
 def test_a_photograph_is_made_smaller_with_its_camera_and_never_larger(tmp_path):
@@ -209,56 +170,76 @@ def test_distortion_is_taken_out(tmp_path, bent):
     np.testing.assert_allclose(found[inside], places[inside], atol=0.01)
 
 
-def without_first_camera(folder: Path) -> None:
-    with np.load(folder / "cameras_sphere.npz") as stored:
-        known = {name: stored[name] for name in stored if name != "world_mat_0"}
-    np.savez(folder / "cameras_sphere.npz", **known)
-
-
-def no_numbers(folder: Path) -> None:
-    np.savez(folder / "cameras_sphere.npz", **{f"world_mat_{i}": np.full((4, 4), np.nan) for i in range(10)})
-
-
-MISTAKES = {  # in the ball in IDR's format, and what is said of them
-    "image without camera": (
-        lambda f: shutil.copy(f / "image" / "000004.png", f / "image" / "000010.png"),
-        ("000010.png has no camera", "has 10 cameras, and there are 11 images", "remove"),
-    ),
-    "mask missing": (
-        lambda f: (f / "mask" / "004.png").unlink(),
-        ("000004.png has no mask in", "9 masks (000.png", "add it"),
-    ),
-    "mask of another size": (
-        lambda f: Image.new("L", (10, 10)).save(f / "mask" / "004.png"),
-        ("004.png has 10 x 10 pixels, its image 48 x 40",),
-    ),
-    "empty mask": (
-        lambda f: Image.new("L", SIZE[::-1]).save(f / "mask" / "004.png"),
-        ("the mask of 000004.png is empty", "use no masks"),
-    ),
-    "broken image": (
-        lambda f: (f / "image" / "000004.png").write_bytes(b"no image"),
-        ("000004.png cannot be read as an image", "copy or export it again"),
-    ),
-    "no numbers": (no_numbers, ("world_mat_0", "finite numbers", "export it again")),
-    "gap in the cameras": (without_first_camera, ("cameras_sphere.npz has no world_mat_0", "export it again")),
-    "no images": (lambda f: shutil.rmtree(f / "image"), ("has cameras (IDR/NeuS) but none of their images",)),
-    "no cameras": (
-        lambda f: (f / "cameras_sphere.npz").unlink(),
-        ("has no cameras that are known", "transforms.json", "poses_bounds.npy"),
-    ),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_what_cannot_be_used_is_told_in_one_line(tmp_path, capsys, mistake):
-    spoil, words = MISTAKES[mistake]
+def test_images_of_16_bits_and_of_floats_and_masks_of_labels_are_read(tmp_path):
     idr(tmp_path)
-    spoil(tmp_path)
-    assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and len(err.splitlines()) == 1
-    assert all(word in err for word in words), err
+    plain = read_capture(tmp_path, READ)
+    picture = Image.open(tmp_path / "image" / "000002.png")
+    Image.fromarray(np.asarray(picture.convert("L")).astype(np.uint16) * 257).save(tmp_path / "image" / "000002.png")
+    repainted([tmp_path / "mask" / "002.png"], lambda mask: (mask > 0).astype(np.uint8))
+    found = read_capture(tmp_path, READ)
+    assert torch.equal(found.shots[2].mask, plain.shots[2].mask)
+    grey = plain.shots[2].colours @ torch.tensor([0.299, 0.587, 0.114])
+    torch.testing.assert_close(found.shots[2].colours[..., 0], grey, rtol=0, atol=0.01)
+    Image.fromarray(np.full(SIZE, 0.5, np.float32)).save(tmp_path / "a.tiff")
+    assert np.abs(read_image(tmp_path / "a.tiff", None, 48)[0] - 0.5).max() < 0.01
+
+
+def test_an_alpha_channel_that_is_opaque_is_no_mask(tmp_path):
+    nerf(tmp_path)
+    repainted([*(tmp_path / "train").iterdir()], lambda pixels: np.dstack([pixels[..., :3], np.full(SIZE, 255)]))
+    assert read_capture(tmp_path, READ).masks == ""
+
+
+COLOUR = st.tuples(*[st.sampled_from([0, 90, 180, 255])] * 3)
+
+
+@FEW
+@given(st.lists(COLOUR.filter(any), min_size=2, max_size=2), st.booleans())
+def test_a_mask_is_all_that_is_not_background(tmp_path, colours, alpha):
+    mask = image(cameras()[0])[1]
+    inside, left = np.asarray(mask) > 0, np.arange(SIZE[1])[None] < SIZE[1] / 2
+    painted = np.where(left[..., None], colours[0], colours[1]) * inside[..., None]
+    painted = np.dstack([painted, np.full(SIZE, 255)]) if alpha else painted
+    Image.fromarray(painted.astype(np.uint8)).save(tmp_path / "mask.png")
+    image(cameras()[0])[0].save(tmp_path / "image.png")
+    found = read_image(tmp_path / "image.png", tmp_path / "mask.png", 48)[1]
+    assert found is not None and ((found[..., 0] > 0.5) == inside).all()
+
+
+def test_images_of_two_sizes_each_have_their_camera(tmp_path):
+    idr(tmp_path)
+    for name in ("image/000003.png", "mask/003.png"):
+        Image.open(tmp_path / name).resize((24, 20)).save(tmp_path / name)
+    half = np.diag([0.5, 0.5, 1.0, 1.0])
+    rewritten(tmp_path / "cameras_sphere.npz", lambda known: known | {"world_mat_3": half @ known["world_mat_3"]})
+    assert "24 x 20 and 48 x 40 pixels" in read_capture(tmp_path, READ).summary
+
+
+@each(
+    "size, same",
+    [((400, 300), True), ((401, 300), True), ((133, 100), True), ((400, 297), False), ((4000, 2975), False)],
+)
+def test_a_cropped_image_is_no_smaller_one(size, same):
+    assert _alike(size, (3000, 4000)) == same
+
+
+@each("tag, turn", [*((tag, None) for tag in range(2, 9)), (6, Image.Transpose.ROTATE_90)])
+def test_pixels_are_used_as_stored_or_turned_where_cameras_have_that_size(tmp_path, tag, turn):
+    """A tag of 6 says "turn it by 90 degrees clockwise"."""
+    nerf(tmp_path)
+    plain, exif = read_capture(tmp_path, PLAIN), Image.Exif()
+    exif[ExifTags.Base.Orientation] = tag
+    for file in (tmp_path / "train").iterdir():
+        picture = Image.open(file)
+        (picture if turn is None else picture.transpose(turn)).save(file, exif=exif)
+    found = read_capture(tmp_path, PLAIN)
+    assert all(torch.equal(one.colours, other.colours) for one, other in zip(found.shots, plain.shots, strict=True))
+    stored = "have a tag of orientation (EXIF), and are used as stored, as cameras are"
+    told = "are turned by their tag (EXIF), since their cameras have that size" if turn is not None else stored
+    assert found.notes == (f"10 photographs {told}",)
+
+
+# Names and pairs
 
 
 def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
@@ -271,89 +252,171 @@ def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
     assert (tmp_path / "photos.png").stat().st_size > 10_000
 
 
-def test_a_folder_of_another_format_too_and_broken_ones_are_told(tmp_path):
-    nerf(tmp_path)
-    np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))
-    assert find_layout(tmp_path).notes == ("other cameras in the folder are not used: cameras.npz",)
-    stored = json.loads((tmp_path / "transforms.json").read_text())
-    angle = {name: value for name, value in stored.items() if name != "fl_x"} | {"camera_angle_x": 39.6}
-    flat = stored | {"frames": [frame | {"transform_matrix": [[1.0, 0.0], [0.0, 1.0]]} for frame in stored["frames"]]}
-    for broken, words in ((angle, "between 0 and pi, not 39.6: it is in radians"), (flat, "must be 4 x 4, not 2 x 2")):
-        (tmp_path / "transforms.json").write_text(json.dumps(broken))
-        with pytest.raises(ValueError, match=words):
-            find_layout(tmp_path)
-
-
-def test_flipped_axes_are_told_and_can_be_turned(tmp_path, capsys):
-    nerf(tmp_path)
-    stored = json.loads((tmp_path / "transforms.json").read_text())
-    for frame in stored["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ OPENGL).tolist()
-    (tmp_path / "transforms.json").write_text(json.dumps(stored))
-    picture = ("--into", str(tmp_path / "photos.png"))
-    assert main([str(tmp_path), *picture]) == 2
-    assert "the visual hull of the masks is empty" in (err := capsys.readouterr().err) and "flipped axes" in err
-    assert main([str(tmp_path), "--axes", "flipped", *picture]) == 0
-
-
 def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
     idr(tmp_path)
-    mask = np.asarray(Image.open(tmp_path / "mask" / "007.png"))
-    Image.fromarray(np.roll(mask, 6, axis=1)).save(tmp_path / "mask" / "007.png")
+    repainted([tmp_path / "mask" / "007.png"], lambda mask: np.roll(mask, 6, axis=1))
     assert main([str(tmp_path), "--into", str(tmp_path / "a" / "b")]) == 0
     out = capsys.readouterr().out
     assert "note: least in 000007.png" in out and out.splitlines()[-1] == str(tmp_path / "a" / "b.png")
     assert (tmp_path / "a" / "b.png").is_file()
 
 
-def test_images_of_16_bits_and_masks_of_labels_are_read(tmp_path):
+def test_cameras_of_other_images_are_refused_unless_that_is_asked_for(tmp_path):
     idr(tmp_path)
-    plain = read_capture(tmp_path, Reading(48))
-    picture = Image.open(tmp_path / "image" / "000002.png")
-    Image.fromarray(np.asarray(picture.convert("L")).astype(np.uint16) * 257).save(tmp_path / "image" / "000002.png")
-    mask = np.asarray(Image.open(tmp_path / "mask" / "002.png"))
-    Image.fromarray((mask > 0).astype(np.uint8)).save(tmp_path / "mask" / "002.png")
-    found = read_capture(tmp_path, Reading(48))
-    assert torch.equal(found.shots[2].mask, plain.shots[2].mask)
-    grey = plain.shots[2].colours @ torch.tensor([0.299, 0.587, 0.114])
-    torch.testing.assert_close(found.shots[2].colours[..., 0], grey, rtol=0, atol=0.01)
+    for i, file in enumerate(sorted((tmp_path / "mask").iterdir())):
+        repainted([file], lambda mask, i=i: np.roll(mask, 11 * (-1) ** i, axis=1))
+    with pytest.raises(BadInput, match=r"the visual hull of the masks overlaps .* or set dataset.unchecked=true"):
+        read_capture(tmp_path, READ)
+    capture = read_capture(tmp_path, Reading(48, unchecked=True))
+    assert "cameras may be those of other images" in capture.notes[-1]
 
 
-def test_an_alpha_channel_that_is_opaque_is_no_mask(tmp_path):
+def test_other_cameras_in_the_folder_do_not_matter_and_are_told(tmp_path):
     nerf(tmp_path)
-    for file in (tmp_path / "train").iterdir():
-        Image.open(file).convert("RGB").convert("RGBA").save(file)
-    assert read_capture(tmp_path, Reading(48)).masks == ""
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))  # broken ones
+    capture = read_capture(tmp_path, READ)
+    assert capture.format == "NeRF" and capture.notes == ("other cameras in the folder are not used: poses_bounds.npy",)
 
 
-def test_images_of_two_sizes_each_have_their_camera(tmp_path):
+# NeRF's files
+
+
+def test_masks_that_transforms_json_does_not_name_are_used(tmp_path):
+    nerf(tmp_path)
+    white = np.full(SIZE, 255, np.uint8)
+    white[:, :2] = 0
+    shutil.copytree(tmp_path / "train", tmp_path / "masks")
+    repainted([*(tmp_path / "masks").iterdir()], lambda _: white)
+    own = read_capture(tmp_path, READ)
+    assert any("does not name it" in note for note in own.notes)
+    assert all(shot.mask.float().mean() > 0.9 for shot in own.shots)
+
+
+def test_fields_of_view_and_matrices_give_focal_lengths(tmp_path):
+    nerf(tmp_path)
+    angles = [2 * np.arctan(SIZE[1 - i] / 2 / FOCAL) for i in (0, 1)]
+    matrix = [[FOCAL, 0, MIDDLE[0], 0], [0, FOCAL, MIDDLE[1], 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    plain = json.loads((tmp_path / "transforms.json").read_text())
+    for way in (
+        {"camera_angle_x": angles[0], "camera_angle_y": angles[1]},
+        {"camera_angle_y": angles[1]},
+        {"x_fov": np.degrees(angles[0])},
+        {"intrinsic_matrix": matrix},
+        {"fl_x": FOCAL, "fl_y": None, "w": None, "h": None},
+    ):
+        stored = {key: value for key, value in plain.items() if key not in ("fl_x", "fl_y")} | way
+        (tmp_path / "transforms.json").write_text(json.dumps(stored))
+        capture = read_capture(tmp_path, PLAIN)
+        assert off(capture) < 0.01
+        assert any("transforms.json states no w and h" in note for note in capture.notes) == ("w" in way)
+
+
+def test_each_frame_has_its_own_camera(tmp_path):
+    nerf(tmp_path)
+    own = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    changed(tmp_path, lambda stored: [frame.update({key: stored[key] for key in own}) for frame in stored["frames"]])
+    top = {"fl_x": 1.0, "fl_y": 1.0, "camera_angle_x": 1.0, "y_fov": 9.0, "intrinsic_matrix": np.eye(3).tolist()}
+    changed(tmp_path, lambda stored: stored.update(top, cx=0.0, cy=0.0))
+    assert off(read_capture(tmp_path, PLAIN)) < 0.01
+
+
+MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])  # x left, y up, z forward
+
+
+@each("axes, flag", [(np.eye(4), {}), (OPENGL, {"from_na": True}), (MITSUBA, {"from_mitsuba": True})])
+def test_flags_tell_of_other_axes(tmp_path, axes, flag):
+    nerf(tmp_path)
+    moved(tmp_path, lambda matrix: matrix @ axes)
+    changed(tmp_path, lambda stored: stored.update(flag))
+    assert off(read_capture(tmp_path, PLAIN)) < 0.01
+
+
+def test_flipped_axes_are_told_and_can_be_turned(tmp_path, capsys):
+    nerf(tmp_path)
+    moved(tmp_path, lambda matrix: matrix @ OPENGL)
+    picture = ("--into", str(tmp_path / "photos.png"))
+    assert main([str(tmp_path), *picture]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and len(err.splitlines()) == 1
+    assert "the visual hull of the masks is empty" in err and "flipped axes" in err
+    assert main([str(tmp_path), "--axes", "flipped", *picture]) == 0
+
+
+@FEW
+@given(st.integers(3, 6))
+def test_few_digits_are_the_nearest_rotation(tmp_path, digits):
+    nerf(tmp_path)
+    moved(tmp_path, lambda matrix: matrix.round(digits))
+    assert off(read_capture(tmp_path, PLAIN)) < 0.1
+
+
+# Other formats
+
+
+def test_one_scale_is_that_of_all(tmp_path):
     idr(tmp_path)
-    for name in ("image/000003.png", "mask/003.png"):
-        Image.open(tmp_path / name).resize((24, 20)).save(tmp_path / name)
-    with np.load(tmp_path / "cameras_sphere.npz") as stored:
-        known = dict(stored)
-    known["world_mat_3"] = np.diag([0.5, 0.5, 1.0, 1.0]) @ known["world_mat_3"]
-    np.savez(tmp_path / "cameras_sphere.npz", **known)
-    capture = read_capture(tmp_path, Reading(48))
-    assert "24 x 20 and 48 x 40 pixels" in capture.summary
+    rewritten(
+        tmp_path / "cameras_sphere.npz",
+        lambda known: {key: one for key, one in known.items() if key[:5] == "world" or key[-2:] == "_0"},
+    )
+    capture = read_capture(tmp_path, READ)
+    assert off(capture) < 0.01 and "scale_mat_0 is that of all cameras: 9 have none" in capture.notes[0]
 
 
-@each("share", [0.005, 0.3, 0.7])
-def test_the_hull_is_half_less_the_least_mask_between_pixels(share):
-    """Four photographs from one place show one half; a point lies between the last column of it and the next."""
-    camera = camera_of(16)
-    mask = torch.arange(16).expand(16, 16) < 8
-    shots = [Shot(str(place), camera, torch.zeros(16, 16, 3), mask) for place in range(4)]
-    focal, middle = camera.intrinsics[0, 0], camera.intrinsics[0, 2]
-    across = (8.5 - share - middle) / focal  # of a point at depth 1
-    seen = torch.tensor([across, 0.0, 1.0])
-    point = camera.camera_to_world[:3, :3] @ seen + camera.camera_to_world[:3, 3]
-    assert carve(shots, point[None]).item() == pytest.approx(0.5 - share, abs=1e-5)
+def test_intrinsics_beside_whole_cameras_are_neus_own(tmp_path):
+    idr(tmp_path)
+    file = tmp_path / "cameras_sphere.npz"
+    own = {f"camera_mat_{i}": np.diag([FOCAL, FOCAL, 1.0, 1.0]) for i in range(10)}
+    rewritten(file, lambda known: known | own)
+    for name in (file.name, "cameras.npz"):
+        file = file.rename(tmp_path / name)
+        capture = read_capture(tmp_path, READ)
+        assert capture.format == "IDR/NeuS" and off(capture) < 0.01
 
 
-def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):
+def test_middlebury_needs_no_count(tmp_path):
     middlebury(tmp_path)
-    capture = read_capture(tmp_path, Reading(48, masks=False))
-    assert all(shot.mask is None for shot in capture.shots) and "no masks" in capture.summary
-    np.testing.assert_allclose(capture.sphere.centre, CENTRE, atol=1e-3)
-    assert capture.sphere.radius == pytest.approx(1.5 * 20 / FOCAL, rel=1e-3)
+    file = tmp_path / "ball_par.txt"
+    file.write_text(file.read_text().partition("\n")[2])
+    assert off(read_capture(tmp_path, PLAIN)) < 0.01
+
+
+@FEW
+@given(st.floats(0, 360), st.floats(-80, 80), st.floats(0.5, 2))
+def test_choys_cameras_are_those_of_his_renderer(azimuth, elevation, distance):
+    """Against the steps of the code that came with the renderings."""
+    across, up = np.radians([-azimuth, -elevation])
+    sa, ca, se, ce = np.sin(across), np.cos(across), np.sin(up), np.cos(up)
+    world_to_object = np.array([[ca * ce, -sa, ca * se], [sa * ce, ca, sa * se], [-se, 0, ce]]).T
+    object_to_camera = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]).T
+    expected = np.eye(4)
+    expected[:3, :3] = object_to_camera @ world_to_object
+    expected[:3, 3] = -object_to_camera @ [distance, 0, 0]
+    np.testing.assert_allclose(_from_angles(azimuth, elevation, distance), OPENGL @ expected, atol=1e-12)
+
+
+def test_the_largest_model_is_taken_and_images_without_a_camera_are_named(tmp_path):
+    colmap(tmp_path)
+    shutil.copytree(tmp_path / "sparse" / "0", tmp_path / "sparse" / "1")
+    lines = (tmp_path / "sparse" / "0" / "images.txt").read_text().splitlines()
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:8]) + "\n")
+    for place in ("images", "mask"):
+        shutil.copy(tmp_path / place / "003.png", tmp_path / place / "100.png")
+    capture = read_capture(tmp_path, READ)
+    assert off(capture) < 0.01 and len(capture.shots) == 10
+    assert capture.notes == (
+        "sparse/1 with 10 images is taken, not sparse/0 with 4",
+        "no camera for 1 of the images, such as 100.png",
+    )
+
+
+def test_lines_with_points_quaternions_of_any_length_and_other_ends_of_lines(tmp_path):
+    colmap(tmp_path)
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    text = file.read_text()
+    longer = re.sub(
+        r"(?m)^(\d+) (\S+ \S+ \S+ \S+)", lambda m: f"{m[1]} {' '.join(str(2 * float(v)) for v in m[2].split())}", text
+    )
+    for good in (longer, text.replace("png\n\n", "png\n1.5 2.5 -1 3e1 4.5 -1\n"), text.replace("\n", "\r\n")):
+        file.write_text(good)
+        assert off(read_capture(tmp_path, PLAIN)) < 0.01

@@ -1,15 +1,24 @@
 """Names of images, cameras and masks of each kind, made anew: the pairs are those of the rule, or none are given."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from unicodedata import normalize
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
+from datasets import own_photographs
+from datasets.captures.hull import fit_of
 from datasets.captures.pairing import by_order, located, masks_of, paired
+from datasets.own_photographs import Reading, read_capture
 from renderers.checks import BadInput
+from tests.looped import each
+from tests.made_photographs import CENTRE, PLAIN, READ, SIZE, cameras, colmap, idr, llff, off, renamed
 
 PREFIXES = st.sampled_from(["", "r_", "IMG_2023_", "cam1_a_", "view 3 (4) "])
 WIDTHS = st.sampled_from([1, 3, 6])
@@ -122,3 +131,75 @@ def test_two_paths_to_one_file_are_refused(tmp_path):
     write(tmp_path, "0.png")
     with pytest.raises(BadInput, match=r"a/0.png and b/0.png have cameras, and are one file"):
         located(["a/0.png", "b/0.png"], tmp_path)
+
+
+# Whole folders
+
+
+@each("format, folder", [(idr, "image"), (llff, "images_4")])
+def test_names_without_zeros_are_paired_in_string_order(tmp_path, format, folder):
+    tmp_path = tmp_path / folder
+    tmp_path.mkdir()
+    format(tmp_path)
+    order = sorted(f"{i}.png" for i in range(8, 18))
+    for place in (folder, "mask"):
+        renamed(tmp_path / place, lambda i: order[i])
+    capture = read_capture(tmp_path, READ)
+    assert [shot.name for shot in capture.shots] == order
+    told = "10 images, paired with cameras by name order: 17.png before 8.png"
+    assert capture.notes[0] == f"{told}; if cameras follow the numbers, give these leading zeros"
+    (tmp_path / folder / "12.png").unlink()
+    assert [shot.name for shot in read_capture(tmp_path, READ).shots] == [name for name in order if name != "12.png"]
+
+
+@each("lost", [0, 9])
+def test_where_names_do_not_tell_what_is_missing_masks_do(tmp_path, monkeypatch, lost):
+    """Of 000 to 009, or of 001 to 010, 001 to 009 are left, and a small ball is not where the cameras look."""
+    tmp_path = tmp_path / str(lost)
+    tmp_path.mkdir()
+    idr(tmp_path)
+    rng = np.random.default_rng(0)
+    points = CENTRE + [0.15, 0.1, 0.2] + 0.12 * rng.normal(size=(4000, 3)).clip(-1, 1)
+    for i, camera in enumerate(cameras()):
+        columns, rows = camera.project(torch.from_numpy(points).float())[0].long().T
+        mask = np.zeros(SIZE, np.uint8)
+        mask[rows, columns] = 255
+        Image.fromarray(mask).save(tmp_path / "mask" / f"{i:03d}.png")
+    for place in ("image", "mask"):
+        renamed(tmp_path / place, lambda i: f"{i + (lost > 0):03d}.png")
+        (tmp_path / place / f"{lost + (lost > 0):03d}.png").unlink()
+    capture = read_capture(tmp_path, READ)
+    assert "which images are missing was found by the masks" in capture.notes[-1]
+    for shot, camera in zip(capture.shots, (cameras()[1:] if lost == 0 else cameras()[:9]), strict=True):
+        np.testing.assert_allclose(shot.camera.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-4)
+    with pytest.raises(BadInput, match="do not tell which, nor do masks"):
+        read_capture(tmp_path, PLAIN)
+    with monkeypatch.context() as patch:
+        patch.setattr(own_photographs, "fit_of", lambda *given: replace(fit_of(*given), shown=(0.4,)))
+        with pytest.raises(BadInput, match=r"the photographs show 40% of the object"):
+            read_capture(tmp_path, READ)
+
+
+def test_files_of_a_mac_are_no_images(tmp_path):
+    idr(tmp_path)
+    for file in [*tmp_path.rglob("*.png")]:
+        file.with_name(f"._{file.name}").write_bytes(b"AppleDouble")
+    assert off(read_capture(tmp_path, PLAIN)) < 0.01
+
+
+@pytest.mark.parametrize("named", ["a b (1)/{0}", "C:\\me\\images\\{0}", "/home/me/images/{0}", "left/{0}"])
+def test_names_with_folders_blanks_and_paths_of_elsewhere(tmp_path, named):
+    colmap(tmp_path)
+    inner = named.format("") if named[0] not in "C/" else ""
+    if inner:
+        for place in ("images", "mask"):
+            (tmp_path / place).rename(tmp_path / "moved")
+            (tmp_path / place).mkdir()
+            (tmp_path / "moved").rename(tmp_path / place / inner.strip("/"))
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    file.write_text(re.sub(r"(\d{3}\.png)", lambda name: named.format(name[0]), file.read_text()))
+    assert off(read_capture(tmp_path, PLAIN)) < 0.01
+    (tmp_path / "images").rename(tmp_path / "elsewhere")
+    with pytest.raises(BadInput, match=r"none of their images, such as .*000.png; its files end with .png, .txt"):
+        read_capture(tmp_path, READ)
+    assert off(read_capture(tmp_path, Reading(48, masks=False, images="elsewhere"))) < 0.01

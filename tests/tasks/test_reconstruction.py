@@ -27,11 +27,11 @@ from datasets.scene import Scene, Truth, sample_surface, see
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
-from tests.datasets.test_captures import CENTRE, RADIUS, nerf
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
+from tests.made_photographs import CENTRE, RADIUS, nerf
 from tests.run.driving import command, record_of
 from tests.tiny import Blind, altered, ball_prior, camera_of, run_of
 

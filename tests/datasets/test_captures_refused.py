@@ -1,0 +1,161 @@
+"""Photographs that cannot be used are refused with the true cause: of each format, what people do wrong."""
+
+import re
+import shutil
+from collections.abc import Callable
+from os import truncate
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from datasets.own_photographs import Reading, read_capture
+from renderers.checks import BadInput
+from tests.made_photographs import (
+    PLAIN,
+    READ,
+    SIZE,
+    changed,
+    colmap,
+    idr,
+    llff,
+    middlebury,
+    moved,
+    nerf,
+    repainted,
+    rewritten,
+)
+
+Spoil = Callable[[Path], object]
+ONE = slice(4, 5)  # of the files of a folder
+
+
+def removed(name: str) -> Spoil:
+    return lambda folder: shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
+
+
+def copied(name: str, other: str) -> Spoil:
+    return lambda folder: shutil.copy(folder / name, folder / other)
+
+
+def written(name: str, content: bytes) -> Spoil:
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def cameras(change: Callable[[dict], dict]) -> Spoil:
+    return lambda folder: rewritten(folder / "cameras_sphere.npz", change)
+
+
+def stored(change: Callable[[dict], object]) -> Spoil:
+    return lambda folder: changed(folder, change)
+
+
+def fourth(**values) -> Spoil:
+    return stored(lambda known: known["frames"][3].update(values))
+
+
+def every(**values) -> Spoil:
+    return stored(lambda known: [frame.update(values) for frame in known["frames"]])
+
+
+def placed(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+    return lambda folder: moved(folder, change)
+
+
+def masks(change: Callable[[np.ndarray], np.ndarray], some: slice = slice(None)) -> Spoil:
+    return lambda folder: repainted(sorted((folder / "mask").iterdir())[some], change)
+
+
+def text(name: str, old: str, new: str) -> Spoil:
+    """Replaces what a pattern matches."""
+    return lambda folder: (folder / name).write_text(re.sub(old, new, (folder / name).read_text()))
+
+
+def turned(folder: Path) -> None:
+    """Turns the images, and says so by their tag."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 8
+    for file in (folder / "image").iterdir():
+        Image.open(file).transpose(Image.Transpose.ROTATE_90).save(file, exif=exif)
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
+FETCH = "is a Git LFS pointer; fetch it with 'git lfs pull'"
+IMAGES, MATRICES, LINES = "sparse/0/images.txt", "cameras_sphere.npz", "ball_par.txt"
+TRANSPOSED = [[80.0, 0, 0], [0, 80, 0], [20, 15, 1]]
+WIDE, FLAT = np.diag([2.0, 2.0, 1.0, 1.0]), np.diag([1.0, 1.0, 0.7, 1.0])
+REFUSED = {
+    idr: [
+        (removed(MATRICES), r"has no cameras that are known.*transforms\.json.*poses_bounds\.npy"),
+        (removed("image"), r"has cameras \(IDR/NeuS\) but none of their images"),
+        (copied("image/000004.png", "image/000010.png"), "000010.png has no camera.*10 cameras.* 11 images.*remove"),
+        (written("image/000004.png", b"no image"), "000004.png cannot be read as an image.*copy or export it again"),
+        (lambda f: truncate(f / "image/000003.png", 100), "000003.png cannot be read as an image"),
+        (written("image/000003.png", POINTER), FETCH),
+        (written(MATRICES, POINTER), FETCH),
+        (removed("mask/004.png"), r"000004.png has no mask in.*9 masks \(000.png.*add it"),
+        (lambda f: Image.new("L", (10, 10)).save(f / "mask/004.png"), "004.png has 10 x 10 pixels, its image 48 x 40"),
+        (turned, r"a mask has the size of its image; the image's tag of orientation \(EXIF\)"),
+        (masks(np.zeros_like, ONE), "the mask of 000004.png is empty.*use no masks"),
+        (masks(lambda mask: 255 - mask, ONE), "1 of the masks, such as that of 000004.png.* white along the border"),
+        (masks(lambda mask: 255 - mask), "10 of the masks.* are white along the border, as inverted ones"),
+        (masks(lambda mask: 0 * mask + 255), "the masks are white everywhere"),
+        (cameras(lambda known: dict.fromkeys(known, np.full((4, 4), np.nan))), "world_mat_0 must have finite numbers"),
+        (cameras(lambda known: {key: known[key] for key in [*known][1:]}), f"{MATRICES} has no world_mat_0.*export"),
+        (cameras(lambda known: known | {"scale_mat_0": FLAT}), "scale_mat_0 must scale all axes alike"),
+        (cameras(lambda known: known | {"scale_mat_3": np.eye(4)}), "scale_mat_3 differs from scale_mat_0"),
+        (cameras(lambda known: {key: WIDE @ one if key[0] == "w" else one for key, one in known.items()}), "2.1 times"),
+    ],
+    llff: [(written("poses_bounds.npy", POINTER), FETCH)],
+    nerf: [
+        (written("transforms.json", POINTER), FETCH),
+        (every(mask_path="train/r_0.png"), "train/r_0.png is the mask of several images"),
+        (stored(lambda known: known.pop("frames")), "transforms.json has no frames"),
+        (stored(lambda known: known["frames"].append(known["frames"][0])), "has ./train/r_0 twice"),
+        (stored(lambda known: known["frames"][3].pop("file_path")), "a frame has no file_path"),
+        (fourth(file_path=None), "a frame has no file_path"),
+        (fourth(transform_matrix=None), "r_3 has no transform_matrix"),
+        (fourth(transform_matrix=np.zeros((4, 4)).tolist()), "r_3: transform_matrix must be invertible"),
+        (fourth(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()), "r_3.png must have a rotation, but .* mirrors"),
+        (fourth(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "r_3.png must .* its axes have lengths 0.5"),
+        (placed(lambda matrix: matrix[:2, :2]), "must be 4 x 4, not 2 x 2"),
+        (placed(np.transpose), "r_0: transform_matrix must have 0 0 0 1 as its .*: it may be transposed; export it"),
+        (placed(lambda matrix: np.vstack([np.c_[matrix[:3, :3], [2.0] * 3], matrix[3]])),
+         r"all 10 cameras, of r_0.png to r_9.png, are at one place, \(2, 2, 2\)"),
+        (stored(lambda known: known.update(w=0, h=0)), r"must be of one pixel or more, not \(0, 0\)"),
+        (stored(lambda known: known.pop("h")), "r_0 has no h"),
+        (stored(lambda known: [known.pop(key) for key in ("fl_x", "fl_y")]), "r_0 has no focal length: give fl_x"),
+        (fourth(fl_x=60.0, camera_angle_x=0.5), r"r_3: focal lengths differ, 60 pixels by fl_x, 93\.9\d* pixels by c"),
+        (every(camera_angle_x=39.6), "between 0 and pi, not 39.6: it is in radians"),
+        (every(intrinsic_matrix=TRANSPOSED), "transposed"),
+        (every(intrinsic_matrix=np.ravel(TRANSPOSED).tolist()), "must be 3 x 3"),
+    ],
+    middlebury: [(text(LINES, r"(?s)(ball0002.*?\n)(.*)", r"\1\2\1"), "ball_par.txt has ball0002.png twice")],
+    colmap: [
+        (text(IMAGES, "\n\n", "\n"), "images.txt: after 000.png there must be a line of its points"),
+        (text(IMAGES, r"(?m)^4 \S+ \S+ \S+ \S+", "4 0 0 0 0"), "the quaternion of 003.png is 0 0 0 0"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("write, spoil, words", [(write, *row) for write, rows in REFUSED.items() for row in rows])
+def test_what_cannot_be_used_is_told_in_one_line(tmp_path, write, spoil, words):
+    write(tmp_path)
+    spoil(tmp_path)
+    with pytest.raises(BadInput, match=words) as caught:
+        read_capture(tmp_path, READ)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_without_masks_nothing_is_said_of_them_and_less_can_be_known(tmp_path):
+    idr(tmp_path)
+    (tmp_path / "mask" / "004.png").unlink()
+    assert read_capture(tmp_path, PLAIN).masks == ""
+    with pytest.raises(BadInput, match=r"dataset\.images=image is for COLMAP, and .* has IDR/NeuS: leave it out"):
+        read_capture(tmp_path, Reading(SIZE[1], masks=False, images="image"))
+    (tmp_path / MATRICES).unlink()
+    nerf(tmp_path)
+    moved(tmp_path, lambda matrix: np.hstack([np.eye(4)[:, :3], matrix[:, 3:]]))
+    with pytest.raises(BadInput, match="the cameras look in parallel"):
+        read_capture(tmp_path, PLAIN)
