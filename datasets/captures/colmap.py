@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from datasets.captures.frames import Frame, Layout, motion
 from datasets.captures.lenses import colmap_lens
-from datasets.captures.pairing import images_in, located, masks_of, without_camera, without_image
+from datasets.captures.pairing import images_in, located, masks_of, without
 from datasets.extras import install
 from renderers.checks import BadInput
 
@@ -47,9 +47,9 @@ def colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None
         Frame(found[name], *cameras[name][:2], masks.get(path), *cameras[name][2:]) for name, path in short.items()
     ]
     notes = [*_chosen(folder, place, {one: len(model.images) for one, model in models.items()})]
-    notes += [*([how] if how else []), *paired, *without_image([name for name in cameras if name not in found])]
+    notes += [*how, *paired, *without("image", [name for name in cameras if name not in found])]
     if base != folder:
-        notes += without_camera(name for name in images_in(base, deep=True) if name not in there)
+        notes += without("camera", [name for name in images_in(base, deep=True) if name not in there])
     points = np.array([point.xyz for point in models[place].points3D.values()])
     around = _about(points) if len(points) else None
     return Layout("COLMAP", tuple(frames), None, tuple(notes), around, missing=next(iter(cameras), ""))

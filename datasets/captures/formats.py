@@ -57,7 +57,7 @@ def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) 
     bare = list[Layout]()
     for name, files in there.items():
         more = {"images": images} if name == "COLMAP" else {}
-        layout = _read(name, partial(FORMATS[name][0], folder, files, masks, **more), folder)
+        layout = _read(f"{name} cameras of {files[0]}", partial(FORMATS[name][0], folder, files, masks, **more), folder)
         if layout.frames:
             if images is not None and name != "COLMAP":
                 raise BadInput(f"dataset.images={images} is for COLMAP, and {folder} has {layout.format}: leave it out")
@@ -74,8 +74,8 @@ def _files(folder: Path, patterns: Sequence[str]) -> list[Path]:
     return [file for some in found for file in some if file.is_file() and not file.name.startswith(".")]
 
 
-def _read(name: str, read: Callable[[], Layout], folder: Path) -> Layout:
-    """What a format's reader finds; where a file of it is broken, an error that names the format.
+def _read(what: str, read: Callable[[], Layout], folder: Path) -> Layout:
+    """What a format's reader finds; where a file of it is broken, an error that says of what cameras.
 
     Raises:
         BadInput: where something is missing, or cannot be read.
@@ -84,13 +84,13 @@ def _read(name: str, read: Callable[[], Layout], folder: Path) -> Layout:
         return read()
     except FAULTS as error:
         files = (file for file in sorted(folder.rglob("*")) if file.is_file())
-        pointer = next((f"{file} {what}" for file in files if "LFS" in (what := mistaken(file))), None)
+        pointer = next((f"{file} {kind}" for file in files if "LFS" in (kind := mistaken(file))), None)
         if pointer is not None:
             raise BadInput(pointer) from None
         if isinstance(error, BadInput):
             raise
-        what = " ".join(str(error).split())
-        raise BadInput(f"the {name} cameras of {folder} cannot be read ({what}): export them again") from error
+        why = " ".join(str(error).split())
+        raise BadInput(f"the {what} cannot be read ({why}): export them again") from error
 
 
 def _no_images(folder: Path, found: list[Layout]) -> str:

@@ -1,7 +1,7 @@
 """Cameras as matrices in one `.npz` file: IDR and NeuS, and DVR."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,10 +38,14 @@ def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     scale, notes = _scale(known, count, str(file))
     masks, how = masks_of(folder, images if masked else {}, sorted_too=True)
     apart = _is_dvr(known)
-    make = _dvr_frames(file, known, scale, images) if apart else _idr_frames(known, scale)
+    depths = _depths(folder, images) if apart else {}
 
     def frame(i: int, name: str) -> Frame:
-        return make(i, images[name], masks.get(name))
+        world = known[f"world_mat_{i}"]
+        if not apart:
+            return Frame(images[name], *decomposed((world @ scale)[:3]), masks.get(name))
+        seen = need(known, f"camera_mat_{i}", str(file)) @ world @ scale
+        return _dvr_frame(seen, images[name], masks.get(name), depths.get(name))
 
     frames, rival, found = made(answers, count, frame)
     sphere = (np.zeros(3), CUBE if apart else 1.0) if any(key.startswith("scale_mat_") for key in known) else None
@@ -57,32 +61,19 @@ def _is_dvr(known: Matrices) -> bool:
     return bool(lengths.max() <= 1.01 * lengths.min())
 
 
-def _idr_frames(known: Matrices, scale: Float[np.ndarray, "4 4"]) -> Callable[[int, Path, Path | None], Frame]:
-    """What makes the frame of camera i."""
-
-    def frame(i: int, image: Path, mask: Path | None) -> Frame:
-        return Frame(image, *decomposed((known[f"world_mat_{i}"] @ scale)[:3]), mask)
-
-    return frame
+def _depths(folder: Path, images: dict[str, Path]) -> dict[str, Path]:
+    """The files of depths, by the names of their images."""
+    stored = {one.name: one for one in sorted(folder.glob("depth/*.exr")) if not one.name.startswith(".")}
+    return {name: stored[depth] for name, depth in paired([*images], [*stored])[0].items()}
 
 
-def _dvr_frames(
-    file: Path, known: Matrices, scale: Float[np.ndarray, "4 4"], images: dict[str, Path]
-) -> Callable[[int, Path, Path | None], Frame]:
-    """What makes the frame of camera i: -1 and 1 are the centres of the first and of the last pixel."""
-    stored = {one.name: one for one in sorted(file.parent.glob("depth/*.exr")) if not one.name.startswith(".")}
-    depths = {images[name]: stored[depth] for name, depth in paired([*images], [*stored])[0].items()}
-
-    def frame(i: int, image: Path, mask: Path | None) -> Frame:
-        half = (np.array(image_size(image)) - 1) / 2
-        pixels = np.array([[half[0], 0, half[0], 0], [0, half[1], half[1], 0], [0, 0, 1.0, 0]])
-        seen = need(known, f"camera_mat_{i}", str(file)) @ known[f"world_mat_{i}"] @ scale
-        intrinsics, motion = decomposed(pixels @ seen)
-        unit = 1 / float(seen[2, :3] @ motion[2, :3])  # a depth is the third number of a projected point
-        depth = (depths[image], unit) if image in depths else None
-        return Frame(image, intrinsics, motion, mask, depth=depth)
-
-    return frame
+def _dvr_frame(seen: Float[np.ndarray, "4 4"], image: Path, mask: Path | None, depth: Path | None) -> Frame:
+    """The frame of a projection onto an image whose first and last pixels have their centres at -1 and 1."""
+    half = (np.array(image_size(image)) - 1) / 2
+    pixels = np.array([[half[0], 0, half[0], 0], [0, half[1], half[1], 0], [0, 0, 1.0, 0]])
+    intrinsics, motion = decomposed(pixels @ seen)
+    unit = 1 / float(seen[2, :3] @ motion[2, :3])  # a depth is the third number of a projected point
+    return Frame(image, intrinsics, motion, mask, depth=None if depth is None else (depth, unit))
 
 
 def _scale(known: Matrices, count: int, file: str) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
@@ -106,9 +97,5 @@ def _scale(known: Matrices, count: int, file: str) -> tuple[Float[np.ndarray, "4
     for i in there:
         if np.abs(known[f"scale_mat_{i}"] - scale).max() > SIMILAR * size**0.5:
             raise BadInput(f"{file}: scale_mat_{i} differs from scale_mat_{there[0]}: the unit sphere must be the same")
-    lacking = [i for i in range(count) if i not in there]
-    if not lacking:
-        return scale, ()
-    return scale, (
-        f"scale_mat_{there[0]} is that of all cameras: {len(lacking)} have none, such as camera {lacking[0]}",
-    )
+    lacking = [f"{count - len(there)} have none, such as camera {i}" for i in range(count) if i not in there]
+    return scale, tuple(f"scale_mat_{there[0]} is that of all cameras: {told}" for told in lacking[:1])

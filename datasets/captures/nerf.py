@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from datasets.captures.frames import OPENGL, Frame, Layout, image_size, need, whole
 from datasets.captures.lenses import nerf_lens
-from datasets.captures.pairing import located, masks_of, natural, without_image
+from datasets.captures.pairing import located, masks_of, natural, without
 from renderers.checks import BadInput
 
 AXES = {"from_na": np.eye(4), "from_mitsuba": np.diag([-1.0, -1.0, 1.0, 1.0])}  # flags of NeuS2 and instant-ngp
@@ -21,10 +21,7 @@ SAME = 0.02  # most by which two of them may differ, as a share
 
 def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """camera_to_world in OpenGL's axes, or as `AXES` has them; fields of view, or intrinsics; a lens."""
-    try:
-        stored = json.loads(files[0].read_text(encoding="utf-8-sig"))
-    except ValueError as error:
-        raise BadInput(f"{files[0]} is no JSON file ({error}): export it again") from None
+    stored = json.loads(files[0].read_text(encoding="utf-8-sig"))
     every = need(stored, "frames", str(files[0]))
     if not isinstance(every, list) or not all(isinstance(frame, dict) for frame in every):
         raise BadInput(f"{files[0]}: frames must be a list with a table for each image: export it again")
@@ -39,11 +36,10 @@ def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     masks, told = _masks(folder, known, found) if masked else ({}, ())
     frames = [_frame(known[path], image, masks.get(path), f"{files[0]}, {path}") for path, image in found.items()]
     missing = [path for path in known if path not in found]
-    unsized = [
-        path for path in found if not {"w", "h", *_focal_keys("x")[1:], *_focal_keys("y")[1:]} & set(known[path])
-    ]
-    guessed = (f"{files[0].name} states no w and h: focal lengths are taken for the size of the images",)
-    notes = (*([how] if how else []), *told, *without_image(missing), *(guessed if unsized else ()))
+    notes = (*how, *told, *without("image", missing))
+    of_size = {"w", "h", *_focal_keys("x")[1:], *_focal_keys("y")[1:]}
+    if any(not of_size & {*known[path]} for path in found):
+        notes += (f"{files[0].name} states no w and h: focal lengths are taken for the size of the images",)
     frames = sorted(frames, key=lambda frame: natural(frame.image.name))
     return Layout("NeRF", tuple(frames), None, notes, missing=missing[0] if missing else "")
 

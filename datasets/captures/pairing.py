@@ -75,7 +75,7 @@ def made(
     """
     found = [tuple(make(i, name) for i, name in sorted(places.items())) for places in answers]
     names, unused = sorted(answers[0].values()), [f"camera {i}" for i in range(count) if i not in answers[0]]
-    notes = without_image(unused) if len(answers) == 1 else (f"no image for {len(unused)} of the cameras",)
+    notes = without("image", unused) if len(answers) == 1 else (f"no image for {len(unused)} of the cameras",)
     if names != sorted(names, key=natural):
         one, other = next(pair for pair in pairwise(names) if natural(pair[0]) > natural(pair[1]))
         told = f"{len(names)} images, paired with cameras by name order: {one} before {other}"
@@ -206,8 +206,8 @@ def _padded(pairs: Mapping[str, str]) -> bool:
     return all(_stem(name).isdecimal() and _stem(mask).isdecimal() for name, mask in pairs.items())
 
 
-def located(names: Iterable[str], base: Path) -> tuple[dict[str, Path], str]:
-    """The image files of paths that a file of cameras names, and a note on how they were found, or "".
+def located(names: Iterable[str], base: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """The image files of paths that a file of cameras names, and a note on how they were found, if that is unusual.
 
     Paths are relative to `base`, with / or \\; their suffix may be left out, or be another one. Where none is there,
     leading folders are left out, as those of another machine.
@@ -224,22 +224,17 @@ def located(names: Iterable[str], base: Path) -> tuple[dict[str, Path], str]:
         there = {name: file for name, tail in tails.items() if (file := _existing(tail, listed))}
         if len(there) > len(found):
             found, left = there, skip
-    _check_distinct(found)
-    for name, file in found.items():
-        if left:
-            return found, f"images by the ends of their paths, without {PurePosixPath(*parts[name][:left])}"
-        suffix = PurePosixPath(parts[name][-1]).suffix
-        if suffix.lower() in IMAGES and suffix != file.suffix:
-            return found, f"images with the suffix {file.suffix}, named with {suffix}"
-    return found, ""
-
-
-def _check_distinct(found: Mapping[str, Path]) -> None:
     by_file: dict[Path, str] = {}
     for name, file in found.items():
-        if file in by_file:
-            raise BadInput(f"{by_file[file]} and {name} have cameras, and are one file, {file}: name each image once")
-        by_file[file] = name
+        if (other := by_file.setdefault(file, name)) != name:
+            raise BadInput(f"{other} and {name} have cameras, and are one file, {file}: name each image once")
+    for name, file in found.items():
+        if left:
+            return found, (f"images by the ends of their paths, without {PurePosixPath(*parts[name][:left])}",)
+        suffix = PurePosixPath(parts[name][-1]).suffix
+        if suffix.lower() in IMAGES and suffix != file.suffix:
+            return found, (f"images with the suffix {file.suffix}, named with {suffix}",)
+    return found, ()
 
 
 def _existing(file: Path, listed: dict[Path, dict[str, Path]]) -> Path | None:
@@ -262,15 +257,10 @@ def _plain(name: str) -> str:
     return normalize("NFC", name).lower()
 
 
-def without_image(names: Sequence[str]) -> tuple[str, ...]:
-    """A note on cameras whose image is not there; none where all are."""
-    return (f"no image for {len(names)} of the cameras, such as {names[0]}",) if names else ()
-
-
-def without_camera(names: Iterable[str]) -> tuple[str, ...]:
-    """A note on images without a camera; none where all have one."""
-    lost = [*names]
-    return (f"no camera for {len(lost)} of the images, such as {lost[0]}",) if lost else ()
+def without(what: str, names: Sequence[str]) -> tuple[str, ...]:
+    """A note on cameras without an image, or on images without a camera, by their names; none where there is none."""
+    of = {"image": "cameras", "camera": "images"}[what]
+    return (f"no {what} for {len(names)} of the {of}, such as {names[0]}",) if names else ()
 
 
 def _some(names: Iterable[str]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from datasets.captures.frames import OPENGL, Frame, Layout, centred, image_size, motion, whole
-from datasets.captures.pairing import by_order, first_images, images_in, located, made, masks_of, paired, without_image
+from datasets.captures.pairing import by_order, first_images, images_in, located, made, masks_of, paired, without
 from renderers.checks import BadInput
 
 
@@ -32,7 +32,7 @@ def middlebury(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     masks, told = masks_of(folder, there if masked else {})
     frames = tuple(Frame(file, *cameras[name], masks.get(file.name)) for name, file in found.items())
     missing = [name for name in cameras if name not in found]
-    notes = (*([how] if how else []), *told, *without_image(missing))
+    notes = (*how, *told, *without("image", missing))
     return Layout("Middlebury", frames, None, notes, missing=missing[0] if missing else "")
 
 
@@ -42,8 +42,6 @@ def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     rows, images = np.load(file), first_images(folder, "images", "images_2", "images_4", "images_8")
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInput(f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)}")
-    if len(broken := np.flatnonzero(~np.isfinite(rows[:, :15]).all(axis=1))):
-        raise BadInput(f"{file}: row {broken[0]} must have finite numbers: export it again")
     answers = by_order([*images], len(rows), file.name)
     masks, how = masks_of(folder, images if masked else {})
 
@@ -70,7 +68,7 @@ def blended_mvs(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     masks, how = masks_of(folder, images if masked else {})
     frames = [_mvs_frame(cameras[name], images[image], masks.get(image)) for name, image in pairs.items()]
     missing = [name for name in cameras if name not in pairs]
-    notes = (*how, *without_image(missing))
+    notes = (*how, *without("image", missing))
     return Layout("BlendedMVS", tuple(frames), None, notes, missing=missing[0] if missing else "")
 
 

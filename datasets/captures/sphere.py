@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from jaxtyping import Float
 
 from datasets.captures.hull import carve
 from datasets.shot import Shot
@@ -60,23 +59,17 @@ def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:
 def doubt_of(shots: Sequence[Shot]) -> str:
     """What may be wrong with photographs that do not fit: the size of their images, or inverted masks; "" else."""
     masked = [(shot.name, shot.mask) for shot in shots if shot.mask is not None]
-    white = [name for name, mask in masked if all(bool(side.float().mean() > 0.5) for side in _border(mask))]
-    if white:
+    sides = [(name, (mask[0], mask[-1], mask[:, 0], mask[:, -1])) for name, mask in masked]
+    if white := [name for name, four in sides if all(bool(side.float().mean() > 0.5) for side in four)]:
         which = f"{len(white)} of the masks, such as that of {white[0]}, are"
         return f"{which} white along the border, as inverted ones: make the object white, and the rest black"
     return _size_doubt([shot.camera for shot in shots])
 
 
-def _border(mask: Bool[Tensor, "height width"]) -> tuple[Tensor, ...]:
-    return mask[0], mask[-1], mask[:, 0], mask[:, -1]
-
-
 def _size_doubt(cameras: Sequence[Camera]) -> str:
     """What is said of cameras whose principal point lies as if their images had another size; "" of others."""
-    shares = np.array(
-        [[2 * one.intrinsics[0, 2] / one.width, 2 * one.intrinsics[1, 2] / one.height] for one in cameras]
-    )
-    across, down = np.median(shares, axis=0)
+    middles = [(one.intrinsics[0, 2] / one.width, one.intrinsics[1, 2] / one.height) for one in cameras]
+    across, down = 2 * np.median(np.array(middles), axis=0)
     if abs(across / down - 1) > ALIKE or max(across, 1 / across) < RESIZED or across <= 0:
         return ""
     return (
@@ -116,9 +109,8 @@ def looked_at(shots: Sequence[Shot], spans: Sequence[tuple[float, float] | None]
     if np.mean(depths < 0) > BESIDE:
         found += "; but that lies behind most of them: try flipped axes (stated ones, where they are flipped)"
     elif spread < NARROW:
-        found += (
-            f"; they look from within {np.degrees(spread**0.5):.2g} degrees, so that it is hardly known how far away"
-        )
+        angle = np.degrees(spread**0.5)
+        found += f"; they look from within {angle:.2g} degrees, so that it is hardly known how far away"
     return Sphere(centre, _shown(shots, centre), found)
 
 

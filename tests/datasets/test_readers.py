@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from datasets.mesh import Mesh
+from datasets.meshes import load_mesh
 from datasets.readers.ply import read_ply
 from datasets.readers.polygons import Polygons, ears
 from datasets.readers.text import read_obj, read_off, read_stl
@@ -230,36 +231,48 @@ def test_a_tetrahedron_is_read_in_unusual_spellings(name):
     assert mesh.watertight and mesh.volume == pytest.approx(1 / 6)
 
 
-REFUSED = {
-    "a longer .stl": (
-        read_stl,
-        "x".ljust(80) + "\4\0\0\0" + "\0" * 201,
-        "284 bytes for the 4 faces that it claims, found 285",
-    ),
-    "no end of an .stl": (read_stl, SOLID[:-11], "from 'solid' to 'endsolid', found 'solid a facet norma' to "),
-    "an .stl of commas": (read_stl, SOLID.replace("1 0 0", "1,0 0 0"), "'vertex x y z' .*'1,0'"),
-    "two corners": (read_stl, SOLID.replace("  vertex 1 0 0\n", "", 1), "3 corners or more in a facet, found 2"),
-    "comma": (read_obj, "v 0,5 0 0\n", r"'v x y z', found 'v 0,5 0 0'"),
-    "zero": (read_obj, V + "f 0 1 2\n", "found 'f 0 1 2'"),
-    "too far back": (read_obj, V + "f -5 1 2\n", "from -4 to -1, found 'f -5 1 2'"),
-    "beyond": (read_obj, V + "f 1 2 5\n", "4 vertices, but one uses number 4 counted from 0, 5 from 1"),
-    "free form": (read_obj, V + F + "surf 0 1 0 1 1 2 3 4\n", "has a free-form surface"),
-    "four dimensions": (read_off, "4OFF\n4 4 6\n" + ROWS, "must be text and begin with OFF.*found '4OFF'"),
-    "binary": (read_off, "OFF BINARY\n\0\0", "must be text .*found 'OFF BINARY'"),
-    "fewer": (read_off, "OFF4 5 6\n" + ROWS, "truncated.* claims 4 vertices and 5 faces, and it holds 4 and 4"),
-    "fewer, with colours": (read_off, "OFF4 9 6\n" + ROWS.replace("\n3", " 1 0 0\n3"), "and it holds 4 and 4"),
-    "more": (read_off, "OFF4 3 6\n" + ROWS, "claims 4 vertices and 3 faces, and it holds 4 and 4"),
-    "words": (read_off, "OFF\n4 4 6\n" + ROWS.replace("3 0 2 1", "3 0 two 1"), "'two'"),
-    "no list": (read_ply, f"{HEAD}element face 1\nproperty int a\nend_header\n" + "0 " * 13, "found a;"),
-    "rows cut short": (read_ply, STRIPS, "ends within the 1 rows of 'tristrips'"),
-    "a longer body": (read_ply, STRIPS + "\n3 0 1 2\n7 7\n", "header says, found 2 numbers more"),
-    "no end of the header": (read_ply, HEAD, "its header has no line 'end_header'"),
-    "an unknown type": (read_ply, HEAD.replace("float x", "real x") + "end_header\n", "found 'property real x'"),
+REFUSED = {  # the name of a file, its content, and what is said of it
+    "longer.stl": ("x".ljust(80) + "\4\0\0\0" + "\0" * 201, "284 bytes for the 4 faces that it claims, found 285"),
+    "endless.stl": (SOLID[:-11], "from 'solid' to 'endsolid', found 'solid a facet norma' to "),
+    "commas.stl": (SOLID.replace("1 0 0", "1,0 0 0"), "'vertex x y z' .*'1,0'"),
+    "two corners.stl": (SOLID.replace("  vertex 1 0 0\n", "", 1), "3 corners or more in a facet, found 2"),
+    "page.stl": ("\n<!DOCTYPE html>\n", "is a web page"),
+    "empty.obj": ("", "found 0 bytes"),
+    "commas.obj": ("v 0,5 0 0\n", r"'v x y z', found 'v 0,5 0 0'"),
+    "zero.obj": (V + "f 0 1 2\n", "found 'f 0 1 2'"),
+    "too far back.obj": (V + "f -5 1 2\n", "from -4 to -1, found 'f -5 1 2'"),
+    "beyond.obj": (V + "f 1 2 5\n", "4 vertices, but one uses number 4 counted from 0, 5 from 1"),
+    "nan.obj": (V + "v nan 0 0\nf 1 2 5\n", "NaN"),
+    "free form.obj": (V + F + "surf 0 1 0 1 1 2 3 4\n", "has a free-form surface"),
+    "points.obj": (V, "must have faces, found none: it holds 4 vertices"),
+    "other.obj": ("OFF\n4 4 6\n" + ROWS, "it holds at most points or lines, as .obj writes them"),
+    "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "must have an area, found 0"),
+    "point.obj": ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "must have an area, found 0"),
+    "packed.obj": (b"\x1f\x8b\x08\x00", "is compressed by gzip; unpack it"),
+    "four dimensions.off": ("4OFF\n4 4 6\n" + ROWS, "must be text and begin with OFF.*found '4OFF'"),
+    "binary.off": ("OFF BINARY\n\0\0", "must be text .*found 'OFF BINARY'"),
+    "fewer.off": ("OFF4 5 6\n" + ROWS, "truncated.* claims 4 vertices and 5 faces, and it holds 4 and 4"),
+    "fewer, with colours.off": ("OFF4 9 6\n" + ROWS.replace("\n3", " 1 0 0\n3"), "and it holds 4 and 4"),
+    "more.off": ("OFF4 3 6\n" + ROWS, "claims 4 vertices and 3 faces, and it holds 4 and 4"),
+    "words.off": ("OFF\n4 4 6\n" + ROWS.replace("3 0 2 1", "3 0 two 1"), "'two'"),
+    "inf.off": ("OFF\n4 4 6\n" + ROWS.replace("0 0 1", "0 0 inf"), "infinite"),
+    "no list.ply": (f"{HEAD}element face 1\nproperty int a\nend_header\n" + "0 " * 13, "found a;"),
+    "cut short.ply": (STRIPS, "ends within the 1 rows of 'tristrips'"),
+    "longer.ply": (STRIPS + "\n3 0 1 2\n7 7\n", "header says, found 2 numbers more"),
+    "endless.ply": (HEAD, "its header has no line 'end_header'"),
+    "an unknown type.ply": (HEAD.replace("float x", "real x") + "end_header\n", "found 'property real x'"),
+    "words.ply": ("this is\nno mesh\n", "does not begin with a line 'ply'"),
+    "mac.ply": (b"\x00\x05\x16\x07\x00\x02", "holds a Mac's notes on a file"),
+    "pointer.glb": ("version https://git-lfs.github.com/spec/v1\noid", "Git LFS pointer; fetch it with 'git lfs pull'"),
 }
 
 
 @each("name", REFUSED)
-def test_what_is_not_understood_is_named(name):
-    reader, content, message = REFUSED[name]
-    with pytest.raises(ValueError, match=message):
-        reader(content.encode())
+def test_a_broken_file_is_one_clear_error(tmp_path, name):
+    content, message = REFUSED[name]
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ValueError, match=message) as caught:
+        load_mesh(tmp_path / name)
+    assert str(caught.value).startswith(f"mesh file '{tmp_path / name}': ")
+    assert "; " in str(caught.value)  # the remedy
+    assert caught.value.__cause__ is None and caught.value.__suppress_context__  # no traceback of a library
