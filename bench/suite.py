@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from math import isclose
+from math import isclose, isnan
 from pathlib import Path
 from typing import Any
 
@@ -174,17 +174,13 @@ def show(results_dir: Path) -> int:
     if any(map(standing.not_run, standing.rows)):
         print("A row that lacks runs is not compared: its shares are of fewer problems. suite=quick makes them.")
     print(f"{'renderer':<32} share of targets reached, against the first; in each set; field values")
-    for row in standing.rows:
-        parts = [
-            f"{name} {percent(standing.share(row, name).value)}" for name in standing.sets if standing.of(row, name)
-        ]
-        ratio, gain = standing.ratio(row), standing.gain(row)
-        parts += [f"{100 * gain.value:+.0f} points by tuning"] if gain else []
-        parts += [f"{number(ratio.value)} of DIST's field values"] if ratio else []
-        parts += [f"{count} {status}" for status, count in standing.failures(row).most_common()]
-        parts += [f"{lacking} not run"] if (lacking := standing.not_run(row)) else []
-        share = "" if gain else percent(standing.share(row).value)  # a tuned row lacks sets
-        print(f"{row:<32} {share:>5}  {standing.against(row):<8}  {', '.join(parts)}")
+    for line in map(standing.line, standing.rows):
+        parts = [f"{name} {percent(line[name])}" for name in standing.sets if not isnan(line[name])]
+        parts += [f"{100 * line['gain'].value:+.0f} points by tuning"] if line["gain"] else []
+        parts += [f"{number(line['ratio'].value)} of DIST's field values"] if line["ratio"] else []
+        parts += [line["failed"]] if line["failed"] else []
+        share = "" if line["gain"] else percent(line["share"].value)  # a tuned row lacks sets
+        print(f"{line['row']:<32} {share:>5}  {line['against']:<8}  {', '.join(parts)}")
     print(*(path.with_suffix(".png") for path in written), index, sep="\n")
     return 0
 

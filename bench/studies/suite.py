@@ -1,13 +1,12 @@
 """The suite: the share of problems and targets that each renderer reaches over its cost, and the standing."""
 
 from dataclasses import replace
-from math import nan
 from typing import Any
 
 from bench.report.data.runs import together
 from bench.report.study import Result, Runs, Selection, chart, format, table
 from bench.report.suite.attempts import BY_ITSELF, EXPERIMENT, GIVEN, attempts_of, place, read_attempts, suite
-from bench.report.suite.standing import SECONDS, Standing
+from bench.report.suite.standing import Standing
 from bench.report.write import paper
 
 PLACE = 1
@@ -32,7 +31,7 @@ def make(*several: Runs | None) -> Result:
     runs = together(*several)
     attempts, problems = read_attempts(paper.SHIPPED, runs.results_dir)
     standing = Standing([*attempts, *attempts_of(runs.records, runs.results_dir)])
-    lines = [_line(standing, row) for row in standing.rows]
+    lines = [standing.line(row) for row in standing.rows]
     panels = [_panel(standing, None), *(_panel(standing, name) for name in standing.sets)]
     figure = chart.draw_lead(panels, 5.4)
     return Result(
@@ -53,24 +52,6 @@ def make(*several: Runs | None) -> Result:
     )
 
 
-def _line(standing: Standing, row: str) -> dict[str, Any]:
-    failures, lacking, seconds = standing.failures(row), standing.not_run(row), standing.ratio(row, SECONDS)
-    failed = ", ".join(f"{count} {status}" for status, count in failures.most_common())
-    return {
-        **{"against": standing.against(row), "row": row, "preset": standing.preset(row), "share": standing.share(row)},
-        **{name: standing.share(row, name).value for name in standing.sets},
-        **{
-            "at_dist": nan if row.endswith(BY_ITSELF) else standing.share_at(row, 1.0),
-            "wrong": standing.wrong(row),
-            "ratio": standing.ratio(row),
-        },
-        "gain": standing.gain(row),
-        "problems": len(standing.of(row)),
-        "seconds": seconds if seconds and seconds.known else None,
-        "failed": ", ".join(filter(None, [failed, f"{lacking} not run" if lacking else ""])),
-    }
-
-
 def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Column]:
     def ratio(name: str, heading: str) -> table.Column:
         def words(line: Any) -> str:
@@ -83,12 +64,7 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
 
     return [
         table.text("row", "Renderer"),
-        table.Column(
-            "share",
-            "Reached",
-            lambda line: line["share"].value,
-            words=_share,
-        ),
+        table.Column("share", "Reached", lambda line: line["share"].value, words=_share),
         table.text("against", "Against the first"),
         *(
             table.Column(name, f"{name}, {format.plural(standing.scenes(name), 'scene')}", show=table.percent)

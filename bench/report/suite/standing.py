@@ -220,6 +220,20 @@ class Standing:
         found = {one.key[:3]: medians[one.set] for one in self.judged if one.set in medians}
         return found | {one.key[:3]: one.cost for one in known}
 
+    def line(self, row: str) -> dict[str, Any]:
+        """What tables say of a row."""
+        lacking, seconds = self.not_run(row), self.ratio(row, SECONDS)
+        failed = [f"{count} {status}" for status, count in self.failures(row).most_common()]
+        return {
+            **{"against": self.against(row), "row": row, "preset": self.preset(row), "share": self.share(row)},
+            **{name: self.share(row, name).value for name in self.sets},
+            **{"ratio": self.ratio(row), "gain": self.gain(row), "wrong": self.wrong(row)},
+            "at_dist": nan if row.endswith(BY_ITSELF) else self.share_at(row, 1.0),
+            "problems": len(self.of(row)),
+            "seconds": seconds if seconds and seconds.known else None,
+            "failed": ", ".join([*failed, *([f"{lacking} not run"] if lacking else [])]),
+        }
+
     def profile(self, row: str, of_set: str | None = None) -> tuple[list[float], list[float]]:
         """Costs over the reference's, ascending, to the row's largest, and the share that it has reached at each."""
         own = [one for one in self.of(row, of_set) if one.key[:3] in self.units]
