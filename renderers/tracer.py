@@ -9,17 +9,7 @@ from torch import Tensor
 from renderers.bracket import BLOCK, Bracket, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import (
-    PATIENT,
-    Coarse,
-    Field,
-    Kind,
-    Values,
-    Wrapper,
-    carries_gradient,
-    coarse_of,
-    points_in_sphere,
-)
+from renderers.field import PATIENT, Coarse, Field, Kind, Values, Wrapper, carries_gradient, coarse_of, points_in_sphere
 from renderers.gradients import crossing
 from renderers.packed_march import Reached, Stop, Stride, approach, march
 from renderers.rendering import Deferred, Rendering, Status, assemble

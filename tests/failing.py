@@ -105,6 +105,4 @@ FAILURES = {
     "hog": _hog,
     "detached_loss": lambda rendering: rendering,
 }
-LOSSES = {
-    "detached_loss": lambda loss: loss.detach() + 1,
-}
+LOSSES = {"detached_loss": lambda loss: loss.detach() + 1}

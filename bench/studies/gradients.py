@@ -55,10 +55,7 @@ def make(runs: Runs) -> Result:
         "cosine and scale.",
         question="Are the gradients true?",
         verdict=_verdict(told),
-        remarks=(
-            *NOTES,
-            f"{unseen} errors of exactly zero lie below the figure's logarithmic axes." if unseen else "",
-        ),
+        remarks=(*NOTES, f"{unseen} errors of exactly zero lie below the figure's logarithmic axes." if unseen else ""),
         columns=COLUMNS,
         lines=told.to_dict("records"),
         data=told.drop(columns=["name", "preset"]),

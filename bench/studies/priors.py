@@ -68,10 +68,7 @@ def _block(runs: Runs, name: str, own: list[records.Record]) -> gallery.Block:
     cells, titles = [], []
     for record in own:
         scene, ratio = gallery.Scene(runs, [record], gallery.REFERENCE), _ratio(record)
-        cells += [
-            scene.shared([record], gallery.normals("reference_")),
-            scene.cell(record, gallery.normals()),
-        ]
+        cells += [scene.shared([record], gallery.normals("reference_")), scene.cell(record, gallery.normals())]
         titles += ["truth", "fit" if ratio is None else f"fit: {format.number(ratio)} × floor"]
     return gallery.Block("", titles, {name: cells})
 

@@ -85,8 +85,7 @@ class Own(nn.Module):
 
 
 @pytest.mark.parametrize(
-    "field, words",
-    [(Own(), "test_field_files.Own is no class"), (sphere(0.5), "function is no class")],
+    "field, words", [(Own(), "test_field_files.Own is no class"), (sphere(0.5), "function is no class")]
 )
 def test_a_class_of_the_users_is_told_and_left_out(field, words, tmp_path):
     assert words in (save_field(field, tmp_path / FIELD) or "")

@@ -117,16 +117,7 @@ def test_the_camera_straight_above_stands_a_degree_beside():
     assert above == pytest.approx([0.0, 2.5 * cos(pi / 180), 2.5 * sin(pi / 180)], abs=1e-5)
 
 
-@each(
-    "points, count",
-    [
-        ("dense", 200),
-        ("2.5%", 5),
-        ("0.01%", 1),
-        (7, 7),
-        (" 7 ", 7),
-    ],
-)
+@each("points, count", [("dense", 200), ("2.5%", 5), ("0.01%", 1), (7, 7), (" 7 ", 7)])
 def test_an_amount_gives_so_many_pixels_of_the_foreground(points, count):
     observed = observed_pixels(MASK, points, seed=0)
     assert observed.dtype == torch.bool

@@ -8,14 +8,7 @@ import torch
 import trimesh
 from scipy.ndimage import binary_dilation
 
-from bench.reconstruct.subject import (
-    HULL_SAMPLES,
-    ON_SURFACE,
-    Depths,
-    Subject,
-    given_distances,
-    hull_distances,
-)
+from bench.reconstruct.subject import HULL_SAMPLES, ON_SURFACE, Depths, Subject, given_distances, hull_distances
 from bench.tasks.surfaces import Hull
 from datasets.mesh import Mesh
 from datasets.photographs import around
@@ -101,8 +94,7 @@ def seen_by(*cameras, surface: Mesh, points: np.ndarray) -> np.ndarray:
 def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
     front, back = icosphere(0.3, (0.0, 0.0, 0.6)), icosphere(0.25, (0.0, 0.0, -0.5))
     both = Mesh(
-        np.concatenate([front.vertices, back.vertices]),
-        np.concatenate([front.faces, back.faces + len(front.vertices)]),
+        np.concatenate([front.vertices, back.vertices]), np.concatenate([front.faces, back.faces + len(front.vertices)])
     )
     towards = np.array([[0.0, 0.0, 0.9], [0.05, 0.0, -0.5 + np.sqrt(0.25**2 - 0.05**2)]])  # one on each, at z = 2.5
     camera, aside = camera_of(16), camera_of(16, angles=(60.0, 0.0))

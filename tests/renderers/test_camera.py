@@ -44,11 +44,7 @@ def test_axes_are_x_right_y_down_z_forward_with_pixel_centres_at_a_half():
 
 
 @settings(max_examples=5)
-@given(
-    angle=st.floats(-pi, pi),
-    translation=st.tuples(*[st.floats(-3, 3)] * 3),
-    seed=st.integers(0, 2**32),
-)
+@given(angle=st.floats(-pi, pi), translation=st.tuples(*[st.floats(-3, 3)] * 3), seed=st.integers(0, 2**32))
 def test_points_along_the_rays_project_back_to_their_pixels_and_depth_is_camera_z(angle, translation, seed):
     view = camera(motion(angle, translation))
     distance = 0.5 + torch.rand(40, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))

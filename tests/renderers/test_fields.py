@@ -6,17 +6,7 @@ import pytest
 import torch
 
 from renderers.field import Counts, Field, Flops, Kind, Meter, autograd_normals
-from renderers.fields.analytic import (
-    Shape,
-    box,
-    capsule,
-    cylinder,
-    plane,
-    rounded_box,
-    smooth_union,
-    sphere,
-    torus,
-)
+from renderers.fields.analytic import Shape, box, capsule, cylinder, plane, rounded_box, smooth_union, sphere, torus
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, vector
 

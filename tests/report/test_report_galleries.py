@@ -9,12 +9,7 @@ from tests.report.test_report_paper import page_of, told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 COLOURS = {normal: tuple(np.array(normal) / 2 + 0.5) for normal in (UP, RIGHT, TOWARDS)}
-NAMES = {
-    "DeepSDF samples": "deepsdf",
-    "DIST": "dist_depth",
-    "DIST with mask": "dist_mask",
-    "IDR with mask": "idr_mask",
-}
+NAMES = {"DeepSDF samples": "deepsdf", "DIST": "dist_depth", "DIST with mask": "dist_mask", "IDR with mask": "idr_mask"}
 SQUARE = np.zeros((8, 8), dtype=bool)
 SQUARE[2:6, 2:6] = True
 
@@ -35,12 +30,7 @@ def completed(results, row, points, *, dataset="sofa", index=0, seed=0, status="
         row,
         **{"task": "deepsdf" if row.startswith("DeepSDF") else "completion", "method": NAMES[row], "dataset": dataset},
         status=status,
-        settings={
-            "task": {"points": points},
-            "dataset": {"name": dataset},
-            "index": index,
-            "seed": seed,
-        },
+        settings={"task": {"points": points}, "dataset": {"name": dataset}, "index": index, "seed": seed},
     )
     if pictures:
         saved(folder, **shown)

@@ -32,12 +32,7 @@ def climbed(
     known |= {"recommended_error": known[f"{needs}.error"], "saved_free": PAPERS / SIZES[needs]}
     known |= {"saved_stored": PAPERS / STORED[needs], "saved_bytes": PAPERS / STORED[needs]}
     known |= {"auto.field": needs, "auto.stored": STORED[needs], "auto.error": 0.02, "auto.standard_error": 0.001}
-    known |= {
-        "auto.seconds": 4.0,
-        "auto.evaluations": 500,
-        "auto.flops": 100_000,
-        "auto.overhead": 1.5,
-    }
+    known |= {"auto.seconds": 4.0, "auto.evaluations": 500, "auto.flops": 100_000, "auto.overhead": 1.5}
     known |= {"frugal.stored": STORED[needs], "frugal.error": 0.03, "frugal.evaluations": 250}
     known |= {"frugal.seconds": 1.0} | metrics
     known = {name: value for name, value in known.items() if value is not ...}

@@ -12,17 +12,7 @@ SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 
 
 def broke(
-    results,
-    axis,
-    label,
-    level,
-    *,
-    status="ok",
-    measure="rendering",
-    criteria=None,
-    loss=None,
-    repeats=None,
-    **metrics,
+    results, axis, label, level, *, status="ok", measure="rendering", criteria=None, loss=None, repeats=None, **metrics
 ):
     """A run of the atlas whose breakdown lies at a level; with a curve of ten trials.
 

@@ -9,16 +9,7 @@ from bench.records.format import plural
 from bench.records.metrics import FIRST, MEASURED, SHOWN
 from bench.records.names import Node, in_order, settings_of, told_apart
 from bench.records.record import NEUTRAL_KEYS, as_number, digest, plain, row_name, started
-from bench.report.data.records import (
-    OURS,
-    Record,
-    family,
-    grouped,
-    loop_seconds,
-    run_key,
-    setting,
-    value_evaluations,
-)
+from bench.report.data.records import OURS, Record, family, grouped, loop_seconds, run_key, setting, value_evaluations
 from bench.report.site.files import Folder
 
 DIGITS = 5  # of numbers in the list; a run's own page has all of them
@@ -29,7 +20,7 @@ CUSTOM = "custom"  # the choice of renderer that stands for a user's class
 MOST_TOLD = 3  # settings in a name
 # Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
 IN_COLUMNS = NEUTRAL_KEYS | {
-    *("dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw", "scale"),
+    *("dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw", "scale")
 }
 # What is named first where several settings tell runs apart.
 TOLD_FIRST = ("renderer", "task", "field", "method", "silhouette", "view")
