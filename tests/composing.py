@@ -8,9 +8,11 @@ from hydra import compose, initialize_config_dir
 from hydra._internal.config_repository import CachingConfigRepository
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from bench.config import CONF, register
+from bench.records.folder import Identity, identify
+from bench.run.command import options_first
 
 _KEPT: dict[str, CachingConfigRepository] = {}
 
@@ -32,3 +34,16 @@ def composed(*overrides: str, hydra: bool = False) -> DictConfig:
         loader: ConfigLoader = GlobalHydra.instance().config_loader()
         loader.repository = _KEPT.setdefault("all", ReadOnce(loader.repository))
         return compose("config", overrides=list(overrides), return_hydra_config=hydra)
+
+
+def identified(*arguments: str) -> Identity:
+    """The run that a command line describes."""
+    overrides = options_first([*arguments])
+    GlobalHydra.instance().clear()
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides, return_hydra_config=True)
+    runtime = config.hydra.runtime
+    OmegaConf.set_struct(config, False)
+    del config["hydra"]
+    return identify(config, runtime, overrides)

@@ -9,18 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 import trimesh
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.config import CONF, register
 from bench.records import folder as run_folder
-from bench.records.folder import identify
 from bench.run.command import _explain, options_first
 from bench.run.plan import refusal
 from bench.setup import inputs
+from tests.composing import identified
 from tests.looped import each
 from tests.run.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, wait_for
 
@@ -76,16 +72,8 @@ def test_an_invalid_command_line_is_an_error_with_the_nearest_name(monkeypatch, 
 def explained(monkeypatch, *arguments: str) -> str:
     """What is said of a command line that cannot be; empty where it can."""
     monkeypatch.setattr(sys, "argv", ["bench", *arguments])
-    GlobalHydra.instance().clear()
-    register()
     try:
-        overrides = options_first([*arguments])
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("config", overrides, return_hydra_config=True)
-        runtime = config.hydra.runtime
-        OmegaConf.set_struct(config, False)
-        del config["hydra"]
-        return refusal(identify(config, runtime, overrides).config)
+        return refusal(identified(*arguments).config)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         return _explain(error)
 

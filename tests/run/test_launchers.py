@@ -12,15 +12,11 @@ from pathlib import Path
 
 import psutil
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
-from bench.config import CONF, register
-from bench.records.folder import identify
 from bench.records.read import read_records
 from bench.report.write.html import write_index
 from bench.run.pack import grouped
+from tests.composing import identified
 from tests.report.page_data import Page
 from tests.run.driving import FAILING, PATIENCE, ROOT, Outcome, command, driver, errors, wait_for
 from tests.run.test_process import CASES
@@ -78,25 +74,14 @@ def plan_of(results: Path) -> dict:
     return json.loads(path.read_text())
 
 
-def folder_of(results: Path, *arguments: str) -> Path:
-    """The run folder of a cell."""
-    register()
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", [*arguments, f"results_dir={results}"], return_hydra_config=True)
-    runtime = config.hydra.runtime
-    OmegaConf.set_struct(config, False)
-    del config["hydra"]
-    return results / "runs" / identify(config, runtime, arguments).name
-
-
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory) -> Swept:
     """A sweep by workers: a run that ends by itself, one that hangs, one without a folder."""
     need("workers")
     results = tmp_path_factory.mktemp("workers")
     arguments = ("hydra/launcher=workers", *LIMITED, "threads=null")
-    blocked = folder_of(results, *FAILING, *arguments, f"+renderer.how={NO_FOLDER}")
+    cell = identified(*FAILING, *arguments, f"+renderer.how={NO_FOLDER}", f"results_dir={results}")
+    blocked = results / "runs" / cell.name
     blocked.parent.mkdir()
     blocked.symlink_to(results / "nowhere")
     cells = f"+renderer.how={','.join(HOWS)}"
