@@ -274,8 +274,10 @@ def test_cameras_of_other_images_are_refused_unless_that_is_asked_for(tmp_path):
 def test_other_cameras_in_the_folder_do_not_matter_and_are_told(tmp_path):
     nerf(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))  # broken ones
-    capture = read_capture(tmp_path, READ)
-    assert capture.format == "NeRF" and capture.notes == ("other cameras in the folder are not used: poses_bounds.npy",)
+    np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))  # without images
+    layout = find_layout(tmp_path)
+    told = "other cameras in the folder are not used: cameras.npz, poses_bounds.npy"
+    assert layout.format == "NeRF" and layout.notes == (told,)
 
 
 # NeRF's files

@@ -333,6 +333,7 @@ def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_comparison(monke
     assert standing.lacking("Dist, tuned") == len(SCENES) and standing.not_run("Dist, tuned") == 0
     gains = [standing.gain(row) for row in standing.rows[:4]]
     assert gains[0] is None and [gain and round(gain.value, 9) for gain in gains[1:]] == [-1.0, None, 0.2]
+    assert standing.line("Lost, tuned")["failed"] == "1 not run" and standing.line("B, tuned")["gain"] == gains[1]
     assert {line["name"] for line in _panel(standing, None)["series"]} == {"B", "Dist", "Lost"}
     assert {line["name"] for line in _panel(standing, "complete")["series"]} == {"B", "Dist, tuned", "Lost"}
     assert "tuned: complete of Dist." in "".join(_doubts(standing))
