@@ -46,20 +46,15 @@ def colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None
     frames = [
         Frame(found[name], *cameras[name][:2], masks.get(path), *cameras[name][2:]) for name, path in short.items()
     ]
-    notes = [*_chosen(folder, place, {one: len(model.images) for one, model in models.items()})]
+    counts = {one: f"{one.relative_to(folder)} with {len(model.images)}" for one, model in models.items()}
+    others = [told for one, told in counts.items() if one != place]
+    notes = [f"{counts[place]} images is taken, not {', '.join(others)}"] if others else []
     notes += [*how, *paired, *without("image", [name for name in cameras if name not in found])]
     if base != folder:
         notes += without("camera", [name for name in images_in(base, deep=True) if name not in there])
     points = np.array([point.xyz for point in models[place].points3D.values()])
     around = _about(points) if len(points) else None
     return Layout("COLMAP", tuple(frames), None, tuple(notes), around, missing=next(iter(cameras), ""))
-
-
-def _chosen(folder: Path, place: Path, counts: dict[Path, int]) -> list[str]:
-    """A note where there are several models."""
-    others = [f"{one.relative_to(folder)} with {count}" for one, count in counts.items() if one != place]
-    chosen = f"{place.relative_to(folder)} with {counts[place]} images is taken"
-    return [f"{chosen}, not {', '.join(others)}"] if others else []
 
 
 def _cameras(model: Any, place: Path) -> dict[str, tuple[Any, ...]]:

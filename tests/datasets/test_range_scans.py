@@ -19,6 +19,7 @@ from tests.made_scans import RADIUS, TURNS, write_scans
 from tests.run.driving import command, record_of
 
 VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=48)
+EMPTY = b"ply\nformat ascii 1.0\nelement vertex 0\nproperty int x\nproperty int y\nproperty int z\nend_header\n"
 FAR = replace(VIEWS, distance=20.0, field_of_view=6.2)  # as far as the scanner, whose rays are parallel
 
 
@@ -99,11 +100,13 @@ def test_a_folder_that_lacks_something_is_refused(tmp_path, spoil, says):
         scans(tmp_path)
 
 
-def test_a_scan_that_is_cut_short_is_refused(tmp_path):
+def test_a_scan_that_is_cut_short_or_has_no_points_is_refused(tmp_path):
     scan = write_scans(tmp_path) / "scan_0.ply"
-    scan.write_bytes(scan.read_bytes()[: scan.stat().st_size // 2])
-    with pytest.raises(ValueError, match=r"scan '.*scan_0.ply' must be a whole .ply file, but it is truncated"):
-        make_scene(scans(tmp_path), VIEWS, split=Split.TEST, index=0)
+    cut = f"scan '{scan}' must be a whole .ply file, but it is truncated"
+    for content, says in ((scan.read_bytes()[:9000], cut), (EMPTY, "has no points")):
+        scan.write_bytes(content)
+        with pytest.raises(ValueError, match=says):
+            make_scene(scans(tmp_path), VIEWS, split=Split.TEST, index=0)
 
 
 def test_the_mesh_may_be_named_and_is_told(tmp_path):
@@ -114,14 +117,6 @@ def test_the_mesh_may_be_named_and_is_told(tmp_path):
     assert scans(folder, "small.ply").mesh(Split.TEST, 0).repairs[0] == "the true shape is 'small.ply'"
     with pytest.raises(ValueError, match=r"dataset.truth=none.ply is not in"):
         scans(folder, "none.ply")
-
-
-def test_a_scan_without_points_is_refused(tmp_path):
-    (write_scans(tmp_path) / "scan_0.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    with pytest.raises(ValueError, match="has no points"):
-        make_scene(scans(tmp_path), VIEWS, split=Split.TEST, index=0)
 
 
 def test_it_has_as_many_numbers_as_scans_and_no_prior(folder):

@@ -52,13 +52,9 @@ class Swept:
         return {record["config"]["renderer"]["how"]: record["status"] for record in read_records(self.results)[0]}
 
 
-def available(launcher: str) -> bool:
-    package = LAUNCHERS[launcher][0]
-    return not package or (find_spec("hydra_plugins") is not None and find_spec(package) is not None)
-
-
 def need(launcher: str) -> None:
-    if not available(launcher):
+    package = LAUNCHERS[launcher][0]
+    if package and (find_spec("hydra_plugins") is None or find_spec(package) is None):
         pytest.skip(f"the plugin of {launcher} is not installed: pip install -e '.[joblib,submitit,ray]'")
 
 
