@@ -1,5 +1,6 @@
 """The suite: the share of problems and targets that each renderer reaches over its cost, and the standing."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -53,35 +54,28 @@ def make(*several: Runs | None) -> Result:
 
 
 def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Column]:
-    def ratio(name: str, heading: str) -> table.Column:
-        def words(line: Any) -> str:
-            return format.MISSING if line[name] is None else str(line[name])
+    """The columns; without those that may be known of no row."""
 
-        return table.Column(name, heading, lambda line: line[name] and line[name].value, words=words)
+    def of_interval(name: str, heading: str, words: Callable[[Any], str] | None = None) -> table.Column:
+        said = words or (lambda line: format.MISSING if line[name] is None else str(line[name]))
+        return table.Column(name, heading, lambda line: line[name] and line[name].value, words=said)
 
-    def known(name: str) -> bool:
-        return any(line[name] is not None for line in lines)
-
-    return [
+    scenes = {name: format.plural(standing.scenes(name), "scene") for name in standing.sets}
+    every = [
         table.text("row", "Renderer"),
-        table.Column("share", "Reached", lambda line: line["share"].value, words=_share),
+        of_interval("share", "Reached", _share),
         table.text("against", "Against the first"),
-        *(
-            table.Column(name, f"{name}, {format.plural(standing.scenes(name), 'scene')}", show=table.percent)
-            for name in standing.sets
-        ),
-        *(
-            [table.Column("gain", "Gain by tuning", lambda line: line["gain"] and line["gain"].value, words=_points)]
-            if known("gain")
-            else []
-        ),
+        *(table.Column(name, f"{name}, {count}", show=table.percent) for name, count in scenes.items()),
+        of_interval("gain", "Gain by tuning", _points),
         table.Column("at_dist", "At DIST's cost", show=table.percent),
-        ratio("ratio", "Field values over DIST's"),
-        *([ratio("seconds", "Seconds over DIST's")] if known("seconds") else []),
-        *([table.Column("wrong", "Wrong pixels", show=_percent)] if known("wrong") else []),
+        of_interval("ratio", "Field values over DIST's"),
+        of_interval("seconds", "Seconds over DIST's"),
+        table.Column("wrong", "Wrong pixels", show=_percent),
         table.text("failed", "Failed"),
         table.PRESET,
     ]
+    unknown = [name for name in ("gain", "seconds", "wrong") if all(line[name] is None for line in lines)]
+    return [column for column in every if column.key not in unknown]
 
 
 def _share(line: Any) -> str:
@@ -166,21 +160,19 @@ def _doubts(standing: Standing) -> list[str]:
     versions = len({one.code for one in standing.attempts})
     machines = len({one.machine for one in standing.attempts})
     loaded = sum(not one.timed for one in standing.attempts)
-    return [
-        f"Not shown, since their set has other settings: runs of {', '.join(other)}." if other else "",
-        f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have." if alone else "",
+    told = {
+        f"Not shown, since their set has other settings: runs of {', '.join(other)}.": other,
+        f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have.": alone,
         "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes, where there is "
         "one for a set. Gain: points over its row at the set's setting, at the same problems. A set's chart has the "
-        f"better of two rows that have all its problems, tuned: {', '.join(drawn) or 'none'}."
-        if tuned
-        else "",
-        f"Runs of {versions} versions of the code." if versions > 1 else "",
-        f"Runs of {machines} machines: seconds are compared with DIST's on the same one alone." if machines > 1 else "",
-        f"Seconds of {loaded} of {len(standing.attempts)} runs are left out: the machine was loaded." if loaded else "",
-        f"Not judged, since there is no start that is worse than the reference: {'; '.join(standing.left_out)}."
-        if standing.left_out
-        else "",
-    ]
+        f"better of two rows that have all its problems, tuned: {', '.join(drawn) or 'none'}.": tuned,
+        f"Runs of {versions} versions of the code.": versions > 1,
+        f"Runs of {machines} machines: seconds are compared with DIST's on the same one alone.": machines > 1,
+        f"Seconds of {loaded} of {len(standing.attempts)} runs are left out: the machine was loaded.": loaded,
+        "Not judged, since there is no start that is worse than the reference: "
+        f"{'; '.join(standing.left_out)}.": standing.left_out,
+    }
+    return [text for text, holds in told.items() if holds]
 
 
 PAGES = {"suite": make}
