@@ -216,12 +216,7 @@ def check_top_level(config: Mapping[str, Any]) -> None:
 
 
 def build(
-    node: Mapping[Any, Any],
-    name: str,
-    packages: Sequence[str] = (),
-    target: str = "",
-    *,
-    role: type | None = None,
+    node: Mapping[Any, Any], name: str, packages: Sequence[str] = (), target: str = "", *, role: type | None = None
 ) -> Any:
     """The object that a YAML node describes: its `_target_`, or `target`, with its other keys as arguments.
 

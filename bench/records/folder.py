@@ -21,12 +21,7 @@ from datasets.extras import version
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (
-    *(
-        "bench/report",
-        "bench/studies",
-        "bench/trackers",
-        "bench/progress.py",
-    ),
+    *("bench/report", "bench/studies", "bench/trackers", "bench/progress.py"),
     *(f"bench/{name}.py" for name in ("judge", "merge", "suite", "tune", "train", "photos", "turntable")),
     *(f"bench/run/{name}.py" for name in ("compose", "library", "pack", "plan", "summary", "sweep")),
     *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),

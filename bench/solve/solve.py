@@ -235,12 +235,7 @@ def descend(
         try:
             note_objective()
             optimise(
-                problem,
-                settings,
-                run.inputs.device,
-                history=history,
-                on_step=on_step,
-                least_reference=least_reference,
+                problem, settings, run.inputs.device, history=history, on_step=on_step, least_reference=least_reference
             )
             note_objective()
         except NotReached as error:

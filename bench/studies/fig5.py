@@ -22,10 +22,7 @@ COLUMNS = (
         table.Column(key, heading, show=table.thousandfold)
         for key, heading in (("end", "End"), ("low", "least"), ("high", "most"))
     ),
-    *(
-        table.Column("seconds", "Loop", show=format.seconds),
-        table.Column("spearman", "ρ"),
-    ),
+    *(table.Column("seconds", "Loop", show=format.seconds), table.Column("spearman", "ρ")),
 )
 HIGH = 0.7  # a correlation that is called high
 NOTES = (

@@ -8,13 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bench.evaluate.finite_differences import (
-    Paint,
-    differences,
-    image_differences,
-    outline_steps,
-    subrays,
-)
+from bench.evaluate.finite_differences import Paint, differences, image_differences, outline_steps, subrays
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs

@@ -11,15 +11,7 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge
 from bench.reconstruct.losses import Losses
 from bench.reconstruct.pixels import Stack
 from bench.reconstruct.problem import ReconstructionProblem
-from bench.reconstruct.subject import (
-    GIVEN,
-    GUIDES,
-    HULL,
-    PhotographTask,
-    Subject,
-    given_distances,
-    hull_distances,
-)
+from bench.reconstruct.subject import GIVEN, GUIDES, HULL, PhotographTask, Subject, given_distances, hull_distances
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings

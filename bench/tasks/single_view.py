@@ -35,7 +35,7 @@ from renderers.rendering import check_kind
 NETWORK, CODE, MEAN, NEAREST, BEST = "network", "code", "mean", "nearest", "best"
 DEFINITIONS = COLOURED_DEFINITIONS | {
     "iou": "intersection over union of the volumes, by points drawn evenly in the cube (DVR, Sec. 4.1), from 0 to 1; "
-    "before: of the mean code of all training images",
+    "before: of the mean code of all training images"
 }
 TRAINING = {
     "seconds.training": "of the network, once for all shapes; not part of the run's time",
@@ -52,7 +52,7 @@ FITTED = "fitted_mask_iou"
 OF_PICTURE = {
     FITTED: "Of the mask of the given picture and the silhouette of the shape from the best of many views, both scaled "
     "to the same box: number of pixels that are foreground in both divided by the number that are foreground in at "
-    "least one. The camera of the picture is not known, so that nothing else can be judged.",
+    "least one. The camera of the picture is not known, so that nothing else can be judged."
 }
 TRIED = 200  # views in the search for that of a picture
 

@@ -31,11 +31,7 @@ DEFINITIONS = {
     "failed_...": "trials that failed in this way; each counts once, as its most frequent kind of failure",
     "evaluations_per_ray": "field values per ray; median of the trials at the mild end",
 }
-MEASURED = {
-    "rendering": judge.OF_RENDERINGS,
-    "gradient": judge.OF_GRADIENTS,
-    "fit": fit.DEFINITIONS,
-}
+MEASURED = {"rendering": judge.OF_RENDERINGS, "gradient": judge.OF_GRADIENTS, "fit": fit.DEFINITIONS}
 
 
 @dataclass(frozen=True)

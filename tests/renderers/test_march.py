@@ -110,10 +110,7 @@ def test_rays_that_have_ended_are_asked_within_the_sphere():
     trace(Shape(strict, WALL.kind), within, replace(PLAIN, active_only=False), steps=20)
 
 
-@each(
-    "steps, queries",
-    [(2, 2 * 4), (4, 12 + 16), (10, 12 + 48 + 4 * 64)],
-)
+@each("steps, queries", [(2, 2 * 4), (4, 12 + 16), (10, 12 + 48 + 4 * 64)])
 def test_coarse_to_fine_asks_blocks_of_16_then_of_4_then_pixels(steps, queries):
     # 8 x 8 pixels: 2 x 2 rays for three steps, 4 x 4 for three, then 8 x 8. At 0.01 a step none of them ends.
     front, count = trace(constant(0.01), sheet(8, 8), PLAIN, steps=steps)

@@ -247,12 +247,7 @@ def test_each_line_of_the_curve_is_json_and_on_the_disk_as_it_comes(tmp_path):
 
 @pytest.mark.parametrize(
     ("every", "iterations", "looks"),
-    [
-        (None, 5, []),
-        (3, 7, [0, 3, 6]),
-        ("doubling", 9, [0, 1, 2, 4, 8]),
-        ("doubling", 1, [0]),
-    ],
+    [(None, 5, []), (3, 7, [0, 3, 6]), ("doubling", 9, [0, 1, 2, 4, 8]), ("doubling", 1, [0])],
 )
 def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(clock, tmp_path, every, iterations, looks):
     class Slow(Toy):

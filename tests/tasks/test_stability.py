@@ -107,9 +107,7 @@ def test_a_doubled_step_breaks_a_plate_that_sphere_tracing_never_misses(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("guard", "stress"),
-    [({"step_back": True}, "thin_plate"), ({"least_step": 1e-3}, "grazing_plane")],
-    ids=str,
+    ("guard", "stress"), [({"step_back": True}, "thin_plate"), ({"least_step": 1e-3}, "grazing_plane")], ids=str
 )
 def test_a_guard_moves_its_breakdown(tmp_path, guard, stress):
     bare = run(tmp_path / "bare", stress, load("renderer", "dist", **AGGRESSIVE))

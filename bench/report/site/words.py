@@ -72,18 +72,12 @@ STATUSES = {
         "verbose=true shows where the error came from, and isolation=off lets a debugger stop there. log.txt has "
         "all of it.",
     ),
-    RunStatus.KILLED: Said(
-        "It was stopped from outside, or is still under way.",
-        "The same command runs it again.",
-    ),
+    RunStatus.KILLED: Said("It was stopped from outside, or is still under way.", "The same command runs it again."),
     RunStatus.UNSUPPORTED: Said(
         "The renderer lacks what the task needs.",
         "This is an answer, not an error. The reason says what is lacking; another renderer or setting may have it.",
     ),
-    RunStatus.REFUSED: Said(
-        "The configuration is invalid.",
-        "The reason names the key and what to type instead.",
-    ),
+    RunStatus.REFUSED: Said("The configuration is invalid.", "The reason names the key and what to type instead."),
     NOT_RUN: Said(
         "A sweep planned it, and it has not been run.",
         "The command of the sweep runs what is missing, and reuses what is there.",
