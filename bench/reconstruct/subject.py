@@ -202,16 +202,14 @@ def truth_of(
         return None, None, []
     if (number := dataset.dtu_scan) is not None:
         return None, read_scan(Path(dataset.truth), number), published(number)
-    to_sphere = np.linalg.inv(to_world)
-    points = read_points(dataset.truth)
+    mesh, points = None, read_points(dataset.truth)
     if points is None:
-        whole = read_mesh(dataset.truth).moved(to_sphere)
+        whole = read_mesh(dataset.truth).moved(np.linalg.inv(to_world))
         mesh = whole.cut_off()
         share = mesh.area / whole.area if mesh else 0.0
     else:
-        mesh, points = None, points @ to_sphere[:3, :3].T + to_sphere[:3, 3]
-        inside = np.linalg.norm(points, axis=1) <= 1
-        points, share = points[inside], float(inside.mean())
+        given, points = len(points), within(points, to_world)
+        share = len(points) / given
     if not share:
         raise BadInput(
             f"nothing of dataset.truth={dataset.truth} lies in the unit sphere of the photographs: it must be in the "
@@ -219,6 +217,13 @@ def truth_of(
         )
     told = f"{share:.0%} of {dataset.truth} lies in the unit sphere, and is the truth"
     return mesh, points, [told] if share < 1 else []
+
+
+def within(points: Float[np.ndarray, "n 3"], to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "m 3"]:
+    """Those points of the file's world that lie in the unit sphere, in its world."""
+    to_sphere = np.linalg.inv(to_world)
+    moved = points @ to_sphere[:3, :3].T + to_sphere[:3, 3]
+    return moved[np.linalg.norm(moved, axis=1) <= 1]
 
 
 def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:

@@ -7,15 +7,18 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 from bench.evaluate.state import GREY, painted
 from bench.reconstruct.stereo import Cloud
-from bench.reconstruct.subject import visible
+from bench.reconstruct.subject import Subject, visible, within
 from datasets.mesh import Mesh
+from datasets.meshes import read_points
 from datasets.repair import needed_meshlab
 from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import Camera
+from renderers.checks import BadInput
 
 NEIGHBOURS = 16  # points whose plane gives a normal
 OUTLYING = 2.0  # standard deviations of the mean distance to neighbours, beyond which a point is left out
@@ -30,6 +33,25 @@ def given_clouds(shots: Sequence[Shot]) -> list[Cloud]:
             points = shot.camera.rays().at(shot.camera.distance(shot.depth))[shot.depth > 0]
             clouds.append(Cloud(points.double().numpy(), shot.camera))
     return clouds
+
+
+def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
+    """The points of a file that lie in the unit sphere, each with the given camera that is nearest to it.
+
+    Raises:
+        BadInput: where it is no cloud of points, or lies elsewhere.
+    """
+    points = read_points(path)
+    if points is None:
+        raise BadInput(f"task.cloud={path} has faces: give a cloud of points, or judge it by python -m bench.judge")
+    points = within(points, np.eye(4) if subject.to_world is None else subject.to_world)
+    if not len(points):
+        raise BadInput(
+            f"nothing of task.cloud={path} lies in the unit sphere of the photographs: give it in their cameras' world"
+        )
+    cameras = [shot.camera for shot in subject.given]
+    _, nearest = cKDTree(np.stack([camera.center.double().numpy() for camera in cameras])).query(points)
+    return [Cloud(points[nearest == place], camera) for place, camera in enumerate(cameras)]
 
 
 def fused(clouds: Sequence[Cloud]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

@@ -28,7 +28,7 @@ PASSIVE = (
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
 NO_STRESS = "none"
-FILE_KEYS = ("path", "image_path", "mask_path", "truth", "codes")  # of files that a run reads
+FILE_KEYS = ("path", "image_path", "mask_path", "truth", "codes", "cloud")  # of files that a run reads
 IN_FOLDERS = ("*", "ModelParameters/*", "LatentCodes/*")  # and of a folder those of DeepSDF
 ARCHIVES = (".zip", ".tar", ".gz")  # which are left out of it: gigabytes that no run reads
 FIELD = "field.safetensors"  # of a run's folder, which alone is read of it; see `datasets.field_files`

@@ -8,7 +8,7 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
-from bench.reconstruct.surfaces import fused, given_clouds, poisson, with_colours
+from bench.reconstruct.surfaces import fused, given_clouds, measured_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COSTS
 from datasets.captures.hull import hull_mesh
@@ -79,16 +79,20 @@ class Hull(_Surface):
 
 @dataclass(frozen=True)
 class Poisson(_Surface):
-    """Given depths, fused by screened Poisson reconstruction.
+    """Given depths, or points that something else made of the photographs, fused by screened Poisson reconstruction.
 
     Args:
         fusing: of their points.
+        cloud: a file of points in the cameras' world, such as a multi-view stereo's; None takes the given depths.
     """
 
     fusing: Fusing
+    cloud: str | None = None
 
     def surface(self, subject: Subject) -> Mesh | None:
-        """The fused points of the given depths."""
+        """The fused points."""
+        if self.cloud is not None:
+            return self.fusing.surface(measured_clouds(self.cloud, subject))
         if all(shot.depth is None for shot in subject.given):
             raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task=stereo")
         return self.fusing.surface(given_clouds(subject.given))

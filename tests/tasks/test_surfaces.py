@@ -12,6 +12,7 @@ from bench.reconstruct.surfaces import with_colours
 from bench.solve.solve import COSTS
 from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
+from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
 from tests.tasks.test_reconstruction import assert_coloured_mesh, run_in, scene  # noqa: F401, a fixture
@@ -116,3 +117,22 @@ def test_a_trim_that_leaves_nothing_is_empty(scene, tmp_path):  # noqa: F811
     assert set(record.metrics) == SCORES
     assert record.metrics["seen_chamfer_l1"] == np.inf and record.metrics["mask_iou"] == 0
     assert {path.name for path in tmp_path.iterdir()}.isdisjoint({"mesh.ply", "images.npz", "summary.png"})
+
+
+def test_points_of_another_program_are_read_in_the_cameras_world(scene, tmp_path):  # noqa: F811
+    subject = POISSON.subject(run_in(tmp_path / "run", scene).inputs)
+    to_world = np.diag([5.0, 5.0, 5.0, 1.0])
+    to_world[:3, 3] = (1.0, -2.0, 30.0)
+    points = np.concatenate([sample_surface(subject.truth, 8000, seed=0).points, [[3.0, 0.0, 0.0]]])
+    file, lines = tmp_path / "points.ply", 5 * points + to_world[:3, 3]
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n" + "".join(f"property float {x}\n" for x in "xyz")
+    file.write_text(header + "end_header\n" + "".join(f"{x} {y} {z}\n" for x, y, z in lines))
+    task = replace(POISSON, cloud=str(file))
+    found = task.surface(replace(subject, to_world=to_world))
+    assert found is not None and found.volume == pytest.approx(subject.truth.volume, rel=0.1)  # turned outward
+    assert Truth(subject.truth).distance(found.vertices).mean() < 0.02
+    with pytest.raises(BadInput, match=r"nothing of task\.cloud=.* lies in the unit sphere"):
+        task.surface(subject)
+    subject.truth.save(tmp_path / "mesh.ply")
+    with pytest.raises(BadInput, match="has faces: give a cloud of points"):
+        replace(POISSON, cloud=str(tmp_path / "mesh.ply")).surface(subject)
