@@ -13,6 +13,7 @@ Any other KEY=VALUE is that of `python -m bench`.
 """
 
 import random
+import re
 import subprocess
 import sys
 import tempfile
@@ -48,6 +49,7 @@ from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 PAGE = "suite"  # its name in the folder `paper`
 GOES_ON = (0, 1)  # exit statuses of a sweep that has ended, though runs may have failed
 LABEL = f"label='${{renderer._label_}}{BY_ITSELF}'"
+FIXED = rf"[+~]*(({'|'.join([*STATED, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"  # keys that are the suite's
 SETTINGS = ("stated", "tuned")  # that of the set for all renderers, or the renderer's own
 
 
@@ -82,9 +84,7 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         key, _, value = argument.partition("=")
         if key in ("suite", "set", "setting", "verify"):
             own[key] = value
-        elif key.lstrip("+~").partition(".")[0] in (*STATED, "sizes", "scale") and key not in [
-            given for given, _ in GIVEN.values()
-        ]:
+        elif re.match(FIXED, key) and key not in [given for given, _ in GIVEN.values()]:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
         elif "=" in argument:
             passed.append(argument)

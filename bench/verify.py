@@ -95,17 +95,16 @@ def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
     if not again:
         print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")
         return None
-    apart = {name: _apart(numbers[name], again[name]) if name in numbers else inf for name in again}
+    names = [*again, *(name for name in numbers if name not in again and compute is _from_rerun)]
+    apart = {name: _apart(numbers[name], again[name]) if name in numbers and name in again else inf for name in names}
     wrong = [name for name, gap in apart.items() if not gap <= most]  # nor is one that is not a number
     if not wrong:
         widest, others = max(apart.values()), len(numbers.keys() - again.keys())
         rest = f"; {others} others are not of the field" if others else ""
         print(f"agrees: {folder.name}, {how}: {plural(len(again), 'metric')}, at most {widest:.1g} apart{rest}")
         return True
-    told = [
-        f"{name} is {number(numbers[name]) if name in numbers else 'not'} in the record, now {number(again[name])}"
-        for name in wrong
-    ]
+    pairs = {name: [number(of[name]) if name in of else "not there" for of in (numbers, again)] for name in wrong}
+    told = [f"{name} is {before} in the record, now {now}" for name, (before, now) in pairs.items()]
     why = "; ".join(_reasons(record, environment())) or "code and machine are the same: was the record edited?"
     print(f"differs: {folder.name}, {how}: {'; '.join(told)}. {why}")
     return False

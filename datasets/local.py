@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from datasets.deform import deform
+from datasets.extras import version
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
 from datasets.scene import Split, seed_of
@@ -100,10 +101,10 @@ def _load(path: Path, changed: int, radius: float) -> Mesh:
 def repaired(path: Path) -> Mesh:
     """As `load_mesh`, but what took long is kept in the user's cache, since each run loads its mesh again.
 
-    What is kept is of this code and of this file: a change of either makes it anew.
+    What is kept is of this code, of PyMeshLab's version and of this file: a change of one makes it anew.
     """
     code = sorted(Path(__file__).parent.rglob("*.py"))
-    made_of = b"\0".join(file.read_bytes() for file in (*code, path))
+    made_of = b"\0".join([str(version("pymeshlab")).encode(), *(file.read_bytes() for file in (*code, path))])
     cached = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     kept = Path(cached, "implicit-bench", "meshes", f"{hashlib.sha256(made_of).hexdigest()[:16]}.npz")
     with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), kept.open("rb") as file, np.load(file) as parts:

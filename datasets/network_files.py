@@ -35,6 +35,7 @@ from renderers.fields.published import LAYERS, SIGNED, Residual, deepsdf, implic
 VERSION = 1  # raise it when reading or measuring changes the fields
 REACH = 1.05  # scene units: half the side of the cube in which the surface within the unit sphere is extracted
 AUTO = "auto"
+CODES = 16  # of a network, of which its sign and its steepest slope are measured
 INSIDE = {AUTO: None, "negative": 1.0, "positive": -1.0}  # signs; see `Meaning`
 OWN_LEVEL = "occupancy networks' own meshes are at 0.2, dataset.level=-1.386"
 PARTS = ("ModelParameters", "LatentCodes")  # of a DeepSDF folder, in each of which `latest.pth` is read
@@ -173,14 +174,18 @@ class ModuleFile(NetworkFile):
     module: Module
 
     def identity(self) -> dict[str, Any]:
-        """See `NetworkFile`; the network is told by what it prints."""
-        return super().identity() | {"module": repr(self.module)}
+        """See `NetworkFile`; the network is told by what it prints, and by its own numbers and words."""
+        own = {key: value for key, value in vars(self.module).items() if isinstance(value, int | float | str)}
+        return super().identity() | {"module": f"{self.module!r} {own}"}
 
     def read(self) -> Published:
-        """The network with the weights of the file, whatever prefix their names have there."""
-        tensors, module = _tensors(Path(self.path)), deepcopy(cast(nn.Module, self.module))
+        """The network with the weights of the file, whatever prefix their names have there, as it is evaluated."""
+        tensors, module = _tensors(Path(self.path)), deepcopy(cast(nn.Module, self.module)).eval()
         names = [*module.state_dict()]
-        prefix = next((name.removesuffix(names[0]) for name in tensors if f".{name}".endswith(f".{names[0]}")), "")
+        found = [name.removesuffix(names[0]) for name in tensors if f".{name}".endswith(f".{names[0]}")]
+        if len(found) > 1 and "" not in found:
+            raise BadInput(f"it has several networks, {', '.join(found)}: save the state_dict() of one of them")
+        prefix = "" if "" in found else next(iter(found), "")
         try:
             module.load_state_dict({name: tensors[prefix + name] for name in names if prefix + name in tensors})
         except RuntimeError as error:
@@ -218,6 +223,8 @@ def _known(file: NetworkFile, index: int, content: str) -> Known:
 
 def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> Known:
     """The network with a field that is negative inside and of the kind that was measured."""
+    some = codes[:: max(len(codes) // CODES, 1)]
+    others = [network.at(code) for code in some] if len(codes) > 1 else []
     meaning = measured(
         network.at(codes[index]),
         codes,
@@ -225,6 +232,7 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
         sign=INSIDE[file.inside],
         level=file.level,
         scale=file.scale,
+        others=others,
     )
     facts, kind = meaning.facts, meaning.kind
     if not facts.least < 0 < facts.most:

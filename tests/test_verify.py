@@ -66,7 +66,7 @@ def test_runs_that_nobody_touched_agree(runs, capsys):
     [
         ({"metrics": {"chamfer_l1": 0.001}}, ["chamfer_l1 is 0.00100 in the record, now", "was the record edited?"]),
         ({"metrics": {"fscore": 0.5}, "code": "f" * 40}, ["fscore is 0.500", "the code differs: ffffffffffff then"]),
-        ({"metrics": {"fscore": GONE}}, ["fscore is not in the record, now", "was the record edited?"]),
+        ({"metrics": {"fscore": GONE}}, ["fscore is not there in the record, now", "was the record edited?"]),
         ({"metrics": {"fscore": 0.5}, "environment": {}}, ["fscore is 0.500", "cpu differs: None then"]),
     ],
 )
@@ -101,6 +101,7 @@ def test_what_cannot_be_compared_is_told(copied, capsys, spoil, words):
     [
         ({}, 0, "agrees: copy, run again"),
         ({"metrics": {"fscore": 0.5}}, 1, "fscore is 0.500 in the record, now"),
+        ({"metrics": {"invented": 0.5}}, 1, "invented is 0.500 in the record, now not there"),
         ({"config_hash": "other"}, 1, "its overrides give another configuration today"),
         ({"status": "nan"}, 1, "it ended nan, and now"),
     ],

@@ -72,7 +72,8 @@ class Identity:
         users = tuple(sorted(set(named) - set(OURS)))
         dataset = self.config.get("dataset") or {}
         read = [path for key in FILE_KEYS for path in _values(self.config, key)]
-        read += _values(dataset, "split")  # a list of shapes; that of a run is a word
+        for named in _values(dataset, "split"):  # a list of shapes, beside which are others; that of a run is a word
+            read += sorted(map(str, Path(named).parent.glob(f"*{Path(named).suffix or named}")))
         files = [_content(Path(path)) for path in read]
         files += [_classes(str(dataset["path"]))] if "synset" in dataset else []
         return digest([_our_code(), *(_package(name) for name in users), *files])

@@ -19,8 +19,8 @@ NOTES = (
     "foreground, in front of black.",
     "All rows but DVR's own share one field, rate and iterations; volumes have the cross entropy of their opacity for "
     "the masks and a budget of samples a ray.",
-    "DVR at its paper's rate has no more iterations than others, and is far from its end; its row of ten times as long "
-    "has ten times the rate too.",
+    "DVR's own rows have their paper's rate and no more iterations than others, and are far from their end; "
+    "`+method=dvr_long` has ten times of both.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
     "measured rows.",
 )

@@ -21,7 +21,7 @@ NOTES = (
     "A run ends after the iterations of its set, or at the set's budget of field values; thin lines begin where the "
     "row's runs have ended. A run that did not end ok reaches nothing. A set has one setting and one loss for all.",
     "Ratios: over the targets that both rows reach, the median over scenes of the geometric mean. Less, or not told: "
-    "than the first row, by flipped signs over scenes with Holm's correction at 5 % in all.",
+    "than the first row, by flipped signs over scenes, at 5 % over all pairs of rows (Bonferroni).",
     "Wrong pixels: of the prior's own networks, over the object's; missed, spurious, or .02 scene units off in depth. "
     "They do not count in what is reached.",
 )

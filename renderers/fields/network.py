@@ -1,6 +1,6 @@
 """A field of any network: points and perhaps a code to values, of which it is measured what they mean."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -26,7 +26,7 @@ from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder, passes
 
 DRAWN = 2**14  # points in the unit sphere at which values and slopes are measured
-AROUND = 4096  # points on the unit sphere
+AROUND, FEW = 4096, 512  # points on the unit sphere; those for another code
 NEAR = 0.1  # share of the points, those of least magnitude, whose slopes say whether values are distances
 EVEN = 0.25  # near its surface a distance has a slope of 1, up to this, at four of five points
 ANY_SLOPE = (
@@ -109,6 +109,7 @@ def measured(
     sign: float | None = None,
     level: float = 0.0,
     scale: float = 1.0,
+    others: Sequence[Values] = (),
 ) -> Meaning:
     """What the values of a field mean, by values and slopes in the unit sphere.
 
@@ -117,9 +118,10 @@ def measured(
         kind: what is said of it; None measures it. A bound is divided by its steepest slope with a margin of 20 %, and
             so is what is no distance: it is a bound as far as no slope between the points is steeper.
         sign: 1 where values below the level are inside, -1 where those above it are; None takes those that are rarer
-            on the unit sphere.
+            on the unit sphere, of this field or of most of the others.
         level: of the surface.
         scale: what values are multiplied by.
+        others: fields of the same network at other codes, whose sign and bound are the same.
 
     Raises:
         BadInput: where values are not finite.
@@ -130,14 +132,22 @@ def measured(
         around = field(nn.functional.normalize(points[:AROUND], dim=-1)).double() - level
     if unknown := int((~values.isfinite()).sum()):
         raise BadInput(f"its value is not finite at {unknown} of {DRAWN} points of the unit sphere: check its weights")
-    gradients = torch.cat([autograd_gradients(cast(Field, field), some) for some in points.split(AROUND)])
-    slopes = scale * torch.linalg.vector_norm(gradients, dim=-1).double()
+    slopes = scale * torch.cat([_slopes(field, some) for some in points.split(AROUND)])
     if sign is None:
-        sign = 1.0 if float((around > 0).double().mean()) >= 0.5 else -1.0
+        with torch.no_grad():
+            at = [around, *(other(points[:FEW] / points[:FEW].norm(dim=-1, keepdim=True)) - level for other in others)]
+        above = sum(float((values > 0).double().mean()) >= 0.5 for values in at)
+        sign = 1.0 if 2 * above >= len(at) else -1.0
     facts = _facts(points, sign * scale * values, sign * around, slopes)
-    kind = kind or facts.kind
-    divisor = STEEPEST_MARGIN * facts.steepest if kind is Kind.BOUND else 1.0
+    kind, divisor = kind or facts.kind, 1.0
+    if kind is Kind.BOUND:
+        steepest = [scale * float(_slopes(other, points[:AROUND]).max()) for other in others]
+        divisor = STEEPEST_MARGIN * max([facts.steepest, *steepest])
     return Meaning(facts, kind, divisor, sign * scale / divisor)
+
+
+def _slopes(field: Values, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    return torch.linalg.vector_norm(autograd_gradients(cast(Field, field), points), dim=-1).double()
 
 
 def _facts(points: Tensor, values: Tensor, around: Tensor, slopes: Tensor) -> Facts:

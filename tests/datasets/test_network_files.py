@@ -21,7 +21,7 @@ from datasets.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
 from renderers.field import Kind, points_in_sphere
-from renderers.fields.network import from_module
+from renderers.fields.network import from_module, measured
 from tests.documentation import code_of
 from tests.looped import each
 from tests.renderers.test_published import CODE, occupancy
@@ -33,10 +33,10 @@ import torch
 class Net(torch.nn.Module):
     def __init__(self, scale):
         super().__init__()
-        self.inner, self.scale = torch.nn.Linear(3, 1), scale
+        self.inner, self.scale, self.drop = torch.nn.Linear(3, 1), scale, torch.nn.Dropout(0.5)
 
     def forward(self, points):
-        return self.inner(points) * self.scale / 2
+        return self.drop(self.inner(points)) * self.scale / 2
 """
 POINTS = points_in_sphere(64, torch.zeros(()))
 RADIUS = 0.5  # of the octahedron's faces about the origin
@@ -173,6 +173,15 @@ def test_a_deepsdf_folder_has_a_shape_for_each_code(tmp_path_factory, codes):
         torch.testing.assert_close(values, octahedron(POINTS) + code, rtol=0, atol=1e-6)
     with pytest.raises(BadInput, match="it has 2 codes, and index=2 is none of them: set index=0 to 1"):
         file.network(2)
+
+
+def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
+    codes = torch.tensor([[0.1], [-0.2], [-0.45]])  # the last reaches through most of the unit sphere
+    known = deepsdf_folder(tmp_path, codes).network(2)
+    values = known.decoder.at(known.codes[2])(POINTS)
+    torch.testing.assert_close(values, octahedron(POINTS) - 0.45, rtol=0, atol=1e-6)
+    bound = measured(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
+    assert bound.divisor == pytest.approx(3 * measured(octahedron, POINTS, kind=Kind.BOUND).divisor)
 
 
 def test_half_floats_are_converted_and_other_codes_are_read(tmp_path):
@@ -349,6 +358,9 @@ def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkey
     inputs = composed_inputs(*given, "task=ablation", "packages=[mynet]")
     field = inputs.prior.decoder.at(inputs.prior.codes[0])
     torch.testing.assert_close(field(POINTS), POINTS @ state["weight"][0] + 0.25, rtol=0, atol=1e-6)
+    torch.save({f"{of}.inner.{key}": value for of in "ab" for key, value in state.items()}, tmp_path / "c.pth")
+    with pytest.raises(BadInput, match=r"it has several networks, a\., b\.: save the state_dict"):
+        composed_inputs(*(text.replace("a.pth", "c.pth") for text in given), "task=ablation", "packages=[mynet]")
     torch.save({"net.inner.bias": state["bias"]}, tmp_path / "b.pth")
     with pytest.raises(BadInput, match=r"not those of Net: .* Missing key.*inner\.weight"):
         composed_inputs(*(text.replace("a.pth", "b.pth") for text in given), "task=ablation", "packages=[mynet]")
