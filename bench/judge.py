@@ -285,6 +285,8 @@ def main(arguments: list[str] | None = None) -> int:
             raise ValueError("--into writes rows of a method: add --method NAME")
         if given.like is not None and given.mesh.is_dir() and not (given.mesh / "record.json").is_file():
             raise ValueError(f"--like names the problem of one run, and {given.mesh} is a folder: name one mesh")
+        if given.like is not None and not given.unit_sphere and read_record(given.like)["dataset"] != "photos":
+            raise ValueError("--like names a run, whose metrics are in scene units: add --unit-sphere, and its truth")
         items, verdicts = items_of(given.mesh, given.truth, given.scan), list[Verdict]()
         for item in items:
             try:

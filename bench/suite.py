@@ -169,8 +169,9 @@ def show(results_dir: Path) -> int:
     for problem in problems:
         print(f"not read: {problem}", file=sys.stderr)
     own = {(*one.key, one.started) for one in kept}
-    stand = sum((*one.key, one.started) in own for one in standing.attempts)
-    print(f"{plural(len(kept), 'run')} of {results_dir}, of which {stand} stand in this table, beside shipped ones.")
+    mine = [one.row for one in standing.attempts if (*one.key, one.started) in own]
+    told = f"of which {len(mine)} stand in this table, in rows with a star"
+    print(f"{plural(len(kept), 'run')} of {results_dir}, {told}, beside shipped ones.")
     if any(map(standing.not_run, standing.rows)):
         print("A row that lacks runs is not compared: its shares are of fewer problems. suite=quick makes them.")
     print(f"{'renderer':<32} share of targets reached, against the first; in each set; field values")
@@ -179,8 +180,10 @@ def show(results_dir: Path) -> int:
         parts += [f"{100 * line['gain'].value:+.0f} points by tuning"] if line["gain"] else []
         parts += [f"{number(line['ratio'].value)} of DIST's field values"] if line["ratio"] else []
         parts += [line["failed"]] if line["failed"] else []
+        parts += [f"wrong pixels {number(100 * line['wrong'])} %"] if line["wrong"] is not None else []
         share = "" if line["gain"] else percent(line["share"].value)  # a tuned row lacks sets
-        print(f"{line['row']:<32} {share:>5}  {line['against']:<8}  {', '.join(parts)}")
+        row = line["row"] + (" *" if line["row"] in mine else "")
+        print(f"{row:<32} {share:>5}  {line['against']:<8}  {', '.join(parts)}")
     print(*(path.with_suffix(".png") for path in written), index, sep="\n")
     return 0
 

@@ -91,11 +91,12 @@ def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
     except (ValueError, OSError) as error:
         print(f"not compared: {folder.name}, {how}: {error}")
         return False
-    numbers, again = _numbers(record.metrics), _numbers(found)
+    rerun = compute is _from_rerun
+    numbers, again = _numbers(_whole(vars(record)) if rerun else record.metrics), _numbers(found)
     if not again:
         print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")
         return None
-    names = [*again, *(name for name in numbers if name not in again and compute is _from_rerun)]
+    names = [*again, *(name for name in numbers if name not in again and rerun)]
     apart = {name: _apart(numbers[name], again[name]) if name in numbers and name in again else inf for name in names}
     wrong = [name for name, gap in apart.items() if not gap <= most]  # nor is one that is not a number
     if not wrong:
@@ -108,6 +109,13 @@ def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
     why = "; ".join(_reasons(record, environment())) or "code and machine are the same: was the record edited?"
     print(f"differs: {folder.name}, {how}: {'; '.join(told)}. {why}")
     return False
+
+
+def _whole(record: dict[str, Any]) -> dict[str, Any]:
+    """All numbers of a record that a run gives again: its metrics, those at the start, and its counts."""
+    counts = {f"{name} evaluations": count for name, count in record["evaluations"].items()}
+    starts = {f"{name} at the start": value for name, value in record["metrics_start"].items()}
+    return {**record["metrics"], **starts, **counts}
 
 
 def _numbers(metrics: dict[str, Any]) -> dict[str, float]:
@@ -151,7 +159,7 @@ def _from_rerun(folder: Path, record: Record) -> Again:
         raise BadInput("its overrides give another configuration today: a default or a file has changed")
     if again["status"] != record.status:
         raise BadInput(f"it ended {record.status}, and now {again['status']}: {again.get('reason', '')}")
-    return again["metrics"], lambda: again["environment"]
+    return _whole(again), lambda: again["environment"]
 
 
 def _apart(first: float, second: float) -> float:

@@ -199,3 +199,5 @@ def test_a_row_may_answer_the_problem_of_a_run(files, capsys):
     assert (folder / "mesh.ply").is_file()
     error = refused(capsys, files / "found", "--truth", files / "truth", *more)
     assert "--like names the problem of one run" in error
+    Record("run", "completion", "newton", "mesh", 3, config, scene="spot").write(files / "run")
+    assert "in scene units: add --unit-sphere" in refused(capsys, mesh, "--truth", files / "truth/small.ply", *more)

@@ -180,15 +180,21 @@ def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None
         like: a tensor of the dtype and device at which the network works; None takes its first parameter, or float32.
 
     Raises:
-        BadInput: where values are not finite.
+        BadInput: where values are not finite, or not negative inside and positive about it.
     """
     parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
     like = (parameters or [torch.zeros(())])[0] if like is None else like
+    dtype = parameters[0].dtype if parameters else None
 
     def values(points: Tensor) -> Tensor:
-        return network(points.reshape(-1, 3)).reshape(points.shape[:-1])
+        return network(points.reshape(-1, 3).to(dtype or points.dtype)).reshape(points.shape[:-1]).to(points.dtype)
 
     meaning = measured(values, like, kind=kind, sign=1.0)
+    if not meaning.facts.least < 0 < meaning.facts.most or meaning.facts.leaves == 1:
+        raise BadInput(
+            f"its values in the unit sphere, from {meaning.facts.least:.3g} to {meaning.facts.most:.3g}, are no shape "
+            "that is negative inside: negate them, subtract the level of the surface, or scale the points"
+        )
     return Shape(
         lambda points: meaning.factor * values(points),
         meaning.kind,

@@ -298,6 +298,14 @@ def test_every_renderer_takes_a_plain_module_of_the_users(name):
     assert (hit == (closest < RADIUS)).float().mean() > 0.97
 
 
+def test_a_module_whose_values_are_no_shape_is_refused_and_half_floats_are_rendered():
+    for wrong in (lambda points: 0.5 - points.norm(dim=-1), lambda points: octahedron(points).sigmoid()):
+        with pytest.raises(BadInput, match="negate them, subtract the level of the surface"):
+            from_module(wrong)
+    plane = torch.nn.Linear(3, 1).half()
+    assert from_module(plane)(POINTS).dtype == POINTS.dtype == torch.float32
+
+
 def test_a_module_that_is_no_distance_becomes_a_bound_by_its_slope():
     module = torch.nn.Linear(3, 1)
     torch.nn.init.constant_(module.weight, 2.0)  # a slope of 2 sqrt(3), which no distance has

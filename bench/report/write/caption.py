@@ -93,7 +93,8 @@ def _setup(runs: Runs) -> str:
     resolution = sizes.pop() if len(sizes) == 1 else None
     config = runs.requested()
     network = setting(config, "prior", "network") or setting(config, "scale", "network") or {}
-    layers, width = setting(network, "layers"), setting(network, "width")
+    ours = runs.records[0]["dataset"] != "network"  # of others a note of the run says what it is
+    layers, width = (setting(network, "layers"), setting(network, "width")) if ours else (None, None)
     machines = [_machine(*machine) for machine in runs.machines()]
     parts = {
         "scenes": f"{'Scene' if len(shown) == 1 else f'{len(shown)} scenes:'} {_listed(shown)}",
