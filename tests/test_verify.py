@@ -101,7 +101,7 @@ def test_what_cannot_be_compared_is_told(copied, capsys, spoil, words):
     [
         ({}, 0, "agrees: copy, run again"),
         ({"metrics": {"fscore": 0.5}}, 1, "fscore is 0.500 in the record, now"),
-        ({"evaluations": {"value": 1}}, 1, "value evaluations is 1.00 in the record, now"),
+        ({"evaluations": {"value": 1}}, 1, "value evaluations is 1 in the record, now"),
         ({"metrics": {"invented": 0.5}}, 1, "invented is 0.500 in the record, now not there"),
         ({"config_hash": "other"}, 1, "its overrides give another configuration today"),
         ({"status": "nan"}, 1, "it ended nan, and now"),

@@ -10,10 +10,13 @@ INFINITE = "∞"
 def number(x: int | float | str | None, scale: float = 1.0) -> str:
     """`x * scale` to three significant digits, such as 0.0123, 12.3, 1230 or 1.23e-7.
 
-    Zero is "0"; None is missing; not a number is "nan". A string is returned unchanged.
+    An int below a million stands in full; zero is "0"; None is missing; not a number is "nan". A string is returned
+    unchanged.
     """
     if isinstance(x, str):
         return x
+    if isinstance(x, int) and not isinstance(x, bool) and scale == 1 and abs(x) < 10**6:
+        return str(x)
     if x is None:
         return MISSING
     value = float(x) * scale

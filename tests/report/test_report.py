@@ -214,6 +214,8 @@ def test_report_never_imports_torch():
         (format.number, 9.996, "10.0"),
         (format.number, 99.96, "100"),
         (format.number, 1234.5, "1230"),
+        (format.number, 1389, "1389"),
+        (format.number, 1_430_000, "1.43e6"),
         (format.number, -12.34, "-12.3"),
         (format.number, 0.00001234, "1.23e-5"),
         (format.number, 1.5e9, "1.50e9"),
