@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from bench.records.metrics import DVR_TABLE2
+from bench.records.read import curve_lines
+from bench.report.data.kept import KEPT
 from bench.report.data.records import SCALE, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
 from bench.report.tuning import TUNED
@@ -19,8 +21,7 @@ NOTES = (
     "foreground, in front of black.",
     "All rows but DVR's own share one field, rate and iterations; volumes have the cross entropy of their opacity for "
     "the masks and a budget of samples a ray.",
-    "DVR's own rows have their paper's rate and no more iterations than others, and are far from their end; "
-    "`+method=dvr_long` has ten times of both.",
+    "DVR's own rows have their paper's rate and no more iterations than others; `+method=dvr_long` has ten times both.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
     "measured rows.",
 )
@@ -41,6 +42,7 @@ RUNS = (
 )
 PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics("seen_chamfer_l1", "psnr"))
 
+RISING = 0.5  # dB
 SCENES = 2  # of `figures`
 ALIKE = {  # rows that are not shown there, since they look as another does
     *("rgb_dist", "rgb_idr", "rgb_naive", "rgb_relaxed_boundary", "rgb_volsdf", "rgb_unisurf"),
@@ -87,12 +89,26 @@ def make(runs: Runs) -> Result:
             scenes,
             show=table.thousandfold,
         ),
-        remarks=NOTES,
+        remarks=[*NOTES, _rising(runs)],
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
         figure=medians.draw_runs(runs, panels),
     )
+
+
+def _rising(runs: Runs) -> str:
+    """Which rows are not at their end; of runs without a folder it is not known."""
+    gains = dict[str, list[float]]()
+    for record in runs.records:
+        lines = (curve_lines(runs.folder(record)) if KEPT not in record else None) or []
+        points = [line for line in lines if line.get("psnr") is not None]
+        late = [line["psnr"] for line in points if 2 * line["iteration"] >= points[-1]["iteration"]]
+        if late:
+            gains.setdefault(row_of(record).name, []).append(late[-1] - late[0])
+    rising = [name for name, found in gains.items() if float(np.median(found)) > RISING]
+    told = f"Not at their end, as the PSNR rose by over {RISING} dB in the second half of the iterations"
+    return f"{told}: {', '.join(rising)}." if rising else ""
 
 
 def _conditions(runs: Runs) -> str:

@@ -1,5 +1,7 @@
 """The pages on shapes from photographs, made from run folders whose numbers are known."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,16 @@ def chosen(results, page=dvr_table2):
 
 def line_of(result, row):
     return result.table.set_index("Method").loc[row]
+
+
+def test_rows_that_still_rise_are_named(tmp_path):
+    for row, psnr in ((NEWTON, [10.0, 20.0, 20.4]), (IDR, [10.0, 14.0, 19.0])):
+        folder = made(tmp_path, row, scored(0.01))
+        lines = [{"iteration": n, "psnr": value} for n, value in zip((1, 200, 399), psnr, strict=True)]
+        (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    made(tmp_path, HULL, scored(0.05))
+    (note,) = [note for note in page_of(tmp_path, "dvr_table2").notes if note.startswith("Not at their end")]
+    assert note.endswith(f"iterations: {IDR}.")
 
 
 def test_a_line_has_the_medians_over_scenes_with_failed_runs_worst(tmp_path):
