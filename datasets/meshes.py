@@ -86,6 +86,14 @@ def read_mesh(path: str | Path) -> Mesh:
         raise BadInput(f"mesh file '{path}': {error}") from None
 
 
+def read_pieces(path: str | Path) -> Mesh:
+    """The mesh of a file, or of all files of a folder, such as BlendedMVS's `textured_mesh`; see `read_mesh`."""
+    pieces = [read_mesh(file) for file in find_meshes(path)]
+    firsts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    faces = [piece.faces + first for piece, first in zip(pieces, firsts, strict=False)]
+    return Mesh(np.concatenate([piece.vertices for piece in pieces]), np.concatenate(faces))
+
+
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"] | None:
     """The points of a cloud: a file without faces, or the `pointcloud.npz` of DVR's data; None of one that has faces.
 

@@ -119,7 +119,8 @@ class OwnPhotographs:
             raise ValueError(f"dataset.path={self.path} is no folder: give the folder that has the photographs")
         if self.truth is not None and not Path(self.truth).exists():
             raise ValueError(
-                f"dataset.truth={self.truth} is not there: give a mesh, a cloud of points, or DTU's folder"
+                f"dataset.truth={self.truth} is not there: give a mesh, a folder of its pieces, a cloud of "
+                "points, or DTU's folder"
             )
 
     @property
@@ -129,7 +130,7 @@ class OwnPhotographs:
         Raises:
             BadInput: where neither `scan` nor the folder's name says it.
         """
-        if self.truth is None or not Path(self.truth).is_dir():
+        if self.truth is None or not Path(self.truth, "Points").is_dir():
             return None
         return scan_number(self.name) if self.scan is None else self.scan
 

@@ -15,7 +15,7 @@ from bench.evaluate.evaluate import cloud_metrics, drawn
 from bench.setup.inputs import RunContext, RunInputs
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
-from datasets.meshes import read_mesh, read_points
+from datasets.meshes import read_mesh, read_pieces, read_points
 from datasets.own_photographs import Photographed
 from datasets.photographs import Photography
 from datasets.scene import Surface, Truth, sample_surface, see
@@ -202,9 +202,9 @@ def truth_of(
         return None, None, []
     if (number := dataset.dtu_scan) is not None:
         return None, read_scan(Path(dataset.truth), number), published(number)
-    mesh, points = None, read_points(dataset.truth)
+    mesh, points = None, None if Path(dataset.truth).is_dir() else read_points(dataset.truth)
     if points is None:
-        whole = read_mesh(dataset.truth).moved(np.linalg.inv(to_world))
+        whole = read_pieces(dataset.truth).moved(np.linalg.inv(to_world))
         mesh = whole.cut_off()
         share = mesh.area / whole.area if mesh else 0.0
     else:

@@ -188,11 +188,15 @@ def test_candidates_that_cannot_be_are_refused_before_photographs_are_taken(scen
         executed(run_in(tmp_path, scene, renderer="newton", field="auto"), **{"auto.candidates": candidates})
 
 
-@pytest.mark.parametrize("kind", ["mesh", "cloud", "dtu"])
+@pytest.mark.parametrize("kind", ["mesh", "pieces", "cloud", "dtu"])
 def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
     points = (on_ball(20_000, RADIUS) - DTU_CENTRE) + CENTRE
     truth = tmp_path / f"{kind}.ply"
     ball(RADIUS, CENTRE).save(truth) if kind == "mesh" else trimesh.PointCloud(points).export(truth)
+    if kind == "pieces":
+        truth = folder(tmp_path, kind)
+        for place, faces in enumerate(np.array_split(ball(RADIUS, CENTRE).faces, 3)):
+            Mesh(ball(RADIUS, CENTRE).vertices, faces).compact().save(truth / f"{place}.ply")
     if kind == "dtu":
         write_dtu(truth.with_suffix(""), points, plane=(0, 0, 1, 0), centre=CENTRE)
     truth = truth if kind != "dtu" else truth.with_suffix("")
@@ -210,13 +214,14 @@ def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
         return
     unit = np.linalg.norm(np.loadtxt(tmp_path / "run" / "to_world.txt")[:3, 0])
     assert metrics["accuracy"] * unit == pytest.approx(away, abs=0.01 * RADIUS)
-    assert ("seen_chamfer_l1" in metrics) == ("normal_consistency" in metrics) == (kind == "mesh")
+    assert ("seen_chamfer_l1" in metrics) == ("normal_consistency" in metrics) == (kind in ("mesh", "pieces"))
 
 
 def test_a_truth_elsewhere_and_a_scan_without_a_number_are_refused(tmp_path):
     ball(RADIUS, CENTRE + 9).save(tmp_path / "far.ply")
     with pytest.raises(BadInput, match=r"nothing of dataset.truth=.*far.ply lies in the unit sphere"):
         executed(run_in(folder(tmp_path, "one"), None, truth=str(tmp_path / "far.ply")))
+    (tmp_path / "Points").mkdir()
     with pytest.raises(BadInput, match=r"'two' does not end in the number of a scan of DTU: set dataset.scan=65"):
         executed(run_in(folder(tmp_path, "two"), None, truth=str(tmp_path)))
     with pytest.raises(ValueError, match=r"dataset.truth=gone.ply is not there"):
