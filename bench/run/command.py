@@ -44,6 +44,7 @@ Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, t
 --cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML; --hydra-help is Hydra's own."""
 USAGE = 2  # exit status of a wrong command line
 FAILED = 1
+AS_TYPED = {"dataset.path: ": "field_path: ", "dataset.module.": "field."}  # with field=file; see `with_network`
 EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 KERNELS = "IMPLICIT_BENCH_KERNELS"  # see renderers/kernels/library.py, whose import takes that of torch
@@ -76,7 +77,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     if (text := _answer(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
         return _print(text)
     catch_signals()
-    Sweep.runs = runs
+    Sweep.runs, typed = runs, AS_TYPED if "field=file" in sys.argv else {}
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
         sys.argv[1:] = with_network(options_first(sys.argv[1:]))
@@ -92,7 +93,10 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
         return _tell(f"{text}; nothing was run" if none else text, INTERRUPTED)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         leave_server()
-        return _tell(_with_file(_explain(error)), USAGE)
+        text = _with_file(_explain(error))
+        for key, short in typed.items():
+            text = text.replace(key, short)
+        return _tell(text, USAGE)
     except BrokenPipeError:  # `| head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return FAILED

@@ -7,6 +7,7 @@ import io
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from itertools import islice
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -133,7 +134,8 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     known = times(plan, reused)
     taken = {cell.id: known[kind(vars(cell))] for cell in plan.cells if cell.id not in reused}
     for number, cell in enumerate(plan.cells, 1):
-        named = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {cell.dataset}"
+        file = Path((cell.config["dataset"] or {}).get("path") or "").name
+        named = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {f'{cell.dataset} {file}'.strip()}"
         about = "reused" if cell.id in reused else about_as_long(taken[cell.id])
         print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named, about) if part))
     parts = [f"{len(plan.cells)} planned: {len(taken)} to run"]

@@ -3,6 +3,7 @@
 `cell_of` is the one place where a configuration becomes objects: for the check of a sweep, and for each run.
 """
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -212,12 +213,14 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
 
     view, auto = parts("view", "auto")
     made, notes = renderer(config["renderer"])
-    task, dataset, evaluation, prior, models = parts("task", "dataset", "evaluation", "prior", "models")
+    task, dataset, evaluation, models = parts("task", "dataset", "evaluation", "models")
     split, index, threads = *_place(config["split"], config["index"]), config["threads"]
     device, cache = pick_device(config["device"]), Path(config["priors_dir"])
 
     shown = dataset.network(index) if isinstance(dataset, Networked) else None
-    known = shown if isinstance(prior, PriorSettings) else prior.network(0)
+    with _naming("prior", config["prior"]):
+        (prior,) = parts("prior")
+        known = shown if isinstance(prior, PriorSettings) else prior.network(0)
 
     def make_prior() -> Prior:
         if known is not None:
@@ -243,6 +246,16 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     )
     _check(task, inputs, index)
     return Cell(task, inputs, prior, known.decoder.width if known else prior.network.width, threads)
+
+
+@contextmanager
+def _naming(group: str, node: Node) -> Iterator[None]:
+    """Within it, an error of a dataset's class that has the place of another group names the keys of that group."""
+    try:
+        yield
+    except ValueError as error:
+        error.args = (re.sub(rf"(?<![\w/])dataset\.(?=(?:{'|'.join(node)})\b)", f"{group}.", str(error)),)
+        raise
 
 
 def _place(split: str, index: int) -> tuple[Split, int]:

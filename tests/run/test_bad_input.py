@@ -167,6 +167,17 @@ def test_an_invalid_value_is_an_error_before_anything_slow(monkeypatch, no_prior
     assert_one_line(explained(monkeypatch, argument), *words)
 
 
+@each("argument, words", [
+    ("field.width=3", ("field._target_ names 'mynet.Net': type packages=[mynet]",)),
+    ("packages=[torch]", ("error: field_path: there is nothing at 'none.pth'",)),
+])  # fmt: skip
+def test_keys_of_a_network_are_named_as_typed(bench, argument, words):
+    of = "mynet.Net" if "width" in argument else "torch.nn.Identity"
+    code, _, err = bench("field=file", "field_path=none.pth", f"field._target_={of}", argument)
+    assert code == 2
+    assert_one_line(err, *words)
+
+
 def test_more_points_than_pixels_are_an_error(bench):
     code, _, err = bench(*TINY, "task.points=5000")
     assert code == 2

@@ -172,6 +172,12 @@ def test_like_runs_have_the_same_task_renderer_and_scale_and_took_their_whole_ti
     assert times_of([run(2.0), run(3.0, method="dist/mask")], method="dist/mask") == ([3.0], 1)
 
 
+def test_a_plan_names_the_file_of_a_dataset(tmp_path, capsys):
+    cell = PlannedCell("c", [], "ablation", "dist", "module", 0, {"dataset": {"path": "mine/net.pth"}})
+    plan_module.show_plan(Plan("p", tmp_path, [cell]), {"c"}, 1)
+    assert "ablation, dist, module net.pth  reused" in capsys.readouterr().out
+
+
 def test_of_many_like_runs_a_part_is_read(times_of):
     many = [run(1.0, scale="desk")] * 50 + [run(2.0)] * 200
     assert times_of(many) == ([2.0] * plan_module.LIKE, 50 + plan_module.LIKE)
