@@ -256,9 +256,11 @@ def write_row(verdict: Verdict, item: Item, place: int, judge: Judge, given: arg
 def parsed(arguments: list[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.judge", description=__doc__)
-    parser.add_argument("mesh", type=Path, help="a mesh file, a run folder, or a folder of meshes")
+    parser.add_argument(
+        "mesh", type=Path, metavar="MESH", help="a mesh file with faces, a run folder, or a folder of these"
+    )
     truth = parser.add_mutually_exclusive_group(required=True)
-    truth.add_argument("--truth", type=Path, help="a mesh or a cloud of points; of a folder of meshes, a folder")
+    truth.add_argument("--truth", type=Path, help="the true mesh, or points on it; a folder where MESH is one")
     truth.add_argument("--dtu", type=Path, metavar="FOLDER", help="DTU's, with Points/stl and ObsMask")
     parser.add_argument("--scan", type=int, help="of DTU (default: the number in the mesh's name)")
     threshold = "of F, in units or per cent of the truth's extent (default: %(default)s)".replace("per cent", "%%")
