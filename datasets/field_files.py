@@ -4,7 +4,7 @@ Objects are of the classes of `CLASSES` alone, with plain values: nothing in a f
 """
 
 import json
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from renderers.checks import BadInput
-from renderers.field import Field, Flops, Kind, Moved
+from renderers.field import Field, Flops, Kind, Moved, Wrapper
 from renderers.fields import coloured, network, occupancy, published
 from renderers.fields.analytic import Shape
 from renderers.fields.grid import Grid
@@ -23,6 +23,7 @@ from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.fields.parts import Formula
 
 FIELD = "field.safetensors"  # in a run's folder
+RUNS = Path("results/local/runs")  # whose names `bench.load().folder` has
 VERSION = "1"  # raise it when a class of these changes what it holds
 MOST = 16_000_000  # bytes of a field that is stored
 CLASSES: dict[str, type] = {
@@ -62,14 +63,29 @@ def load_field(run: Path | str, device: torch.device | str = "cpu") -> Field:
     """The final field of a run, on a device, without gradients towards its numbers.
 
     Args:
-        run: its folder, or the file in it.
+        run: its folder, or the file in it, or its name in `RUNS`.
         device: of its tensors, and of points that it takes.
 
     Raises:
         BadInput: where there is none, or it cannot be read.
     """
     tree, tensors = _read(Path(run))
-    return _field(tree, {name: tensor.to(device) for name, tensor in tensors.items()})
+    return Loaded(_field(tree, {name: tensor.to(device) for name, tensor in tensors.items()}), torch.device(device))
+
+
+@dataclass(frozen=True)
+class Loaded(Wrapper):
+    """A field of a file; it also takes points in float64, of numpy, or on another device."""
+
+    inner: Field
+    device: torch.device
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.inner(torch.as_tensor(points, dtype=torch.float32, device=self.device))
+
+    def __getattr__(self, name: str) -> Any:
+        """What else the field offers, such as its coarse values, bounds and colours."""
+        return getattr(object.__getattribute__(self, "inner"), name)
 
 
 def load_network(run: Path | str) -> network.Published:
@@ -176,9 +192,15 @@ def _field(tree: Any, tensors: dict[str, Tensor]) -> Field:
 
 
 def _read(run: Path) -> tuple[Any, dict[str, Tensor]]:
-    path = run / FIELD if run.is_dir() else run
+    place = run if run.exists() else RUNS / run
+    path = place / FIELD if place.is_dir() else place
+    if not place.exists():
+        raise BadInput(f"there is nothing at '{run}': give the folder of a run, RESULTS/runs/NAME, or a name in {RUNS}")
     if not path.is_file():
-        raise BadInput(f"{run} has no {FIELD}: the run left none; its notes may say why, or run it again")
+        raise BadInput(
+            f"{run} has no {FIELD}: a task that looks for no field, such as ablation, leaves none; of another "
+            "the run's notes say why"
+        )
     try:
         with safe_open(path, "pt") as opened:
             found = opened.metadata() or {}

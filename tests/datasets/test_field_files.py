@@ -1,6 +1,7 @@
 """The field that a run leaves is the same when it is read, and nothing else in its file has an effect."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,11 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 import bench
+from bench.records.read import RESULTS
 from datasets import field_files
 from datasets.field_files import FIELD, load_field, load_network, save_field
 from renderers.checks import BadInput
-from renderers.field import Field, Flops, Kind, Moved
+from renderers.field import Field, Flops, Kind, Moved, bounds_of
 from renderers.fields.analytic import sphere
 from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy, ScaledOccupancyOf
 from renderers.fields.grid import Grid
@@ -60,7 +62,9 @@ def test_a_field_that_is_read_has_the_same_values_and_says_the_same_of_itself(na
     field = FIELDS[name]()
     assert save_field(field, tmp_path / FIELD) is None
     found = bench.load_field(tmp_path)
-    assert type(found) is type(field)
+    assert type(found.inner) is type(field)
+    assert torch.equal(found(POINTS.double().numpy()), found(POINTS))
+    assert (bounds_of(found) is None) is (bounds_of(field) is None)
     torch.testing.assert_close(found(POINTS), field(POINTS).detach(), rtol=0, atol=1e-6)
     assert (found.kind, found.lipschitz) == (field.kind, field.lipschitz) and not found(POINTS).requires_grad
     if hasattr(field, "colours"):
@@ -105,12 +109,21 @@ def changed(path: Path, old: str, new: str) -> None:
     save_file(load_file(path), path, {"version": field_files.VERSION, "field": tree.replace(old, new)})
 
 
+def test_the_name_of_a_run_is_enough_where_runs_are_by_default(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = Path(RESULTS, "runs", "one")
+    folder.mkdir(parents=True)
+    save_field(FIELDS["decoder"](), folder / FIELD)
+    assert torch.equal(load_field("one")(POINTS), load_field(folder)(POINTS))
+
+
 @pytest.mark.parametrize(
     "spoil, words",
     [
         (lambda path: path.write_bytes(path.read_bytes()[:-100]), "may be cut short"),
         (lambda path: path.write_bytes(b""), "may be cut short"),
-        (Path.unlink, f"has no {FIELD}"),
+        (Path.unlink, f"has no {FIELD}: a task that looks for no field, such as ablation"),
+        (lambda path: shutil.rmtree(path.parent), "there is nothing at .*: give the folder of a run"),
         (lambda path: save_file(load_file(path), path), "version None of fields"),
         (lambda path: changed(path, "Linear", "Popen"), "'Popen', which is none of ours"),
         (lambda path: changed(path, '"octaves"', '"forward"'), "no attribute 'forward' that a file may set"),
