@@ -59,6 +59,8 @@ class ShapeNet:
         if not self.synset.isdigit():
             check_choice("dataset.synset", self.synset, tuple(SYNSETS))
         _ = self.files  # raises where something is missing
+        if self.renders is not None and not (pictured := Path(self.renders) / self.folder.name).is_dir():
+            raise ValueError(f"dataset.renders: there is no folder '{pictured}': give the one that has SYNSET/ID")
 
     @property
     def name(self) -> str:
@@ -88,10 +90,11 @@ class ShapeNet:
     def _file(self, split: Split, index: int) -> Path:
         files = self.files[split]
         if not files or (index >= len(files) and split is Split.TEST):
-            raise BadInput(
-                f"{self.name} has {len(files)} {split} shapes in '{self.folder}', and none of number {index}: set a "
-                "smaller index, or unpack more shapes, or give another dataset.split"
-            )
+            what = f"and none of number {index}: set a smaller index, unpack more shapes, or give another dataset.split"
+            if split is not Split.TEST:
+                what = "and a prior is trained on some: put their list beside dataset.split, unpack more shapes, "
+                what += "or set prior=deepsdf prior.path=FOLDER"
+            raise BadInput(f"{self.name} has {len(files)} {split} shapes in '{self.folder}', {what}")
         return files[index % len(files)]
 
     @cached_property
@@ -140,10 +143,10 @@ def _shapes(folder: Path) -> dict[str, Path]:
     for inner in MESHES:
         if found := sorted(folder.glob(f"*/{inner}")):
             return {_id(file): file for file in found}
-    raise ValueError(
-        f"dataset.path: '{folder}' has no ID/{MESHES[0]} (v2) and no ID/{MESHES[1]} (v1): give the folder of "
-        "ShapeNetCore in which that of the synset is unpacked"
-    )
+    what = f"'{folder}' has no ID/{MESHES[0]} (v2) and no ID/{MESHES[1]} (v1)"
+    for place in (folder, folder.parent):
+        what = what if place.is_dir() else f"there is no folder '{place}'"
+    raise ValueError(f"dataset.path: {what}: give the folder of ShapeNetCore in which that of the synset is unpacked")
 
 
 def _lists(file: Path) -> dict[Split, Path]:
