@@ -7,6 +7,7 @@ import hashlib
 import json
 import pickle
 import re
+import struct
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -38,12 +39,15 @@ AUTO = "auto"
 CODES = 16  # of a network, of which its sign and its steepest slope are measured
 INSIDE = {AUTO: None, "negative": 1.0, "positive": -1.0}  # signs; see `Meaning`
 OWN_LEVEL = "occupancy networks' own meshes are at 0.2, dataset.level=-1.386"
+OWN_CLASS = "field._target_=PACKAGE.CLASS"
 PARTS = ("ModelParameters", "LatentCodes")  # of a DeepSDF folder, in each of which `latest.pth` is read
 LATEST = "latest.pth"
 TENSORS = (
     "DeepSDF (name the folder with its specs.json); IDR, NeuS, VolSDF (implicit_network.lin0, sdf_network.lin0); "
     "occupancy networks, DVR (fc_p, conv_p)"
 )
+# What the loader raises of bytes that are no pickle of weights.
+GARBLED = (pickle.UnpicklingError, LookupError, UnicodeDecodeError, struct.error)
 SCALARS = [  # of numpy, in which some checkpoints hold their best loss; plain numbers
     *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
     *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
@@ -213,9 +217,8 @@ def _known(file: NetworkFile, index: int, content: str) -> Known:
         network, codes = _read(file)
         enlarged(network.inner, file.scale)
         if index >= len(codes):
-            raise BadInput(
-                f"it has {len(codes)} codes, and index={index} is none of them: set index=0 to {len(codes) - 1}"
-            )
+            some = f"{len(codes)} codes, and index={index} is none of them: set index=0 to {len(codes) - 1}"
+            raise BadInput(f"it has {some if len(codes) > 1 else 'one code: set index=0'}")
         return _measured(file, network, codes, index, content)
     except BadInput as error:
         raise BadInput(f"the network {file.path}: {error}") from error
@@ -300,7 +303,9 @@ def _of_names(tensors: dict[str, Tensor]) -> Published:
     if any(f".{first}_p." in f".{name}" for name in tensors for first in ("fc", "conv")):
         return occupancy(tensors)
     names = ", ".join([*tensors][:6]) or "no tensors"
-    raise BadInput(f"it is of no format that is read, which are {TENSORS}; and .npz: it has {names}")
+    raise BadInput(
+        f"it is of no format that is read, which are {TENSORS}; .npz; a class of yours, by {OWN_CLASS}: it has {names}"
+    )
 
 
 def _codes(path: Path) -> Tensor:
@@ -330,21 +335,19 @@ def _tensors(path: Path) -> dict[str, Tensor]:
     try:
         with torch.serialization.safe_globals(SCALARS), warnings.catch_warnings(action="ignore"):
             return dict(_flat(torch.load(path, weights_only=True, map_location="cpu")))
-    except pickle.UnpicklingError as error:
+    except GARBLED as error:
         blocked = re.search(r"GLOBAL (\S+)", str(error))
-        what = blocked[1] if blocked else "no weights"
-        raise BadInput(
-            f"{path.name} is broken, or holds more than weights, which is not run ({what}): save its state_dict() alone"
-        ) from error
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        what = "is no network file, or is broken: name a checkpoint of weights, an .npz or a folder"
+        if blocked:
+            what = f"holds more than weights, which is not run ({blocked[1]}): save its state_dict() alone"
+        raise BadInput(f"{path.name} {what}") from error
+    except (OSError, RuntimeError, EOFError, ValueError, zipfile.BadZipFile) as error:
         if "TorchScript" in str(error):
             raise BadInput(
                 f"{path.name} is TorchScript, a program, which is not run: save its state_dict(), and name its class "
-                "by field._target_=PACKAGE.CLASS"
+                f"by {OWN_CLASS}"
             ) from error
-        raise BadInput(
-            f"{path.name} cannot be read, it may be cut short: {' '.join(str(error).split())[:160]}"
-        ) from error
+        raise BadInput(f"{path.name} cannot be read: it may be cut short, copy it again") from error
 
 
 def _flat(found: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:

@@ -337,8 +337,12 @@ def plain(tensors: Mapping[str, Tensor]) -> Published:
     operations = dict(sorted({name.rpartition(".")[0]: None for name in tensors}.items()))
     kinds = [name.partition(".")[2] for name in operations]
     activations = {kind for kind in kinds if kind not in ("dense", "squeeze_last")}
-    if unknown := sorted(activations - {*ACTIVATIONS}):
-        raise BadInput(f"the network has operations that are not known: {', '.join(unknown)}")
+    if unknown := activations - {*ACTIVATIONS}:
+        names = [name for name in tensors if name.rpartition(".")[0].partition(".")[2] in unknown]
+        raise BadInput(
+            f"the network has operations that are not known: {', '.join(names[:6])}; arrays are named as 0000.dense.A, "
+            f"0000.dense.b, 0001.relu._, with one of {', '.join(ACTIVATIONS)}"
+        )
     shape = "".join("act " if kind in activations else f"{kind} " for kind in kinds)
     if len(activations) != 1 or re.fullmatch(r"(dense act )+dense (squeeze_last )?", shape) is None:
         raise BadInput(f"the network must be dense layers with one activation between them, not {', '.join(kinds)}")

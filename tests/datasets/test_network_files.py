@@ -196,6 +196,8 @@ def test_half_floats_are_converted_and_other_codes_are_read(tmp_path):
 def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):
     file = npz(tmp_path, arrays())
     before = file.network(0).facts.steepest, file.identity()
+    with pytest.raises(BadInput, match=r"it has one code: set index=0$"):
+        file.network(3)
     npz(tmp_path, arrays(3.0))
     assert file.network(0).facts.steepest == pytest.approx(3 * before[0])
     assert file.identity() != before[1]
@@ -214,6 +216,11 @@ def scripted(folder: Path) -> NetworkFile:
     return load("dataset", "network", path=str(folder / "shape.pt"))
 
 
+def text(folder: Path, content: str) -> NetworkFile:
+    (folder / "shape.obj").write_text(content)
+    return load("dataset", "network", path=str(folder / "shape.obj"))
+
+
 def cut(path: str) -> None:
     content = Path(path).read_bytes()
     Path(path).write_bytes(content[: len(content) // 2])
@@ -224,7 +231,9 @@ def cut(path: str) -> None:
     (lambda d: checkpoint(d, {"a.weight": torch.ones(2)}), ("no format that is read", "IDR, NeuS", "a.weight")),
     (lambda d: checkpoint(d, {"module.lin0.bias": torch.ones(2)}), ("DeepSDF (name the folder with its specs.json)",)),
     (lambda d: scripted(d), ("TorchScript, a program, which is not run: save its state_dict()",)),
-    (lambda d: checkpoint(d, {"epoch": 3}), ("no format that is read", "no tensors")),
+    (lambda d: checkpoint(d, {"epoch": 3}), ("no format that is read", "by field._target_=PACKAGE.CLASS", "no ten")),
+    (lambda d: text(d, "v 0 0 0"), ("shape.obj is no network file, or is broken: name a checkpoint",)),
+    (lambda d: text(d, "a mesh"), ("shape.obj is no network file",)),  # "a" is an instruction of pickle
     (lambda d: npz(d, arrays() | {"0001.relu._": np.array([object()])}), ("cannot be read", "allow_pickle")),
     (lambda d: npz(d, arrays(level=9.0)), ("between 8.5", "and the surface at the level 0", "dataset.level")),
     (lambda d: npz(d, arrays() | {"0002.dense.b": np.array([np.nan])}), ("not finite at 16384 of 16384",)),
@@ -244,7 +253,9 @@ def test_a_file_that_will_not_do_is_refused_with_the_cause(tmp_path_factory, mon
 def test_a_truncated_file_is_refused(tmp_path_factory, make):
     file = make(tmp_path_factory.mktemp("cut"))
     cut(file.path)
-    with pytest.raises(BadInput, match=r"cannot be read|is broken"):
+    with pytest.raises(
+        BadInput, match=r"npz: it cannot be read|pth cannot be read: it may be cut short, copy it again$"
+    ):
         file.network(0)
 
 
@@ -355,6 +366,17 @@ def test_its_codes_are_the_prior_of_another_dataset(tmp_path):
     assert inputs.prior.codes.tolist() == file.network(0).codes.tolist() and inputs.trained is None
     values = inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS)
     torch.testing.assert_close(values, octahedron(POINTS) + 0.3, rtol=0, atol=1e-6)
+
+
+@each("wrong, words", [
+    ("prior.path={path}/none", "prior.path: there is nothing at"),
+    ("prior.scale=-1", "prior.scale must be positive"),
+    ("prior.level=9", r"the network {path}: .*: set prior.level \(.*, or prior.scale$"),
+])  # fmt: skip
+def test_keys_of_a_prior_are_named_as_its_own(tmp_path_factory, wrong, words):
+    path = deepsdf_folder(tmp_path_factory.mktemp("dataset.path"), torch.zeros(1, 1)).path
+    with pytest.raises(ValueError, match=words.format(path=path)):
+        composed_inputs("dataset=sphere", "prior=deepsdf", f"prior.path='{path}'", wrong.format(path=path))
 
 
 def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkeypatch):

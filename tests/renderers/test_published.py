@@ -254,7 +254,8 @@ def plain_with(state: Any) -> Any:
     (lambda: cbn_with(lambda s: s | {"decoder.fc_p.weight": drawn(8, 2, 1)}), ("fc_p.weight must be any x 3",)),
     (lambda: cbn_with(lambda s: without(s, "decoder.bn.bn.running_var")), ("lacks decoder.bn.bn.running_var",)),
     (lambda: plain_with(lambda s: s | {"0000.dense.A": drawn(2, 8)}), ("0000.dense.A must be 3 x any", "2 x 8")),
-    (lambda: plain_with(lambda s: s | {"0001.spin._": drawn(1)}), ("not known: spin",)),
+    (lambda: plain_with(lambda s: s | {"0001.spin._": drawn(1)}), ("not known: 0001.spin._",)),
+    (lambda: plain_with(lambda s: {"arr_0": drawn(1)}), ("not known: arr_0; arrays are named as 0000.dense.A",)),
     (lambda: plain_with(lambda s: without(s, "0001.relu._")), ("dense layers with one activation between",)),
 ])  # fmt: skip
 def test_a_network_of_another_shape_is_refused_by_the_names_of_its_weights(read, words):
