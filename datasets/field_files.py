@@ -4,7 +4,7 @@ Objects are of the classes of `CLASSES` alone, with plain values: nothing in a f
 """
 
 import json
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from renderers.checks import BadInput
-from renderers.field import Field, Flops, Kind, Moved, Wrapper
+from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields import coloured, network, occupancy, published
 from renderers.fields.analytic import Shape
 from renderers.fields.grid import Grid
@@ -70,22 +70,7 @@ def load_field(run: Path | str, device: torch.device | str = "cpu") -> Field:
         BadInput: where there is none, or it cannot be read.
     """
     tree, tensors = _read(Path(run))
-    return Loaded(_field(tree, {name: tensor.to(device) for name, tensor in tensors.items()}), torch.device(device))
-
-
-@dataclass(frozen=True)
-class Loaded(Wrapper):
-    """A field of a file; it also takes points in float64, of numpy, or on another device."""
-
-    inner: Field
-    device: torch.device
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return self.inner(torch.as_tensor(points, dtype=torch.float32, device=self.device))
-
-    def __getattr__(self, name: str) -> Any:
-        """What else the field offers, such as its coarse values, bounds and colours."""
-        return getattr(object.__getattribute__(self, "inner"), name)
+    return _field(tree, {name: tensor.to(device) for name, tensor in tensors.items()})
 
 
 def load_network(run: Path | str) -> network.Published:
