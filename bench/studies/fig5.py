@@ -54,7 +54,7 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Loss and Chamfer distance as shapes are completed.",
-        "Loss and Chamfer distance over iterations and seconds.",
+        f"Loss and Chamfer distance over iterations{' and seconds' if runs.timed else ''}.",
         question="Does the error fall with the loss?",
         verdict=f"{_verdict(lines)} {_ends(lines)}".strip(),
         remarks=(*unread, _loss(runs), *NOTES),

@@ -39,7 +39,7 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Error over time and over field values.",
-        "Chamfer distance over seconds and over field values.",
+        f"Chamfer distance over {'seconds and over ' if runs.timed else ''}field values.",
         question="How fast does the error fall?",
         verdict=_verdict(lines),
         remarks=NOTES,
