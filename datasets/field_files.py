@@ -79,8 +79,8 @@ def load_network(run: Path | str) -> network.Published:
     field = _field(tree, tensors)
     if isinstance(field, BoundDecoder):
         decoder = Decoder.of([*field.hidden, field.last], code_length=0, skip=field.skip)
-        return network.Published(decoder, 0)
-    return network.Published(network.Coded(_Held(tree, tensors), code_length=0, width=WIDTH), 0)
+        return network.Published(decoder)
+    return network.Published(network.Coded(_Held(tree, tensors), code_length=0, width=WIDTH))
 
 
 class _Held(nn.Module):

@@ -38,7 +38,6 @@ REACH = 1.05  # scene units: half the side of the cube in which the surface with
 AUTO = "auto"
 CODES = 16  # of a network, of which its sign and its steepest slope are measured
 INSIDE = {AUTO: None, "negative": 1.0, "positive": -1.0}  # signs; see `Meaning`
-OWN_LEVEL = "occupancy networks' own meshes are at 0.2, dataset.level=-1.386"
 OWN_CLASS = "field._target_=PACKAGE.CLASS"
 PARTS = ("ModelParameters", "LatentCodes")  # of a DeepSDF folder, in each of which `latest.pth` is read
 LATEST = "latest.pth"
@@ -116,9 +115,8 @@ class NetworkFile:
         if self.tanh is not None:
             check_at_least("dataset.tanh", self.tanh, 0, "1 is as in DeepSDF's code of 2019")
         if not isfinite(self.level):
-            raise ValueError(
-                f"dataset.level must be finite, not {self.level}: 0 for distances and logits, 0.5 for probabilities"
-            )
+            remedy = "0 for distances and logits, 0.5 for probabilities"
+            raise ValueError(f"dataset.level must be finite, not {self.level}: {remedy}")
         if not Path(self.path).exists():
             raise ValueError(f"dataset.path: there is nothing at '{self.path}': name a network's file or folder")
 
@@ -148,10 +146,8 @@ class NetworkFile:
     def files(self) -> list[Path]:
         """The files that are read."""
         path = Path(self.path)
-        parts = (
-            [path / "specs.json", path / FIELD, *(path / part / LATEST for part in PARTS)] if path.is_dir() else [path]
-        )
-        return [file for file in (*parts, *([Path(self.codes)] if self.codes else [])) if file.is_file()]
+        parts = ("specs.json", FIELD, *(f"{part}/{LATEST}" for part in PARTS)) if path.is_dir() else ("",)
+        return [file for file in (*(path / part for part in parts), Path(self.codes or "")) if file.is_file()]
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: the files' contents, not their paths."""
@@ -193,10 +189,9 @@ class ModuleFile(NetworkFile):
         try:
             module.load_state_dict({name: tensors[prefix + name] for name in names if prefix + name in tensors})
         except RuntimeError as error:
-            raise BadInput(
-                f"its weights are not those of {type(module).__name__}: {' '.join(str(error).split())}"
-            ) from error
-        return Published(Coded(_Body(module), code_length=0, width=WIDTH), 0)
+            told = " ".join(str(error).split())
+            raise BadInput(f"its weights are not those of {type(module).__name__}: {told}") from error
+        return Published(Coded(_Body(module), code_length=0, width=WIDTH))
 
 
 class _Body(nn.Module):
@@ -248,7 +243,8 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
     decoder = settled(network, meaning, level=file.level).requires_grad_(False)
     side = f"values are {'negative' if meaning.factor > 0 else 'positive'} inside, at the level {file.level:g}"
     if isinstance(network.inner, Coded) and isinstance(network.inner.body, Residual):
-        side += f" of the logits, a probability of {torch.tensor(file.level).sigmoid():.2g} ({OWN_LEVEL})"
+        side += f" of the logits, a probability of {torch.tensor(file.level).sigmoid():.2g} (occupancy networks' own "
+        side += "meshes are at 0.2, dataset.level=-1.386)"
     divided = f", by values divided by {meaning.divisor:.3g}" if kind is Kind.BOUND else ""
     return Known(decoder, codes, facts, (f"{file.name}: {side}; {facts.in_words}; taken as a {kind.value}{divided}",))
 
@@ -269,12 +265,12 @@ def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     if file.codes is not None:
         codes = _codes(Path(file.codes))
     length = network.code_length
-    if codes is None and not network.placed:
-        raise BadInput(
-            f"its values depend on a code of {length} numbers, which it does not hold: set dataset.codes=FILE, an .npy "
-            f"or .pth of [shapes, {length}], such as an encoder's output"
-        )
     if codes is None:
+        if not network.placed:
+            raise BadInput(
+                f"its values depend on a code of {length} numbers, which it does not hold: set dataset.codes=FILE, an "
+                f".npy or .pth of [shapes, {length}], such as an encoder's output"
+            )
         codes = torch.zeros(1, length)
     if codes.dim() != 2 or codes.shape[1] != length:
         raise BadInput(f"its codes must be [shapes, {length}], not {list(codes.shape)}")
@@ -318,7 +314,7 @@ def _codes(path: Path) -> Tensor:
     found = [tensor for tensor in _tensors(path).values() if tensor.dim() > 1]
     if len(found) != 1:
         raise BadInput(f"{path.name} must hold one table of codes, not {len(found)}")
-    return found[0].float().squeeze(1) if found[0].dim() == 3 else found[0].float()
+    return (found[0].squeeze(1) if found[0].dim() == 3 else found[0]).float()
 
 
 def _arrays(path: Path) -> dict[str, Tensor]:
@@ -336,17 +332,14 @@ def _tensors(path: Path) -> dict[str, Tensor]:
         with torch.serialization.safe_globals(SCALARS), warnings.catch_warnings(action="ignore"):
             return dict(_flat(torch.load(path, weights_only=True, map_location="cpu")))
     except GARBLED as error:
-        blocked = re.search(r"GLOBAL (\S+)", str(error))
         what = "is no network file, or is broken: name a checkpoint of weights, an .npz or a folder"
-        if blocked:
+        if blocked := re.search(r"GLOBAL (\S+)", str(error)):
             what = f"holds more than weights, which is not run ({blocked[1]}): save its state_dict() alone"
         raise BadInput(f"{path.name} {what}") from error
     except (OSError, RuntimeError, EOFError, ValueError, zipfile.BadZipFile) as error:
         if "TorchScript" in str(error):
-            raise BadInput(
-                f"{path.name} is TorchScript, a program, which is not run: save its state_dict(), and name its class "
-                f"by {OWN_CLASS}"
-            ) from error
+            what = f"a program, which is not run: save its state_dict(), and name its class by {OWN_CLASS}"
+            raise BadInput(f"{path.name} is TorchScript, {what}") from error
         raise BadInput(f"{path.name} cannot be read: it may be cut short, copy it again") from error
 
 

@@ -29,9 +29,7 @@ DRAWN = 2**14  # points in the unit sphere at which values and slopes are measur
 AROUND, FEW = 4096, 512  # points on the unit sphere; those for another code
 NEAR = 0.1  # share of the points, those of least magnitude, whose slopes say whether values are distances
 EVEN = 0.25  # near its surface a distance has a slope of 1, up to this, at four of five points
-ANY_SLOPE = (
-    1.5  # and in the sphere no steeper one, but for one point of a hundred; trained priors of ours are within both
-)
+ANY_SLOPE = 1.5  # and in the sphere no steeper one, but for one point of a hundred; our trained priors are within both
 
 
 @dataclass(frozen=True)
@@ -69,13 +67,11 @@ class Facts:
     def in_words(self) -> str:
         """The facts in one line."""
         low, middle, high = self.near
-        lies = (
-            f"{self.leaves:.1%} of the unit sphere's surface is inside" if self.leaves else "it lies in the unit sphere"
-        )
+        lies, out = "it lies in the unit sphere", f"{self.leaves:.1%} of the unit sphere's surface is inside"
         return (
             f"slopes from {self.flattest:.3g} to {self.steepest:.3g}, near the surface {middle:.3g} "
             f"({low:.3g} to {high:.3g}); {self.inside:.1%} of the sphere is inside, "
-            f"{' x '.join(f'{side:.2f}' for side in self.extent)} in extent; {lies}"
+            f"{' x '.join(f'{side:.2f}' for side in self.extent)} in extent; {out if self.leaves else lies}"
         )
 
 
@@ -103,7 +99,7 @@ class Meaning:
 
 def measured(
     field: Values,
-    like: Tensor | None = None,
+    like: Tensor,
     *,
     kind: Kind | None = None,
     sign: float | None = None,
@@ -114,7 +110,7 @@ def measured(
     """What the values of a field mean, by values and slopes in the unit sphere.
 
     Args:
-        like: a tensor of the dtype and device at which it is evaluated; None for float64 on the CPU.
+        like: a tensor of the dtype and device at which it is evaluated.
         kind: what is said of it; None measures it. A bound is divided by its steepest slope with a margin of 20 %, and
             so is what is no distance: it is a bound as far as no slope between the points is steeper.
         sign: 1 where values below the level are inside, -1 where those above it are; None takes those that are rarer
@@ -306,7 +302,7 @@ class Published(nn.Module):
     kind: Kind
     lipschitz: float | None
 
-    def __init__(self, inner: Decoder | Coded, squash: int) -> None:
+    def __init__(self, inner: Decoder | Coded, squash: int = 0) -> None:
         super().__init__()
         self.inner, self.squash, self.kind, self.lipschitz = inner, squash, Kind.LEVEL, None
         self.code_length, self.width, self.placed = inner.code_length, inner.width, inner.placed
@@ -315,9 +311,8 @@ class Published(nn.Module):
 
     def at(self, code: Float[Tensor, " code_length"]) -> Adjusted:
         """The field of one code."""
-        return Adjusted(
-            cast(Field, self.inner.at(code)), self.squash, self.factor, self.level, self.kind, self.lipschitz
-        )
+        field = cast(Field, self.inner.at(code))
+        return Adjusted(field, self.squash, self.factor, self.level, self.kind, self.lipschitz)
 
 
 def settled(network: Published, meaning: Meaning, *, level: float) -> Decoder | Published:

@@ -34,15 +34,20 @@ class Weights:
 
     Args:
         tensors: by name.
-        prefix: of the names that belong to the network; others are left alone.
+        pattern: of what stands before the names of the network's layers, such as `module.`; other names are left alone.
         whose: what an error calls the checkpoint.
+
+    Raises:
+        BadInput: where no name fits.
     """
 
-    def __init__(self, tensors: Mapping[str, Tensor], *, prefix: str = "", whose: str = "the network") -> None:
-        self.whose, self.prefix = whose, prefix
-        self.left = {
-            name.removeprefix(prefix): value.float() for name, value in tensors.items() if name.startswith(prefix)
-        }
+    def __init__(self, tensors: Mapping[str, Tensor], pattern: str = "", whose: str = "the network") -> None:
+        found = next(filter(None, (re.match(pattern, name) for name in tensors)), None)
+        if found is None:
+            raise BadInput(f"it has no layers of this format: it has {', '.join([*tensors][:6]) or 'no tensors'}")
+        self.whose, self.prefix = whose, found[0]
+        names = [name for name in tensors if name.startswith(self.prefix)]
+        self.left = {name.removeprefix(self.prefix): tensors[name].float() for name in names}
 
     def has(self, name: str) -> bool:
         """Whether a tensor of this name is left, or one that begins with it and a dot."""
@@ -51,22 +56,18 @@ class Weights:
     def take(self, name: str, *shape: int) -> Tensor:
         """A tensor; raises BadInput where it is not there, or has another shape; -1 stands for any number."""
         if name not in self.left:
-            raise BadInput(f"{self.whose} lacks {self.prefix}{name}: it has {self._named(self.left)}")
+            raise BadInput(f"{self.whose} lacks {self.prefix}{name}: it has {self._named()}")
         found = self.left.pop(name)
-        if shape and (
-            found.dim() != len(shape) or any(n not in (-1, m) for n, m in zip(shape, found.shape, strict=True))
-        ):
-            wanted = " x ".join("any" if n == -1 else str(n) for n in shape)
-            raise BadInput(
-                f"{self.whose}: {self.prefix}{name} must be {wanted}, not {' x '.join(map(str, found.shape))}"
-            )
+        if shape and (len(shape) != found.dim() or any(n not in (-1, found.shape[at]) for at, n in enumerate(shape))):
+            wanted, has = " x ".join("any" if n == -1 else str(n) for n in shape), " x ".join(map(str, found.shape))
+            raise BadInput(f"{self.whose}: {self.prefix}{name} must be {wanted}, not {has}")
         return found
 
-    def layer(self, name: str, inputs: int | None = None, outputs: int = -1) -> Layer:
+    def layer(self, name: str, inputs: int = -1, outputs: int = -1) -> Layer:
         """Weight [out, in] and bias of a layer, or of a convolution of size 1, without its weight normalisation."""
         for length, direction in NORMALISED:
             if f"{name}.{direction}" in self.left:
-                weight = self.take(f"{name}.{direction}", outputs, inputs or -1)
+                weight = self.take(f"{name}.{direction}", outputs, inputs)
                 scale = self.take(f"{name}.{length}", len(weight), 1)
                 weight = weight * (scale / torch.linalg.vector_norm(weight, dim=1, keepdim=True))
                 break
@@ -74,24 +75,24 @@ class Weights:
             full = f"{name}.weight"
             if full in self.left and self.left[full].dim() == 3:  # a convolution
                 self.left[full] = self.left[full].squeeze(-1)
-            weight = self.take(full, outputs, inputs or -1)
+            weight = self.take(full, outputs, inputs)
         return weight, self.take(f"{name}.bias", len(weight))
 
     def count(self, pattern: str) -> int:
         """How many layers there are, by the largest number in their names; raises BadInput where there is none."""
         numbers = [int(found[1]) for name in self.left if (found := re.match(pattern, name))]
         if not numbers:
-            raise BadInput(f"{self.whose} has no layers {self.prefix}{pattern}: it has {self._named(self.left)}")
+            raise BadInput(f"{self.whose} has no layers {self.prefix}{pattern}: it has {self._named()}")
         return max(numbers) + 1
 
     def finish(self) -> None:
         """Raises BadInput where tensors are left that no layer took."""
         if self.left:
-            raise BadInput(f"{self.whose} has weights of another network: {self._named(self.left)}")
+            raise BadInput(f"{self.whose} has weights of another network: {self._named()}")
 
-    def _named(self, names: Mapping[str, Any]) -> str:
-        shown = [f"{self.prefix}{name}" for name in [*names][:6]]
-        return ", ".join(shown) + (f" and {len(names) - 6} more" if len(names) > 6 else "") or "nothing"
+    def _named(self) -> str:
+        shown, more = [f"{self.prefix}{name}" for name in [*self.left][:6]], len(self.left) - 6
+        return ", ".join(shown) + (f" and {more} more" if more > 0 else "") or "nothing"
 
 
 class Layered(nn.Module):
@@ -120,7 +121,7 @@ class Layered(nn.Module):
         self.weights = nn.ParameterList(weight for weight, _ in layers)
         self.biases = nn.ParameterList(bias for _, bias in layers)
         self.activation, self.again, self.frequencies, self.shrink = activation, dict(again or {}), frequencies, shrink
-        self.norms = nn.ModuleDict({str(at): _norm(*norm) for at, norm in (norms or {}).items()})
+        self.norms = nn.ModuleDict({str(at): _of(nn.LayerNorm(len(of[0])), of) for at, of in (norms or {}).items()})
 
     def forward(self, points: Tensor, code: Tensor) -> Tensor:
         waves = [part for n in range(self.frequencies) for part in ((points * 2**n).sin(), (points * 2**n).cos())]
@@ -152,9 +153,9 @@ class Residual(nn.Module):
         norms: list["Norm"],
     ) -> None:
         super().__init__()
-        self.first, self.last = _linear(*first), _linear(*last)
-        self.blocks = nn.ModuleList(nn.ModuleList(_linear(*layer) for layer in block) for block in blocks)
-        self.shifts = nn.ModuleDict({str(at): _linear(*layer) for at, layer in shifts.items()})
+        self.first, self.last = _linear(first), _linear(last)
+        self.blocks = nn.ModuleList(nn.ModuleList(map(_linear, block)) for block in blocks)
+        self.shifts = nn.ModuleDict({str(at): _linear(layer) for at, layer in shifts.items()})
         self.norms = nn.ModuleList(norms)
 
     def forward(self, points: Tensor, code: Tensor) -> Tensor:
@@ -181,9 +182,7 @@ class Norm(nn.Module):
     def __init__(self, weights: Weights, name: str, code_length: int) -> None:
         super().__init__()
         kind = "conv" if weights.has(f"{name}.conv_gamma") else "fc"
-        self.gamma, self.beta = (
-            _linear(*weights.layer(f"{name}.{kind}_{one}", code_length)) for one in ("gamma", "beta")
-        )
+        self.gamma, self.beta = (_linear(weights.layer(f"{name}.{kind}_{x}", code_length)) for x in ("gamma", "beta"))
         self.register_buffer("mean", weights.take(f"{name}.bn.running_mean", -1))
         self.register_buffer("deviation", (weights.take(f"{name}.bn.running_var", -1) + 1e-5).sqrt())
         weights.left.pop(f"{name}.bn.num_batches_tracked", None)
@@ -202,7 +201,7 @@ def deepsdf(tensors: Mapping[str, Tensor], specs: Mapping[str, Any], *, squash: 
             has. Code that states `geom_dimension` has not.
     """
     network, code_length, dims = _checked(specs)
-    weights = Weights(tensors, prefix=prefix_of(tensors, f"{OUTER}(?={LAYERS})"), whose="ModelParameters")
+    weights = Weights(tensors, f"{OUTER}(?={LAYERS})", "ModelParameters")
     again, given = {}, code_length + 3
     latent_in, everywhere = network.get("latent_in") or (), bool(network.get("xyz_in_all"))
     normed = set(network.get("norm_layers") or ()) if not network.get("weight_norm") else set()
@@ -231,7 +230,7 @@ def _checked(specs: Any) -> tuple[Mapping[str, Any], int, list[int]]:
         raise BadInput(f"specs.json must have NetworkSpecs, an object, not {network!r}: take that of the training")
     numbers = {key: network.get(key) or [] for key in ("dims", "latent_in", "norm_layers")}
     numbers |= {"CodeLength": [specs.get("CodeLength")], "geom_dimension": [network.get("geom_dimension", 3)]}
-    wrong = [key for key, found in numbers.items() if not isinstance(found, list) or not all(map(_counts, found))]
+    wrong = [key for key, of in numbers.items() if type(of) is not list or any(type(n) is not int or n < 0 for n in of)]
     wrong += [] if numbers["dims"] else ["dims"]
     wrong += [key for key in ("xyz_in_all", "use_tanh", "weight_norm") if type(network.get(key) or False) is not bool]
     if wrong:
@@ -245,30 +244,25 @@ def _checked(specs: Any) -> tuple[Mapping[str, Any], int, list[int]]:
     return network, specs["CodeLength"], network["dims"]
 
 
-def _counts(found: Any) -> bool:
-    """Whether it is a whole number, 0 or more."""
-    return type(found) is int and found >= 0
-
-
 def implicit(tensors: Mapping[str, Tensor]) -> Published:
     """The network of IDR, NeuS and VolSDF: softplus layers of encoded points, of whose outputs the first is the value.
 
     Its encoding, and the layers that take it again, follow from the widths. NeuS's `scale`, which a checkpoint does not
     hold, is left out; so is VolSDF's outer sphere, which is the scene's background.
     """
-    prefix = prefix_of(tensors, rf"(?:.*\.)?{SIGNED}\.(?={LAYERS})")
-    weights = Weights(tensors, prefix=prefix, whose="the network")
+    weights = Weights(tensors, rf"(?:.*\.)?{SIGNED}\.(?={LAYERS})")
     layers: list[Layer] = []
     again: dict[int, bool] = {}
     for index in range(weights.count(LAYERS)):
         weight, bias = weights.layer(f"lin{index}")
-        if layers and weight.shape[1] != len(layers[-1][1]):
+        takes = weight.shape[1]
+        width = len(layers[-1][1]) if layers else takes
+        if takes != width:
             again[index] = True
-            joined = len(layers[-1][1]) + layers[0][0].shape[1]
-            if weight.shape[1] != joined:
+            if takes != (joined := width + layers[0][0].shape[1]):
                 raise BadInput(
-                    f"{prefix}lin{index} takes {weight.shape[1]} numbers: it must be the {len(layers[-1][1])} of "
-                    f"lin{index - 1}, or these and the input, {joined}"
+                    f"{weights.prefix}lin{index} takes {takes} numbers: it must be the {width} of lin{index - 1}, or "
+                    f"these and the input, {joined}"
                 )
         layers.append((weight, bias))
     weights.finish()
@@ -276,12 +270,12 @@ def implicit(tensors: Mapping[str, Tensor]) -> Published:
     frequencies, rest = divmod(inputs - 3, 6)
     if rest or not 0 <= frequencies <= MOST_FREQUENCIES:
         raise BadInput(
-            f"{prefix}lin0 takes {inputs} numbers: it must be 3, the point, and 6 for each of at most "
+            f"{weights.prefix}lin0 takes {inputs} numbers: it must be 3, the point, and 6 for each of at most "
             f"{MOST_FREQUENCIES} frequencies of an encoding"
         )
     layers[-1] = (layers[-1][0][:1], layers[-1][1][:1])
     body = Layered(layers, activation="softplus", again=again, frequencies=frequencies, shrink=sqrt(0.5))
-    return Published(Coded(body, code_length=0, width=max(len(bias) for _, bias in layers)), 0)
+    return Published(Coded(body, code_length=0, width=max(len(bias) for _, bias in layers)))
 
 
 def occupancy(tensors: Mapping[str, Tensor]) -> Published:
@@ -292,9 +286,7 @@ def occupancy(tensors: Mapping[str, Tensor]) -> Published:
     """
     if any("encoder.unet" in name or "encoder.fc_pos" in name for name in tensors):
         raise BadInput("it is a convolutional occupancy network, whose code differs from point to point: not read")
-    weights = Weights(
-        tensors, prefix=prefix_of(tensors, rf"(?:{OUTER}|.*\.decoder\.)(?=(?:fc|conv)_p\.)"), whose="the decoder"
-    )
+    weights = Weights(tensors, rf"(?:{OUTER}|.*\.decoder\.)(?=(?:fc|conv)_p\.)", "the decoder")
     kind = "fc" if weights.has("fc_p") else "conv"
     first = weights.layer(f"{kind}_p", 3)
     width = len(first[1])
@@ -303,11 +295,8 @@ def occupancy(tensors: Mapping[str, Tensor]) -> Published:
     names = [f"blocks.{at}" if listed else f"block{at}" for at in range(count)]
     if weights.has("fc_z") and kind == "fc":
         first = (first[0], first[1] + weights.layer("fc_z", outputs=width)[1])
-    shifts: dict[int, Layer] = {}
-    if weights.has("fc_c.0"):
-        shifts = {at: weights.layer(f"fc_c.{at}", outputs=width) for at in range(count)}
-    elif weights.has("fc_c"):
-        shifts = {0: weights.layer("fc_c", outputs=width)}
+    moved = {at: f"fc_c.{at}" for at in range(count)} if weights.has("fc_c.0") else {0: "fc_c"}
+    shifts = {at: weights.layer(name, outputs=width) for at, name in moved.items()} if weights.has("fc_c") else {}
     code_length = shifts[0][0].shape[1] if shifts else 0
     norms: list[Norm] = []
     if weights.has("bn"):
@@ -318,15 +307,15 @@ def occupancy(tensors: Mapping[str, Tensor]) -> Published:
         places = [f"{name}.bn_{at}" for name in names for at in (0, 1)]
         norms = [Norm(weights, place, code_length) for place in (*places, "bn")]
         if weights.has("fc_z"):
-            moved = weights.layer("fc_z", outputs=code_length)[1]
+            latent = weights.layer("fc_z", outputs=code_length)[1]
             with torch.no_grad():
                 for layer in (one for norm in norms for one in (norm.gamma, norm.beta)):
-                    layer.bias.copy_(layer(moved))
+                    layer.bias.copy_(layer(latent))
     blocks = [(weights.layer(f"{name}.fc_0", width), weights.layer(f"{name}.fc_1", outputs=width)) for name in names]
     last = weights.layer(f"{kind}_out", width)
     weights.finish()
     body = Residual(first, blocks, last, shifts=shifts, norms=norms)
-    return Published(Coded(body, code_length=code_length, width=width), 0)
+    return Published(Coded(body, code_length=code_length, width=width))
 
 
 def plain(tensors: Mapping[str, Tensor]) -> Published:
@@ -346,7 +335,7 @@ def plain(tensors: Mapping[str, Tensor]) -> Published:
     shape = "".join("act " if kind in activations else f"{kind} " for kind in kinds)
     if len(activations) != 1 or re.fullmatch(r"(dense act )+dense (squeeze_last )?", shape) is None:
         raise BadInput(f"the network must be dense layers with one activation between them, not {', '.join(kinds)}")
-    weights, layers = Weights(tensors, whose="the network"), []
+    weights, layers = Weights(tensors), []
     for name in operations:
         if name.endswith("dense"):
             weight = weights.take(f"{name}.A", len(layers[-1][1]) if layers else 3, -1).T
@@ -357,31 +346,15 @@ def plain(tensors: Mapping[str, Tensor]) -> Published:
     if len(layers[-1][1]) != 1:
         raise BadInput(f"the network's last layer must give 1 number, not {len(layers[-1][1])}")
     if activations == {"relu"}:
-        return Published(Decoder.of(layers, code_length=0, skip=0), 0)
+        return Published(Decoder.of(layers, code_length=0, skip=0))
     body = Layered(layers, activation=activations.pop())
-    return Published(Coded(body, code_length=0, width=max(len(bias) for _, bias in layers)), 0)
+    return Published(Coded(body, code_length=0, width=max(len(bias) for _, bias in layers)))
 
 
-def prefix_of(tensors: Mapping[str, Tensor], *patterns: str) -> str:
-    """What stands before the names of layers, such as `module.`, up to the end of the first pattern that a name fits.
-
-    Raises:
-        BadInput: where no name fits.
-    """
-    for pattern in patterns:
-        for name in tensors:
-            if found := re.match(pattern, name):
-                return found[0]
-    raise BadInput(f"it has no layers of this format: it has {', '.join([*tensors][:6]) or 'no tensors'}")
+def _linear(values: Layer) -> nn.Linear:
+    return _of(nn.Linear(values[0].shape[1], len(values[0])), values)
 
 
-def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    layer = nn.Linear(weight.shape[1], len(weight))
-    layer.weight, layer.bias = nn.Parameter(weight), nn.Parameter(bias)
-    return layer
-
-
-def _norm(weight: Tensor, bias: Tensor) -> nn.LayerNorm:
-    layer = nn.LayerNorm(len(weight))
-    layer.weight, layer.bias = nn.Parameter(weight), nn.Parameter(bias)
+def _of(layer: Any, values: Layer) -> Any:
+    layer.weight, layer.bias = map(nn.Parameter, values)
     return layer
