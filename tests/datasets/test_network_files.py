@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from torch import Tensor
 
-from bench.config import CONF, load, register
+from bench.config import load
 from bench.run.command import with_network
 from bench.setup.inputs import RunInputs
 from datasets.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
-from renderers.field import Kind, points_in_sphere
+from renderers.field import Field, Kind, points_in_sphere
 from renderers.fields.network import from_module, measured
+from tests.composing import composed
 from tests.documentation import code_of
 from tests.looped import each
 from tests.renderers.test_published import CODE, occupancy
@@ -69,13 +69,10 @@ def checkpoint(folder: Path, state: Any, name: str = "shape.pth") -> NetworkFile
 
 def deepsdf_folder(folder: Path, codes: Any, dtype: torch.dtype = torch.float32) -> NetworkFile:
     """A DeepSDF folder whose code is added to the octahedron's values."""
-    weight = torch.cat([torch.tensor([[1.0], [-1.0]]).repeat(3, 1), torch.zeros(6, 3)], dim=1)
-    weight[:, 1:] = torch.tensor(arrays()["0000.dense.A"]).T
-    ends = torch.zeros(2, 4)  # of the code alone: relu(c) - relu(-c)
-    ends[:, 0] = torch.tensor([1.0, -1.0])
-    weight[:, 0] = 0.0
-    last = torch.cat([torch.full((1, 6), 1 / np.sqrt(3)), torch.tensor([[1.0, -1.0]])], dim=1)
-    state = {"module.lin0.weight": torch.cat([weight, ends]), "module.lin0.bias": torch.zeros(8)}
+    ends = torch.tensor([[1.0, -1.0]])  # of the code alone: relu(c) - relu(-c)
+    weight = torch.block_diag(ends.T, torch.tensor(arrays()["0000.dense.A"]).T)
+    last = torch.cat([ends, torch.full((1, 6), 1 / np.sqrt(3))], dim=1)
+    state = {"module.lin0.weight": weight, "module.lin0.bias": torch.zeros(8)}
     state |= {"module.lin1.weight": last.float(), "module.lin1.bias": torch.tensor([-RADIUS])}
     specs = {"NetworkSpecs": {"dims": [8], "geom_dimension": 3, "weight_norm": False}, "CodeLength": 1}
     stored = {"model_state_dict": {name: value.to(dtype) for name, value in state.items()}, "epoch": 3}
@@ -86,12 +83,20 @@ def deepsdf_folder(folder: Path, codes: Any, dtype: torch.dtype = torch.float32)
     return load("dataset", "network", path=str(folder))
 
 
+def field_of(file: NetworkFile, index: int = 0) -> Field:
+    known = file.network(index)
+    return known.decoder.at(known.codes[index])
+
+
+def near(found: Tensor, expected: Tensor, most: float = 1e-6) -> None:
+    torch.testing.assert_close(found, expected, rtol=0, atol=most)
+
+
 def test_a_distance_is_found_to_be_one_and_its_values_stay(tmp_path):
     file = npz(tmp_path, arrays())
-    known = file.network(0)
-    field = known.decoder.at(known.codes[0])
+    known, field = file.network(0), field_of(file)
     assert (field.kind, field.lipschitz) == (Kind.DISTANCE, None)
-    torch.testing.assert_close(field(POINTS), octahedron(POINTS), rtol=0, atol=1e-6)
+    near(field(POINTS), octahedron(POINTS))
     facts = known.facts
     assert facts.leaves == 0 and 0.99 < facts.flattest <= facts.steepest < 1.01
     assert facts.inside == pytest.approx(2 * 3**0.5 * RADIUS**3 * 2 / (4 / 3 * np.pi), abs=0.02)
@@ -108,21 +113,19 @@ def test_a_distance_is_found_to_be_one_and_its_values_stay(tmp_path):
     (-0.4, 0.4, "positive", Kind.BOUND, 0.48),
 ])  # fmt: skip
 def test_sign_level_and_slope_are_measured(tmp_path, factor, level, inside, kind, divided):
-    file = npz(tmp_path, arrays(factor, level))
-    file = replace(file, level=level)
-    known = file.network(0)
-    field = known.decoder.at(known.codes[0])
-    assert field.kind is kind and f"values are {inside} inside" in known.notes[0]
-    torch.testing.assert_close(field(POINTS) * divided, abs(factor) * octahedron(POINTS), rtol=0, atol=1e-4)
+    file = replace(npz(tmp_path, arrays(factor, level)), level=level)
+    field = field_of(file)
+    assert field.kind is kind and f"values are {inside} inside" in file.network(0).notes[0]
+    near(field(POINTS) * divided, abs(factor) * octahedron(POINTS), 1e-4)
 
 
 def test_values_between_0_and_1_are_probabilities_only_where_that_is_said(tmp_path):
     file = npz(tmp_path, arrays(0.2, 0.3))  # from 0.2 to 0.3 and a little
     with pytest.raises(BadInput, match=r"level 0 is not among them: set dataset.level \(0.5 where they are prob"):
         file.network(0)
-    known = replace(file, level=0.3).network(0)
-    values = known.decoder.at(known.codes[0])(POINTS)
-    assert torch.equal(values < 0, octahedron(POINTS) < 0) and "at the level 0.3" in known.notes[0]
+    file = replace(file, level=0.3)
+    assert torch.equal(field_of(file)(POINTS) < 0, octahedron(POINTS) < 0)
+    assert "at the level 0.3" in file.network(0).notes[0]
 
 
 def test_a_network_of_a_code_is_not_read_without_one_and_its_level_is_told(tmp_path):
@@ -135,20 +138,16 @@ def test_a_network_of_a_code_is_not_read_without_one_and_its_level_is_told(tmp_p
     with pytest.raises(BadInput, match=r"a code of 2 numbers, which it does not hold: set dataset.codes=FILE"):
         file.network(0)
     np.save(path, CODE.numpy()[None])
-    note = replace(file, codes=str(path)).network(0).notes[0]
-    assert "level 0 of the logits, a probability of 0.5 (" in note and "dataset.level=-1.386" in note
-    assert (
-        "level -1.386 of the logits, a probability of 0.2 ("
-        in replace(file, codes=str(path), level=-1.386).network(0).notes[0]
-    )
+    for level, probability in ((0.0, 0.5), (-1.386, 0.2)):
+        note = replace(file, codes=str(path), level=level).network(0).notes[0]
+        assert f"level {level:g} of the logits, a probability of {probability} (" in note
+        assert "dataset.level=-1.386" in note
 
 
 def test_what_is_said_of_a_network_goes_before_what_is_measured(tmp_path):
-    file = replace(npz(tmp_path, arrays(20.0)), kind="level", inside="positive", scale=0.5)
-    known = file.network(0)
-    field = known.decoder.at(known.codes[0])
+    field = field_of(replace(npz(tmp_path, arrays(20.0)), kind="level", inside="positive", scale=0.5))
     assert field.kind is Kind.LEVEL
-    torch.testing.assert_close(field(0.5 * POINTS), -10 * octahedron(POINTS), rtol=0, atol=1e-4)
+    near(field(0.5 * POINTS), -10 * octahedron(POINTS), 1e-4)
 
 
 def test_the_surface_is_the_true_mesh_closed_where_it_leaves_the_sphere(tmp_path):
@@ -168,18 +167,14 @@ def test_the_surface_is_the_true_mesh_closed_where_it_leaves_the_sphere(tmp_path
 def test_a_deepsdf_folder_has_a_shape_for_each_code(tmp_path_factory, codes):
     file = deepsdf_folder(tmp_path_factory.mktemp("folder"), codes)
     for index, code in enumerate((0.1, -0.2)):
-        known = file.network(index)
-        values = known.decoder.at(known.codes[index])(POINTS)
-        torch.testing.assert_close(values, octahedron(POINTS) + code, rtol=0, atol=1e-6)
+        near(field_of(file, index)(POINTS), octahedron(POINTS) + code)
     with pytest.raises(BadInput, match="it has 2 codes, and index=2 is none of them: set index=0 to 1"):
         file.network(2)
 
 
 def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
     codes = torch.tensor([[0.1], [-0.2], [-0.45]])  # the last reaches through most of the unit sphere
-    known = deepsdf_folder(tmp_path, codes).network(2)
-    values = known.decoder.at(known.codes[2])(POINTS)
-    torch.testing.assert_close(values, octahedron(POINTS) - 0.45, rtol=0, atol=1e-6)
+    near(field_of(deepsdf_folder(tmp_path, codes), 2)(POINTS), octahedron(POINTS) - 0.45)
     bound = measured(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
     assert bound.divisor == pytest.approx(3 * measured(octahedron, POINTS, kind=Kind.BOUND).divisor)
 
@@ -187,10 +182,9 @@ def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
 def test_half_floats_are_converted_and_other_codes_are_read(tmp_path):
     file = deepsdf_folder(tmp_path, torch.zeros(1, 1), torch.float16)
     np.save(tmp_path / "mine.npy", np.array([[0.0], [0.125]]))
-    known = replace(file, codes=str(tmp_path / "mine.npy")).network(1)
-    values = known.decoder.at(known.codes[1])(POINTS)
+    values = field_of(replace(file, codes=str(tmp_path / "mine.npy")), 1)(POINTS)
     assert values.dtype == torch.float32
-    torch.testing.assert_close(values, octahedron(POINTS) + 0.125, rtol=0, atol=1e-3)
+    near(values, octahedron(POINTS) + 0.125, 1e-3)
 
 
 def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):
@@ -216,14 +210,21 @@ def scripted(folder: Path) -> NetworkFile:
     return load("dataset", "network", path=str(folder / "shape.pt"))
 
 
-def text(folder: Path, content: str) -> NetworkFile:
-    (folder / "shape.obj").write_text(content)
+def holding(folder: Path, content: bytes) -> NetworkFile:
+    (folder / "shape.obj").write_bytes(content)
     return load("dataset", "network", path=str(folder / "shape.obj"))
 
 
-def cut(path: str) -> None:
-    content = Path(path).read_bytes()
-    Path(path).write_bytes(content[: len(content) // 2])
+def cut(file: NetworkFile) -> NetworkFile:
+    content = Path(file.path).read_bytes()
+    Path(file.path).write_bytes(content[: len(content) // 2])
+    return file
+
+
+def lacking(folder: Path, name: str) -> NetworkFile:
+    file = deepsdf_folder(folder, torch.zeros(1, 1))
+    (folder / name).unlink()
+    return file
 
 
 @each("make, words", [
@@ -232,8 +233,13 @@ def cut(path: str) -> None:
     (lambda d: checkpoint(d, {"module.lin0.bias": torch.ones(2)}), ("DeepSDF (name the folder with its specs.json)",)),
     (lambda d: scripted(d), ("TorchScript, a program, which is not run: save its state_dict()",)),
     (lambda d: checkpoint(d, {"epoch": 3}), ("no format that is read", "by field._target_=PACKAGE.CLASS", "no ten")),
-    (lambda d: text(d, "v 0 0 0"), ("shape.obj is no network file, or is broken: name a checkpoint",)),
-    (lambda d: text(d, "a mesh"), ("shape.obj is no network file",)),  # "a" is an instruction of pickle
+    (lambda d: holding(d, b"v 0 0 0"), ("shape.obj is no network file, or is broken: name a checkpoint",)),
+    (lambda d: holding(d, b"a mesh"), ("shape.obj is no network file",)),  # "a" is an instruction of pickle
+    (lambda d: holding(d, pickle.dumps(Command(), protocol=2)), ("not run",)),
+    (lambda d: cut(npz(d, arrays())), ("npz: it cannot be read",)),
+    (lambda d: cut(checkpoint(d, {"x": torch.ones(9999)})), ("cannot be read: it may be cut short, copy it again",)),
+    (lambda d: lacking(d, "specs.json"), ("the folder has no specs.json",)),
+    (lambda d: lacking(d, "ModelParameters/latest.pth"), ("the folder has no ModelParameters/latest.pth",)),
     (lambda d: npz(d, arrays() | {"0001.relu._": np.array([object()])}), ("cannot be read", "allow_pickle")),
     (lambda d: npz(d, arrays(level=9.0)), ("between 8.5", "and the surface at the level 0", "dataset.level")),
     (lambda d: npz(d, arrays() | {"0002.dense.b": np.array([np.nan])}), ("not finite at 16384 of 16384",)),
@@ -249,37 +255,6 @@ def test_a_file_that_will_not_do_is_refused_with_the_cause(tmp_path_factory, mon
     assert not (folder / "was_run").exists()
 
 
-@each("make", [lambda d: npz(d, arrays()), lambda d: checkpoint(d, {"lin0.weight": torch.ones(99, 99)})])
-def test_a_truncated_file_is_refused(tmp_path_factory, make):
-    file = make(tmp_path_factory.mktemp("cut"))
-    cut(file.path)
-    with pytest.raises(
-        BadInput, match=r"npz: it cannot be read|pth cannot be read: it may be cut short, copy it again$"
-    ):
-        file.network(0)
-
-
-def test_an_old_pickle_that_would_run_a_command_does_not(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "shape.pth").write_bytes(pickle.dumps(Command(), protocol=2))
-    with pytest.raises(BadInput, match="not run"):
-        load("dataset", "network", path="shape.pth").network(0)
-    assert not (tmp_path / "was_run").exists()
-
-
-@each("lost, words", [
-    ("specs.json", ("the folder has no specs.json",)),
-    ("ModelParameters/latest.pth", ("the folder has no ModelParameters/latest.pth",)),
-])  # fmt: skip
-def test_a_folder_that_lacks_a_file_is_refused(tmp_path_factory, lost, words):
-    folder = tmp_path_factory.mktemp("folder")
-    file = deepsdf_folder(folder, torch.zeros(1, 1))
-    (folder / lost).unlink()
-    with pytest.raises(BadInput) as error:
-        file.network(0)
-    assert all(word in str(error.value) for word in words)
-
-
 @each("settings, words", [
     ({"path": "nowhere.npz"}, "there is nothing at 'nowhere.npz'"),
     ({"scale": 0.0}, "dataset.scale must be positive"),
@@ -292,10 +267,10 @@ def test_settings_are_checked(tmp_path_factory, settings, words):
         replace(file, **settings)
 
 
-RENDERERS = ("dist", "dvr", "idr", "mesh_proxy", "naive", "neus", "newton", "range_analysis", "unisurf", "volsdf")
-
-
-@each("name", [*RENDERERS, "relaxed_boundary"])
+@each("name", (
+    "dist", "dvr", "idr", "mesh_proxy", "naive", "neus", "newton", "range_analysis", "relaxed_boundary", "unisurf",
+    "volsdf",
+))  # fmt: skip
 def test_every_renderer_takes_a_plain_module_of_the_users(name):
     class Ball(torch.nn.Module):
         def forward(self, points: Tensor) -> Tensor:
@@ -346,9 +321,7 @@ def test_half_of_the_two_is_refused(given, words):
 
 
 def composed_inputs(*overrides: str) -> RunInputs:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        register()
-        return cell_from(compose("config", [*overrides, "scale=smoke"])).inputs
+    return cell_from(composed(*overrides, "scale=smoke")).inputs
 
 
 def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
@@ -356,16 +329,14 @@ def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
     inputs = composed_inputs("task=ablation", "dataset=network", f"dataset.path={file.path}", "index=1")
     fitted = inputs.fitted()
     assert len(inputs.prior.codes) == 2 and inputs.notes[-1] == file.network(1).notes[0]
-    values = fitted.decoder.at(fitted.codes[0])(POINTS)
-    torch.testing.assert_close(values, octahedron(POINTS) - 0.2, rtol=0, atol=1e-6)
+    near(fitted.decoder.at(fitted.codes[0])(POINTS), octahedron(POINTS) - 0.2)
 
 
 def test_its_codes_are_the_prior_of_another_dataset(tmp_path):
     file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
     inputs = composed_inputs("dataset=sphere", "prior=deepsdf", f"prior.path={file.path}", "split=train")
     assert inputs.prior.codes.tolist() == file.network(0).codes.tolist() and inputs.trained is None
-    values = inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS)
-    torch.testing.assert_close(values, octahedron(POINTS) + 0.3, rtol=0, atol=1e-6)
+    near(inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS), octahedron(POINTS) + 0.3)
 
 
 @each("wrong, words", [
@@ -386,14 +357,15 @@ def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkey
     torch.save({"model": {f"net.inner.{key}": value for key, value in state.items()}, "step": 3}, tmp_path / "a.pth")
     given = with_network(["field=file", f"field_path={tmp_path}/a.pth", "field._target_=mynet.Net", "field.scale=2"])
     inputs = composed_inputs(*given, "task=ablation", "packages=[mynet]")
-    field = inputs.prior.decoder.at(inputs.prior.codes[0])
-    torch.testing.assert_close(field(POINTS), POINTS @ state["weight"][0] + 0.25, rtol=0, atol=1e-6)
-    torch.save({f"{of}.inner.{key}": value for of in "ab" for key, value in state.items()}, tmp_path / "c.pth")
-    with pytest.raises(BadInput, match=r"it has several networks, a\., b\.: save the state_dict"):
-        composed_inputs(*(text.replace("a.pth", "c.pth") for text in given), "task=ablation", "packages=[mynet]")
-    torch.save({"net.inner.bias": state["bias"]}, tmp_path / "b.pth")
-    with pytest.raises(BadInput, match=r"not those of Net: .* Missing key.*inner\.weight"):
-        composed_inputs(*(text.replace("a.pth", "b.pth") for text in given), "task=ablation", "packages=[mynet]")
+    near(inputs.prior.decoder.at(inputs.prior.codes[0])(POINTS), POINTS @ state["weight"][0] + 0.25)
+    several = {f"{of}.inner.{key}": value for of in "ab" for key, value in state.items()}
+    for wrong, words in (
+        (several, r"it has several networks, a\., b\.: save the state_dict"),
+        ({"net.inner.bias": state["bias"]}, r"not those of Net: .* Missing key.*inner\.weight"),
+    ):
+        torch.save(wrong, tmp_path / "a.pth")
+        with pytest.raises(BadInput, match=words):
+            composed_inputs(*given, "task=ablation", "packages=[mynet]")
     with pytest.raises(ValueError, match=r"type packages=\[mynet\] if you trust it"):
         composed_inputs(*given, "task=ablation")
 

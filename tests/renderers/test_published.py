@@ -12,7 +12,6 @@ from renderers.checks import BadInput
 from renderers.field import bounds_of, coarse_of, points_in_sphere
 from renderers.fields import published
 from renderers.fields.mlp import BoundDecoder
-from renderers.fields.network import Published
 from tests.looped import each
 
 POINTS = points_in_sphere(64, torch.zeros(()))
@@ -200,15 +199,6 @@ def test_a_plain_network_has_the_values_of_its_operations(activation):
     field = published.plain(state).at(torch.zeros(3))
     torch.testing.assert_close(field(POINTS), values, rtol=0, atol=1e-6)
     assert isinstance(field.inner, BoundDecoder) == (activation == "relu")
-
-
-@each("make", [lambda: published.plain(plain("relu")[0]), lambda: published.plain(plain("elu")[0])])
-def test_without_a_code_the_code_is_the_place_of_the_shape(make):
-    torch.manual_seed(0)
-    network: Published = make()
-    place = torch.tensor([0.1, -0.2, 0.3])
-    there, here = network.at(place)(POINTS + place), network.at(torch.zeros(3))(POINTS)
-    torch.testing.assert_close(there, here, rtol=0, atol=1e-6)
 
 
 def without(state: State, key: str) -> State:
