@@ -91,11 +91,6 @@ class Judge:
         if not re.fullmatch(r"[\d.eE+-]+%?", self.threshold) or not float(self.threshold.rstrip("%")) > 0:
             raise ValueError(f"--threshold must be a positive number, or one with %, found {self.threshold}: 1%")
 
-    @property
-    def worst(self) -> dict[str, float]:
-        """The metrics of what is no mesh."""
-        return WORST_SURFACE if self.folder is None else dtu.WORST
-
     def verdict(self, item: Item) -> Verdict:
         """Judges a mesh.
 
@@ -141,9 +136,8 @@ class Judge:
             places = (places - centre) * factor
         extent = float(np.linalg.norm(np.ptp(places, axis=0)))
         threshold = float(self.threshold.rstrip("%")) * (extent / 100 if self.threshold.endswith("%") else 1)
-        notes.append(
-            f"{self.points} points of each; F at {threshold:.4g}, {threshold / extent:.2%} of the truth's extent"
-        )
+        at = f"{threshold:.4g}, {threshold / extent:.2%} of the truth's extent"
+        notes.append(f"{self.points} points of each; F at {at}")
         found = sample_surface(mesh, self.points, self.seed + 1)
         if surface is None:
             metrics = cloud_metrics(found, drawn(places, self.points, self.seed), threshold=threshold)
@@ -175,21 +169,17 @@ def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
     name = mesh.stem
     if (mesh / "record.json").is_file():
         name, mesh = mesh.name, mesh / (WORLD if (mesh / WORLD).is_file() else "mesh.ply")
-    if mesh.is_dir():
-        meshes = {file.stem: file for file in find_meshes(mesh)}
-        if truth is None:
-            return [Item(name, file, scan_number(name) if scan is None else scan) for name, file in meshes.items()]
-        if not truth.is_dir():
-            raise ValueError(f"{mesh} is a folder and --truth {truth} is none: give a folder with files of equal names")
-        truths = {file.stem: file for file in find_meshes(truth)}
-        if unknown := sorted(meshes.keys() - truths.keys()):
-            raise ValueError(f"{meshes[unknown[0]]} has no truth: name it as a file of {truth}, such as {min(truths)}")
-        return [Item(name, meshes.get(name), file) for name, file in truths.items()]
+    meshes = {file.stem: file for file in find_meshes(mesh)} if mesh.is_dir() else {name: mesh}
     if truth is None:
-        return [Item(name, mesh, scan_number(mesh.stem) if scan is None else scan)]
-    if truth.is_dir():
+        return [Item(name, file, scan_number(file.stem) if scan is None else scan) for name, file in meshes.items()]
+    if mesh.is_dir() and not truth.is_dir():
+        raise ValueError(f"{mesh} is a folder and --truth {truth} is none: give a folder with files of equal names")
+    if truth.is_dir() and not mesh.is_dir():
         raise ValueError(f"--truth {truth} is a folder, and {mesh} is one mesh: name the file")
-    return [Item(name, mesh, truth)]
+    truths = {file.stem: file for file in find_meshes(truth)} if truth.is_dir() else {name: truth}
+    if unknown := sorted(meshes.keys() - truths.keys()):
+        raise ValueError(f"{meshes[unknown[0]]} has no truth: name it as a file of {truth}, such as {min(truths)}")
+    return [Item(name, meshes.get(name), file) for name, file in truths.items()]
 
 
 def units(judge: Judge) -> dict[str, str]:
@@ -263,7 +253,7 @@ def parsed(arguments: list[str] | None) -> argparse.Namespace:
     truth.add_argument("--truth", type=Path, help="the true mesh, or points on it; a folder where MESH is one")
     truth.add_argument("--dtu", type=Path, metavar="FOLDER", help="DTU's, with Points/stl and ObsMask")
     parser.add_argument("--scan", type=int, help="of DTU (default: the number in the mesh's name)")
-    threshold = "of F, in units or per cent of the truth's extent (default: %(default)s)".replace("per cent", "%%")
+    threshold = "of F, in units or %% of the truth's extent (default: %(default)s)"
     parser.add_argument("--threshold", default=THRESHOLD, help=threshold)
     parser.add_argument("--points", type=int, default=POINTS, help="sampled on each surface (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the samples (default: %(default)s)")
@@ -296,7 +286,8 @@ def main(arguments: list[str] | None = None) -> int:
             except (OSError, ValueError) as error:
                 if len(items) == 1:
                     raise
-                verdicts.append(Verdict(item.name, dict(judge.worst), failure=" ".join(str(error).split())))
+                worst = WORST_SURFACE if given.dtu is None else dtu.WORST
+                verdicts.append(Verdict(item.name, dict(worst), failure=" ".join(str(error).split())))
         show(verdicts, units(judge))
         if given.into is not None:
             check_links(given.into)

@@ -170,9 +170,8 @@ def _field(tree: Any, tensors: dict[str, Tensor]) -> Field:
         if shape != (2,) or not isinstance(field.kind, Kind):
             raise BadInput("it is no field")
     except (TypeError, KeyError, ValueError, AttributeError, RuntimeError, IndexError, StopIteration) as error:
-        if isinstance(error, BadInput):
-            raise BadInput(f"{FIELD} cannot be used: {error}") from error
-        raise BadInput(f"{FIELD} cannot be used, its parts do not fit: {' '.join(str(error).split())[:160]}") from error
+        cause = "" if isinstance(error, BadInput) else ", its parts do not fit"
+        raise BadInput(f"{FIELD} cannot be used{cause}: {' '.join(str(error).split())[:160]}") from error
     return cast(Field, field)
 
 

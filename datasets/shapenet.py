@@ -28,7 +28,6 @@ SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
 NAMES = {number: name for name, number in SYNSETS.items()}
 MESHES = ("models/model_normalized.obj", "model.obj")  # of v2 and of v1, in the folder of a shape
 WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"}  # in the names of lists
-NORMALISED = ("deepsdf", "onet")
 BUFFER = 1.03  # of DeepSDF: the unit sphere is so many times as large as the shape
 UNKNOWN = "warning: the file does not say what is inside: here it is what the wrap encloses; DeepSDF drops such shapes"
 
@@ -55,7 +54,7 @@ class ShapeNet:
     renders: str | None = None
 
     def __post_init__(self) -> None:
-        check_choice("dataset.normalised", self.normalised, NORMALISED)
+        check_choice("dataset.normalised", self.normalised, ("deepsdf", "onet"))
         if not self.synset.isdigit():
             check_choice("dataset.synset", self.synset, tuple(SYNSETS))
         _ = self.files  # raises where something is missing

@@ -43,7 +43,6 @@ DEFINITIONS = {
     "dtu_overall": "Mean of dtu_accuracy and dtu_completeness, the Chamfer distance of tables on DTU, in mm.",
 }
 WORST = dict.fromkeys(NAMES, inf)
-_SCANS = ", ".join(map(str, DVR_SCANS))
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,6 @@ class DtuScan:
     """What a mesh of a scan is judged by, in the world of DTU's cameras, in mm.
 
     Args:
-        number: of the scan.
         points: of the structured light scanner.
         plane: a, b, c, d of the table; points above it have a x + b y + c z + d > 0.
         observed: cells of a grid that the scanner saw.
@@ -59,7 +57,6 @@ class DtuScan:
         spacing: of the grid.
     """
 
-    number: int
     points: Float[np.ndarray, "n 3"]
     plane: Float[np.ndarray, "4"]
     observed: Bool[np.ndarray, "x y z"]
@@ -109,13 +106,14 @@ def read_scan(folder: Path, number: int) -> DtuScan:
             f"found {shapes}: copy them again"
         )
     corners = box.astype(np.float32).astype(np.float64)
-    return DtuScan(number, points, level.ravel().astype(float), observed > 0, corners, float(spacing.ravel()[0]))
+    return DtuScan(points, level.ravel().astype(float), observed > 0, corners, float(spacing.ravel()[0]))
 
 
 def published(number: int) -> list[str]:
     """What DVR's Table 2 has, in words, where it has the scan."""
     rows = "; ".join(f"{name}: {values[-1]:.3f}" for name, values in DVR_TABLE2.items())
-    told = f"published, DVR, Table 2, dtu_overall in mm, mean of scans {_SCANS}: {rows}"
+    scans = ", ".join(map(str, DVR_SCANS))
+    told = f"published, DVR, Table 2, dtu_overall in mm, mean of scans {scans}: {rows}"
     return [told] if number in DVR_SCANS else []
 
 
