@@ -246,9 +246,7 @@ def write_row(verdict: Verdict, item: Item, place: int, judge: Judge, given: arg
 def parsed(arguments: list[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.judge", description=__doc__)
-    parser.add_argument(
-        "mesh", type=Path, metavar="MESH", help="a mesh file with faces, a run folder, or a folder of these"
-    )
+    parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh with faces, a run folder, or a folder of these")
     truth = parser.add_mutually_exclusive_group(required=True)
     truth.add_argument("--truth", type=Path, help="the true mesh, or points on it; a folder where MESH is one")
     truth.add_argument("--dtu", type=Path, metavar="FOLDER", help="DTU's, with Points/stl and ObsMask")

@@ -51,9 +51,8 @@ def main(arguments: Sequence[str]) -> int:
         if given.rerun < 0:
             raise ValueError(f"--rerun must be 0 or more, not {given.rerun}")
         folders = [folder for path in given.runs for folder in _folders(path)]
-        agree = [_told(folder, "from its field", _from_field, SAME) for folder in folders]
-        for folder in random.sample(folders, min(given.rerun, len(folders))):
-            agree.append(_told(folder, "run again", _from_rerun, AGREE))
+        agree = [_told(folder) for folder in folders]
+        agree += [_told(folder, rerun=True) for folder in random.sample(folders, min(given.rerun, len(folders)))]
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -75,11 +74,12 @@ def _folders(path: Path) -> list[Path]:
     return found
 
 
-def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
+def _told(folder: Path, *, rerun: bool = False) -> bool | None:
     """Whether the metrics of a run, computed once more, are those of its record; prints a line about it.
 
     None where there is nothing to compare.
     """
+    how, compute, most = ("run again", _from_rerun, AGREE) if rerun else ("from its field", _from_field, SAME)
     try:
         if link := link_out(folder, folder.parent):
             raise BadInput(f"{link} is a link out of the folder")
@@ -91,7 +91,6 @@ def _told(folder: Path, how: str, compute: Any, most: float) -> bool | None:
     except (ValueError, OSError) as error:
         print(f"not compared: {folder.name}, {how}: {error}")
         return False
-    rerun = compute is _from_rerun
     numbers, again = _numbers(_whole(vars(record)) if rerun else record.metrics), _numbers(found)
     if not again:
         print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")

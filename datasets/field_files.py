@@ -42,18 +42,14 @@ PRIVATE = ("_size",)  # the one attribute with an underscore that a module of th
 WIDTH = 256  # neurons of which a pass through a field of any class is thought
 
 
-class Unstored(Exception):
-    """A field cannot be stored; the message says why."""
-
-
 def save_field(field: Field, path: Path) -> str | None:
     """Writes a field; gives a note, and writes nothing, where it has a class that is not ours or is too large."""
     tensors: dict[str, Tensor] = {}
     try:
         tree = _plain(field, tensors)
         if (size := sum(one.nbytes for one in tensors.values())) > MOST:
-            raise Unstored(f"it has {size / 1e6:.0f} MB, and {MOST / 1e6:.0f} MB are the most")
-    except Unstored as error:
+            raise BadInput(f"it has {size / 1e6:.0f} MB, and {MOST / 1e6:.0f} MB are the most")
+    except BadInput as error:
         return f"the run leaves no {FIELD}: {error}"
     path.write_bytes(save(tensors, {"version": VERSION, "kind": field.kind.value, "field": json.dumps(tree)}))
     return None
@@ -100,7 +96,7 @@ def _plain(value: Any, tensors: dict[str, Tensor]) -> Any:
     """A value as JSON has it; its tensors are added to `tensors`, by numbers.
 
     Raises:
-        Unstored: for an object of another class.
+        BadInput: for an object of another class.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -116,7 +112,7 @@ def _plain(value: Any, tensors: dict[str, Tensor]) -> Any:
         return {"pairs": [[key, _plain(one, tensors)] for key, one in value.items()]}
     name = type(value).__name__
     if CLASSES.get(name) is not type(value):
-        raise Unstored(f"{type(value).__module__}.{type(value).__qualname__} is no class that is stored")
+        raise BadInput(f"{type(value).__module__}.{type(value).__qualname__} is no class that is stored")
     if is_dataclass(value):
         return {"class": name, "has": {one.name: _plain(getattr(value, one.name), tensors) for one in fields(value)}}
     states = {state: _plain(dict(vars(value)[state]), tensors) for state in STATES}

@@ -212,9 +212,8 @@ def deepsdf_with(state: Any, **changed: Any) -> Any:
 
 
 def implicit_with(changed: State) -> Any:
-    return published.implicit(
-        implicit("sdf_network.", 0, directly)[0] | {f"sdf_network.{key}": one for key, one in changed.items()}
-    )
+    state = implicit("sdf_network.", 0, directly)[0]
+    return published.implicit(state | {f"sdf_network.{key}": one for key, one in changed.items()})
 
 
 def cbn_with(state: Any) -> Any:
@@ -230,8 +229,7 @@ def plain_with(state: Any) -> Any:
     (lambda: deepsdf_with(lambda s: s | {"lin1.weight_v": drawn(9, 16)}), ("lin1.weight_v must be 7 x 16", "9 x 16")),
     (lambda: deepsdf_with(lambda s: s | {"lin9.bias": drawn(2)}), ("weights of another network: lin9.bias",)),
     (lambda: deepsdf_with(lambda s: s, geom_dimension=2), ("points of 2 numbers",)),
-    (lambda: deepsdf_with(lambda s: s, dims="16"), ("dims '16'", "lists of whole numbers")),
-    (lambda: deepsdf_with(lambda s: s, latent_in=2), ("latent_in 2",)),
+    (lambda: deepsdf_with(lambda s: s, dims="16", latent_in=2), ("dims '16', latent_in 2: dims", "of whole numbers")),
     (lambda: deepsdf_with(lambda s: s, norm_layers=[0, "1"]), ("norm_layers [0, '1']",)),
     (lambda: deepsdf_with(lambda s: s, use_tanh="false"), ("use_tanh 'false'", "true or false")),
     (lambda: published.deepsdf({}, {"NetworkSpecs": SPECS, "CodeLength": "2"}), ("CodeLength '2'",)),
