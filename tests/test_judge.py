@@ -44,6 +44,10 @@ def refused(capsys, *arguments) -> str:
     return error
 
 
+def pair(files: Path, name: str) -> tuple:
+    return files / f"found/{name}.ply", "--truth", files / f"truth/{name}.ply", *FEW
+
+
 def plate(height: float) -> Mesh:
     corners = np.array([[0.0, 0, height], [10, 0, height], [10, 10, height], [0, 10, height]])
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
@@ -63,7 +67,7 @@ def files(tmp_path) -> Path:
 def test_spheres_and_plates_are_as_far_apart_as_they_were_made(files, capsys):
     # A point's nearest one lies beside its nearest place, by about half the spacing of 4,000 points: 0.06 of 4 pi 2^2.
     for name, apart, beside in (("small", 0.2, 0.06), ("plate", 1.0, 0.08)):
-        found = judged(capsys, files / f"found/{name}.ply", "--truth", files / f"truth/{name}.ply", *FEW)[name]
+        found = judged(capsys, *pair(files, name))[name]
         most = (apart**2 + 2 * beside**2) ** 0.5
         for metric in ("accuracy", "completeness", "chamfer_l1"):
             assert 0.99 * apart < found[metric] < most
@@ -72,15 +76,12 @@ def test_spheres_and_plates_are_as_far_apart_as_they_were_made(files, capsys):
 
 
 def test_the_threshold_is_in_units_or_per_cent_of_the_truths_extent(files, capsys):
-    pair = (files / "found/plate.ply", "--truth", files / "truth/plate.ply", *FEW, "--threshold")
-    assert judged(capsys, *pair, "0.999")["plate"]["fscore"] == 0  # no point is nearer than 1
-    assert judged(capsys, *pair, "1.1")["plate"]["fscore"] > 0.99
-    some, same = (judged(capsys, *pair, text)["plate"]["fscore"] for text in ("1.005", f"{100.5 / 200**0.5}%"))
-    assert 0.2 < some == same < 0.95
-    for text in ("0", "-1", "x", "1%%"):
-        assert "--threshold must be a positive number, or one with %" in refused(
-            capsys, *pair[:-1], f"--threshold={text}"
-        )
+    texts = ("0.999", "1.1", "1.005", f"{100.5 / 200**0.5}%")
+    given = [(*pair(files, "plate"), f"--threshold={text}") for text in (*texts, "0", "-1", "x", "1%%")]
+    none, most, some, same = (judged(capsys, *one)["plate"]["fscore"] for one in given[:4])
+    assert none == 0 and most > 0.99 and 0.2 < some == same < 0.95  # no point is nearer than 1
+    for one in given[4:]:
+        assert "--threshold must be a positive number, or one with %" in refused(capsys, *one)
 
 
 def test_a_cloud_is_a_truth_and_has_no_normals(files, capsys):
@@ -93,7 +94,7 @@ def test_in_the_unit_sphere_the_size_of_the_files_does_not_count(files, capsys):
     made = [read_mesh(files / name / "small.ply") for name in ("truth", "found")]
     for mesh, name in zip(made, ("a", "small"), strict=True):
         mesh.moved(np.array([[7.0, 0, 0, 50], [0, 7, 0, 1], [0, 0, 7, -9], [0, 0, 0, 1]])).save(files / f"{name}.ply")
-    first = judged(capsys, files / "found/small.ply", "--truth", files / "truth/small.ply", *FEW, "--unit-sphere")
+    first = judged(capsys, *pair(files, "small"), "--unit-sphere")
     second = judged(capsys, files / "small.ply", "--truth", files / "a.ply", *FEW, "--unit-sphere")
     assert second["small"] == pytest.approx(first["small"], rel=1e-3)
     assert first["small"]["accuracy"] == pytest.approx(0.97 * 0.2 / 2, abs=0.007)
@@ -113,9 +114,8 @@ def test_a_folder_has_a_row_for_each_truth_and_medians(files, capsys):
     assert found["large"]["chamfer_l1"] == found["plate"]["chamfer_l1"] == found["median"]["chamfer_l1"] == np.inf
     assert found["large"]["fscore"] == 0 < found["small"]["normal_consistency"]
     plate(0.0).save(files / "found/stray.ply")
-    assert "stray.ply has no truth: name it as a file of" in refused(
-        capsys, files / "found", "--truth", files / "truth"
-    )
+    error = refused(capsys, files / "found", "--truth", files / "truth")
+    assert "stray.ply has no truth: name it as a file of" in error
 
 
 def test_what_is_no_mesh_is_refused_by_its_cause(files, capsys):
@@ -148,11 +148,8 @@ def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path,
     capture = read_capture(tmp_path / "photos", Reading(800))
     there.moved(np.linalg.inv(capture.to_world)).save(tmp_path / "scan65.ply")
     away = ball(0.1 * RADIUS, PHOTOGRAPHED + np.array([0, 0, 1.6 * RADIUS]))
-    both = (
-        np.concatenate([there.vertices, away.vertices]),
-        np.concatenate([there.faces, away.faces + len(there.vertices)]),
-    )
-    Mesh(*both).save(tmp_path / "both65.ply")
+    faces = np.concatenate([there.faces, away.faces + len(there.vertices)])
+    Mesh(np.concatenate([there.vertices, away.vertices]), faces).save(tmp_path / "both65.ply")
     expected = dtu_metrics(there, read_scan(tmp_path / "dtu", 65), seed=0)
     where = ("--dtu", tmp_path / "dtu")
     first = judged(capsys, tmp_path / "there65.ply", *where)
@@ -190,8 +187,8 @@ def test_a_row_may_answer_the_problem_of_a_run(files, capsys):
     run = Record("run", "reconstruction", "newton", "photos", 3, config, scene="scan65")
     (files / "run").mkdir()
     run.write(files / "run")
-    mesh, more = files / "found/small.ply", ("--like", files / "run", "--method", "NeuS", "--into", files / "results")
-    judged(capsys, mesh, "--truth", files / "truth/small.ply", *FEW, *more)
+    more = ("--like", files / "run", "--method", "NeuS", "--into", files / "results")
+    judged(capsys, *pair(files, "small"), *more)
     (folder,) = (files / "results/runs").iterdir()
     row = Record.of(read_record(folder))
     assert (row.name, row.task, row.dataset, row.seed, row.scene) == ("NeuS", "reconstruction", "photos", 3, "scan65")
@@ -200,4 +197,4 @@ def test_a_row_may_answer_the_problem_of_a_run(files, capsys):
     error = refused(capsys, files / "found", "--truth", files / "truth", *more)
     assert "--like names the problem of one run" in error
     Record("run", "completion", "newton", "mesh", 3, config, scene="spot").write(files / "run")
-    assert "in scene units: add --unit-sphere" in refused(capsys, mesh, "--truth", files / "truth/small.ply", *more)
+    assert "in scene units: add --unit-sphere" in refused(capsys, *pair(files, "small"), *more)

@@ -123,18 +123,17 @@ def measured(
         BadInput: where values are not finite.
     """
     points = points_in_sphere(DRAWN, like)
+    surface = nn.functional.normalize(points[:AROUND], dim=-1)
     with torch.no_grad():
         values = torch.cat([field(some) for some in points.split(AROUND)]).double() - level
-        around = field(nn.functional.normalize(points[:AROUND], dim=-1)).double() - level
+        around = [field(surface).double() - level, *(other(surface[:FEW]) - level for other in others)]
     if unknown := int((~values.isfinite()).sum()):
         raise BadInput(f"its value is not finite at {unknown} of {DRAWN} points of the unit sphere: check its weights")
     slopes = scale * torch.cat([_slopes(field, some) for some in points.split(AROUND)])
     if sign is None:
-        with torch.no_grad():
-            at = [around, *(other(points[:FEW] / points[:FEW].norm(dim=-1, keepdim=True)) - level for other in others)]
-        above = sum(float((values > 0).double().mean()) >= 0.5 for values in at)
-        sign = 1.0 if 2 * above >= len(at) else -1.0
-    facts = _facts(points, sign * scale * values, sign * around, slopes)
+        above = sum(float((found > 0).double().mean()) >= 0.5 for found in around)
+        sign = 1.0 if 2 * above >= len(around) else -1.0
+    facts = _facts(points, sign * scale * values, sign * around[0], slopes)
     kind, divisor = kind or facts.kind, 1.0
     if kind is Kind.BOUND:
         steepest = [scale * float(_slopes(other, points[:AROUND]).max()) for other in others]

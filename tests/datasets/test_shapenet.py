@@ -30,9 +30,7 @@ TINY = (
 )  # fmt: skip
 
 
-def write_shape(
-    folder: Path, synset: str, name: str, version: int = 2, *, shape: trimesh.Trimesh | None = None
-) -> None:
+def write_shape(folder: Path, synset: str, name: str, version: int = 2, shape: trimesh.Trimesh | None = None) -> None:
     """A shape as v1 or v2 of ShapeNetCore has it; a box whose second side is longer the larger its id."""
     place = folder / synset / name / ("models" if version == 2 else "")
     place.mkdir(parents=True)
