@@ -39,8 +39,7 @@ AUTO = "auto"
 CODES = 16  # of a network, of which its sign and its steepest slope are measured
 INSIDE = {AUTO: None, "negative": 1.0, "positive": -1.0}  # signs; see `Meaning`
 OWN_CLASS = "field._target_=PACKAGE.CLASS"
-PARTS = ("ModelParameters", "LatentCodes")  # of a DeepSDF folder, in each of which `latest.pth` is read
-LATEST = "latest.pth"
+PARTS = ("ModelParameters/latest.pth", "LatentCodes/latest.pth")  # of a DeepSDF folder
 TENSORS = (
     "DeepSDF (name the folder with its specs.json); IDR, NeuS, VolSDF (implicit_network.lin0, sdf_network.lin0); "
     "occupancy networks, DVR (fc_p, conv_p)"
@@ -146,7 +145,7 @@ class NetworkFile:
     def files(self) -> list[Path]:
         """The files that are read."""
         path = Path(self.path)
-        parts = ("specs.json", FIELD, *(f"{part}/{LATEST}" for part in PARTS)) if path.is_dir() else ("",)
+        parts = ("specs.json", FIELD, *PARTS) if path.is_dir() else ("",)
         return [file for file in (*(path / part for part in parts), Path(self.codes or "")) if file.is_file()]
 
     def identity(self) -> dict[str, Any]:
@@ -221,8 +220,7 @@ def _known(file: NetworkFile, index: int, content: str) -> Known:
 
 def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> Known:
     """The network with a field that is negative inside and of the kind that was measured."""
-    some = codes[:: max(len(codes) // CODES, 1)]
-    others = [network.at(code) for code in some] if len(codes) > 1 else []
+    others = [network.at(code) for code in codes[:: max(len(codes) // CODES, 1)]] if len(codes) > 1 else []
     meaning = measured(
         network.at(codes[index]),
         codes,
@@ -285,9 +283,9 @@ def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | No
         raise BadInput("the folder has no specs.json: name a DeepSDF folder, or a file") from None
     except ValueError as error:
         raise BadInput(f"specs.json must be JSON: {error}") from error
-    weights, latent = (path / part / LATEST for part in PARTS)
+    weights, latent = (path / part for part in PARTS)
     if not weights.is_file():
-        raise BadInput(f"the folder has no {PARTS[0]}/{LATEST}")
+        raise BadInput(f"the folder has no {PARTS[0]}")
     network = deepsdf(_tensors(weights), specs, squash=squash)
     return network, _codes(latent) if latent.is_file() and not network.placed else None
 
@@ -353,7 +351,5 @@ def _flat(found: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
 
 def _content(files: list[Path]) -> str:
     """A hash of files."""
-    whole = hashlib.sha256()
-    for file in files:
-        whole.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
-    return whole.hexdigest()
+    each = (file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest() for file in files)
+    return hashlib.sha256(b"".join(each)).hexdigest()

@@ -190,12 +190,8 @@ def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None
             f"its values in the unit sphere, from {meaning.facts.least:.3g} to {meaning.facts.most:.3g}, are no shape "
             "that is negative inside: negate them, subtract the level of the surface, or scale the points"
         )
-    return Shape(
-        lambda points: meaning.factor * values(points),
-        meaning.kind,
-        meaning.lipschitz,
-        flops_of(network) if isinstance(network, nn.Module) else None,
-    )
+    flops = flops_of(network) if isinstance(network, nn.Module) else None
+    return Shape(lambda points: meaning.factor * values(points), meaning.kind, meaning.lipschitz, flops)
 
 
 def flops_of(network: nn.Module) -> Flops:

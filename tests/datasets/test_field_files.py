@@ -112,21 +112,18 @@ def test_the_name_of_a_run_is_enough_where_runs_are_by_default(tmp_path, monkeyp
     assert torch.equal(load_field("one")(POINTS), load_field(folder)(POINTS))
 
 
-@pytest.mark.parametrize(
-    "spoil, words",
-    [
-        (lambda path: path.write_bytes(path.read_bytes()[:-100]), "may be cut short"),
-        (lambda path: path.write_bytes(b""), "may be cut short"),
-        (Path.unlink, f"has no {FIELD}: a task that looks for no field, such as ablation"),
-        (lambda path: shutil.rmtree(path.parent), "there is nothing at .*: give the folder of a run"),
-        (lambda path: save_file(load_file(path), path), "version None of fields"),
-        (lambda path: changed(path, "Linear", "Popen"), "'Popen', which is none of ours"),
-        (lambda path: changed(path, '"octaves"', '"forward"'), "no attribute 'forward' that a file may set"),
-        (lambda path: changed(path, '"octaves"', '"_forward_hooks"'), "no attribute '_forward_hooks'"),
-        (lambda path: changed(path, '"octaves": 1', '"octaves": 2'), "its parts do not fit"),
-        (lambda path: changed(path, '"t0"', '"t99"'), "its parts do not fit"),
-    ],
-)
+@pytest.mark.parametrize("spoil, words", [
+    (lambda path: path.write_bytes(path.read_bytes()[:-100]), "may be cut short"),
+    (lambda path: path.write_bytes(b""), "may be cut short"),
+    (Path.unlink, f"has no {FIELD}: a task that looks for no field, such as ablation"),
+    (lambda path: shutil.rmtree(path.parent), "there is nothing at .*: give the folder of a run"),
+    (lambda path: save_file(load_file(path), path), "version None of fields"),
+    (lambda path: changed(path, "Linear", "Popen"), "'Popen', which is none of ours"),
+    (lambda path: changed(path, '"octaves"', '"forward"'), "no attribute 'forward' that a file may set"),
+    (lambda path: changed(path, '"octaves"', '"_forward_hooks"'), "no attribute '_forward_hooks'"),
+    (lambda path: changed(path, '"octaves": 1', '"octaves": 2'), "its parts do not fit"),
+    (lambda path: changed(path, '"t0"', '"t99"'), "its parts do not fit"),
+])  # fmt: skip
 def test_a_file_that_will_not_do_is_refused_with_the_cause(spoil, words, tmp_path):
     save_field(FIELDS["coloured"](), tmp_path / FIELD)
     spoil(tmp_path / FIELD)
