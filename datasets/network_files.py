@@ -154,6 +154,7 @@ class NetworkFile:
         return {"name": "network", "version": VERSION, "contents": _content(self.files), **settings}
 
 
+@runtime_checkable
 class Module(Protocol):
     """A network of the user's, an nn.Module: points [n, 3] to values [n] or [n, 1]."""
 

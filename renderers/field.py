@@ -295,7 +295,7 @@ def autograd_normals(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[T
     return torch.nn.functional.normalize(autograd_gradients(field, points), dim=-1)
 
 
-def autograd_gradients(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+def autograd_gradients(field: Values, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Gradients of the field by automatic differentiation, of any length; without a graph."""
     with torch.enable_grad():
         leaf = points.detach().requires_grad_(True)

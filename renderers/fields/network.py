@@ -142,7 +142,7 @@ def measured(
 
 
 def _slopes(field: Values, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    return torch.linalg.vector_norm(autograd_gradients(cast(Field, field), points), dim=-1).double()
+    return torch.linalg.vector_norm(autograd_gradients(field, points), dim=-1).double()
 
 
 def _facts(points: Tensor, values: Tensor, around: Tensor, slopes: Tensor) -> Facts:
