@@ -164,9 +164,9 @@ def show(results_dir: Path) -> int:
         write_attempts(attempts_of(records, results_dir), results_dir)
         written = paper.write_paper(records, results_dir, only=PAGE)
         index = write_page(records, unread, results_dir, MOST_MESHES)
-    (kept, _), (attempts, problems) = read_attempts(results_dir), read_attempts(paper.SHIPPED, results_dir)
-    standing = Standing(attempts)
-    for problem in problems:
+    (shipped, unread_shipped), (kept, unread_kept) = read_attempts(paper.SHIPPED), read_attempts(results_dir)
+    standing = Standing([*shipped, *kept])
+    for problem in [*unread_shipped, *unread_kept]:
         print(f"not read: {problem}", file=sys.stderr)
     own = {(*one.key, one.started) for one in kept}
     mine = [one.row for one in standing.attempts if (*one.key, one.started) in own]

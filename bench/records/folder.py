@@ -72,8 +72,8 @@ class Identity:
         users = tuple(sorted(set(named) - set(OURS)))
         dataset = self.config.get("dataset") or {}
         read = [path for key in FILE_KEYS for path in _values(self.config, key)]
-        for named in _values(dataset, "split"):  # a list of shapes, beside which are others; that of a run is a word
-            read += sorted(map(str, Path(named).parent.glob(f"*{Path(named).suffix or named}")))
+        for split in map(Path, _values(dataset, "split")):  # a list of shapes, beside which are others
+            read += sorted(map(str, split.parent.glob(f"*{split.suffix or split.name}")))
         files = [_content(Path(path)) for path in read]
         files += [_classes(str(dataset["path"]))] if "synset" in dataset else []
         return digest([_our_code(), *(_package(name) for name in users), *files])

@@ -13,6 +13,7 @@ from bench.records.record import as_number, row_name
 SCALE = 1000.0  # of Chamfer distances, in tables and figures
 ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
 SHAPENET = "shapenet_"  # beginning of the families of `dataset=shapenet`; the class follows
+DOUBTFUL = ("loaded machine", "shared device", "missing synchronisation")  # beginnings of notes on times
 OURS = "renderers."  # beginning of the targets of this project's renderers
 Record = dict[str, Any]
 RunKey = tuple[Any, ...]  # solid, view, seed, and further conditions, such as the number of points
@@ -58,9 +59,6 @@ def iterations_of(record: Record) -> int | None:
     """The number of the optimiser's iterations, which a task without an optimiser has among its own settings."""
     config = record["config"]
     return setting(config, "task", "optimiser", "iterations") or setting(config, "task", "iterations")
-
-
-DOUBTFUL = ("loaded machine", "shared device", "missing synchronisation")  # beginnings of notes
 
 
 def doubtful(record: Record) -> bool:

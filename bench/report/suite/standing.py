@@ -8,7 +8,7 @@ set of problems weighs the same. Renderings, which have no course, stand apart: 
 
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
 from math import comb, inf, isfinite, nan
 from typing import Any
@@ -267,8 +267,10 @@ class Standing:
         def place(one: Attempt) -> tuple[Any, ...]:
             return (*one.key[:3], one.machine if of == SECONDS else "")
 
-        timed = [one for one in self.everything if one.timed and self._is_alike(one)]
-        known = sorted(timed, key=lambda one: one.started) if of == SECONDS else self.alike
+        known = self.alike
+        if of == SECONDS:  # of whatever age, the newest on each machine
+            timed = [one for one in self.everything if one.timed and self._is_alike(one)]
+            known = sorted(timed, key=lambda one: one.started)
         others = {place(one): one for one in known if one.row == self.reference}
         scenes: dict[str, list[tuple[float, float]]] = {}
         for one in self.of(row):
@@ -303,12 +305,7 @@ class Standing:
     def _chance(self, first: str, second: str) -> float:
         """The probability of as large a difference of shares where each scene's has either sign (permutation test)."""
         by_scene = self._apart(first, second)
-        if len(by_scene) <= FLIPS:
-            signs = np.array([*product((1, -1), repeat=len(by_scene))])
-        else:
-            signs = np.random.default_rng(0).choice((1, -1), (2**FLIPS, len(by_scene)))
-            signs[0] = 1  # what was found is one of them
-        return float(np.mean(np.abs(signs @ by_scene) >= abs(by_scene.sum()) - 1e-12))
+        return float(np.mean(np.abs(_signs(len(by_scene)) @ by_scene) >= abs(by_scene.sum()) - 1e-12))
 
     def _apart(self, first: str, second: str) -> np.ndarray:
         """What each scene [scenes] adds to the difference of two rows' shares."""
@@ -325,14 +322,24 @@ class Standing:
     def resolution(self) -> float | None:
         """The difference of shares at which a row is told in four cases of five, in the median of rows.
 
-        As by a t-test over scenes at the level of a pair. None where there are too few scenes
-        to tell any row from the first, however far it is behind.
+        As by a t-test over scenes at the level of a pair. None where there are too few scenes to tell any row from the
+        first, however far it is behind.
         """
         first, *others = self.ranked or [""]
         if not others or 2 / 2 ** self.scenes() > self._level:
             return None
         spreads = [float(np.std(self._apart(first, row), ddof=1)) * self.scenes() ** 0.5 for row in others]
         return float(sum(stdtrit(self.scenes() - 1, (1 - self._level / 2, POWER))) * np.median(spreads))
+
+
+@cache
+def _signs(scenes: int) -> np.ndarray:
+    """The signs of scenes [flips, scenes]: all of few scenes, random ones of more, of which the first is what is."""
+    if scenes <= FLIPS:
+        return np.array([*product((1, -1), repeat=scenes)])
+    signs = np.random.default_rng(0).choice((1, -1), (2**FLIPS, scenes))
+    signs[0] = 1
+    return signs
 
 
 def _over_scenes(reached: np.ndarray, every: np.ndarray) -> Interval:
