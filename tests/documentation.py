@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = ("README.md", "CONTRIBUTING.md", *(f"{room}/README.md" for room in ("bench", "conf", "datasets", "renderers")))
 CODE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"\s{2,}# .*$")
-SPAN = re.compile(r"`(python -m [^`]+)`")
+SPAN = re.compile(r"`((?:python -m |-m \+experiment=)[^`]+)`")  # tables leave `python -m bench` out
 LINK = re.compile(r"\]\(([^)#\s]*)(#[^)\s]*)?\)")
 SCANS = re.compile(r"dataset=scans|\+experiment=scans")
 
@@ -54,7 +54,8 @@ def commands() -> list[Command]:
         bare = CODE.sub("", text_of(file))
         lines = [COMMENT.sub("", line).strip() for line in bare.splitlines() if line.startswith("    ")]
         spans = [" ".join(span.split()) for span in SPAN.findall(bare.replace("\n", " "))]
-        for part in (part.strip() for line in (*lines, *spans) for part in line.split("&&")):
+        whole = [f"python -m bench {span}" if span.startswith("-m ") else span for span in spans]
+        for part in (part.strip() for line in (*lines, *whole) for part in line.split("&&")):
             if part.startswith("python -m "):
                 found.setdefault(part, Command(file, tuple(shlex.split(part))))
     return list(found.values())

@@ -1,6 +1,7 @@
 """The README files show commands that compose, code that runs, and links that lead somewhere."""
 
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -264,5 +265,12 @@ SETTINGS_OF_SPEED = re.compile(r"(dist_alpha|dist_epsilon|dist_steps|dvr_fixed)_
 @pytest.mark.parametrize("group", ["renderer", "experiment"])
 def test_the_page_of_choices_names_every_file(group):
     names = {name for name in tables.names(group) if not name.startswith("_")}
-    said = set(re.findall(r"`([a-z0-9_]+)`", text_of("conf/README.md")))
+    said = set(re.findall(r"(?:`|\+experiment=)([a-z0-9_]+)[` ]", text_of("conf/README.md")))
     assert {name for name in names if not SETTINGS_OF_SPEED.match(name)} <= said
+
+
+def test_the_table_of_the_papers_has_the_numbers_of_shapes_that_are_shipped():
+    rows = re.findall(r"^\| \[[^|]*?README\.md#(\w+)\)[^|]*\|[^|]*\|[^|]*\| (\d+) \|", text_of("conf/README.md"), re.M)
+    captions = {name: json.loads((ROOT / f"results/paper/{name}.json").read_text())["caption"] for name, _ in rows}
+    shipped = {name: re.search(r"\((\d+) shape", caption) for name, caption in captions.items()}
+    assert len(rows) > 12 and [(name, n) for name, n in rows if n != (shipped[name][1] if shipped[name] else "1")] == []
