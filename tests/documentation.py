@@ -5,12 +5,14 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 import trimesh
 from PIL import Image
 
 from datasets.shapenet import SYNSETS, ShapeNet
 from datasets.views import ViewSampler
 from tests.datasets.test_shapenet import IDS, write_renders, write_shape, write_shapenet, write_split
+from tests.made_networks import arrays, deepsdf_folder, npz
 from tests.made_photographs import idr
 from tests.made_scans import write_scans
 
@@ -20,6 +22,7 @@ CODE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"\s{2,}# .*$")
 SPAN = re.compile(r"`((?:python -m |-m \+experiment=)[^`]+)`")  # tables leave `python -m bench` out
 LINK = re.compile(r"\]\(([^)#\s]*)(#[^)\s]*)?\)")
+NETWORK = re.compile(r"field_path=|prior\.path=")
 SCANS = re.compile(r"dataset=scans|\+experiment=scans")
 
 
@@ -82,7 +85,7 @@ def anchors(text: str) -> set[str]:
 def make_files(folder: Path) -> dict[str, str]:
     """Makes what the words of commands stand for, in a folder; gives the path of each word."""
     mine = (f"mine/conf/{group}" for group in ("renderer", "task", "experiment", "dataset"))
-    for name in ("captures", "scans", "chairs", *mine):
+    for name in ("captures", "scans", "chairs", "network", *mine):
         (folder / name).mkdir(parents=True)
     idr(folder / "captures")
     write_scans(folder / "scans")
@@ -96,6 +99,9 @@ def make_files(folder: Path) -> dict[str, str]:
     named = dict.fromkeys(("YOURS.obj", "cow.obj", "spot.obj"), folder / "one.obj")
     named |= {"FOLDER": folder / "captures", "chairs/": folder / "chairs", "my_conf": folder / "mine" / "conf"}
     named |= {"FILE": folder / "picture.png", "MASK": folder / "mask.png"}
+    deepsdf_folder(folder / "network", 0.1 * torch.arange(4.0)[:, None])
+    named["NETWORK"] = folder / "network"
+    named |= dict.fromkeys(("fox.npz", "mine.npz"), npz(folder, arrays()).path)
     shapenet = write_shapenet(folder / "ShapeNetCore.v2")
     for name in IDS:
         write_shape(shapenet, SYNSETS["car"], name)
@@ -126,6 +132,8 @@ def filled(command: Command, made: dict[str, str]) -> list[str]:
     named = {"NAME": "sofa", **made}
     if SCANS.search(str(command)):
         named["FOLDER"] = made["SCANS"]
+    elif NETWORK.search(str(command)):
+        named |= {"FOLDER": made["NETWORK"], "FILE": made["fox.npz"]}
     elif mesh:
         named |= {"FOLDER": made["chairs/"], "FILE": made["YOURS.obj"]}
     own = ["--config-dir", "my_conf", "packages=[my_package]"] if command.arguments == ("renderer=mine",) else []

@@ -1,6 +1,5 @@
 """A network's file as a dataset: what is measured of it, and what is refused; the files are made here."""
 
-import json
 import os
 import pickle
 import warnings
@@ -24,6 +23,7 @@ from renderers.fields.network import from_module, measured
 from tests.composing import composed
 from tests.documentation import code_of
 from tests.looped import each
+from tests.made_networks import RADIUS, arrays, deepsdf_folder, npz, octahedron
 from tests.renderers.test_published import CODE, occupancy
 from tests.tiny import camera_of, cell_from
 
@@ -39,48 +39,11 @@ class Net(torch.nn.Module):
         return self.drop(self.inner(points)) * self.scale / 2
 """
 POINTS = points_in_sphere(64, torch.zeros(()))
-RADIUS = 0.5  # of the octahedron's faces about the origin
-
-
-def arrays(factor: float = 1.0, level: float = 0.0) -> dict[str, Any]:
-    """An octahedron, exactly: (|x| + |y| + |z|) / sqrt(3) - RADIUS, times a factor, and a level."""
-    axes = np.eye(3, dtype=np.float32)
-    return {
-        **{"0000.dense.A": np.concatenate([axes, -axes], axis=1), "0000.dense.b": np.zeros(6, np.float32)},
-        "0001.relu._": np.zeros(0, np.float32),
-        "0002.dense.A": np.full((6, 1), factor / np.sqrt(3), np.float32),
-        "0002.dense.b": np.array([level - factor * RADIUS], np.float32),
-    }
-
-
-def octahedron(points: Tensor) -> Tensor:
-    return points.abs().sum(-1) / np.sqrt(3) - RADIUS
-
-
-def npz(folder: Path, found: dict[str, Any]) -> NetworkFile:
-    np.savez(folder / "shape.npz", **found)
-    return load("dataset", "network", path=str(folder / "shape.npz"))
 
 
 def checkpoint(folder: Path, state: Any, name: str = "shape.pth") -> NetworkFile:
     torch.save(state, folder / name)
     return load("dataset", "network", path=str(folder / name))
-
-
-def deepsdf_folder(folder: Path, codes: Any, dtype: torch.dtype = torch.float32) -> NetworkFile:
-    """A DeepSDF folder whose code is added to the octahedron's values."""
-    ends = torch.tensor([[1.0, -1.0]])  # of the code alone: relu(c) - relu(-c)
-    weight = torch.block_diag(ends.T, torch.tensor(arrays()["0000.dense.A"]).T)
-    last = torch.cat([ends, torch.full((1, 6), 1 / np.sqrt(3))], dim=1)
-    state = {"module.lin0.weight": weight, "module.lin0.bias": torch.zeros(8)}
-    state |= {"module.lin1.weight": last.float(), "module.lin1.bias": torch.tensor([-RADIUS])}
-    specs = {"NetworkSpecs": {"dims": [8], "geom_dimension": 3, "weight_norm": False}, "CodeLength": 1}
-    stored = {"model_state_dict": {name: value.to(dtype) for name, value in state.items()}, "epoch": 3}
-    for part, content in (("ModelParameters", stored), ("LatentCodes", {"latent_codes": codes})):
-        (folder / part).mkdir()
-        torch.save(content, folder / part / "latest.pth")
-    (folder / "specs.json").write_text(json.dumps(specs))
-    return load("dataset", "network", path=str(folder))
 
 
 def field_of(file: NetworkFile, index: int = 0) -> Field:
