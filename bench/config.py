@@ -37,7 +37,9 @@ DOUBLING = "doubling"
 SELF, HERE = "_self_", "@_here_"  # of a list of defaults: the file itself; where one of another group goes
 OURS = ("renderers", "datasets", "bench")  # packages that a `_target_` may always name
 PACKAGE = "_package_"  # of the node `renderer`: one more, that of the class typed for renderer=custom
-RESERVED = ("_target_", PACKAGE, "_prior_", "_field_", LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
+OF = "of"  # of a prior: a dataset whose prior it is
+DEFAULTS = ("_prior_", "_field_", "_similarity_", "_iterations_")  # of a dataset or a task: what other keys follow
+RESERVED = ("_target_", PACKAGE, *DEFAULTS, OF, LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
 ROLES = {  # what the class of a node of the top level must be
     "task": "bench.setup.inputs.Task",
     "renderer": "renderers.rendering.Renderer",
@@ -341,7 +343,7 @@ def load(group: str, name: str, **arguments: Any) -> Any:
 def _with_defaults(group: str, name: str) -> DictConfig:
     """What a choice holds, over those that its `defaults` name, in their order, as Hydra has it."""
     node = OmegaConf.create(choice(group, name))
-    bases = [str(base) for base in node.pop("defaults", [SELF])]
+    bases = [base for base in node.pop("defaults", [SELF]) if isinstance(base, str)]  # not what it sets of others
     places = [
         base.removeprefix("/").removesuffix(HERE).split("/") if base[0] == "/" else [group, base] for base in bases
     ]

@@ -53,11 +53,7 @@ class Scan:
             raise BadInput(f"scan '{self.file}' {error}") from None
         if len(points) < 3 or not np.isfinite(points).all():
             raise BadInput(f"scan '{self.file}' has no points, or some that are not finite: copy the file again")
-        faces = Delaunay(points[:, :2]).simplices
-        corners = points[faces]
-        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        faces = faces[edges.max(axis=1) <= LONGEST * np.median(edges)]
-        return Mesh(self.rotation.apply(points) + self.translation, faces)
+        return replace(joined(points[:, :2], points), vertices=self.rotation.apply(points) + self.translation)
 
 
 @dataclass(frozen=True)
@@ -151,6 +147,14 @@ class RangeScans:
         if index >= len(self.scans):
             raise BadInput(f"index must be at most {len(self.scans) - 1}, the last scan of {self.name}, not {index}")
         return self.scans[index]
+
+
+def joined(places: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]) -> Mesh:
+    """The open surface of points that are neighbours at their places in a view, but for those that are far apart."""
+    faces = Delaunay(places).simplices
+    corners = points[faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    return Mesh(points, faces[edges.max(axis=1) <= LONGEST * np.median(edges)])
 
 
 def _scan(conf: Path, number: int, words: list[str]) -> Scan:

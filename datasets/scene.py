@@ -189,17 +189,21 @@ class Scene:
         mesh: the true shape.
         view: its true images.
         measured: camera z that a scanner measured at the view's pixels, 0 where it measured none; None without one.
+        to_world: the similarity from the scene's world into that of a file; None of a scene that is its own.
+        part: whether `mesh` is only what the view shows of an unknown shape, an open surface.
     """
 
     name: str
     mesh: Mesh
     view: View
     measured: Float[Tensor, "height width"] | None = None
+    to_world: Float[np.ndarray, "4 4"] | None = None
+    part: bool = False
 
     @cached_property
     def cast_on(self) -> Truth:
         """The true shape, for ray casting and signed distances."""
-        return Truth(self.mesh)
+        return Truth(self.mesh, closed=not self.part)
 
     def given(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
         """The view whose depths may be given to a task, and the pixels that have one.
@@ -215,7 +219,7 @@ class Scene:
     @property
     def on_depths(self) -> list[str]:
         """How many depths a scanner measured, and how good they are, in words; empty without one."""
-        if self.measured is None:
+        if self.measured is None or self.part:
             return []
         both = self.view.mask & (self.measured > 0)
         off = (self.measured - self.view.depth)[both].abs()
@@ -244,8 +248,23 @@ class Scanned(Protocol):
         ...
 
 
+@runtime_checkable
+class OneView(Protocol):
+    """A dataset of one object that is known from one view, and perhaps from a mesh; its place is not known."""
+
+    def placed(self, resolution: int) -> Scene:
+        """The scene, y up, with what is seen within the unit sphere.
+
+        Args:
+            resolution: most pixels of the view's longer side.
+        """
+        ...
+
+
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
     """The scene of shape number `index` of a split, with the camera of that number."""
+    if isinstance(dataset, OneView):
+        return dataset.placed(views.resolution)
     mesh = dataset.mesh(split, index)
     scanned = dataset if isinstance(dataset, Scanned) else None
     camera = views.towards(scanned.towards_scanner(index)) if scanned else views.draw(seed_of(split, index))

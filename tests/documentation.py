@@ -5,6 +5,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 import trimesh
 from PIL import Image
@@ -96,7 +97,8 @@ def make_files(folder: Path) -> dict[str, str]:
     picture.paste(255, (12, 16, 40, 32))
     picture.save(folder / "mask.png")
     picture.convert("RGB").save(folder / "picture.png")
-    named = dict.fromkeys(("YOURS.obj", "cow.obj", "spot.obj"), folder / "one.obj")
+    np.save(folder / "depth.npy", np.pad(np.full((24, 32), 2.0), 12))
+    named = {"DEPTH": folder / "depth.npy"} | dict.fromkeys(("YOURS.obj", "cow.obj", "spot.obj"), folder / "one.obj")
     named |= {"FOLDER": folder / "captures", "chairs/": folder / "chairs", "my_conf": folder / "mine" / "conf"}
     named |= {"FILE": folder / "picture.png", "MASK": folder / "mask.png"}
     deepsdf_folder(folder / "network", 0.1 * torch.arange(4.0)[:, None])

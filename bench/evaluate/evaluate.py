@@ -57,6 +57,7 @@ DEFINITIONS: dict[str, str] = {
     **OWN_DEFINITIONS,
 }
 
+OF_PART = ("completeness", "chamfer_gt_to_pred")  # what a part of the truth can judge: is it in the prediction?
 CHAMFER = ("chamfer_l1", "chamfer_l2")  # what checkpoints judge by
 
 # The score of a run without a surface: the worst.
@@ -120,10 +121,10 @@ def image_metrics(
 ) -> dict[str, float]:
     """The metrics of `IMAGE`, unscaled.
 
-    Depth is camera z and is read only where both masks are true. A predicted depth there that is not a number
-    counts as infinitely wrong.
+    Depth is camera z and is read only where both masks are true and the true depth is known, which 0 is not. A
+    predicted depth there that is not a number counts as infinitely wrong.
     """
-    common = predicted_mask & truth_mask
+    common = predicted_mask & truth_mask & (truth_depth > 0)
     error = np.abs(predicted_depth[common].astype(np.float64) - truth_depth[common])
     error[np.isnan(error)] = np.inf
     return {
@@ -200,15 +201,16 @@ def view_metrics(seen: View, true: View, prefix: str = "") -> dict[str, float]:
 
 
 def chamfer_only(state: State) -> dict[str, float]:
-    """The state's Chamfer distances only, as in `evaluate`: for checkpoints."""
+    """The state's Chamfer distances only, as in `evaluate`: for checkpoints. None where a part is the truth."""
     scores = _surface_scores(state)
-    return {name: scores[name] for name in CHAMFER}
+    return {name: scores[name] for name in CHAMFER if name in scores}
 
 
 def _surface_scores(state: State) -> dict[str, float]:
     inputs, mesh = state.inputs, state.mesh
     found = None if mesh is None else sample_surface(mesh, inputs.evaluation.points, inputs.seed + 1)
-    return surface_metrics(found, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
+    scores = surface_metrics(found, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
+    return {name: scores[name] for name in OF_PART} if inputs.scene.part else scores
 
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:

@@ -81,7 +81,7 @@ def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: lis
             ViewPair(name, state.pictured(front), state.pictured(back))
             for name, state in zip(("before", "after"), states, strict=True)
         ),
-        ViewPair("truth", see(truth, front), see(truth, back)),
+        ViewPair("measured" if inputs.scene.part else "truth", see(truth, front), see(truth, back)),
     )
     save(_summary(pairs, given, title), folder / "summary.png")
     draw_curve(folder / "curve.png", curve)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 
-from bench.config import EvaluationSettings, build_once
+from bench.config import OF, EvaluationSettings, build_once, load
 from bench.machine.environment import pick_device, using_threads
 from bench.progress import Report
 from bench.records.record import Record
@@ -23,7 +23,7 @@ from bench.setup.fields import FieldChoice
 from bench.shape_prior import Prior, PriorSettings, prior_for
 from datasets.network_files import Networked
 from datasets.own_photographs import Photographed
-from datasets.scene import SPLIT_STRIDE, Dataset, Scene, Split, Surface, make_scene, sample_surface, scene_name
+from datasets.scene import SPLIT_STRIDE, Dataset, OneView, Scene, Split, Surface, make_scene, sample_surface, scene_name
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.field import Field
@@ -51,6 +51,7 @@ class RunInputs:
     field: FieldChoice  # what an unknown shape is made of
     dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
+    has_prior: bool = True
     trained: int | None = None  # number of the scene's shape among the prior's codes; None where it is not of these
 
     @property
@@ -79,6 +80,14 @@ class RunInputs:
         """The prior of the dataset, loaded or trained at its first use: not every task needs one."""
         with torch.random.fork_rng():  # training a prior must not change later random draws
             return self.make_prior()
+
+    def check_prior(self) -> None:
+        """Raises BadInput for an object of one's own, which has no prior, where none is named."""
+        if not self.has_prior:
+            raise BadInput(
+                f"{self.scene_name} has no prior of its own: set prior.of=sofa, plane, table or car, or prior=deepsdf "
+                "prior.path=FOLDER; of a depth image, or take field=auto, without a prior"
+            )
 
     def check_fitted(self) -> int:
         """The place of the scene's shape among the codes of the prior.
@@ -218,20 +227,24 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     device, cache = pick_device(config["device"]), Path(config["priors_dir"])
 
     shown = dataset.network(index) if isinstance(dataset, Networked) else None
+    family = config["prior"].get(OF)
     with _naming("prior", config["prior"]):
         (prior,) = parts("prior")
+        learnt = dataset if family is None else load("dataset", family)
         known = shown if isinstance(prior, PriorSettings) else prior.network(0)
+
+    own = prior.shapes if isinstance(prior, PriorSettings) and family is None else 0
 
     def make_prior() -> Prior:
         if known is not None:
             return Prior(known.decoder, known.codes)
         with using_threads(threads or ALL_THREADS):  # training pays with more of them
-            return prior_for(dataset, prior, cache, device, progress)
+            return prior_for(learnt, prior, cache, device, progress)
 
     inputs = RunInputs(
         renderer=made,
         views=view,
-        scene_name=dataset.name if isinstance(dataset, Photographed) else scene_name(dataset, split, index),
+        scene_name=dataset.name if isinstance(dataset, Photographed | OneView) else scene_name(dataset, split, index),
         make_scene=lambda: make_scene(dataset, view, split=split, index=index),
         make_prior=make_prior,
         make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
@@ -242,7 +255,8 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         field=FieldChoice(config["field"], models),
         dataset=dataset,
         notes=(*notes, *(known.notes if known else ())),
-        trained=index if known is shown and (shown or (split == Split.TRAIN and index < prior.shapes)) else None,
+        has_prior=family is not None or known is not None or not isinstance(dataset, Photographed | OneView),
+        trained=index if known is shown and (shown or (split == Split.TRAIN and index < own)) else None,
     )
     _check(task, inputs, index)
     return Cell(task, inputs, prior, known.decoder.width if known else prior.network.width, threads)
@@ -272,8 +286,10 @@ def _check(task: Task, inputs: RunInputs, index: int) -> None:
     name = type(task).__name__
     if not isinstance(task, Task):
         raise ValueError(f"task {name} lacks execute: see bench/setup/inputs.py")
-    if inputs.photographed is not None and index:
-        raise ValueError(f"photographs show one object, with index=0, not {index}: give another dataset.path")
+    if isinstance(inputs.dataset, Photographed | OneView) and index:
+        raise ValueError(f"{inputs.dataset.name} is one object, with index=0, not {index}: give another dataset.path")
+    if isinstance(inputs.dataset, OneView) and not getattr(task, "takes_one_view", False):
+        raise ValueError(f"the task {name} needs a true shape, and one view has none: set task=completion")
     if not inputs.field.of_prior and not isinstance(task, TakesField):
         raise ValueError(f"the task {name} does not take field={inputs.field.name}: remove it")
     if isinstance(task, Checks):

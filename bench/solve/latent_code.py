@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import log, pi
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from renderers.checks import check_at_least, check_choice
 from renderers.field import Counts, Field, Meter, Moved
 
 Terms = dict[str, Tensor]
+BEGUN = 0.8  # size of a prior's shape against its own, where its size is looked for: it may grow, and move aside
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,14 @@ class CodePenalty:
         """The weighted penalty."""
         squares = code.square()
         return self.weight * (squares.sum() if self.average == "sum" else squares.mean())
+
+
+def turned(count: int) -> Float[Tensor, "count 7"]:
+    """Similarities, see `renderers.field.Moved`: evenly spaced rotations about the vertical axis, of size `BEGUN`."""
+    found = torch.zeros(count, 7)
+    found[:, 4] = (torch.arange(count) / count + 0.5) % 1 * 2 * pi - pi
+    found[:, 6] = log(BEGUN)
+    return found
 
 
 @dataclass

@@ -5,8 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.config import DOUBLING
@@ -20,6 +21,8 @@ from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
 from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
 from datasets.field_files import FIELD, save_field
+from datasets.mesh import Mesh
+from datasets.meshes import read_mesh
 from datasets.scene import Scene
 from renderers.camera import Camera
 from renderers.field import Counts, Field
@@ -146,7 +149,9 @@ def solve(
     def errors_at(iteration: int) -> dict[str, float]:
         current = state() if iteration else first
         filmstrip.add(iteration, current, problem.camera())
-        return problem.checkpoint(current) if iteration else {name: before.metrics[name] for name in problem.tracked}
+        if iteration:
+            return problem.checkpoint(current)
+        return {name: before.metrics[name] for name in problem.tracked if name in before.metrics}
 
     history = descend(problem, settings, run, errors_at)
     with run.off_clock():
@@ -168,6 +173,20 @@ def solve_task(task: InverseTask, run: RunContext) -> State:
         return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
 
     return solve(problem, task.optimiser, run, DEFINITIONS, gallery=True)
+
+
+def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | None:
+    """Writes `to_world.txt` into a run's folder, and its mesh, which it gives, as `mesh_world.ply`; all digits of both.
+
+    Args:
+        to_world: the similarity from the scene's world into that of a file.
+    """
+    np.savetxt(folder / "to_world.txt", to_world, fmt="%.17g")
+    if not (folder / "mesh.ply").is_file():
+        return None
+    mesh = read_mesh(folder / "mesh.ply")
+    mesh.moved(to_world).save(folder / "mesh_world.ply")
+    return mesh
 
 
 def note_result(run: RunContext, after: Evaluation) -> None:

@@ -1,6 +1,7 @@
 """Shape completion: optimise the code of a shape to match a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -11,12 +12,12 @@ from bench.models.field import solve_by_growth
 from bench.models.observations import RayObservations, hold_out, tiles, together
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem
+from bench.solve.latent_code import CodePenalty, CodeProblem, turned
 from bench.solve.observed_view import DEPTH_LOSSES, GivenView
-from bench.solve.optimise import OptimiserSettings
-from bench.solve.solve import check_field_gradient, solve_task
+from bench.solve.optimise import OptimiserSettings, StartSettings
+from bench.solve.solve import check_field_gradient, save_in_world, solve_task
 from datasets.scene import Scene
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import check_at_least, check_choice, check_positive
@@ -45,6 +46,9 @@ class Completion:
         silhouette: loss of the mask.
         silhouette_weight: of that loss.
         code: penalty on the code.
+        similarity: whether a shift, a rotation and a size of the prior's shape are optimised as well.
+        rotations: their number, about the vertical axis, that the similarity begins from.
+        trial: iterations of each, see `bench.solve.optimise.StartSettings`.
         optimiser: iterations and learning rates.
     """
 
@@ -58,9 +62,13 @@ class Completion:
     silhouette: SilhouetteLoss
     silhouette_weight: float
     code: CodePenalty
+    similarity: bool
+    rotations: int
+    trial: int
     optimiser: OptimiserSettings
 
     takes_field: ClassVar[bool] = True
+    takes_one_view: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         parse_amount(self.points)
@@ -68,8 +76,15 @@ class Completion:
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "normal_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
-
         check_positive("task.normal_width", self.normal_width, "0.02 is two thirds of a pixel at 64 x 64")
+        check_at_least("task.rotations", self.rotations, 1, "12 are 30 degrees apart")
+        if self.similarity:
+            StartSettings(self.rotations, self.trial).check(self.optimiser.iterations)
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput where a prior is asked for, and there is none."""
+        if inputs.field.of_prior:
+            inputs.check_prior()
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
@@ -77,18 +92,25 @@ class Completion:
         inputs = run.inputs
         if inputs.field.of_prior:
             solve_task(self, run)
-            return
-        check_field_gradient(inputs.renderer)
-        observations, given = self.observations(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
-        solve_by_growth(observations, given, run, iterations=self.optimiser.iterations)
+        else:
+            check_field_gradient(inputs.renderer)
+            scene, renderer = inputs.scene, inputs.renderer
+            observations, given = self.observations(scene, renderer, seed=inputs.seed, device=inputs.device)
+            solve_by_growth(observations, given, run, iterations=self.optimiser.iterations)
+        if inputs.scene.to_world is not None:
+            save_in_world(run.folder, inputs.scene.to_world)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
-        """The problem of a scene; it starts from code zero, the mean shape."""
+        """The problem of a scene; it starts from code zero, the mean shape, in each rotation."""
         check_field_gradient(renderer)
         given, observed = self._given(scene, renderer, seed=seed, device=device)
-        return CodeProblem(prior, self.code, given.compare, observed, observed.numel(), device)
+        problem = partial(CodeProblem, prior, self.code, given.compare, observed, observed.numel(), device)
+        if not self.similarity:
+            return problem()
+        codes = torch.zeros(self.rotations, prior.decoder.code_length)
+        return problem(initial=codes, misplaced=turned(self.rotations), trial=self.trial)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device

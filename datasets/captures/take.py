@@ -166,8 +166,25 @@ def _unlike_border(colours: Int[np.ndarray, "height width 3"]) -> Bool[np.ndarra
     return np.abs(colours - background).max(axis=-1) > COLOURED
 
 
+def opened_mask(path: Path) -> Bool[np.ndarray, "height width"]:
+    """The object's pixels in an image that shows it white; raises BadInput where it cannot be read."""
+    return np.asarray(_foreground(_opened(path))) > HALF
+
+
 def _depths(path: Path, unit: float, size: tuple[int, int]) -> Float[Tensor, "height width"]:
-    """Camera z of the nearest pixel of a file of depths, 0 where it is not known.
+    """Camera z of the nearest pixel of a file of depths, 0 where it is not known; raises as `stored_depths` does."""
+    depths = stored_depths(path, "remove the folder of depths")
+    known = np.isfinite(depths) & (depths > 0)
+    image = Image.fromarray(np.where(known, depths * unit, 0).astype(np.float32))
+    return torch.from_numpy(np.array(image.resize(size, Image.Resampling.NEAREST)))
+
+
+def stored_depths(path: Path, otherwise: str) -> Float[np.ndarray, "height width"]:
+    """The first channel of a file of depths, such as an EXR, as OpenCV reads it.
+
+    Args:
+        path: of the file.
+        otherwise: what else can be done where it cannot be read.
 
     Raises:
         BadInput: where OpenCV is not installed, or the file cannot be read.
@@ -176,17 +193,14 @@ def _depths(path: Path, unit: float, size: tuple[int, int]) -> Float[Tensor, "he
     try:
         import cv2
     except ImportError as error:
-        raise BadInput(f"{path} is read by OpenCV: {install('stereo')}, or remove the folder of depths") from error
+        raise BadInput(f"{path} is read by OpenCV: {install('stereo')}, or {otherwise}") from error
     try:
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         stored = None
     if stored is None:
-        raise BadInput(f"{path} cannot be read as depths: copy it again, or remove the folder of depths")
-    depths = stored.reshape(*stored.shape[:2], -1)[..., 0].astype(np.float64)
-    known = np.isfinite(depths) & (depths > 0)
-    image = Image.fromarray(np.where(known, depths * unit, 0).astype(np.float32))
-    return torch.from_numpy(np.array(image.resize(size, Image.Resampling.NEAREST)))
+        raise BadInput(f"{path} cannot be read as depths: copy it again, or {otherwise}")
+    return stored.reshape(*stored.shape[:2], -1)[..., 0].astype(np.float64)
 
 
 def _undistorted(

@@ -82,6 +82,7 @@ def paths(tmp_path_factory) -> dict[str, str]:
     mesh, scans = tmp_path_factory.mktemp("mesh") / "box.obj", tmp_path_factory.mktemp("scans")
     trimesh.creation.box().export(mesh)
     unread = dict.fromkeys(("photos", "network", "module"), str(mesh.parent))  # whose content is not read to build it
+    unread["depth_image"] = str(mesh)
     found = unread | {"mesh": str(mesh), "scans": str(write_scans(scans))}
     return found | {"shapenet": str(write_shapenet(tmp_path_factory.mktemp("shapenet")))}
 
@@ -139,6 +140,7 @@ def test_every_choice_composes_and_builds(paths, row):
     needed = [f"dataset.path={path}" for name, path in paths.items() if name == row["dataset"]]
     needed += CUSTOM if row["renderer"] == "custom" else ()
     needed += LINEAR if row["dataset"] == "module" else []
+    needed += ["dataset.intrinsics=[9,9,4,4]"] if row["dataset"] == "depth_image" else []
     needed += [f"prior.path={paths['network']}"] if row["prior"] == "deepsdf" else []
     config = composed(*(f"{group}={name}" for group, name in row.items()), *needed)
     builds(config)

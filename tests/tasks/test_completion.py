@@ -33,6 +33,9 @@ SETTINGS = Completion(
     silhouette=Own(),
     silhouette_weight=4.0,
     code=CodePenalty(0.1, "sum"),
+    similarity=False,
+    rotations=2,
+    trial=3,
     optimiser=OptimiserSettings(20, 0.01, "constant"),
 )
 # An image of 2 x 2 pixels with a focal length of 1 pixel: all bearings are (+-0.5, +-0.5, 1).

@@ -1,0 +1,105 @@
+"""Depth images of a sphere and of a sofa: where the scene puts what they show, what is refused, what a prior makes."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from bench.config import load
+from datasets.depth_image import PLACED
+from datasets.meshes import read_mesh
+from datasets.scene import Split, Truth, see
+from datasets.views import look_at
+from renderers.camera import Camera
+from tests.looped import each
+from tests.run.driving import command, record_of
+
+STEP = 0.002  # units of the world for a step of the stored numbers
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A sofa that was turned, enlarged and shifted, its depth image and its mask; the folder and the camera."""
+    folder, motion = tmp_path_factory.mktemp("depths"), np.diag([7.0, 7.0, 7.0, 1.0])
+    motion[:3] = Rotation.from_euler("y", 75, degrees=True).as_matrix() @ motion[:3]
+    motion[:3, 3] = 20.0, -5.0, 3.0
+    mesh = load("dataset", "sofa").mesh(Split.VALIDATION, 0).moved(motion)
+    mesh.save(folder / "sofa.ply")
+    target = torch.tensor([20.0, -5.0, 4.0])
+    pinhole = torch.tensor([[150.0, 0, 70.3], [0, 140.0, 52.8], [0, 0, 1]])
+    view = see(Truth(mesh), Camera(pinhole, look_at(target + torch.tensor([12.0, 9.0, 14.0]), target), 120, 150))
+    stored = (view.depth.numpy() / STEP).round().astype(np.uint16)
+    Image.fromarray(stored).save(folder / "depth.png")
+    np.save(folder / "depth.npy", np.where(stored, stored.astype(float), np.nan))
+    np.savez(folder / "depth.npz", rgb=np.zeros((2, 2, 3)), depth=stored[..., None])
+    Image.fromarray(np.uint8(255 * view.mask.numpy())).save(folder / "mask.png")
+    return folder, view.camera
+
+
+def depth_image(made, **changed):
+    folder, camera = made
+    keys = {"path": str(folder / "depth.png"), "intrinsics": [150.0, 140.0, 70.3, 52.8], "scale": STEP}
+    return load("dataset", "depth_image", **keys | {"camera_to_world": camera.camera_to_world.tolist()} | changed)
+
+
+@each("change", [{}, {"suffix": ".npy"}, {"suffix": ".npz"}, {"suffix": ".exr"}, {"pixels": 200}, {"unknown": True}])
+def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, change, pixels=40, suffix=".png", unknown=False):
+    folder, camera = made
+    if suffix == ".exr":
+        os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+        cv2 = pytest.importorskip("cv2", reason="OpenCV is an extra: pip install -e '.[stereo]'")
+        cv2.imwrite(str(folder / "depth.exr"), np.array(Image.open(folder / "depth.png"), np.float32))
+    changed = {"camera_to_world": None} if unknown else {"mask_path": str(folder / "mask.png")}
+    scene = depth_image(made, path=str(folder / f"depth{suffix}"), **changed).placed(pixels)
+    view, known = scene.given()
+    points = view.camera.rays().at(view.camera.distance(view.depth))[known].double().numpy()
+    assert PLACED < np.linalg.norm(points, axis=1).max() < 1 and known.sum() > pixels
+    assert scene.part and max(known.shape) <= pixels and torch.equal(known, view.mask)
+    world = points @ scene.to_world[:3, :3].T + scene.to_world[:3, 3]
+    if unknown:
+        motion = camera.camera_to_world.double().numpy()
+        world = world @ motion[:3, :3].T + motion[:3, 3]
+    assert Truth(read_mesh(folder / "sofa.ply")).distance(world).max() < 2 * STEP
+    facing = (scene.view.normals * view.camera.rays().directions).sum(-1)[scene.view.mask]
+    assert (facing <= 0).all()
+
+
+@each(
+    "key, value, says",
+    [
+        ("path", "nothing.png", "dataset.path=nothing.png is no file"),
+        ("scale", 0.0, "dataset.scale must be positive"),
+        ("intrinsics", [150.0, 140.0, 70.3], r"intrinsics must have shape \[3, 3\].*write \[fx,fy,cx,cy\]"),
+        ("camera_to_world", (2 * np.eye(4)).tolist(), "must hold a rotation.*for a rigid motion"),
+    ],
+)
+def test_what_is_no_camera_or_file_is_refused(made, key, value, says):
+    with pytest.raises(ValueError, match=says):
+        depth_image(made, **{key: value})
+
+
+def test_files_without_depths_are_refused(made, tmp_path):
+    stored, mask = {"a": np.zeros((4, 4, 3)), "b": np.zeros((9, 9)), "c": np.ones((9, 9))}, str(made[0] / "mask.png")
+    for (name, numbers), says in zip(stored.items(), ("one number", "no object", "120 and 9 x 9"), strict=True):
+        np.save(tmp_path / f"{name}.npy", numbers)
+        with pytest.raises(ValueError, match=says):
+            depth_image(made, path=str(tmp_path / f"{name}.npy"), mask_path=mask if name == "c" else None).placed(32)
+
+
+def test_a_prior_completes_what_is_seen_wherever_it_is(made, tmp_path):
+    folder, camera = made
+    rows = str(camera.camera_to_world.tolist()).replace(" ", "")
+    given = ("dataset=depth_image", f"dataset.path={folder}/depth.png", "dataset.intrinsics=[150,140,70.3,52.8]")
+    known = (f"dataset.scale={STEP}", f"dataset.camera_to_world={rows}", f"dataset.truth={folder}/sofa.ply")
+    small = ("scale=smoke", "view.resolution=24", "evaluation.grid=32", "evaluation.every=null", "threads=1")
+    for wrong, says in ((("task=pose",), "set task=completion"), ((), "set prior.of=sofa"), (("index=1",), "index=0")):
+        assert says in command(*given, *small, *wrong, f"results_dir={tmp_path}").err
+    fewer = ("task.rotations=6", "task.optimiser.iterations=80", "evaluation.picture=null", "isolation=off")
+    done = command(*given, *known, *small, *fewer, "prior.of=sofa", f"results_dir={tmp_path}")
+    record = record_of(done.out)
+    assert record["metrics"]["chamfer_l1"] < 0.25 * record["metrics_start"]["chamfer_l1"]
+    found = read_mesh(f"{done.out.splitlines()[-1]}/mesh_world.ply").vertices
+    assert np.median(Truth(read_mesh(folder / "sofa.ply")).distance(found)) < 0.4  # of 14 across
