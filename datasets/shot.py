@@ -11,6 +11,8 @@ from torch import Tensor
 from datasets.scene import Split
 from renderers.camera import Camera
 
+TURN = np.eye(3)  # none
+
 
 def mask_iou(found: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> float:
     """Intersection over union of two masks; 1 where both are empty."""
@@ -55,10 +57,15 @@ class Shot:
             allowed[shown] = self.mask[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
         return allowed
 
-    def within(self, centre: Float[np.ndarray, "3"], radius: float) -> "Shot":
-        """The same photograph, in single precision, in a world where the sphere about `centre` is the unit sphere."""
+    def within(self, centre: Float[np.ndarray, "3"], radius: float, turn: Float[np.ndarray, "3 3"] = TURN) -> "Shot":
+        """The same photograph, in single precision, in a world where the sphere about `centre` is the unit sphere.
+
+        Args:
+            turn: from the axes of that world to those of this one.
+        """
         motion = self.camera.world_to_camera.double().clone()
         motion[:3, 3] = (motion[:3, :3] @ torch.from_numpy(centre).double() + motion[:3, 3]) / radius
+        motion[:3, :3] = motion[:3, :3] @ torch.from_numpy(turn)
         depth = None if self.depth is None else self.depth / radius
         camera = replace(self.camera, intrinsics=self.camera.intrinsics.float(), world_to_camera=motion.float())
         return replace(self, camera=camera, depth=depth)

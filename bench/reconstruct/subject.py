@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from bench.evaluate.dtu import DEFINITIONS as DTU_DEFINITIONS
 from bench.evaluate.dtu import DtuScan, dtu_metrics, published, read_scan
 from bench.evaluate.evaluate import cloud_metrics, drawn
 from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.solve import save_in_world
 from datasets.captures.hull import hull_mesh
-from datasets.mesh import Mesh
-from datasets.meshes import read_mesh, read_pieces, read_points
+from datasets.mesh import Mesh, fit_in_sphere
+from datasets.meshes import read_pieces, read_points
 from datasets.own_photographs import Photographed
 from datasets.photographs import Photography
 from datasets.scene import Surface, Truth, sample_surface, see
@@ -28,6 +30,8 @@ NO_HULL = "the visual hull needs a mask of each photograph: leave out dataset.ma
 NONE, GIVEN, HULL = "none", "given", "hull"  # where distances are known; see `Depths`
 GUIDES = (NONE, GIVEN, HULL)
 HULL_SAMPLES = 96  # per axis
+TILTED = 0.1  # weight of the cameras' y axes beside the x axes, which alone leave the vertical open from one side
+HULL_RADIUS = 0.75  # scene units, of the sphere about the hull from which a prior's shape is moved: see `upright`
 ON_SURFACE = 0.01  # scene units that a point may lie behind the first hit of its ray, on its side, and be seen
 
 
@@ -84,17 +88,10 @@ class Subject:
     )
 
     def finish(self, run: RunContext) -> None:
-        """Writes `to_world.txt`, a 4 x 4 matrix, and `mesh_world.ply`, in the file's world; all digits of both.
-
-        The mesh is judged by the points, where there are some.
-        """
+        """Writes the mesh in the file's world, see `save_in_world`; where there are points, it is judged by them."""
         if self.to_world is None:
             return
-        np.savetxt(run.folder / "to_world.txt", self.to_world, fmt="%.17g")
-        mesh = None
-        if (run.folder / "mesh.ply").is_file():
-            mesh = read_mesh(run.folder / "mesh.ply")
-            mesh.moved(self.to_world).save(run.folder / "mesh_world.ply")
+        mesh = save_in_world(run.folder, self.to_world)
         if self.points is not None:
             with run.off_clock():
                 run.record.metrics |= self.judged(mesh, run.inputs)
@@ -121,6 +118,33 @@ class Subject:
         """Which points of a mesh's surface at least one given photograph sees; see `visible`."""
         scene = Truth(mesh, closed=False)
         return np.any([visible(scene, shot, sampled) for shot in self.given], axis=0)
+
+
+def upright(subject: Subject) -> Subject:
+    """The subject in a world whose y is the cameras' vertical, with the masks' hull about its origin.
+
+    Cameras are taken to be held level: the vertical is the direction to which their x is at right angles, and their y
+    is not. Without masks the unit sphere stays where it is.
+    """
+    axes = torch.stack([shot.camera.world_to_camera[:2, :3] for shot in subject.given]).double().numpy()
+    across, down = np.einsum("nki,nkj->kij", axes, axes)
+    up = np.linalg.eigh(across - TILTED * down)[1][:, 0]
+    up = up if (axes[:, 1] @ up).sum() < 0 else -up
+    turn = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()
+    centre, radius, to_old = np.zeros(3), 1.0, np.eye(4)
+    masked = all(shot.mask is not None for shot in subject.given)
+    if masked and (hull := hull_mesh(subject.given, HULL_SAMPLES)) is not None:
+        centre, shrunk = fit_in_sphere(hull.used, HULL_RADIUS)
+        radius = 1 / shrunk
+    to_old[:3, :3], to_old[:3, 3] = radius * turn, centre
+    return replace(
+        subject,
+        given=tuple(shot.within(centre, radius, turn) for shot in subject.given),
+        held_out=tuple(shot.within(centre, radius, turn) for shot in subject.held_out),
+        truth=None if subject.truth is None else subject.truth.moved(np.linalg.inv(to_old)),
+        to_world=None if subject.to_world is None else subject.to_world @ to_old,
+        points=within(subject.points, to_old) if isinstance(subject.points, np.ndarray) else subject.points,
+    )
 
 
 def visible(scene: Truth, shot: Shot, sampled: Surface) -> Bool[np.ndarray, " n"]:

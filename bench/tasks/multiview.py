@@ -1,25 +1,34 @@
 """Shape from many views: optimise the code for photometric consistency between views (DIST, Sec. 4.2.2)."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from math import radians
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.setup.inputs import RunContext
+from bench.evaluate.evaluate import evaluate
+from bench.evaluate.state import State
+from bench.pictures.run_figures import draw_curve
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge_mesh
+from bench.reconstruct.pictures import note_surface
+from bench.reconstruct.subject import NONE, Depths, PhotographTask, Subject, upright
+from bench.reconstruct.surfaces import with_colours
+from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, turned
 from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
-from bench.solve.solve import check_field_gradient, solve_task
-from datasets.photographs import Photography
+from bench.solve.solve import COSTS, check_field_gradient, descend, solve_task
+from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Field
-from renderers.rendering import Renderer, at_iteration
+from renderers.rendering import Observed, Renderer, at_iteration, check_kind
+from renderers.silhouette import SilhouetteLoss
 
 MIN_SCALE, MAX_SHIFT = 0.8, 0.2
 SURE = 0.999  # least weight of neighbouring pixels on the shape for a depth to be interpolated between them
@@ -27,11 +36,11 @@ FAR_APART = 60.0  # degrees between compared photographs, above which the record
 
 
 @dataclass(frozen=True)
-class Multiview:
-    """Shape from photographs whose cameras are known; no mask is used.
+class Multiview(PhotographTask):
+    """Shape from photographs whose cameras are known; of those that are taken of a scene no mask is used.
 
     Args:
-        images: settings of the photographs.
+        images, longest, held_out, masks: see `PhotographTask`; all but the first are of photographs of one's own.
         focal: focal length of the photographs' cameras over that of the scene's camera (DIST, Fig. 10 a).
         views_per_step: views that an iteration compares, evenly spaced; they shift by one with each iteration.
         neighbour: a view is compared with the one that is this many views further.
@@ -43,12 +52,14 @@ class Multiview:
         starts, trial: see `bench.solve.optimise.StartSettings`.
         coarse_blur: standard deviation of the initial Gaussian blur of the images, as a share of their height; it falls
             to 0 over the first half of a start's iterations.
+        rotations: their number, about the vertical axis, from which a similarity of one's own photographs begins.
+        silhouette, silhouette_weight: loss of the masks of one's own photographs, and its weight.
         scale, degrees, shift: scale, rotation and shift of the initial shape against the true one; where one is not
             neutral, a similarity transform is optimised as well (DIST, Fig. 12). Ratio, degrees, scene units.
+        similarity: whether one is optimised in any case.
         optimiser: iterations and learning rates.
     """
 
-    images: Photography
     focal: float
     views_per_step: int
     neighbour: int
@@ -63,9 +74,14 @@ class Multiview:
     degrees: float
     shift: float
     similarity: bool
+    rotations: int
+    silhouette: SilhouetteLoss
+    silhouette_weight: float
     optimiser: OptimiserSettings
+    depths: Depths = field(default=Depths(NONE, 0.0), init=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_at_least("task.views_per_step", self.views_per_step, 1, "the paper uses 8")
         check_at_least("task.neighbour", self.neighbour, 1, "1 is the closest next view")
         if self.neighbour % self.images.views == 0:
@@ -82,6 +98,8 @@ class Multiview:
                 f"task.scale must lie between {MIN_SCALE} and {1 / MIN_SCALE}, and task.shift be {MAX_SHIFT} at "
                 f"most, not {self.scale} and {self.shift}: priors are not trained outside of this range"
             )
+        check_at_least("task.rotations", self.rotations, 1, "12 are 30 degrees apart")
+        check_at_least("task.silhouette_weight", self.silhouette_weight, 0, "0 switches the term off")
         self.turns.check(self.optimiser.iterations)
 
     @property
@@ -94,13 +112,64 @@ class Multiview:
         """Whether a similarity is optimised as well."""
         return self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0
 
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput without a prior, and ValueError where rotations use up the iterations."""
+        inputs.check_prior()
+        if inputs.photographed is not None:
+            _ = self._turning
+
+    @property
+    def _turning(self) -> "Multiview":
+        """The same with the mean shape in each of the rotations as starts, where the place of an object is sought."""
+        return replace(self, starts=self.rotations, start_scale=0.0) if self.similarity else self
+
     def execute(self, run: RunContext) -> None:
         """Optimises the code, and evaluates the shape before and after."""
+        if run.inputs.photographed is not None:
+            self._turning._of_photographs(run)
+            return
         apart = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
         if apart > FAR_APART:
             note = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
             run.record.notes = [*run.record.notes, note]
         solve_task(self, run)
+
+    def _of_photographs(self, run: RunContext) -> None:
+        """The same for photographs of one's own, by which the shape is judged, with the colours of those given."""
+        inputs, record = run.inputs, run.record
+        check_field_gradient(inputs.renderer)
+        record.definitions = COLOURED_DEFINITIONS | COSTS
+        subject = self.subject(inputs)
+        record.notes = [*record.notes, subject.found]
+        given = GivenPhotographs(self, inputs.renderer, subject.given, inputs.device, own=True)
+        problem = self._problem(inputs.prior, given, torch.Generator().manual_seed(inputs.seed))
+        check_kind(inputs.renderer, problem.field())
+
+        def scores(names: Sequence[str]) -> dict[str, float]:
+            found = judge_mesh(_coloured(problem.field(), subject, inputs), subject, inputs).metrics
+            return {name: found[name] for name in names if name in found}
+
+        with run.off_clock():
+            record.metrics_start = scores(list(COLOURED_DEFINITIONS))
+        history = descend(problem, self.optimiser, run, lambda iteration: scores(("psnr", "seen_chamfer_l1")))
+        with run.off_clock():
+            mesh = _coloured(problem.field(), subject, inputs)
+            note_surface(run, mesh, subject, {}, history, problem.field())
+            draw_curve(run.folder / "curve.png", history.curve)
+        subject.finish(run)
+
+    def subject(self, inputs: RunInputs) -> Subject:
+        """See `PhotographTask`; set upright where a place is looked for."""
+        found = super().subject(inputs)
+        return upright(found) if self.similarity else found
+
+    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+        """The metrics of a field that a run ended on; see `bench.setup.inputs.Judges`."""
+        if run.inputs.photographed is None:
+            return evaluate(State(field, run.inputs)).metrics
+        subject = self.subject(run.inputs)
+        found = judge_mesh(mesh := _coloured(field, subject, run.inputs), subject, run.inputs).metrics
+        return found | (subject.judged(mesh, run.inputs) if subject.points is not None else {})
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
@@ -110,20 +179,24 @@ class Multiview:
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
         photographs = self.images.take(scene.cast_on, scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        given = GivenPhotographs(self, renderer, photographs, device)
+        return self._problem(prior, GivenPhotographs(self, renderer, photographs, device), generator)
+
+    def _problem(self, prior: Prior, given: "GivenPhotographs", generator: torch.Generator) -> CodeProblem:
         if len(prior.codes) < 2:
             raise BadInput("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")
         spread = self.start_scale * prior.codes.std(0)
         codes = spread * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
+        misplaced = self._misplaced(generator) if self.sought else None
+        observed = torch.zeros(given.colours.shape[1:3], dtype=torch.bool, device="cpu")
         return CodeProblem(
             prior,
             self.code,
             given.compare,
-            torch.zeros_like(scene.view.mask),
-            2 * given.per_step * scene.view.mask.numel(),
-            device,
+            observed,
+            2 * given.per_step * observed.numel(),
+            given.colours.device,
             initial=codes,
-            misplaced=self._misplaced(generator) if self.sought else None,
+            misplaced=turned(self.starts) if given.own and self.similarity else misplaced,
             trial=self.trial,
             photographs=given.colours.cpu().numpy(),
             compared_at=self.optimiser.iterations,  # where images are no longer blurred
@@ -136,21 +209,48 @@ class Multiview:
         return similarity.expand(self.starts, -1)
 
 
+def _coloured(field: Field, subject: Subject, inputs: RunInputs) -> Mesh | None:
+    mesh = State(field, inputs).mesh
+    return mesh and with_colours(mesh, subject.given)
+
+
 class GivenPhotographs:
     """The given photographs; `compare` renders a field's depths and warps the photographs by them."""
 
-    def __init__(self, settings: Multiview, renderer: Renderer, photographs: list[Shot], device: torch.device):
-        self.settings, self.renderer = settings, renderer
+    def __init__(
+        self,
+        settings: Multiview,
+        renderer: Renderer,
+        photographs: Sequence[Shot],
+        device: torch.device,
+        *,
+        own: bool = False,
+    ):
+        """Keeps what is compared; photographs of one's own have any order, and perhaps masks that are compared, too.
+
+        Raises:
+            BadInput: where photographs differ in size.
+        """
+        self.settings, self.renderer, self.own = settings, renderer, own
+        if len({photograph.colours.shape for photograph in photographs}) > 1:
+            raise BadInput("task=multiview compares photographs of one size, and these differ: leave others out")
         self.cameras = [photograph.camera.to(device) for photograph in photographs]
         self.rays = [camera.rays() for camera in self.cameras]
         self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
         self.per_step = min(settings.views_per_step, len(photographs))
+        count, masks = len(photographs), [one.mask for one in photographs if own and one.mask is not None]
+        self.others = [(view + settings.neighbour) % count for view in range(count)]
+        if own:
+            places = torch.stack([camera.center for camera in self.cameras])
+            nearest = torch.cdist(places, places).argsort(dim=1)  # the first is the view itself
+            self.others = nearest[:, min(settings.neighbour, count - 1)].tolist()
+        self.masks = torch.stack(masks).to(device) if masks else None
 
     def pairs(self, iteration: int) -> list[tuple[int, int]]:
         """The views that an iteration compares, evenly spaced, each paired with its neighbour; they shift by one."""
         count = len(self.cameras)
         views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
-        return [(view, (view + self.settings.neighbour) % count) for view in views]
+        return [(view, self.others[view]) for view in views]
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
@@ -160,7 +260,8 @@ class GivenPhotographs:
         """
         renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration)
         colours = self.blurred(iteration)
-        mine = rendered(renderer, field, self._together([pair[0] for pair in pairs]))
+        views, rays = [pair[0] for pair in pairs], self._together([pair[0] for pair in pairs])
+        mine = rendered(renderer, field, rays)
         with torch.no_grad():
             others = rendered(renderer, field, self._together([pair[1] for pair in pairs]))
         differences = []
@@ -174,7 +275,12 @@ class GivenPhotographs:
         together = torch.cat(differences)
         if not len(together):
             raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
-        return {"photometric": self.settings.photometric_weight * together.mean()}
+        terms = {"photometric": self.settings.photometric_weight * together.mean()}
+        if self.masks is not None:
+            given = Observed(self.masks[views], torch.full_like(mine.distance, torch.nan))
+            off = self.settings.silhouette(renderer, field, rays, mine, given)
+            terms["silhouette"] = self.settings.silhouette_weight * off
+        return terms
 
     def _sees(
         self,

@@ -1,6 +1,7 @@
 """Shape from many views of a ball, by a prior of balls."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,22 +9,29 @@ import torch
 import trimesh
 
 from bench.config import load
+from bench.reconstruct.subject import HULL_RADIUS
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
 from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
+from datasets.meshes import read_mesh
 from datasets.scene import Scene, Truth
 from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
+from tests.made_photographs import CENTRE, RADIUS, idr
+from tests.run.driving import command, record_of
 from tests.tiny import CPU, ball_prior, camera_of, scene_of
 
 RENDERER = load("renderer", "dist")
 CAMERA = camera_of(16, angles=(0.0, 20.0))
 PRIOR = ball_prior(radius=0.5)
 SETTINGS = Multiview(
-    images=PLAINLY, focal=1.0, views_per_step=4, neighbour=1, visible=1e-3, photometric_weight=5.0,
-    code=CodePenalty(0.0, "sum"), start_scale=0.0, starts=1, trial=3, coarse_blur=0.0,
-    scale=1.0, degrees=0.0, shift=0.0, similarity=False, optimiser=OptimiserSettings(30, 0.01, "constant"),
+    images=PLAINLY, longest=24, held_out=5, masks=True, focal=1.0, views_per_step=4, neighbour=1,
+    visible=1e-3, photometric_weight=5.0, code=CodePenalty(0.0, "sum"), start_scale=0.0,
+    starts=1, trial=3, coarse_blur=0.0,
+    scale=1.0, degrees=0.0, shift=0.0, similarity=False, rotations=2,
+    silhouette=load("silhouette", "cross_entropy_sharp"), silhouette_weight=10.0,
+    optimiser=OptimiserSettings(30, 0.01, "constant"),
 )  # fmt: skip
 
 
@@ -156,3 +164,20 @@ def test_gradients_reach_the_pixels():
     image = torch.rand(5, 5, 2, generator=torch.Generator().manual_seed(1)).double()
     places = (0.7 + 3.5 * torch.rand(20, 2, generator=torch.Generator().manual_seed(2))).double().requires_grad_()
     assert torch.autograd.gradcheck(lambda p: sample(image, p)[0], places)
+
+
+def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is_put_there(tmp_path):
+    idr(tmp_path)
+    given = ("task=multiview", "dataset=photos", f"dataset.path={tmp_path}", "scale=smoke", "threads=1")
+    assert "set prior.of=sofa" in command(*given, f"results_dir={tmp_path}").err
+    small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=40", "evaluation.grid=24")
+    done = command(*given, *small, "prior.of=car", "isolation=off", f"results_dir={tmp_path}")
+    record, folder = record_of(done.out), Path(done.out.splitlines()[-1])
+    assert record["metrics"]["mask_iou"] > record["metrics_start"]["mask_iou"]
+    found = np.loadtxt(folder / "to_world.txt")
+    radius = np.linalg.norm(found[:3, 0]) * HULL_RADIUS
+    assert found[:3, 3] == pytest.approx(CENTRE, abs=0.1 * RADIUS) and 1 < radius / RADIUS < 1.3
+    assert found[:3, 1] / np.linalg.norm(found[:3, 1]) == pytest.approx([0.0, 1.0, 0.0], abs=0.03)
+    vertices = read_mesh(folder / "mesh_world.ply").vertices - CENTRE
+    assert np.abs(vertices.mean(axis=0)).max() < 0.3 * RADIUS and np.linalg.norm(vertices, axis=1).max() < 1.5 * RADIUS
+    assert (folder / "summary.png").is_file() and (folder / "curve.png").is_file()
