@@ -246,6 +246,7 @@ def register_resolvers() -> None:
     OmegaConf.register_new_resolver("methods", _methods, replace=True)
     OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
     OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
+    OmegaConf.register_new_resolver("stem_of", _stem, replace=True)
     OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
 
 
@@ -298,6 +299,13 @@ def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
     if kind == "space":
         return ",".join(f"space/{name}" for name in kept)
     return ",".join(f"{name},tuned/{name}" for name in kept if name in tuned)
+
+
+def _stem(path: str | None) -> str:
+    """The name of a file, without suffix, by which a row is told from the same row of another file."""
+    if path is None:
+        raise ValueError("+method=cloud needs a file of points: add task.cloud=POINTS.ply")
+    return Path(path).stem
 
 
 def _drawn(dimension: int, least: float, most: float, *, _root_: DictConfig) -> float | int:

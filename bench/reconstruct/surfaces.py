@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from bench.evaluate.state import GREY, painted
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import Subject, visible, within
+from datasets.captures.hull import carve
 from datasets.mesh import Mesh
 from datasets.meshes import read_points
 from datasets.repair import needed_meshlab
@@ -38,6 +39,8 @@ def given_clouds(shots: Sequence[Shot]) -> list[Cloud]:
 def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
     """The points of a file that lie in the unit sphere, each with the given camera that is nearest to it.
 
+    Where photographs have masks, those more than a pixel outside of the visual hull are left out (DVR, Sec. 4.2).
+
     Raises:
         BadInput: where it is no cloud of points, or lies elsewhere.
     """
@@ -49,6 +52,8 @@ def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
         raise BadInput(
             f"nothing of task.cloud={path} lies in the unit sphere of the photographs: give it in their cameras' world"
         )
+    if all(shot.mask is not None for shot in subject.given):
+        points = points[(carve(subject.given, torch.from_numpy(points).float()) < 0.5).numpy()]
     cameras = [shot.camera for shot in subject.given]
     _, nearest = cKDTree(np.stack([camera.center.double().numpy() for camera in cameras])).query(points)
     return [Cloud(points[nearest == place], camera) for place, camera in enumerate(cameras)]

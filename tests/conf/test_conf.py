@@ -156,7 +156,8 @@ def test_every_choice_composes_and_builds(paths, row):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_composes_and_builds(name):
-    builds(composed(f"+method={name}"))
+    cloud = ["task.cloud=points.ply"] if name.startswith("cloud") else []  # the row has the file's name
+    builds(composed(f"+method={name}", *cloud))
 
 
 @pytest.mark.parametrize("place", [0, -1], ids=["first", "last"])

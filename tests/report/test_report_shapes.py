@@ -146,6 +146,14 @@ def test_photographs_need_no_chamfer(tmp_path):
     assert result.verdict.endswith(": *23.0* (Newton, RGB) to 12.0 (Visual hull); n = 2 folders.")
 
 
+def test_photographs_with_a_truth_have_its_errors(tmp_path):
+    photographed(tmp_path, NEWTON, PHOTO_SCORES | {"dtu_accuracy": 1.5, "dtu_completeness": 2.5, "dtu_overall": 2.0})
+    photographed(tmp_path, HULL, {}, status="empty")
+    table = page_of(tmp_path, "photos").table
+    assert [*table.columns][1:5] == ["Accuracy (mm)", "Completeness (mm)", "Chamfer-L1 (mm)", "PSNR (dB)"]
+    assert table.iloc[0, 1:4].tolist() == ["1.50", "2.50", "2.00"] and table.iloc[1, 1] == "∞"
+
+
 def test_photographs_without_masks_have_no_overlap(tmp_path):
     photographed(tmp_path, NEWTON, {"psnr": 20.0, "ssim": 0.5})
     line = line_of(page_of(tmp_path, "photos"), NEWTON)

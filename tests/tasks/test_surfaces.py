@@ -8,7 +8,7 @@ import pytest
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN
 from bench.reconstruct.stereo import Matching
 from bench.reconstruct.subject import Depths
-from bench.reconstruct.surfaces import with_colours
+from bench.reconstruct.surfaces import measured_clouds, with_colours
 from bench.solve.solve import COSTS
 from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
@@ -123,7 +123,7 @@ def test_points_of_another_program_are_read_in_the_cameras_world(scene, tmp_path
     subject = POISSON.subject(run_in(tmp_path / "run", scene).inputs)
     to_world = np.diag([5.0, 5.0, 5.0, 1.0])
     to_world[:3, 3] = (1.0, -2.0, 30.0)
-    points = np.concatenate([sample_surface(subject.truth, 8000, seed=0).points, [[3.0, 0.0, 0.0]]])
+    points = np.concatenate([sample_surface(subject.truth, 8000, seed=0).points, [[3.0, 0.0, 0.0], [0.0, 0.9, 0.0]]])
     file, lines = tmp_path / "points.ply", 5 * points + to_world[:3, 3]
     header = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n" + "".join(f"property float {x}\n" for x in "xyz")
     file.write_text(header + "end_header\n" + "".join(f"{x} {y} {z}\n" for x, y, z in lines))
@@ -131,6 +131,8 @@ def test_points_of_another_program_are_read_in_the_cameras_world(scene, tmp_path
     found = task.surface(replace(subject, to_world=to_world))
     assert found is not None and found.volume == pytest.approx(subject.truth.volume, rel=0.1)  # turned outward
     assert Truth(subject.truth).distance(found.vertices).mean() < 0.02
+    kept = np.concatenate([cloud.points for cloud in measured_clouds(str(file), replace(subject, to_world=to_world))])
+    assert 7900 < len(kept) <= 8000 and kept[:, 1].max() < 0.85  # that beside the visual hull is left out
     with pytest.raises(BadInput, match=r"nothing of task\.cloud=.* lies in the unit sphere"):
         task.surface(subject)
     subject.truth.save(tmp_path / "mesh.ply")
