@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench.progress import Report
 from bench.reconstruct.pixels import Pixels
+from bench.reconstruct.subject import hull_distances
 from bench.records.record import digest
 from bench.shape_prior import kept
 from datasets.captures.hull import carve
@@ -87,21 +88,33 @@ class ImagesOf:
         near = near + NEAR_HULL * torch.randn(POINTS, 3, generator=draw, device="cpu")
         return torch.cat([anywhere[:POINTS], near]), torch.cat([inside[:POINTS], carve(shots, near) < 0])
 
-    def pixels(self, view: int, count: int, generator: torch.Generator, device: torch.device) -> Pixels:
-        """Random pixels of an image whose rays meet the unit sphere, with colours, mask and depth."""
+    @cached_property
+    def to_hull(self) -> list[Float[Tensor, "height width"]]:
+        """Distances along the rays of each image to the visual hull of the masks; NaN beside it."""
+        return hull_distances([replace(shot, depth=None) for shot in self.shots()])
+
+    def pixels(
+        self, view: int, count: int, generator: torch.Generator, device: torch.device, *, hull: bool = False
+    ) -> Pixels:
+        """Random pixels of an image whose rays meet the unit sphere, with colours, mask and depth.
+
+        Args:
+            hull: whether the distance that a loss of the mask may use is that to the visual hull, not the given one.
+        """
         camera = self.cameras[view]
         rays = camera.rays().flat()
         meets = sphere_span(rays)[2].nonzero().squeeze(-1)
         chosen = meets[torch.randint(len(meets), (count,), generator=generator, device="cpu")]
         at_one = camera.depth(torch.ones_like(self.depths[view])).flatten()[chosen]
         mask, depth = self.masks[view].flatten()[chosen], self.depths[view].flatten()[chosen]
+        distance = torch.where(mask, depth / at_one, torch.nan)
         return Pixels(
             rays[chosen].to(device),
             (self.colours[view].reshape(-1, 3)[chosen].float() / 255).to(device),
             at_one.to(device),
             mask.to(device),
-            torch.where(mask, depth / at_one, torch.nan).to(device),
-            None,
+            distance.to(device),
+            (self.to_hull[view].flatten()[chosen] if hull else distance).to(device),
             None,
         )
 

@@ -17,11 +17,12 @@ from bench.progress import Report, notice
 from bench.reconstruct.losses import Losses
 from bench.single_view.images import ImagesOf
 from bench.single_view.network import SingleView, SingleViewNetwork
-from bench.solve.optimise import OptimiserSettings
-from renderers.checks import check_at_least, check_positive
+from bench.solve.optimise import SCHEDULES, OptimiserSettings
+from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Meter, occupancy_logits
 from renderers.fields.coloured import LOGIT_WIDTH, OccupancyOf
 from renderers.rendering import Renderer, at_iteration
+from renderers.silhouette import DEPTH
 
 LARGEST_GRADIENT = 1.0  # norm to which a step's gradient is shortened
 
@@ -52,6 +53,11 @@ class Supervision:
         check_at_least("supervision.points", self.points, 1, "1024 work")
 
     @property
+    def to_hull(self) -> bool:
+        """Whether a loss of the mask asks for a depth (DVR, Eq. 15) and none is given, but that of the visual hull."""
+        return getattr(self.losses.silhouette, "occupied_at", None) == DEPTH and not self.losses.depth
+
+    @property
     def renders(self) -> bool:
         """Whether any term is of a rendering."""
         losses = self.losses
@@ -66,7 +72,8 @@ class TrainingSettings:
         steps: optimiser steps, each on `shapes_per_step` shapes, of each a random image to encode and one to compare.
         shapes_per_step: their number.
         rays: of the image that is compared.
-        learning_rate: of Adam at the start; it falls to zero along a cosine.
+        learning_rate: of Adam at the start.
+        schedule: of the rate, see `OptimiserSettings`.
         keep_every: steps after which the state is kept on disk, for a training that is stopped.
         seed: of weights, batches and rays.
     """
@@ -75,6 +82,7 @@ class TrainingSettings:
     shapes_per_step: int
     rays: int
     learning_rate: float
+    schedule: str
     keep_every: int
     seed: int
 
@@ -82,10 +90,11 @@ class TrainingSettings:
         for name in ("steps", "shapes_per_step", "rays", "keep_every"):
             check_at_least(f"task.training.{name}", getattr(self, name), 1, "conf/scale has values that work")
         check_positive("task.training.learning_rate", self.learning_rate, "1e-3 works")
+        check_choice("task.training.schedule", self.schedule, SCHEDULES)
 
     def rate(self, step: int) -> float:
         """The learning rate of a step, counted from 0."""
-        return OptimiserSettings(self.steps, self.learning_rate, "cosine").rate(step)
+        return OptimiserSettings(self.steps, self.learning_rate, self.schedule).rate(step)
 
 
 @dataclass
@@ -180,7 +189,7 @@ class Lessons:
         terms, given = [], self.supervision
         if given.renders:
             view = int(torch.randint(len(images.cameras), (1,), generator=draw, device="cpu"))
-            pixels = images.pixels(view, self.settings.rays, draw, self.device)
+            pixels = images.pixels(view, self.settings.rays, draw, self.device, hull=given.to_hull)
             terms.append(given.losses(renderer, shape, metered, pixels)["total"])
         if given.occupancy:
             terms.append(given.occupancy * self._known(shape, images.points, images.inside, draw))

@@ -127,7 +127,8 @@ class OneImage:
         check_field_gradient(inputs.renderer)
         sampler = replace(inputs.views, resolution=self.image_pixels, elevation=self.elevation)
         settings = {name: config["task"][name] for name in DECIDING} | {"view": asdict(sampler)}
-        settings["training"] = {name: x for name, x in settings["training"].items() if name != "keep_every"}
+        unsaid = {"keep_every": config["task"]["training"]["keep_every"], "schedule": "cosine"}  # as it always was
+        settings["training"] = {name: x for name, x in settings["training"].items() if unsaid.get(name) != x}
         if self.supervision.renders:
             renderer = {k: v for k, v in config["renderer"].items() if not k.startswith("_") or k == "_target_"}
             settings["renderer"] = renderer | ({"auto": config["auto"]} if AUTO in renderer.values() else {})

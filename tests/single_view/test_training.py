@@ -19,7 +19,7 @@ from datasets.scene import Split
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.field import Counts
-from renderers.silhouette import CrossEntropy
+from renderers.silhouette import CrossEntropy, Occupancy
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.tiny import silent
@@ -35,7 +35,7 @@ LOSSES = Losses(
 RGB = Supervision(LOSSES, occupancy=0.0, hull=0.0, points=64)
 VOLUME = Supervision(replace(LOSSES, colour=0.0, silhouette_weight=0.0), occupancy=1.0, hull=0.0, points=256)
 SETTINGS = TrainingSettings(
-    steps=6, shapes_per_step=2, rays=32, learning_rate=5e-3, keep_every=2, seed=0
+    steps=6, shapes_per_step=2, rays=32, learning_rate=5e-3, schedule="cosine", keep_every=2, seed=0
 )  # fmt: skip
 
 
@@ -123,6 +123,17 @@ def test_pixels_are_those_of_the_image(images):
     assert torch.equal(known, pixels.mask)
     found = pixels.rays.at(pixels.distance.nan_to_num())[known].norm(dim=1)
     assert found.numpy() == pytest.approx(0.55, abs=0.01)
+    torch.testing.assert_close(pixels.guide, pixels.distance, equal_nan=True)
+    behind = images[1].pixels(2, 50, torch.Generator().manual_seed(0), CPU, hull=True).guide
+    both = behind.isfinite() & known
+    assert both.sum() > 0.9 * known.sum() and bool((behind < pixels.distance + 0.05)[both].all())
+    assert float((pixels.distance - behind)[both].max()) > 0.02  # three masks leave more than the ball
+
+
+def test_the_visual_hull_takes_the_place_of_a_depth_that_is_not_known():
+    masks = Occupancy(width=0.02, weight=1.0, sphere_radius=1.0, occupied_at="depth")
+    own = replace(RGB, losses=replace(LOSSES, silhouette=masks))
+    assert own.to_hull and not RGB.to_hull and not replace(own, losses=replace(own.losses, depth=1.0)).to_hull
 
 
 def test_it_learns_which_ball_an_image_shows(images, renderer, tmp_path):
