@@ -51,6 +51,8 @@ class Supervision:
         if self.hull < 1 and not self.renders and not self.occupancy:
             raise ValueError("supervision has no term after the hull's steps: give a weight, or supervision.hull=1")
         check_at_least("supervision.points", self.points, 1, "1024 work")
+        if self.losses.colour_gradient:
+            raise ValueError("supervision.losses.colour_gradient must be 0: no patches are drawn, but single pixels")
 
     @property
     def to_hull(self) -> bool:
@@ -60,8 +62,7 @@ class Supervision:
     @property
     def renders(self) -> bool:
         """Whether any term is of a rendering."""
-        losses = self.losses
-        return self.hull < 1 and any((losses.colour, losses.colour_gradient, losses.depth, losses.silhouette_weight))
+        return self.hull < 1 and any((self.losses.colour, self.losses.depth, self.losses.silhouette_weight))
 
 
 @dataclass(frozen=True)

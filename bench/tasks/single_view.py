@@ -116,7 +116,7 @@ class OneImage:
     @property
     def knows_colours(self) -> bool:
         """Whether the training knows any colour."""
-        return any((self.supervision.losses.colour, self.supervision.losses.colour_gradient))
+        return self.supervision.losses.colour > 0
 
     def recipe(self, inputs: RunInputs, config: dict[str, Any]) -> Recipe:
         """What determines the network that a run's configuration asks for.

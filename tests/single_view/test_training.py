@@ -326,6 +326,7 @@ def test_the_overlap_is_that_of_volumes(images):
         (NETWORK, {"channels": (12,)}, "task.network.channels must be multiples of 8"),
         (NETWORK, {"reads": "density"}, "task.network.reads must be one of occupancy, distance"),
         (RGB, {"hull": 1.5}, "supervision.hull must be a share of the steps, 0 to 1, not 1.5"),
+        (RGB, {"losses": replace(LOSSES, colour_gradient=1.0)}, "colour_gradient must be 0: no patches are drawn"),
         (VOLUME, {"occupancy": 0.0}, "supervision has no term after the hull's steps: give a weight"),
     ],
 )
