@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
 
 from bench.evaluate.state import GREY, painted
 from bench.reconstruct.stereo import Cloud
@@ -23,6 +22,8 @@ from renderers.checks import BadInput
 
 NEIGHBOURS = 16  # points whose plane gives a normal
 OUTLYING = 2.0  # standard deviations of the mean distance to neighbours, beyond which a point is left out
+IN_FRONT = 0.05  # scene units: how much nearer another point of a pixel is, that hides one
+FAR = 1e4  # beyond all cameras that see a point
 FACING = 4.0  # power of the cosine between normal and view direction, by which photographs are weighted
 
 
@@ -37,7 +38,7 @@ def given_clouds(shots: Sequence[Shot]) -> list[Cloud]:
 
 
 def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
-    """The points of a file that lie in the unit sphere, each with the given camera that is nearest to it.
+    """The points of a file that lie in the unit sphere, each with the nearest given camera that sees it.
 
     Where photographs have masks, those more than a pixel outside of the visual hull are left out (DVR, Sec. 4.2).
 
@@ -55,8 +56,25 @@ def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
     if all(shot.mask is not None for shot in subject.given):
         points = points[(carve(subject.given, torch.from_numpy(points).float()) < 0.5).numpy()]
     cameras = [shot.camera for shot in subject.given]
-    _, nearest = cKDTree(np.stack([camera.center.double().numpy() for camera in cameras])).query(points)
-    return [Cloud(points[nearest == place], camera) for place, camera in enumerate(cameras)]
+    seeing = _seeing(torch.from_numpy(points).float(), cameras).numpy()
+    return [Cloud(points[seeing == place], camera) for place, camera in enumerate(cameras)]
+
+
+def _seeing(points: Float[torch.Tensor, "n 3"], cameras: Sequence[Camera]) -> Int[torch.Tensor, " n"]:
+    """The nearest camera that sees each point, none of its pixel being in front; the nearest where none does."""
+    least, seeing = torch.full((len(points),), torch.inf), torch.zeros(len(points), dtype=torch.long)
+    for place, camera in enumerate(cameras):
+        pixels, depth = camera.project(points)
+        inside = camera.shows(points)
+        column, row = torch.where(inside[:, None], pixels, 0.0).long().T
+        pixel = row * (camera.width + 1) + column
+        front = torch.full(((camera.height + 1) * (camera.width + 1),), torch.inf)
+        front.scatter_reduce_(0, pixel, torch.where(inside, depth, torch.inf), "amin")
+        hidden = ~inside | (depth > front[pixel] + IN_FRONT)
+        distance = torch.linalg.vector_norm(points - camera.center, dim=-1) + torch.where(hidden, FAR, 0.0)
+        seeing[distance < least] = place
+        least = torch.minimum(least, distance)
+    return seeing
 
 
 def fused(clouds: Sequence[Cloud]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

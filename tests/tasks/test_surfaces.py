@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN
 from bench.reconstruct.stereo import Matching
 from bench.reconstruct.subject import Depths
-from bench.reconstruct.surfaces import measured_clouds, with_colours
+from bench.reconstruct.surfaces import fused, measured_clouds, with_colours
 from bench.solve.solve import COSTS
 from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
@@ -138,3 +139,14 @@ def test_points_of_another_program_are_read_in_the_cameras_world(scene, tmp_path
     subject.truth.save(tmp_path / "mesh.ply")
     with pytest.raises(BadInput, match="has faces: give a cloud of points"):
         replace(POISSON, cloud=str(tmp_path / "mesh.ply")).surface(subject)
+
+
+def test_points_are_turned_to_a_camera_that_sees_them_not_to_the_nearest(scene, tmp_path):  # noqa: F811
+    """The inner side of a plate far from the middle, which hides it from the camera that is nearest."""
+    subject = POISSON.subject(run_in(tmp_path / "run", scene).inputs)
+    plate = trimesh.creation.box((0.2, 0.9, 0.9)).apply_translation([0.6, 0.0, 0.0])
+    trimesh.PointCloud(trimesh.sample.sample_surface(plate, 6000, seed=0)[0]).export(tmp_path / "plate.ply")
+    bare = replace(subject, given=tuple(replace(shot, mask=None) for shot in subject.given))
+    points, normals = fused(measured_clouds(str(tmp_path / "plate.ply"), bare))
+    for inner, side in ((points[:, 0] < 0.52, -1), (points[:, 0] > 0.68, 1)):
+        assert (side * normals[inner, 0] > 0).mean() > 0.95
