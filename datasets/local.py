@@ -13,11 +13,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from datasets.colours import FileColours, named_files
 from datasets.deform import deform
 from datasets.extras import version
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
 from datasets.scene import Split, seed_of
+from datasets.textures import Texture
 from renderers.checks import check_at_least, check_share
 
 VERSION = 4  # raise it when reading, repair or deformation changes the shapes
@@ -58,13 +60,21 @@ class LocalMeshes:
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """A shape as a closed mesh; its `repairs` say what was repaired in the file."""
-        files = self.files(split)
-        file = files[index % len(files)]
+        files, file = self.files(split), self._file(split, index)
         mesh = _load(file, file.stat().st_mtime_ns, self.radius)
         alone = len(find_meshes(self.path)) == 1
         if index < len(files) and (split is Split.TRAIN or not alone):
             return mesh
         return normalise(deform(mesh, seed_of(split, index), strength=self.strength), self.radius)
+
+    def texture(self, split: Split, index: int) -> Texture:
+        """The colours of a shape, as its file has them; see `Textured`."""
+        file = self._file(split, index)
+        return FileColours(file, repaired(file), self.mesh(split, index))
+
+    def _file(self, split: Split, index: int) -> Path:
+        files = self.files(split)
+        return files[index % len(files)]
 
     def files(self, split: Split) -> list[Path]:
         """The files of a split; splits share none, unless there are fewer than three."""
@@ -73,7 +83,9 @@ class LocalMeshes:
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: the files' contents, not their paths."""
-        contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in find_meshes(self.path)]
+        meshes = find_meshes(self.path)
+        named = [other for file in meshes for other in named_files(file) if other.is_file()]
+        contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in (*meshes, *named)]
         return {
             "name": "mesh",
             "version": VERSION,

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from datasets.mesh import Mesh
+from datasets.textures import Texture
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.checks import BadInput
@@ -40,6 +41,15 @@ class Dataset(Protocol):
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: datasets of equal identity hold the same ones."""
+        ...
+
+
+@runtime_checkable
+class Textured(Protocol):
+    """A dataset whose shapes have colours of their own."""
+
+    def texture(self, split: Split, index: int) -> Texture:
+        """The colours of shape number `index` of a split; raises ValueError where it has none."""
         ...
 
 
@@ -133,6 +143,13 @@ class Truth:
         weights = np.stack([1 - along.sum(axis=1), along[:, 0], along[:, 1]], axis=1) * hit[:, None]
         return weights, self._faces[np.where(hit, answer["primitive_ids"].numpy().astype(np.int64), 0)]
 
+    def nearest(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]:
+        """Gives the nearest point of the surface by the corners of its face: their weights, and vertices."""
+        found = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, dtype=np.float32)))
+        along = found["primitive_uvs"].numpy().astype(np.float64)
+        weights = np.stack([1 - along.sum(axis=1), along[:, 0], along[:, 1]], axis=1)
+        return weights, self._faces[found["primitive_ids"].numpy().astype(np.int64)]
+
     def signed_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Gives the distance to the surface, negative inside, with the sign by majority over five rays per point."""
         points = np.asarray(points, dtype=np.float32)
@@ -191,6 +208,7 @@ class Scene:
         measured: camera z that a scanner measured at the view's pixels, 0 where it measured none; None without one.
         to_world: the similarity from the scene's world into that of a file; None of a scene that is its own.
         part: whether `mesh` is only what the view shows of an unknown shape, an open surface.
+        texture: the colours of the shape; None where it has none.
     """
 
     name: str
@@ -199,6 +217,7 @@ class Scene:
     measured: Float[Tensor, "height width"] | None = None
     to_world: Float[np.ndarray, "4 4"] | None = None
     part: bool = False
+    texture: Texture | None = None
 
     @cached_property
     def cast_on(self) -> Truth:
@@ -291,3 +310,13 @@ def see(truth: Truth, camera: Camera) -> View:
     distance = torch.from_numpy(np.where(hits.hit, hits.distance, 0.0).astype(np.float32)).view(rays.shape)
     normals = torch.from_numpy(np.where(hits.hit[:, None], hits.normals, 0.0).astype(np.float32))
     return View(camera, camera.depth(distance), normals.view(*rays.shape, 3), mask)
+
+
+def painted(view: View, texture: Texture) -> Float[Tensor, "height width 3"]:
+    """The colours of what a view shows, without light; 0 on the background."""
+    rays = view.camera.rays()
+    points = rays.at(view.camera.distance(view.depth))[view.mask].numpy().astype(np.float64)
+    colours = texture(points, view.normals[view.mask].numpy().astype(np.float64))
+    image = torch.zeros(*view.mask.shape, 3)
+    image[view.mask] = torch.from_numpy(colours.astype(np.float32))
+    return image

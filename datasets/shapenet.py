@@ -12,12 +12,14 @@ import numpy as np
 
 from datasets.captures.formats import find_layout
 from datasets.captures.take import take
+from datasets.colours import FileColours
 from datasets.local import VERSION, deal, repaired
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.meshes import read_mesh
 from datasets.repair import WRAPPED
 from datasets.scene import Split
 from datasets.shot import Shot
+from datasets.textures import Texture
 from renderers.checks import BadInput, check_choice
 
 SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
@@ -78,6 +80,11 @@ class ShapeNet:
         if lost := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
             told.append(f"warning: {len(lost)} shapes of the list are not on disk, and left out, such as {min(lost)}")
         return replace(mesh, repairs=(*told, *mesh.repairs))
+
+    def texture(self, split: Split, index: int) -> Texture:
+        """The colours of a shape, as its file has them; see `Textured`."""
+        file = self._file(split, index)
+        return FileColours(file, repaired(file), self.mesh(split, index))
 
     def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
         """See `Pictured`."""

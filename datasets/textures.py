@@ -9,13 +9,14 @@ from scipy.ndimage import map_coordinates
 
 PHOTOGRAPHS = ("astronaut", "brick", "chelsea", "coffee", "grass", "gravel", "rocket")  # that scikit-image ships
 ONE_COLOUR = ("painted", "plain")
-TEXTURES = ("noise", *ONE_COLOUR, *PHOTOGRAPHS)
+TEXTURES = ("noise", "banded", *ONE_COLOUR, *PHOTOGRAPHS)
 LATTICE = 64  # random colours per axis, after which solid noise repeats
 OCTAVES = 3  # each halves the cells and the weight
 CONTRAST = 2.0  # factor that spreads averages of random numbers, which lie near a half
 SHARPNESS = 4.0  # power of the normal's components in the blend of the three projections
 PLAIN = 0.75  # brightness of a surface without texture
 PAINT = (0.3, 1.0)  # range of the channels of a paint
+BANDS = 3  # paints of a banded surface
 
 
 Texture = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
@@ -26,10 +27,10 @@ def make_texture(name: str, size: float, seed: int) -> Texture:
     """A texture by name.
 
     Args:
-        name: "noise"; "plain", grey; "painted", one random colour; or a photograph, projected along x, y and z and
-            blended by the normal.
-        size: of noise's coarsest cells, or of a photograph's shorter side on the surface, in scene units.
-        seed: of noise and paint.
+        name: "noise"; "banded", horizontal bands of three random colours in turn; "plain", grey; "painted", one random
+            colour; or a photograph, projected along x, y and z and blended by the normal.
+        size: of noise's coarsest cells, a band's height, or a photograph's shorter side on the surface, in scene units.
+        seed: of noise and paints.
     """
     if name == "noise":
         return lambda points, normals: _solid_noise(points, size, seed)
@@ -38,6 +39,9 @@ def make_texture(name: str, size: float, seed: int) -> Texture:
     if name == "painted":
         paint = np.random.default_rng(seed).uniform(*PAINT, 3)
         return lambda points, normals: np.broadcast_to(paint, points.shape)
+    if name == "banded":
+        paints = np.random.default_rng(seed).uniform(*PAINT, (BANDS, 3))
+        return lambda points, normals: paints[np.floor(points[:, 1] / size).astype(np.int64) % BANDS]
     return lambda points, normals: _triplanar(points, normals, photograph(name), size)
 
 

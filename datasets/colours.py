@@ -1,0 +1,114 @@
+"""Colours of a mesh file's own surface, by its textures, materials or vertices, on the shapes that are made of it."""
+
+import re
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from datasets.mesh import Mesh
+from datasets.meshes import read_mesh
+from datasets.scene import Truth
+from renderers.checks import BadInput
+
+GREY = 0.7  # of parts without colours, beside parts that have some
+
+
+class Piece(NamedTuple):
+    """A part of a file's surface; `values` are colours of its vertices, or their u, v and 0 in an image."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    values: Float[np.ndarray, "v 3"]
+    image: Any = None
+    known: bool = True  # whether the file gives it a colour
+
+
+class FileColours:
+    """A `Texture`: a point has the colour of the nearest point of the file's surface, before that was repaired.
+
+    Args:
+        path: of the file.
+        rest: its repaired mesh.
+        shape: the same faces, moved to where points are.
+
+    Raises:
+        ValueError: the file cannot be read, has no colours, or names files that are not there.
+    """
+
+    def __init__(self, path: Path, rest: Mesh, shape: Mesh) -> None:
+        self._rest, self._shape, self._pieces = rest.vertices, Truth(shape), _pieces(path, path.stat().st_mtime_ns)
+        firsts = np.cumsum([0, *(len(piece.vertices) for piece in self._pieces)])
+        faces = [piece.faces + first for piece, first in zip(self._pieces, firsts, strict=False)]
+        vertices = np.concatenate([piece.vertices for piece in self._pieces])
+        self._own = Truth(Mesh(vertices, np.concatenate(faces)), closed=False)
+        self._values = np.concatenate([piece.values for piece in self._pieces])
+        self._piece = np.repeat(range(len(self._pieces)), np.diff(firsts))
+
+    @property
+    def texels(self) -> int:
+        """Pixels of the file's images."""
+        images = {id(piece.image): piece.image for piece in self._pieces if piece.image is not None}
+        return sum(image.width * image.height for image in images.values())
+
+    def __call__(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> np.ndarray:
+        from trimesh.visual.color import uv_to_interpolated_color
+
+        weights, corners = self._shape.nearest(points)
+        weights, corners = self._own.nearest(np.einsum("nk,nkd->nd", weights, self._rest[corners]))
+        colours, piece = np.einsum("nk,nkd->nd", weights, self._values[corners]), self._piece[corners[:, 0]]
+        for number, (*_, image, _) in enumerate(self._pieces):
+            if image is not None:
+                here = piece == number
+                colours[here] = uv_to_interpolated_color(colours[here, :2], image)[:, :3] / 255
+        return colours.clip(0, 1)
+
+
+def named_files(path: Path) -> list[Path]:
+    """The .mtl files that an .obj names, and the images that these name, whether they are there or not."""
+    libraries = _named(path, "mtllib") if path.suffix.lower() == ".obj" else []
+    return [*libraries, *(image for file in libraries if file.is_file() for image in _named(file, "map_Kd"))]
+
+
+def _named(path: Path, key: str) -> list[Path]:
+    """The files that lines of a key name, beside `path`; an option such as `-s 1 1 1` stands before the name."""
+    lines = re.findall(rf"^\s*{key}[ \t]+(.+?)\s*$", path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
+    names = [line.split()[-1] if line.startswith("-") else line for line in dict.fromkeys(lines)]
+    return [path.parent / name.replace("\\", "/") for name in names]
+
+
+@lru_cache(maxsize=64)
+def _pieces(path: Path, changed: int) -> list[Piece]:
+    """The parts of a file, read again when it has changed."""
+    import trimesh
+
+    mesh, named, pieces = read_mesh(path), named_files(path), []
+    if missing := [file for file in named if not file.is_file()]:
+        raise BadInput(f"mesh file '{path}' names '{missing[0].name}', which is not there: put it at '{missing[0]}'")
+    if named or path.suffix.lower() == ".glb":
+        try:
+            parts = trimesh.load_scene(path, process=False).dump()
+            pieces = [_piece(part) for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        except Exception as error:  # of trimesh, whatever it does with a file that our readers read
+            raise BadInput(f"the materials of mesh file '{path}' cannot be read: {error}") from error
+    if any(piece.known for piece in pieces):
+        return pieces
+    if mesh.colours is None:
+        what = "neither a texture nor those of materials or vertices: export it with its materials"
+        raise BadInput(f"mesh file '{path}' has no colours, {what}")
+    return [Piece(mesh.vertices, mesh.faces, mesh.colours)]
+
+
+def _piece(part: Any) -> Piece:
+    vertices, faces, visual = np.array(part.vertices), np.array(part.faces), part.visual
+    material = getattr(visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is not None and visual.uv is not None:
+        return Piece(vertices, faces, np.pad(visual.uv, ((0, 0), (0, 1))), image)
+    if visual.kind in ("vertex", "face"):
+        return Piece(vertices, faces, visual.vertex_colors[:, :3] / 255)
+    known = material is not None and getattr(material, "baseColorFactor", material) is not None
+    colour = material.main_color[:3] / 255 if known else np.full(3, GREY)
+    return Piece(vertices, faces, np.tile(colour, (len(vertices), 1)), known=known)

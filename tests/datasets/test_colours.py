@@ -1,0 +1,77 @@
+"""Colours of mesh files: textures, materials and vertices, on the file's shape and on its deformations."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from datasets.local import LocalMeshes
+from datasets.scene import Split, sample_surface
+from renderers.checks import BadInput
+from tests.looped import each
+
+RAMP = np.linspace(0, 255, 256).round().astype(np.uint8)
+
+
+def textured(folder: Path, suffix: str) -> Path:
+    """A box whose texture gives red by u, which is x, and green by v, which is y; vertices are split as at a seam."""
+    box = trimesh.creation.box((1.0, 0.8, 0.6))
+    corners = np.asarray(box.vertices)[np.asarray(box.faces)].reshape(-1, 3)
+    image = np.zeros((256, 256, 3), np.uint8)
+    image[..., 0], image[..., 1] = RAMP, RAMP[::-1, None]
+    uv = corners[:, :2] / (1.0, 0.8) + 0.5
+    visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray(image))
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    trimesh.Trimesh(corners, faces, process=False, visual=visual).export(folder / f"box.{suffix}")
+    return folder / f"box.{suffix}"
+
+
+def shapes(path: Path) -> LocalMeshes:
+    return LocalMeshes(str(path), radius=0.97, strength=1.0)
+
+
+@each("suffix", ["obj", "glb"])
+def test_a_texture_is_seen_on_the_shape_and_goes_with_its_deformations(tmp_path, suffix):
+    dataset = shapes(textured(tmp_path, suffix))
+    rest = dataset.mesh(Split.TRAIN, 0)
+    surface = sample_surface(rest, 300, seed=0)
+    texture = dataset.texture(Split.TRAIN, 0)
+    colours = texture(surface.points, surface.normals)
+    across = surface.points[:, :2] / np.ptp(rest.vertices, axis=0)[:2] + 0.5
+    assert np.abs(colours[:, :2] - across).max() < 0.01 and not colours[:, 2].any()
+    assert texture.texels == 256 * 256
+    bent = dataset.mesh(Split.TEST, 3)
+    centres, moved = (mesh.vertices[mesh.faces].mean(axis=1) for mesh in (rest, bent))
+    own = dataset.texture(Split.TEST, 3)(moved, moved)
+    assert np.abs(own - texture(centres, centres)).max() < 0.01
+    assert np.abs(moved - centres).max() > 0.02
+
+
+def test_without_an_image_the_colours_are_those_of_vertices_or_of_the_material(tmp_path):
+    box = trimesh.creation.box()
+    box.export(tmp_path / "material.obj")
+    text = (tmp_path / "material.obj").read_text()
+    (tmp_path / "material.obj").write_text("mtllib paints.mtl\nusemtl red\n" + text)
+    (tmp_path / "paints.mtl").write_text("newmtl red\nKd 1.0 0.2 0.0\n")
+    box.visual.vertex_colors = np.tile([255, 51, 0, 255], (8, 1))
+    for name in ("vertices.ply", "vertices.glb"):
+        box.export(tmp_path / name)
+    for name in ("vertices.ply", "vertices.glb", "material.obj"):
+        texture = shapes(tmp_path / name).texture(Split.TRAIN, 0)
+        assert texture(np.eye(3), np.eye(3)) == pytest.approx(np.tile([1.0, 0.2, 0.0], (3, 1)), abs=0.01)
+        assert texture.texels == 0
+
+
+def test_what_has_no_colours_or_lacks_a_file_is_an_error_that_says_so(tmp_path):
+    trimesh.creation.box().export(tmp_path / "plain.ply")
+    with pytest.raises(BadInput, match=r"plain.ply' has no colours.* export it with its materials"):
+        shapes(tmp_path / "plain.ply").texture(Split.TRAIN, 0)
+    path = textured(tmp_path, "obj")
+    whole = shapes(path).identity()
+    (image,) = tmp_path.glob("*.png")
+    image.rename(tmp_path / "elsewhere")
+    with pytest.raises(BadInput, match=f"names '{image.name}', which is not there: put it at"):
+        shapes(path).texture(Split.TRAIN, 0)
+    assert shapes(path).identity() != whole
