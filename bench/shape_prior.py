@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from math import cos, pi, sqrt
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +23,10 @@ from bench.machine.environment import describe
 from bench.progress import Report, notice
 from bench.records.record import digest, file_lock, to_json, write_text
 from datasets.mesh import Mesh
-from datasets.scene import Dataset, Split, Truth, sample_surface
-from renderers.checks import check_at_least, check_positive
+from datasets.scene import Dataset, Split, Textured, Truth, sample_surface, seed_of
+from datasets.textures import TEXTURES, Texture, make_texture
+from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.fields.coloured import TexturedDecoder, TexturedShape
 from renderers.fields.mlp import Decoder
 from renderers.fields.network import Published
 
@@ -46,6 +49,31 @@ class NetworkSettings:
 
 
 @dataclass(frozen=True)
+class ColourSettings:
+    """The colours that a prior learns beside the distance.
+
+    Args:
+        texture, size: of shapes without colours of their own; see `datasets.textures.make_texture`.
+        samples: points on the surface of each shape.
+        points_per_step: number of them that a step takes of a shape.
+        weight: of the mean absolute error of colours.
+    """
+
+    texture: str
+    size: float
+    samples: int
+    points_per_step: int
+    weight: float
+
+    def __post_init__(self) -> None:
+        check_choice("prior.colour.texture", self.texture, TEXTURES)
+        check_positive("prior.colour.size", self.size, "0.3 suits shapes in the unit sphere")
+        check_at_least("prior.colour.samples", self.samples, 1, "8000 work")
+        check_at_least("prior.colour.points_per_step", self.points_per_step, 1, "64 work")
+        check_positive("prior.colour.weight", self.weight, "0.1 works")
+
+
+@dataclass(frozen=True)
 class PriorSettings:
     """How a prior is trained.
 
@@ -60,6 +88,7 @@ class PriorSettings:
         code_penalty: weight of the mean squared length of the codes.
         surface_width: errors are weighted by w / (w + |distance|), which is largest at the surface; w in scene units.
         seed: of samples, codes, weights and batches.
+        colour: what is learnt of colours; None learns the distance alone.
     """
 
     network: NetworkSettings
@@ -74,6 +103,7 @@ class PriorSettings:
     code_penalty: float
     surface_width: float
     seed: int
+    colour: ColourSettings | None = None
 
     def __post_init__(self) -> None:
         for name in ("shapes", "samples", "steps", "shapes_per_step", "points_per_step"):
@@ -86,21 +116,46 @@ class PriorSettings:
         """Whether it is no prior, but a network that is fitted to one shape."""
         return self.shapes == 1
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Plain data that determines the training."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+    def new_decoder(self) -> Decoder | TexturedDecoder:
+        """A decoder that begins near the distance of a sphere."""
+        if self.colour is None:
+            decoder = shape = Decoder(**asdict(self.network))
+        else:
+            decoder = TexturedDecoder(**asdict(self.network))
+            shape = decoder.shape
+        initialise_to_sphere(shape, radius=0.5)
+        return decoder
+
+    def texture(self, dataset: Dataset, split: Split, index: int) -> Texture | None:
+        """The colours of a shape: its own, where its dataset has some; None where no colours are learnt."""
+        if self.colour is None:
+            return None
+        if isinstance(dataset, Textured):
+            return dataset.texture(split, index)
+        return make_texture(self.colour.texture, self.colour.size, seed_of(split, index))
+
 
 @dataclass(frozen=True)
 class Prior:
     """A decoder whose codes are shapes, and the codes of its training shapes. Code zero is the mean shape."""
 
-    decoder: Decoder | Published
+    decoder: Decoder | Published | TexturedDecoder
     codes: Float[Tensor, "shapes code_length"]
 
 
 @dataclass(frozen=True)
 class DistanceSamples:
-    """Signed distances of some shapes."""
+    """Signed distances of some shapes, and the colours of points on their surfaces, where these are learnt."""
 
     points: Float[Tensor, "shapes samples 3"]
     distances: Float[Tensor, "shapes samples"]
+    surface: Float[Tensor, "shapes places 3"] | None = None
+    colours: Float[Tensor, "shapes places 3"] | None = None
 
 
 def distance_samples(
@@ -110,13 +165,17 @@ def distance_samples(
 
     Distances are those of the mesh, not of a formula: smooth unions and sheared parts have none.
     """
-    points, distances = [], []
+    parts = []
     for index in range(shapes):
-        where, distance = sample_distances(dataset.mesh(split, index), settings.samples, settings.seed + index)
-        points.append(where)
-        distances.append(distance)
+        mesh, seed = dataset.mesh(split, index), settings.seed + index
+        part = sample_distances(mesh, settings.samples, seed)
+        if settings.colour and (texture := settings.texture(dataset, split, index)):
+            surface = sample_surface(mesh, settings.colour.samples, seed)
+            colours = texture(surface.points, surface.normals)
+            part += tuple(torch.from_numpy(one.astype(np.float32)) for one in (surface.points, colours))
+        parts.append(part)
         progress(f"sampling {split} shapes", index + 1, shapes)
-    return DistanceSamples(torch.stack(points), torch.stack(distances))
+    return DistanceSamples(*map(torch.stack, zip(*parts, strict=True)))
 
 
 def sample_distances(mesh: Mesh, count: int, seed: int) -> tuple[Float[Tensor, "count 3"], Float[Tensor, " count"]]:
@@ -135,11 +194,10 @@ def near_surface_first(
 def train(samples: DistanceSamples, settings: PriorSettings, device: torch.device, progress: Report) -> Prior:
     """Fits the decoder and a code for each shape together (DeepSDF, Sec. 4.2, without its clamp)."""
     torch.manual_seed(settings.seed)
-    decoder = Decoder(**asdict(settings.network))
-    initialise_to_sphere(decoder, radius=0.5)
+    decoder = settings.new_decoder()
     codes = settings.code_sigma * torch.randn(len(samples.points), settings.network.code_length)
     decoder, codes = decoder.to(device), nn.Parameter(codes.to(device))
-    samples = DistanceSamples(samples.points.to(device), samples.distances.to(device))
+    samples = DistanceSamples(*(part if part is None else part.to(device) for part in vars(samples).values()))
     optimiser = torch.optim.Adam(
         [*decoder.parameters(), codes], lr=settings.learning_rate, betas=(0.9, settings.beta2), fused=True
     )
@@ -153,9 +211,13 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
         chosen = torch.randperm(shapes, device=device)[:rows]
         picked = torch.randint(count, (rows, settings.points_per_step), device=device)
         points, distances = samples.points[chosen[:, None], picked], samples.distances[chosen[:, None], picked]
-        error = (decoder.at(codes[chosen])(points) - distances).abs()
-        weighted = near_surface_first(error, distances, settings.surface_width)
+        shape = decoder.at(codes[chosen])
+        weighted = near_surface_first((shape(points) - distances).abs(), distances, settings.surface_width)
         loss = weighted.mean() + settings.code_penalty * codes[chosen].square().sum(-1).mean()
+        if settings.colour and isinstance(shape, TexturedShape):
+            loss = loss + settings.colour.weight * _colour_error(
+                shape, samples, chosen, settings.colour.points_per_step
+            )
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
@@ -163,6 +225,14 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
         if step % 50 == 0 or step + 1 == settings.steps:
             progress(phase, step + 1, settings.steps, loss.item())
     return Prior(decoder.cpu().requires_grad_(False), codes.detach().cpu())
+
+
+def _colour_error(shape: TexturedShape, samples: DistanceSamples, chosen: Tensor, count: int) -> Tensor:
+    """The mean absolute error of colours at random points on the surfaces of the chosen shapes."""
+    assert samples.surface is not None and samples.colours is not None
+    places = torch.randint(samples.surface.shape[1], (len(chosen), count), device=chosen.device)
+    found = shape.paint(samples.surface[chosen[:, None], places])
+    return (found - samples.colours[chosen[:, None], places]).abs().mean()
 
 
 def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 200, near: float = 0.02) -> float:
@@ -252,7 +322,7 @@ def find(dataset: Dataset, settings: PriorSettings, priors_dir: Path) -> Path | 
 
 def prior_key(dataset: Dataset, settings: PriorSettings) -> str:
     """A hash of what determines a prior: shapes, settings, and the version of the training."""
-    return digest({"version": VERSION, "dataset": dataset.identity(), "settings": asdict(settings)})
+    return digest({"version": VERSION, "dataset": dataset.identity(), "settings": settings.identity})
 
 
 def make_prior(dataset: Dataset, settings: PriorSettings, folder: Path, device: torch.device, progress: Report) -> Path:
@@ -266,7 +336,7 @@ def make_prior(dataset: Dataset, settings: PriorSettings, folder: Path, device: 
         "key": prior_key(dataset, settings),
         "version": VERSION,
         "dataset": dataset.identity(),
-        "settings": asdict(settings),
+        "settings": settings.identity,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": {"sampling": sampled - started, "training": trained - sampled},
         "parameters": sum(p.numel() for p in prior.decoder.parameters()),
@@ -328,7 +398,7 @@ def _load(path: Path, settings: PriorSettings) -> Prior:
         tensors = load_file(path)
     except (SafetensorError, OSError) as error:
         raise ValueError(f"the prior {path} cannot be read ({error}): delete it, and it is trained again") from error
-    decoder = Decoder(**asdict(settings.network))
+    decoder = settings.new_decoder()
     codes = tensors.pop("codes")
     decoder.load_state_dict(tensors)
     return Prior(decoder.requires_grad_(False), codes)

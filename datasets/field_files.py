@@ -31,6 +31,7 @@ CLASSES: dict[str, type] = {
     for one in (
         *(BoundDecoder, Grid, Shape, Formula, Flops, Moved, network.Adjusted, network.AtCode),
         *(coloured.ColouredDistance, coloured.ColouredGrid, coloured.OccupancyOf, coloured.ScaledOccupancyOf),
+        coloured.TexturedShape,
         *(occupancy.BoundOccupancy, occupancy.OccupancyNetwork, occupancy.Block),
         *(published.Layered, published.Residual, published.Norm),
         *(nn.Linear, nn.LayerNorm, nn.ModuleList, nn.ModuleDict, nn.ParameterList),

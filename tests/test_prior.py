@@ -1,7 +1,7 @@
 """Shape priors: that a small one learns, how they are kept, and that the shipped ones belong to this code."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ import trimesh
 from bench import shape_prior as prior_store
 from bench.shape_prior import (
     SHIPPED,
+    ColourSettings,
     NetworkSettings,
     PriorSettings,
     distance_samples,
@@ -109,7 +110,7 @@ def test_a_prior_is_kept_with_its_record(kept):
     assert sorted(path.name for path in folder.glob("[!.]*")) == [f"boxes-{key}.json", f"boxes-{key}.safetensors"]
     record = json.loads((folder / f"boxes-{key}.json").read_text())
     assert record["key"] == key
-    assert (record["dataset"], record["settings"]) == (Boxes().identity(), asdict(SETTINGS))
+    assert (record["dataset"], record["settings"]) == (Boxes().identity(), SETTINGS.identity)
     assert record["surface_error"]["validation"] < record["surface_error"]["mean_shape"]
     assert record["parameters"] == sum(p.numel() for p in prior.decoder.parameters())
     assert prior.codes.shape == (3, 4)
@@ -139,6 +140,24 @@ def test_a_kept_prior_is_loaded_and_not_trained_again(kept, monkeypatch):
     code = torch.full((4,), 0.1)
     assert torch.equal(again.decoder.at(code)(points), prior.decoder.at(code)(points))
     assert torch.equal(again.codes, prior.codes)
+
+
+def test_a_prior_of_colours_learns_them_and_is_kept(tmp_path):
+    colour = ColourSettings("banded", size=0.8, samples=500, points_per_step=128, weight=0.3)
+    settings = replace(SETTINGS, network=replace(SETTINGS.network, code_length=8), steps=300, colour=colour)
+    prior = prior_for(Boxes(), settings, tmp_path, CPU, silent)
+    samples = distance_samples(Boxes(), Split.TRAIN, replace(settings, seed=9), 3, silent)
+    with torch.no_grad():
+        shapes = prior.decoder.at(prior.codes)
+        wrong = (shapes.paint(samples.surface) - samples.colours).abs().mean()
+        plain = (samples.colours.mean(dim=1, keepdim=True) - samples.colours).abs().mean()
+        assert wrong < 0.4 * plain
+        assert shapes(samples.surface).abs().mean() < 0.03
+        half = prior.codes[0] * torch.tensor([1.0] * 4 + [-1.0] * 4)  # another texture on the same shape
+        points, other = samples.surface[0], prior.decoder.at(half)
+        assert torch.equal(other(points), prior.decoder.at(prior.codes[0])(points))
+        assert (other.paint(points) - shapes.paint(samples.surface)[0]).abs().max() > 0.01
+    assert find(Boxes(), replace(settings, colour=replace(colour, size=0.5)), tmp_path) is None
 
 
 def test_another_dataset_or_setting_has_another_key(kept, monkeypatch):
@@ -172,7 +191,7 @@ def test_the_shipped_prior_is_that_of_the_default_configuration(family, compose_
     dataset, settings = desk.inputs.dataset, desk.prior
     (record,) = (record for record in shipped_records() if record["dataset"]["name"] == family)
     assert record["key"] == prior_key(dataset, settings)
-    assert record["settings"] == asdict(settings)
+    assert record["settings"] == settings.identity
     assert probe(dataset) == pytest.approx(record["probe"], rel=1e-4)  # the family is as it was
     error = record["surface_error"]
     assert max(error["validation"], error["training"]) < 0.003 and error["mean_shape"] > 5 * error["validation"]

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.state import State, coloured_image, colours_at
+from bench.evaluate.state import State, coloured_image, colours_at, vertex_colours
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
@@ -58,6 +58,10 @@ DEFINITIONS: dict[str, str] = {
 }
 
 OF_PART = ("completeness", "chamfer_gt_to_pred")  # what a part of the truth can judge: is it in the prediction?
+COLOUR = {
+    "colour_error": "Mean absolute difference between the field's colours and the true ones, from 0 to 1, at points"
+    " sampled on the whole true surface, seen or not.",
+}
 CHAMFER = ("chamfer_l1", "chamfer_l2")  # what checkpoints judge by
 
 # The score of a run without a surface: the worst.
@@ -162,7 +166,13 @@ def evaluate(state: State) -> Evaluation:
     own = render_view(state.field, truth.camera, state.inputs)
     metrics = _surface_scores(state) | view_metrics(state.seen(truth.camera), truth) | view_metrics(own, truth, OWN)
     failure = (RunStatus.EMPTY, "the field has no surface in the unit sphere") if state.mesh is None else None
-    return Evaluation(metrics, state.mesh, failure, unrendered(state, [own]), state.field)
+    mesh, texture, device = state.mesh, state.inputs.scene.texture, state.inputs.device
+    if texture is not None and isinstance(state.field, Coloured):
+        surface = state.inputs.true_surface
+        found = colours_at(state.field, torch.from_numpy(surface.points).float(), None, device).numpy()
+        metrics["colour_error"] = float(np.abs(found - texture(surface.points, surface.normals)).mean())
+        mesh = mesh and replace(mesh, colours=vertex_colours(state.field, mesh, device))
+    return Evaluation(metrics, mesh, failure, unrendered(state, [own]), state.field)
 
 
 def unrendered(state: State, own: Sequence[View]) -> tuple[str, ...]:

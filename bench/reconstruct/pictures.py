@@ -1,6 +1,5 @@
 """Pictures of a reconstruction: held-out photographs beside the shape with its colours. Not part of any timing."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from bench.evaluate.state import State
-from bench.pictures.run_figures import at_size, draw_curve, normals_image, picture_normals
+from bench.pictures.colours import Seen, save_arrays, seen_arrays
+from bench.pictures.run_figures import at_size, draw_curve, normals_image
 from bench.pictures.style import SCREEN, bare, save
 from bench.reconstruct.judge import judge_mesh, judged_pixels
 from bench.reconstruct.subject import Subject
@@ -30,9 +30,6 @@ from renderers.field import Field
 
 MOST_HELD_OUT, MOST_GIVEN = 3, 12  # photographs in a picture
 ERRORS = colormaps["magma_r"].with_extremes(bad="0.85")  # grey where nothing is judged
-Seen = Callable[[Camera], tuple[View, Float[Tensor, "height width 3"]]]  # a camera's view of a shape, and its colours
-SMALLER = (8, 4, 1)  # by which the largest size of a rendering is divided
-TURNS = (120.0, 240.0)  # degrees about the vertical axis
 WORST = 0.3  # mean difference of colours that is shown darkest
 
 
@@ -104,32 +101,14 @@ def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: 
         for name, figure in figures.items():
             save(figure, folder / f"{name}.png")
     shot = subject.held_out[len(subject.held_out) // 2]
-    arrays = {"photograph": shot.colours} | _seen_arrays(seen, at_size(shot.camera, inputs.evaluation.picture))
+    arrays = {"photograph": shot.colours} | seen_arrays(seen, at_size(shot.camera, inputs.evaluation.picture))
     if len(subject.given) == 1:
         arrays["given"] = subject.given[0].colours
     if subject.truth is not None:
         behind = turned(at_size(shot.camera, inputs.evaluation.picture), np.pi)
         true = normals_image(see(Truth(subject.truth, closed=False), behind))
-        arrays |= _seen_arrays(seen, behind, "back_") | {"back_truth": torch.from_numpy(true)}
-    if inputs.evaluation.gallery is not None:
-        arrays |= _rendered_again(seen, shot.camera, inputs.evaluation.gallery)
-    plain = {name: (array if array.dtype == torch.bool else array.half()).numpy() for name, array in arrays.items()}
-    np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
-
-
-def _rendered_again(seen: Seen, camera: Camera, largest: int) -> dict[str, Tensor]:
-    """Pictures of a shape in several sizes, size_0_... and so on, and at the last from other sides, turned_0_..."""
-    cameras = {f"size_{place}_": at_size(camera, largest // smaller) for place, smaller in enumerate(SMALLER)}
-    at_last = at_size(camera, largest)
-    cameras |= {f"turned_{place}_": turned(at_last, np.radians(angle)) for place, angle in enumerate(TURNS)}
-    return {k: v for prefix, one in cameras.items() for k, v in _seen_arrays(seen, one, prefix).items()}
-
-
-def _seen_arrays(seen: Seen, camera: Camera, prefix: str = "") -> dict[str, Tensor]:
-    """The colours, normals and hits that a camera sees, by names with a prefix."""
-    view, image = seen(camera)
-    parts = {"colours": image, "normals": picture_normals(view), "hit": view.mask}
-    return {prefix + name: part for name, part in parts.items()}
+        arrays |= seen_arrays(seen, behind, "back_") | {"back_truth": torch.from_numpy(true)}
+    save_arrays(folder, arrays)
 
 
 def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Figure:

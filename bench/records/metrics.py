@@ -35,6 +35,7 @@ SHOWN = {  # in the order of tables
     "psnr": Metric("PSNR (dB)", better=HIGHER),
     "psnr_image": Metric("PSNR of whole images (dB)", better=HIGHER),
     "ssim": Metric("SSIM", better=HIGHER),
+    "colour_error": Metric("error of colours (x1000)", 1000.0, LOWER),
     "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
     "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),
 }

@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -50,6 +50,7 @@ class RunInputs:
     cache: Path  # folder of priors and references
     field: FieldChoice  # what an unknown shape is made of
     dataset: Dataset | None = None  # of the scene
+    coloured: bool = False  # whether the prior has colours
     notes: tuple[str, ...] = ()  # on settings with the value `auto`
     has_prior: bool = True
     trained: int | None = None  # number of the scene's shape among the prior's codes; None where it is not of these
@@ -234,6 +235,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         known = shown if isinstance(prior, PriorSettings) else prior.network(0)
 
     own = prior.shapes if isinstance(prior, PriorSettings) and family is None else 0
+    coloured = isinstance(prior, PriorSettings) and known is None and prior.colour is not None
 
     def make_prior() -> Prior:
         if known is not None:
@@ -245,7 +247,10 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         renderer=made,
         views=view,
         scene_name=dataset.name if isinstance(dataset, Photographed | OneView) else scene_name(dataset, split, index),
-        make_scene=lambda: make_scene(dataset, view, split=split, index=index),
+        make_scene=lambda: replace(
+            make_scene(dataset, view, split=split, index=index),
+            texture=prior.texture(dataset, split, index) if coloured else None,
+        ),
         make_prior=make_prior,
         make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
         evaluation=evaluation,
@@ -255,6 +260,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         field=FieldChoice(config["field"], models),
         dataset=dataset,
         notes=(*notes, *(known.notes if known else ())),
+        coloured=coloured,
         has_prior=family is not None or known is not None or not isinstance(dataset, Photographed | OneView),
         trained=index if known is shown and (shown or (split == Split.TRAIN and index < own)) else None,
     )

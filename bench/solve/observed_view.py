@@ -12,8 +12,9 @@ from bench.solve.latent_code import Terms
 from datasets.scene import View
 from renderers.boundary import rendered
 from renderers.camera import Rays
-from renderers.field import Field
-from renderers.rendering import Observed, Renderer, at_iteration
+from renderers.field import Field, Meter
+from renderers.fields.coloured import TexturedShape
+from renderers.rendering import Observed, Renderer, Rendering, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 DEPTH, POINTS = "depth", "points"  # what a depth loss takes the mean of; see `bench.tasks.completion.Completion`
@@ -78,6 +79,8 @@ class GivenView:
     normals: Float[Tensor, "*rays 3"] | None = None  # unit, in world coordinates; None where they are not given
     normal_weight: float = 0.0  # of 1 less their cosine with those of the rendered surface
     normal_width: float = 0.0  # scene units, see `slopes_over`
+    colours: Float[Tensor, "*rays 3"] | None = None  # of an image; NaN where it does not show the shape
+    colour_weight: float = 0.0  # of the mean absolute error of a `TexturedShape`'s
 
     @staticmethod
     def of(
@@ -130,13 +133,23 @@ class GivenView:
             slopes = slopes_over(field, rendering.points[compared], self.normal_width)
             off = normal_error(torch.nn.functional.normalize(slopes, dim=-1), self.normals[compared])
             terms["normals"] = self.normal_weight * off
+        if self.colours is not None:
+            terms["colour"] = self.colour_weight * self._colour_error(field, rendering)
         if self.mask is not None:
             given = torch.where(self.observed, self.depth / self.depth_of_distance, torch.nan)
             silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, Observed(self.mask, given))
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
 
+    def _colour_error(self, field: Field, rendering: Rendering) -> Float[Tensor, ""]:
+        """The mean absolute error of colours where the shape is hit and shown (DIST, B.3)."""
+        shape = field.inner if isinstance(field, Meter) else field
+        assert self.colours is not None and isinstance(shape, TexturedShape)
+        seen = rendering.hit & ~self.colours.isnan().any(-1)
+        error = (shape.paint(rendering.points[seen]) - self.colours[seen]).abs()
+        return error.sum() / (3 * seen.sum().clamp_min(1))
+
     def _changed(self, change: Callable[[Any], Any]) -> "GivenView":
         """The same with each part changed that there is."""
-        names = ("rays", "depth", "depth_of_distance", "observed", "mask", "normals")
+        names = ("rays", "depth", "depth_of_distance", "observed", "mask", "normals", "colours")
         return replace(self, **{name: change(part) for name in names if (part := getattr(self, name)) is not None})

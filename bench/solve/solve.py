@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.config import DOUBLING
-from bench.evaluate.evaluate import DEFINITIONS, Evaluation
+from bench.evaluate.evaluate import COLOUR, DEFINITIONS, Evaluation
 from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
@@ -172,7 +172,8 @@ def solve_task(task: InverseTask, run: RunContext) -> State:
     def problem() -> Problem:
         return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
 
-    return solve(problem, task.optimiser, run, DEFINITIONS, gallery=True)
+    definitions = DEFINITIONS | COLOUR if inputs.coloured else DEFINITIONS
+    return solve(problem, task.optimiser, run, definitions, gallery=True)
 
 
 def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | None:

@@ -1,6 +1,6 @@
 """Shape completion: optimise the code of a shape to match a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bench.models.field import solve_by_growth
 from bench.models.observations import RayObservations, hold_out, tiles, together
+from bench.pictures.colours import note_colours
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext, RunInputs
@@ -18,9 +19,9 @@ from bench.solve.latent_code import CodePenalty, CodeProblem, turned
 from bench.solve.observed_view import DEPTH_LOSSES, GivenView
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
-from datasets.scene import Scene
+from datasets.scene import Scene, painted
 from datasets.views import observed_pixels, parse_amount
-from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
@@ -30,7 +31,7 @@ HELD_OUT = 0.2  # share of the observations that is held out, by tiles of the vi
 
 @dataclass(frozen=True)
 class Completion:
-    """Shape from one sparse depth image, with or without its mask.
+    """Shape from one sparse depth image, with or without its mask, and shape and colour from a colour image.
 
     Args:
         points: amount of depth that is given; see `datasets.views.observed_pixels`. Dense depth implies the mask.
@@ -43,6 +44,8 @@ class Completion:
             the same pixels (DIST, B.3); beyond 0 the normals of these pixels are given as well.
         normal_width: scene units over which the rendered surface's normals are taken; see
             `bench.solve.observed_view.slopes_over`.
+        colour_weight: of the mean absolute error of colours, over all pixels that show the shape and are hit (DIST,
+            B.3); beyond 0 the colours of these pixels are given, and the prior must have colours.
         silhouette: loss of the mask.
         silhouette_weight: of that loss.
         code: penalty on the code.
@@ -59,6 +62,7 @@ class Completion:
     depth_weight: float
     normal_weight: float
     normal_width: float
+    colour_weight: float
     silhouette: SilhouetteLoss
     silhouette_weight: float
     code: CodePenalty
@@ -74,7 +78,7 @@ class Completion:
         parse_amount(self.points)
         check_choice("task.depths", self.depths, (MEASURED, EXACT))
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
-        for name in ("depth_weight", "normal_weight", "silhouette_weight"):
+        for name in ("depth_weight", "normal_weight", "colour_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
         check_positive("task.normal_width", self.normal_width, "0.02 is two thirds of a pixel at 64 x 64")
         check_at_least("task.rotations", self.rotations, 1, "12 are 30 degrees apart")
@@ -82,16 +86,20 @@ class Completion:
             StartSettings(self.rotations, self.trial).check(self.optimiser.iterations)
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput where a prior is asked for, and there is none."""
+        """Raises BadInput where a prior is asked for, and there is none, or none of colours."""
         if inputs.field.of_prior:
             inputs.check_prior()
+        if self.colour_weight and not (inputs.coloured and inputs.field.of_prior):
+            raise BadInput("task.colour_weight needs codes of shape and colour: set prior=textured field=prior")
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
         run.record.notes = [*run.record.notes, *run.inputs.scene.on_depths]
         inputs = run.inputs
         if inputs.field.of_prior:
-            solve_task(self, run)
+            state = solve_task(self, run)
+            if self.colour_weight:
+                note_colours(run, state)
         else:
             check_field_gradient(inputs.renderer)
             scene, renderer = inputs.scene, inputs.renderer
@@ -133,4 +141,8 @@ class Completion:
         given = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
         if self.normal_weight:
             given = given.with_normals(view.normals, self.normal_weight, width=self.normal_width)
+        if self.colour_weight:
+            assert scene.texture is not None
+            image = painted(view, scene.texture).where(view.mask[..., None], torch.nan)
+            given = replace(given, colours=image.to(device), colour_weight=self.colour_weight)
         return given, observed

@@ -1,9 +1,9 @@
-"""Fields of one shape with colours, for shapes that are learnt from images: each begins as a sphere."""
+"""Fields with colours: of one shape, learnt from images, each of which begins as a sphere; and of a code."""
 
 from dataclasses import dataclass
 from itertools import pairwise
 from math import pi, sqrt
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, cast, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, Flops, Kind, OccupancyField
+from renderers.field import Bounds, Field, Flops, Kind, OccupancyField, Wrapper, bounds_of
 from renderers.fields.grid import FLOPS, Grid
-from renderers.fields.mlp import passes
+from renderers.fields.mlp import BoundDecoder, Decoder, passes
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
 
 SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second derivative
@@ -236,6 +236,56 @@ class ColouredGrid(nn.Module):
         places = (points.flip(-1) / self.reach).reshape(1, -1, 1, 1, 3)  # it takes z, y and x
         sampled = torch.nn.functional.grid_sample(self.logits[None], places, padding_mode="border", align_corners=True)
         return torch.sigmoid(COLOUR_SCALE * sampled.reshape(3, -1).T.reshape(points.shape))
+
+
+class TexturedDecoder(nn.Module):
+    """A decoder of distance, of the first half of a code, and one of colour, of the whole code.
+
+    Source: DIST, B.1: a shape code and a texture code of 256 each; the texture network takes both.
+    Deviates: colours are a sigmoid of its outputs; it has no narrowed layer before the skip, which needs a width above
+        the code's length.
+
+    Args:
+        layers, width, skip: of both; see `Decoder`.
+        code_length: of both codes together, even.
+        narrow: of the decoder of distance.
+    """
+
+    def __init__(self, *, layers: int, width: int, code_length: int, skip: int, narrow: bool) -> None:
+        super().__init__()
+        if code_length % 2:
+            raise ValueError(f"code_length must be even, not {code_length}: a half of it is the shape's")
+        self.code_length, self.width = code_length, width
+        self.shape = Decoder(layers=layers, width=width, code_length=code_length // 2, skip=skip, narrow=narrow)
+        self.texture = Decoder(layers=layers, width=width, code_length=code_length, skip=skip, narrow=False, outputs=3)
+
+    def at(self, code: Float[Tensor, "*shapes code_length"]) -> "TexturedShape":
+        """The field of one code, or of a batch of codes."""
+        shape = self.shape.at(code[..., : self.code_length // 2])
+        return TexturedShape(cast(Field, shape), self.texture.at(code))
+
+
+@dataclass(frozen=True)
+class TexturedShape(Wrapper):
+    """The field of a `TexturedDecoder` at one code, whose colours are those of points alone, and not counted."""
+
+    inner: Field
+    texture: BoundDecoder
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """See `BoundDecoder`."""
+        return bounds_of(self.inner)
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.inner(points)
+
+    def paint(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """The colours of points."""
+        return torch.sigmoid(self.texture.outputs(points))
+
+    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
+        return self.paint(points)
 
 
 def encoded(vectors: Float[Tensor, "*batch 3"], octaves: int) -> Float[Tensor, "*batch encoding"]:

@@ -48,9 +48,10 @@ class Decoder(nn.Module):
         skip: index of the hidden layer whose input also takes the code and the point; 0 for no skip.
         narrow: make the layer before the skip narrower, so that its output and the second input have `width` together,
             as DeepSDF does. False keeps its width.
+        outputs: numbers per point; more than one is read by `BoundDecoder.outputs`.
     """
 
-    def __init__(self, *, layers: int, width: int, code_length: int, skip: int, narrow: bool) -> None:
+    def __init__(self, *, layers: int, width: int, code_length: int, skip: int, narrow: bool, outputs: int = 1) -> None:
         super().__init__()
         check_at_least("layers", layers, 1, "DeepSDF has 8")
         check_at_least("width", width, 1, "DeepSDF has 512")
@@ -65,13 +66,13 @@ class Decoder(nn.Module):
         self.code_length, self.skip, self.width, self.placed = code_length, skip, width, False
         self.kind: Kind = Kind.DISTANCE
         self.lipschitz: float | None = None
-        inputs, outputs = [again] + [width] * (layers - 1), [width] * layers
+        inputs, sizes = [again] + [width] * (layers - 1), [width] * layers
         if skip and narrow:
-            outputs[skip - 1] -= again
+            sizes[skip - 1] -= again
         elif skip:
             inputs[skip] += again
-        self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in zip(inputs, outputs, strict=True))
-        self.last = nn.Linear(width, 1)
+        self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in zip(inputs, sizes, strict=True))
+        self.last = nn.Linear(width, outputs)
 
     def at(self, code: Float[Tensor, "*shapes code_length"]) -> "BoundDecoder":
         """The field of one code, or of a batch of codes.
@@ -165,6 +166,10 @@ class BoundDecoder:
         chunks = [forward(chunk) for chunk in passes(flat, self._width)]
         values = torch.cat(chunks) if len(chunks) != 1 else chunks[0]
         return values.view(points.shape[:-1])
+
+    def outputs(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch outputs"]:
+        """The numbers of a decoder with several per point, with a graph."""
+        return self._forward(points)
 
     @cached_property
     def _width(self) -> int:

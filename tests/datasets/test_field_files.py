@@ -16,7 +16,13 @@ from datasets.field_files import FIELD, load_field, load_network, save_field
 from renderers.checks import BadInput
 from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields.analytic import sphere
-from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy, ScaledOccupancyOf
+from renderers.fields.coloured import (
+    ColouredDistance,
+    ColouredGrid,
+    ColouredOccupancy,
+    ScaledOccupancyOf,
+    TexturedDecoder,
+)
 from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
 from renderers.fields.network import Coded, Published
@@ -49,6 +55,7 @@ FIELDS = {
     "published": published,
     "grid": lambda: Grid(numbers(6, 6, 6).permute(2, 1, 0), 1.05),
     "coloured": lambda: ColouredDistance(layers=2, width=8, octaves=1, radius=0.5, directional=True),
+    "textured": lambda: TexturedDecoder(layers=2, width=8, code_length=4, skip=1, narrow=False).at(numbers(4)),
     "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
     "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,
     "occupancy_at_code": lambda: ScaledOccupancyOf(OccupancyNetwork(width=8, code_length=3).at(numbers(3))),

@@ -101,6 +101,11 @@ def test_unknown_kernels_are_refused_before_a_run(bench, tmp_path, no_prior, mon
     assert_one_line(err, "IMPLICIT_BENCH_KERNELS must be torch or compiled, not 'quick'")
 
 
+@each("arguments", [("task.colour_weight=1",), ("task.colour_weight=1", "prior=textured", "field=grid_8")])
+def test_colours_are_asked_of_a_prior_that_has_some(monkeypatch, arguments):
+    assert_one_line(explained(monkeypatch, *arguments), "set prior=textured field=prior")
+
+
 def test_a_mistyped_key_in_a_row_of_the_users_names_its_file(bench, tmp_path, no_prior):
     (tmp_path / "my conf").mkdir()
     table = tmp_path / "my conf" / "methods.yaml"

@@ -16,6 +16,7 @@ from datasets.mesh import Mesh
 from datasets.scene import Scene, View
 from renderers.camera import Camera
 from renderers.field import Kind
+from renderers.fields.coloured import TexturedDecoder
 from renderers.fields.mlp import Decoder
 from renderers.rendering import Capabilities, Rendering, Status, Unsupported, check_kind
 from renderers.silhouette import Own
@@ -30,6 +31,7 @@ SETTINGS = Completion(
     depth_weight=10.0,
     normal_weight=0.0,
     normal_width=0.02,
+    colour_weight=0.0,
     silhouette=Own(),
     silhouette_weight=4.0,
     code=CodePenalty(0.1, "sum"),
@@ -115,6 +117,19 @@ def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
     terms, given = values(problem), problem.compare.__self__
     assert (given.normal_weight, given.normal_width) == (3.0, 0.02) and torch.equal(given.normals, scene.view.normals)
     assert terms["total"] == pytest.approx(sum(terms[name] for name in terms if name != "total"))
+
+
+def test_colours_are_compared_where_the_shape_is_shown_and_hit(problem_of, scene):
+    """Of the three pixels that show the shape two are hit; the gradient reaches both halves of the code."""
+    torch.manual_seed(0)
+    textured = Prior(TexturedDecoder(layers=2, width=16, code_length=4, skip=1, narrow=False), torch.zeros(1, 4))
+    red = replace(scene, texture=lambda points, normals: np.tile([0.9, 0.2, 0.2], (len(points), 1)))
+    problem = replace(SETTINGS, colour_weight=3.0).problem(red, textured, Fake(), seed=0, device=CPU)
+    terms = problem.loss(0)
+    found = problem.field().paint(red.view.camera.rays().at(torch.tensor(DISTANCE))[0])
+    assert terms["colour"].item() == pytest.approx(3 * (found - torch.tensor([0.9, 0.2, 0.2])).abs().mean().item())
+    terms["colour"].backward()
+    assert (problem.code.grad[:2] != 0).any() and (problem.code.grad[2:] != 0).all()
 
 
 def test_no_pixel_to_compare_costs_nothing(problem_of):

@@ -264,7 +264,6 @@ def run_command(folder: Path, *arguments: str):
 
 def test_a_command_learns_photographs(tmp_path):
     small = ("task.optimiser.iterations=4", "task.rays=64", "field=grid_8", "task.longest=16")
-    small += ("evaluation.gallery=8",)  # its galleries are not those of a code
     code, out, err = run_command(tmp_path, "task=reconstruction", "renderer=idr", *small, "dataset.masks=false")
     assert code == 0 or "did not fall" in err, err
     record = record_of(out)
