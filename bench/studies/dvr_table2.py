@@ -1,6 +1,4 @@
-"""Table 2 and Figs. 6 to 8 of DVR, Fig. 19 of DIST: shape and colour from rendered photographs."""
-
-from dataclasses import replace
+"""Table 2 and Figs. 6 to 8 of DVR: shape and colour from rendered photographs."""
 
 import numpy as np
 
@@ -49,21 +47,6 @@ ALIKE = {  # rows that are not shown there, since they look as another does
     *("rgbd_dvr", "dvr_paper_depth", "stereo", "poisson_5"),
 }
 ARRAYS = ("photograph", "colours", "normals", "hit")
-
-PRESET, AGAIN = "rgb_dist", 3  # the row that `rerendering` shows, where it has a run that ended ok, and its scenes
-SIDES = {  # prefixes in images.npz, see `bench.reconstruct.pictures`; turns are about the vertical axis
-    "coarse": "size_0_",
-    "finer": "size_1_",
-    "full size": "size_2_",
-    "turned by 120°": "turned_0_",
-    "turned by 240°": "turned_1_",
-}
-LIGHTS = {  # towards the light; axes to the right, up, towards the camera
-    "light from the left": (-0.8, 0.3, 0.5),
-    "light from above": (0.0, 0.9, 0.45),
-    "light from the right": (0.8, 0.3, 0.5),
-}
-AMBIENT = 0.25  # of a light; the rest falls off with the cosine
 
 
 def make(runs: Runs) -> Result:
@@ -145,43 +128,4 @@ def figures(runs: Runs) -> Result:
     )
 
 
-def rerendering(runs: Runs) -> Result:
-    """The shapes of one row in several sizes, from other sides, and under other lights."""
-    ended = [row for row, of in runs.rows().items() if any(run["status"] == "ok" for run in of)] or list(runs.rows())
-    row = next((row for row in ended if row.preset.removeprefix(TUNED) == PRESET), ended[0])
-    of_scene = grouped([record for record in runs.records if row_of(record) == row], medians.scene_of)
-    kept = {name: records[0] for name, records in list(of_scene.items())[:AGAIN]}
-    shown = replace(runs, records=list(kept.values()), left_out=runs.left_out + len(runs.records) - len(kept))
-    arrays = [prefix + part for prefix in SIDES.values() for part in ("colours", "normals", "hit")]
-    scenes = {name: gallery.Scene(runs, [record], ["photograph", *arrays]) for name, record in kept.items()}
-    paints = {"photograph": lambda found: [found["photograph"]]}
-    paints |= {name: gallery.colours(prefix) for name, prefix in SIDES.items()}
-    paints |= {name: _lit(light) for name, light in LIGHTS.items()}
-    lines = {name: [scene.cell(kept[name], paint) for paint in paints.values()] for name, scene in scenes.items()}
-    return Result(
-        shown,
-        "A reconstructed shape, rendered again.",
-        f"The shape of {row.name}, of the first scenes, in several sizes, from other sides, and under other lights.",
-        remarks=(
-            "Shapes were learnt from photographs alone; the one shown was held out, sizes and lights are seen by its "
-            "camera, and turns are about the vertical axis.",
-            f"Lights: the learnt colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
-            *gallery.missing(scenes.values()),
-        ),
-        run_columns=PICTURED,
-        figure=gallery.draw([gallery.Block("", list(paints), lines)]),
-    )
-
-
-def _lit(light: tuple[float, float, float]) -> gallery.Paint:
-    """Pictures of a shape in its full size under a light."""
-
-    def paint(found: gallery.Arrays) -> list[np.ndarray]:
-        colours, normals, hit = (found[SIDES["full size"] + part] for part in ("colours", "normals", "hit"))
-        cosine = (normals @ light / np.linalg.norm(light)).clip(0)[..., None]
-        return [gallery.coloured(colours * (AMBIENT + (1 - AMBIENT) * cosine), hit)]
-
-    return paint
-
-
-PAGES = {"dvr_table2": make, "dvr_figures": figures, "rerendering": rerendering}
+PAGES = {"dvr_table2": make, "dvr_figures": figures}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.report.gallery import Block, Cell, draw
-from bench.studies import dvr_table2
+from bench.studies import fig8
 from tests.report.test_report_paper import page_of, told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -134,44 +134,45 @@ def test_misplaced_shapes_stand_over_the_displacement(tmp_path):
     assert found["start", "truth"] == COLOURS[TOWARDS]
 
 
-def rendered(results, row, method, *, dataset="sofa", status="ok", size=16):
+def rendered(results, split, *, dataset="sofa", status="ok", kinds=()):
     folder = write_run(
         results,
-        "dvr_table2",
-        row,
-        **{"task": "reconstruction", "dataset": dataset, "method": method, "status": status},
-        settings={"task": {"_target_": "reconstruction"}, "dataset": {"name": dataset}, "index": 0},
+        "fig8",
+        "DIST, one colour image",
+        **{"task": "completion", "dataset": dataset, "method": "dist_colour", "status": status},
+        **({"metrics": dict(zip(fig8.BYTES, (256, 3000, 500, 9000), strict=True))} if kinds else {}),
+        settings={"task": {"_target_": "completion"}, "dataset": {"name": dataset}, "index": 0, "split": split},
     )
-    if not size:
-        return
     arrays = {"photograph": np.ones((8, 8, 3), np.float16)}
-    for prefix, length in (("size_0_", 2), ("size_1_", 4), ("size_2_", size), ("turned_0_", size), ("turned_1_", size)):
-        hit = np.ones((length, length), dtype=bool)
-        arrays |= {f"{prefix}hit": hit, f"{prefix}colours": np.full((length, length, 3), 0.8, np.float16)}
-        arrays[f"{prefix}normals"] = np.broadcast_to(np.array(RIGHT, np.float16), (length, length, 3))
-    np.savez(folder / "images.npz", **arrays)
+    for prefix, length in (("size_0_", 2), ("size_1_", 4), ("size_2_", 8), ("turned_0_", 8), ("turned_1_", 8)):
+        for kind, shade in kinds:
+            hit, name = np.ones((length, length), dtype=bool), kind + prefix
+            arrays |= {f"{name}hit": hit, f"{name}colours": np.full((length, length, 3), shade, np.float16)}
+            arrays[f"{name}normals"] = np.broadcast_to(np.array(RIGHT, np.float16), (length, length, 3))
+    if kinds:
+        np.savez(folder / "images.npz", **arrays)
 
 
-def test_a_shape_is_shown_in_sizes_from_sides_and_under_lights(tmp_path):
-    rendered(tmp_path, "Newton, RGB", "rgb_newton", size=0)
-    rendered(tmp_path, "DIST, RGB", "rgb_dist")
-    rendered(tmp_path, "DIST, RGB", "rgb_dist", dataset="car", status="crashed", size=0)
+def test_codes_of_shape_and_colour_are_shown_beside_the_mesh_and_its_bytes(tmp_path):
+    rendered(tmp_path, "train", kinds=(("", 0.8), ("trained_", 0.6), ("true_", 0.4)))
+    rendered(tmp_path, "test", kinds=(("", 0.8), ("true_", 0.4)))
+    rendered(tmp_path, "test", dataset="car", status="crashed")
     result = page_of(tmp_path, "rerendering")
-    found = cells(result.figure.axes[0])
-    columns = [column for row, column in found if row == "sofa 0"]
-    sizes = list(dvr_table2.SIDES)
-    assert columns == ["photograph", *sizes, *dvr_table2.LIGHTS]
-    assert all(found["sofa 0", column] == pytest.approx((0.8,) * 3, abs=1e-3) for column in sizes)
-    left, above, right = (found["sofa 0", name][0] for name in dvr_table2.LIGHTS)
-    assert left == pytest.approx(above) == pytest.approx(0.8 * dvr_table2.AMBIENT, abs=1e-3)  # normals to the right
+    known, unseen, failed = (cells(axis) for axis in result.figure.axes)
+    assert {row for row, _ in known} == {"mesh", "code of training", "code of the image"}
+    assert {row for row, _ in unseen} == {"mesh", "code of the image"}
+    sizes, lights = list(fig8.SIDES), list(fig8.LIGHTS)
+    assert [column for row, column in known if row == "mesh"] == ["given", *sizes, *lights]
+    for row, shade in (("mesh", 0.4), ("code of training", 0.6), ("code of the image", 0.8)):
+        assert all(known[row, column] == pytest.approx((shade,) * 3, abs=1e-3) for column in sizes)
+    left, above, right = (known["code of the image", name][0] for name in lights)
+    assert left == pytest.approx(above) == pytest.approx(0.8 * fig8.AMBIENT, abs=1e-3)  # normals to the right
     cosine = 0.8 / np.sqrt(0.8**2 + 0.3**2 + 0.5**2)
-    assert right == pytest.approx(0.8 * (dvr_table2.AMBIENT + (1 - dvr_table2.AMBIENT) * cosine), abs=1e-3)
-    assert set(notes(result.figure)) == {"crashed"}
+    assert right == pytest.approx(0.8 * (fig8.AMBIENT + (1 - fig8.AMBIENT) * cosine), abs=1e-3)
+    assert set(notes(result.figure)) == {"crashed"} and failed
+    assert "has *256* bytes, mesh and texture 4 kB" in result.verdict and "has 9 kB" in result.verdict
     assert "No pictures of 1 run: no images.npz." in told(result)
-    assert (
-        "1 of 2 runs did not end ok" in result.caption
-        and "The shape of DIST, RGB, of the first scenes" in result.caption
-    )
+    assert "1 of 3 runs did not end ok" in result.caption
 
 
 def test_a_picture_fills_its_cell_with_the_part_in_the_window_and_is_cut_there():

@@ -1,0 +1,98 @@
+"""Figs. 8 and 19 of DIST: shapes with colours, as codes, rendered in sizes, from sides and under lights."""
+
+import numpy as np
+
+from bench.report.study import Result, Runs, Selection, format, gallery, records, table
+
+PLACE = 47
+READS = (Selection("fig8", conditions=("split",), setup=("machine",)),)
+SIDES = {  # prefixes in images.npz, see `bench.pictures.colours.rendered_again`; turns are about the vertical axis
+    "coarse": "size_0_",
+    "finer": "size_1_",
+    "full size": "size_2_",
+    "turned by 120°": "turned_0_",
+    "turned by 240°": "turned_1_",
+}
+LIGHTS = {  # towards the light; axes to the right, up, towards the camera
+    "light from the left": (-0.8, 0.3, 0.5),
+    "light from above": (0.0, 0.9, 0.45),
+    "light from the right": (0.8, 0.3, 0.5),
+}
+AMBIENT = 0.25  # of a light; the rest falls off with the cosine
+KINDS = {"true_": "mesh", "trained_": "code of training", "": "code of the image"}
+BYTES = ("code_bytes", "mesh_bytes", "texture_bytes", "network_bytes")
+DEFINED = {key: f"{key.partition('_')[0].capitalize()} (bytes)" for key in BYTES} | {"colour_error": "Error of colour"}
+
+
+def _name(record: records.Record) -> str:
+    return f"{records.family(record)}, {records.setting(record['config'], 'split')} {records.index(record)}"
+
+
+COLUMNS = (
+    table.text("shape", "Shape", _name),
+    *(table.metric(key, DEFINED[key], table.whole) for key in BYTES),
+    table.metric("colour_error", DEFINED["colour_error"]),
+    table.metric("chamfer_l2", "Chamfer-L2 × 1000", table.thousandfold),
+)
+
+
+def make(runs: Runs) -> Result:
+    """A line per shape, and pictures of its mesh, of its code of training, and of the code of one image."""
+    code, *whole, network = (runs.number(key).median() for key in BYTES)
+    scenes = {_name(record): gallery.Scene(runs, [record], _arrays(record)) for record in runs.records}
+    return Result(
+        runs,
+        "Shapes with colours as codes, rendered in sizes, from sides and under lights.",
+        "Renderings of the mesh, and of codes of shape and colour; a test shape has no code of training.",
+        question="How much smaller is a code than mesh and texture?",
+        verdict=f"A code of shape and colour has *{code:.0f}* bytes, mesh and texture {sum(whole) / 1000:.0f} kB "
+        f"(medians, n = {format.plural(len(runs.records), 'shape')}); the network that all codes of a family share has "
+        f"{network / 1000:.0f} kB.",
+        remarks=(
+            "A code of the image is found from the one that is given, its colours and mask, without depth.",
+            f"Lights: colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
+            *records.definitions(runs.records, DEFINED),
+            *gallery.missing(scenes.values()),
+        ),
+        columns=COLUMNS,
+        lines=runs.records,
+        run_columns=(table.FAMILY, *table.IDENTITY, *COLUMNS[1:]),
+        figure=gallery.draw([_block(scenes[_name(record)], record) for record in runs.records]),
+    )
+
+
+def _kinds(record: records.Record) -> dict[str, str]:
+    trained = records.setting(record["config"], "split") == "train"
+    return {prefix: kind for prefix, kind in KINDS.items() if trained or prefix != "trained_"}
+
+
+def _arrays(record: records.Record) -> list[str]:
+    sides = [kind + side for kind in _kinds(record) for side in SIDES.values()]
+    return ["photograph", *(side + part for side in sides for part in ("colours", "normals", "hit"))]
+
+
+def _block(scene: gallery.Scene, record: records.Record) -> gallery.Block:
+    first = {"": scene.whole([record], "photograph")}
+    rows = {
+        kind: [first.get(prefix, gallery.Cell()), *(scene.cell(record, paint) for paint in _paints(prefix))]
+        for prefix, kind in _kinds(record).items()
+    }
+    return gallery.Block(_name(record), ["given", *SIDES, *LIGHTS], rows)
+
+
+def _paints(prefix: str) -> list[gallery.Paint]:
+    """Pictures of a shape in sizes and from sides, and of its full size under lights."""
+    lit = [_lit(prefix + SIDES["full size"], light) for light in LIGHTS.values()]
+    return [*(gallery.colours(prefix + side) for side in SIDES.values()), *lit]
+
+
+def _lit(prefix: str, light: tuple[float, float, float]) -> gallery.Paint:
+    def paint(found: gallery.Arrays) -> list[np.ndarray]:
+        colours, normals, hit = (found[prefix + part] for part in ("colours", "normals", "hit"))
+        cosine = (normals @ light / np.linalg.norm(light)).clip(0)[..., None]
+        return [gallery.coloured(colours * (AMBIENT + (1 - AMBIENT) * cosine), hit)]
+
+    return paint
+
+
+PAGES = {"rerendering": make}
