@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import CONF, register
-from bench.records.folder import Identity, identify
+from bench.records.folder import Identity, identify, resolved
 from bench.run.command import options_first
 
 _KEPT: dict[str, CachingConfigRepository] = {}
@@ -46,4 +46,4 @@ def identified(*arguments: str) -> Identity:
     runtime = config.hydra.runtime
     OmegaConf.set_struct(config, False)
     del config["hydra"]
-    return identify(config, runtime, overrides)
+    return identify(resolved(config, runtime), runtime, overrides)

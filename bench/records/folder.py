@@ -79,26 +79,33 @@ class Identity:
         return digest([_our_code(), *(_package(name) for name in users), *files])
 
 
-def identify(config: DictConfig, runtime: DictConfig, overrides: Sequence[str]) -> Identity:
-    """The run that a configuration describes, after all checks of it that need no torch.
+def resolved(config: DictConfig, runtime: DictConfig) -> dict[str, Any]:
+    """A composed configuration as plain data; missing values are kept, as an error of the run that its record reports.
 
     Args:
         config: without Hydra's own node.
         runtime: `hydra.runtime`, which has the names of the chosen YAMLs.
-        overrides: of the run.
 
     Raises:
-        ValueError: for an invalid value, and where the command line removes a part that every run has.
+        ValueError: where the command line removes a part that every run has, or sets a draw that nothing asks for.
     """
     check_draw(config)
-    choices = runtime.choices
     for part in ("task", "renderer", "dataset"):
-        if part not in choices:
+        if part not in runtime.choices:
             raise ValueError(f"every run needs a {part}: remove ~{part} from the command line")
-    # Missing values are kept: they are an error of the run, which its record reports.
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     if isinstance(values.get("renderer"), dict):
-        values["renderer"] = own_row(values["renderer"], str(choices["renderer"]), runtime)
+        values["renderer"] = own_row(values["renderer"], str(runtime.choices["renderer"]), runtime)
+    return values
+
+
+def identify(values: dict[str, Any], runtime: DictConfig, overrides: Sequence[str]) -> Identity:
+    """The run that a configuration describes, as `resolved` gives it, after all checks of it that need no torch.
+
+    Raises:
+        ValueError: for an invalid value.
+    """
+    choices = runtime.choices
     seen = choices["dataset"] if choices.get("stress", NO_STRESS) == NO_STRESS else choices["stress"]
     named = {"task": choices["task"], "renderer": choices["renderer"], "dataset": seen}
     named["method"] = choices.get("method") or ""

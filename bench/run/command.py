@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import CONF, register, type_of, wrong_type
-from bench.records.folder import Identity, identify
+from bench.records.folder import Identity, identify, resolved
 from bench.run.pack import register_slurm
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
@@ -197,7 +197,7 @@ def _identified(config: DictConfig) -> Identity:
         raise ValueError(f"{KERNELS} must be torch or compiled, not {asked!r}: unset it for compiled")
     if Path(hydra.runtime.cwd) != Path.cwd():  # of such a worker
         config.results_dir = str(Path(hydra.runtime.cwd) / config.results_dir)
-    return identify(config, hydra.runtime, hydra.overrides.task)
+    return identify(resolved(config, hydra.runtime), hydra.runtime, hydra.overrides.task)
 
 
 def _call(program: Callable[[], None]) -> None:

@@ -1,5 +1,6 @@
 """What is planned is checked before anything runs; plan=true lists it, and leaves nothing behind."""
 
+import re
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -99,10 +100,12 @@ def test_a_plan_says_in_how_many_jobs_the_runs_are(results):
     ("-m", "scale=smoke", "renderer.alpha=1.5,null", "label=a,'b c','${renderer._label_}'"),
     ("-m", "+method=space/dist_mask,space/idr_mask", "draw=0,3"),
     ("-m", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
+    ("-m", "seed=1,2", "index=0,3", "label='${index}',b"),
 ])  # fmt: skip
 def test_a_cell_is_what_hydra_makes_of_it(results, monkeypatch, arguments):
     quick = planned(results, *arguments)
     monkeypatch.setattr(compose.Composer, "_sets_a_value", lambda *_: False)
+    monkeypatch.setattr(compose, "LONE", re.compile("(?!)"))
     monkeypatch.setattr(compose, "ReadOnce", lambda repository: repository)
     assert planned(results, *arguments) == quick
     assert len({cell.id for cell in quick}) == len(quick)
