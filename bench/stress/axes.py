@@ -13,11 +13,12 @@ from bench.records.record import RunStatus
 from bench.stress.fit import FITS, judge_fit
 from bench.stress.judge import judge_gradient, judge_rendering
 from bench.stress.trial import Conditions, Failure, Outcome
-from datasets.stress.scenes import SCENES
+from datasets.stress.distortions import OF_NETWORKS
+from datasets.stress.scenes import SCENES, Scene, of_network
 from renderers.checks import check_choice
 from renderers.rendering import Renderer, Unsupported
 
-GROUPS = ("geometry", "viewing", "field", "observation", "optimisation")
+GROUPS = ("geometry", "viewing", "field", "network", "observation", "optimisation")
 MEASURES = ("rendering", "gradient", "fit")
 
 
@@ -55,7 +56,8 @@ class Stress:
     """One axis of the stress atlas.
 
     Args:
-        scene: a name of `datasets.stress.scenes.SCENES`; for measure=fit, one of `bench.stress.fit.FITS`.
+        scene: a name of `datasets.stress.scenes.SCENES`, or of `OF_NETWORKS` in `datasets.stress.distortions`; for
+            measure=fit, one of `bench.stress.fit.FITS`.
         measure: what is tested: "rendering", its "gradient", or the result of a "fit".
         group: of axes in the atlas.
         sweep: the range of severities.
@@ -73,7 +75,7 @@ class Stress:
     def __post_init__(self) -> None:
         check_choice("task.stress.group", self.group, GROUPS)
         check_choice("task.stress.measure", self.measure, MEASURES)
-        check_choice("task.stress.scene", self.scene, FITS if self.measure == "fit" else tuple(SCENES))
+        check_choice("task.stress.scene", self.scene, FITS if self.measure == "fit" else (*SCENES, *OF_NETWORKS))
         if self.repeats not in (None, 1):
             raise ValueError(f"task.stress.repeats must be 1 or null, not {self.repeats}: set task.search.repeats")
 
@@ -93,6 +95,11 @@ class Stress:
             )
         value = max(round(severity), 1) if isinstance(present, int) else severity
         return replace(renderer, **{self.setting: value})  # type: ignore[type-var]
+
+    def made(self, conditions: Conditions) -> Scene:
+        """What makes the exams of a rendering or its gradient."""
+        network = conditions.network if self.scene in OF_NETWORKS else None
+        return of_network(self.scene, *network) if network else SCENES[self.scene]
 
     def trial(self, renderer: Renderer, level: float, repeat: int, conditions: Conditions) -> Outcome:
         """Trial number `repeat` at a level, the same one for every renderer. An exception is recorded as a failure.
@@ -117,5 +124,5 @@ class Stress:
         stressed = self.stressed(renderer, severity)
         if self.measure == "fit":
             return judge_fit(self.scene, severity, draw, renderer=stressed, conditions=conditions)
-        exam = SCENES[self.scene](severity, draw, conditions.resolution)
+        exam = self.made(conditions)(severity, draw, conditions.resolution)
         return (judge_rendering if self.measure == "rendering" else judge_gradient)(exam, stressed, conditions)

@@ -5,11 +5,14 @@ from enum import StrEnum
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from bench.machine.limits import Limits
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.optimise import OptimiserSettings
 from renderers.checks import check_at_least, check_choice, check_positive, check_share
+from renderers.fields.mlp import Decoder
+from renderers.fields.network import Published
 from renderers.silhouette import SilhouetteLoss
 
 
@@ -67,13 +70,18 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions of all trials: W of a W x W rendering, the fit, criteria of success, limits, and the device."""
+    """The conditions of all trials: W of a W x W rendering, the fit, criteria of success, limits, and the device.
+
+    Args:
+        network: that is disturbed, and its codes, where it is one.
+    """
 
     resolution: int
     fit: FitSettings
     criteria: Criteria
     limits: Limits
     device: torch.device
+    network: tuple[Decoder | Published, Tensor] | None = None
 
 
 class Failure(StrEnum):

@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from torch import Tensor
 
 from bench.machine.limits import Limits
 from bench.pictures.run_figures import draw_failure
@@ -15,7 +16,10 @@ from bench.stress.axes import Stress
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from datasets.network_files import Networked
+from datasets.stress.distortions import OF_NETWORKS
 from renderers.checks import BadInput, check_at_least
+from renderers.fields.mlp import Decoder
+from renderers.fields.network import Published
 from renderers.rendering import Renderer, Unsupported
 
 DEFINITIONS = {
@@ -62,14 +66,19 @@ class Stability:
         check_at_least("task.resolution", self.resolution, 8, "64 resolves thin parts")
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput for a network, which has no part in the scenes of the stress."""
-        if isinstance(inputs.dataset, Networked):
-            raise BadInput("task=stability has scenes of its own, and renders no network: remove field=file")
+        """Raises BadInput for a network of the user's under a stress that it has no part in."""
+        if not isinstance(inputs.dataset, Networked):
+            return
+        own, some = self.stress.scene, ", ".join(OF_NETWORKS)
+        if own not in OF_NETWORKS:
+            raise BadInput(f"the stress {own} renders no network: remove field=file, or set stress={some}")
+        if own == "far_code" and inputs.prior.decoder.placed:
+            raise BadInput("the network has no code that the stress far_code could change: set stress=noisy_weights")
 
     def execute(self, run: RunContext) -> None:
         """Searches; fills the record, writes a line per trial to curve.jsonl, and draws the mildest failure."""
         record, renderer = run.record, run.inputs.renderer
-        conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device)
+        conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device, self._of(run))
         record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")
         self._check(renderer)
@@ -92,6 +101,13 @@ class Stability:
             kind = PIXEL_NAMES.get(first.outcome.failure or "", first.outcome.failure)
             title = f"{what}: first failure ({kind}) at {first.severity:.3g} {self.stress.sweep.unit}"
             draw_failure(run.folder, first.outcome.images, first.severity, title)
+
+    def _of(self, run: RunContext) -> tuple[Decoder | Published, Tensor] | None:
+        """The network that is disturbed and its codes, those of the prior; None where the scene has none."""
+        if self.stress.scene not in OF_NETWORKS:
+            return None
+        prior, device = run.inputs.prior, run.inputs.device
+        return prior.decoder.to(device).requires_grad_(False), prior.codes.to(device)
 
     def _check(self, renderer: Renderer) -> None:
         """Raises Unsupported, before the first trial, where the renderer rejects the setting of the mild end."""

@@ -1,8 +1,9 @@
-"""Distortions of a cube's distance, as by a network, quantisation or an error. All still claim to be distances.
+"""Distortions of a cube's distance, as by a network, quantisation or an error, and of trained networks.
 
-A distortion takes the cube, a severity in the units of conf/stresses.yaml, and a random generator. It gives the field
-and the truth: the cube, or where the surface is moved, the moved one, solved in float64, so that a renderer is judged
-by the surface of the field that it was given.
+A distortion takes the cube, a severity in the units of conf/stresses.yaml, and a random generator. It gives the field,
+which still claims to be a distance, and the truth: the cube, or where the surface is moved, the moved one, solved in
+float64, so that a renderer is judged by the surface of the field that it was given. That of a network takes the
+network, whose weights it changes, and a code; it gives the code.
 """
 
 from collections.abc import Callable
@@ -14,6 +15,8 @@ from torch import Tensor
 from datasets.stress.solids import ReferenceTruth, Solid, Truth, box
 from renderers.field import Field
 from renderers.fields.analytic import Shape
+from renderers.fields.mlp import Decoder
+from renderers.fields.network import Published
 
 CUBE = 0.5  # half the side length of the cube
 RIPPLES = 15.0  # radians per scene unit
@@ -57,14 +60,14 @@ def coarse_floats(cube: Solid, severity: float, draw: np.random.Generator) -> tu
     `CUBE` by at most half the spacing of the numbers there, so that its surface is that of a larger cube.
     """
     bits = round(severity)
-
-    def rounded(numbers: Tensor) -> Tensor:
-        mantissa, exponent = torch.frexp(numbers.detach())
-        scale = 2.0**bits
-        return numbers + (torch.ldexp(torch.round(mantissa * scale) / scale, exponent) - numbers).detach()
-
     larger = box((CUBE + 0.5 * 2.0**-bits,) * 3)
-    return Shape(lambda points: rounded(cube.field(rounded(points)))), larger
+    return Shape(lambda points: _rounded(cube.field(_rounded(points, bits)), bits)), larger
+
+
+def _rounded(numbers: Tensor, bits: int) -> Tensor:
+    """Numbers with so many bits of mantissa; their gradient is as if they were not rounded."""
+    mantissa, exponent = torch.frexp(numbers.detach())
+    return numbers + (torch.ldexp(torch.round(mantissa * 2.0**bits) / 2.0**bits, exponent) - numbers).detach()
 
 
 def quantised(cube: Solid, severity: float, draw: np.random.Generator) -> tuple[Field, Truth]:
@@ -90,3 +93,25 @@ DISTORTIONS: dict[str, Distortion] = {
     "coarse_floats": coarse_floats,
     "quantised": quantised,
 }
+
+
+def noisy_weights(network: Decoder | Published, code: Tensor, severity: float, draw: np.random.Generator) -> Tensor:
+    """Adds Gaussian noise to each matrix and bias, of a standard deviation in shares of its root mean square."""
+    for weight in network.parameters():
+        weight += severity * weight.square().mean().sqrt() * torch.from_numpy(draw.normal(size=weight.shape)).to(weight)
+    return code
+
+
+def coarse_weights(network: Decoder | Published, code: Tensor, severity: float, draw: np.random.Generator) -> Tensor:
+    """Rounds all weights to `severity` bits of mantissa; values are computed in float32."""
+    for weight in network.parameters():
+        weight.copy_(_rounded(weight, round(severity)))
+    return code
+
+
+def far_code(network: Decoder | Published, code: Tensor, severity: float, draw: np.random.Generator) -> Tensor:
+    """Multiplies a code of the training."""
+    return severity * code
+
+
+OF_NETWORKS = {change.__name__: change for change in (noisy_weights, coarse_weights, far_code)}

@@ -5,6 +5,7 @@ renderer gets the same exams.
 """
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import reduce
 from math import asin, atan, cos, degrees, exp, pi, radians, sin
@@ -16,16 +17,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from datasets.stress import distortions
-from datasets.stress.distortions import CUBE
+from datasets.stress.distortions import CUBE, THINNEST
 from datasets.stress.solids import ReferenceTruth, Solid, Truth, box, half_space, rod, sphere_solid
 from datasets.views import ViewSampler
 from renderers.camera import Camera
-from renderers.field import Field, Kind
+from renderers.field import Field, Kind, points_in_sphere, steepest
 from renderers.fields.analytic import Shape
+from renderers.fields.mlp import Decoder
+from renderers.fields.network import Published
 
 DISTANCE = 2.5  # of the camera from the origin, scene units
 ALL_AROUND = (0.0, 360.0)
 CORNER = {"azimuth": (37.0, 53.0), "elevation": (27.0, 43.0)}  # three sides of a cube, none of them grazing
+ABOVE = (15.0, 35.0)  # degrees of elevation, from which networks are seen, as in conf/config.yaml
+REDRAWN, SEEN = 20, 4096  # draws of a disturbed network at most; points of which one must be inside
 CUBE_VIEW = 44.0  # degrees: it fills the picture
 GRAZING_SHARE = 0.1  # of `grazing_plane`: half the picture's height over its distance, divided by the angle's sine
 GRAZING_SHIFT, GRAZING_ROLL = 0.1, 10.0  # of its camera: along the plane, in scene units; about its axis, in degrees
@@ -181,6 +186,30 @@ def _distorted(distortion: distortions.Distortion) -> Scene:
         camera = _cube(draw, resolution).camera
         field, surface = distortion(cube, severity, draw)
         return Exam(field, camera, surface)
+
+    return scene
+
+
+def of_network(name: str, network: Decoder | Published, codes: Float[Tensor, "shapes code_length"]) -> Scene:
+    """A trained network at one of its codes, disturbed; the truth is the disturbed network in float64.
+
+    What has lost its shape is drawn again.
+
+    Args:
+        name: of `distortions.OF_NETWORKS`.
+        codes: of the training.
+    """
+
+    @torch.no_grad()
+    def scene(severity: float, draw: np.random.Generator, resolution: int) -> Exam:
+        for _ in range(REDRAWN):
+            changed = deepcopy(network)
+            code = distortions.OF_NETWORKS[name](changed, codes[draw.integers(len(codes))], severity, draw)
+            exact = deepcopy(changed).cpu().double().at(code.cpu().double())
+            if (exact(points_in_sphere(SEEN)) < 0).any():
+                break
+        truth = ReferenceTruth(exact, steepest(exact, radius=1.0), THINNEST)
+        return Exam(changed.at(code), _camera(draw, resolution, elevation=ABOVE), truth)
 
     return scene
 

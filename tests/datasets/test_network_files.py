@@ -326,10 +326,13 @@ def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkey
         composed_inputs(*given, "task=ablation")
 
 
-def test_scenes_of_a_stress_are_of_no_network(tmp_path):
-    path = npz(tmp_path, arrays()).path
-    with pytest.raises(BadInput, match="has scenes of its own, and renders no network: remove field=file"):
-        composed_inputs("task=stability", "stress=gap", "dataset=network", f"dataset.path={path}")
+def test_a_stress_that_a_network_has_no_part_in_is_refused(tmp_path):
+    given = ("task=stability", "dataset=network", f"dataset.path={npz(tmp_path, arrays()).path}")
+    with pytest.raises(BadInput, match="the stress gap renders no network: remove field=file, or set stress="):
+        composed_inputs(*given, "stress=gap")
+    with pytest.raises(BadInput, match="no code that the stress far_code could change: set stress=noisy_weights"):
+        composed_inputs(*given, "stress=far_code")
+    composed_inputs(*given, "stress=noisy_weights")
 
 
 def test_a_network_of_ones_own_is_trained_and_read_as_the_page_says(tmp_path, monkeypatch):
