@@ -137,6 +137,7 @@ class Evidence:
         status, reason: how the fit ended.
         seconds, evaluations, gradients, flops: of the fit with its warm start, without checkpoints.
         iterations: of the fit, without its warm start.
+        falling: whether the last of all rounds still lowered the error; see `Fitter.finish`.
         checkpoints: seconds, evaluations, gradients, flops and error at each checkpoint.
     """
 
@@ -151,6 +152,7 @@ class Evidence:
     gradients: int = 0
     flops: int = 0
     iterations: int = 0
+    falling: bool = False
     checkpoints: list[dict[str, float]] = field(default_factory=list)
 
     @property

@@ -48,7 +48,7 @@ def fit_all(fitter: Fitter, candidates: list[Candidate]) -> Iterator[Fitted]:
     fitter, best = replace(fitter, part="fit_all"), None
     for candidate in candidates:
         fitted = fitter.begin(candidate, None if best is None else best.model)
-        fitter.fit(fitted, fitter.settings.iterations, checkpoints=True)
+        fitter.finish(fitted, checkpoints=True)
         if not fitted.failed and (best is None or fitted.evidence.mean < best.evidence.mean):
             best = fitted
         yield fitted
@@ -64,14 +64,16 @@ def check(chosen: Fitted, fits: list[Fitted], views: Views, settings: CheckSetti
 def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: float) -> Evidence:
     """Fits a candidate again from the same start, at pixel precision, with a number of rays that follows the loss.
 
-    The renderer is at pixel precision; the fit begins with a share of the rays, and is evaluated as all others are.
+    The renderer is at pixel precision; the fit begins with a share of the rays, and has as many rounds and is evaluated
+    as the one before.
     """
     settings = replace(fitter.settings, fewest_rays=fewest_rays)
     frugal = replace(
         fitter, settings=settings, observations=fitter.observations.through(renderer), part="frugal", spent={}
     )
     fitted = frugal.begin(chosen.candidate, chosen.previous, evaluate=False)
-    frugal.fit(fitted, settings.iterations, checkpoints=False)
+    for _ in range(chosen.evidence.iterations // settings.iterations):
+        frugal.fit(fitted, settings.iterations, checkpoints=False)
     if not fitted.failed:
         fitted.evidence.error = fitter.observations.error(fitted.model.frozen())
     return fitted.evidence

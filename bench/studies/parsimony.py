@@ -11,8 +11,9 @@ PLACE = 160
 READS = (Selection("parsimony", setup=("scenes", "pixels", "machine"), alike=("models", "task")),)
 COSTS = ("seconds", "flops", "evaluations")
 NOTES = (
-    "All candidates are fitted to depth and silhouettes of the same views with the same rays and iterations; the error "
-    "is the mean distance along the normal over held-out rays, most of them of other views.",
+    "All candidates are fitted to depth and silhouettes of the same views with the same rays, in rounds, until one "
+    "lowers the held-out error by no more than its noise. It is the mean distance along the normal over held-out rays, "
+    "most of them of other views.",
     "Recommended is the smallest candidate by {size} whose error is within one standard error (s.e.) of the best "
     "candidate's, or under half a pixel at the nearest distance: those are filled in the figure.",
     "Seeds held: the share of draws of further views on which the recommended candidate is within one standard error "
@@ -35,7 +36,7 @@ def make(runs: Runs) -> Result:
         question="How little model does a shape need?",
         verdict=_verdict([line for line in lines if line["ok"]]),
         interval="± is one standard error, by the jackknife over views",
-        remarks=[note.format(size=AXES[size]) for note in NOTES],
+        remarks=[*(note.format(size=AXES[size]) for note in NOTES), _falling(lines)],
         data=table.to_data(CANDIDATES, [line | own for line in lines for own in _candidates(line)]),
         columns=COLUMNS,
         lines=lines,
@@ -75,6 +76,12 @@ def _candidates(line: Line) -> list[Line]:
         | {"recommended": one is found.chosen, "best": one is found.best}
         for one in (found.results if line["ok"] else ())
     ] or [{}]
+
+
+def _falling(lines: list[Line]) -> str:
+    """Which candidates are not at their end, and on which scenes."""
+    found = [f"{one.label} ({line['scene']})" for line in lines for one in line["candidates"].results if one.falling]
+    return f"Not at their end, as the last round still lowered their error: {', '.join(found)}." if found else ""
 
 
 def _verdict(lines: list[Line]) -> str:

@@ -40,6 +40,7 @@ NEEDS = {
     "NAME.free, NAME.stored, NAME.bytes": SIZES,
     "NAME.sparse_bytes": "of a grid: size of a file with the fitted samples, a bit per sample that tells which they "
     "are, and the previous field, from which the other samples can be computed; no choice uses it",
+    "NAME.iterations, NAME.falling": "of its fit; whether the error still fell in its last round, models.fit.rounds",
     "NAME.flops_per_query": "floating-point operations per value, an estimate for formulas",
     "NAME.seconds, NAME.evaluations, NAME.flops": "of its fit, with finding its start and the warm start, "
     "without checkpoints",
@@ -87,11 +88,12 @@ class Capacity:
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
         views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
         observations = views.observations(inputs.seed)
+        longest = models.fit.rounds * models.fit.iterations
         with curve_file(run.folder) as write_line:
 
             def on_line(name: str, line: dict[str, Any]) -> None:
                 write_line({"candidate": name, **line})
-                run.progress(f"fitting {name}", line["iteration"] + 1, models.fit.iterations, line["total"])
+                run.progress(f"fitting {name}", line["iteration"] + 1, longest, line["total"])
 
             candidates = by_size(models.candidates, models.size)
             fitter = Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
@@ -130,7 +132,7 @@ def costs(name: str, evidence: Evidence) -> dict[str, Any]:
     if evidence.size.sparse_bytes is not None:
         known["sparse_bytes"] = evidence.size.sparse_bytes
     known["flops_per_query"] = evidence.flops_per_query
-    spent = {key: getattr(evidence, key) for key in ("seconds", "evaluations", "flops")}
+    spent = {key: getattr(evidence, key) for key in ("seconds", "evaluations", "flops", "iterations", "falling")}
     error = evidence.error
     failure = {"failed": f"{evidence.status}: {evidence.reason}"} if error is None else {}
     errors = {} if error is None else {"error": error.mean, "standard_error": error.standard_error}

@@ -1,6 +1,6 @@
 """Fields of the ladder: their formulas, their held-out error, what is chosen by it, and how they grow."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -32,7 +32,7 @@ from tests.looped import each
 from tests.tiny import CPU
 
 DIST = load("renderer", "dist", n_gradient_samples=1)
-FIT = FitSettings(iterations=30, fewest_rays=1.0, warm_iterations=60, warm_points=128, eikonal_weight=1.0)
+FIT = FitSettings(iterations=30, rounds=2, fewest_rays=1.0, warm_iterations=60, warm_points=128, eikonal_weight=1.0)
 SAMPLER = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 24)
 WEIGHTS = SimpleNamespace(depth_loss="depth", depth_weight=10.0, silhouette=Own(), silhouette_weight=10.0)
 VIEWS = ViewSettings(fitted=6, held_out=4, share=0.1, elevation=60.0, rays=256)
@@ -427,13 +427,12 @@ class Told:
 
     begun: list[tuple[float, float | None]]
     part: str = ""
-    settings: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(iterations=1))
 
     def begin(self, candidate: float, previous: float | None) -> SimpleNamespace:
         self.begun.append((candidate, previous))
         return SimpleNamespace(failed=candidate < 0, evidence=SimpleNamespace(mean=candidate), model=candidate)
 
-    def fit(self, fitted: SimpleNamespace, iterations: int, *, checkpoints: bool) -> None: ...
+    def finish(self, fitted: SimpleNamespace, *, checkpoints: bool) -> None: ...
 
 
 def test_a_refit_with_nothing_changed_is_the_fit():
@@ -442,6 +441,15 @@ def test_a_refit_with_nothing_changed_is_the_fit():
     first, second = fits[1].evidence, refit(fits[1], fitter, DIST, fewest_rays=1.0)
     assert fits[1].previous is fits[0].model
     assert (second.mean, second.evaluations, second.flops) == (first.mean, first.evaluations, first.flops)
+
+
+@each("shape, name, rounds, falling", [("ball", "sphere", 6, False), ("capsule", "network_2x32", 2, True)])
+def test_a_fit_goes_on_while_its_error_falls_and_says_where_it_was_stopped(shape, name, rounds, falling):
+    torch.manual_seed(0)
+    fitter = fitter_of(shape, iterations=8, rounds=rounds, warm_iterations=20)
+    fitted = fitter.begin(candidate(name), None)
+    fitter.finish(fitted, checkpoints=False)
+    assert fitted.evidence.falling is falling is (fitted.evidence.iterations == 8 * rounds)
 
 
 def test_the_clock_of_a_fit_goes_on_where_its_trial_ended():
