@@ -136,8 +136,8 @@ def measured(
     facts = _facts(points, sign * scale * values, sign * around[0], slopes)
     kind, divisor = kind or facts.kind, 1.0
     if kind is Kind.BOUND:
-        steepest = [scale * float(_slopes(other, points[:AROUND]).max()) for other in others]
-        divisor = STEEPEST_MARGIN * max([facts.steepest, *steepest])
+        steepest = max(others, key=lambda other: float(_slopes(other, points[:FEW]).max()), default=field)
+        divisor = STEEPEST_MARGIN * max(facts.steepest, scale * float(_slopes(steepest, points[:AROUND]).max()))
     return Meaning(facts, kind, divisor, sign * scale / divisor)
 
 
