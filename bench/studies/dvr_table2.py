@@ -44,7 +44,7 @@ RISING = 0.5  # dB
 SCENES = 2  # of `figures`
 ALIKE = {  # rows that are not shown there, since they look as another does
     *("rgb_dist", "rgb_idr", "rgb_naive", "rgb_relaxed_boundary", "rgb_volsdf", "rgb_unisurf"),
-    *("rgbd_dvr", "dvr_paper_depth", "stereo", "poisson_5"),
+    *("rgb_newton_auto", "rgbd_dvr", "dvr_paper_depth", "stereo", "poisson_5"),
 }
 ARRAYS = ("photograph", "colours", "normals", "hit")
 
