@@ -98,8 +98,9 @@ class Stress:
 
     def made(self, conditions: Conditions) -> Scene:
         """What makes the exams of a rendering or its gradient."""
-        network = conditions.network if self.scene in OF_NETWORKS else None
-        return of_network(self.scene, *network) if network else SCENES[self.scene]
+        if (prior := conditions.prior) is None or self.scene not in OF_NETWORKS:
+            return SCENES[self.scene]
+        return of_network(self.scene, prior.decoder.to(conditions.device), prior.codes.to(conditions.device))
 
     def trial(self, renderer: Renderer, level: float, repeat: int, conditions: Conditions) -> Outcome:
         """Trial number `repeat` at a level, the same one for every renderer. An exception is recorded as a failure.

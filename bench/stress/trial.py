@@ -5,14 +5,12 @@ from enum import StrEnum
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from bench.machine.limits import Limits
+from bench.shape_prior import Prior
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.optimise import OptimiserSettings
 from renderers.checks import check_at_least, check_choice, check_positive, check_share
-from renderers.fields.mlp import Decoder
-from renderers.fields.network import Published
 from renderers.silhouette import SilhouetteLoss
 
 
@@ -70,18 +68,14 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions of all trials: W of a W x W rendering, the fit, criteria of success, limits, and the device.
-
-    Args:
-        network: that is disturbed, and its codes, where it is one.
-    """
+    """The conditions of all trials: W of a W x W rendering, the fit, criteria, limits, device, and any network."""
 
     resolution: int
     fit: FitSettings
     criteria: Criteria
     limits: Limits
     device: torch.device
-    network: tuple[Decoder | Published, Tensor] | None = None
+    prior: Prior | None = None
 
 
 class Failure(StrEnum):

@@ -4,7 +4,6 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from torch import Tensor
 
 from bench.machine.limits import Limits
 from bench.pictures.run_figures import draw_failure
@@ -18,8 +17,6 @@ from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from datasets.network_files import Networked
 from datasets.stress.distortions import OF_NETWORKS
 from renderers.checks import BadInput, check_at_least
-from renderers.fields.mlp import Decoder
-from renderers.fields.network import Published
 from renderers.rendering import Renderer, Unsupported
 
 DEFINITIONS = {
@@ -78,7 +75,8 @@ class Stability:
     def execute(self, run: RunContext) -> None:
         """Searches; fills the record, writes a line per trial to curve.jsonl, and draws the mildest failure."""
         record, renderer = run.record, run.inputs.renderer
-        conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device, self._of(run))
+        prior = run.inputs.prior if self.stress.scene in OF_NETWORKS else None
+        conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device, prior)
         record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")
         self._check(renderer)
@@ -101,13 +99,6 @@ class Stability:
             kind = PIXEL_NAMES.get(first.outcome.failure or "", first.outcome.failure)
             title = f"{what}: first failure ({kind}) at {first.severity:.3g} {self.stress.sweep.unit}"
             draw_failure(run.folder, first.outcome.images, first.severity, title)
-
-    def _of(self, run: RunContext) -> tuple[Decoder | Published, Tensor] | None:
-        """The network that is disturbed and its codes, those of the prior; None where the scene has none."""
-        if self.stress.scene not in OF_NETWORKS:
-            return None
-        prior, device = run.inputs.prior, run.inputs.device
-        return prior.decoder.to(device).requires_grad_(False), prior.codes.to(device)
 
     def _check(self, renderer: Renderer) -> None:
         """Raises Unsupported, before the first trial, where the renderer rejects the setting of the mild end."""

@@ -40,7 +40,7 @@ def stress_named(name: str) -> Stress:
 
 
 def conditions(resolution: int = 32) -> Conditions:
-    return Conditions(resolution, FIT, CRITERIA, LIMITS, CPU, (BALL.decoder, BALL.codes))
+    return Conditions(resolution, FIT, CRITERIA, LIMITS, CPU, BALL)
 
 
 def drawn(seed: int = 0) -> np.random.Generator:
@@ -145,7 +145,14 @@ def test_repeats_of_a_trial_have_other_outcomes_or_there_is_one_trial(name):
     assert differ == (stress.repeats is None)
 
 
-MOVED = {"perturbed": 0.1, "quantised": 0.1, "coarse_floats": 3, "noisy_weights": 0.3, "coarse_weights": 3, "far_code": 3}
+MOVED = {
+    "perturbed": 0.1,
+    "quantised": 0.1,
+    "coarse_floats": 3,
+    "noisy_weights": 0.3,
+    "coarse_weights": 3,
+    "far_code": 3,
+}
 
 
 @each("name, severity", MOVED.items())
