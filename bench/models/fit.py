@@ -121,15 +121,15 @@ class Fitter:
         fitted.evidence.iterations += self._run(fitted, problem, settings, checkpoints=checkpoints)
         self._evaluate(fitted)
 
-    def finish(self, fitted: Fitted, *, checkpoints: bool) -> None:
+    def finish(self, fitted: Fitted, rounds: int) -> None:
         """Fits a candidate round by round, until a round lowers its held-out error by no standard error of the change.
 
-        Where it is still falling after the last of `settings.rounds`, the evidence says so.
+        Where it is still falling after the last of all rounds, the evidence says so.
         """
         evidence = fitted.evidence
-        for _ in range(self.settings.rounds):
+        for _ in range(rounds):
             before = evidence.error
-            self.fit(fitted, self.settings.iterations, checkpoints=checkpoints)
+            self.fit(fitted, self.settings.iterations, checkpoints=True)
             gain = inf if before is None else before.mean - evidence.mean
             noise = 0.0 if before is None or evidence.error is None else evidence.error.noise_of_difference(before)
             evidence.falling = not fitted.failed and gain > noise

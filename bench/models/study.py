@@ -43,12 +43,12 @@ class Choice:
     enough: bool  # its error is under the footprint
 
 
-def fit_all(fitter: Fitter, candidates: list[Candidate]) -> Iterator[Fitted]:
-    """Fits every candidate; each may begin from the best one before it."""
+def fit_all(fitter: Fitter, candidates: list[Candidate], rounds: int = 1) -> Iterator[Fitted]:
+    """Fits every candidate, by so many rounds at most; each may begin from the best one before it."""
     fitter, best = replace(fitter, part="fit_all"), None
     for candidate in candidates:
         fitted = fitter.begin(candidate, None if best is None else best.model)
-        fitter.finish(fitted, checkpoints=True)
+        fitter.finish(fitted, rounds)
         if not fitted.failed and (best is None or fitted.evidence.mean < best.evidence.mean):
             best = fitted
         yield fitted

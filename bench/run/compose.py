@@ -6,8 +6,6 @@ all cells that differ in the shape or the seed alone.
 """
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +18,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from omegaconf import DictConfig, OmegaConf, base
+from omegaconf import DictConfig, OmegaConf
 
 from bench.records.folder import Identity, identify, resolved
 from bench.records.read import Plan, PlannedCell
@@ -128,17 +126,6 @@ def swept_over(config: DictConfig) -> list[list[str]]:
     return swept
 
 
-@contextmanager
-def values_parsed_once() -> Iterator[None]:
-    """Within it, OmegaConf keeps how it reads a value such as `${seed}`: nearly half of the time of a cell."""
-    parse = base.parse
-    base.parse = cache(parse)
-    try:
-        yield
-    finally:
-        base.parse = parse
-
-
 def make_plan(config: DictConfig, swept: list[list[str]]) -> Plan:
     """All cells of a sweep, from the overrides of each.
 
@@ -148,15 +135,13 @@ def make_plan(config: DictConfig, swept: list[list[str]]) -> Plan:
     """
     composer, common = Composer(config), set.intersection(*map(set, swept))
     cells: list[PlannedCell] = []
-    with values_parsed_once():
-        for number, overrides in enumerate(swept, 1):
-            try:
-                identity = composer.identity(overrides)
-            except ValueError as error:
-                differing = " ".join(override for override in overrides if override not in common)
-                where = f"cell {number} of {len(swept)} ({differing}): " if differing else ""
-                raise ValueError(f"{where}{error}; nothing was run") from error
-            cells.append(planned(identity))
+    for number, overrides in enumerate(swept, 1):
+        try:
+            cells.append(planned(composer.identity(overrides)))
+        except ValueError as error:
+            differing = " ".join(override for override in overrides if override not in common)
+            where = f"cell {number} of {len(swept)} ({differing}): " if differing else ""
+            raise ValueError(f"{where}{error}; nothing was run") from error
     first = cells[0].config
     name = f"{first['experiment'] or cells[0].task}-{digest([cell.id for cell in cells])}"
     return Plan(name, Path(first["results_dir"]), cells)

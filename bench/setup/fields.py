@@ -50,7 +50,6 @@ class FitSettings:
 
     Args:
         iterations: of the fit with the renderer's loss; with task=capacity, of a round.
-        rounds: largest number of them, which go on while the held-out error falls.
         fewest_rays: least share of the rays in an iteration where their number follows the loss; 1 always takes all.
             See `bench.setup.auto.rays_share`.
         warm_iterations, warm_points: iterations and points per iteration of the warm start, which fits the observed
@@ -60,14 +59,13 @@ class FitSettings:
     """
 
     iterations: int
-    rounds: int
     fewest_rays: float
     warm_iterations: int
     warm_points: int
     eikonal_weight: float
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "rounds", "warm_points"):
+        for name in ("iterations", "warm_points"):
             check_at_least(f"models.fit.{name}", getattr(self, name), 1, "conf/scale has values that work")
         check_share("models.fit.fewest_rays", self.fewest_rays, "1 always takes all rays")
         check_at_least("models.fit.warm_iterations", self.warm_iterations, 0, "0 switches the warm start off")

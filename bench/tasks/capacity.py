@@ -19,7 +19,7 @@ from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.solve import COSTS, check_field_gradient, note_result
-from renderers.checks import check_choice, check_positive, check_share
+from renderers.checks import check_at_least, check_choice, check_positive, check_share
 from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss
 
@@ -40,7 +40,7 @@ NEEDS = {
     "NAME.free, NAME.stored, NAME.bytes": SIZES,
     "NAME.sparse_bytes": "of a grid: size of a file with the fitted samples, a bit per sample that tells which they "
     "are, and the previous field, from which the other samples can be computed; no choice uses it",
-    "NAME.iterations, NAME.falling": "of its fit; whether the error still fell in its last round, models.fit.rounds",
+    "NAME.iterations, NAME.falling": "of its fit; whether the error still fell in its last round, task.rounds",
     "NAME.flops_per_query": "floating-point operations per value, an estimate for formulas",
     "NAME.seconds, NAME.evaluations, NAME.flops": "of its fit, with finding its start and the warm start, "
     "without checkpoints",
@@ -63,6 +63,7 @@ class Capacity:
 
     Args:
         depth_loss, depth_weight, silhouette, silhouette_weight: see `bench.tasks.completion.Completion`.
+        rounds: of `models.fit.iterations` that a fit has at most; see `bench.models.fit.Fitter.finish`.
         frugal_rays: share of the rays that the recommended candidate's fit at pixel precision begins with.
         checks: of the choice on further views.
     """
@@ -71,10 +72,12 @@ class Capacity:
     depth_weight: float
     silhouette: SilhouetteLoss
     silhouette_weight: float
+    rounds: int
     frugal_rays: float
     checks: CheckSettings
 
     def __post_init__(self) -> None:
+        check_at_least("task.rounds", self.rounds, 1, "1 fits once, 4 as long as the error falls")
         check_share("task.frugal_rays", self.frugal_rays, "0.125 begins with an eighth of the rays")
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "silhouette_weight"):
@@ -88,7 +91,7 @@ class Capacity:
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
         views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
         observations = views.observations(inputs.seed)
-        longest = models.fit.rounds * models.fit.iterations
+        longest = self.rounds * models.fit.iterations
         with curve_file(run.folder) as write_line:
 
             def on_line(name: str, line: dict[str, Any]) -> None:
@@ -100,7 +103,7 @@ class Capacity:
             renderer, settings_notes = inputs.make_pixel_precise()  # before the fits: it may be refused
             growth = grow(fitter, candidates, models.growth)
             fits: dict[str, Fitted] = {}
-            for fitted in fit_all(fitter, candidates):
+            for fitted in fit_all(fitter, candidates, self.rounds):
                 name = fitted.candidate.name
                 fits[name] = fitted
                 record.metrics |= costs(name, fitted.evidence)  # in case the run is stopped

@@ -32,7 +32,7 @@ from tests.looped import each
 from tests.tiny import CPU
 
 DIST = load("renderer", "dist", n_gradient_samples=1)
-FIT = FitSettings(iterations=30, rounds=2, fewest_rays=1.0, warm_iterations=60, warm_points=128, eikonal_weight=1.0)
+FIT = FitSettings(iterations=30, fewest_rays=1.0, warm_iterations=60, warm_points=128, eikonal_weight=1.0)
 SAMPLER = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 24)
 WEIGHTS = SimpleNamespace(depth_loss="depth", depth_weight=10.0, silhouette=Own(), silhouette_weight=10.0)
 VIEWS = ViewSettings(fitted=6, held_out=4, share=0.1, elevation=60.0, rays=256)
@@ -432,7 +432,7 @@ class Told:
         self.begun.append((candidate, previous))
         return SimpleNamespace(failed=candidate < 0, evidence=SimpleNamespace(mean=candidate), model=candidate)
 
-    def finish(self, fitted: SimpleNamespace, *, checkpoints: bool) -> None: ...
+    def finish(self, fitted: SimpleNamespace, rounds: int) -> None: ...
 
 
 def test_a_refit_with_nothing_changed_is_the_fit():
@@ -446,9 +446,9 @@ def test_a_refit_with_nothing_changed_is_the_fit():
 @each("shape, name, rounds, falling", [("ball", "sphere", 6, False), ("capsule", "network_2x32", 2, True)])
 def test_a_fit_goes_on_while_its_error_falls_and_says_where_it_was_stopped(shape, name, rounds, falling):
     torch.manual_seed(0)
-    fitter = fitter_of(shape, iterations=8, rounds=rounds, warm_iterations=20)
+    fitter = fitter_of(shape, iterations=8, warm_iterations=20)
     fitted = fitter.begin(candidate(name), None)
-    fitter.finish(fitted, checkpoints=False)
+    fitter.finish(fitted, rounds)
     assert fitted.evidence.falling is falling is (fitted.evidence.iterations == 8 * rounds)
 
 

@@ -111,7 +111,7 @@ def test_a_users_renderer_without_epsilon_works(compose_config, tmp_path):
 def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
     ladder = ModelSettings(("sphere",), "stored", FIT, GROWTH, VIEWS)
     run = run_of(tmp_path, Blind(), ball_prior(), camera_of(8), field=FieldChoice("prior", ladder))
-    task = Capacity("depth", 10.0, Own(), 10.0, 0.5, CheckSettings(4, 2, 2))
+    task = Capacity("depth", 10.0, Own(), 10.0, 1, 0.5, CheckSettings(4, 2, 2))
     with pytest.raises(Unsupported, match="no gradient towards the field"):
         task.execute(run)
 
@@ -164,4 +164,4 @@ def test_invalid_settings_are_told_with_their_reason(compose_config, tmp_path):
     record = run(tmp_path, compose_config, "task=gradients", "+experiment=fitted", "field=auto")
     assert record.status == "refused" and "does not take field=auto: remove it" in record.reason
     with pytest.raises(ValueError, match="frugal_rays must be above 0"):
-        Capacity("depth", 10.0, Own(), 10.0, 0.0, CheckSettings(4, 2, 2))
+        Capacity("depth", 10.0, Own(), 10.0, 1, 0.0, CheckSettings(4, 2, 2))
