@@ -57,9 +57,15 @@ def make_reference(field: Field, camera: Camera) -> Reference:
     return Reference(rendering.distance * rendering.hit, normals, rendering.hit)
 
 
-def _key(prior: Prior, camera: Camera) -> str:
+def fingerprint(prior: Prior) -> str:
+    """A hash of a prior's weights and codes."""
     weights = hashlib.sha256()
-    for tensor in (*prior.decoder.state_dict().values(), prior.codes[0]):
+    for tensor in (*prior.decoder.state_dict().values(), prior.codes):
         weights.update(tensor.cpu().contiguous().numpy().tobytes())
+    return weights.hexdigest()
+
+
+def _key(prior: Prior, camera: Camera) -> str:
     numbers = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
-    return digest({"version": VERSION, "weights": weights.hexdigest(), "camera": numbers})
+    weights = fingerprint(Prior(prior.decoder, prior.codes[:1]))
+    return digest({"version": VERSION, "weights": weights, "camera": numbers})

@@ -1,5 +1,6 @@
 """From an image to a code, and from a code to a shape with colours (DVR, Secs. 3.1, 3.5)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -60,15 +61,7 @@ class SingleView(nn.Module):
     def __init__(self, settings: SingleViewNetwork) -> None:
         super().__init__()
         self.settings = settings
-        stages: list[nn.Module] = [nn.Conv2d(4, settings.channels[0], 7, stride=2, padding=3, bias=False)]
-        previous = settings.channels[0]
-        for place, channels in enumerate(settings.channels):
-            for block in range(settings.blocks):
-                stride = 2 if place and not block else 1
-                stages.append(_Residual(previous, channels, stride))
-                previous = channels
-        self.stages = nn.Sequential(*stages, nn.ReLU(), nn.AdaptiveAvgPool2d(PLACES), nn.Flatten())
-        self.code = nn.Linear(previous * PLACES**2, settings.code_length)
+        self.stages, self.code = encoder(4, settings.channels, settings.blocks, settings.code_length)
         self.decoder = OccupancyNetwork(width=settings.width, code_length=settings.code_length)
         begin_as_sphere(self.decoder, settings.radius)
 
@@ -80,6 +73,18 @@ class SingleView(nn.Module):
     def at(self, code: Float[Tensor, " code_length"]) -> OccupancyOf:
         """The shape of a code, with colours."""
         return READINGS[self.settings.reads](self.decoder.at(code))
+
+
+def encoder(inputs: int, channels: Sequence[int], blocks: int, code_length: int) -> tuple[nn.Sequential, nn.Linear]:
+    """A residual network from images [batch, inputs, height, width] to features, and its last layer, to codes."""
+    stages: list[nn.Module] = [nn.Conv2d(inputs, channels[0], 7, stride=2, padding=3, bias=False)]
+    previous = channels[0]
+    for place, count in enumerate(channels):
+        for block in range(blocks):
+            stages.append(_Residual(previous, count, 2 if place and not block else 1))
+            previous = count
+    whole = nn.Sequential(*stages, nn.ReLU(), nn.AdaptiveAvgPool2d(PLACES), nn.Flatten())
+    return whole, nn.Linear(previous * PLACES**2, code_length)
 
 
 class _Residual(nn.Module):

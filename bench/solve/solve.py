@@ -17,7 +17,7 @@ from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
 from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
 from datasets.field_files import FIELD, save_field
@@ -172,8 +172,12 @@ def solve_task(task: InverseTask, run: RunContext) -> State:
     def problem() -> Problem:
         return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
 
-    definitions = DEFINITIONS | COLOUR if inputs.coloured else DEFINITIONS
-    return solve(problem, task.optimiser, run, definitions, gallery=True)
+    return solve(problem, task.optimiser, run, defined(inputs), gallery=True)
+
+
+def defined(inputs: RunInputs) -> dict[str, str]:
+    """The definitions of what a solved code is judged by."""
+    return DEFINITIONS | COLOUR if inputs.coloured else DEFINITIONS
 
 
 def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | None:

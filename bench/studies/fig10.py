@@ -10,7 +10,8 @@ CONDITIONS = (
 READS = (Selection("fig10", tuple(f"task.{one.key}" for one in CONDITIONS)),)
 NOTES = (
     "One condition varies, the other is at 1; the noise is in standard deviations of the prior's training codes, so "
-    "that 0 is the mean shape.",
+    "that 0 is the mean shape or, of a row with an encoder, that of the encoder's code.",
+    "A mesh row moves the vertices of the prior's mesh by the photometric error, as PMO does, the paper's other curve.",
     "A run that did not end ok counts as infinite, drawn at the upper edge.",
     "The paper (Fig. 10, a chart without numbers) finds its method robust to both.",
 )

@@ -14,10 +14,12 @@ NOTES = (
     "Error: mean squared distance from points of the true surface to the nearest of the found one, in that direction "
     "only, in squared scene units, times 1000; that of a run that did not end ok is infinite.",
     f"{compare.RATIO} {compare.FAILURE}",
-    f"All runs start from random codes, one per shape, the same for each method. {compare.FITTED}",
+    "Runs start from random codes, one per shape, the same for each method, but where a row starts from an encoder's "
+    f"code. {compare.FITTED}",
     "“Published” is DIST, Table 3, which does not say whether it has means or medians: 50 shapes of PMO's renderings "
     "of ShapeNet, with another prior and metric scale, which cannot be compared directly with the measured rows.",
 )
+ENCODED = "task.encoder.batch"  # set where a row starts from an encoder's code
 MESH = "multiview_mesh"  # the preset that PMO's rows are to be read beside
 ON_MESH = (
     "“{row}” moves the vertices of the prior's mesh by the photometric error, as PMO (Lin et al. 2019) does, from the "
@@ -37,8 +39,13 @@ def make(runs: Runs) -> Result:
     label = "Chamfer, truth to prediction × 1000 (scene units²)"
     found = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, label)
     starts = records.SCALE * runs.number(f"start_{records.ONE_WAY}")
+    encoded = runs.setting(ENCODED) != ""
+    of_kind = {"start: random codes": starts[~encoded], "start: encoder's codes": starts[encoded]}
     above = {
-        "start: random codes": starts.groupby(runs.frame.family, sort=False).median().dropna().to_dict(),
+        **{
+            name: own.groupby(runs.frame.family, sort=False).median().dropna().to_dict()
+            for name, own in of_kind.items()
+        },
         compare.ORACLE: compare.oracles(runs, records.ONE_WAY),
     }
     published = {name: {row: {"": str(number)} for row, number in rows.items()} for name, rows in PUBLISHED.items()}
@@ -67,8 +74,8 @@ def pictures(runs: Runs) -> Result:
         "least numbers.",
         remarks=(
             f"{gallery.JUDGED}, seen from the first photograph's side.",
-            "Start: the shape of the random code that all rows begin with; a mesh row moves the vertices of the "
-            "prior's mesh, as PMO does, and is no run of PMO's code.",
+            "Start: the shape of the random code that rows begin with, but those with an encoder; a mesh row moves the "
+            "vertices of the prior's mesh, as PMO does, and is no run of PMO's code.",
             "DIST, Figs. 11 and 23, shows shapes of ShapeNet beside PMO; these are of other families.",
             *gallery.missing(scenes.values()),
         ),
@@ -79,7 +86,8 @@ def pictures(runs: Runs) -> Result:
 
 def _cells(names: list[str], own: list[records.Record], scene: gallery.Scene) -> list[gallery.Cell]:
     of_row = {records.row_of(record).name: record for record in own}
-    shared = [scene.shared(own, gallery.normals(kind)) for kind in (gallery.TRUE, gallery.START)]
+    drawn = [r for r in own if records.setting(r["config"], *ENCODED.split(".")) is None]
+    shared = [scene.shared(own, gallery.normals(gallery.TRUE)), scene.shared(drawn, gallery.normals(gallery.START))]
     return [*shared, *(scene.cell(of_row.get(name), gallery.normals(gallery.FOUND)) for name in names)]
 
 

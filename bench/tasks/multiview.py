@@ -17,9 +17,10 @@ from bench.reconstruct.subject import NONE, Depths, PhotographTask, Subject, upr
 from bench.reconstruct.surfaces import with_colours
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
+from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, turned
 from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
-from bench.solve.solve import COSTS, check_field_gradient, descend, solve_task
+from bench.solve.solve import COSTS, check_field_gradient, defined, descend, solve
 from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot
@@ -58,6 +59,8 @@ class Multiview(PhotographTask):
             neutral, a similarity transform is optimised as well (DIST, Fig. 12). Ratio, degrees, scene units.
         similarity: whether one is optimised in any case.
         optimiser: iterations and learning rates.
+        encoder: gives the code about which initial ones are drawn, the mean of the photographs'; None: zero, the mean
+            shape's.
     """
 
     focal: float
@@ -78,6 +81,7 @@ class Multiview(PhotographTask):
     silhouette: SilhouetteLoss
     silhouette_weight: float
     optimiser: OptimiserSettings
+    encoder: EncoderSettings | None = None
     depths: Depths = field(default=Depths(NONE, 0.0), init=False)
 
     def __post_init__(self) -> None:
@@ -132,7 +136,17 @@ class Multiview(PhotographTask):
         if apart > FAR_APART:
             note = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
             run.record.notes = [*run.record.notes, note]
-        solve_task(self, run)
+        inputs = run.inputs
+
+        def problem() -> CodeProblem:
+            made = self.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
+            if self.encoder is not None and made.photographs is not None:
+                first = self.encoder.start(run, self.images, torch.from_numpy(made.photographs))
+                for code in made.codes:
+                    code.data += first.to(code)
+            return made
+
+        solve(problem, self.optimiser, run, defined(inputs), gallery=True)
 
     def _of_photographs(self, run: RunContext) -> None:
         """The same for photographs of one's own, by which the shape is judged, with the colours of those given."""

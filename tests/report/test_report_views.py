@@ -83,6 +83,14 @@ def test_published_numbers_of_pmo_stand_beside_the_mesh_row(tmp_path):
     assert "“Mesh, 48³” moves the vertices" in told(result) and "read it beside “published: PMO, random" in told(result)
 
 
+def test_an_encoders_start_is_a_line_of_its_own(tmp_path):
+    found(tmp_path, "table3", "DIST", 1.0, start=8.0)
+    found(tmp_path, "table3", "DIST, encoder's start", 0.5, start=2.0, encoder={"batch": 16})
+    result = page_of(tmp_path, "table3")
+    assert row(result, "start: random codes")["Median"] == "8.00"
+    assert row(result, "start: encoder's codes")["Median"] == "2.00"
+
+
 def test_rows_may_have_images_of_their_own_size(tmp_path):
     found(tmp_path, "table3", "DIST", 1.0)
     write_run(

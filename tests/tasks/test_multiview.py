@@ -10,17 +10,20 @@ import trimesh
 
 from bench.config import load
 from bench.reconstruct.subject import HULL_RADIUS
+from bench.shape_prior import Prior
+from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
 from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
+from datasets.mesh import extract
 from datasets.meshes import read_mesh
-from datasets.scene import Scene, Truth
+from datasets.scene import Scene, Truth, see
 from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.made_photographs import CENTRE, RADIUS, idr
 from tests.run.driving import command, record_of
-from tests.tiny import CPU, ball_prior, camera_of, scene_of
+from tests.tiny import CPU, ball_prior, camera_of, phases_of, run_of, scene_of
 
 RENDERER = load("renderer", "dist")
 CAMERA = camera_of(16, angles=(0.0, 20.0))
@@ -85,6 +88,21 @@ def test_random_starts_differ_and_share_the_budget(scene):
     assert all(distance > 0 for distance in moved)
     ends = [np.mean([line["total"] for line in history.curve[start:9:3]]) for start in range(3)]
     assert kept == int(np.argmin(ends))
+
+
+def test_an_encoder_is_trained_once_and_gives_the_code_about_which_starts_are_drawn(tmp_path):
+    prior, camera = Prior(PRIOR.decoder, 3 * PRIOR.codes), camera_of(32, angles=(0.0, 20.0))
+    encoder = EncoderSettings((8,), 1, 32, 6, 4, 8, OptimiserSettings(80, 0.01, "cosine"))
+    true = extract(prior.decoder.at(prior.codes[0]), grid=24, reach=1.0)
+    seen = Scene("a ball", true, see(Truth(true), camera))
+    task = replace(SETTINGS, optimiser=OptimiserSettings(1, 1e-9, "constant"))
+    run = run_of(tmp_path, RENDERER, prior, camera, make_scene=lambda: seen)
+    run = replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, points=1000)))
+    task.execute(run)
+    at_zero = run.record.metrics_start["chamfer_l1"]
+    trained = ["training the encoder" in phases_of(run, replace(task, encoder=encoder)) for _ in range(2)]
+    assert trained == [True, False]  # the second one reads it
+    assert run.record.metrics_start["chamfer_l1"] < 0.6 * at_zero
 
 
 def test_a_misplaced_ball_is_put_back(scene):
