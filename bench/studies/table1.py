@@ -24,6 +24,8 @@ NOTES = (
     "decide nothing.",
     "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
     "hit.",
+    "Behind the surface is the share of field values, of a rendering of at most 64 pixels per side, that are negative "
+    "(DIST, Fig. 14).",
     "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: not to be compared with our rows.",
 )
 _TIMES = ("forward_seconds", "backward_seconds", "step_seconds")
@@ -31,7 +33,7 @@ _TIMES = ("forward_seconds", "backward_seconds", "step_seconds")
 MEASURED = (
     *("queries", "coarse_queries", "step_queries", "step_coarse_queries", "step_gradients", *_TIMES),
     *(f"{time}_{end}" for time in _TIMES for end in ("low", "high")),
-    *("repeats", "forward_gemm", "step_gemm", "rays", "peak_memory_bytes", "hits", "lost", "false", "wrong"),
+    *("repeats", "forward_gemm", "step_gemm", "rays", "peak_memory_bytes", "hits", "lost", "false", "wrong", "behind"),
     *("depth_error_p99", "depth_error_max", "depth_error_median"),
 )
 
@@ -132,6 +134,7 @@ COLUMNS = (  # of a record, for readers; metrics are those of the largest size t
         "Depth error median / max",
         table.together(records.measured, format.number, "depth_error_median", "depth_error_max"),
     ),
+    metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
     table.shown("Published queries", lambda record: str(_published(record, 2) or "")),
     table.shown("Published time", lambda record: str(_published(record, 3) or "")),
 )

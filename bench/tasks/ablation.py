@@ -13,6 +13,7 @@ from statistics import median
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from bench.config import load
@@ -22,15 +23,17 @@ from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.observed_view import slopes_over
 from bench.solve.solve import check_field_gradient, counted
 from datasets.scene import View
 from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Counts, Field, Meter, autograd_normals
+from renderers.field import Bounds, Counts, Field, Meter, Wrapper, autograd_normals, bounds_of
 from renderers.rendering import Observed, Renderer, Rendering, check_kind
 
 BASE = "base"  # the run's renderer, where others are timed beside it
+SIGNED = 64  # most pixels per side of the rendering whose negative values are counted
 SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
 WARM_UP = 8  # pixels per side of the image that is rendered before the timing, on a CPU
 DEFINITIONS = {
@@ -55,6 +58,8 @@ DEFINITIONS = {
     "product, in float32 or, of coarse values, in bfloat16, over the median time",
     "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in a step; of no CPU, where it does not repeat",
     "lost, false": "missed pixels, which only the float64 reference hits; spurious ones, which only the renderer hits",
+    "behind": "share of the field values of one more rendering, untimed and of at most 64 pixels per side, that are "
+    "negative: samples behind the surface (DIST, Fig. 14)",
     "pixel_errors": "lost, false and wrong together; at the start: hits, those of an image in which nothing is hit",
     "cost": "of one rendering, in field values: a coarse one counts as an eighth",
     "rays, hits": "pixels of the image; pixels that the reference hits",
@@ -89,6 +94,8 @@ class Ablation:
         rounds: of these, in each of which every renderer takes one step and renders once.
         size: of the image, in pixels per side; None: as `view` has it.
         threads: of the CPU; None: those of the run.
+        normal_width: of the differences that give the normals of pictures (DIST, Eq. 3: 2 delta), in scene units; None:
+            the field's gradients.
     """
 
     repeats: int
@@ -99,6 +106,7 @@ class Ablation:
     rounds: int = 1
     size: int | None = None
     threads: int | None = None
+    normal_width: float | None = None
 
     def __post_init__(self) -> None:
         check_at_least("task.repeats", self.repeats, 1, "3 show the spread")
@@ -109,6 +117,8 @@ class Ablation:
             check_at_least("task.size", self.size, 8, "128 is quick")
         if self.threads is not None:
             check_at_least("task.threads", self.threads, 1, "1 is steadiest")
+        if self.normal_width is not None:
+            check_positive("task.normal_width", self.normal_width, "0.01 shows the shape; null takes gradients")
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a network that was fitted to the scene's shape."""
@@ -175,7 +185,8 @@ class Ablation:
         machine, again = record.environment, gemm_peak(bench.device)  # measured close to the times
         machine["gemm_peak_flops"] = max(machine["gemm_peak_flops"], again)
         numbers = {
-            name: costs(one.forward, one.step, machine) | one.errors(self.wrong) for name, one in benches.items()
+            name: costs(one.forward, one.step, machine) | one.errors(self.wrong) | {"behind": one.behind()}
+            for name, one in benches.items()
         }
         record.metrics = {"size": bench.camera.height, **numbers[BASE], "cost": bench.forward.counts.cost}
         record.metrics_start = {"pixel_errors": record.metrics["hits"]}
@@ -191,7 +202,7 @@ class Ablation:
                 if (over := one.step.counts.over_bound(one.decoder.at(one.code))) is not None:
                     found["work_over_bound"] = over
                 record.metrics |= {f"{name}.{key}": number for key, number in found.items()}
-        found, true = bench.views()
+        found, true = bench.views(self.normal_width)
         save_images(run.folder, found, true)
         draw_against(run.folder / "summary.png", found, true, title=f"{record.name}, {record.scene}: {record.status}")
 
@@ -247,6 +258,25 @@ def ratios(mine: Clocked, base: Clocked, name: str) -> dict[str, float]:
         over = [one / other for one, other in zip(times, others, strict=True)]
         found |= {f"{of}_ratio": median(over), f"{of}_ratio_low": min(over), f"{of}_ratio_high": max(over)}
     return found
+
+
+@dataclass
+class Signs(Wrapper):
+    """A Field that counts its values and the negative ones; it offers bounds, but no coarse values."""
+
+    inner: Field
+    asked: int = 0
+    negative: int = 0
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        values = self.inner(points)
+        self.asked += values.numel()
+        self.negative += int((values < 0).sum())
+        return values
+
+    @property
+    def bounds(self) -> Bounds | None:
+        return bounds_of(self.inner)
 
 
 class Workbench:
@@ -306,12 +336,27 @@ class Workbench:
             numbers |= {"depth_error_median": middle, "depth_error_p99": high, "depth_error_max": error.max().item()}
         return numbers
 
-    def views(self) -> tuple[View, View]:
-        """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes."""
+    def behind(self) -> float:
+        """The share of the values of a small rendering that are negative."""
+        signs, side = Signs(self.decoder.at(self.code.detach())), min(SIGNED, self.camera.height)
+        with torch.no_grad():
+            rendered(self.renderer, signs, self.camera.resized(side, side).rays().to(self.device))
+        return signs.negative / max(signs.asked, 1)
+
+    def views(self, normal_width: float | None = None) -> tuple[View, View]:
+        """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes.
+
+        Args:
+            normal_width: see `Ablation`; the reference's normals are always gradients.
+        """
         assert self.rendering is not None
         hit, cosine = self.rendering.hit, self.camera.double().depth(torch.ones_like(self.reference.distance))
         normals = torch.zeros_like(self.rendering.points)
-        normals[hit] = autograd_normals(self.decoder.at(self.code.detach()), self.rendering.points[hit])
+        field, points = self.decoder.at(self.code.detach()), self.rendering.points[hit]
+        if normal_width is None:
+            normals[hit] = autograd_normals(field, points)
+        else:
+            normals[hit] = torch.nn.functional.normalize(slopes_over(field, points, normal_width), dim=-1)
         hit, distance = hit.cpu(), self.rendering.distance.cpu().double()
         return (
             View(self.camera, distance * cosine * hit, normals.cpu(), hit),

@@ -11,9 +11,12 @@ from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import solve_task
 from datasets.scene import Scene
 from datasets.views import observed_pixels, parse_amount
-from renderers.checks import check_positive
+from renderers.camera import sphere_span
+from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
 from renderers.rendering import Renderer
+
+FREE = 8  # samples of a ray, evenly spaced from the unit sphere to the offset before the surface
 
 
 @dataclass(frozen=True)
@@ -21,8 +24,9 @@ class DeepSDF:
     """Shape from one sparse depth image whose true normals are given: the baseline of DIST, Table 2.
 
     Each observed point p with normal n gives the samples p + offset n and p - offset n, whose distances are +offset and
-    -offset. DeepSDF's samples of free space are left out: they did not improve results on validation shapes. The
-    renderer takes no part in the optimisation: it renders only the pictures and the evaluated images.
+    -offset. DeepSDF's samples of free space, on the rays in front of these, are switched on by `free_space`: there the
+    field must not be negative. The renderer takes no part in the optimisation: it renders only the pictures and the
+    evaluated images.
 
     Args:
         points: amount of depth that is given; see `datasets.views.observed_pixels`.
@@ -30,6 +34,7 @@ class DeepSDF:
         distance_weight: of the mean absolute error of the distances.
         code: penalty on the code.
         optimiser: iterations and learning rates.
+        free_space: weight of the mean of what lies below zero at `FREE` samples of each ray in free space.
     """
 
     points: str
@@ -37,11 +42,13 @@ class DeepSDF:
     distance_weight: float
     code: CodePenalty
     optimiser: OptimiserSettings
+    free_space: float = 0.0
 
     def __post_init__(self) -> None:
         parse_amount(self.points)
         check_positive("task.offset", self.offset, "0.02 works")
         check_positive("task.distance_weight", self.distance_weight, "1 works")
+        check_at_least("task.free_space", self.free_space, 0, "0 switches the samples of free space off")
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, and evaluates the shape before and after."""
@@ -60,9 +67,16 @@ class DeepSDF:
         surface = rays.at(distance)
         points = torch.cat([surface + shift, surface - shift]).to(device)
         distances = self.offset * torch.tensor([1.0, -1.0]).repeat_interleave(len(distance)).to(device)
+        entry = sphere_span(rays)[0][:, None]
+        ahead = (distance[:, None] - self.offset - entry).clamp_min(0)
+        free = rays.at_each(entry + ahead * (torch.arange(FREE) + 0.5) / FREE).to(device)
 
         def compare(field: Field, iteration: int) -> Terms:
-            """The weighted mean absolute error (DeepSDF, Eq. 10, without its clamp)."""
-            return {"distance": self.distance_weight * (field(points) - distances).abs().mean()}
+            """The weighted mean absolute error (DeepSDF, Eq. 10, without its clamp), and that of free space."""
+            terms = {"distance": self.distance_weight * (field(points) - distances).abs().mean()}
+            if self.free_space:
+                terms["free_space"] = self.free_space * torch.relu(-field(free)).mean()
+            return terms
 
-        return CodeProblem(prior, self.code, compare, observed, len(points), device)
+        asked = len(points) + (free.numel() // 3 if self.free_space else 0)
+        return CodeProblem(prior, self.code, compare, observed, asked, device)

@@ -167,6 +167,22 @@ def test_the_images_are_those_of_the_renderer_and_of_the_reference(dist):
     assert (differ < 0.01).mean() > 0.9  # others lie beside an edge of the polyhedron
 
 
+def test_longer_steps_ask_more_behind_the_surface(tmp_path):
+    regular, longer = (
+        measured(tmp_path / name, load("renderer", name)).record.metrics["behind"]
+        for name in ("dist_dynamic", "dist_aggressive")
+    )
+    assert 0 <= regular < 0.02 and 0.05 < longer < 0.5  # DIST, Fig. 14
+
+
+def test_normals_may_be_differences(tmp_path, dist):
+    wide = measured(tmp_path, load("renderer", "dist"), replace(SETTINGS, normal_width=0.3))
+    exact, drawn = (np.load(run.folder / "images.npz") for run in (dist, wide))
+    cosine = (drawn["normals"] * exact["normals"]).sum(-1)[exact["hit"]]
+    assert 0.9 < cosine.min() < np.median(cosine) < 0.9999  # smooth over the polyhedron's faces
+    assert np.allclose(np.linalg.norm(drawn["normals"][exact["hit"]], axis=-1), 1, atol=1e-2)
+
+
 @dataclass
 class Fake:
     """Hits where it is told, at known distances, with a gradient of one value of the field a ray."""
@@ -252,7 +268,7 @@ def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, v
     run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
     assert run.record.status is RunStatus.OK
     assert run.record.metrics["repeats"] == times
-    assert costly.rendered == [WARM_UP**2] + [SIZE**2] * 2 * times
+    assert costly.rendered == [WARM_UP**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
 
 
 def test_renderers_that_cannot_are_unsupported(tmp_path):

@@ -69,6 +69,18 @@ def test_the_samples_lie_on_both_sides_at_the_offset(wall):
     assert asked[0][:, 2].sort().values.tolist() == pytest.approx([0.1] * 16 + [0.3] * 16, abs=1e-5)
 
 
+def test_free_space_before_the_surface_must_not_be_inside(wall):
+    asked = []
+    problem_of(wall, plane(0.2), free_space=3.0).compare(lambda points: asked.append(points) or points[..., 2], 0)
+    heights = asked[1][..., 2]
+    assert heights.shape == (16, 8) and 0.3 < heights.min() < 0.4 and 0.9 < heights.max() < 1.0
+    within = torch.relu(0.7 - heights).mean().item()  # of the field z - 0.7
+    problem = problem_of(wall, plane(0.7), free_space=3.0)
+    assert problem.loss(0)["free_space"].item() == pytest.approx(3 * within, rel=1e-4) and within > 0.1
+    assert problem.rays_per_iteration == 32 + 128
+    assert problem_of(wall, plane(0.2), free_space=3.0).loss(0)["free_space"].item() == 0
+
+
 def test_it_finds_the_plane_and_counts_its_samples(wall):
     problem = problem_of(wall, plane(0.4), code=CodePenalty(0.0, "sum"))
     assert problem.rays_per_iteration == 32
