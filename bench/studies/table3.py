@@ -20,10 +20,10 @@ NOTES = (
     "of ShapeNet, with another prior and metric scale, which cannot be compared directly with the measured rows.",
 )
 ENCODED = "task.encoder.batch"  # set where a row starts from an encoder's code
-MESH = "multiview_mesh"  # the preset that PMO's rows are to be read beside
+PMO = {"multiview_mesh": "PMO, random start", "multiview_mesh_encoder": "PMO"}  # published rows to read presets beside
 ON_MESH = (
-    "“{row}” moves the vertices of the prior's mesh by the photometric error, as PMO (Lin et al. 2019) does, from the "
-    "same codes as other rows: read it beside “published: PMO, random start”."
+    "“{row}” moves the vertices of the prior's mesh by the photometric error, as PMO (Lin et al. 2019) does: read it "
+    "beside “published: {published}”."
 )
 SEEN = table.metrics(records.ONE_WAY, "chamfer_l2")
 RUNS = (
@@ -49,13 +49,14 @@ def make(runs: Runs) -> Result:
         compare.ORACLE: compare.oracles(runs, records.ONE_WAY),
     }
     published = {name: {row: {"": str(number)} for row, number in rows.items()} for name, rows in PUBLISHED.items()}
+    on_mesh = [ON_MESH.format(row=row.name, published=PMO[row.preset]) for row in runs.rows() if row.preset in PMO]
     return found.result(
         "Shape from many views, without a mask.",
         "Which method finds a shape by photographs from many views, without a mask?",
         ratio="Ratio to DIST",
         plotted="Median error over {shapes and seeds}, over shapes alone, and the median cost of runs that ended ok.",
         verdict=found.best("errors × 1000, from truth to prediction"),
-        remarks=(*NOTES, *(ON_MESH.format(row=row.name) for row in runs.rows() if row.preset == MESH)),
+        remarks=(*NOTES, *on_mesh),
         lines=found.beside(above, published),
         run_columns=RUNS,
     )
