@@ -127,6 +127,9 @@ class Ablation:
     def execute(self, run: RunContext) -> None:
         """Measures costs and errors, and writes them to the record, images.npz and a picture."""
         run.record.definitions = DEFINITIONS | (IN_TURN if self.beside else {})
+        if self.normal_width is not None:
+            note = f"normals of pictures are differences over {self.normal_width:g} scene units (DIST, Eq. 3)"
+            run.record.notes = [*run.record.notes, note]
         with using_threads(self.threads or torch.get_num_threads()):
             self._measure(run)
 
