@@ -203,7 +203,7 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     assert row.replace(r"\&", "").count("&") == 12 and row.count(r"\\") == 1  # the 13 cells of one row
     assert r"$\infty$" in row and r"64$\times$64" in text and text.isascii()
     shown = next(paper.shown for paper in find_paper(tmp_path) if paper.name == "table1")
-    assert shown.rows[0][0] == hostile and len(shown.rows[0]) == len(shown.columns) == 12
+    assert shown.rows[0][0] == hostile and len(shown.rows[0]) == len(shown.columns) == 13
     assert Page(tmp_path).paper("table1")["rows"][0][0] == hostile  # reading it checks that no script can come of it
 
 
