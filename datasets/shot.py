@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from datasets.scene import Split
@@ -47,14 +48,15 @@ class Shot:
             if part is not None and tuple(part.shape[:2]) != size:
                 raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(part.shape[:2])}")
 
-    def allows(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Which points of the world its mask does not exclude: those in the mask, and those that are not shown."""
+    def allows(self, points: Float[Tensor, "n 3"], margin: float = 0.0) -> Bool[Tensor, " n"]:
+        """Which points of the world its mask allows: those that are not shown, or at most `margin` pixels outside."""
         allowed = torch.ones(len(points), dtype=torch.bool)
         if self.mask is not None:
             points = points.to(self.camera.intrinsics.dtype)
             shown, (height, width) = self.camera.shows(points), self.mask.shape
             columns, rows = self.camera.project(points[shown])[0].long().unbind(-1)
-            allowed[shown] = self.mask[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
+            mask = distance_transform_edt(~self.mask.numpy()) <= margin if margin else self.mask.numpy()
+            allowed[shown] = torch.from_numpy(mask)[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
         return allowed
 
     def within(self, centre: Float[np.ndarray, "3"], radius: float, turn: Float[np.ndarray, "3 3"] = TURN) -> "Shot":

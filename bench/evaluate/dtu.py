@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from bench.records.metrics import DVR_SCANS, DVR_TABLE2
@@ -152,9 +151,7 @@ def culled(mesh: Mesh, shots: Sequence[Shot]) -> Mesh | None:
     for shot in shots:
         if shot.mask is None:
             raise BadInput(f"culling needs a mask of each photograph, and {shot.name} has none")
-        reach = DILATION * max(shot.mask.shape)
-        wide = distance_transform_edt(~shot.mask.numpy()) <= reach
-        kept &= replace(shot, mask=torch.from_numpy(wide)).allows(points).numpy()
+        kept &= shot.allows(points, DILATION * max(shot.mask.shape)).numpy()
     faces = mesh.faces[kept[mesh.faces].all(axis=1)]
     return replace(mesh, faces=faces).compact() if len(faces) else None
 

@@ -141,7 +141,8 @@ def upright(subject: Subject) -> Subject:
         subject,
         given=tuple(shot.within(centre, radius, turn) for shot in subject.given),
         held_out=tuple(shot.within(centre, radius, turn) for shot in subject.held_out),
-        truth=None if subject.truth is None else subject.truth.moved(np.linalg.inv(to_old)),
+        truth=None if subject.truth is None else subject.truth.moved(np.linalg.inv(to_old)).cut_off(),
+        found=f"{subject.found}; set upright for the prior, its unit sphere {radius:.3g} times as large",
         to_world=None if subject.to_world is None else subject.to_world @ to_old,
         points=within(subject.points, to_old) if isinstance(subject.points, np.ndarray) else subject.points,
     )

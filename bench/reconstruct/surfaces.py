@@ -11,7 +11,6 @@ from scipy.ndimage import map_coordinates
 from bench.evaluate.state import GREY, painted
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import Subject, visible, within
-from datasets.captures.hull import carve
 from datasets.mesh import Mesh
 from datasets.meshes import read_points
 from datasets.repair import needed_meshlab
@@ -40,7 +39,7 @@ def given_clouds(shots: Sequence[Shot]) -> list[Cloud]:
 def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
     """The points of a file that lie in the unit sphere, each with the nearest given camera that sees it.
 
-    Where photographs have masks, those more than a pixel outside of the visual hull are left out (DVR, Sec. 4.2).
+    Where photographs have masks, those more than a pixel of this run outside of one are left out (DVR, Sec. 4.2).
 
     Raises:
         BadInput: where it is no cloud of points, or lies elsewhere.
@@ -54,7 +53,8 @@ def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
             f"nothing of task.cloud={path} lies in the unit sphere of the photographs: give it in their cameras' world"
         )
     if all(shot.mask is not None for shot in subject.given):
-        points = points[(carve(subject.given, torch.from_numpy(points).float()) < 0.5).numpy()]
+        where = torch.from_numpy(points).float()
+        points = points[torch.stack([shot.allows(where, margin=1.0) for shot in subject.given]).all(0).numpy()]
     cameras = [shot.camera for shot in subject.given]
     seeing = _seeing(torch.from_numpy(points).float(), cameras).numpy()
     return [Cloud(points[seeing == place], camera) for place, camera in enumerate(cameras)]

@@ -249,7 +249,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         scene_name=dataset.name if isinstance(dataset, Photographed | OneView) else scene_name(dataset, split, index),
         make_scene=lambda: replace(
             make_scene(dataset, view, split=split, index=index),
-            texture=prior.texture(dataset, split, index) if coloured else None,
+            texture=prior.texture(dataset, split, index) if coloured and not isinstance(dataset, OneView) else None,
         ),
         make_prior=make_prior,
         make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),

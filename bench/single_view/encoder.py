@@ -1,5 +1,6 @@
 """An encoder from photographs to a prior's codes, from which shape from many views may start (PMO, Lin et al. 2019)."""
 
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 
 import torch
@@ -57,7 +58,7 @@ class EncoderSettings:
         Args:
             like: settings of the photographs, and of those of the training.
         """
-        inputs, prior = run.inputs, Prior(run.inputs.prior.decoder.cpu(), run.inputs.prior.codes)
+        inputs, prior = run.inputs, Prior(deepcopy(run.inputs.prior.decoder).cpu(), run.inputs.prior.codes)
         settings = {"encoder": asdict(self), "photographs": asdict(like), "view": asdict(inputs.views)}
         key = digest({"version": VERSION, "prior": fingerprint(prior), **settings})
         with torch.random.fork_rng(), torch.device("cpu"):

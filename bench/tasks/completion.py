@@ -19,7 +19,7 @@ from bench.solve.latent_code import CodePenalty, CodeProblem, turned
 from bench.solve.observed_view import DEPTH_LOSSES, GivenView
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
-from datasets.scene import Scene, painted
+from datasets.scene import OneView, Scene, painted
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.rendering import Renderer
@@ -91,6 +91,8 @@ class Completion:
             inputs.check_prior()
         if self.colour_weight and not (inputs.coloured and inputs.field.of_prior):
             raise BadInput("task.colour_weight needs codes of shape and colour: set prior=textured field=prior")
+        if self.colour_weight and (self.similarity or isinstance(inputs.dataset, OneView)):
+            raise BadInput("colours are compared of shapes that stand as the prior's do: set task.colour_weight=0")
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
