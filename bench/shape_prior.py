@@ -123,12 +123,8 @@ class PriorSettings:
 
     def new_decoder(self) -> Decoder | TexturedDecoder:
         """A decoder that begins near the distance of a sphere."""
-        if self.colour is None:
-            decoder = shape = Decoder(**asdict(self.network))
-        else:
-            decoder = TexturedDecoder(**asdict(self.network))
-            shape = decoder.shape
-        initialise_to_sphere(shape, radius=0.5)
+        decoder = (Decoder if self.colour is None else TexturedDecoder)(**asdict(self.network))
+        initialise_to_sphere(decoder if isinstance(decoder, Decoder) else decoder.shape, radius=0.5)
         return decoder
 
     def texture(self, dataset: Dataset, split: Split, index: int) -> Texture | None:
@@ -179,8 +175,18 @@ def distance_samples(
 
 
 def sample_distances(mesh: Mesh, count: int, seed: int) -> tuple[Float[Tensor, "count 3"], Float[Tensor, " count"]]:
-    """Points mostly near a mesh's surface, and their signed distances, in scene units."""
-    where = _sample_points(mesh, count, seed)
+    """Points and their signed distances, in scene units.
+
+    Half of them are close to the mesh's surface, a third farther from it, the rest anywhere in a sphere.
+    """
+    generator = np.random.default_rng(seed)
+    near, around = count // 2, count // 3
+    surface = sample_surface(mesh, near + around, seed).points
+    sigma = np.repeat([NEAR, AROUND], [near, around])[:, None]
+    around_surface = surface + sigma * generator.standard_normal(surface.shape)
+    free = generator.standard_normal((count - near - around, 3))
+    free *= RADIUS * generator.random((len(free), 1)) ** (1 / 3) / np.linalg.norm(free, axis=1, keepdims=True)
+    where = np.concatenate([around_surface, free])
     return torch.from_numpy(where.astype(np.float32)), torch.from_numpy(Truth(mesh).signed_distance(where))
 
 
@@ -284,18 +290,6 @@ def initialise_to_sphere(decoder: Decoder, radius: float) -> None:
             layer.weight[:, -3:] = 0.0
     nn.init.normal_(decoder.last.weight, sqrt(pi / decoder.width), 1e-4)
     nn.init.constant_(decoder.last.bias, -radius)
-
-
-def _sample_points(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
-    """Half of the points close to the surface, a third farther from it, the rest anywhere in a sphere."""
-    generator = np.random.default_rng(seed)
-    near, around = count // 2, count // 3
-    surface = sample_surface(mesh, near + around, seed).points
-    sigma = np.repeat([NEAR, AROUND], [near, around])[:, None]
-    around_surface = surface + sigma * generator.standard_normal(surface.shape)
-    free = generator.standard_normal((count - near - around, 3))
-    free *= RADIUS * generator.random((len(free), 1)) ** (1 / 3) / np.linalg.norm(free, axis=1, keepdims=True)
-    return np.concatenate([around_surface, free])
 
 
 def prior_for(

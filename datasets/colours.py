@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from datasets.mesh import Mesh
+from datasets.mesh import Mesh, joined
 from datasets.meshes import read_mesh
 from datasets.scene import Truth
 from renderers.checks import BadInput
@@ -19,8 +19,7 @@ GREY = 0.7  # of parts without colours, beside parts that have some
 class Piece(NamedTuple):
     """A part of a file's surface; `values` are colours of its vertices, or their u, v and 0 in an image."""
 
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    mesh: Mesh
     values: Float[np.ndarray, "v 3"]
     image: Any = None
     known: bool = True  # whether the file gives it a colour
@@ -40,12 +39,9 @@ class FileColours:
 
     def __init__(self, path: Path, rest: Mesh, shape: Mesh) -> None:
         self._rest, self._shape, self._pieces = rest.vertices, Truth(shape), _pieces(path, path.stat().st_mtime_ns)
-        firsts = np.cumsum([0, *(len(piece.vertices) for piece in self._pieces)])
-        faces = [piece.faces + first for piece, first in zip(self._pieces, firsts, strict=False)]
-        vertices = np.concatenate([piece.vertices for piece in self._pieces])
-        self._own = Truth(Mesh(vertices, np.concatenate(faces)), closed=False)
+        self._own = Truth(joined([piece.mesh for piece in self._pieces]), closed=False)
         self._values = np.concatenate([piece.values for piece in self._pieces])
-        self._piece = np.repeat(range(len(self._pieces)), np.diff(firsts))
+        self._piece = np.repeat(range(len(self._pieces)), [len(piece.values) for piece in self._pieces])
 
     @property
     def texels(self) -> int:
@@ -59,10 +55,10 @@ class FileColours:
         weights, corners = self._shape.nearest(points)
         weights, corners = self._own.nearest(np.einsum("nk,nkd->nd", weights, self._rest[corners]))
         colours, piece = np.einsum("nk,nkd->nd", weights, self._values[corners]), self._piece[corners[:, 0]]
-        for number, (*_, image, _) in enumerate(self._pieces):
-            if image is not None:
+        for number, one in enumerate(self._pieces):
+            if one.image is not None:
                 here = piece == number
-                colours[here] = uv_to_interpolated_color(colours[here, :2], image)[:, :3] / 255
+                colours[here] = uv_to_interpolated_color(colours[here, :2], one.image)[:, :3] / 255
         return colours.clip(0, 1)
 
 
@@ -98,17 +94,17 @@ def _pieces(path: Path, changed: int) -> list[Piece]:
     if mesh.colours is None:
         what = "neither a texture nor those of materials or vertices: export it with its materials"
         raise BadInput(f"mesh file '{path}' has no colours, {what}")
-    return [Piece(mesh.vertices, mesh.faces, mesh.colours)]
+    return [Piece(mesh, mesh.colours)]
 
 
 def _piece(part: Any) -> Piece:
-    vertices, faces, visual = np.array(part.vertices), np.array(part.faces), part.visual
+    mesh, visual = Mesh(np.array(part.vertices), np.array(part.faces)), part.visual
     material = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and visual.uv is not None:
-        return Piece(vertices, faces, np.pad(visual.uv, ((0, 0), (0, 1))), image)
+        return Piece(mesh, np.pad(visual.uv, ((0, 0), (0, 1))), image)
     if visual.kind in ("vertex", "face"):
-        return Piece(vertices, faces, visual.vertex_colors[:, :3] / 255)
+        return Piece(mesh, visual.vertex_colors[:, :3] / 255)
     known = material is not None and getattr(material, "baseColorFactor", material) is not None
     colour = material.main_color[:3] / 255 if known else np.full(3, GREY)
-    return Piece(vertices, faces, np.tile(colour, (len(vertices), 1)), known=known)
+    return Piece(mesh, np.tile(colour, (len(mesh.vertices), 1)), known=known)

@@ -1,6 +1,6 @@
 """The triangle mesh, and how one is extracted from a field."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -163,6 +163,13 @@ class Mesh:
         if self.colours is not None:
             places["colour"] = (255 * self.colours.clip(0, 1)).round()
         path.write_bytes(header.encode("ascii") + places.tobytes() + rows.tobytes())
+
+
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """The meshes as one, without colours."""
+    firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + first for part, first in zip(parts, firsts, strict=False)]
+    return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
 def normalise(mesh: Mesh, radius: float) -> Mesh:

@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float
 
-from datasets.mesh import Mesh
+from datasets.mesh import Mesh, joined
 from datasets.readers.glb import read_glb
 from datasets.readers.ply import read_ply
 from datasets.readers.polygons import Polygons
@@ -88,10 +88,7 @@ def read_mesh(path: str | Path) -> Mesh:
 
 def read_pieces(path: str | Path) -> Mesh:
     """The mesh of a file, or of all files of a folder, such as BlendedMVS's `textured_mesh`; see `read_mesh`."""
-    pieces = [read_mesh(file) for file in find_meshes(path)]
-    firsts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-    faces = [piece.faces + first for piece, first in zip(pieces, firsts, strict=False)]
-    return Mesh(np.concatenate([piece.vertices for piece in pieces]), np.concatenate(faces))
+    return joined([read_mesh(file) for file in find_meshes(path)])
 
 
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"] | None:

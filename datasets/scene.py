@@ -19,6 +19,7 @@ from renderers.camera import Camera
 from renderers.checks import BadInput
 
 SPLIT_STRIDE = 1_000_000  # distance between the seeds of two splits, more than a split has shapes
+Corners = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]  # of a point on a face: their weights, and vertices
 
 
 class Split(StrEnum):
@@ -133,22 +134,21 @@ class Truth:
         face = answer["primitive_ids"].numpy().astype(np.int64)
         return Hits(distance=distance, normals=normals, hit=np.isfinite(distance), face=face)
 
-    def corners(
-        self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]:
+    def corners(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Corners:
         """Gives the first hit of each ray by the corners of its face: their weights, 0 without a hit, and vertices."""
-        answer = self._scene.cast_rays(self._tensor(np.concatenate([origins, directions], axis=-1, dtype=np.float32)))
-        along = answer["primitive_uvs"].numpy().astype(np.float64)
-        hit = np.isfinite(answer["t_hit"].numpy())
-        weights = np.stack([1 - along.sum(axis=1), along[:, 0], along[:, 1]], axis=1) * hit[:, None]
-        return weights, self._faces[np.where(hit, answer["primitive_ids"].numpy().astype(np.int64), 0)]
+        rays = np.concatenate([origins, directions], axis=-1, dtype=np.float32)
+        answer = self._scene.cast_rays(self._tensor(rays))
+        return self._corners(answer, np.isfinite(answer["t_hit"].numpy()))
 
-    def nearest(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]:
+    def nearest(self, points: Float[np.ndarray, "n 3"]) -> Corners:
         """Gives the nearest point of the surface by the corners of its face: their weights, and vertices."""
         found = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, dtype=np.float32)))
+        return self._corners(found, np.ones(len(points), dtype=bool))
+
+    def _corners(self, found: Any, hit: Bool[np.ndarray, " n"]) -> Corners:
         along = found["primitive_uvs"].numpy().astype(np.float64)
-        weights = np.stack([1 - along.sum(axis=1), along[:, 0], along[:, 1]], axis=1)
-        return weights, self._faces[found["primitive_ids"].numpy().astype(np.int64)]
+        weights = np.stack([1 - along.sum(axis=1), along[:, 0], along[:, 1]], axis=1) * hit[:, None]
+        return weights, self._faces[np.where(hit, found["primitive_ids"].numpy().astype(np.int64), 0)]
 
     def signed_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Gives the distance to the surface, negative inside, with the sign by majority over five rays per point."""

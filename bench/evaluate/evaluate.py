@@ -65,15 +65,8 @@ COLOUR = {
 CHAMFER = ("chamfer_l1", "chamfer_l2")  # what checkpoints judge by
 
 # The score of a run without a surface: the worst.
-WORST_SURFACE = {
-    "chamfer_l2": np.inf,
-    "chamfer_l1": np.inf,
-    "chamfer_gt_to_pred": np.inf,
-    "accuracy": np.inf,
-    "completeness": np.inf,
-    "fscore": 0.0,
-    "normal_consistency": 0.0,
-}
+WORST_SURFACE = dict.fromkeys(("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness"), np.inf)
+WORST_SURFACE |= {"fscore": 0.0, "normal_consistency": 0.0}
 
 
 def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: float) -> dict[str, float]:

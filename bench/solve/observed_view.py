@@ -77,7 +77,7 @@ class GivenView:
     observed: Bool[Tensor, "*rays"]
     mask: Bool[Tensor, "*rays"] | None
     normals: Float[Tensor, "*rays 3"] | None = None  # unit, in world coordinates; None where they are not given
-    normal_weight: float = 0.0  # of 1 less their cosine with those of the rendered surface
+    normal_weight: float = 0.0  # of 1 less their cosine with those of the rendered surface, where observed and hit
     normal_width: float = 0.0  # scene units, see `slopes_over`
     colours: Float[Tensor, "*rays 3"] | None = None  # of an image; NaN where it does not show the shape
     colour_weight: float = 0.0  # of the mean absolute error of a `TexturedShape`'s
@@ -102,16 +102,6 @@ class GivenView:
             observed=observed,
             mask=mask,
         ).to(device)
-
-    def with_normals(self, normals: Float[Tensor, "*rays 3"], weight: float, *, width: float) -> "GivenView":
-        """The same with normals that are given as well, and compared at pixels that are observed and hit.
-
-        Args:
-            normals: unit, in world coordinates.
-            weight: of 1 less their cosine with those of the rendered surface.
-            width: of these, see `slopes_over`.
-        """
-        return replace(self, normals=normals.to(self.depth.device), normal_weight=weight, normal_width=width)
 
     def to(self, device: torch.device) -> "GivenView":
         """The same on a device."""

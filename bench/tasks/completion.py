@@ -142,7 +142,8 @@ class Completion:
         mask = view.mask if self.mask or self.points == "dense" else None
         given = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
         if self.normal_weight:
-            given = given.with_normals(view.normals, self.normal_weight, width=self.normal_width)
+            more = {"normal_weight": self.normal_weight, "normal_width": self.normal_width}
+            given = replace(given, normals=view.normals.to(device), **more)
         if self.colour_weight:
             assert scene.texture is not None
             image = painted(view, scene.texture).where(view.mask[..., None], torch.nan)

@@ -1,5 +1,6 @@
 """The term of the normals: its value by closed forms, its gradient by differences in float64."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -46,7 +47,7 @@ def given(normals: Tensor, observed: Tensor, renderer: str = "idr", weight: floa
     blank = torch.zeros(6, 6, dtype=torch.float64)
     view = View(CAMERA, blank, blank[..., None].expand(-1, -1, 3), torch.ones(6, 6, dtype=torch.bool))
     seen = GivenView.of(view, WEIGHTS, RENDERERS[renderer], observed=observed, mask=None, device=CPU)
-    return seen.with_normals(normals, weight, width=WIDTH)
+    return replace(seen, normals=normals, normal_weight=weight, normal_width=WIDTH)
 
 
 ALL = torch.ones(6, 6, dtype=torch.bool)
