@@ -90,7 +90,6 @@ class Capacity:
         record.definitions = DEFINITIONS | COSTS | NEEDS
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
         views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
-        observations = views.observations(inputs.seed)
         longest = self.rounds * models.fit.iterations
         with curve_file(run.folder) as write_line:
 
@@ -99,32 +98,28 @@ class Capacity:
                 run.progress(f"fitting {name}", line["iteration"] + 1, longest, line["total"])
 
             candidates = by_size(models.candidates, models.size)
-            fitter = Fitter(observations, models.fit, inputs.seed, inputs.device, on_line)
+            fitter = Fitter(views.observations(inputs.seed), models.fit, inputs.seed, inputs.device, on_line)
             renderer, settings_notes = inputs.make_pixel_precise()  # before the fits: it may be refused
             growth = grow(fitter, candidates, models.growth)
-            fits: dict[str, Fitted] = {}
+            fits: list[Fitted] = []
             for fitted in fit_all(fitter, candidates, self.rounds):
-                name = fitted.candidate.name
-                fits[name] = fitted
-                record.metrics |= costs(name, fitted.evidence)  # in case the run is stopped
-                filmstrip.add(name, State(fitted.model.frozen(), inputs))
+                fits.append(fitted)
+                record.metrics |= costs(fitted.candidate.name, fitted.evidence)  # in case the run is stopped
+                filmstrip.add(fitted.candidate.name, State(fitted.model.frozen(), inputs))
                 run.progress("fitting all candidates", len(fits), len(candidates), fitted.evidence.mean)
-            evidence = [fitted.evidence for fitted in fits.values()]
+            evidence = [fitted.evidence for fitted in fits]
             note_fits(record, [*growth.tried, *evidence], fitter)
             choice = choose(evidence, views.footprint, models.size)
-            chosen = fits[choice.chosen.candidate]
-            checked = check(chosen, list(fits.values()), views, self.checks, seed=inputs.seed)
+            chosen = next(fitted for fitted in fits if fitted.evidence is choice.chosen)
+            checked = check(chosen, fits, views, self.checks, seed=inputs.seed)
             frugal = refit(chosen, fitter, renderer, fewest_rays=self.frugal_rays)
             metrics = needs(choice, evidence, growth) | checked | costs("frugal", frugal)
-        result = evaluate(State(chosen.model.frozen(), inputs))
+        result, name = evaluate(State(chosen.model.frozen(), inputs)), chosen.candidate.name
         metrics = result.metrics | {"footprint": views.footprint} | metrics
-        saving = pixel_precision_summary(frugal, chosen.evidence)
-        precision_notes = [f"pixel precision: {note}" for note in [*settings_notes, saving]]
-        notes = summary(choice, growth), *final_notes(chosen.renderer), *precision_notes, *result.notes
+        precise = [f"pixel precision: {note}" for note in (*settings_notes, precision(frugal, chosen.evidence))]
+        notes = summary(choice, growth), *final_notes(chosen.renderer), *precise, *result.notes
         note_result(run, replace(result, metrics=metrics, notes=notes))
-        filmstrip.save(
-            run.folder, f"{record.title}: needs {chosen.candidate.name.replace('_', ' ')}", chosen.candidate.name
-        )
+        filmstrip.save(run.folder, f"{record.title}: needs {name.replace('_', ' ')}", name)
         if inputs.evaluation.picture is not None:
             draw_candidates(run.folder, record.metrics, record.title)
 
@@ -182,7 +177,7 @@ def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
     return {f"saved_{key}": ratio for key, ratio in ratios.items()}
 
 
-def pixel_precision_summary(frugal: Evidence, plain: Evidence) -> str:
+def precision(frugal: Evidence, plain: Evidence) -> str:
     """The fit at pixel precision compared with the plain one."""
     if frugal.error is None:
         return f"the fit ended as {frugal.status}: {frugal.reason}"
