@@ -35,6 +35,7 @@ VERSION = 1  # raise it when training changes, so that no prior of the old train
 HELD_OUT = 8  # validation shapes on which a new prior is evaluated
 NEAR, AROUND = 0.01, 0.08  # standard deviations, in scene units, of half and of a third of the samples
 RADIUS = 1.1  # scene units, of the sphere that the other samples fill: rays start on the unit sphere
+CLOSE = 0.02  # scene units, from the surface, within which a prior is judged
 
 
 @dataclass(frozen=True)
@@ -127,10 +128,8 @@ class PriorSettings:
         initialise_to_sphere(decoder if isinstance(decoder, Decoder) else decoder.shape, radius=0.5)
         return decoder
 
-    def texture(self, dataset: Dataset, split: Split, index: int) -> Texture | None:
-        """The colours of a shape: its own, where its dataset has some; None where no colours are learnt."""
-        if self.colour is None:
-            return None
+    def texture(self, dataset: Dataset, split: Split, index: int) -> Texture:
+        """The colours of a shape where colours are learnt: its own, where its dataset has some."""
         if isinstance(dataset, Textured):
             return dataset.texture(split, index)
         return make_texture(self.colour.texture, self.colour.size, seed_of(split, index))
@@ -165,9 +164,9 @@ def distance_samples(
     for index in range(shapes):
         mesh, seed = dataset.mesh(split, index), settings.seed + index
         part = sample_distances(mesh, settings.samples, seed)
-        if settings.colour and (texture := settings.texture(dataset, split, index)):
+        if settings.colour:
             surface = sample_surface(mesh, settings.colour.samples, seed)
-            colours = texture(surface.points, surface.normals)
+            colours = settings.texture(dataset, split, index)(surface.points, surface.normals)
             part += tuple(torch.from_numpy(one.astype(np.float32)) for one in (surface.points, colours))
         parts.append(part)
         progress(f"sampling {split} shapes", index + 1, shapes)
@@ -220,10 +219,8 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
         shape = decoder.at(codes[chosen])
         weighted = near_surface_first((shape(points) - distances).abs(), distances, settings.surface_width)
         loss = weighted.mean() + settings.code_penalty * codes[chosen].square().sum(-1).mean()
-        if settings.colour and isinstance(shape, TexturedShape):
-            loss = loss + settings.colour.weight * _colour_error(
-                shape, samples, chosen, settings.colour.points_per_step
-            )
+        if (colour := settings.colour) is not None:
+            loss = loss + colour.weight * _colour_error(shape, samples, chosen, colour.points_per_step)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
@@ -235,20 +232,18 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
 
 def _colour_error(shape: TexturedShape, samples: DistanceSamples, chosen: Tensor, count: int) -> Tensor:
     """The mean absolute error of colours at random points on the surfaces of the chosen shapes."""
-    assert samples.surface is not None and samples.colours is not None
     places = torch.randint(samples.surface.shape[1], (len(chosen), count), device=chosen.device)
     found = shape.paint(samples.surface[chosen[:, None], places])
     return (found - samples.colours[chosen[:, None], places]).abs().mean()
 
 
-def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 200, near: float = 0.02) -> float:
-    """Mean error of the distance within `near` of the surface, with codes fitted to the samples from zero.
+def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 200) -> float:
+    """As `surface_error`, with codes fitted to the samples from zero.
 
     Args:
         decoder: not changed.
         samples: of any shapes, in training or not.
         steps: of Adam, whose rate falls to zero; 0 evaluates the mean shape.
-        near: in scene units, as the result.
     """
     shapes, count = samples.distances.shape
     codes = torch.zeros(shapes, decoder.code_length, requires_grad=True)
@@ -262,17 +257,15 @@ def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 200, n
         error.mean().backward()
         optimiser.step()
         schedule.step()
-    return surface_error(decoder, codes, samples, near=near)
+    return surface_error(decoder, codes, samples)
 
 
 @torch.no_grad()
-def surface_error(
-    decoder: Decoder, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples, *, near: float = 0.02
-) -> float:
-    """Mean error of the distance within `near` of the surface, in scene units, at the codes of the samples' shapes."""
+def surface_error(decoder: Decoder, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples) -> float:
+    """Mean error of the distance within `CLOSE` of the surface, in scene units, at the codes of the samples' shapes."""
     errors = []
     for code, points, distances in zip(codes, samples.points, samples.distances, strict=True):
-        close = distances.abs() < near
+        close = distances.abs() < CLOSE
         errors.append((decoder.at(code)(points[close]) - distances[close]).abs())
     return torch.cat(errors).mean().item()
 

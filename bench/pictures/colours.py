@@ -18,7 +18,6 @@ from bench.setup.inputs import RunContext
 from datasets.photographs import turned
 from datasets.scene import Scene, View, painted, see
 from renderers.camera import Camera
-from renderers.fields.coloured import Coloured
 
 Seen = Callable[[Camera], tuple[View, Float[Tensor, "height width 3"]]]  # a camera's view of a shape, and its colours
 SMALLER = (8, 4, 1)  # by which the largest size of a rendering is divided
@@ -48,14 +47,10 @@ def note_colours(run: RunContext, state: State) -> None:
         "network_bytes": 4 * sum(weights.numel() for weights in prior.decoder.parameters()),
     }
     run.record.definitions |= DEFINITIONS
-    fields = {"": state.field}
+    shown: dict[str, Seen] = {"": lambda camera: render_image(state.field, camera, inputs)}
     if inputs.trained is not None:
-        fields["trained_"] = prior.decoder.at(prior.codes[inputs.trained].to(inputs.device))
-    shown: dict[str, Seen] = {
-        prefix: lambda camera, field=field: render_image(field, camera, inputs)
-        for prefix, field in fields.items()
-        if isinstance(field, Coloured)
-    }
+        known = prior.decoder.at(prior.codes[inputs.trained].to(inputs.device))
+        shown["trained_"] = lambda camera: render_image(known, camera, inputs)
     shown["true_"] = lambda camera: _of_mesh(scene, camera)
     camera, evaluation = scene.view.camera, inputs.evaluation
     given = _of_mesh(scene, camera)[1].where(scene.view.mask[..., None], 1.0)
@@ -68,7 +63,6 @@ def note_colours(run: RunContext, state: State) -> None:
 
 
 def _of_mesh(scene: Scene, camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
-    assert scene.texture is not None
     view = see(scene.cast_on, camera)
     return view, painted(view, scene.texture)
 

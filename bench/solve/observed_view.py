@@ -133,8 +133,7 @@ class GivenView:
 
     def _colour_error(self, field: Field, rendering: Rendering) -> Float[Tensor, ""]:
         """The mean absolute error of colours where the shape is hit and shown (DIST, B.3)."""
-        shape = field.inner if isinstance(field, Meter) else field
-        assert self.colours is not None and isinstance(shape, TexturedShape)
+        shape: TexturedShape = field.inner if isinstance(field, Meter) else field
         seen = rendering.hit & ~self.colours.isnan().any(-1)
         error = (shape.paint(rendering.points[seen]) - self.colours[seen]).abs()
         return error.sum() / (3 * seen.sum().clamp_min(1))

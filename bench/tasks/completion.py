@@ -145,7 +145,6 @@ class Completion:
             more = {"normal_weight": self.normal_weight, "normal_width": self.normal_width}
             given = replace(given, normals=view.normals.to(device), **more)
         if self.colour_weight:
-            assert scene.texture is not None
             image = painted(view, scene.texture).where(view.mask[..., None], torch.nan)
             given = replace(given, colours=image.to(device), colour_weight=self.colour_weight)
         return given, observed
