@@ -30,10 +30,10 @@ def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
                     metrics={"chamfer_l2": error} if ok else {},
                     evaluations={"value": values},
                     seconds={"forward": seconds / 2, "backward": seconds / 2},
+                    index=index,
                     settings={
                         "task": {"points": points, "_target_": "completion"},
                         "silhouette": {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"},
-                        **{"dataset": {"name": name}, "index": index},
                     },
                 )
     return choose(read_records(results)[0], one_loss.READS[0], results)
@@ -145,7 +145,7 @@ def test_the_reference_is_the_first_row_of_the_plan_not_the_oldest_of_its_preset
 
 def test_rows_of_other_families_with_other_evaluations_are_told(tmp_path):
     for name, points in (("sofa", 1000), ("plane", 5000)):
-        evaluation = {"evaluation": {"points": points}, "prior": {"name": name}, "dataset": {"name": name}}
+        evaluation = {"evaluation": {"points": points}, "prior": {"name": name}}
         write_run(tmp_path, "one_loss", "DIST", dataset=name, settings=evaluation)
     assert choose(read_records(tmp_path)[0], one_loss.READS[0], tmp_path).mixed() == ["evaluation.points"]
 
@@ -165,11 +165,8 @@ def test_the_table_of_tuned_rows_has_their_ratio_to_the_default(tmp_path):
                     label,
                     **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": preset},
                     metrics={"chamfer_l2": factor * (1 + index) / 1000},
-                    settings={
-                        "task": {"points": points, "_target_": "completion"},
-                        "dataset": {"name": "sofa"},
-                        "index": index,
-                    },
+                    index=index,
+                    settings={"task": {"points": points, "_target_": "completion"}},
                 )
     result = tuned.make(choose(read_records(tmp_path)[0], tuned.READS[0], tmp_path))
     table = result.table.set_index("Method")

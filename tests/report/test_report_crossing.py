@@ -39,9 +39,8 @@ def crossed(results, *, both=BOTH, families=("sofa", "plane"), shapes=6, failed=
                         "task": {"points": points, "_target_": "completion"},
                         "renderer": {"_target_": target, "_label_": label},
                         "silhouette": {"_target_": f"renderers.silhouette.{loss}", "_label_": loss_label},
-                        "dataset": {"name": name},
-                        "index": index,
                     },
+                    index=index,
                 )
     return choose(read_records(results)[0], READS[0], results)
 

@@ -19,24 +19,11 @@ ROWS = {
 }
 
 
-def made(
-    results,
-    row,
-    chamfer,
-    *,
-    renderer="newton",
-    dataset="car",
-    index=0,
-    status="ok",
-    seconds=None,
-    experiment="dvr_table1",
-    **more,
-):
+def made(results, row, chamfer, *, status="ok", experiment="dvr_table1", **more):
     metrics = {"iou": 1 - chamfer, "chamfer_l1": chamfer / 10, "normal_consistency": 0.9, "mask_iou": 0.8, "psnr": 20.0}
     return write_run(
-        results, experiment, row, task="single_view", dataset=dataset, method=ROWS[row],
-        renderer=renderer, status=status, metrics=metrics if status == "ok" else {}, seconds=seconds or {}, **more,
-        settings={"dataset": {"name": dataset}, "index": index},
+        results, experiment, row, task="single_view", method=ROWS[row], status=status,
+        metrics=metrics if status == "ok" else {}, **{"renderer": "newton"} | more,
     )  # fmt: skip
 
 
@@ -136,8 +123,8 @@ def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
 def budget(results, shapes, views, chamfer, index):
     return write_run(
         results, "single_view_budget", "RGB and depth", task="single_view", method="single_view_rgb_depth",
-        metrics={"iou": 0.8, "chamfer_l1": chamfer},
-        settings={"dataset": {"name": "car"}, "index": index, "task": {"shapes": shapes, "views": views}},
+        metrics={"iou": 0.8, "chamfer_l1": chamfer}, index=index,
+        settings={"task": {"shapes": shapes, "views": views}},
     )  # fmt: skip
 
 

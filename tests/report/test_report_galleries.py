@@ -14,42 +14,33 @@ SQUARE = np.zeros((8, 8), dtype=bool)
 SQUARE[2:6, 2:6] = True
 
 
-def saved(folder, found=UP, start=RIGHT, true=TOWARDS):
+def saved(folder, found):
     """Writes squares with one normal each; None is a shape that nothing shows."""
     arrays = {"given": np.where(SQUARE, 2.0, np.nan).astype(np.float16)}
-    for name, normal in (("found", found), ("start", start), ("true", true)):
+    for name, normal in (("found", found), ("start", RIGHT), ("true", TOWARDS)):
         hit = np.stack([SQUARE, SQUARE]) & (normal is not None)
         arrays |= {f"{name}_hit": hit, f"{name}_normals": (hit[..., None] * np.array(normal or UP)).astype(np.float16)}
     np.savez(folder / "images.npz", **arrays)
 
 
-def completed(results, row, points, *, dataset="sofa", index=0, seed=0, status="ok", pictures=True, **shown):
-    folder = write_run(
-        results,
-        "table2",
-        row,
-        **{"task": "deepsdf" if row.startswith("DeepSDF") else "completion", "method": NAMES[row], "dataset": dataset},
-        status=status,
-        settings={"task": {"points": points}, "dataset": {"name": dataset}, "index": index, "seed": seed},
-    )
+def completed(results, row, points, found=UP, *, pictures=True, **changed):
+    task = "deepsdf" if row.startswith("DeepSDF") else "completion"
+    known = {"task": task, "method": NAMES[row], "dataset": "sofa", "settings": {"task": {"points": points}}}
+    folder = write_run(results, "table2", row, **known | changed)
     if pictures:
-        saved(folder, **shown)
+        saved(folder, found)
 
 
-def many_views(results, experiment, row, *, dataset="car", index=0, status="ok", pictures=True, task=None, **shown):
+def many_views(results, experiment, row, found, *, index=0, status="ok", **task):
     folder = write_run(
         results,
         experiment,
         row,
-        **{"task": "multiview", "dataset": dataset, "status": status, "method": f"multiview_{row[:4].lower()}"},
-        settings={
-            "task": {"shift": 0.0, "degrees": 0.0, "scale": 1.0, **(task or {})},
-            "dataset": {"name": dataset},
-            "index": index,
-        },
+        **{"task": "multiview", "status": status, "method": f"multiview_{row[:4].lower()}"},
+        index=index,
+        settings={"task": {"shift": 0.0, "degrees": 0.0, "scale": 1.0, **task}},
     )
-    if pictures:
-        saved(folder, **shown)
+    saved(folder, found)
 
 
 def cells(axis, across=1):
@@ -110,8 +101,8 @@ def test_a_run_that_failed_is_shown_as_such_with_its_picture_or_without(tmp_path
 
 def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
     for index in range(6):
-        many_views(tmp_path, "table3", "DIST", index=index, found=UP)
-        many_views(tmp_path, "table3", "Mesh, 48³", index=index, status="ok" if index else "diverged", found=RIGHT)
+        many_views(tmp_path, "table3", "DIST", UP, index=index)
+        many_views(tmp_path, "table3", "Mesh, 48³", RIGHT, index=index, status="ok" if index else "diverged")
     result = page_of(tmp_path, "multiview_gallery")
     found = cells(result.figure.axes[0])
     assert list(dict.fromkeys(row for row, _ in found)) == [f"car {index}" for index in range(4)]
@@ -124,7 +115,7 @@ def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
 
 def test_misplaced_shapes_stand_over_the_displacement(tmp_path):
     for task in ({"degrees": 20.0}, {}, {"similarity": True}, {"shift": 0.1}, {"scale": 0.8}):
-        many_views(tmp_path, "fig12", "DIST", task=task, found=UP if task else RIGHT)
+        many_views(tmp_path, "fig12", "DIST", UP if task else RIGHT, **task)
     result = page_of(tmp_path, "misplaced_gallery")
     found = cells(result.figure.axes[0])
     columns = [column for row, column in found if row == "DIST"]
@@ -141,7 +132,7 @@ def rendered(results, split, *, dataset="sofa", status="ok", kinds=()):
         "DIST, one colour image",
         **{"task": "completion", "dataset": dataset, "method": "dist_colour", "status": status},
         **({"metrics": dict(zip(fig8.BYTES, (256, 3000, 500, 9000), strict=True))} if kinds else {}),
-        settings={"task": {"_target_": "completion"}, "dataset": {"name": dataset}, "index": 0, "split": split},
+        settings={"task": {"_target_": "completion"}, "split": split},
     )
     arrays = {"photograph": np.ones((8, 8, 3), np.float16)}
     for prefix, length in (("size_0_", 2), ("size_1_", 4), ("size_2_", 8), ("turned_0_", 8), ("turned_1_", 8)):

@@ -31,13 +31,15 @@ PAGES = {"table1": table1, "fig4": fig4, "fig5": fig5, "fig7": fig7, "gradients"
 def write_run(results: Path, experiment: str | None, label: str | None, **changed) -> Path:
     """Writes a run folder whose record is an ok one of the experiment, and gives the folder.
 
-    `changed` are fields of the record; `settings` those of its configuration, `minute` when it started. The label's
-    preset is the renderer's, or, where it is a method, the method's.
+    `changed` are fields of the record; `settings` those of its configuration, where `index`, `seed` and the name of the
+    dataset stand as well; `minute` when it started. The label's preset is the renderer's, or, where it is a method, the
+    method's.
     """
     number = len(list((results / "runs").glob("*")))
     settings, minute = changed.pop("settings", {}), changed.pop("minute", number)
     task = {"fig5": "completion", "gradients": "gradients"}.get(experiment or "", "ablation")
-    config = {"experiment": experiment, "label": label, "index": 0, "seed": 0, "view": {"resolution": 64}}
+    config = {"experiment": experiment, "label": label, "index": changed.pop("index", 0), "view": {"resolution": 64}}
+    config |= {"seed": changed.get("seed", 0), "dataset": {"name": changed.get("dataset", "car")}}
     config |= {"renderer": {"epsilon": 5e-5}, "prior": {"network": NETWORK}, "results_dir": str(results)} | settings
     record = {"schema": 1, "id": str(number), "task": task, "dataset": "car", "scene": "car 0"}
     preset = PRESETS.get(label or "", "dist")

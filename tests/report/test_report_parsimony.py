@@ -14,17 +14,14 @@ VIEWS = {"fitted": 12, "held_out": 8, "share": 0.1}
 CONFIG = {"task": {"checks": {"seeds": 20, "drawn": 8}}, "models": {"views": VIEWS, "fit": {"iterations": 100}}}
 
 
-def climbed(
-    results, scene, errors, *, needs, failed=(), at_auto=None, enough=1, status="ok", settings=None, **metrics
-) -> None:
-    """A run whose candidates have these errors in half pixels of 0.02; at `at_auto` the network came to auto's."""
+def climbed(results, scene, errors, *, needs, failed=(), status="ok", **metrics) -> None:
+    """A run whose candidates have these errors in half pixels of 0.02."""
     known = {"footprint": 0.02, "chamfer_l2": 0.001, "held_out_seeds": 20, "held_out_seeds_within": 0.6}
-    known |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": enough}
+    known |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": 1}
     for name, error in errors.items():
         spent = {"free": SIZES[name], "stored": STORED[name], "bytes": 4 * STORED[name], **COSTS}
         spent |= {"flops_per_query": 2 * SIZES[name]}
         spent |= {"failed": "nan: why"} if name in failed else {"error": 0.02 * error, "standard_error": 0.001}
-        spent |= dict.fromkeys((f"{cost}_at_auto" for cost in COSTS), at_auto if name == NETWORK else None)
         known |= {f"{name}.{key}": value for key, value in spent.items()}
     best = min((name for name in errors if name not in failed), key=lambda name: errors[name])
     known |= {"recommended_field": needs, "best_field": best, "recommended_by": "stored"}
@@ -39,7 +36,7 @@ def climbed(
     changed = {"status": status, "reason": "" if status == "ok" else "why", "metrics": known if status == "ok" else {}}
     write_run(
         *(results, "parsimony", None),
-        **{"task": "capacity", "dataset": scene, "scene": f"{scene} test 0", "settings": settings or CONFIG, **changed},
+        **{"task": "capacity", "dataset": scene, "scene": f"{scene} test 0", "settings": CONFIG, **changed},
     )
 
 

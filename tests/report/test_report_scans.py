@@ -8,13 +8,13 @@ from tests.report.test_report_paper import page_of, write_run
 DRAGON, BUNNY = "scans/dragon", "scans/bunny"
 
 
-def made(results, depths, error, *, folder=DRAGON, index=0, status="ok", renderer="newton"):
+def made(results, depths, error, *, folder=DRAGON, status="ok", renderer="newton", **changed):
     """A run whose three errors are `error`, twice and three times that, in thousandths."""
     metrics = {name: place * error / 1000 for place, name in enumerate(scans.METRICS, 1)}
     return write_run(
         results, "scans", renderer, task="completion", dataset="scans", method="", renderer=renderer, status=status,
-        metrics=metrics if status == "ok" else {},
-        settings={"task": {"depths": depths}, "dataset": {"path": folder}, "index": index},
+        metrics=metrics if status == "ok" else {}, **changed,
+        settings={"task": {"depths": depths}, "dataset": {"path": folder}},
     )  # fmt: skip
 
 

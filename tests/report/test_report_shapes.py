@@ -32,7 +32,7 @@ FACTORS = {"accuracy": 0.5, "completeness": 1.5, "chamfer_l1": 1.0}
 PHOTO_SCORES = {"psnr": 20.0, "ssim": 0.5, "mask_iou": 0.9, "mask_iou_least": 0.8}
 
 
-def made(results, row, metrics, *, dataset="sofa", experiment="dvr_table2", index=0, seconds=2.0, **changed):
+def made(results, row, metrics, *, dataset="sofa", experiment="dvr_table2", seconds=2.0, **changed):
     """A run of a row; it costs 1000 field values unless it has no loop."""
     task = TASKS.get(row, "reconstruction")
     values = 0 if row in LEVELS else 1000
@@ -46,7 +46,7 @@ def made(results, row, metrics, *, dataset="sofa", experiment="dvr_table2", inde
         metrics=metrics,
         evaluations=evaluations,
         seconds={"forward": 0.75 * seconds, "backward": 0.25 * seconds},
-        settings={"task": {"_target_": task}, "dataset": where, "index": index},
+        settings={"task": {"_target_": task}, "dataset": where},
     )
 
 

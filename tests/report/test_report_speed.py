@@ -13,21 +13,18 @@ from tests.report.test_report_paper import page_of, told, write_run
 
 def completed(results, label, errors, **changed):
     """A completion whose looks have these errors x 1000, at 1, 2, 3, ... seconds; the last is that of its end."""
-    status, index, renderer = changed.get("status", "ok"), changed.get("index", 0), changed.get("renderer", "dist")
     steps = len(errors) - 1
     folder = write_run(
         results,
         "speed_completion",
         label,
         task="completion",
-        status=status,
         dataset="sofa",
-        renderer=renderer,
         metrics={"chamfer_l2": errors[-1] / 1000},
         seconds={"forward": 0.75 * steps, "backward": 0.25 * steps},
         evaluations={"value": 100 * steps},
-        settings={"index": index, "task": {"points": "50"}, "renderer": {"steps": 50}, "split": "test"},
-        notes=changed.get("notes", []),
+        settings={"task": {"points": "50"}, "renderer": {"steps": 50}, "split": "test"},
+        **{"notes": []} | changed,
     )
     lines = [
         {
@@ -43,11 +40,12 @@ def completed(results, label, errors, **changed):
     return folder
 
 
-def rendered(results, label, seconds, error, *, size=64, index=0, queries=1000):
+def rendered(results, label, seconds, error, *, size=64, queries=1000, **changed):
     """A rendering."""
     metrics = {"forward_seconds": seconds, "error_p95": error, "queries": queries}
-    settings = {"view": {"resolution": size}, "split": "train", "index": index}
-    write_run(results, "speed_rendering", label, task="ablation", dataset="sofa", metrics=metrics, settings=settings)
+    settings = {"view": {"resolution": size}, "split": "train"}
+    known = {"task": "ablation", "dataset": "sofa", "metrics": metrics, "settings": settings}
+    write_run(results, "speed_rendering", label, **known, **changed)
 
 
 @pytest.fixture

@@ -11,26 +11,15 @@ from tests.report.test_report_paper import page_of, told, write_run
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 
 
-def broke(
-    results, axis, label, level, *, status="ok", measure="rendering", criteria=None, loss=None, repeats=None, **metrics
-):
-    """A run of the atlas whose breakdown lies at a level; with a curve of ten trials.
-
-    With `repeats` of 1 there is no interval; `loss` is the label of its loss of the mask.
-    """
-    within = {"breakdown": None if not 0 <= level <= 1 else 0.01**level}
-    ends = {"level": level, "level_low": level - 0.05, "level_high": level + 0.05}
-    within |= {
-        f"breakdown{end}": 0.01 ** (level + by) if 0 <= level + by <= 1 else None
-        for end, by in (("_low", -0.05), ("_high", 0.05))
-    }
-    counts = {"trials": 10, "grid_trials": 40, "mild_trials": 5, "severe_trials": 5}
-    counts |= {"mild_successes": 5 * (level > 0), "severe_successes": 5 * (level > 1), "evaluations_per_ray": 4.0}
-    if repeats == 1:
-        within |= {"breakdown_low": None, "breakdown_high": None}
-        ends |= {"level_low": None, "level_high": None}
-        counts |= {"mild_trials": 1, "severe_trials": 1, "mild_successes": int(level > 0), "severe_successes": 0}
-    known = {**within, **ends, **counts, "failed_lost": 3, "failed_false": 1, **metrics}
+def broke(results, axis, label, level, *, status="ok", measure="rendering", criteria=None, repeats=None, **metrics):
+    """A run of the atlas whose breakdown lies at a level; with a curve of ten trials, or one trial at each end."""
+    off, trials = (None, 1) if repeats == 1 else (0.05, 5)
+    ends = {"": level, "_low": off and level - off, "_high": off and level + off}
+    known = {f"level{end}": at for end, at in ends.items()}
+    known |= {f"breakdown{end}": 0.01**at if at is not None and 0 <= at <= 1 else None for end, at in ends.items()}
+    known |= {"trials": 10, "grid_trials": 40, "evaluations_per_ray": 4.0, "failed_lost": 3, "failed_false": 1}
+    known |= {f"{end}_trials": trials for end in ("mild", "severe")}
+    known |= {"mild_successes": trials * (level > 0), "severe_successes": trials * (level > 1)} | metrics
     stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP, "repeats": repeats}
     search = {"levels": 11, "repeats": 4}
     folder = write_run(
@@ -43,7 +32,6 @@ def broke(
         settings={
             "task": {"stress": stress, "search": search, "fit_search": search, "criteria": criteria or {}},
             "stress": stress,
-            "silhouette": {"_label_": loss} if loss else {},
         },
     )
     if status == "ok":

@@ -39,8 +39,9 @@ def drawn(
                     status=status or "ok",
                     metrics={} if status else {"chamfer_l2": scale * value * OWN[index] / 1000},
                     evaluations={"value": 100 * (draw + 1)},
+                    index=index,
                     settings={
-                        **{"split": split, "draw": draw, "index": index},
+                        **{"split": split, "draw": draw},
                         "dataset": {"name": family, "ranges": {f"width of a {family}": 1.0}},
                         "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
                         "renderer": {"epsilon": 5e-5, "steps": 10 + draw},

@@ -10,7 +10,7 @@ from tests.report.test_report_paper import page_of, told, write_run
 ENDS = ONE_WAY
 
 
-def found(results, experiment, label, chamfer, *, index=0, start=8.0, renderer="dist", method="", **task):
+def found(results, experiment, label, chamfer, *, start=8.0, renderer="dist", method="", **task):
     """A run of shape from many views; None as its Chamfer distance x 1000 is a run that failed."""
     return write_run(
         results,
@@ -24,11 +24,12 @@ def found(results, experiment, label, chamfer, *, index=0, start=8.0, renderer="
         metrics_start={ENDS: start / 1000},
         seconds={"forward": 2.0, "backward": 1.0},
         evaluations={"value": 5000},
-        settings={"task": {"focal": 1.0, "start_scale": 1.0, **task}, "index": index, "dataset": {"name": "car"}},
+        index=task.pop("index", 0),
+        settings={"task": {"focal": 1.0, "start_scale": 1.0, **task}},
     )
 
 
-def posed(results, label, degrees, success, *, seed=0, task="pose", dataset=None, index=0, **changed):
+def posed(results, label, degrees, success, *, task="pose", dataset=None, **changed):
     """A run of camera pose; None as its success is a run that failed, though its pose is right."""
     return write_run(
         results,
@@ -40,11 +41,9 @@ def posed(results, label, degrees, success, *, seed=0, task="pose", dataset=None
         seconds={"forward": 1.5, "backward": 0.5} if task == "pose" else {"forward": 0.25, "backward": 0.0},
         settings={
             "task": {"degrees": degrees, "shift": 0.1, "success_degrees": 5.0, "success_distance": 0.05, "starts": 1},
-            "seed": seed,
-            "index": index,
             "dataset": dataset or {"name": "car"},
         },
-        **{"seed": seed} | changed,
+        **changed,
     )
 
 
@@ -98,7 +97,7 @@ def test_rows_may_have_images_of_their_own_size(tmp_path):
         task="multiview",
         metrics={ENDS: 0.002},
         metrics_start={ENDS: 0.004},
-        settings={"task": {"focal": 1.0}, "view": {"resolution": 32}, "dataset": {"name": "car"}},
+        settings={"task": {"focal": 1.0}, "view": {"resolution": 32}},
     )
     result = page_of(tmp_path, "table3")
     assert row(result, "DIST")["Median"] == "1.00"
