@@ -14,7 +14,6 @@ from bench.stress.search import SearchSettings
 from bench.tasks.stability import Stability
 from renderers import IDR
 from renderers.march import Stepping
-from renderers.rendering import Unsupported
 from tests.stress.test_stress import CRITERIA, FIT, stress_named
 from tests.tiny import ball_prior, camera_of, run_of
 
@@ -61,16 +60,8 @@ def test_the_breakdown_is_that_of_the_closed_form(tmp_path, case):
     metrics = run(tmp_path, case[0], renderer)
     assert within(case[0], metrics, severity)
     assert metrics["trials"] <= metrics["grid_trials"] / 2
-
-
-def test_one_trial_per_level_gives_no_interval(tmp_path):
-    metrics = run(tmp_path, "camera_inside", load("renderer", "idr"))
-    names = ("breakdown_low", "breakdown_high", "level_low", "level_high", "width")
-    assert [metrics[name] for name in names] == [None] * 5
-    assert 0 < metrics["level"] < 1
-    assert (metrics["mild_trials"], metrics["severe_trials"], metrics["grid_trials"]) == (1, 1, 17)
-    levels = [json.loads(line)["level"] for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
-    assert len(levels) == len(set(levels)) == metrics["trials"]
+    once = stress_named(case[0]).repeats == 1  # trial per level, which gives no interval
+    assert (metrics["level_low"] is None) == (metrics["grid_trials"] == SEARCH.levels) == once
 
 
 def test_an_exception_of_a_trial_is_a_failure_and_the_search_continues(tmp_path):
@@ -136,11 +127,6 @@ def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
         assert (images["kinds"] == 3).sum() > 0
         assert images["severity"] == pytest.approx(next(x["severity"] for x in lines if x["level"] == mildest))
     assert (tmp_path / "failure.png").stat().st_size > 5000
-
-
-def test_a_missing_setting_is_an_error_before_the_first_trial(tmp_path):
-    with pytest.raises(Unsupported, match="IDR has no alpha, or it is null: choose another renderer"):
-        run(tmp_path, "alpha", load("renderer", "idr"))
 
 
 def test_a_task_without_a_stress_names_the_remedy():
