@@ -7,13 +7,13 @@ import trimesh
 from scipy.io import savemat
 
 from datasets.mesh import Mesh
+from tests.tiny import icosphere
 
 CENTRE, RADIUS, NUMBER = np.array([3.0, -7.0, 600.0]), 20.0, 65
 
 
 def ball(radius: float = RADIUS, centre=CENTRE, subdivisions: int = 4) -> Mesh:
-    made = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    return Mesh(np.array(made.vertices) + centre, np.array(made.faces))
+    return icosphere(radius, centre, subdivisions)
 
 
 def write_dtu(

@@ -3,7 +3,6 @@
 import json
 from dataclasses import dataclass, replace
 
-import numpy as np
 import pytest
 import torch
 import trimesh
@@ -24,9 +23,8 @@ from bench.shape_prior import (
     train,
 )
 from datasets.families import FAMILIES
-from datasets.mesh import Mesh
 from datasets.scene import Split
-from tests.tiny import CPU, cell_from, silent
+from tests.tiny import CPU, cell_from, mesh_of, silent
 
 SETTINGS = PriorSettings(
     network=NetworkSettings(layers=3, width=48, code_length=4, skip=1, narrow=False),
@@ -53,8 +51,7 @@ class Boxes:
 
     def mesh(self, split, index):
         height = [0.2, 0.5, 0.8][index % 3] + (0.0 if split is Split.TRAIN else 0.05)
-        made = trimesh.creation.box((2 * self.widest, 2 * height, 0.6))
-        return Mesh(np.array(made.vertices), np.array(made.faces))
+        return mesh_of(trimesh.creation.box((2 * self.widest, 2 * height, 0.6)))
 
     def identity(self):
         return {"name": self.name, "widest": self.widest}

@@ -1,5 +1,6 @@
 """The command bench.turntable: what turns, in which colours, into which file, and its errors."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from bench.records.record import Record
 from bench.turntable import UPRIGHT, main, stand, turntable
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
+from tests.tiny import icosphere
 
 SIZE = 32
 RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
@@ -19,9 +21,8 @@ RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 
 def ball(radius: float = 0.8, at: tuple[float, float, float] = (0, 0, 0), split: int = 0) -> Mesh:
     """A sphere, red on the negative side of the axis `split` and blue on the other."""
-    made = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    colours = np.where(made.vertices[:, [split]] < 0, RED, BLUE)
-    return Mesh(np.array(made.vertices) + at, np.array(made.faces), colours=colours)
+    made = icosphere(radius, at)
+    return replace(made, colours=np.where(made.vertices[:, [split]] < at[split], RED, BLUE))
 
 
 def frames_of(path: Path) -> list[np.ndarray]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import EvaluationSettings
@@ -78,10 +79,10 @@ def plane_decoder(normal: Any, code_weights: Any, offset: float) -> Decoder:
     return decoder.requires_grad_(False)
 
 
-def ball_prior(radius: float = 0.5, scale: float = 1.0, width: int = 128) -> Prior:
+def ball_prior(radius: float = 0.5, width: int = 128) -> Prior:
     """A polyhedron near a ball about the first three numbers of a code; the fourth one swells it. It has two codes.
 
-    Its field is `scale` times a distance, nearly: max(normal . x, 0) has the mean |x| / 4 over all directions.
+    Its field is nearly a distance: max(normal . x, 0) has the mean |x| / 4 over all directions.
     """
     heights = 1 - (2 * torch.arange(width) + 1) / width
     turns = torch.pi * (1 + 5**0.5) * torch.arange(width)
@@ -90,8 +91,8 @@ def ball_prior(radius: float = 0.5, scale: float = 1.0, width: int = 128) -> Pri
     decoder = Decoder(layers=1, width=width, code_length=4, skip=0, narrow=False).requires_grad_(False)
     decoder.hidden[0].weight.copy_(torch.cat([-normals, torch.full((width, 1), -0.5), normals], dim=1))
     decoder.hidden[0].bias.zero_()
-    decoder.last.weight.fill_(4 * scale / width)
-    decoder.last.bias.fill_(-radius * scale)
+    decoder.last.weight.fill_(4 / width)
+    decoder.last.bias.fill_(-radius)
     return Prior(decoder, torch.tensor([[0.05, -0.1, 0.1, 0.05], [-0.1, 0.0, 0.0, 0.0]]))
 
 
@@ -100,9 +101,18 @@ def camera_of(pixels: int, *, field_of_view: float = 50.0, angles: tuple[float, 
     return ViewSampler(2.5, field_of_view, (0.0, 0.0), (0.0, 0.0), pixels).camera(*angles)
 
 
-def scene_of(made: Any, camera: Camera) -> Scene:
-    """A mesh of trimesh, seen by a camera."""
-    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
+def mesh_of(made: trimesh.Trimesh) -> Mesh:
+    """A mesh of trimesh as one of ours."""
+    return Mesh(np.array(made.vertices), np.array(made.faces))
+
+
+def icosphere(radius: float, centre: Any = (0.0, 0.0, 0.0), subdivisions: int = 4) -> Mesh:
+    """A sphere of triangles."""
+    return mesh_of(trimesh.creation.icosphere(subdivisions, radius).apply_translation(centre))
+
+
+def scene_of(mesh: Mesh, camera: Camera) -> Scene:
+    """A mesh, seen by a camera."""
     return Scene("a shape", mesh, see(Truth(mesh), camera))
 
 

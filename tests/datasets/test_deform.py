@@ -1,17 +1,18 @@
 """Deformations: seeded, the identity at strength 0, smooth and never folding."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import trimesh
 
 from datasets.deform import STRETCH, TAPER, TWIST, Deformation, deform
 from datasets.mesh import Mesh
 from tests.looped import each
+from tests.tiny import icosphere
 
 
 def ball() -> Mesh:
-    made = trimesh.creation.icosphere(2)
-    return Mesh(np.array(made.vertices), np.array(made.faces), repairs=("1 hole closed",))
+    return replace(icosphere(1.0, subdivisions=2), repairs=("1 hole closed",))
 
 
 def jacobians(deformation: Deformation, points: np.ndarray) -> np.ndarray:

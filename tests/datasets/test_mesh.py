@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets.mesh import Mesh, normalise
+from datasets.mesh import Mesh, joined, normalise
 from tests.looped import each
+from tests.tiny import mesh_of
 
 
 def box(extents=(1.0, 2.0, 3.0)) -> Mesh:
-    made = trimesh.creation.box(extents)
-    return Mesh(np.array(made.vertices), np.array(made.faces))
+    return mesh_of(trimesh.creation.box(extents))
 
 
 def test_a_box_has_its_closed_form_measures():
@@ -28,7 +28,7 @@ def test_volume_is_negative_inside_out_and_does_not_move_with_the_mesh():
 
 def test_two_boxes_are_two_parts():
     mesh = box((1, 1, 1))
-    both = Mesh(np.concatenate([mesh.vertices, 2 * mesh.vertices + 9]), np.concatenate([mesh.faces, mesh.faces + 8]))
+    both = joined([mesh, Mesh(2 * mesh.vertices + 9, mesh.faces)])
     assert both.parts.tolist() == [0] * 12 + [1] * 12
     assert both.part_volumes == pytest.approx([1, 8])
 

@@ -9,10 +9,12 @@ import trimesh
 
 from bench.reconstruct.surfaces import poisson
 from datasets.mesh import Mesh
+from datasets.mesh import joined as as_one
 from datasets.meshes import find_meshes, load_mesh, read_points, repair
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.looped import each
+from tests.tiny import mesh_of
 
 
 def box(at=(0.0, 0.0, 0.0), size=1.0, inverted=False) -> trimesh.Trimesh:
@@ -24,9 +26,7 @@ def box(at=(0.0, 0.0, 0.0), size=1.0, inverted=False) -> trimesh.Trimesh:
 
 
 def joined(*parts: trimesh.Trimesh) -> Mesh:
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
-    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
-    return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+    return as_one([mesh_of(part) for part in parts])
 
 
 def sheet(height) -> Mesh:

@@ -6,15 +6,13 @@ from math import pi
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from bench.tasks.multiview import sample
-from datasets.mesh import Mesh
 from datasets.photographs import HIGHEST, Photography, around, turned
 from datasets.scene import Truth
 from datasets.textures import ONE_COLOUR, PHOTOGRAPHS, TEXTURES, make_texture
 from tests.looped import each
-from tests.tiny import camera_of
+from tests.tiny import camera_of, icosphere
 
 PLAINLY = Photography(
     views=8,
@@ -32,8 +30,7 @@ CAMERA = camera_of(32, angles=(0.0, 20.0))
 
 @pytest.fixture(scope="module")
 def ball() -> Truth:
-    made = trimesh.creation.icosphere(subdivisions=4, radius=0.7)
-    return Truth(Mesh(np.array(made.vertices), np.array(made.faces)))
+    return Truth(icosphere(0.7))
 
 
 @each("name", TEXTURES)

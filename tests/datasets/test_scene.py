@@ -7,16 +7,12 @@ import pytest
 import torch
 import trimesh
 
-from datasets.mesh import Mesh
 from datasets.scene import Split, Truth, make_scene, see
 from datasets.views import ViewSampler, look_at
 from renderers.camera import Camera
+from tests.tiny import mesh_of
 
 VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=40)
-
-
-def from_trimesh(made: trimesh.Trimesh) -> Mesh:
-    return Mesh(np.array(made.vertices), np.array(made.faces))
 
 
 @dataclass(frozen=True)
@@ -29,7 +25,7 @@ class Boxes:
 
     def mesh(self, split, index):
         made = trimesh.creation.box((0.4 + 0.05 * index, 0.3, 0.3))
-        return replace(from_trimesh(made.apply_translation((0, self.moved, 0))), repairs=self.repairs)
+        return replace(mesh_of(made.apply_translation((0, self.moved, 0))), repairs=self.repairs)
 
     def identity(self):
         return {"moved": self.moved}
@@ -43,7 +39,7 @@ def bearings(height, width, focal):
 
 def test_a_sphere_beside_the_axis_in_an_oblong_image_has_the_depth_of_its_closed_form():
     radius, centre = 0.6, np.array([0.3, 0.2, -0.1])
-    mesh = from_trimesh(trimesh.creation.icosphere(subdivisions=5, radius=radius).apply_translation(centre))
+    mesh = mesh_of(trimesh.creation.icosphere(subdivisions=5, radius=radius).apply_translation(centre))
     motion = look_at(torch.tensor([1.0, 1.5, 2.0]), torch.zeros(3))
     camera = Camera(torch.tensor([[30.0, 0, 20], [0, 30, 12], [0, 0, 1]]), motion, height=24, width=40)
     view = see(Truth(mesh), camera)

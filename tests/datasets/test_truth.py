@@ -6,15 +6,12 @@ import trimesh
 
 from datasets.mesh import Mesh
 from datasets.scene import Truth, sample_surface
-
-
-def from_trimesh(made: trimesh.Trimesh) -> Mesh:
-    return Mesh(np.array(made.vertices), np.array(made.faces))
+from tests.tiny import mesh_of
 
 
 @pytest.fixture(scope="module")
 def box() -> Mesh:
-    return from_trimesh(trimesh.creation.box((1, 1, 1)))
+    return mesh_of(trimesh.creation.box((1, 1, 1)))
 
 
 def box_distance(points: np.ndarray) -> np.ndarray:
@@ -57,7 +54,7 @@ def test_an_open_mesh_has_no_truth(box):
 
 
 def test_samples_lie_on_the_surface_evenly_by_area_with_outward_normals():
-    mesh = from_trimesh(trimesh.creation.box((1, 2, 4)))
+    mesh = mesh_of(trimesh.creation.box((1, 2, 4)))
     sampled = sample_surface(mesh, 20000, seed=0)
     points, normals = sampled.points, sampled.normals
     assert np.abs(Truth(mesh).signed_distance(points)).max() < 1e-6

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from bench.config import load
 from bench.evaluate.evaluate import DEFINITIONS, chamfer_only, evaluate, render_view
@@ -15,7 +14,7 @@ from bench.solve.solve import note_result
 from datasets.scene import sample_surface
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
-from tests.tiny import ball_prior, camera_of, run_of, scene_of
+from tests.tiny import ball_prior, camera_of, icosphere, run_of, scene_of
 
 RADIUS = 0.6
 
@@ -24,7 +23,7 @@ RADIUS = 0.6
 def inputs(tmp_path_factory) -> RunInputs:
     """A sphere as the truth, judged with 3,000 samples."""
     camera = camera_of(24, angles=(30.0, 20.0))
-    scene = scene_of(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS), camera)
+    scene = scene_of(icosphere(RADIUS), camera)
     renderer = load("renderer", "naive", steps=40, epsilon=1e-4)
     found = run_of(tmp_path_factory.mktemp("run"), renderer, ball_prior(), camera, make_scene=lambda: scene).inputs
     return replace(found, evaluation=replace(found.evaluation, grid=48, points=3000, fscore_threshold=0.05))

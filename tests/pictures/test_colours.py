@@ -1,18 +1,19 @@
 """A run that finds shape and colour from one image: its numbers and its pictures."""
 
-import json
+from pathlib import Path
 
 import numpy as np
 
+from tests.run.driving import command, record_of
 
-def test_a_command_finds_shape_and_colour_from_one_image(isolated, tmp_path):
+
+def test_a_command_finds_shape_and_colour_from_one_image(tmp_path):
     small = ("scale=smoke", "isolation=off", "evaluation.grid=24", "evaluation.points=200", "evaluation.gallery=32")
     small += ("evaluation.picture=16", "task.optimiser.iterations=4", "prior.shapes=2", "prior.steps=100", "threads=1")
     small += ("dataset=ellipsoid", "dataset.resolution=24", "prior.network.width=32", "prior.samples=2000")
-    code, out, err = isolated("+method=dist_colour", *small, "split=train")
-    folder = tmp_path / "r" / "runs" / out.split("/")[-1].strip()
-    record = json.loads((folder / "record.json").read_text())
+    code, out, err = command("+method=dist_colour", *small, "split=train", f"results_dir={tmp_path}")
     assert code == 0 or "did not fall" in err, err
+    record, folder = record_of(out), Path(out.splitlines()[-1])
     metrics, before = record["metrics"], record["metrics_start"]
     assert 0 < metrics["colour_error"] < 1 and before["colour_error"] < 1
     assert (metrics["code_bytes"], metrics["texture_bytes"] > 0, metrics["mesh_bytes"] > 0) == (4 * 64, True, True)

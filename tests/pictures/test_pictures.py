@@ -1,13 +1,11 @@
 """Pictures of runs: the strip and the film, what galleries are made of, legends that stay within their figure."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -21,10 +19,11 @@ from bench.reconstruct.problem import ReconstructionProblem
 from bench.report.site.files import ALT
 from bench.tasks.pose import TRACKED
 from datasets.mesh import Mesh
-from datasets.scene import Scene, Truth, View, see
+from datasets.scene import Truth, View, see
 from renderers.fields.analytic import sphere
 from tests.reconstruct.test_losses import ball, cast, shot_of
-from tests.tiny import ball_prior, camera_of, run_of
+from tests.run.driving import command, record_of
+from tests.tiny import ball_prior, camera_of, icosphere, run_of, scene_of
 
 CAMERA = camera_of(16)
 
@@ -39,9 +38,7 @@ def drawn(monkeypatch) -> list[Figure]:
 
 @pytest.fixture
 def inputs(tmp_path):
-    made = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
-    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
-    scene = Scene("ball", mesh, see(Truth(mesh), CAMERA))
+    scene = scene_of(icosphere(0.6, subdivisions=3), CAMERA)
     inputs = run_of(tmp_path, load("renderer", "dist"), ball_prior(), CAMERA, make_scene=lambda: scene).inputs
     return replace(inputs, evaluation=replace(inputs.evaluation, picture=24, grid=48))
 
@@ -155,9 +152,8 @@ def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, drawn):
 
 def half_ball(radius: float) -> Mesh:
     """A ball of which the half towards the camera, at z above 0, is there."""
-    made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    vertices, faces = np.array(made.vertices), np.array(made.faces)
-    return Mesh(vertices, faces[(vertices[faces][..., 2] >= 0).all(axis=1)]).compact()
+    whole = icosphere(radius, subdivisions=3)
+    return replace(whole, faces=whole.faces[(whole.vertices[whole.faces][..., 2] >= 0).all(axis=1)]).compact()
 
 
 def test_shapes_are_seen_by_two_cameras_and_depths_where_they_are_given(inputs, tmp_path):
@@ -191,14 +187,13 @@ def test_depths_are_coloured_from_the_nearest_to_the_farthest():
     assert image.get_clim() == (known.min(), known.max()) and known.min() < known.max()
 
 
-def test_a_run_writes_them_where_they_are_asked_for(isolated, tmp_path):
+def test_a_run_writes_them_where_they_are_asked_for(tmp_path):
     small = ("scale=smoke", "evaluation.picture=null", "evaluation.grid=24", "evaluation.points=100", "isolation=off")
-    code, out, _ = isolated("task=deepsdf", *small, "task.optimiser.iterations=2", "evaluation.gallery=12")
+    small += ("task.optimiser.iterations=2", "evaluation.gallery=12", f"results_dir={tmp_path}")
+    code, out, _ = command("task=deepsdf", *small)
     assert code == 0
-    folder = tmp_path / "r" / "runs" / out.split("/")[-1].strip()
-    with np.load(folder / "images.npz") as images:
-        record = json.loads((folder / "record.json").read_text())
-        assert np.isfinite(images["given"]).sum() == record["evaluations"]["observed"]
+    with np.load(f"{out.splitlines()[-1]}/images.npz") as images:
+        assert np.isfinite(images["given"]).sum() == record_of(out)["evaluations"]["observed"]
         assert all(images[f"{kind}_hit"].any() for kind in ("start", "found", "true"))
 
 

@@ -6,7 +6,6 @@ from math import inf, log10
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from bench.config import load
 from bench.evaluate.evaluate import render, render_image
@@ -15,13 +14,12 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, image_scores, jud
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness, roughness_scores
 from bench.records.record import RunStatus
-from datasets.mesh import Mesh
 from datasets.photographs import around
 from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import sphere_span
 from tests.reconstruct.test_losses import Ball, ball, cast, shot_of
-from tests.tiny import ball_prior, camera_of, run_of
+from tests.tiny import ball_prior, camera_of, icosphere, run_of
 
 CENTRE = (0.1, -0.05, 0.15)
 MASK_IOU = ("mask_iou", "mask_iou_least")
@@ -38,10 +36,8 @@ def painted(*, red: float = 0.0, radius: float = 0.6) -> Ball:
 @pytest.fixture(scope="module")
 def subject() -> Subject:
     """Photographs of a sphere from all around."""
-    made = trimesh.creation.icosphere(subdivisions=4, radius=0.6)
     shots = [shot_of(painted(), camera, str(number)) for number, camera in enumerate(around(camera_of(24), 8))]
-    truth = Mesh(np.array(made.vertices) + CENTRE, np.array(made.faces))
-    return Subject(tuple(shots[1:7]), (shots[0], shots[7]), truth, "a sphere")
+    return Subject(tuple(shots[1:7]), (shots[0], shots[7]), icosphere(0.6, CENTRE), "a sphere")
 
 
 @pytest.fixture

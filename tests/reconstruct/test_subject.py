@@ -10,29 +10,23 @@ from scipy.ndimage import binary_dilation
 
 from bench.reconstruct.subject import HULL_SAMPLES, ON_SURFACE, Depths, Subject, given_distances, hull_distances
 from bench.tasks.surfaces import Hull
-from datasets.mesh import Mesh
+from datasets.mesh import Mesh, joined
 from datasets.photographs import around
-from datasets.scene import Scene, Surface, Truth, sample_surface, see
+from datasets.scene import Surface, sample_surface
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.reconstruct.test_losses import RENDERERS, ball, shot_of
-from tests.tiny import ball_prior, camera_of, run_of
+from tests.tiny import ball_prior, camera_of, icosphere, run_of, scene_of
 
 NO_DEPTHS = Depths("none", 0.0)
 CAMERA = camera_of(24, angles=(0.0, 20.0))
 IMAGES = replace(PLAINLY, places="sphere", views=9)
 
 
-def icosphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
-    made = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    return Mesh(np.array(made.vertices) + centre, np.array(made.faces))
-
-
 @pytest.fixture
 def inputs(tmp_path):
-    mesh = icosphere(0.6)
-    scene = Scene("ball", mesh, see(Truth(mesh), CAMERA))
+    scene = scene_of(icosphere(0.6), CAMERA)
     return run_of(tmp_path, RENDERERS["idr"], ball_prior(), CAMERA, make_scene=lambda: scene).inputs
 
 
@@ -93,9 +87,7 @@ def seen_by(*cameras, surface: Mesh, points: np.ndarray) -> np.ndarray:
 
 def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
     front, back = icosphere(0.3, (0.0, 0.0, 0.6)), icosphere(0.25, (0.0, 0.0, -0.5))
-    both = Mesh(
-        np.concatenate([front.vertices, back.vertices]), np.concatenate([front.faces, back.faces + len(front.vertices)])
-    )
+    both = joined([front, back])
     towards = np.array([[0.0, 0.0, 0.9], [0.05, 0.0, -0.5 + np.sqrt(0.25**2 - 0.05**2)]])  # one on each, at z = 2.5
     camera, aside = camera_of(16), camera_of(16, angles=(60.0, 0.0))
     assert seen_by(camera, surface=both, points=towards).tolist() == [True, False]
@@ -112,7 +104,7 @@ def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
 @each("wound", [1, -1])
 def test_the_far_side_of_a_plate_is_not_seen_however_thin_and_whichever_way_it_is_wound(wound):
     box = trimesh.creation.box(extents=(0.8, 0.8, 0.9 * ON_SURFACE))
-    plate = Mesh(np.array(box.vertices), np.array(box.faces)[:, ::wound])
+    plate = Mesh(box.vertices, box.faces[:, ::wound])
     sampled = sample_surface(plate, 2000, 0)
     towards = sampled.points[:, 2] > 0
     sides = np.abs(sampled.points[:, :2]).max(axis=1) < 0.38  # beside the rim, through which a camera sees a little

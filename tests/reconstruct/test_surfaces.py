@@ -14,8 +14,7 @@ from tests.looped import each
 from tests.reconstruct.test_judge import CENTRE
 from tests.reconstruct.test_judge import painted as coloured_ball
 from tests.reconstruct.test_losses import ball, shot_of
-from tests.reconstruct.test_subject import icosphere
-from tests.tiny import camera_of
+from tests.tiny import camera_of, icosphere
 
 RADIUS = 0.6
 FRONT, BACK = camera_of(24), camera_of(24, angles=(180.0, 0.0))  # at z = 2.5 and at z = -2.5

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from bench.config import load
 from bench.reconstruct.losses import Losses
@@ -14,7 +13,6 @@ from bench.single_view.images import NEAR, POINTS, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Failed, Lessons, Supervision, TrainingSettings
-from datasets.mesh import Mesh
 from datasets.scene import Split
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
@@ -22,9 +20,8 @@ from renderers.field import Counts
 from renderers.silhouette import CrossEntropy, Occupancy
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
-from tests.tiny import silent
+from tests.tiny import CPU, icosphere, silent
 
-CPU = torch.device("cpu")
 SAMPLER = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(10.0, 40.0), resolution=16)
 IMAGING = Imaging(replace(PLAINLY, views=3, texture_size=1.0), SAMPLER)
 NETWORK = SingleViewNetwork(channels=(8, 8), blocks=1, code_length=6, width=16, reads="distance", radius=0.5)
@@ -46,8 +43,7 @@ class Balls:
     name: str = "balls"
 
     def mesh(self, split, index):
-        made = trimesh.creation.icosphere(subdivisions=3, radius=(0.35, 0.55, 0.8)[index % 3])
-        return Mesh(np.array(made.vertices), np.array(made.faces))
+        return icosphere((0.35, 0.55, 0.8)[index % 3], subdivisions=3)
 
     def identity(self):
         return {"name": self.name}

@@ -16,7 +16,7 @@ from bench.tasks.prior_fit import PriorFit
 from datasets.mesh import Mesh, extract
 from datasets.scene import Scene, Truth, View, see
 from tests.looped import each
-from tests.tiny import CPU, ball_prior, camera_of, plane_decoder, run_of
+from tests.tiny import CPU, altered, ball_prior, camera_of, plane_decoder, run_of
 
 PRIOR = ball_prior()
 RENDERER = load("renderer", "dist")  # neither task renders with it
@@ -104,7 +104,7 @@ def test_a_prior_that_can_show_a_shape_is_fitted_to_it_and_the_record_is_filled(
     gradients = prior_fit.autograd_gradients
     monkeypatch.setattr(prior_fit, "autograd_gradients", lambda f, points: asked.append(points) or gradients(f, points))
     run = run_of(tmp_path_factory.mktemp("run"), RENDERER, PRIOR, ball.view.camera, make_scene=lambda: ball)
-    task.execute(replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, points=500))))
+    task.execute(altered(run, {"inputs.evaluation.points": 500}))
     record, images = run.record, run.folder / "images.npz"
     assert (record.status, record.reason) == ("ok", "")
     assert record.metrics["chamfer_l2"] < 0.5 * record.metrics_start["chamfer_l2"]

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import trimesh
 from hydra import compose, initialize_config_dir
 
 from bench.config import CONF, build, load, register
@@ -17,7 +16,7 @@ from bench.tasks.pose import Pose, PoseProblem
 from datasets.scene import Scene
 from renderers.fields.analytic import sphere
 from tests.single_view.test_training import NETWORK, RGB, SETTINGS, images  # noqa: F401, a fixture
-from tests.tiny import CPU, ball_prior, camera_of, run_of, scene_of, silent
+from tests.tiny import CPU, altered, ball_prior, camera_of, icosphere, run_of, scene_of, silent
 
 CASES = {
     "completion": ("task.points=50",),
@@ -32,7 +31,7 @@ ADAM = OptimiserSettings(iterations=3, learning_rate=0.01, schedule="cosine")
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A ball of radius 0.5, seen in 24 x 24 pixels."""
-    return scene_of(trimesh.creation.icosphere(subdivisions=3, radius=0.5), camera_of(24, angles=(30.0, 20.0)))
+    return scene_of(icosphere(0.5, subdivisions=3), camera_of(24, angles=(30.0, 20.0)))
 
 
 @pytest.mark.parametrize(
@@ -58,7 +57,7 @@ def test_a_reconstruction_stays_on_the_device_of_its_run(scene, tmp_path, render
         config = compose("config", ["task=reconstruction", "scale=smoke", "task.longest=24", "task.rays=64", *weights])
     task, tested = build(config.task, "task"), load("renderer", renderer)
     run = run_of(tmp_path, tested, ball_prior(), camera_of(24), make_scene=lambda: scene)
-    run = replace(run, inputs=replace(run.inputs, field=FieldChoice("network_2x16", None)))
+    run = altered(run, {"inputs.field": FieldChoice("network_2x16", None)})
     subject = replace(task, depths=Depths("20%", 0.01)).subject(run.inputs)
     check(task.problem(run.inputs.field.name, subject, run))
 

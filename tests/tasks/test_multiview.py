@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from bench.config import load
 from bench.reconstruct.subject import HULL_RADIUS
@@ -17,13 +16,13 @@ from bench.solve.optimise import History, NotReached, OptimiserSettings, optimis
 from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
 from datasets.mesh import extract
 from datasets.meshes import read_mesh
-from datasets.scene import Scene, Truth, see
+from datasets.scene import Scene, Truth
 from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.made_photographs import CENTRE, RADIUS, idr
 from tests.run.driving import command, record_of
-from tests.tiny import CPU, ball_prior, camera_of, phases_of, run_of, scene_of
+from tests.tiny import CPU, altered, ball_prior, camera_of, icosphere, phases_of, run_of, scene_of
 
 RENDERER = load("renderer", "dist")
 CAMERA = camera_of(16, angles=(0.0, 20.0))
@@ -41,7 +40,7 @@ SETTINGS = Multiview(
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A ball of radius 0.5, the prior's mean shape."""
-    return scene_of(trimesh.creation.icosphere(subdivisions=4, radius=0.5), CAMERA)
+    return scene_of(icosphere(0.5), CAMERA)
 
 
 def problem_of(scene, **changed):
@@ -93,11 +92,10 @@ def test_random_starts_differ_and_share_the_budget(scene):
 def test_an_encoder_is_trained_once_and_gives_the_code_about_which_starts_are_drawn(tmp_path):
     prior, camera = Prior(PRIOR.decoder, 3 * PRIOR.codes), camera_of(32, angles=(0.0, 20.0))
     encoder = EncoderSettings((8,), 1, 32, 6, 4, 8, OptimiserSettings(80, 0.01, "cosine"))
-    true = extract(prior.decoder.at(prior.codes[0]), grid=24, reach=1.0)
-    seen = Scene("a ball", true, see(Truth(true), camera))
+    seen = scene_of(extract(prior.decoder.at(prior.codes[0]), grid=24, reach=1.0), camera)
     task = replace(SETTINGS, optimiser=OptimiserSettings(1, 1e-9, "constant"))
     run = run_of(tmp_path, RENDERER, prior, camera, make_scene=lambda: seen)
-    run = replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, points=1000)))
+    run = altered(run, {"inputs.evaluation.points": 1000})
     task.execute(run)
     at_zero = run.record.metrics_start["chamfer_l1"]
     trained = ["training the encoder" in phases_of(run, replace(task, encoder=encoder)) for _ in range(2)]

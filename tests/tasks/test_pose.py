@@ -19,7 +19,7 @@ from renderers.fields.analytic import box
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.tiny import CPU, Blind, ball_prior, camera_of, run_of, scene_of
+from tests.tiny import CPU, Blind, altered, ball_prior, camera_of, mesh_of, run_of, scene_of
 
 SIZES = (0.5, 0.35, 0.2)
 CAMERA = camera_of(24, angles=(30.0, 20.0))
@@ -40,7 +40,7 @@ DIST = load("renderer", "dist")
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A box with three unlike sides."""
-    return scene_of(trimesh.creation.box(2 * np.array(SIZES)), CAMERA)
+    return scene_of(mesh_of(trimesh.creation.box(2 * np.array(SIZES))), CAMERA)
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def test_a_known_shape_is_the_scenes(run):
 
 
 def test_a_renderer_without_a_gradient_towards_rays_is_unsupported(run):
-    blind = replace(run, inputs=replace(run.inputs, renderer=Blind()))
+    blind = altered(run, {"inputs.renderer": Blind()})
     with pytest.raises(Unsupported, match="Blind has no gradient towards rays"):
         SETTINGS.execute(blind)
 

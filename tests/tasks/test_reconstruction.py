@@ -23,7 +23,7 @@ from bench.tasks.reconstruction import Reconstruction
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
 from datasets.own_photographs import OwnPhotographs
-from datasets.scene import Scene, Truth, sample_surface, see
+from datasets.scene import Scene, sample_surface
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
@@ -33,7 +33,7 @@ from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE, RADIUS, nerf
 from tests.run.driving import command, record_of
-from tests.tiny import Blind, altered, ball_prior, camera_of, run_of
+from tests.tiny import Blind, altered, ball_prior, camera_of, icosphere, run_of, scene_of
 
 PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")
 SETTINGS = Reconstruction(
@@ -57,10 +57,8 @@ SETTINGS = Reconstruction(
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """An ellipsoid, larger than the sphere that fields begin as."""
-    made = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
-    mesh = Mesh(np.array(made.vertices) * [0.8, 0.65, 0.6], np.array(made.faces))
-    camera = camera_of(24)
-    return Scene("ellipsoid", mesh, see(Truth(mesh), camera))
+    made = scene_of(icosphere(1.0).moved(np.diag([0.8, 0.65, 0.6, 1.0])), camera_of(24))
+    return replace(made, name="ellipsoid")  # by which photographs are drawn
 
 
 def run_in(folder: Path, scene: Scene | None, *, renderer: str = "idr", field: str = "grid_12", **more) -> RunContext:
@@ -93,9 +91,7 @@ def assert_coloured_mesh(folder: Path) -> np.ndarray:
 
 
 def test_a_rendered_mesh_is_learnt_with_its_colours(scene, tmp_path):
-    run = run_in(tmp_path, scene)
-    run = replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, every=10)))
-    record = executed(run)
+    record = executed(altered(run_in(tmp_path, scene), {"inputs.evaluation.every": 10}))
     assert (record.status, record.reason) == ("ok", "")
     first, last = record.metrics_start, record.metrics
     assert set(first) == set(last) == set(COLOURED_DEFINITIONS) - set(WEIGHT) <= set(record.definitions)
@@ -118,7 +114,7 @@ def test_a_rendered_mesh_is_learnt_with_its_colours(scene, tmp_path):
 
 
 def without_pictures(run: RunContext) -> RunContext:
-    return replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, picture=None)))
+    return altered(run, {"inputs.evaluation.picture": None})
 
 
 @pytest.mark.parametrize(("masks", "margin"), [("not used", 0.3), ("none", 0.05)])  # behind it all is judged
@@ -168,10 +164,8 @@ def test_a_guide_reaches_the_loss_of_occupancy(scene, tmp_path):
 
 
 def test_a_renderer_without_a_gradient_is_unsupported(scene, tmp_path):
-    run = run_in(tmp_path, scene)
-    run = replace(run, inputs=replace(run.inputs, renderer=Blind()))
     with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
-        executed(run)
+        executed(altered(run_in(tmp_path, scene), {"inputs.renderer": Blind()}))
 
 
 @each("field", ["union_3", "prior"])
@@ -201,8 +195,7 @@ def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
         write_dtu(truth.with_suffix(""), points, plane=(0, 0, 1, 0), centre=CENTRE)
     truth = truth if kind != "dtu" else truth.with_suffix("")
     run = without_pictures(run_in(folder(tmp_path, "run"), None, truth=str(truth), scan=65))
-    evaluation = replace(run.inputs.evaluation, points=20_000)
-    record = executed(replace(run, inputs=replace(run.inputs, evaluation=evaluation)))
+    record = executed(altered(run, {"inputs.evaluation.points": 20_000}))
     assert record.status == "ok", record.reason
     mesh = read_mesh(tmp_path / "run" / "mesh_world.ply")
     away = np.abs(np.linalg.norm(sample_surface(mesh, 4000, 0).points - CENTRE, axis=1) - RADIUS).mean()

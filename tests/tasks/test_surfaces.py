@@ -16,7 +16,12 @@ from datasets.captures.hull import hull_mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
-from tests.tasks.test_reconstruction import assert_coloured_mesh, run_in, scene  # noqa: F401, a fixture
+from tests.tasks.test_reconstruction import (  # noqa: F401, a fixture
+    assert_coloured_mesh,
+    run_in,
+    scene,
+    without_pictures,
+)
 from tests.tiny import altered
 
 SHARED = {
@@ -43,9 +48,7 @@ SCORES = {name for name in COLOURED_DEFINITIONS if not name.startswith(OWN)}
 def test_a_surface_has_colours_metrics_and_pictures_and_no_evaluations(scene, tmp_path, name):  # noqa: F811
     if name == "stereo":
         pytest.importorskip("cv2", reason="task=stereo needs OpenCV")
-    run = run_in(tmp_path, scene)
-    run = replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, points=2000)))
-    task = TASKS[name]
+    run, task = altered(run_in(tmp_path, scene), {"inputs.evaluation.points": 2000}), TASKS[name]
     task.execute(run)
     record, metrics = run.record, run.record.metrics
     assert (record.status, record.reason) == ("ok", "")
@@ -65,10 +68,6 @@ def test_a_surface_has_colours_metrics_and_pictures_and_no_evaluations(scene, tm
         assert 0.1 < arrays["hit"].mean() < 0.9 and arrays["colours"][arrays["hit"]].std() > 0.02
         assert not arrays["colours"][~arrays["hit"]].any()
     assert not (tmp_path / "curve.jsonl").exists()
-
-
-def without_pictures(run):
-    return replace(run, inputs=replace(run.inputs, evaluation=replace(run.inputs.evaluation, picture=None)))
 
 
 def test_held_out_photographs_give_neither_shape_nor_colours(scene, tmp_path, monkeypatch):  # noqa: F811
