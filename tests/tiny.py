@@ -23,6 +23,7 @@ from renderers.fields.mlp import Decoder
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
+TRIANGLE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
 PEAK = 1e10  # operations a second that the machine of a run is said to do
 
 
@@ -120,8 +121,7 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
     """A run under way in a folder; its scene has no image of its own, since tasks that measure need none."""
     blank = torch.zeros(camera.height, camera.width)
     view = View(camera, blank, blank[..., None].expand(-1, -1, 3), blank.bool())
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    scene = Scene("a scene", Mesh(corners, np.array([[0, 2, 1]])), view)
+    scene = Scene("a scene", TRIANGLE, view)
     inputs = RunInputs(
         renderer=renderer,
         scene_name=scene.name,

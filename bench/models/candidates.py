@@ -82,7 +82,8 @@ def union_of(name: str, count: int) -> Candidate:
     flops = count * PARTS["rounded_box"].flops
 
     def starts(seen: Seen) -> list[Model]:
-        old = [] if seen.previous is None else _parts_of(seen.previous)
+        of_union = seen.previous is not None and seen.previous.candidate.startswith("union_")
+        old = list(seen.previous.parameters[0].detach().cpu()) if of_union else []
         kept = old if len(old) < count else []
         points = _subsampled(seen.points)
         choices = [_cluster_boxes(points, count, seen.seed + start) for start in range(CLUSTERINGS)]
@@ -216,11 +217,6 @@ def _cluster_box(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) ->
         return _fitting_box(cluster[:: -(-len(cluster) // MAX_CLUSTER_POINTS)])
     middle = cluster.mean(0) if len(cluster) else points.mean(0)
     return torch.cat([middle, torch.zeros(3), torch.full((3,), MIN_HALF_SIZE).log()])
-
-
-def _parts_of(model: Model) -> list[Float[Tensor, "10"]]:
-    """The parts of a union; none of another model."""
-    return list(model.parameters[0].detach().cpu()) if model.candidate.startswith("union_") else []
 
 
 def _near_points(points: Float[Tensor, "n 3"], cell: float, resolution: int) -> Int[Tensor, " m"]:

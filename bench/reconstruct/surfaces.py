@@ -28,12 +28,11 @@ FACING = 4.0  # power of the cosine between normal and view direction, by which 
 
 def given_clouds(shots: Sequence[Shot]) -> list[Cloud]:
     """The points of all given depths."""
-    clouds = []
-    for shot in shots:
-        if shot.depth is not None:
-            points = shot.camera.rays().at(shot.camera.distance(shot.depth))[shot.depth > 0]
-            clouds.append(Cloud(points.double().numpy(), shot.camera))
-    return clouds
+    return [
+        Cloud(shot.camera.rays().at(shot.camera.distance(shot.depth))[shot.depth > 0].double().numpy(), shot.camera)
+        for shot in shots
+        if shot.depth is not None
+    ]
 
 
 def measured_clouds(path: str, subject: Subject) -> list[Cloud]:

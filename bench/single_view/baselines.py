@@ -51,8 +51,7 @@ def mean_shape(dataset: Dataset, count: int, cache: Path, progress: Report) -> M
 
 def most_alike(image: Float[Tensor, "4 height width"], images: Sequence[ImagesOf]) -> int:
     """The shape one of whose images has the least mean squared difference from an image, mask included."""
-    shown = [torch.stack([one.image(view) for view in range(len(one.cameras))]) for one in images]
-    return int(torch.stack([(one - image).square().mean(dim=(1, 2, 3)).min() for one in shown]).argmin())
+    return int(torch.stack([(one.images() - image).square().mean(dim=(1, 2, 3)).min() for one in images]).argmin())
 
 
 def best_shape(mesh: Mesh, dataset: Dataset, count: int) -> int:

@@ -66,6 +66,10 @@ class ImagesOf:
         """An image as encoders take it; see `as_input`."""
         return as_input(self.colours[view].float() / 255, self.masks[view])
 
+    def images(self) -> Float[Tensor, "views 4 height width"]:
+        """All of them as encoders take them."""
+        return torch.stack([self.image(view) for view in range(len(self.cameras))])
+
     def first(self, views: int) -> "ImagesOf":
         """The first images; the points stay."""
         return replace(self, **{name: getattr(self, name)[:views] for name in OF_VIEWS})

@@ -115,7 +115,7 @@ class Recipe:
                 self._write(path, {"status": "nan", "reason": str(error)}, device)
                 raise
             with torch.no_grad():
-                mean = torch.stack([model(_inputs(one, device)).mean(dim=0) for one in images]).mean(dim=0)
+                mean = torch.stack([model(one.images().to(device)).mean(dim=0) for one in images]).mean(dim=0)
             unseen = self.imaging.images(self.dataset, Split.VALIDATION, VALIDATION, cache, progress)
             found = _found(model, course, unseen, mean, device)
             seconds = {"images": made, "training": course.seconds}
@@ -143,10 +143,6 @@ def overlap(shape: Values, images: ImagesOf, device: torch.device) -> float:
     found = shape(images.points[uniform].to(device)).cpu() < 0
     true = images.inside[uniform]
     return float((found & true).sum() / (found | true).sum().clamp_min(1))
-
-
-def _inputs(images: ImagesOf, device: torch.device) -> torch.Tensor:
-    return torch.stack([images.image(view) for view in range(len(images.cameras))]).to(device)
 
 
 def _found(

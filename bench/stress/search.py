@@ -86,10 +86,9 @@ class Search:
                 return end
         found, (low, high) = self.result(), self._interval()
         if high - low <= 2 / last or low > 1 or high < 0:
-            incomplete = [
-                end for end in (0, last) if self._needs_count(end, found) and tried.count(end) < self.settings.repeats
-            ]
-            return incomplete[0] if incomplete else None
+            decides = {0: found.level < 1 / last, last: found.level > 1 - 1 / last}
+            short = [end for end in decides if decides[end] and tried.count(end) < self.settings.repeats]
+            return short[0] if short else None
         return self._most_informative()
 
     def note(self, index: int, success: bool) -> None:
@@ -111,11 +110,6 @@ class Search:
         """The middle below which this share of the posterior lies."""
         below = self.probabilities.sum(axis=1).cumsum()
         return float(self.middles[min(int(np.searchsorted(below, share)), len(below) - 1)])
-
-    def _needs_count(self, end: int, found: Breakdown) -> bool:
-        """Whether the sweep's end needs its full count: the breakdown lies at it or beyond."""
-        step = 1 / (self.settings.levels - 1)
-        return found.level < step if end == 0 else found.level > 1 - step
 
     def _most_informative(self) -> int:
         """The level whose trial leaves the least expected entropy."""

@@ -72,18 +72,12 @@ def _arrays(record: records.Record) -> list[str]:
 
 
 def _block(scene: gallery.Scene, record: records.Record) -> gallery.Block:
-    first = {"": scene.whole([record], "photograph")}
-    rows = {
-        kind: [first.get(prefix, gallery.Cell()), *(scene.cell(record, paint) for paint in _paints(prefix))]
-        for prefix, kind in _kinds(record).items()
-    }
+    first, rows = {"": scene.whole([record], "photograph")}, {}
+    for prefix, kind in _kinds(record).items():
+        paints = [gallery.colours(prefix + side) for side in SIDES.values()]
+        paints += [_lit(prefix + SIDES["full size"], light) for light in LIGHTS.values()]
+        rows[kind] = [first.get(prefix, gallery.Cell()), *(scene.cell(record, paint) for paint in paints)]
     return gallery.Block(_name(record), ["given", *SIDES, *LIGHTS], rows)
-
-
-def _paints(prefix: str) -> list[gallery.Paint]:
-    """Pictures of a shape in sizes and from sides, and of its full size under lights."""
-    lit = [_lit(prefix + SIDES["full size"], light) for light in LIGHTS.values()]
-    return [*(gallery.colours(prefix + side) for side in SIDES.values()), *lit]
 
 
 def _lit(prefix: str, light: tuple[float, float, float]) -> gallery.Paint:

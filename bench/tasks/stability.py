@@ -113,12 +113,11 @@ class Stability:
 
     def _metrics(self, search: Search | Bisection, trials: "_Trials") -> dict[str, float | None]:
         found = search.result()
-        levels = {"": found.level, "_low": found.low, "_high": found.high}
-        within = {end: self._severity(level) for end, level in levels.items()}
+        levels, severity = {"": found.level, "_low": found.low, "_high": found.high}, self.stress.sweep.severity
         (mild, milds), (severe, severes) = trials.at(0), trials.at(1)
         failed = Counter(trial.outcome.failure for trial in trials.all)
         return {
-            **{f"breakdown{end}": severity for end, severity in within.items()},
+            **{f"breakdown{end}": severity(x) if x is not None and 0 <= x <= 1 else None for end, x in levels.items()},
             **{f"level{end}": level for end, level in levels.items()},
             "width": found.width,
             "trials": len(trials.all),
@@ -130,10 +129,6 @@ class Stability:
             "evaluations_per_ray": trials.spent(),
             **{f"failed_{kind.replace(' ', '_')}": failed[kind] for kind in Failure if kind and failed[kind]},
         }
-
-    def _severity(self, level: float | None) -> float | None:
-        """The severity at a level; None outside the sweep."""
-        return self.stress.sweep.severity(level) if level is not None and 0 <= level <= 1 else None
 
 
 @dataclass
@@ -179,6 +174,6 @@ class _Trials:
 
     def spent(self) -> float | None:
         """Median field values per ray at the mild end."""
-        costs = [trial.outcome.numbers.get("evaluations_per_ray") for trial in self.all if trial.level == 0]
-        known = [cost for cost in costs if cost is not None]
-        return float(np.median(known)) if known else None
+        mild = [trial.outcome.numbers for trial in self.all if trial.level == 0]
+        costs = [numbers["evaluations_per_ray"] for numbers in mild if "evaluations_per_ray" in numbers]
+        return float(np.median(costs)) if costs else None

@@ -12,7 +12,6 @@ from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.tasks.completion import Completion
-from datasets.mesh import Mesh
 from datasets.scene import Scene, View
 from renderers.camera import Camera
 from renderers.field import Kind
@@ -21,8 +20,8 @@ from renderers.fields.mlp import Decoder
 from renderers.rendering import Capabilities, Rendering, Status, Unsupported, check_kind
 from renderers.silhouette import Own
 from tests.looped import each
+from tests.tiny import CPU, TRIANGLE
 
-CPU = torch.device("cpu")
 SETTINGS = Completion(
     points="dense",
     depths="measured",
@@ -73,9 +72,8 @@ class Fake:
 def scene() -> Scene:
     motion = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]])
     camera = Camera(torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]), motion, height=2, width=2)
-    mesh = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
     normals = torch.tensor([[[0.0, 0.6, 0.8], [0.6, 0.0, 0.8]], [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]])
-    return Scene("a scene", mesh, View(camera, torch.tensor(DEPTH), normals, torch.tensor(MASK)))
+    return Scene("a scene", TRIANGLE, View(camera, torch.tensor(DEPTH), normals, torch.tensor(MASK)))
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.tasks import prior_fit
 from bench.tasks.deepsdf import DeepSDF
 from bench.tasks.prior_fit import PriorFit
-from datasets.mesh import Mesh, extract
+from datasets.mesh import extract
 from datasets.scene import Scene, Truth, View, see
 from tests.looped import each
-from tests.tiny import CPU, altered, ball_prior, camera_of, plane_decoder, run_of
+from tests.tiny import CPU, TRIANGLE, altered, ball_prior, camera_of, plane_decoder, run_of
 
 PRIOR = ball_prior()
 RENDERER = load("renderer", "dist")  # neither task renders with it
@@ -36,8 +36,7 @@ def wall() -> Scene:
     camera = camera_of(4, field_of_view=20.0)
     depth = torch.full((4, 4), 2.3)
     normals = torch.tensor([0.0, 0, 1]).expand(4, 4, 3).clone()
-    corners = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
-    return Scene("wall", corners, View(camera, depth, normals, torch.ones(4, 4, dtype=torch.bool)))
+    return Scene("wall", TRIANGLE, View(camera, depth, normals, torch.ones(4, 4, dtype=torch.bool)))
 
 
 def plane(height: float) -> Prior:

@@ -16,12 +16,7 @@ from datasets.captures.hull import hull_mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
-from tests.tasks.test_reconstruction import (  # noqa: F401, a fixture
-    assert_coloured_mesh,
-    run_in,
-    scene,
-    without_pictures,
-)
+from tests.tasks.test_reconstruction import assert_coloured_mesh, run_in, scene  # noqa: F401, a fixture
 from tests.tiny import altered
 
 SHARED = {
@@ -80,7 +75,7 @@ def test_held_out_photographs_give_neither_shape_nor_colours(scene, tmp_path, mo
 
     for name, function in (("with_colours", with_colours), ("hull_mesh", hull_mesh)):
         monkeypatch.setattr(f"bench.tasks.surfaces.{name}", noted(function))
-    HULL.execute(without_pictures(run_in(tmp_path, scene)))
+    HULL.execute(altered(run_in(tmp_path, scene), {"inputs.evaluation.picture": None}))
     assert [[shot.name for shot in shots] for shots in used] == [["1", "2", "3", "5", "6", "7"]] * 2
 
 
