@@ -30,11 +30,6 @@ class CandidateResult:
         return self.numbers.get("error")
 
     @property
-    def falling(self) -> bool:
-        """Whether its fit was stopped while its error still fell."""
-        return bool(self.numbers.get("falling"))
-
-    @property
     def kind(self) -> str:
         """Its key in `KINDS`."""
         return next(kind for kind in KINDS if self.name.startswith(kind))

@@ -21,7 +21,7 @@ from bench.evaluate.evaluate import (
 )
 from bench.evaluate.state import State, coloured_image, unseen, vertex_colours
 from bench.reconstruct.subject import Subject
-from bench.reconstruct.surfaces import painter
+from bench.reconstruct.surfaces import painter, with_colours
 from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness_scores
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
@@ -29,6 +29,7 @@ from datasets.mesh import Mesh
 from datasets.scene import View, sample_surface
 from datasets.shot import Shot, mask_iou
 from renderers.camera import sphere_span
+from renderers.field import Field
 
 SEEN = "seen_"  # prefix of metrics over the parts of both surfaces that given photographs see
 SURFACE = tuple(WORST_SURFACE)  # their names
@@ -74,8 +75,8 @@ def judge(state: State, subject: Subject) -> Evaluation:
     if state.mesh is None:
         failure = RunStatus.EMPTY, "the field has no surface in the unit sphere"
         return Evaluation(metrics, None, failure, field=field)
-    coloured = replace(state.mesh, colours=vertex_colours(field, state.mesh, inputs.device))
-    return Evaluation(metrics, coloured, notes=unrendered(state, views), field=field)
+    mesh = replace(state.mesh, colours=vertex_colours(field, state.mesh, inputs.device))
+    return Evaluation(metrics, mesh, notes=unrendered(state, views), field=field)
 
 
 def judge_mesh(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> Evaluation:
@@ -87,6 +88,12 @@ def judge_mesh(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> Evalua
     metrics |= image_scores([view for view, _ in seen], [image for _, image in seen], subject.held_out)
     failure = (RunStatus.EMPTY, "no surface was found") if mesh is None else None
     return Evaluation(metrics, mesh, failure)
+
+
+def coloured(field: Field, subject: Subject, inputs: RunInputs) -> Mesh | None:
+    """The mesh of a field, with the colours of the given photographs."""
+    mesh = State(field, inputs).mesh
+    return mesh and with_colours(mesh, subject.given)
 
 
 def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> dict[str, float]:

@@ -80,7 +80,8 @@ def _candidates(line: Line) -> list[Line]:
 
 def _falling(lines: list[Line]) -> str:
     """Which candidates are not at their end, and on which scenes."""
-    found = [f"{one.label} ({line['scene']})" for line in lines for one in line["candidates"].results if one.falling]
+    fits = [(one, line["scene"]) for line in lines for one in line["candidates"].results]
+    found = [f"{one.label} ({scene})" for one, scene in fits if one.numbers.get("falling")]
     return f"Not at their end, as the last round still lowered their error: {', '.join(found)}." if found else ""
 
 

@@ -11,17 +11,15 @@ from torch import Tensor
 from bench.evaluate.evaluate import evaluate
 from bench.evaluate.state import State
 from bench.pictures.run_figures import draw_curve
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge_mesh
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, coloured, judge_mesh
 from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.subject import NONE, Depths, PhotographTask, Subject, upright
-from bench.reconstruct.surfaces import with_colours
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, turned
 from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
 from bench.solve.solve import COSTS, check_field_gradient, defined, descend, solve
-from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot
 from renderers.boundary import rendered
@@ -160,14 +158,14 @@ class Multiview(PhotographTask):
         check_kind(inputs.renderer, problem.field())
 
         def scores(names: Sequence[str]) -> dict[str, float]:
-            found = judge_mesh(_coloured(problem.field(), subject, inputs), subject, inputs).metrics
+            found = judge_mesh(coloured(problem.field(), subject, inputs), subject, inputs).metrics
             return {name: found[name] for name in names if name in found}
 
         with run.off_clock():
             record.metrics_start = scores(list(COLOURED_DEFINITIONS))
         history = descend(problem, self.optimiser, run, lambda iteration: scores(("psnr", "seen_chamfer_l1")))
         with run.off_clock():
-            mesh = _coloured(problem.field(), subject, inputs)
+            mesh = coloured(problem.field(), subject, inputs)
             note_surface(run, mesh, subject, {}, history, problem.field())
             draw_curve(run.folder / "curve.png", history.curve)
         subject.finish(run)
@@ -182,7 +180,7 @@ class Multiview(PhotographTask):
         if run.inputs.photographed is None:
             return evaluate(State(field, run.inputs)).metrics
         subject = self.subject(run.inputs)
-        found = judge_mesh(mesh := _coloured(field, subject, run.inputs), subject, run.inputs).metrics
+        found = judge_mesh(mesh := coloured(field, subject, run.inputs), subject, run.inputs).metrics
         return found | (subject.judged(mesh, run.inputs) if subject.points is not None else {})
 
     def problem(
@@ -221,11 +219,6 @@ class Multiview(PhotographTask):
         axis, direction = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=1)
         similarity = torch.cat([self.shift * direction, radians(self.degrees) * axis, torch.tensor([self.scale]).log()])
         return similarity.expand(self.starts, -1)
-
-
-def _coloured(field: Field, subject: Subject, inputs: RunInputs) -> Mesh | None:
-    mesh = State(field, inputs).mesh
-    return mesh and with_colours(mesh, subject.given)
 
 
 class GivenPhotographs:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.evaluate.evaluate import OWN, Evaluation
 from bench.evaluate.state import State, vertex_colours
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, judge, judge_mesh
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, coloured, judge, judge_mesh
 from bench.reconstruct.pictures import draw_picture, draw_reconstruction, note_surface
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import with_colours
@@ -166,10 +166,9 @@ class OneImage:
         if self.image_path is not None:
             return {}
         images, subject = self._images(run, self.recipe(run.inputs, run.record.config))
-        state = State(field, run.inputs)
         if self.method == NETWORK:
-            return self._judged(state, images, subject).metrics
-        mesh = None if state.mesh is None else with_colours(state.mesh, subject.given)
+            return self._judged(State(field, run.inputs), images, subject).metrics
+        mesh = coloured(field, subject, run.inputs)
         return judge_mesh(mesh, subject, run.inputs).metrics | {"iou": overlap(field, images, run.inputs.device)}
 
     def _images(self, run: RunContext, recipe: Recipe) -> tuple[ImagesOf, Subject]:
@@ -255,10 +254,9 @@ class OneImage:
         settings, least = self.search.optimiser, self.search.least_reference
         history = descend(problem, settings, run, lambda iteration: {}, least_reference=least)
         with run.off_clock():
-            mesh = State(problem.field(), inputs).mesh
-            mesh = None if mesh is None else with_colours(mesh, subject.given)
-            scores = {"iou": overlap(problem.field(), images, inputs.device)}
-            note_surface(run, mesh, subject, scores, history, problem.field())
+            field = problem.field()
+            scores = {"iou": overlap(field, images, inputs.device)}
+            note_surface(run, coloured(field, subject, inputs), subject, scores, history, field)
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""
