@@ -35,6 +35,7 @@ VERSION = 1  # raise it when training changes, so that no prior of the old train
 HELD_OUT = 8  # validation shapes on which a new prior is evaluated
 NEAR, AROUND = 0.01, 0.08  # standard deviations, in scene units, of half and of a third of the samples
 RADIUS = 1.1  # scene units, of the sphere that the other samples fill: rays start on the unit sphere
+Trained = Decoder | TexturedDecoder
 CLOSE = 0.02  # scene units, from the surface, within which a prior is judged
 
 
@@ -122,7 +123,7 @@ class PriorSettings:
         """Plain data that determines the training."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
-    def new_decoder(self) -> Decoder | TexturedDecoder:
+    def new_decoder(self) -> Trained:
         """A decoder that begins near the distance of a sphere."""
         decoder = (Decoder if self.colour is None else TexturedDecoder)(**asdict(self.network))
         initialise_to_sphere(decoder if isinstance(decoder, Decoder) else decoder.shape, radius=0.5)
@@ -139,7 +140,7 @@ class PriorSettings:
 class Prior:
     """A decoder whose codes are shapes, and the codes of its training shapes. Code zero is the mean shape."""
 
-    decoder: Decoder | Published | TexturedDecoder
+    decoder: Trained | Published
     codes: Float[Tensor, "shapes code_length"]
 
 
@@ -237,7 +238,7 @@ def _colour_error(shape: TexturedShape, samples: DistanceSamples, chosen: Tensor
     return (found - samples.colours[chosen[:, None], places]).abs().mean()
 
 
-def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 200) -> float:
+def fit_error(decoder: Trained, samples: DistanceSamples, *, steps: int = 200) -> float:
     """As `surface_error`, with codes fitted to the samples from zero.
 
     Args:
@@ -261,7 +262,7 @@ def fit_error(decoder: Decoder, samples: DistanceSamples, *, steps: int = 200) -
 
 
 @torch.no_grad()
-def surface_error(decoder: Decoder, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples) -> float:
+def surface_error(decoder: Trained, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples) -> float:
     """Mean error of the distance within `CLOSE` of the surface, in scene units, at the codes of the samples' shapes."""
     errors = []
     for code, points, distances in zip(codes, samples.points, samples.distances, strict=True):
