@@ -18,6 +18,7 @@ from datasets.mesh import Mesh
 from datasets.meshes import load_mesh
 from datasets.range_scans import joined
 from datasets.scene import Scene, Split, Truth, View, see
+from datasets.shot import camera_within
 from datasets.views import look_at
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_positive
@@ -130,20 +131,17 @@ class DepthImage:
             known: the pixels on the object that have one.
             intrinsics: of these pixels.
         """
-        motion = self.camera.camera_to_world.numpy()
-        turn = motion[:3, :3]  # from the camera's axes to the scene's
+        to_world = np.eye(4)
         if self.camera_to_world is None:
             eye = torch.tensor([0.0, sin(radians(DOWN)), cos(radians(DOWN))])
-            turn = look_at(eye, torch.zeros(3))[:3, :3].T.double().numpy()
-        alone = Camera(intrinsics, torch.eye(4).double(), *known.shape)
-        points = alone.rays().at(alone.distance(depth)).numpy()[known] @ turn.T
+            to_world[:3, :3] = look_at(eye, torch.zeros(3))[:3, :3].numpy()
+        camera = Camera(intrinsics, self.camera.world_to_camera, *known.shape)
+        points = camera.rays().at(camera.distance(depth)).numpy()[known] @ to_world[:3, :3]
         low, high = np.quantile(points, [TRIMMED, 1 - TRIMMED], axis=0)
         centre = (low + high) / 2
-        size = np.quantile(np.linalg.norm(points - centre, axis=1), 1 - TRIMMED) / PLACED
-        in_units = np.eye(4)
-        in_units[:3, :3], in_units[:3, 3] = turn.T, turn.T @ centre / size
-        to_world = motion @ np.diag([size, size, size, 1]) @ in_units
-        return to_world, Camera(intrinsics.float(), torch.from_numpy(in_units).float(), *known.shape)
+        to_world[:3, 3] = to_world[:3, :3] @ centre
+        to_world[:3, :3] *= np.quantile(np.linalg.norm(points - centre, axis=1), 1 - TRIMMED) / PLACED
+        return to_world, camera_within(camera, to_world)
 
 
 def _stored(path: Path) -> Float[np.ndarray, "h w"]:

@@ -244,9 +244,10 @@ def _capture(layout: Layout, reading: Reading) -> Capture:
     longest = reading.longest
     whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
     source = "files" if frames[0].mask is not None else "the alpha channel"
-    within = tuple(shot.within(sphere.centre, sphere.radius) for shot in shots)
     to_world = np.diag([*[sphere.radius] * 3, 1.0])
-    to_world[:3, 3] = sphere.centre + middle
+    to_world[:3, 3] = sphere.centre
+    within = tuple(shot.within(to_world) for shot in shots)
+    to_world[:3, 3] += middle
     return Capture(
         layout.format,
         within,

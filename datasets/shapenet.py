@@ -91,7 +91,7 @@ class ShapeNet:
         if self.renders is None:
             return None
         folder = Path(self.renders) / self.folder.name / _id(self._file(split, index))
-        return tuple(take(frame, longest).within(np.zeros(3), 1.0) for frame in find_layout(folder).frames)
+        return tuple(take(frame, longest).within(np.eye(4)) for frame in find_layout(folder).frames)
 
     def _file(self, split: Split, index: int) -> Path:
         files = self.files[split]

@@ -12,8 +12,6 @@ from torch import Tensor
 from datasets.scene import Split
 from renderers.camera import Camera
 
-TURN = np.eye(3)  # none
-
 
 def mask_iou(found: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> float:
     """Intersection over union of two masks; 1 where both are empty."""
@@ -59,18 +57,17 @@ class Shot:
             allowed[shown] = torch.from_numpy(mask)[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
         return allowed
 
-    def within(self, centre: Float[np.ndarray, "3"], radius: float, turn: Float[np.ndarray, "3 3"] = TURN) -> "Shot":
-        """The same photograph, in single precision, in a world where the sphere about `centre` is the unit sphere.
+    def within(self, to_world: Float[np.ndarray, "4 4"]) -> "Shot":
+        """The same photograph, in single precision, in a world from which this similarity leads to its own."""
+        depth = None if self.depth is None else self.depth / float(np.linalg.norm(to_world[:3, 0]))
+        return replace(self, camera=camera_within(self.camera, to_world), depth=depth)
 
-        Args:
-            turn: from the axes of that world to those of this one.
-        """
-        motion = self.camera.world_to_camera.double().clone()
-        motion[:3, 3] = (motion[:3, :3] @ torch.from_numpy(centre).double() + motion[:3, 3]) / radius
-        motion[:3, :3] = motion[:3, :3] @ torch.from_numpy(turn)
-        depth = None if self.depth is None else self.depth / radius
-        camera = replace(self.camera, intrinsics=self.camera.intrinsics.float(), world_to_camera=motion.float())
-        return replace(self, camera=camera, depth=depth)
+
+def camera_within(camera: Camera, to_world: Float[np.ndarray, "4 4"]) -> Camera:
+    """A camera, in single precision, in a world from which a similarity leads to its own."""
+    motion = camera.world_to_camera.double() @ torch.from_numpy(to_world)
+    motion[:3] /= float(np.linalg.norm(to_world[:3, 0]))
+    return replace(camera, intrinsics=camera.intrinsics.float(), world_to_camera=motion.float())
 
 
 @runtime_checkable

@@ -92,13 +92,14 @@ class Subject:
         if self.to_world is None:
             return
         mesh = save_in_world(run.folder, self.to_world)
-        if self.points is not None:
-            with run.off_clock():
-                run.record.metrics |= self.judged(mesh, run.inputs)
-            run.record.definitions |= DTU_DEFINITIONS if isinstance(self.points, DtuScan) else {}
+        with run.off_clock():
+            run.record.metrics |= self.judged(mesh, run.inputs)
+        run.record.definitions |= DTU_DEFINITIONS if isinstance(self.points, DtuScan) else {}
 
     def judged(self, mesh: Mesh | None, inputs: RunInputs) -> dict[str, float]:
-        """The metrics of a mesh in the unit sphere against the points."""
+        """The metrics of a mesh in the unit sphere against the points; none where there are none."""
+        if self.points is None:
+            return {}
         if isinstance(self.points, DtuScan):
             return dtu_metrics(mesh and mesh.moved(self.to_world), self.points, seed=inputs.seed)
         count, threshold = inputs.evaluation.points, inputs.evaluation.fscore_threshold
@@ -130,22 +131,25 @@ def upright(subject: Subject) -> Subject:
     across, down = np.einsum("nki,nkj->kij", axes, axes)
     up = np.linalg.eigh(across - TILTED * down)[1][:, 0]
     up = up if (axes[:, 1] @ up).sum() < 0 else -up
-    turn = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()
-    centre, radius, to_old = np.zeros(3), 1.0, np.eye(4)
-    masked = all(shot.mask is not None for shot in subject.given)
-    if masked and (hull := hull_mesh(subject.given, HULL_SAMPLES)) is not None:
-        centre, shrunk = fit_in_sphere(hull.used, HULL_RADIUS)
+    to_old, radius = np.eye(4), 1.0
+    if (hull := _hull(subject.given)) is not None:
+        to_old[:3, 3], shrunk = fit_in_sphere(hull.used, HULL_RADIUS)
         radius = 1 / shrunk
-    to_old[:3, :3], to_old[:3, 3] = radius * turn, centre
+    to_old[:3, :3] = radius * Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()
     return replace(
         subject,
-        given=tuple(shot.within(centre, radius, turn) for shot in subject.given),
-        held_out=tuple(shot.within(centre, radius, turn) for shot in subject.held_out),
+        given=tuple(shot.within(to_old) for shot in subject.given),
+        held_out=tuple(shot.within(to_old) for shot in subject.held_out),
         truth=None if subject.truth is None else subject.truth.moved(np.linalg.inv(to_old)).cut_off(),
         found=f"{subject.found}; set upright for the prior, its unit sphere {radius:.3g} times as large",
         to_world=None if subject.to_world is None else subject.to_world @ to_old,
         points=within(subject.points, to_old) if isinstance(subject.points, np.ndarray) else subject.points,
     )
+
+
+def _hull(shots: Sequence[Shot]) -> Mesh | None:
+    """The visual hull; None where it is empty, or a mask is not known."""
+    return hull_mesh(shots, HULL_SAMPLES) if all(shot.mask is not None for shot in shots) else None
 
 
 def visible(scene: Truth, shot: Shot, sampled: Surface) -> Bool[np.ndarray, " n"]:
@@ -266,8 +270,7 @@ def hull_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:
     Raises:
         BadInput: without masks, or where their hull is empty.
     """
-    hull = hull_mesh(shots, HULL_SAMPLES) if all(shot.mask is not None for shot in shots) else None
-    if hull is None:
+    if (hull := _hull(shots)) is None:
         raise BadInput(f"{NO_HULL}, or set task.guide=none")
     scene = Truth(hull, closed=False)
     views = [see(scene, shot.camera) for shot in shots]

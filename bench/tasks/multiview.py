@@ -157,16 +157,18 @@ class Multiview(PhotographTask):
         problem = self._problem(inputs.prior, given, torch.Generator().manual_seed(inputs.seed))
         check_kind(inputs.renderer, problem.field())
 
-        def scores(names: Sequence[str]) -> dict[str, float]:
-            found = judge_mesh(coloured(problem.field(), subject, inputs), subject, inputs).metrics
-            return {name: found[name] for name in names if name in found}
+        def mesh() -> Mesh | None:
+            return coloured(problem.field(), subject, inputs)
+
+        def scores(iteration: int) -> dict[str, float]:
+            found = judge_mesh(mesh(), subject, inputs).metrics
+            return {name: found[name] for name in ("psnr", "seen_chamfer_l1") if name in found}
 
         with run.off_clock():
-            record.metrics_start = scores(list(COLOURED_DEFINITIONS))
-        history = descend(problem, self.optimiser, run, lambda iteration: scores(("psnr", "seen_chamfer_l1")))
+            record.metrics_start = judge_mesh(mesh(), subject, inputs).metrics
+        history = descend(problem, self.optimiser, run, scores)
         with run.off_clock():
-            mesh = coloured(problem.field(), subject, inputs)
-            note_surface(run, mesh, subject, {}, history, problem.field())
+            note_surface(run, mesh(), subject, {}, history, problem.field())
             draw_curve(run.folder / "curve.png", history.curve)
         subject.finish(run)
 
@@ -180,8 +182,8 @@ class Multiview(PhotographTask):
         if run.inputs.photographed is None:
             return evaluate(State(field, run.inputs)).metrics
         subject = self.subject(run.inputs)
-        found = judge_mesh(mesh := coloured(field, subject, run.inputs), subject, run.inputs).metrics
-        return found | (subject.judged(mesh, run.inputs) if subject.points is not None else {})
+        found = judge_mesh(coloured(field, subject, run.inputs), subject, run.inputs)
+        return found.metrics | subject.judged(found.mesh, run.inputs)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device

@@ -88,7 +88,7 @@ class Reconstruction(PhotographTask):
         """The metrics of a field that a run ended on; see `bench.setup.inputs.Judges`."""
         subject = self.subject(run.inputs)
         found = judge(State(field, run.inputs), subject)
-        return found.metrics | (subject.judged(found.mesh, run.inputs) if subject.points is not None else {})
+        return found.metrics | subject.judged(found.mesh, run.inputs)
 
     def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
         """The problem of photographs with the field of a name."""
