@@ -20,6 +20,7 @@ from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, turned
 from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
 from bench.solve.solve import COSTS, check_field_gradient, defined, descend, solve
+from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot
 from renderers.boundary import rendered
