@@ -1,4 +1,4 @@
-"""`python -m bench.prior dataset=sofa`: trains the prior of a dataset, or finds it, and prints its path."""
+"""`python -m bench.prior dataset=sofa`: finds or trains the prior of a dataset, or of `prior.of`; prints its path."""
 
 import sys
 
@@ -13,17 +13,16 @@ def main() -> int:
         from bench.machine.environment import flushing_denormals
         from bench.progress import run_progress
         from bench.setup.inputs import cell_of
-        from bench.shape_prior import PriorSettings, find, make_prior
+        from bench.shape_prior import PriorSettings, prior_file
         from datasets.network_files import Networked
 
         cell = cell_of(run.config)
-        dataset, settings, folder = cell.inputs.dataset, cell.prior, cell.inputs.cache
-        if isinstance(dataset, Networked) or not isinstance(settings, PriorSettings):
+        inputs, settings = cell.inputs, cell.prior
+        if isinstance(inputs.dataset, Networked) or not isinstance(settings, PriorSettings):
             raise ValueError("the codes of a network are the prior already: there is nothing to train")
-        path = find(dataset, settings, folder)
-        if path is None:
-            with flushing_denormals(), run_progress("prior") as progress:
-                path = make_prior(dataset, settings, folder, cell.inputs.device, progress)
+        inputs.check_prior()
+        with flushing_denormals(), run_progress("prior") as progress:
+            path = prior_file(cell.learnt, settings, inputs.cache, inputs.device, progress)
         print(path)
 
     return command_line(train, runs=False)

@@ -289,7 +289,14 @@ def initialise_to_sphere(decoder: Decoder, radius: float) -> None:
 def prior_for(
     dataset: Dataset, settings: PriorSettings, priors_dir: Path, device: torch.device, progress: Report
 ) -> Prior:
-    """The prior of a dataset: shipped, else from `priors_dir`, else newly trained and stored there."""
+    """The prior of a dataset; see `prior_file`."""
+    return _load(prior_file(dataset, settings, priors_dir, device, progress), settings)
+
+
+def prior_file(
+    dataset: Dataset, settings: PriorSettings, priors_dir: Path, device: torch.device, progress: Report
+) -> Path:
+    """The path of a dataset's prior: shipped, else in `priors_dir`, where a new one is stored once it is trained."""
     path = find(dataset, settings, priors_dir)
     if path is None:
         with file_lock(priors_dir, prior_key(dataset, settings)):
@@ -298,7 +305,7 @@ def prior_for(
                 what = "fitting a network to one shape" if settings.of_one_shape else "training a prior"
                 notice(f"{what} of {dataset.name}, once; it is stored in {priors_dir}")
                 path = make_prior(dataset, settings, priors_dir, device, progress)
-    return _load(path, settings)
+    return path
 
 
 def find(dataset: Dataset, settings: PriorSettings, priors_dir: Path) -> Path | None:

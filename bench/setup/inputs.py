@@ -178,6 +178,7 @@ class Cell:
 
     Args:
         prior: how the prior is trained, where it has to be; or the network whose codes it is.
+        learnt: the dataset whose prior is trained.
         width: of the prior's network, in neurons per layer.
         threads: of the CPU; None leaves it to `threads_for`.
     """
@@ -185,6 +186,7 @@ class Cell:
     task: Task
     inputs: RunInputs
     prior: PriorSettings | Networked
+    learnt: Dataset
     width: int
     threads: int | None
 
@@ -265,7 +267,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         trained=index if known is shown and (shown or (split == Split.TRAIN and index < own)) else None,
     )
     _check(task, inputs, index)
-    return Cell(task, inputs, prior, known.decoder.width if known else prior.network.width, threads)
+    return Cell(task, inputs, prior, learnt, known.decoder.width if known else prior.network.width, threads)
 
 
 @contextmanager

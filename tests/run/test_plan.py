@@ -1,7 +1,6 @@
 """What is planned is checked before anything runs; plan=true lists it, and leaves nothing behind."""
 
 import re
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -187,12 +186,13 @@ def test_of_many_like_runs_a_part_is_read(times_of):
     assert times_of([run(1.0, scale="desk")] * 900) == ([], plan_module.MOST)
 
 
-def test_the_cells_of_a_sweep_are_no_runs(tmp_path, monkeypatch, capsys):
+def test_the_cells_of_a_sweep_are_no_runs_and_a_prior_is_of_whom_it_is_asked(tmp_path):
     where = f"results_dir={tmp_path / 'r'}"
-    monkeypatch.setattr(sys, "argv", ["bench", "-m", "dataset=sofa,plane", where])
-    assert prior_main() == 0
-    assert [Path(line).name.split("-")[0] for line in capsys.readouterr().out.splitlines()] == ["sofa", "plane"]
+    for asked in (["dataset=sofa,plane"], ["dataset=photos", f"dataset.path={tmp_path}", "prior.of=sofa,plane"]):
+        done = command("-m", *asked, where, main=prior_main)
+        assert [Path(line).name.split("-")[0] for line in done.out.splitlines()] == ["sofa", "plane"], done.err
     assert not list((tmp_path / "r").rglob("plan.json"))
+    assert "set prior.of=sofa" in command("dataset=photos", f"dataset.path={tmp_path}", where, main=prior_main).err
 
 
 @pytest.mark.parametrize("main", [prior_main, train_main])
