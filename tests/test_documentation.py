@@ -28,17 +28,13 @@ from bench.run.command import with_network
 from bench.run.pack import register_slurm
 from tests import composing, documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
+from tests.run.driving import SMALLEST
 from tests.run.driving import command as typed
 
 HYDRA = ("bench", "bench.prior", "bench.train")  # commands whose arguments are choices and keys
 COMMANDS = documentation.commands()
 COMPOSED = [command for command in COMMANDS if command.module in HYDRA]
-SMALL = (
-    "scale=smoke", "isolation=off", "threads=1", "task.optimiser.iterations=3", "view.resolution=16", "task.points=20",
-    "evaluation.picture=null", "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null",
-)  # fmt: skip
-
-
+SMALL = (*SMALLEST, "task.optimiser.iterations=3", "view.resolution=16", "task.points=20")
 QUICK = (  # with all sizes of scale=smoke that make a run last
     "scale=smoke", "isolation=off", "threads=1", "scale.grid=24", "scale.sweep_grid=24", "scale.points=200",
     "scale.picture=16", "scale.iterations=3", "scale.priors.own.shapes=4", "scale.priors.own.steps=10",

@@ -16,7 +16,7 @@ from datasets.scene import Split, make_scene, sample_surface
 from datasets.views import ViewSampler
 from tests.looped import each
 from tests.made_scans import RADIUS, TURNS, write_scans
-from tests.run.driving import command, record_of
+from tests.run.driving import SMALLEST, command, record_of
 
 VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=48)
 EMPTY = b"ply\nformat ascii 1.0\nelement vertex 0\nproperty int x\nproperty int y\nproperty int z\nend_header\n"
@@ -126,16 +126,15 @@ def test_it_has_as_many_numbers_as_scans_and_no_prior(folder):
         scans(folder).mesh(Split.TRAIN, 0)
 
 
-def test_a_run_takes_the_depths_that_it_is_told(folder, tmp_path, depths="exact"):
-    arguments = ("dataset=scans", f"dataset.path={folder}", "index=1", "field=sphere", "scale=smoke", "threads=1")
-    small = ("view.resolution=16", "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null")
-    given = ("task.points=dense", f"task.depths={depths}", "task.optimiser.iterations=4", "evaluation.picture=null")
-    done = command(*arguments, *small, *given, "isolation=off", f"results_dir={tmp_path}")
+def test_a_run_takes_the_depths_that_it_is_told(folder, tmp_path):
+    arguments = ("dataset=scans", f"dataset.path={folder}", "index=1", "field=sphere", "view.resolution=16")
+    given = ("task.points=dense", "task.depths=exact", "task.optimiser.iterations=4")
+    done = command(*SMALLEST, *arguments, *given, f"results_dir={tmp_path}")
     record = record_of(done.out)
     assert record["scene"] == f"{folder.name} test 1"
     (note,) = [note for note in record["notes"] if note.startswith("measured: ")]
     assert record["evaluations"]["observed"] == int(note.split()[1])
-    assert record["config"]["task"]["depths"] == depths
+    assert record["config"]["task"]["depths"] == "exact"
 
 
 def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
@@ -146,11 +145,11 @@ def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
     return Mesh(ball.vertices, np.concatenate([np.delete(ball.faces, [first, second], axis=0), tube]))
 
 
-def test_a_scan_with_a_tangle_keeps_its_surface(inverted=True):
+def test_a_scan_with_a_tangle_keeps_its_surface():
     ball = trimesh.creation.icosphere(5)
     near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]
     tangled = handled(ball, 0, near)
-    mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]) if inverted else tangled, smoothed)
+    mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]), smoothed)
     assert mesh.watertight
     assert mesh.repairs[-1].startswith("replaced by its Poisson reconstruction, since its parts do not close")
     points = sample_surface(mesh, 2000, seed=0).points

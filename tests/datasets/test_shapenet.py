@@ -19,15 +19,11 @@ from datasets.shapenet import ShapeNet
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
-from tests.run.driving import command, record_of
+from tests.run.driving import SMALLEST, command, record_of
 
 SOFA, TABLE = "04256520", "04379243"
 IDS = [f"{number:02x}a9" for number in (11, 3, 7, 12, 5, 10)]  # on disk; in no order
-TINY = (
-    "scale=smoke", "isolation=off", "threads=1", "field=box", "view.resolution=12", "task.points=20",
-    "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null", "evaluation.picture=null",
-    "task.optimiser.iterations=2",
-)  # fmt: skip
+TINY = (*SMALLEST, "field=box", "view.resolution=12", "task.points=20", "task.optimiser.iterations=2")
 
 
 def write_shape(folder: Path, synset: str, name: str, version: int = 2, shape: trimesh.Trimesh | None = None) -> None:

@@ -26,6 +26,10 @@ FAILING = (
     "view.resolution=12", "task.points=20", "evaluation.grid=16", "evaluation.points=100", "evaluation.picture=null",
     "evaluation.every=null", "threads=1",
 )  # fmt: skip
+SMALLEST = (
+    "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null",
+    "evaluation.picture=null",
+)  # fmt: skip
 PATIENCE = 120.0  # seconds that a test waits for what must come; it is there to end a test that hangs
 
 

@@ -32,7 +32,7 @@ from tests.looped import each
 from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE, RADIUS, nerf
-from tests.run.driving import command, record_of
+from tests.run.driving import SMALLEST, command, record_of
 from tests.tiny import Blind, altered, ball_prior, camera_of, icosphere, run_of, scene_of
 
 PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")
@@ -244,20 +244,11 @@ def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
     assert named.evaluations == record.evaluations
 
 
-TINY = (
-    "dataset=photos", "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=16", "evaluation.points=100",
-    "evaluation.every=null", "evaluation.picture=null",
-)  # fmt: skip
-
-
-def run_command(folder: Path, *arguments: str):
-    nerf(folder)
-    return command(*TINY, f"dataset.path={folder}", f"results_dir={folder / 'results'}", *arguments)
-
-
 def test_a_command_learns_photographs(tmp_path):
-    small = ("task.optimiser.iterations=4", "task.rays=64", "field=grid_8", "task.longest=16")
-    code, out, err = run_command(tmp_path, "task=reconstruction", "renderer=idr", *small, "dataset.masks=false")
+    nerf(tmp_path)
+    given = ("dataset=photos", f"dataset.path={tmp_path}", "dataset.masks=false", f"results_dir={tmp_path / 'results'}")
+    small = (*SMALLEST, "task.optimiser.iterations=4", "task.rays=64", "field=grid_8", "task.longest=16")
+    code, out, err = command(*given, "task=reconstruction", "renderer=idr", *small)
     assert code == 0 or "did not fall" in err, err
     record = record_of(out)
     assert record["scene"] == tmp_path.name and record["task"] == "reconstruction"
