@@ -247,6 +247,7 @@ def register_resolvers() -> None:
     OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
     OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
     OmegaConf.register_new_resolver("stem_of", _stem, replace=True)
+    OmegaConf.register_new_resolver("prior_kind", _prior_kind, replace=True)
     OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
 
 
@@ -301,10 +302,16 @@ def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
     return ",".join(f"{name},tuned/{name}" for name in kept if name in tuned)
 
 
+def _prior_kind(of: str | None, own: str) -> str:
+    """A key of `scale.priors`: the kind of prior of the run's dataset, or of the one that `prior.of` names."""
+    known = read_rows(CONF)["dataset"]
+    return own if of is None else str(known.get(of, {}).get("_prior_", "own"))
+
+
 def _stem(path: str | None) -> str:
     """The name of a file, without suffix, by which a row is told from the same row of another file."""
     if path is None:
-        raise ValueError("+method=cloud needs a file of points: add task.cloud=POINTS.ply")
+        return "no file"  # which the task refuses
     return Path(path).stem
 
 

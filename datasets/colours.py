@@ -1,6 +1,5 @@
 """Colours of a mesh file's own surface, by its textures, materials or vertices, on the shapes that are made of it."""
 
-import re
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from datasets.extras import named_files
 from datasets.mesh import Mesh, joined
 from datasets.meshes import read_mesh
 from datasets.scene import Truth
@@ -60,19 +60,6 @@ class FileColours:
                 here = piece == number
                 colours[here] = uv_to_interpolated_color(colours[here, :2], one.image)[:, :3] / 255
         return colours.clip(0, 1)
-
-
-def named_files(path: Path) -> list[Path]:
-    """The .mtl files that an .obj names, and the images that these name, whether they are there or not."""
-    libraries = _named(path, "mtllib") if path.suffix.lower() == ".obj" else []
-    return [*libraries, *(image for file in libraries if file.is_file() for image in _named(file, "map_Kd"))]
-
-
-def _named(path: Path, key: str) -> list[Path]:
-    """The files that lines of a key name, beside `path`; an option such as `-s 1 1 1` stands before the name."""
-    lines = re.findall(rf"^\s*{key}[ \t]+(.+?)\s*$", path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
-    names = [line.split()[-1] if line.startswith("-") else line for line in dict.fromkeys(lines)]
-    return [path.parent / name.replace("\\", "/") for name in names]
 
 
 @lru_cache(maxsize=64)

@@ -28,6 +28,7 @@ TRIMMED = 0.01  # share of the points on each side that do not count for it, suc
 DOWN = 25.0  # degrees by which a camera of unknown place is taken to look down
 MARGIN = 0.1  # share of the object's extent in the image that is shown around it
 FEWEST = 20  # pixels with a depth
+APART = 0.15  # scene units: median distance of what is seen from a truth, beyond which it is that of something else
 FORMS = "write [fx,fy,cx,cy] or [[fx,0,cx],[0,fy,cy],[0,0,1]], and [4, 4] numbers for a rigid motion"
 
 
@@ -110,12 +111,18 @@ class DepthImage:
             )
         to_world, camera = self._placed(torch.from_numpy(depth), known, torch.from_numpy(intrinsics))
         measured = torch.from_numpy(depth * mask / np.linalg.norm(to_world[:3, 0])).float()
+        points = camera.rays().at(camera.distance(measured)).double().numpy()[known]
         if self.truth is None:
-            points = camera.rays().at(camera.distance(measured)).double().numpy()[known]
             mesh = joined(np.argwhere(known)[:, ::-1] * (1, -1), points)  # faces look at the camera
             note = "judged by what is seen, since there is no dataset.truth"
         else:
             mesh, note = load_mesh(self.truth).moved(np.linalg.inv(to_world)), f"the true shape is '{self.truth}'"
+            apart = float(np.median(Truth(mesh).distance(points)))
+            if apart > APART:
+                raise BadInput(
+                    f"what {self.path} shows lies {apart / PLACED:.2g} of its radius from dataset.truth (median): give "
+                    "both in one world, by dataset.camera_to_world and dataset.scale, and check dataset.intrinsics"
+                )
         seen = see(Truth(mesh, closed=False), camera)
         view = View(camera, seen.depth, seen.normals, torch.from_numpy(mask))
         mesh = replace(mesh, repairs=(note, *mesh.repairs))

@@ -1,5 +1,6 @@
-"""Libraries that not everybody needs: whether they are installed, and how extras of this project are."""
+"""What needs no library: which of them are installed, and the files that a mesh file names."""
 
+import re
 import shlex
 from importlib import metadata
 from pathlib import Path
@@ -26,3 +27,16 @@ def install(extra: str, root: Path = ROOT) -> str:
         return f"pip install 'implicit-bench[{extra}]'"
     folder = "." if root == Path.cwd() else str(root)
     return f"pip install -e {shlex.quote(f'{folder}[{extra}]')}"
+
+
+def named_files(path: Path) -> list[Path]:
+    """The .mtl files that an .obj names, and the images that these name, whether they are there or not."""
+    libraries = _named(path, "mtllib") if path.suffix.lower() == ".obj" else []
+    return [*libraries, *(image for file in libraries if file.is_file() for image in _named(file, "map_Kd"))]
+
+
+def _named(path: Path, key: str) -> list[Path]:
+    """The files that lines of a key name, beside `path`; an option such as `-s 1 1 1` stands before the name."""
+    lines = re.findall(rf"^\s*{key}[ \t]+(.+?)\s*$", path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
+    names = [line.split()[-1] if line.startswith("-") else line for line in dict.fromkeys(lines)]
+    return [path.parent / name.replace("\\", "/") for name in names]

@@ -13,9 +13,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from datasets.colours import FileColours, named_files
+from datasets.colours import FileColours
 from datasets.deform import deform
-from datasets.extras import version
+from datasets.extras import named_files, version
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
 from datasets.scene import Split, seed_of

@@ -124,16 +124,22 @@ class Fitter:
     def finish(self, fitted: Fitted, rounds: int) -> None:
         """Fits a candidate round by round, until a round lowers its held-out error by no standard error of the change.
 
+        A round that raises the error, or fails after another, is taken back.
+
         Where it is still falling after the last of all rounds, the evidence says so.
         """
         evidence = fitted.evidence
         for _ in range(rounds):
-            before = evidence.error
+            before, kept = evidence.error, [one.detach().clone() for one in fitted.model.parameters]
             self.fit(fitted, self.settings.iterations, checkpoints=True)
             gain = inf if before is None else before.mean - evidence.mean
             noise = 0.0 if before is None or evidence.error is None else evidence.error.noise_of_difference(before)
             evidence.falling = not fitted.failed and gain > noise
             if not evidence.falling:
+                if before is not None and not gain > 0:  # the round is taken back, and its cost counts
+                    for parameter, old in zip(fitted.model.parameters, kept, strict=True):
+                        parameter.data.copy_(old)
+                    evidence.error, evidence.status, evidence.reason = before, RunStatus.OK, ""
                 break
 
     def _run(

@@ -51,19 +51,22 @@ class Given:
         observed: its pixels whose depth was given.
         photographs: all of them, or None.
         mask: whether the silhouette was given as well.
+        coloured: whether its colours were.
     """
 
     view: View
     observed: Bool[np.ndarray, "height width"]
     photographs: Float[np.ndarray, "views height width 3"] | None = None
     mask: bool = True
+    coloured: bool = False
 
     @property
     def summary(self) -> str:
         """The input in words."""
         if self.photographs is not None:
             return f"{len(self.photographs)} photographs"
-        return f"{'mask and ' if self.mask else ''}{int(self.observed.sum())} depths"
+        parts = {"mask": self.mask, "colours": self.coloured, f"{int(self.observed.sum())} depths": self.observed.any()}
+        return " and ".join(name for name, there in parts.items() if there) or "distances"
 
 
 @rc_context(SCREEN)

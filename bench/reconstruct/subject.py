@@ -55,9 +55,7 @@ class Depths:
         if self.points == NONE:
             return replace(shot, depth=None)
         if shot.depth is None or shot.mask is None:
-            raise BadInput(
-                "these photographs have no depths: take task=stereo, or set task.depths.points=none of another"
-            )
+            raise BadInput("these photographs have no depths: set task.depths.points=none, or take task=stereo")
         first, second = np.random.default_rng(seed).integers(2**62, size=2).tolist()
         chosen = observed_pixels(shot.mask, self.points, first)
         noise = self.noise * torch.randn(shot.depth.shape, generator=torch.Generator().manual_seed(second))

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import OURS, Rerun, check, check_draw
 from bench.records.record import NEUTRAL_KEYS, RunStatus, digest, file_lock, leads_out, link_out, read_record, to_json
 from bench.tables import own_row
-from datasets.extras import version
+from datasets.extras import named_files, version
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (
@@ -237,14 +237,15 @@ def _package(name: str) -> str:
 
 
 def _content(path: Path) -> str:
-    """Hash of a file's name and bytes, of a run's field, or of all files of a folder; empty where there is none."""
+    """Hash of a file's name, bytes and the files it names, of a run's field, or a folder; empty where there is none."""
     try:
         if (path / FIELD).is_file():
             return _content(path / FIELD)
         if path.is_dir():
             found = [child for part in IN_FOLDERS for child in sorted(path.glob(part)) if child.is_file()]
             return digest([_content(child) for child in found if child.suffix not in ARCHIVES])
-        return digest([path.name, hashlib.sha256(path.read_bytes()).hexdigest()])
+        own = [path.name, hashlib.sha256(path.read_bytes()).hexdigest()]
+        return digest([*own, *map(_content, named_files(path))])
     except OSError:
         return ""
 

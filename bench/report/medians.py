@@ -39,6 +39,7 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
 
     A metric that a run lacks though it ended ok is None.
     """
+    runs = runs.made
     frame = runs.frame[["row", "preset"]].assign(
         **{name: scored(runs, name) for name in names},
         ok=(runs.frame.status == "ok").to_numpy(bool),

@@ -36,7 +36,7 @@ def columns(method: str, *ratios: Column) -> tuple[Column, ...]:
 
 def lines_of(runs: Runs, family: str, presets: Iterable[str]) -> list[dict[str, Any]]:
     """A line per row of one family, with its ratio to the row of each of some presets under that preset."""
-    own = runs.where(runs.frame.family == family)
+    own = runs.where(runs.frame.family == family).made
     errors = {row: errors_of(records) for row, records in own.rows().items()}
     others = {row: values for row, values in errors.items() if row.preset in presets}
     return [

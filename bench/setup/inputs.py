@@ -87,7 +87,7 @@ class RunInputs:
         if not self.has_prior:
             raise BadInput(
                 f"{self.scene_name} has no prior of its own: set prior.of=sofa, plane, table or car, or prior=deepsdf "
-                "prior.path=FOLDER; of a depth image, or take field=auto, without a prior"
+                "prior.path=FOLDER; a depth image is completed without one by field=auto"
             )
 
     def check_fitted(self) -> int:
@@ -196,6 +196,14 @@ class Cell:
         torch.manual_seed(self.inputs.seed)
 
 
+def _family(name: str) -> Dataset:
+    """The dataset that `prior.of` names."""
+    try:
+        return load("dataset", name)
+    except ValueError:
+        raise BadInput(f"prior.of={name} has no prior: name sofa, plane, table, car or a primitive") from None
+
+
 def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None) -> Cell:
     """Builds everything that a configuration names, and checks all of it before the first slow step.
 
@@ -233,7 +241,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     family = config["prior"].get(OF)
     with _naming("prior", config["prior"]):
         (prior,) = parts("prior")
-        learnt = dataset if family is None else load("dataset", family)
+        learnt = dataset if family is None else _family(family)
         known = shown if isinstance(prior, PriorSettings) else prior.network(0)
 
     own = prior.shapes if isinstance(prior, PriorSettings) and family is None else 0

@@ -70,6 +70,7 @@ class CodeProblem:
         photographs: the given ones, for pictures.
         compared_at: iteration at which the first and the last loss are evaluated; None: each at its own.
         judged: gives of a field what must fall in place of the loss; None: the loss.
+        mask, coloured: whether a mask is given, and colours, for pictures.
     """
 
     prior: Prior
@@ -84,6 +85,8 @@ class CodeProblem:
     photographs: Float[np.ndarray, "views height width 3"] | None = None
     compared_at: int | None = None
     judged: Callable[[Field], float] | None = None
+    mask: bool = True
+    coloured: bool = False
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = CHAMFER
@@ -130,7 +133,8 @@ class CodeProblem:
 
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
-        given = Given(states[0].inputs.scene.given()[0], self.observed.cpu().numpy(), self.photographs)
+        view, observed = states[0].inputs.scene.given()[0], self.observed.cpu().numpy()
+        given = Given(view, observed, self.photographs, self.mask, self.coloured)
         draw_run(folder, states, given, curve, title)
 
     def loss(self, iteration: int) -> Terms:

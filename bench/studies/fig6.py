@@ -33,7 +33,7 @@ RUNS = (
 
 def make(runs: Runs) -> Result:
     """A line per method: its success rate at each angle, and its costs."""
-    found = _poses(runs)
+    found = _poses(runs.made)
     rows = dict(list(found.groupby(["row", "preset"], sort=False)))
     angles = sorted(found.degrees.unique())
     settings = records.setting(runs.requested(), "task") or {}

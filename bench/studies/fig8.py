@@ -39,16 +39,19 @@ COLUMNS = (
 def make(runs: Runs) -> Result:
     """A line per shape, and pictures of its mesh, of its code of training, and of the code of one image."""
     code, *whole, network = (runs.number(key).median() for key in BYTES)
+    errors = runs.number("colour_error").groupby(runs.setting("split"), sort=False).median()
+    told = ", ".join(f"*{error:.2g}* ({split})" for split, error in errors.items())
     scenes = {_name(record): gallery.Scene(runs, [record], _arrays(record)) for record in runs.records}
     return Result(
         runs,
         "Shapes with colours as codes, rendered in sizes, from sides and under lights.",
         "Renderings of the mesh, and of codes of shape and colour; a test shape has no code of training.",
-        question="How much smaller is a code than mesh and texture?",
-        verdict=f"A code of shape and colour has *{code:.0f}* bytes, mesh and texture {sum(whole) / 1000:.0f} kB "
-        f"(medians, n = {format.plural(len(runs.records), 'shape')}); the network that all codes of a family share has "
-        f"{network / 1000:.0f} kB.",
+        question="What does a code of shape and colour show?",
+        verdict=f"Error of colour {told}; a code has {code:.0f} bytes, the network that all codes of a family share "
+        f"{network / 1000:.0f} kB, mesh and texture as they come {sum(whole) / 1000:.0f} kB (medians, "
+        f"n = {format.plural(len(runs.records), 'shape')}).",
         remarks=(
+            "Meshes are as finely cut as they come: one with the error of its code has far fewer triangles.",
             "A code of the image is found from the one that is given, its colours and mask, without depth.",
             f"Lights: colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
             *records.definitions(runs.records, DEFINED),

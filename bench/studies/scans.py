@@ -34,7 +34,7 @@ Line = dict[str, Any]
 
 def make(runs: Runs) -> Result:
     """A line per row."""
-    counted = runs.where(runs.frame.status != "refused")
+    counted = runs.made
     pairs = {metric: _pairs(counted, metric) for metric in METRICS}
     lines = [_line(row.name, counted, pairs) for row in runs.rows()]
     scans = len(pairs["depth_mae"].groupby(["family", "solid", "seed"]))

@@ -116,7 +116,9 @@ class Completion:
         """The problem of a scene; it starts from code zero, the mean shape, in each rotation."""
         check_field_gradient(renderer)
         given, observed = self._given(scene, renderer, seed=seed, device=device)
-        problem = partial(CodeProblem, prior, self.code, given.compare, observed, observed.numel(), device)
+        compared = observed & (self.depth_weight > 0)
+        problem = partial(CodeProblem, prior, self.code, given.compare, compared, observed.numel(), device)
+        problem = partial(problem, mask=given.mask is not None, coloured=self.colour_weight > 0)
         if not self.similarity:
             return problem()
         codes = torch.zeros(self.rotations, prior.decoder.code_length)

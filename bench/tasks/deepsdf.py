@@ -79,4 +79,4 @@ class DeepSDF:
             return terms
 
         asked = len(points) + (free.numel() // 3 if self.free_space else 0)
-        return CodeProblem(prior, self.code, compare, observed, asked, device)
+        return CodeProblem(prior, self.code, compare, observed, asked, device, mask=False)

@@ -92,4 +92,4 @@ class PriorFit:
             return {"distance": near_surface_first(error, distances[picked], self.surface_width).mean()}
 
         nothing = torch.zeros_like(scene.view.mask)
-        return CodeProblem(prior, self.code, compare, nothing, self.batch, device)
+        return CodeProblem(prior, self.code, compare, nothing, self.batch, device, mask=False)

@@ -3,13 +3,14 @@
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
 from bench.reconstruct.surfaces import fused, given_clouds, measured_clouds, poisson, with_colours
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import COSTS
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
@@ -89,12 +90,17 @@ class Poisson(_Surface):
     fusing: Fusing
     cloud: str | None = None
 
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput where there is no such file."""
+        if self.cloud is not None and not Path(self.cloud).is_file():
+            raise BadInput(f"task.cloud={self.cloud} is no file: check the path")
+
     def surface(self, subject: Subject) -> Mesh | None:
         """The fused points."""
         if self.cloud is not None:
             return self.fusing.surface(measured_clouds(self.cloud, subject))
         if all(shot.depth is None for shot in subject.given):
-            raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task=stereo")
+            raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task.cloud=POINTS.ply")
         return self.fusing.surface(given_clouds(subject.given))
 
 

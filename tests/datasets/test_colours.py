@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from bench.records.folder import Identity
 from datasets.local import LocalMeshes
 from datasets.scene import Split, sample_surface
 from renderers.checks import BadInput
@@ -75,3 +76,14 @@ def test_what_has_no_colours_or_lacks_a_file_is_an_error_that_says_so(tmp_path):
     with pytest.raises(BadInput, match=f"names '{image.name}', which is not there: put it at"):
         shapes(path).texture(Split.TRAIN, 0)
     assert shapes(path).identity() != whole
+
+
+def test_a_changed_texture_is_another_run(tmp_path):
+    cube = tmp_path / "cube.obj"
+    cube.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd t.png\n")
+    (tmp_path / "t.png").write_bytes(b"red")
+    before = Identity({}, {"dataset": {"path": str(cube)}}).code
+    assert Identity({}, {"dataset": {"path": str(cube)}}).code == before
+    (tmp_path / "t.png").write_bytes(b"blue")
+    assert Identity({}, {"dataset": {"path": str(cube)}}).code != before

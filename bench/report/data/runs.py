@@ -13,7 +13,7 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import requested, row_name, started
 from bench.report.data.frame import to_frame
-from bench.report.data.kept import KEPT
+from bench.report.data.kept import KEPT, NO_ATTEMPTS
 from bench.report.data.records import SCALE, Record, Row, doubtful, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
@@ -100,6 +100,12 @@ class Runs:
     def where(self, kept: pd.Series) -> "Runs":
         """Those runs alone; they are not counted as left out."""
         return replace(self, records=[record for record, keep in zip(self.records, kept, strict=True) if keep])
+
+    @property
+    def made(self) -> "Runs":
+        """Without cells that were not run, killed or refused, which are no failures; all where no other is there."""
+        made = ~self.frame.status.isin(NO_ATTEMPTS)
+        return self.where(made) if made.any() else self
 
     def other(self, selection: Selection) -> "Runs | None":
         """The runs of another experiment of the same results folder."""
