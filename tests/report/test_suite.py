@@ -9,19 +9,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from bench import merge
 from bench.records.read import read_records
-from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
+from bench.report.suite.attempts import (
+    Attempt, attempts_of, joined, place, read_attempts, settings_of, suite, write_attempts,
+)  # fmt: skip
 from bench.report.suite.standing import SECONDS, Standing
 from bench.studies.suite import _doubts, _panel
 from bench.suite import _sweeps, main, parsed, show
 from bench.tables import choice, read_yaml
+from tests.composing import composed
 from tests.report.test_report_paper import write_run
 
 DIST = choice("renderer", "dist")["_label_"]
 RESULTS = Path(__file__).resolve().parents[2] / "results"  # what is shipped
 SCENES = tuple(f"{family} test {index}" for family in ("vase", "lamp") for index in range(4))  # not among references
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def attempt(row: str, scene: str, errors: dict[float, float], **changed) -> Attempt:
@@ -418,3 +424,12 @@ def test_the_shipped_page_is_that_of_the_shipped_rows():
     with (RESULTS / "paper" / "suite.csv").open(encoding="utf-8") as file:
         shown = {line["row"]: float(line["share"]) for line in csv.DictReader(file)}
     assert {row: standing.share(row).value for row in standing.rows} == pytest.approx(shown)
+
+
+def test_the_shipped_rows_are_of_todays_settings():
+    """Else a fresh run would stand beside none of them: a new key of a task or a prior changes every hash."""
+    each = {(one.set, one.tuned): one for one in read_attempts(ROOT / "results")[0]}
+    for (of_set, tuned), one in each.items():
+        config = OmegaConf.to_container(composed(*one.overrides), resolve=True, throw_on_missing=False)
+        assert one.settings == settings_of(config, of_set, tuned), of_set
+    assert len(each) > 5

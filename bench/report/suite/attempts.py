@@ -192,7 +192,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         waited=said.get("waited_share"),
         **{name: said.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
         threads=said.get("threads"),
-        **{"started": record["started"], "code": record.get("code", ""), "settings": _settings(config, given, tuned)},
+        **{"started": record["started"], "code": record.get("code", ""), "settings": settings_of(config, of_set, tuned)},
         curve=curve,
         overrides=portable(record.get("overrides", ())),
     )
@@ -209,9 +209,9 @@ def portable(overrides: Iterable[str]) -> list[str]:
     return [text for text in overrides if not text.lstrip("+~").startswith(("results_dir=", "hydra", "-"))]
 
 
-def _settings(config: dict[str, Any], given: str, tuned: bool) -> str:
+def settings_of(config: dict[str, Any], of_set: str, tuned: bool) -> str:
     """A hash of what a set states for all renderers, without what its problems, or tuned settings, differ in."""
-    known = flat({part: config.get(part) for part in STATED})
+    known, (given, _) = flat({part: config.get(part) for part in STATED}), GIVEN.get(of_set, ("", ""))
     left = [key for key in known if key == given or (tuned and re.match(FREE, key))]
     return digest({key: str(value) for key, value in known.items() if key not in left})
 
