@@ -30,7 +30,7 @@ DISTANCE = 2.5  # of the camera from the origin, scene units
 ALL_AROUND = (0.0, 360.0)
 CORNER = {"azimuth": (37.0, 53.0), "elevation": (27.0, 43.0)}  # three sides of a cube, none of them grazing
 ABOVE = (15.0, 35.0)  # degrees of elevation, from which networks are seen, as in conf/config.yaml
-REDRAWN, SEEN = 20, 4096  # draws of a disturbed network at most; points of which one must be inside
+REDRAWN, SEEN, LEAST = 20, 4096, 0.01  # draws of a disturbed network at most; points, and the share that must be inside
 CUBE_VIEW = 44.0  # degrees: it fills the picture
 GRAZING_SHARE = 0.1  # of `grazing_plane`: half the picture's height over its distance, divided by the angle's sine
 GRAZING_SHIFT, GRAZING_ROLL = 0.1, 10.0  # of its camera: along the plane, in scene units; about its axis, in degrees
@@ -206,7 +206,7 @@ def of_network(name: str, network: Decoder | Published, codes: Float[Tensor, "sh
             changed = deepcopy(network)
             code = distortions.OF_NETWORKS[name](changed, codes[draw.integers(len(codes))], severity, draw)
             exact = deepcopy(changed).cpu().double().at(code.cpu().double())
-            if (exact(points_in_sphere(SEEN)) < 0).any():
+            if (exact(points_in_sphere(SEEN)) < 0).double().mean() > LEAST:
                 break
         truth = ReferenceTruth(exact, steepest(exact, radius=1.0), THINNEST)
         return Exam(changed.at(code), _camera(draw, resolution, elevation=ABOVE), truth)

@@ -433,7 +433,8 @@ def test_a_fit_goes_on_while_its_error_falls_and_says_where_it_was_stopped(shape
     fitted = fitter.begin(candidate(name), None)
     fitter.finish(fitted, rounds)
     assert fitted.evidence.falling is falling is (fitted.evidence.iterations == 8 * rounds)
-    assert fitter.observations.error(fitted.model.frozen()).mean == pytest.approx(fitted.evidence.mean)  # of what is left
+    left = fitter.observations.error(fitted.model.frozen())
+    assert left.mean == pytest.approx(fitted.evidence.mean)
 
 
 def test_the_clock_of_a_fit_goes_on_where_its_trial_ended():

@@ -13,9 +13,8 @@ from omegaconf import OmegaConf
 
 from bench import merge
 from bench.records.read import read_records
-from bench.report.suite.attempts import (
-    Attempt, attempts_of, joined, place, read_attempts, settings_of, suite, write_attempts,
-)  # fmt: skip
+from bench.report.suite import attempts
+from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
 from bench.report.suite.standing import SECONDS, Standing
 from bench.studies.suite import _doubts, _panel
 from bench.suite import _sweeps, main, parsed, show
@@ -431,5 +430,5 @@ def test_the_shipped_rows_are_of_todays_settings():
     each = {(one.set, one.tuned): one for one in read_attempts(ROOT / "results")[0]}
     for (of_set, tuned), one in each.items():
         config = OmegaConf.to_container(composed(*one.overrides), resolve=True, throw_on_missing=False)
-        assert one.settings == settings_of(config, of_set, tuned), of_set
+        assert one.settings == attempts.settings_of(config, of_set, tuned), of_set
     assert len(each) > 5

@@ -192,7 +192,8 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         waited=said.get("waited_share"),
         **{name: said.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
         threads=said.get("threads"),
-        **{"started": record["started"], "code": record.get("code", ""), "settings": settings_of(config, of_set, tuned)},
+        **{"started": record["started"], "code": record.get("code", "")},
+        settings=settings_of(config, of_set, tuned),
         curve=curve,
         overrides=portable(record.get("overrides", ())),
     )
