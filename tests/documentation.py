@@ -3,6 +3,7 @@
 import re
 import shlex
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from datasets.shapenet import SYNSETS, ShapeNet
 from datasets.views import ViewSampler
 from tests.datasets.test_shapenet import IDS, write_renders, write_shape, write_shapenet, write_split
 from tests.made_networks import arrays, deepsdf_folder, npz
-from tests.made_photographs import idr
+from tests.made_photographs import CENTRE, RADIUS, dvr, idr
 from tests.made_scans import write_scans
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,6 +24,7 @@ CODE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"\s{2,}# .*$")
 SPAN = re.compile(r"`((?:python -m |-m \+experiment=)[^`]+)`")  # tables leave `python -m bench` out
 LINK = re.compile(r"\]\(([^)#\s]*)(#[^)\s]*)?\)")
+DENSE = "task.depths.points=dense"  # of photographs that have depths
 NETWORK = re.compile(r"field_path=|prior\.path=")
 SCANS = re.compile(r"dataset=scans|\+experiment=scans")
 
@@ -92,7 +94,9 @@ def make_files(folder: Path) -> dict[str, str]:
     write_scans(folder / "scans")
     trimesh.creation.box((1, 0.6, 0.8)).export(folder / "one.obj")
     for number in range(4):
-        trimesh.creation.box((1, 0.6 + 0.1 * number, 0.8)).export(folder / "chairs" / f"{number}.obj")
+        box = trimesh.creation.box((1, 0.6 + 0.1 * number, 0.8))
+        box.visual.vertex_colors = (90, 60, 30, 255)
+        box.export(folder / "chairs" / f"{number}.obj")
     picture = Image.new("L", (48, 48))
     picture.paste(255, (12, 16, 40, 32))
     picture.save(folder / "mask.png")
@@ -103,6 +107,13 @@ def make_files(folder: Path) -> dict[str, str]:
     named |= {"FILE": folder / "picture.png", "MASK": folder / "mask.png"}
     deepsdf_folder(folder / "network", 0.1 * torch.arange(4.0)[:, None])
     named["NETWORK"] = folder / "network"
+    (folder / "depths").mkdir()
+    if find_spec("cv2"):
+        dvr(folder / "depths")
+    named["DEPTHS"] = folder / "depths"
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS).apply_translation(CENTRE)
+    trimesh.PointCloud(ball.vertices).export(folder / "tola.ply")
+    named["tola.ply,colmap.ply"] = folder / "tola.ply"
     named |= dict.fromkeys(("fox.npz", "mine.npz"), npz(folder, arrays()).path)
     shapenet = write_shapenet(folder / "ShapeNetCore.v2")
     for name in IDS:
@@ -134,6 +145,8 @@ def filled(command: Command, made: dict[str, str]) -> list[str]:
     named = {"NAME": "sofa", **made}
     if SCANS.search(str(command)):
         named["FOLDER"] = made["SCANS"]
+    elif DENSE in command.words:
+        named["FOLDER"] = made["DEPTHS"]
     elif NETWORK.search(str(command)):
         named |= {"FOLDER": made["NETWORK"], "FILE": made["fox.npz"]}
     elif mesh:

@@ -219,7 +219,7 @@ def cell_of(command: Command, made: dict[str, str]) -> list[str]:
     "command", [c for c in COMPOSED if c.module == "bench" and not re.search("NAME|plan=true", str(c))], ids=str
 )
 def test_every_command_runs(made, tmp_path, command):
-    if "+method=stereo" in command.words:
+    if {"+method=stereo", documentation.DENSE} & set(command.words):
         pytest.importorskip("cv2", reason="stereo is an extra: pip install -e '.[stereo]'")
     fitted = {"+experiment=table1", "+experiment=gradients"} & set(command.words)
     small = SHIPPED if "+method=single_view" in command.words else FITTED if fitted else QUICK
