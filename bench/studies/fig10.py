@@ -25,7 +25,7 @@ def make(runs: Runs) -> Result:
         "Shape from many views under other focal lengths and starts.",
         f"{conditions.BELOW[0].upper()}{conditions.BELOW[1:]}.",
         question="Does another focal length or start change the shape that is found?",
-        verdict=_verdict(runs),
+        verdict=_verdict(runs.made),
         interval=conditions.INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
