@@ -304,8 +304,7 @@ def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
 
 def _prior_kind(of: str | None, own: str) -> str:
     """A key of `scale.priors`: the kind of prior of the run's dataset, or of the one that `prior.of` names."""
-    known = read_rows(CONF)["dataset"]
-    return own if of is None else str(known.get(of, {}).get("_prior_", "own"))
+    return own if of is None else str(read_rows(CONF)["dataset"].get(of, {}).get("_prior_", "own"))
 
 
 def _stem(path: str | None) -> str:

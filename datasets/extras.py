@@ -37,6 +37,7 @@ def named_files(path: Path) -> list[Path]:
 
 def _named(path: Path, key: str) -> list[Path]:
     """The files that lines of a key name, beside `path`; an option such as `-s 1 1 1` stands before the name."""
-    lines = re.findall(rf"^\s*{key}[ \t]+(.+?)\s*$", path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
+    line = rf"^[ \t]*{key}[ \t]+(.+?)[ \t]*$"  # of no blank lines, of which a file may have many
+    lines = re.findall(line, path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
     names = [line.split()[-1] if line.startswith("-") else line for line in dict.fromkeys(lines)]
     return [path.parent / name.replace("\\", "/") for name in names]

@@ -124,9 +124,8 @@ class Fitter:
     def finish(self, fitted: Fitted, rounds: int) -> None:
         """Fits a candidate round by round, until a round lowers its held-out error by no standard error of the change.
 
-        A round that raises the error, or fails after another, is taken back.
-
-        Where it is still falling after the last of all rounds, the evidence says so.
+        A round that raises the error, or fails after another, is taken back. Where the error is still falling after the
+        last of all rounds, the evidence says so.
         """
         evidence = fitted.evidence
         for _ in range(rounds):

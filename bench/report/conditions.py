@@ -7,7 +7,6 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.data.kept import NO_ATTEMPTS
 from bench.report.data.records import ONE_WAY, SCALE, Record, by_shape, error, family, grouped, row_of, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, median
 from bench.report.write import chart
@@ -55,7 +54,7 @@ def lines_of(records: Sequence[Record], conditions: Sequence[Condition], metric:
     Each has family, method, preset, the condition as text, the place of the condition, its value `at`, its `runs` and
     their median `error`.
     """
-    records, lines = [record for record in records if record["status"] not in NO_ATTEMPTS] or records, []
+    lines = []
     for place, one in enumerate(conditions):
         alone = [r for r in records if all(other.of(r) == other.neutral for other in conditions if other != one)]
         for (name, row, at), own in grouped(alone, lambda r, one=one: (family(r), row_of(r), one.of(r))).items():

@@ -19,7 +19,7 @@ NOTES = (
 
 def make(runs: Runs) -> Result:
     """A line per family, method and value of a condition."""
-    lines = conditions.lines_of(runs.records, CONDITIONS)
+    lines = conditions.lines_of(runs.made.records, CONDITIONS)
     return Result(
         runs,
         "Shape from many views under other focal lengths and starts.",

@@ -36,7 +36,7 @@ def place_known(record: Record) -> bool:
 
 def make(runs: Runs) -> Result:
     """A line per family, method and value of a condition."""
-    lines = conditions.lines_of([record for record in runs.records if not place_known(record)], CONDITIONS)
+    lines = conditions.lines_of([record for record in runs.made.records if not place_known(record)], CONDITIONS)
     known = grouped(filter(place_known, runs.records), lambda record: (family(record), row_of(record)))
     others = [
         {"family": name, "method": row.name, "condition": KNOWN, "runs": own, "error": conditions.middle(own)}

@@ -28,7 +28,7 @@ def make(runs: Runs) -> Result:
     """A line per family, row and budget."""
     largest = {key: max(map(int, runs.setting(f"task.{key}"))) for key in LABELS}
     budgets = [conditions.Condition(key, label, largest[key]) for key, label in LABELS.items()]
-    lines = conditions.lines_of(runs.records, budgets, "chamfer_l1")
+    lines = conditions.lines_of(runs.made.records, budgets, "chamfer_l1")
     whole = {(line["family"], line["method"]): line["runs"] for line in lines if line["at"] == largest[line["key"]]}
     lines = [line | _judged(line, largest, whole.get((line["family"], line["method"]))) for line in lines]
     return Result(
