@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from datasets.captures.frames import opened
+from datasets.captures.sphere import size_doubt
 from datasets.captures.take import opened_mask, stored_depths
 from datasets.mesh import Mesh
 from datasets.meshes import load_mesh
@@ -102,6 +103,7 @@ class DepthImage:
         if mask.shape != depth.shape:
             sizes = " and ".join(f"{width} x {height}" for height, width in (mask.shape, depth.shape))
             raise BadInput(f"{self.mask_path} and {self.path} must have one size, not {sizes} pixels")
+        doubt = size_doubt([replace(self.camera, height=len(depth), width=len(depth.T))])
         depth, mask, intrinsics = _cut_out(depth, mask, self.camera.intrinsics.numpy(), resolution)
         known = (depth > 0) & mask
         if known.sum() < FEWEST:
@@ -125,7 +127,7 @@ class DepthImage:
                 )
         seen = see(Truth(mesh, closed=False), camera)
         view = View(camera, seen.depth, seen.normals, torch.from_numpy(mask))
-        mesh = replace(mesh, repairs=(note, *mesh.repairs))
+        mesh = replace(mesh, repairs=(*filter(None, (note, doubt)), *mesh.repairs))
         return Scene(self.name, mesh, view, measured, to_world, part=self.truth is None)
 
     def _placed(

@@ -18,6 +18,7 @@ from tests.looped import each
 from tests.run.driving import command, record_of
 
 STEP = 0.002  # units of the world for a step of the stored numbers
+CAMERA = [150.0, 140.0, 70.3, 52.8]
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def made(tmp_path_factory):
 
 def depth_image(made, **changed):
     folder, camera = made
-    keys = {"path": str(folder / "depth.png"), "intrinsics": [150.0, 140.0, 70.3, 52.8], "scale": STEP}
+    keys = {"path": str(folder / "depth.png"), "intrinsics": CAMERA, "scale": STEP}
     return load("dataset", "depth_image", **keys | {"camera_to_world": camera.camera_to_world.tolist()} | changed)
 
 
@@ -79,6 +80,14 @@ def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, change, pi
 def test_what_is_no_camera_or_file_is_refused(made, key, value, says):
     with pytest.raises(ValueError, match=says):
         depth_image(made, **{key: value})
+
+
+def test_intrinsics_of_an_image_of_another_size_are_noted(made):
+    right, twice = (
+        depth_image(made, intrinsics=[factor * number for number in CAMERA]).placed(40).mesh.repairs
+        for factor in (1, 2)
+    )
+    assert len(right) == 1 and "in images about 1.9 times as wide and high" in twice[1]
 
 
 def test_files_without_depths_are_refused(made, tmp_path):
