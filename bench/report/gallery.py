@@ -115,7 +115,7 @@ def normals(prefix: str = "") -> Paint:
     def paint(found: Arrays) -> Sequence[np.ndarray]:
         hit = found[f"{prefix}hit"]
         shown = coloured(found[f"{prefix}normals"] / 2 + 0.5, hit)
-        return shown.reshape(-1, *shown.shape[-3:]) if hit.any() else ()
+        return list(shown.reshape(-1, *shown.shape[-3:])) if hit.any() else []
 
     return paint
 

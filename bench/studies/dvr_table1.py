@@ -81,6 +81,7 @@ def _verdict(family: str, lines: list[dict]) -> str:
 
 def figures(runs: Runs) -> Result:
     """A line for a success and a failure of each family."""
+    runs = runs.made
     rows, of_scene = list(runs.rows()), grouped(runs.records, medians.scene_of)
     shown = {scene: end for of in runs.families().values() for scene, end in _ends(of, rows[0]).items()}
     scenes = {name: gallery.Scene(runs, of_scene[name], (*IMAGES, "normals", "hit")) for name in shown}
