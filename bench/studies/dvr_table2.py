@@ -1,17 +1,19 @@
 """Table 2 and Figs. 6 to 8 of DVR: shape and colour from rendered photographs."""
 
 import numpy as np
+import pandas as pd
 
 from bench.records.metrics import DVR_TABLE2
 from bench.records.read import curve_lines
 from bench.report.data.kept import KEPT
-from bench.report.data.records import SCALE, grouped, row_of, setting
-from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
+from bench.report.data.records import SCALE, Record, Row, grouped, row_of, setting
+from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
 from bench.report.tuning import TUNED
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
-NAMES = ("seen_accuracy", "seen_completeness", "seen_chamfer_l1", "chamfer_l1", "psnr", "ssim", "mask_iou")
+SEEN = "seen_chamfer_l1"
+NAMES = ("seen_accuracy", "seen_completeness", SEEN, "chamfer_l1", "psnr", "ssim", "mask_iou")
 NOTES = (
     "“Seen” is what a given photograph sees of either surface, as none sees the underside; distances are in scene "
     "units, times 1000, and two samplings of one surface by 30,000 points have a Chamfer-L1 of 5.7 to 7.1.",
@@ -19,7 +21,7 @@ NOTES = (
     "foreground, in front of black.",
     "All rows but DVR's own share one field, rate and iterations; volumes have the cross entropy of their opacity for "
     "the masks and a budget of samples a ray.",
-    "DVR's own rows have their paper's rate and no more iterations than others; `+method=dvr_long` has ten times both.",
+    "DVR's own rows have their paper's rate and no more iterations than others, but the one that has ten times both.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
     "measured rows.",
 )
@@ -27,7 +29,7 @@ COLUMNS = (
     table.text("method", "Method"),
     table.Column("seen_accuracy", "Accuracy", show=table.thousandfold),
     table.Column("seen_completeness", "Completeness", show=table.thousandfold),
-    table.Column("seen_chamfer_l1", "Chamfer-L1, seen", show=table.thousandfold),
+    table.Column(SEEN, "Chamfer-L1, seen", show=table.thousandfold),
     table.Column("chamfer_l1", "all", show=table.thousandfold),
     *(table.Column("psnr", "PSNR"), table.Column("ssim", "SSIM"), table.Column("mask_iou", "Mask IoU")),
     *medians.COST,
@@ -38,7 +40,7 @@ RUNS = (
     *table.metrics(*NAMES, "seen_fscore", "mask_iou_least", "own_psnr", "own_mask_iou"),
     *table.LOOP,
 )
-PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics("seen_chamfer_l1", "psnr"))
+PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN, "psnr"))
 
 RISING = 0.5  # dB
 SCENES = 2  # of `figures`
@@ -51,13 +53,13 @@ ARRAYS = ("photograph", "colours", "normals", "hit")
 
 def make(runs: Runs) -> Result:
     """A line per row, and the published ones."""
-    lines, scenes = medians.medians(runs, NAMES), format.plural(len(grouped(runs.records, medians.scene_of)), "scene")
+    lines, scenes = medians.medians(runs, NAMES), _scenes(runs)
     published = [
         {"method": f"published: {name}", **dict(zip(NAMES, (value / SCALE for value in values), strict=False))}
         for name, values in DVR_TABLE2.items()
     ]
     panels = {
-        "Chamfer-L1, seen × 1000 (scene units)": SCALE * medians.scored(runs, "seen_chamfer_l1"),
+        "Chamfer-L1, seen × 1000 (scene units)": SCALE * medians.scored(runs, SEEN),
         **medians.cost(runs),
     }
     return Result(
@@ -68,7 +70,7 @@ def make(runs: Runs) -> Result:
         question="Which method finds shape and colour from photographs?",
         verdict=format.ends(
             "Median Chamfer-L1 × 1000 of what the photographs see",
-            medians.whole(lines, "seen_chamfer_l1"),
+            medians.whole(lines, SEEN),
             scenes,
             show=table.thousandfold,
         ),
@@ -94,6 +96,16 @@ def _rising(runs: Runs) -> str:
     return f"{told}: {', '.join(rising)}." if rising else ""
 
 
+def _unlike(runs: Runs) -> dict[Row, list[Record]]:
+    """One row of those that look alike, or all where no other is there."""
+    unlike = {row: of for row, of in runs.rows().items() if row.preset.removeprefix(TUNED) not in ALIKE}
+    return unlike or runs.rows()
+
+
+def _scenes(runs: Runs) -> str:
+    return format.plural(len(grouped(runs.records, medians.scene_of)), "scene")
+
+
 def _conditions(runs: Runs) -> str:
     """What photographs there were, and how long was optimised."""
     task = next((r["config"]["task"] for r in runs.records if setting(r["config"], "task", "optimiser")), {})
@@ -105,10 +117,38 @@ def _conditions(runs: Runs) -> str:
     )
 
 
+def convergence(runs: Runs) -> Result:
+    """The error on what is seen over the iterations, as the median of a row's scenes; a level without iterations."""
+    runs = runs.made
+    lines = []
+    for row, records in _unlike(runs).items():
+        own = [curves.read(runs.folder(record), ("iteration", "seconds", SEEN))[0] for record in records]
+        course = curves.median(own, [record["status"] != "ok" for record in records], SEEN)
+        mine = (runs.frame.row == row.name) & (runs.frame.preset == row.preset)
+        end = medians.scored(runs, SEEN)[mine].median()
+        last = max((int(curve["iteration"].max()) + 1 for curve in own if len(course)), default=0)
+        found = [*zip(course["iteration"], course["median"], strict=True), (last, end)]
+        lines += [{"row": row.name, "preset": row.preset, "iteration": at, SEEN: error} for at, error in found]
+    data = pd.DataFrame(lines)
+    ends, drawn = data["iteration"].max(), []
+    for (name, preset), line in data.groupby(["row", "preset"], sort=False):
+        x, y = line["iteration"].tolist(), style.finite(SCALE * line[SEEN])
+        drawn.append(chart.curve(name, preset, *((x, y) if x != [0] else ([1, ends], 2 * y))))
+    return Result(
+        runs,
+        "Error over the iterations on photographs.",
+        f"Median over {_scenes(runs)} of the Chamfer-L1 of what the photographs see.",
+        question="Which rows are at their end?",
+        verdict=_rising(runs),
+        remarks=("Of rows that look alike one is shown. A row without iterations is a level.",),
+        data=data,
+        figure=chart.draw([chart.panel_data("", "iteration", "Chamfer-L1, seen × 1000 (scene units)", drawn)], 3.4),
+    )
+
+
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, one row of those that look alike."""
-    rows = [row for row in runs.rows() if row.preset.removeprefix(TUNED) not in ALIKE] or list(runs.rows())
-    every = grouped(runs.records, medians.scene_of)
+    rows, every = list(_unlike(runs)), grouped(runs.records, medians.scene_of)
     shown = {name: [record for record in of if row_of(record) in rows] for name, of in list(every.items())[:SCENES]}
     scenes = {name: gallery.Scene(runs, of, ARRAYS) for name, of in shown.items()}
     photograph = ("held out", "colours", lambda found: [found["photograph"]])
@@ -128,4 +168,4 @@ def figures(runs: Runs) -> Result:
     )
 
 
-PAGES = {"dvr_table2": make, "dvr_figures": figures}
+PAGES = {"dvr_table2": make, "dvr_curves": convergence, "dvr_figures": figures}

@@ -50,6 +50,12 @@ def made(results, row, metrics, *, dataset="sofa", experiment="dvr_table2", seco
     )
 
 
+def curve(folder, name, values):
+    """Writes a run's curve, of one quantity."""
+    lines = [{"iteration": n, "seconds": n / 10, name: value} for n, value in values.items()]
+    (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
 def chosen(results, page=dvr_table2):
     return choose(read_records(results)[0], page.READS[0], results)
 
@@ -60,12 +66,20 @@ def line_of(result, row):
 
 def test_rows_that_still_rise_are_named(tmp_path):
     for row, psnr in ((NEWTON, [10.0, 20.0, 20.4]), (IDR, [10.0, 14.0, 19.0])):
-        folder = made(tmp_path, row, scored(0.01))
-        lines = [{"iteration": n, "psnr": value} for n, value in zip((1, 200, 399), psnr, strict=True)]
-        (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        curve(made(tmp_path, row, scored(0.01)), "psnr", {1: psnr[0], 200: psnr[1], 399: psnr[2]})
     made(tmp_path, HULL, scored(0.05))
     (note,) = [note for note in page_of(tmp_path, "dvr_table2").notes if note.startswith("Not at their end")]
     assert note.endswith(f"iterations: {IDR}.")
+
+
+def test_curves_are_medians_of_scenes_that_end_at_the_errors_of_the_table(tmp_path):
+    for scene, factor in (("sofa", 1), ("car", 3)):
+        folder = made(tmp_path, NEWTON, scored(0.01 * factor), dataset=scene)
+        curve(folder, "seen_chamfer_l1", {0: 0.05 * factor, 200: 0.02 * factor, 399: None})
+        made(tmp_path, HULL, scored(0.04 * factor), dataset=scene)
+    result = page_of(tmp_path, "dvr_curves")
+    of = {row: lines.set_index("iteration")["seen_chamfer_l1"].to_dict() for row, lines in result.data.groupby("row")}
+    assert of[NEWTON] == pytest.approx({0: 0.1, 200: 0.04, 400: 0.02}) and of[HULL] == pytest.approx({0: 0.08})
 
 
 def test_a_line_has_the_medians_over_scenes_with_failed_runs_worst(tmp_path):

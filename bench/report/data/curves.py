@@ -1,6 +1,7 @@
 """Reads the curves of runs from their folders, and gives the median of several runs of one row."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +16,18 @@ HISTORY = ("iteration", "seconds", "value_evaluations", "error", "loss")
 COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
 
 
-def read(folder: Path) -> tuple[pd.DataFrame, str]:
-    """A row for each line of `curve.jsonl`, with `COLUMNS` as floats, nan for missing; and a warning, or ""."""
+def read(folder: Path, columns: Sequence[str] = COLUMNS) -> tuple[pd.DataFrame, str]:
+    """A row for each line of `curve.jsonl`, with these columns as floats, nan for missing; and a warning, or ""."""
     found = lines(folder)
     sound = [line for line in found or [] if as_number(line.get("iteration")) is not None]
-    known = [[as_number(line.get(name)) for name in COLUMNS] for line in sound]
+    known = [[as_number(line.get(name)) for name in columns] for line in sound]
     if found is None:
         warning = "no curve.jsonl"
     elif len(known) < len(found):
         warning = f"{len(found) - len(known)} lines of curve.jsonl cannot be read"
     else:
         warning = "" if found else "curve.jsonl is empty"
-    return pd.DataFrame(known, columns=COLUMNS, dtype=float).drop_duplicates("iteration", keep="last"), warning
+    return pd.DataFrame(known, columns=list(columns), dtype=float).drop_duplicates("iteration", keep="last"), warning
 
 
 def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.DataFrame:
