@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
 from importlib import import_module
-from inspect import Parameter, signature
+from inspect import Parameter, getdoc, signature
 from pathlib import Path
 from types import UnionType
 from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hints
@@ -237,15 +237,14 @@ def build(
         node = cast(dict[Any, Any], OmegaConf.to_container(node, resolve=True, throw_on_missing=False))
     if role is None and target and not ("_target_" in node and name in ROLES):
         role = find_class(target, name, packages, object)
-    for key in ("_target_", *node):
-        if node.get(key) == MISSING:
-            raise ValueError(
-                f"{name}.{key} must be given: set {name}.{key}={'PACKAGE.CLASS' if key[0] == '_' else '...'}"
-            )
+    if node.get("_target_") == MISSING:
+        raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
     own = [str(node[PACKAGE])] if name == "renderer" and PACKAGE in node else []
     cls = find_class(node.get("_target_", target), name, [*packages, *own], role)
     arguments = {str(key): value for key, value in node.items() if key not in RESERVED}
     names = _argument_names(cls)
+    for key in (key for key, value in node.items() if value == MISSING):
+        raise ValueError(_missing(cls, name, key))
     for key in arguments:
         if names is not None and key not in names:
             raise ValueError(f"{name} has no key {key!r}{nearest(str(key), names)}")
@@ -380,11 +379,18 @@ def _typed(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[s
             and item.default is dataclasses.MISSING
             and item.default_factory is dataclasses.MISSING
         ):
-            raise ValueError(f"{name}.{item.name} must be given: set {name}.{item.name}=...")
+            raise ValueError(_missing(cls, name, item.name))
     try:
         return cls(**values)
     except ValueError as error:  # a class within another does not know where it stands
         raise error if "." not in name or name in str(error) else ValueError(f"{name}: {error}") from error
+
+
+def _missing(cls: type, name: str, key: str) -> str:
+    """What is said of a key without a value, with what the docstring of its class says of it."""
+    meaning = re.search(rf"^( *){key}: (.+?)(?=^\1\S|^$|\Z)", getdoc(cls) or "", re.MULTILINE | re.DOTALL)
+    said = f", {' '.join(meaning[2].split()).rstrip('.')}" if meaning else ""
+    return f"{name}.{key} must be given: set {name}.{key}=...{said}"
 
 
 def _node_class(wanted: Any) -> type | None:

@@ -165,7 +165,7 @@ def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior):
     ("index=1000000", ("index must be at most 999999, not 1000000",)),
     ("time_limit=0", ("time_limit must be positive",)),
     ("evaluation.fscore_threshold=0", ("threshold must be positive",)),
-    ("dataset=mesh", ("dataset.path must be given: set dataset.path=",)),
+    ("dataset=mesh", ("dataset.path must be given: set dataset.path=", "a mesh file or a folder of them")),
     ("results_dir=", ("results_dir must name a folder",)),
 ])  # fmt: skip
 def test_an_invalid_value_is_an_error_before_anything_slow(monkeypatch, no_prior, argument, words):
