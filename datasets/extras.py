@@ -1,4 +1,4 @@
-"""What needs no library: which of them are installed, and the files that a mesh file names."""
+"""Which optional libraries are installed, and the files that a mesh file names; imports none of them."""
 
 import re
 import shlex

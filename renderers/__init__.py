@@ -1,7 +1,4 @@
-"""Differentiable renderers of implicit surfaces (implicit-bench). They know no task.
-
-They turn a field and rays into a rendering.
-"""
+"""Differentiable renderers of implicit surfaces (implicit-bench): from a field and rays to a rendering."""
 
 from renderers.camera import Camera, Rays
 from renderers.dist import DIST

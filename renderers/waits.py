@@ -1,4 +1,4 @@
-"""What spares the host waiting for a device: marches that keep rays which have ended, numbers that are not yet read."""
+"""Fewer waits of the host for a device: marches keep rays that have ended, and counts are read late."""
 
 from collections.abc import Callable
 from contextvars import ContextVar

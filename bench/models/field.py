@@ -1,4 +1,4 @@
-"""The field of an unknown shape, where it is no code of a prior: the candidate that early growth ends on."""
+"""The field of an unknown shape without a prior: the candidate that early growth ends on, or a named one."""
 
 from dataclasses import replace
 from typing import Any

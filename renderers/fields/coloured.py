@@ -1,4 +1,4 @@
-"""Fields with colours: of one shape, learnt from images, each of which begins as a sphere; and of a code."""
+"""Fields with colours: of one shape, learnt from images and beginning as a sphere; or of a code."""
 
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""A field of any network: points and perhaps a code to values, of which it is measured what they mean."""
+"""A field of any network from points, and perhaps a code, to values; what its values mean is measured."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
-"""Compiled code beside plain PyTorch, which does the same up to rounding: built once a machine, where that is possible.
+"""Compiled code beside plain PyTorch, which does the same up to rounding: built once per machine, where possible.
 
-It gives values of fields alone, which all renderers ask for: none is compared with others by its engine.
+It computes values of fields only, for all renderers alike, so that no comparison is one of engines.
 `IMPLICIT_BENCH_KERNELS=torch` leaves all to PyTorch.
 """
 
