@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bench.evaluate.state import State, coloured_image, colours_at, vertex_colours
@@ -22,7 +22,7 @@ from renderers.boundary import rendered
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals
 from renderers.fields.coloured import Coloured
-from renderers.rendering import Renderer, Rendering
+from renderers.rendering import Rendering
 
 OWN = "own_"  # prefix of the metrics of what the renderer under test sees
 BEHIND = 2.0  # spacings of the samples that give the mesh: a hit so far behind a part of it is of another part
@@ -110,26 +110,6 @@ def drawn(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.n
     return points if len(points) <= count else np.random.default_rng(seed).choice(points, count, replace=False)
 
 
-def image_metrics(
-    predicted_depth: Float[np.ndarray, "h w"],
-    predicted_mask: Bool[np.ndarray, "h w"],
-    truth_depth: Float[np.ndarray, "h w"],
-    truth_mask: Bool[np.ndarray, "h w"],
-) -> dict[str, float]:
-    """The metrics of `IMAGE`, unscaled.
-
-    Depth is camera z and is read only where both masks are true and the true depth is known, which 0 is not. A
-    predicted depth there that is not a number counts as infinitely wrong.
-    """
-    common = predicted_mask & truth_mask & (truth_depth > 0)
-    error = np.abs(predicted_depth[common].astype(np.float64) - truth_depth[common])
-    error[np.isnan(error)] = np.inf
-    return {
-        "depth_mae": float(error.mean()) if common.any() else np.inf,
-        "mask_iou": mask_iou(predicted_mask, truth_mask),
-    }
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """The comparison of a run's state with the truth.
@@ -198,9 +178,17 @@ def unrendered(state: State, own: Sequence[View]) -> tuple[str, ...]:
 
 
 def view_metrics(seen: View, true: View, prefix: str = "") -> dict[str, float]:
-    """The image metrics of a view against the true one, with a prefix to their names."""
-    found = image_metrics(seen.depth.numpy(), seen.mask.numpy(), true.depth.numpy(), true.mask.numpy())
-    return {prefix + name: value for name, value in found.items()}
+    """The metrics of `IMAGE` of a view against the true one, with a prefix to their names.
+
+    Depths are compared where both masks are true and the true depth is known, which 0 is not. One there that is not a
+    number counts as infinitely wrong.
+    """
+    depth, mask, true_mask = true.depth.numpy(), seen.mask.numpy(), true.mask.numpy()
+    common = mask & true_mask & (depth > 0)
+    error = np.abs(seen.depth.numpy()[common].astype(np.float64) - depth[common])
+    error[np.isnan(error)] = np.inf
+    mean = float(error.mean()) if common.any() else np.inf
+    return {f"{prefix}depth_mae": mean, f"{prefix}mask_iou": mask_iou(mask, true_mask)}
 
 
 def chamfer_only(state: State) -> dict[str, float]:
@@ -218,27 +206,22 @@ def _surface_scores(state: State) -> dict[str, float]:
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     """Renders a field with the run's renderer from a camera, as a View on the CPU."""
-    return view_of(render(inputs.renderer, field, camera, inputs.device), field, camera)
+    return _rendered(field, camera, inputs)[1]
 
 
-def render(renderer: Renderer, field: Field, camera: Camera, device: torch.device) -> Rendering:
-    """A rendering of a field from a camera, without gradients."""
+def _rendered(field: Field, camera: Camera, inputs: RunInputs) -> tuple[Rendering, View]:
+    """The run's rendering of a field, without gradients, and its hits as a View on the CPU."""
     with torch.no_grad():
-        return rendered(renderer, field, camera.rays().to(device))
-
-
-def view_of(rendering: Rendering, field: Field, camera: Camera) -> View:
-    """The hits of a rendering as a View on the CPU."""
+        rendering = rendered(inputs.renderer, field, camera.rays().to(inputs.device))
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()
-    return View(camera, depth, normals.cpu(), rendering.hit.cpu())
+    return rendering, View(camera, depth, normals.cpu(), rendering.hit.cpu())
 
 
 def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[View, Float[Tensor, "height width 3"]]:
     """What the run's renderer shows from a camera: its hits, and their colours or a volume's weighted sums."""
-    rendering = render(inputs.renderer, field, camera, inputs.device)
-    view = view_of(rendering, field, camera)
+    rendering, view = _rendered(field, camera, inputs)
     volume = rendering.volume
     if volume is None:
         return view, coloured_image(field, view, inputs.device)

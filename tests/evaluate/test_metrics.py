@@ -2,11 +2,13 @@ import re
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.evaluate.evaluate import DEFINITIONS, IMAGE, OWN_DEFINITIONS, WORST_SURFACE, image_metrics, surface_metrics
-from datasets.scene import Surface
+from bench.evaluate.evaluate import DEFINITIONS, IMAGE, OWN_DEFINITIONS, WORST_SURFACE, surface_metrics, view_metrics
+from datasets.scene import Surface, View
+from tests.tiny import camera_of
 
 
 def surface(points, normals) -> Surface:
@@ -90,26 +92,29 @@ def test_scaling_the_scene_scales_the_distances(seed, exponent, count):
     assert scaled == pytest.approx({name: plain[name] * scale ** power.get(name, 1) for name in plain})
 
 
+def view(depth: np.ndarray, mask: np.ndarray) -> View:
+    return View(camera_of(8), torch.from_numpy(depth), torch.zeros(*depth.shape, 3), torch.from_numpy(mask))
+
+
 def test_image_worked_example():
     # Foreground in both: two pixels, with errors 0.5 and 0.25; in at least one: three.
     predicted_depth = np.array([[1.5, 2.0], [9.0, np.inf]], dtype=np.float32)
     truth_depth = np.array([[1.0, 2.25], [np.nan, 0.0]], dtype=np.float32)
     predicted_mask, truth_mask = np.array([[True, True], [True, False]]), np.array([[True, True], [False, False]])
-    measured = image_metrics(predicted_depth, predicted_mask, truth_depth, truth_mask)
+    measured = view_metrics(view(predicted_depth, predicted_mask), view(truth_depth, truth_mask))
     assert measured == pytest.approx({"depth_mae": 0.375, "mask_iou": 2 / 3})
 
 
 def test_image_edges():
     depth, none, every = np.ones((2, 3)), np.zeros((2, 3), dtype=bool), np.ones((2, 3), dtype=bool)
 
-    def measured(*images: np.ndarray) -> tuple[float, ...]:
-        found = image_metrics(*images)
-        return found["depth_mae"], found["mask_iou"]
+    def measured(depth: np.ndarray, mask: np.ndarray, true_mask: np.ndarray) -> tuple[float, ...]:
+        return tuple(view_metrics(view(depth, mask), view(np.ones((2, 3)), true_mask)).values())
 
-    assert measured(depth, every, depth, every) == (0, 1)
-    assert measured(depth, none, depth, every) == (np.inf, 0)
-    assert measured(depth, none, depth, none) == (np.inf, 1)
-    assert measured(depth * np.nan, every, depth, every) == (np.inf, 1)
+    assert measured(depth, every, every) == (0, 1)
+    assert measured(depth, none, every) == (np.inf, 0)
+    assert measured(depth, none, none) == (np.inf, 1)
+    assert measured(depth * np.nan, every, every) == (np.inf, 1)
 
 
 def test_every_metric_has_one_sentence():

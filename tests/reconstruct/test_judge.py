@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.evaluate.evaluate import render, render_image
+from bench.evaluate.evaluate import render_image
 from bench.evaluate.state import State, unseen
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, image_scores, judge, surface_scores
 from bench.reconstruct.subject import Subject
@@ -17,6 +17,7 @@ from bench.records.record import RunStatus
 from datasets.photographs import around
 from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
+from renderers.boundary import rendered
 from renderers.camera import sphere_span
 from tests.reconstruct.test_losses import Ball, ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, icosphere, run_of
@@ -139,7 +140,8 @@ def test_a_volume_is_judged_by_the_weighted_sum_that_it_shows(inputs):
     plain = cast(ball(0.6, CENTRE, torch.zeros(3, 10)), torch.float32)  # grey, 1/2
     volume = replace(inputs, renderer=load("renderer", "neus", sharpness=10.0))
     view, image = render_image(plain, camera_of(24), volume)
-    rendering = render(volume.renderer, plain, camera_of(24), inputs.device)
+    with torch.no_grad():
+        rendering = rendered(volume.renderer, plain, camera_of(24).rays())
     assert rendering.volume is not None
     opacity = rendering.volume.summed(torch.ones_like(rendering.volume.weight), 24 * 24).view(24, 24)
     assert bool((view.mask & (opacity < 0.9)).any())
