@@ -18,6 +18,7 @@ from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
+from bench.solve.observed_view import slopes_at
 from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, Unsupported, check_kind, fresh
@@ -207,7 +208,8 @@ class FitProblem:
         self.error = self.observations.depth_error(terms)
         if not self.model.metric and settings.eikonal_weight:
             points = scattered(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, place))
-            terms["eikonal"] = settings.eikonal_weight * _slope_error(counted, points)
+            slopes = torch.linalg.vector_norm(slopes_at(counted, points), dim=-1)
+            terms["eikonal"] = settings.eikonal_weight * (slopes - 1).square().mean()
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
 
@@ -272,10 +274,3 @@ def scattered(surface: Float[Tensor, "n 3"], count: int, draw: torch.Generator) 
 
 def _some(points: Float[Tensor, "n 3"], count: int, draw: torch.Generator) -> Float[Tensor, "count 3"]:
     return points[torch.randint(len(points), (count,), generator=draw).to(points.device)]
-
-
-def _slope_error(shape: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """The mean square of |grad f| - 1 (Gropp et al. 2020)."""
-    leaf = points.detach().requires_grad_()
-    (gradient,) = torch.autograd.grad(shape(leaf).sum(), leaf, create_graph=True)
-    return (torch.linalg.vector_norm(gradient, dim=-1) - 1).square().mean()

@@ -64,9 +64,7 @@ class Appearance:
         Raises:
             BadInput: for a name that has no colours.
         """
-        if name in (PRIOR, AUTO):
-            raise BadInput(f"field={name} has no colours: {FORMS}")
-        kind, sizes = parsed(name)
+        kind, sizes = (name, ()) if name in (PRIOR, AUTO) else parsed(name)
         if kind == "network":
             layers, width = sizes
             shape = {"layers": layers, "width": width, "octaves": self.octaves}

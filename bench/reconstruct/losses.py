@@ -85,11 +85,9 @@ class Losses:
                 terms["colour_gradient"] = self.colour_gradient * _between_neighbours(difference, compared) / rays
         if self.depth and pixels.distance is not None:
             known = rendering.hit & pixels.distance.isfinite()
-            found, given = (
-                rendering.distance[known] * pixels.at_one[known],
-                pixels.distance[known] * pixels.at_one[known],
-            )
-            error = depth_error(self.depth_loss, found, given, pixels.at_one[known])
+            at_one = pixels.at_one[known]
+            found, given = (of[known] * at_one for of in (rendering.distance, pixels.distance))
+            error = depth_error(self.depth_loss, found, given, at_one)
             terms["depth"] = self.depth * error.sum() / rays
         if self.silhouette_weight and pixels.mask is not None:
             observed = Observed(pixels.mask, pixels.guide)
@@ -103,11 +101,8 @@ class Losses:
             terms["normals"] = self.normals * normal_error(normals, pixels.normals[inside])
         if self.eikonal and shape.kind is not Kind.LEVEL:
             anywhere = 2 * torch.rand(ANYWHERE, 3, device=points.device) - 1
-            off = [
-                (torch.linalg.vector_norm(found, dim=-1) - 1).square()
-                for found in (slopes, slopes_at(metered, anywhere))
-            ]
-            terms["eikonal"] = self.eikonal * sum(part.sum() / max(len(part), 1) for part in off)
+            lengths = [torch.linalg.vector_norm(of, dim=-1) for of in (slopes, slopes_at(metered, anywhere))]
+            terms["eikonal"] = self.eikonal * sum((one - 1).square().sum() / max(len(one), 1) for one in lengths)
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
         return {"total": torch.stack(list(terms.values())).sum(), **terms}

@@ -127,17 +127,12 @@ def _turned(
     """A photograph as a camera at its place with other axes sees it."""
     import cv2
 
+    intrinsics = shot.camera.intrinsics.double().numpy().copy()
+    intrinsics[:2, 2] -= 0.5  # OpenCV has the first pixel's centre at (0, 0)
     turn = axes @ shot.camera.world_to_camera.double().numpy()[:3, :3].T
-    maps = cv2.initUndistortRectifyMap(_zero_based(shot.camera), None, turn, projection, (side, side), cv2.CV_32FC1)
+    maps = cv2.initUndistortRectifyMap(intrinsics, None, turn, projection, (side, side), cv2.CV_32FC1)
     image = (255 * shot.colours.numpy().clip(0, 1)).astype(np.uint8)
     return cv2.remap(image, *maps, cv2.INTER_LINEAR)
-
-
-def _zero_based(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    """Intrinsics with the first pixel's centre at (0, 0), as OpenCV has them."""
-    matrix = camera.intrinsics.double().numpy().copy()
-    matrix[:2, 2] -= 0.5
-    return matrix
 
 
 def _within(shots: Sequence[Shot], points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

@@ -106,8 +106,6 @@ class Subject:
 
     def true_surface(self, count: int, seed: int) -> tuple[Surface, Bool[np.ndarray, " n"]]:
         """Samples of the true surface, and which of them a given photograph sees; drawn once."""
-        if self.truth is None:
-            raise ValueError("the true surface of these photographs is not known")
         if (count, seed) not in self.known:
             sampled = sample_surface(self.truth, count, seed)
             self.known[count, seed] = sampled, self.seen(self.truth, sampled)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -136,7 +136,11 @@ class RunContext:
 
 @runtime_checkable
 class Task(Protocol):
-    """A benchmark problem for a renderer and a scene. It names no renderer."""
+    """A benchmark problem for a renderer and a scene. It names no renderer.
+
+    One with `takes_field = True` works with any field, as set by `field=`, in place of a prior's code; one with
+    `takes_one_view = True` needs no true shape.
+    """
 
     def execute(self, run: RunContext) -> None:
         """Executes the task, and fills the run's record and folder.
@@ -145,13 +149,6 @@ class Task(Protocol):
             Unsupported: where the renderer cannot do what the task or its field needs.
         """
         ...
-
-
-@runtime_checkable
-class TakesField(Protocol):
-    """A task that works with any field, as set by `field=`, in place of a prior's code."""
-
-    takes_field: ClassVar[bool]
 
 
 @runtime_checkable
@@ -300,13 +297,11 @@ def _place(split: str, index: int) -> tuple[Split, int]:
 def _check(task: Task, inputs: RunInputs, index: int) -> None:
     """Raises ValueError where parts do not fit together."""
     name = type(task).__name__
-    if not isinstance(task, Task):
-        raise ValueError(f"task {name} lacks execute: see bench/setup/inputs.py")
     if isinstance(inputs.dataset, Photographed | OneView) and index:
         raise ValueError(f"{inputs.dataset.name} is one object, with index=0, not {index}: give another dataset.path")
     if isinstance(inputs.dataset, OneView) and not getattr(task, "takes_one_view", False):
         raise ValueError(f"the task {name} needs a true shape, and one view has none: set task=completion")
-    if not inputs.field.of_prior and not isinstance(task, TakesField):
+    if not inputs.field.of_prior and not getattr(task, "takes_field", False):
         raise ValueError(f"the task {name} does not take field={inputs.field.name}: remove it")
     if isinstance(task, Checks):
         task.check(inputs)

@@ -5,8 +5,6 @@ from functools import partial
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from bench.models.field import solve_by_growth
 from bench.models.observations import RayObservations, hold_out, tiles, together
@@ -115,9 +113,9 @@ class Completion:
     ) -> CodeProblem:
         """The problem of a scene; it starts from code zero, the mean shape, in each rotation."""
         check_field_gradient(renderer)
-        given, observed = self._given(scene, renderer, seed=seed, device=device)
-        compared = observed & (self.depth_weight > 0)
-        problem = partial(CodeProblem, prior, self.code, given.compare, compared, observed.numel(), device)
+        given = self._given(scene, renderer, seed=seed, device=device)
+        compared = given.observed & (self.depth_weight > 0)
+        problem = partial(CodeProblem, prior, self.code, given.compare, compared, compared.numel(), device)
         problem = partial(problem, mask=given.mask is not None, coloured=self.colour_weight > 0)
         if not self.similarity:
             return problem()
@@ -128,17 +126,15 @@ class Completion:
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[RayObservations, Given]:
         """The observations for a field without a prior; a fifth of them, by tiles of the view, is held out."""
-        view, observed = self._given(scene, renderer, seed=seed, device=device)
-        camera = scene.view.camera
+        view = self._given(scene, renderer, seed=seed, device=device)
+        observed, camera = view.observed.cpu(), scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         group = tiles(*observed.shape)
         held = hold_out(together([view]), group, share=HELD_OUT, whole=(), footprint=half_pixel, seed=seed)
         return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
-    def _given(
-        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[GivenView, Bool[Tensor, "height width"]]:
-        """The given part of a scene's view, and the pixels whose depth is given."""
+    def _given(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> GivenView:
+        """The given part of a scene's view."""
         view, known = scene.given(exact=self.depths == EXACT)
         observed = observed_pixels(known, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
@@ -149,4 +145,4 @@ class Completion:
         if self.colour_weight:
             image = painted(view, scene.texture).where(view.mask[..., None], torch.nan)
             given = replace(given, colours=image.to(device), colour_weight=self.colour_weight)
-        return given, observed
+        return given

@@ -20,6 +20,7 @@ from renderers.checks import check_at_least, check_choice
 from renderers.field import Field
 from renderers.rendering import check_kind
 
+UNMASKED = "without masks nothing says where the object ends: expect the shape to keep what is behind it"
 UNCOUNTED = {
     "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "
     "foreground in each iteration, in a volume one per sample with a weight, nor second derivatives"
@@ -69,7 +70,8 @@ class Reconstruction(PhotographTask):
         definitions = COLOURED_DEFINITIONS | UNCOUNTED | (DEFINITIONS if name == AUTO else {})
         run.record.definitions = dict(definitions)
         subject = self.subject(inputs)
-        run.record.notes = [*run.record.notes, subject.found, *self.doubts(subject)]
+        doubts = [UNMASKED] if subject.given[0].mask is None else []
+        run.record.notes = [*run.record.notes, subject.found, *doubts]
         if name != AUTO:
             solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
             subject.finish(run)
@@ -100,9 +102,3 @@ class Reconstruction(PhotographTask):
         return ReconstructionProblem(
             subject, stack, model, self.losses, inputs.renderer, self.rays, iterations, inputs.seed
         )
-
-    def doubts(self, subject: Subject) -> list[str]:
-        """Notes on what the photographs leave open."""
-        if subject.given[0].mask is None:
-            return ["without masks nothing says where the object ends: expect the shape to keep what is behind it"]
-        return []

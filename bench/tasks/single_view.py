@@ -172,10 +172,12 @@ class OneImage:
         return judge_mesh(mesh, subject, run.inputs).metrics | {"iou": overlap(field, images, run.inputs.device)}
 
     def _images(self, run: RunContext, recipe: Recipe) -> tuple[ImagesOf, Subject]:
-        """The images of the scene's shape, and as photographs, of which one is given."""
+        """The images of the scene's shape, and as photographs, of which one is given and all others judge."""
         config = run.record.config
         images = recipe.imaging.of_shape(recipe.dataset, Split(config["split"]), config["index"])
-        return images, subject_of(images, self.given, run.inputs)
+        shots = images.shots()
+        others = tuple(shot for place, shot in enumerate(shots) if place != self.given)
+        return images, Subject((shots[self.given],), others or shots, run.inputs.scene.mesh, "")
 
     def _infer(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
         """The shape that the network gives; before, that of the mean code."""
@@ -290,13 +292,6 @@ def _inferred(run: RunContext, model: SingleView, image: Float[Tensor, "4 height
         state = State(model.at(model(image[None].to(run.inputs.device))[0]), run.inputs)
         _ = state.mesh
     return state
-
-
-def subject_of(images: ImagesOf, given: int, inputs: RunInputs) -> Subject:
-    """The given image, and all others as those that judge."""
-    shots = images.shots()
-    others = tuple(shot for place, shot in enumerate(shots) if place != given)
-    return Subject((shots[given],), others or (shots[given],), inputs.scene.mesh, "")
 
 
 def told(trained: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ import torch
 from bench.config import load
 from bench.models.candidates import PAPERS, REACH, by_size, candidate
 from bench.models.field import rendered
-from bench.models.fit import SCREENING, Fitter, _slope_error, scattered
+from bench.models.fit import SCREENING, FitProblem, Fitter, scattered
 from bench.models.growth import _is_better, cost, grow
 from bench.models.held_out import MISSED, HeldOutError
 from bench.models.model import Evidence, Model, Seen, Size
@@ -287,10 +287,12 @@ def test_growth_ends_with_its_budget():
     assert "larger ones would exceed models.growth.budget" in found.summary("auto")[0]
 
 
-def test_the_slope_error_is_that_of_the_length_of_the_gradient():
-    ball = sphere(0.5)
-    assert _slope_error(ball, points()).item() == pytest.approx(0, abs=1e-9)
-    assert _slope_error(Shape(lambda p: 3 * ball(p)), points()).item() == pytest.approx(4)
+def test_the_eikonal_term_is_the_squared_difference_of_slopes_from_one():
+    observations, ball = views_of("ball").observations(0), sphere(0.5)
+    for factor, expected in ((1, 0), (3, 4)):
+        model = Model("network", [], lambda free, k=factor: Shape(lambda p: k * ball(p)), 0.1, metric=False)
+        terms = FitProblem(model, observations, FIT, 0).loss(0)
+        assert terms["eikonal"].item() == pytest.approx(expected, abs=1e-6)
 
 
 def test_each_of_several_starts_is_tried_before_the_best_one_goes_on(monkeypatch):
