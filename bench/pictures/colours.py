@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bench.evaluate.evaluate import render_image
 from bench.evaluate.state import State
-from bench.pictures.run_figures import at_size, picture_normals
+from bench.pictures.run_figures import at_size, picture_normals, save_arrays
 from bench.pictures.style import SCREEN, bare, save
 from bench.setup.inputs import RunContext
 from datasets.photographs import turned
@@ -80,12 +80,6 @@ def seen_arrays(seen: Seen, camera: Camera, prefix: str = "") -> dict[str, Tenso
     view, image = seen(camera)
     parts = {"colours": image, "normals": picture_normals(view), "hit": view.mask}
     return {prefix + name: part for name, part in parts.items()}
-
-
-def save_arrays(folder: Path, arrays: dict[str, Tensor]) -> None:
-    """Writes images.npz, with numbers in half precision."""
-    plain = {name: (array if array.dtype == torch.bool else array.half()).numpy() for name, array in arrays.items()}
-    np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
 
 
 @rc_context(SCREEN)

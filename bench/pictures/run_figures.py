@@ -118,7 +118,7 @@ def draw_against(path: Path, found: View, true: View, *, title: str) -> None:
     for axis, pair in zip(axes, both, strict=False):
         _show_normals(axis, pair, both)
         axis.set_title(f"normals, {pair.title}")
-    _show_silhouette(both[1])(axes[2], both[0], both)
+    _show_silhouette(axes[2], both[0], both)
     axes[2].set_title("silhouette error")
     figure.suptitle(title)
     save(figure, path)
@@ -188,13 +188,19 @@ def save_gallery(
         meshes: by name; None shows nothing.
     """
     cameras = _cameras(inputs, inputs.evaluation.gallery)
-    arrays = {"given": torch.where(observed.cpu(), inputs.scene.given()[0].depth, torch.nan).half().numpy()}
+    arrays = {"given": torch.where(observed.cpu(), inputs.scene.given()[0].depth, torch.nan)}
     for name, mesh in {**meshes, "true": inputs.scene.mesh}.items():
         truth = None if mesh is None else Truth(mesh, closed=False)
         views = [unseen(camera) if truth is None else see(truth, camera) for camera in cameras]
-        arrays[f"{name}_normals"] = torch.stack([picture_normals(view) for view in views]).half().numpy()
-        arrays[f"{name}_hit"] = torch.stack([view.mask for view in views]).numpy()
-    np.savez_compressed(folder / "images.npz", **arrays)  # type: ignore[arg-type]
+        arrays[f"{name}_normals"] = torch.stack([picture_normals(view) for view in views])
+        arrays[f"{name}_hit"] = torch.stack([view.mask for view in views])
+    save_arrays(folder, arrays)
+
+
+def save_arrays(folder: Path, arrays: dict[str, Tensor]) -> None:
+    """Writes images.npz, with numbers in half precision."""
+    plain = {name: (array if array.dtype == torch.bool else array.half()).numpy() for name, array in arrays.items()}
+    np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
 
 
 def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
@@ -222,7 +228,7 @@ def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
     columns = {
         "depth": _show_depth,
         "normals": _show_normals,
-        "silhouette error": _show_silhouette(pairs[2]),
+        "silhouette error": _show_silhouette,
         "from behind": _show_shaded,
     }
     figure = Figure(figsize=(9.2, 7.4), layout="constrained")
@@ -264,18 +270,15 @@ def _show_shaded(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
     return bare(axis).imshow(shown[part], cmap="gray", vmin=0, vmax=1)
 
 
-def _show_silhouette(truth: ViewPair) -> Any:
-    def show(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> None:
-        found, true = pair.front.mask.numpy(), truth.front.mask.numpy()
-        image = silhouette_image(found, true)
-        missed, spurious = (100 * part.sum() / max(true.sum(), 1) for part in (true & ~found, found & ~true))
-        part = window([other.front.mask.numpy() for other in (*pairs, truth)])
-        bare(axis).imshow(image[part], interpolation="nearest")
-        label = {"transform": axis.transAxes, "fontsize": 8, "bbox": {"facecolor": "white", "lw": 0, "pad": 1.5}}
-        axis.text(0.02, 0.10, f"missed {missed:.1f} %", color=MISSED, **label)
-        axis.text(0.02, 0.02, f"spurious {spurious:.1f} %", color=SPURIOUS, **label)
-
-    return show
+def _show_silhouette(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> None:
+    """Compares a silhouette with that of the truth, the last of the pairs."""
+    found, true = pair.front.mask.numpy(), pairs[-1].front.mask.numpy()
+    missed, spurious = (100 * part.sum() / max(true.sum(), 1) for part in (true & ~found, found & ~true))
+    part = window([other.front.mask.numpy() for other in pairs])
+    bare(axis).imshow(silhouette_image(found, true)[part], interpolation="nearest")
+    label = {"transform": axis.transAxes, "fontsize": 8, "bbox": {"facecolor": "white", "lw": 0, "pad": 1.5}}
+    axis.text(0.02, 0.10, f"missed {missed:.1f} %", color=MISSED, **label)
+    axis.text(0.02, 0.02, f"spurious {spurious:.1f} %", color=SPURIOUS, **label)
 
 
 def _show_given(axis: Any, given: Given) -> None:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from bench.evaluate.state import State
-from bench.pictures.colours import Seen, save_arrays, seen_arrays
-from bench.pictures.run_figures import at_size, draw_curve, normals_image
+from bench.pictures.colours import Seen, seen_arrays
+from bench.pictures.run_figures import at_size, draw_curve, normals_image, save_arrays
 from bench.pictures.style import SCREEN, bare, save
 from bench.reconstruct.judge import judge_mesh, judged_pixels
 from bench.reconstruct.subject import Subject
