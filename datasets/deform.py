@@ -1,11 +1,9 @@
 """Seeded smooth deformations that make many shapes of one mesh."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-
-from datasets.mesh import Mesh
 
 STRETCH = 0.25  # log of the largest scale of an axis: about -22 % to +28 %
 TAPER = 0.25  # largest change of cross-section at |position| = 1 along the axis
@@ -57,18 +55,6 @@ class Deformation:
         points = _taper(points, self.taper, self.taper_axis)
         points = _twist(points, self.twist, self.twist_axis)
         return _bend(points, self.bend, self.bend_axis)
-
-
-def deform(mesh: Mesh, seed: int, strength: float = 1.0) -> Mesh:
-    """Deforms a mesh that lies in the unit sphere; its faces and repairs stay. Normalise it again afterwards.
-
-    Raises:
-        ValueError: the mesh leaves the unit sphere, or the strength is not from 0 to 1.
-    """
-    farthest = np.linalg.norm(mesh.vertices, axis=1).max()
-    if farthest > 1 + 1e-6:
-        raise ValueError(f"mesh: must lie in the unit sphere, found a vertex at {farthest:.4g}; normalise it first")
-    return replace(mesh, vertices=Deformation.draw(seed, strength).apply(mesh.vertices))
 
 
 def _taper(points: np.ndarray, rate: float, axis: int) -> np.ndarray:

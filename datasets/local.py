@@ -5,7 +5,7 @@ import os
 import tempfile
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from datasets.colours import FileColours
-from datasets.deform import deform
+from datasets.deform import Deformation
 from datasets.extras import named_files, version
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
@@ -65,7 +65,8 @@ class LocalMeshes:
         alone = len(find_meshes(self.path)) == 1
         if index < len(files) and (split is Split.TRAIN or not alone):
             return mesh
-        return normalise(deform(mesh, seed_of(split, index), strength=self.strength), self.radius)
+        drawn = Deformation.draw(seed_of(split, index), self.strength)
+        return normalise(replace(mesh, vertices=drawn.apply(mesh.vertices)), self.radius)
 
     def texture(self, split: Split, index: int) -> Texture:
         """The colours of a shape, as its file has them; see `Textured`."""
