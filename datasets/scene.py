@@ -120,7 +120,6 @@ class Truth:
         """Gives the first hit of each ray.
 
         Args:
-            origins: starts of the rays.
             directions: of any length but zero; distances are along the unit ray.
         """
         directions = np.asarray(directions, dtype=np.float64)

@@ -94,7 +94,6 @@ def observed_pixels(mask: Bool[Tensor, "height width"], points: str | int, seed:
     """True on the foreground pixels whose depth is given.
 
     Args:
-        mask: true on the foreground.
         points: "dense" for all, "10%" for a share, 100 for a number.
         seed: of the draw, without replacement.
 

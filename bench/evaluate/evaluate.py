@@ -77,9 +77,6 @@ def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: flo
             `fscore` and `normal_consistency`. A zero normal is consistent with none.
         truth: must not be empty.
         threshold: of `fscore`, in scene units, positive.
-
-    Raises:
-        ValueError: if the truth is empty.
     """
     if len(truth.points) == 0:
         raise ValueError("truth must have points, found 0; sample the true surface before comparing with it.")

@@ -107,12 +107,7 @@ def coloured_image(field: Coloured, view: View, device: torch.device) -> Float[T
 
 
 def painted(mesh: Mesh, truth: Truth, camera: Camera) -> Float[np.ndarray, "height width 3"]:
-    """The colours of a mesh's vertices, interpolated over its faces; grey without colours, black outside of it.
-
-    Args:
-        mesh: with or without colours.
-        truth: of the same mesh.
-    """
+    """The colours of a mesh's vertices, interpolated over its faces; grey without colours, black outside of it."""
     colours = np.full_like(mesh.vertices, GREY) if mesh.colours is None else mesh.colours
     rays = camera.rays()
     weights, corners = truth.corners(rays.flat().origins.double().numpy(), rays.flat().directions.double().numpy())

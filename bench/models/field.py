@@ -40,7 +40,6 @@ def solve_by_growth(observations: RayObservations, given: Given, run: RunContext
     Args:
         observations: that a field is fitted to, some of them held out.
         given: what pictures show of them.
-        run: its record and folder are filled.
         iterations: of a whole fit.
 
     Raises:

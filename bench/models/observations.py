@@ -108,7 +108,6 @@ def hold_out(
         view: of rays in one row.
         group: which view, or part of one, a ray belongs to, from 0.
         share: of the rays with a known depth and of the others, from 0 to 1.
-        whole: groups that are held out as a whole.
         footprint: half a pixel, in scene units.
 
     Raises:

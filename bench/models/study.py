@@ -85,9 +85,6 @@ def shares(
     """The shares of random draws of views on which a choice is as good as the draw's best candidate, and holds.
 
     Args:
-        chosen: errors of the choice in all views.
-        candidates: errors of all candidates.
-        settings: the number of draws, and of views in each.
         footprint: half a pixel, in scene units: a choice with an error below it holds as well.
     """
     draw, within, held = np.random.default_rng([seed, 4]), 0, 0

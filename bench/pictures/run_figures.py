@@ -71,11 +71,7 @@ class Given:
 
 @rc_context(SCREEN)
 def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: list[dict[str, Any]], title: str) -> None:
-    """Writes summary.png and curve.png of a run, at a higher resolution than in the run.
-
-    Args:
-        states: before and after the optimisation.
-    """
+    """Writes summary.png and curve.png of a run's states before and after, at a higher resolution than in the run."""
     inputs = states[0].inputs
     front, back = _cameras(inputs, inputs.evaluation.picture)
     truth = inputs.scene.cast_on

@@ -60,11 +60,7 @@ COLOURED_DEFINITIONS = {
 
 
 def judge(state: State, subject: Subject) -> Evaluation:
-    """Compares a state with the held-out photographs, and with the true surface where there is one.
-
-    Args:
-        state: whose field has colours.
-    """
+    """Compares a state whose field has colours with held-out photographs and, where it is known, the true surface."""
     field, inputs, shots = state.field, state.inputs, subject.held_out
     metrics = surface_scores(state.mesh, subject, inputs) | field_scores(state, shots)
     metrics |= early_weight(field, [state.seen(shot.camera) for shot in shots], inputs)

@@ -34,11 +34,7 @@ WORST = 0.3  # mean difference of colours that is shown darkest
 
 
 def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: list[dict[str, Any]], title: str) -> None:
-    """Writes summary.png, input.png, images.npz and, of a loop, curve.png.
-
-    Args:
-        state: whose field has colours.
-    """
+    """Writes summary.png, input.png, images.npz and, of a loop, curve.png, of a field with colours."""
     if curve:
         draw_curve(folder / "curve.png", curve)
 
@@ -60,9 +56,7 @@ def note_surface(
     """Judges a mesh with colours, notes the result, and writes summary.png, input.png and images.npz.
 
     Args:
-        run: its record and folder are filled.
         mesh: None where no surface was found.
-        subject: that it is judged by.
         history: of the loop that found it, where there was one.
         field: whose surface it is, where it is that of one.
     """

@@ -32,11 +32,9 @@ WEIGHT = {
 def roughness_scores(
     found: tuple[Surface, Bool[np.ndarray, " n"]] | None, true: tuple[Surface, Bool[np.ndarray, " m"]]
 ) -> dict[str, float]:
-    """The metrics of `ROUGHNESS`; infinite without a surface, and without the part where the true one has it.
+    """The metrics of `ROUGHNESS` of a surface with those of its points that are seen, against the true one.
 
-    Args:
-        found: the reconstructed surface, and which of its points are seen.
-        true: the same of the true surface.
+    They are infinite without a surface, and without the part where the true one has it.
     """
     scores = {}
     for name, seen in zip(ROUGHNESS, (True, False), strict=True):

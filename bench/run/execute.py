@@ -28,8 +28,6 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     """Runs a job to its end in the process of a run; its output goes to the job's log.
 
     Args:
-        job: the folder and the record.
-        channel: where messages are sent to.
         parent: the reading end of a pipe that only the parent holds open, and never writes to.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
@@ -53,7 +51,6 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
     """Runs a job, whose record gets a status, and a reason where that is not ok.
 
     Args:
-        job: its record has the configuration.
         checkpoint: receives the record as soon as the machine is known.
 
     Raises:

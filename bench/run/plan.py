@@ -28,12 +28,7 @@ class Shown(BaseException):
 
 
 def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
-    """Why the run of a configuration would be refused; empty where it would not, or would fail in another way.
-
-    Args:
-        config: resolved, as plain data.
-        built: what cells of a sweep share; see `cell_of`.
-    """
+    """Why the run of a configuration would be refused; empty where it would not, or would fail in another way."""
     from bench.setup.inputs import cell_of  # it imports torch
 
     try:

@@ -161,7 +161,6 @@ def _carry_out(job: Job, limits: RunLimits, progress: Report, ready: Callable[[]
     """Does the job in a child process or, for debugging, in this one, and fills its record with what is known.
 
     Args:
-        progress: is told of each step.
         ready: is called when the child has imported what it needs.
     """
     if job.record.config["isolation"] == Isolation.off:

@@ -89,7 +89,6 @@ def rays_share(least: float, footprint: float, error: float) -> float:
     Pixels need be no finer than the error: DIST, Eq. 10, solved for the resolution, whose square is their number.
 
     Args:
-        least: smallest share.
         footprint: half a pixel of the whole image, in scene units.
         error: in scene units.
     """

@@ -312,8 +312,5 @@ def threads_for(width: int) -> int:
 
     A rendering evaluates a narrow network so briefly that threads mostly wait for each other: at 64 x 64 pixels and
     4 layers of 128, the loop of a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
-
-    Args:
-        width: neurons per layer.
     """
     return 1 if width < WIDE else ALL_THREADS

@@ -102,7 +102,6 @@ def optimise(
 
     Args:
         problem: gives the loss; its parameters are changed in place.
-        settings: iterations and learning rate.
         device: that is synchronised when the clock is read.
         history: an empty one, filled during the loop, so that it is complete if the loop is stopped. A loss that
             becomes NaN or diverges ends the loop and sets its status.
@@ -173,11 +172,7 @@ def _read(numbers: list[Tensor]) -> list[float]:
 
 
 def _failed(history: History, largest: float, least_reference: float) -> bool:
-    """Whether the loop must end; notes the reason in the history.
-
-    Args:
-        largest: magnitude of any parameter.
-    """
+    """Whether the loop must end; notes the reason in the history. `largest` is the magnitude of any parameter."""
     loss, first = history.curve[-1]["total"], max(history.curve[0]["total"], least_reference)
     iteration = history.curve[-1]["iteration"]
     if loss != loss or not isfinite(largest):

@@ -119,11 +119,7 @@ class OneImage:
         return self.supervision.losses.colour > 0
 
     def recipe(self, inputs: RunInputs, config: dict[str, Any]) -> Recipe:
-        """What determines the network that a run's configuration asks for.
-
-        Args:
-            config: resolved, as plain data.
-        """
+        """What determines the network that a run's configuration asks for."""
         check_field_gradient(inputs.renderer)
         sampler = replace(inputs.views, resolution=self.image_pixels, elevation=self.elevation)
         settings = {name: config["task"][name] for name in DECIDING} | {"view": asdict(sampler)}

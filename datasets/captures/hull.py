@@ -25,10 +25,6 @@ def carve(shots: Sequence[Shot], points: Float[Tensor, "*batch 3"]) -> Float[Ten
 
     A value is 1/2 less the least mask, from 0 to 1, that is interpolated between pixels; 1/2 for a point that lies in
     less than `SEEN` of the photographs.
-
-    Args:
-        shots: with masks.
-        points: in the world of the cameras.
     """
     flat = points.reshape(-1, 3)
     values = torch.cat([_carved(shots, some) for some in flat.split(CHUNK)]) if len(flat) else flat[:, 0]

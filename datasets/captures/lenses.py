@@ -92,7 +92,6 @@ def colmap_lens(model: str, numbers: list[float], where: str) -> Lens:
     """The lens of a COLMAP camera.
 
     Args:
-        model: its name.
         numbers: all of the camera, focal lengths and principal point first.
 
     Raises:

@@ -46,7 +46,6 @@ def by_order(names: Sequence[str], count: int, where: str) -> list[dict[int, str
 
     Args:
         names: of the images, without folders.
-        count: of cameras.
         where: the file of the cameras, for messages.
 
     Raises:

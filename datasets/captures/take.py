@@ -183,7 +183,6 @@ def stored_depths(path: Path, otherwise: str) -> Float[np.ndarray, "height width
     """The first channel of a file of depths, such as an EXR, as OpenCV reads it.
 
     Args:
-        path: of the file.
         otherwise: what else can be done where it cannot be read.
 
     Raises:
