@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from datasets.mesh import Mesh, extract, fit_in_sphere, normalise
+from datasets.mesh import Mesh, extract, normalise
 from datasets.scene import Split, seed_of
 from renderers.checks import BadInput, check_at_least, check_choice, check_share
 from renderers.field import Kind
@@ -54,33 +54,15 @@ class Family:
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """A shape as a closed mesh, by marching cubes."""
-        return normalise(self._raw_mesh(split, index), self.radius)
-
-    def formula(self, split: Split, index: int) -> Shape:
-        """The same shape as a field: the formula that its mesh was made from, divided by its slope to be a bound."""
-        centre, factor = fit_in_sphere(self._raw_mesh(split, index).used, self.radius)
-        return bounded(self._raw_shape(split, index)).translate(tuple(-centre)).scale(factor)
-
-    def _raw_shape(self, split: Split, index: int) -> Shape:
-        return BUILDERS[self.name](SimpleNamespace(**self.draw(split, index)))
-
-    def _raw_mesh(self, split: Split, index: int) -> Mesh:
-        mesh = extract(self._raw_shape(split, index), grid=self.resolution, reach=HALF_GRID)
+        shape = BUILDERS[self.name](SimpleNamespace(**self.draw(split, index)))
+        mesh = extract(shape, grid=self.resolution, reach=HALF_GRID)
         if mesh is None:
             raise BadInput(f"{self.name} {split} {index} has no surface: check dataset.ranges")
-        return mesh
+        return normalise(mesh, self.radius)
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: families of equal identity hold the same ones."""
         return {"version": VERSION, **asdict(self)}
-
-
-def bounded(shape: Shape) -> Shape:
-    """The shape with values divided by its Lipschitz bound where that is above 1: the same surface, never overshot."""
-    steepest = shape.lipschitz
-    if steepest is None:
-        raise ValueError("shape must have a Lipschitz bound, not None: state one in its builder")
-    return shape if steepest <= 1 else Shape(lambda p: shape(p) / steepest, Kind.BOUND, 1.0)
 
 
 def _all_of(parts: list[Shape]) -> Shape:

@@ -10,7 +10,7 @@ import torch
 from bench.config import CONF, load
 from bench.records.record import digest
 from bench.tables import read_rows
-from datasets.families import BUILDERS, HALF_GRID, Family, bounded
+from datasets.families import BUILDERS, HALF_GRID, Family
 from datasets.scene import SPLIT_STRIDE, Split, seed_of
 from renderers.field import Kind, autograd_gradients
 from tests.looped import each
@@ -89,23 +89,11 @@ def test_a_formula_is_nowhere_steeper_than_its_bound(family):
     generator = torch.Generator().manual_seed(0)
     shapes = [*corners(family, 10), *(family.draw(Split.TRAIN, index) for index in range(10))]
     for parameters in shapes:
-        raw = BUILDERS[family.name](SimpleNamespace(**parameters))
-        field = bounded(raw)
+        field = BUILDERS[family.name](SimpleNamespace(**parameters))
         points = torch.empty(5_000, 3, dtype=torch.float64).uniform_(-1.2, 1.2, generator=generator)
         slopes = autograd_gradients(field, points).norm(dim=-1)
-        assert slopes.max() <= field.lipschitz + 1e-6 == 1 + 1e-6
-        assert field.kind is not Kind.LEVEL
-        assert torch.equal(raw(points) < 0, field(points) < 0)
-
-
-def test_the_shipped_formula_of_a_car_with_much_rake_is_a_bound():
-    car = load("dataset", "car")
-    raked = replace(car, ranges=car.ranges | {"rake": [0.69, 0.7]}, resolution=48)
-    field = raked.formula(Split.TEST, 0)
-    points = torch.empty(50_000, 3, dtype=torch.float64).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
-    slopes = autograd_gradients(field, points).norm(dim=-1)
-    assert 0.9 < slopes.max() <= 1 + 1e-6
-    assert field.kind is Kind.BOUND
+        assert slopes.max() <= field.lipschitz + 1e-6
+        assert field.lipschitz <= 1 or field.kind is Kind.LEVEL
 
 
 def test_parts_share_no_seed():
