@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from datasets.captures.frames import Frame, Layout, motion
@@ -52,8 +51,10 @@ def colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None
     notes += [*how, *paired, *without("image", [name for name in cameras if name not in found])]
     if base != folder:
         notes += without("camera", [name for name in images_in(base, deep=True) if name not in there])
-    points = np.array([point.xyz for point in models[place].points3D.values()])
-    around = _about(points) if len(points) else None
+    points, around = np.array([point.xyz for point in models[place].points3D.values()]), None
+    if len(points):
+        centre = np.median(points, axis=0)
+        around = centre, float(np.quantile(np.linalg.norm(points - centre, axis=1), MOST))
     return Layout("COLMAP", tuple(frames), None, tuple(notes), around, missing=next(iter(cameras), ""))
 
 
@@ -88,9 +89,3 @@ def _written_names(place: Path) -> dict[int, str]:
                     f"{file}: after {rest[-1]} there must be a line of its points, or a blank one: add these"
                 )
     return names
-
-
-def _about(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
-    """The sphere about most of the points."""
-    centre = np.median(points, axis=0)
-    return centre, float(np.quantile(np.linalg.norm(points - centre, axis=1), MOST))

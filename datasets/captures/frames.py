@@ -85,7 +85,7 @@ class Layout:
         points: a sphere about most of the reconstructed points, where the format has them.
         world: from the cameras' world into that of the file.
         rival: other pairs of images and cameras that the names allow; masks decide.
-        missing: of the images that it names but that are not there, the first.
+        missing: the first image that it names, for what is said where none is there.
     """
 
     format: str

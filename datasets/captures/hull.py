@@ -58,20 +58,12 @@ def hull_mesh(shots: Sequence[Shot], samples: int) -> Mesh | None:
     return extract(Shape(hull, Kind.LEVEL, None), grid=samples, reach=1.0)
 
 
-def hull_views(shots: Sequence[Shot], hull: Mesh | None) -> list[Bool[Tensor, "height width"]]:
-    """The hull's silhouette in each photograph: where cameras are right, it covers nearly all of the mask."""
-    if hull is None:
-        return [torch.zeros(shot.camera.height, shot.camera.width, dtype=torch.bool) for shot in shots]
-    truth = Truth(hull, closed=False)
-    return [see(truth, shot.camera).mask for shot in shots]
-
-
 @dataclass(frozen=True)
 class Fit:
     """How well cameras and masks fit.
 
     Args:
-        silhouettes: of the visual hull, in each photograph.
+        silhouettes: of the visual hull, in each photograph: where cameras are right, they cover nearly all of the mask.
         overlaps: their intersection over union with the masks.
         shown: the share of the hull's vertices that each photograph shows.
     """
@@ -83,9 +75,10 @@ class Fit:
 
 def fit_of(shots: Sequence[Shot], samples: int) -> Fit:
     """How well photographs with masks fit, by their visual hull in the unit sphere, `samples` per axis."""
-    hull = hull_mesh(shots, samples)
-    silhouettes = tuple(seen.numpy() for seen in hull_views(shots, hull))
-    overlaps = [mask_iou(seen, np.asarray(shot.mask)) for seen, shot in zip(silhouettes, shots, strict=True)]
-    points = torch.zeros(0, 3) if hull is None else torch.from_numpy(hull.vertices).float()
-    shown = [float(shot.camera.shows(points).float().mean()) if len(points) else 0.0 for shot in shots]
-    return Fit(silhouettes, tuple(overlaps), tuple(shown))
+    hull, masks = hull_mesh(shots, samples), [np.asarray(shot.mask) for shot in shots]
+    if hull is None:
+        return Fit(tuple(map(np.zeros_like, masks)), (0.0,) * len(shots), (0.0,) * len(shots))
+    truth, points = Truth(hull, closed=False), torch.from_numpy(hull.vertices).float()
+    silhouettes = tuple(see(truth, shot.camera).mask.numpy() for shot in shots)
+    shown = tuple(float(shot.camera.shows(points).float().mean()) for shot in shots)
+    return Fit(silhouettes, tuple(map(mask_iou, silhouettes, masks)), shown)

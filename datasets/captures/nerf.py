@@ -35,13 +35,12 @@ def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     found, how = located([*known], folder)
     masks, told = _masks(folder, known, found) if masked else ({}, ())
     frames = [_frame(known[path], image, masks.get(path), f"{files[0]}, {path}") for path, image in found.items()]
-    missing = [path for path in known if path not in found]
-    notes = (*how, *told, *without("image", missing))
+    notes = (*how, *told, *without("image", [path for path in known if path not in found]))
     of_size = {"w", "h", *_focal_keys("x")[1:], *_focal_keys("y")[1:]}
     if any(not of_size & {*known[path]} for path in found):
         notes += (f"{files[0].name} states no w and h: focal lengths are taken for the size of the images",)
     frames = sorted(frames, key=lambda frame: natural(frame.image.name))
-    return Layout("NeRF", tuple(frames), None, notes, missing=missing[0] if missing else "")
+    return Layout("NeRF", tuple(frames), None, notes, missing=next(iter(known), ""))
 
 
 def _masks(

@@ -31,9 +31,8 @@ def middlebury(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
         raise BadInput(f"{folder / lost[0]} has no camera: {files[0].name} has no line for it; remove the image")
     masks, told = masks_of(folder, there if masked else {})
     frames = tuple(Frame(file, *cameras[name], masks.get(file.name)) for name, file in found.items())
-    missing = [name for name in cameras if name not in found]
-    notes = (*how, *told, *without("image", missing))
-    return Layout("Middlebury", frames, None, notes, missing=missing[0] if missing else "")
+    notes = (*how, *told, *without("image", [name for name in cameras if name not in found]))
+    return Layout("Middlebury", frames, None, notes, missing=next(iter(cameras), ""))
 
 
 def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
@@ -67,9 +66,8 @@ def blended_mvs(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
         raise BadInput(f"{images[lost[0]]} has no camera: there is no cams/{Path(lost[0]).stem}_cam.txt")
     masks, how = masks_of(folder, images if masked else {})
     frames = [_mvs_frame(cameras[name], images[image], masks.get(image)) for name, image in pairs.items()]
-    missing = [name for name in cameras if name not in pairs]
-    notes = (*how, *without("image", missing))
-    return Layout("BlendedMVS", tuple(frames), None, notes, missing=missing[0] if missing else "")
+    notes = (*how, *without("image", [name for name in cameras if name not in pairs]))
+    return Layout("BlendedMVS", tuple(frames), None, notes, missing=next(iter(cameras), ""))
 
 
 def _mvs_frame(file: Path, image: Path, mask: Path | None) -> Frame:

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 from bench.photos import main
 from datasets.captures.formats import find_layout
 from datasets.captures.frames import OPENGL
-from datasets.captures.hull import carve, hull_mesh, hull_views
+from datasets.captures.hull import carve, hull_mesh
 from datasets.captures.rows import _from_angles
 from datasets.captures.take import _alike, read_image, take
 from datasets.own_photographs import Reading, read_capture
@@ -77,8 +77,8 @@ def test_the_ball_is_where_it_is_and_its_hull_no_smaller(tmp_path):
     assert np.abs(distances - RADIUS).max() < 0.06  # a pixel is .025 wide there
     assert distances.min() > RADIUS - 0.02 and np.abs(vertices.mean(axis=0)).max() < 0.02
     assert np.linalg.norm(capture.sphere.centre - CENTRE) + RADIUS < capture.sphere.radius < 1.4 * RADIUS
-    for shot, seen in zip(capture.shots, hull_views(capture.shots, hull), strict=True):
-        assert (seen & shot.mask).sum() > 0.9 * shot.mask.sum()
+    for shot, seen in zip(capture.shots, capture.fit.silhouettes, strict=True):
+        assert (torch.from_numpy(seen) & shot.mask).sum() > 0.9 * shot.mask.sum()
 
 
 @each("share", [0.005, 0.3, 0.7])
