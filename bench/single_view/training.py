@@ -93,10 +93,6 @@ class TrainingSettings:
         check_positive("task.training.learning_rate", self.learning_rate, "1e-3 works")
         check_choice("task.training.schedule", self.schedule, SCHEDULES)
 
-    def rate(self, step: int) -> float:
-        """The learning rate of a step, counted from 0."""
-        return OptimiserSettings(self.steps, self.learning_rate, self.schedule).rate(step)
-
 
 @dataclass
 class Course:
@@ -136,6 +132,7 @@ class Lessons:
             Failed: where the loss or its gradient is not finite; `state` stays.
         """
         settings = self.settings
+        rates = OptimiserSettings(settings.steps, settings.learning_rate, settings.schedule)
         torch.manual_seed(settings.seed)
         with torch.device("cpu"):  # whatever the default, so that all devices begin with the same weights
             model = SingleView(network).to(self.device)
@@ -146,7 +143,7 @@ class Lessons:
         for step in range(begun, settings.steps):
             started = time.perf_counter()
             for group in optimiser.param_groups:
-                group["lr"] = settings.rate(step)
+                group["lr"] = rates.rate(step)
             loss = self.give(model, step, course.counts)
             norm = torch.nn.utils.clip_grad_norm_(model.parameters(), LARGEST_GRADIENT)
             if not isfinite(loss) or not bool(norm.isfinite()):

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 from unittest import mock
 
 import torch
@@ -19,6 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from bench.__main__ import main
 from bench.machine.environment import using_threads
 from bench.run import process
+from bench.run.library import Outcome
 
 ROOT = Path(__file__).parents[2]
 FAILING = (
@@ -31,14 +31,6 @@ SMALLEST = (
     "evaluation.picture=null",
 )  # fmt: skip
 PATIENCE = 120.0  # seconds that a test waits for what must come; it is there to end a test that hangs
-
-
-class Outcome(NamedTuple):
-    """What a command line left: its exit status, standard output and standard error."""
-
-    code: int
-    out: str
-    err: str
 
 
 def errors(err: str) -> list[str]:
