@@ -17,7 +17,7 @@ from bench.machine import environment
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus, now
 from bench.run.process import Ended, Job, Notice, Started, Step, reason_of
-from bench.setup.inputs import Cell, RunContext, cell_of
+from bench.setup.inputs import RunContext, cell_of
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 
@@ -59,7 +59,10 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
     folder, record = job.folder, job.record
     before = environment.scheduled()
     try:
-        cell = _built(record, progress)
+        try:
+            cell = cell_of(record.config, progress=progress)
+        except (ValueError, OSError) as error:  # anything invalid in it
+            raise BadInput(reason_of(error)) from error
         cell.start()
         inputs = cell.inputs
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
@@ -85,14 +88,6 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
         record.environment["waited_share"] = environment.waited_share(before)
         record.notes += environment.doubts(record)
         _note(folder, f"{record.status} {record.reason}")
-
-
-def _built(record: Record, progress: Report) -> Cell:
-    """The cell of a record's configuration; raises BadInput for anything invalid in it."""
-    try:
-        return cell_of(record.config, progress=progress)
-    except (ValueError, OSError) as error:
-        raise BadInput(reason_of(error)) from error
 
 
 class _Progress:

@@ -105,10 +105,13 @@ def run(identity: Identity) -> tuple[Path, Record]:
         OSError: where the results folder cannot be written.
         Interrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
-    with claimed(Path(identity.config["results_dir"]), identity, identity.config["rerun"]) as (folder, finished):
+    config = identity.config
+    with claimed(Path(config["results_dir"]), identity, config["rerun"]) as (folder, finished):
         if finished is not None:
             return folder, _reuse(folder, finished)
-        return folder, _run_anew(Job(folder, _new_record(identity)))
+        hashes = {"config_hash": identity.config_hash, "code": identity.code}
+        known = {"seed": config["seed"], "config": config, "overrides": identity.overrides}
+        return folder, _run_anew(Job(folder, Record(identity.name, **identity.choices, **known, **hashes)))
 
 
 def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
@@ -192,18 +195,6 @@ def _export(tracker: Tracker, folder: Path, record: Record) -> None:
     except Exception as error:  # noqa: BLE001 - an error of a server, a database, another library
         record.notes = [*record.notes, f"not exported to the tracker: {' '.join(str(error).split())}"]
         record.write(folder)
-
-
-def _new_record(identity: Identity) -> Record:
-    return Record(
-        identity.name,
-        **identity.choices,
-        seed=identity.config["seed"],
-        config=identity.config,
-        config_hash=identity.config_hash,
-        code=identity.code,
-        overrides=identity.overrides,
-    )
 
 
 def _last_lines(path: Path) -> list[str]:

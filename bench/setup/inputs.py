@@ -177,7 +177,7 @@ class Cell:
         prior: how the prior is trained, where it has to be; or the network whose codes it is.
         learnt: the dataset whose prior is trained.
         width: of the prior's network, in neurons per layer.
-        threads: of the CPU; None leaves it to `threads_for`.
+        threads: of the CPU; None: see `start`.
     """
 
     task: Task
@@ -188,8 +188,13 @@ class Cell:
     threads: int | None
 
     def start(self) -> None:
-        """Gives this process the run's threads and seed."""
-        torch.set_num_threads(self.threads or threads_for(self.width))
+        """Gives this process the run's threads and seed.
+
+        A run that names no threads takes one for a narrow network, else all that PyTorch takes. A rendering evaluates a
+        narrow network so briefly that threads mostly wait for each other: at 64 x 64 pixels and 4 layers of 128, the
+        loop of a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
+        """
+        torch.set_num_threads(self.threads or (1 if self.width < WIDE else ALL_THREADS))
         torch.manual_seed(self.inputs.seed)
 
 
@@ -305,12 +310,3 @@ def _check(task: Task, inputs: RunInputs, index: int) -> None:
         raise ValueError(f"the task {name} does not take field={inputs.field.name}: remove it")
     if isinstance(task, Checks):
         task.check(inputs)
-
-
-def threads_for(width: int) -> int:
-    """How many threads of the CPU a run takes that names none: one for a narrow network, else all that PyTorch takes.
-
-    A rendering evaluates a narrow network so briefly that threads mostly wait for each other: at 64 x 64 pixels and
-    4 layers of 128, the loop of a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
-    """
-    return 1 if width < WIDE else ALL_THREADS

@@ -98,12 +98,8 @@ class CodeProblem:
         first = torch.zeros(1, self.decoder.code_length) if self.initial is None else self.initial
         self.codes = self._free(first)
         self.similarities = [] if self.misplaced is None else self._free(self.misplaced)
+        self.parameters = [*self.codes, *self.similarities]
         self.starts = Starts(StartSettings(len(first), self.trial))
-
-    @property
-    def parameters(self) -> list[Tensor]:
-        """The codes and similarities that the optimiser changes."""
-        return [*self.codes, *self.similarities]
 
     @property
     def code(self) -> Float[Tensor, " code_length"]:

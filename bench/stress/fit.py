@@ -123,7 +123,7 @@ def judge_fit(
     settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
     optimise(problem, settings, conditions.device, history=history, on_step=lambda line: None)
     error = float(problem.field()(_surface(true, draw).to(conditions.device)).abs().mean())
-    spent = history.counts.value / problem.rays_per_iteration / max(len(history.curve), 1)
+    spent = history.counts.value / given.observed.numel() / max(len(history.curve), 1)
     return Outcome(
         _failure(history, error, conditions.criteria.surface_error),
         {"surface_error": error, "evaluations_per_ray": spent},
@@ -140,17 +140,8 @@ class SphereProblem:
     counts: Counts = field(default_factory=Counts)
 
     def __post_init__(self) -> None:
+        self.parameters = [self.free]
         self.watched = self.limits.watch(self.field(), self.free.device)  # the limit is on the whole fit
-
-    @property
-    def parameters(self) -> list[Tensor]:
-        """The parameters that the optimiser changes."""
-        return [self.free]
-
-    @property
-    def rays_per_iteration(self) -> int:
-        """The number of pixels: all are rendered."""
-        return self.given.observed.numel()
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The terms and their sum."""

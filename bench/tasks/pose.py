@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
@@ -189,18 +189,9 @@ class PoseProblem:
         self.cameras = [camera.to(self.device) for camera in self.cameras]
         self.parameters = [torch.zeros(6, device=self.device, requires_grad=True) for _ in self.cameras]
         self.starts = Starts(StartSettings(len(self.cameras), self.settings.trial))
-        self.depth, self.mask = self.view.depth.to(self.device), self.view.mask.to(self.device)
+        self.depth, self.observed = self.view.depth.to(self.device), self.view.mask.to(self.device)
+        self.rays_per_iteration = self.observed.numel()
         self.normals = in_camera_axes(self.view.normals.to(self.device), self.view.camera.to(self.device))
-
-    @property
-    def observed(self) -> Bool[Tensor, "height width"]:
-        """Pixels whose depth is given: all that hit."""
-        return self.mask
-
-    @property
-    def rays_per_iteration(self) -> int:
-        """One ray per pixel."""
-        return self.mask.numel()
 
     def field(self) -> Field:
         """The known shape."""
@@ -235,11 +226,11 @@ class PoseProblem:
         camera = self.cameras[start].with_object_moved(self.parameters[start])
         renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.known, self.counts)
         rendering = rendered(renderer, metered, rays)
-        compared = self.mask & rendering.hit
+        compared = self.observed & rendering.hit
         count = compared.sum().clamp_min(1)
         found, at_one = camera.depth(rendering.distance), camera.depth(torch.ones_like(self.depth))
         error = depth_error(self.settings.depth_loss, found, self.depth, at_one)
-        given = Observed(self.mask, torch.where(self.mask, self.depth / at_one, torch.nan))
+        given = Observed(self.observed, torch.where(self.observed, self.depth / at_one, torch.nan))
         silhouette = self.settings.silhouette(renderer, metered, rays, rendering, given)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,

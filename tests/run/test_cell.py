@@ -1,13 +1,14 @@
 """A configuration becomes objects in one place: each node once, whatever asks for it; and a run takes its threads."""
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
 
 from bench import config as config_module
 from bench.machine.environment import using_threads
-from bench.setup.inputs import ALL_THREADS, cell_of, threads_for
+from bench.setup.inputs import ALL_THREADS, cell_of
 from renderers.checks import BadInput
 from tests.tiny import cell_from, plain
 
@@ -59,9 +60,11 @@ def test_a_shape_has_a_code_of_the_prior_where_its_training_had_the_shape(compos
     assert cell_from(compose_config("split=test", "prior.shapes=2", "index=0")).inputs.trained is None
 
 
-def test_a_narrow_network_takes_one_thread_and_a_wide_one_all():
-    assert threads_for(128) == 1
-    assert threads_for(512) == ALL_THREADS
+def test_a_narrow_network_takes_one_thread_and_a_wide_one_all(compose_config):
+    cell = cell_from(compose_config("scale=smoke"))
+    for width, threads in ((128, 1), (512, ALL_THREADS)):
+        replace(cell, width=width).start()
+        assert torch.get_num_threads() == threads
 
 
 def test_the_threads_that_are_asked_for_are_taken_by_the_run_and_not_by_its_check(compose_config):
