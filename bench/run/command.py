@@ -116,14 +116,12 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
 
 def _answer(arguments: list[str], about: str) -> str | None:
     """The text that a command line asks for in place of a run; None where it asks for none."""
-    if {"--help", "-h", "help"} & {*arguments}:
-        chosen = "\n".join(
-            f"{group}: {', '.join(_choices(group))}" for group in ("task", "renderer", "dataset", "scale")
-        )
-        return f"{about.strip()}\n{HELP}\n\n{chosen}"
-    if "list" in arguments:
-        return "\n".join(f"{group}: {', '.join(_choices(group))}" for group in GROUPS)
-    return None
+    helped = bool({"--help", "-h", "help"} & {*arguments})
+    if not helped and "list" not in arguments:
+        return None
+    groups = ("task", "renderer", "dataset", "scale") if helped else GROUPS
+    listed = "\n".join(f"{group}: {', '.join(_choices(group))}" for group in groups)
+    return f"{about.strip()}\n{HELP}\n\n{listed}" if helped else listed
 
 
 def _print(text: str) -> int:

@@ -241,7 +241,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
 
     shown = dataset.network(index) if isinstance(dataset, Networked) else None
     family = config["prior"].get(OF)
-    with _naming("prior", config["prior"]):
+    with _naming_prior(config["prior"]):
         (prior,) = parts("prior")
         learnt = dataset if family is None else _family(family)
         known = shown if isinstance(prior, PriorSettings) else prior.network(0)
@@ -281,12 +281,12 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
 
 
 @contextmanager
-def _naming(group: str, node: Node) -> Iterator[None]:
-    """Within it, an error of a dataset's class that has the place of another group names the keys of that group."""
+def _naming_prior(node: Node) -> Iterator[None]:
+    """Within it, an error of a dataset's class that has the place of a prior names the keys of that prior."""
     try:
         yield
     except ValueError as error:
-        error.args = (re.sub(rf"(?<![\w/])dataset\.(?=(?:{'|'.join(node)})\b)", f"{group}.", str(error)),)
+        error.args = (re.sub(rf"(?<![\w/])dataset\.(?=(?:{'|'.join(node)})\b)", "prior.", str(error)),)
         raise
 
 
