@@ -45,11 +45,6 @@ class Interval:
         """Whether there is an interval."""
         return not math.isnan(self.low)
 
-    def below(self, edge: float) -> "Interval":
-        """The same with what is beyond the edge set to it, to be drawn."""
-        value, low, high, *points = np.minimum([self.value, self.low, self.high, *self.points], edge).tolist()
-        return Interval(value, low, high, tuple(points))
-
     def times(self, scale: float) -> "Interval":
         """The same times a number."""
         value, low, high, *points = (scale * x for x in (self.value, self.low, self.high, *self.points))
