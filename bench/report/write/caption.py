@@ -14,9 +14,8 @@ from bench.report.data.statistics import Interval
 
 SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
 LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
-MOST_FAILURES = 4  # most failed runs that a caption lists one by one
+MOST_NAMED = 4  # that are listed one by one; more are counted
 OVER = "{shapes and seeds}"  # stands in texts for that over which the runs of an experiment vary
-FEWEST_COUNTED = 4  # rows that are named one by one in a warning; more are counted
 FEW = "fewer than six shapes"  # statistics.FEWEST_SHAPES
 
 
@@ -114,7 +113,7 @@ def _outcome(runs: Runs) -> str:
         return ""
     if not failed:
         return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
-    if len(failed) <= MOST_FAILURES:
+    if len(failed) <= MOST_NAMED:
         listed = "; ".join(_failure(record) for record in failed)
     else:
         statuses = Counter(record["status"] for record in failed).most_common()
@@ -144,7 +143,7 @@ def _compared(runs: Runs) -> str:
 def _loaded(runs: Runs) -> str:
     """A warning where times are doubtful."""
     names = [record["name"] for record in runs.named() if doubtful(record)]
-    few = _listed(names) if len(names) <= FEWEST_COUNTED else f"{len(names)} of {len(runs.records)} runs"
+    few = _listed(names) if len(names) <= MOST_NAMED else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
     return f"Doubtful times, see the notes of the run: {rows}." if names else ""
 
@@ -160,5 +159,5 @@ def _failure(record: Record) -> str:
     return f"{record['name']}: {record['status']} ({reason.rstrip('.')})"
 
 
-def _listed(names: list[str], most: int = 4) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
