@@ -57,13 +57,6 @@ class Gap:
         return f"{self.ratio}; {self.better:g} of {self.shapes}"
 
 
-def gap(first: statistics.Groups, second: statistics.Groups) -> Gap | None:
-    """The gap between two rows on the same shapes, as a median over shapes; None without a shape."""
-    if not len(first):
-        return None
-    return Gap(statistics.ratio(first, second), statistics.better(first, second), len(first))
-
-
 @dataclass(frozen=True)
 class Compared:
     """The runs of a comparison.
@@ -171,12 +164,8 @@ class Compared:
         groups = by_shape(self.means(family, row))
         return statistics.typical(groups) if groups else Interval(math.nan, math.nan, math.nan)
 
-    def gap(self, family: str, row: tuple[str, str], other: tuple[str, str]) -> Gap | None:
-        """The gap between two rows, on the shapes and seeds that both have."""
-        return self.gap_of(family, [row], [other])
-
-    def gap_of(self, family: str, first: list[tuple[str, str]], second: list[tuple[str, str]]) -> Gap | None:
-        """The gap between two groups of rows, each by the geometric mean of its rows' errors."""
+    def gap(self, family: str, first: list[tuple[str, str]], second: list[tuple[str, str]]) -> Gap | None:
+        """The gap between two groups of rows, by the geometric means of their rows; None without a common shape."""
         if not {*first, *second} <= {*self.rows}:
             return None
         tables = {row: self.means(family, row) for row in (*first, *second)}
@@ -184,7 +173,8 @@ class Compared:
         means = (
             {run: float(geometric_mean([tables[row][run] for row in of])) for run in common} for of in (first, second)
         )
-        return gap(*map(by_shape, means))
+        ours, theirs = map(by_shape, means)
+        return Gap(statistics.ratio(ours, theirs), statistics.better(ours, theirs), len(ours)) if ours else None
 
     @cached_property
     def lines(self) -> list[Line]:
@@ -204,7 +194,7 @@ class Compared:
             **{"family": family, "row": row[1], "preset": row[0]},
             **{at: self.median(family, row, at) for at in self.conditions},
             "error": self.error(family, row),
-            "ratio": None if reference == row else self.gap(family, row, reference),
+            "ratio": None if reference == row else self.gap(family, [row], [reference]),
             **{cost: None if math.isnan(value) else float(value) for cost, value in costs.items()},
             "lacking": lacking,
             "failed": f"{(~mine.ok).sum()} of {len(mine)}" + (f", {lacking} missing" if lacking else ""),

@@ -62,7 +62,7 @@ class Crossed:
     def gap(self, family: str, first: list[Setting], second: list[Setting]) -> compare.Gap | None:
         """The gap between two groups of settings; None where one of them was not run."""
         absent = ("", "")
-        return self.found.gap_of(family, *([self.rows.get(key, absent) for key in of] for of in (first, second)))
+        return self.found.gap(family, *([self.rows.get(key, absent) for key in of] for of in (first, second)))
 
 
 def crossed(runs: Runs) -> Crossed:
