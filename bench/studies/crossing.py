@@ -92,7 +92,7 @@ def make(runs: Runs) -> Result:
         "Which renderer is best under which loss of the mask?",
         ratio="",
         remarks=(compare.ERROR, compare.FAILURE, f"Under its own paper's loss: {own}.", LOSSES),
-        data=table.to_data(RUNS, runs.records),
+        run_columns=RUNS,
         figure=draw(settings),
     )
 
@@ -128,8 +128,8 @@ def make_gaps(runs: Runs) -> Result:
         interval=compare.INTERVAL,
         estimates=[line[key].ratio for line in lines for key in compared if line[key] is not None],
         remarks=(compare.RATIO, PARTS, LOSSES, compare.ERROR, compare.FAILURE),
-        data=table.to_data(_columns(compared), lines),
-        table=table.to_table(_columns(compared), lines),
+        columns=_columns(compared),
+        lines=lines,
     )
 
 

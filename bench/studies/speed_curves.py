@@ -44,7 +44,8 @@ def make(runs: Runs) -> Result:
         verdict=_verdict(lines),
         remarks=NOTES,
         data=pd.concat(data)[[*(column.key for column in own), *curves.HISTORY]],
-        table=table.to_table(COLUMNS, lines),
+        columns=COLUMNS,
+        lines=lines,
         figure=chart.draw(panels, 2.9, legend=5, sharey=True),
         chart={"panels": panels, "note": "A line is a run, which a click opens."},
     )

@@ -84,7 +84,8 @@ def make(runs: Runs) -> Result:
         interval="95 % credible intervals, the milder end first",
         remarks=[note.format(**about) for note in NOTES],
         data=_data(runs, cells, axes),
-        table=words,
+        columns=[table.text(name, name) for name in words],
+        lines=words.to_dict("records"),
         figure=draw(cells, axes),
         atlas=_atlas(cells, axes),
     )

@@ -71,7 +71,6 @@ class Result:
         lines: of the table, as its columns read them.
         run_columns: of the raw numbers where these have a line per run, not those of the table.
         data: the raw numbers, including those that the figure plots; by default as the columns have them.
-        table: the numbers as text for readers; by default as the columns have them.
         figure: the figure.
         chart: panels of series for the page, as `chart.panel_data` makes them.
         atlas: a grid of cells for the page, as the study `stability` makes it.
@@ -90,7 +89,6 @@ class Result:
     lines: Sequence[Any] = ()
     run_columns: Sequence[Column] = ()
     data: pd.DataFrame | None = None
-    table: pd.DataFrame | None = None
     figure: Figure | None = None
     chart: dict[str, Any] | None = None
     atlas: dict[str, Any] | None = None
@@ -99,8 +97,11 @@ class Result:
         if self.data is None:
             listed = (self.run_columns, self.runs.records) if self.run_columns else (self.columns, self.lines)
             object.__setattr__(self, "data", to_data(*listed))
-        if self.table is None and self.columns:
-            object.__setattr__(self, "table", to_table(self.columns, self.lines))
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The numbers as text for readers."""
+        return to_table(self.columns, self.lines)
 
     @cached_property
     def caption(self) -> str:
@@ -116,7 +117,6 @@ class Result:
 
     def shown(self, place: int = 0, experiments: Iterable[str] = ()) -> "Shown":
         """All that is read of it, as text; `place` is its place among all pages, `experiments` are what it reads."""
-        table = pd.DataFrame() if self.table is None else self.table.astype(str)
         return Shown(
             place=place,
             experiments=[*experiments],
@@ -124,8 +124,8 @@ class Result:
             question=self.question,
             verdict=caption.SMOKE if self.verdict and caption.tried(self.runs) else self.verdict,
             caption=self.caption,
-            columns=list(map(str, table.columns)),
-            rows=table.to_numpy().tolist(),
+            columns=list(self.table),
+            rows=self.table.to_numpy().tolist(),
             best=best(self.columns, self.lines),
             notes=self.notes,
             drawn=self.figure is not None,
