@@ -34,7 +34,7 @@ def make(runs: Runs) -> Result:
         "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
         "blue) above the angle to the reference's.",
         question="Which threshold of convergence shows the true outline?",
-        verdict=format.ends("Missed and spurious pixels over the hits", wrong, "one shape", show=_percent),
+        verdict=format.ends("Missed and spurious pixels over the hits", wrong, "one shape", show=table.small_percent),
         remarks=(*found.missing, *NOTES),
         columns=COLUMNS,
         lines=lines,
@@ -54,18 +54,14 @@ def _epsilon(record: records.Record) -> float | None:
     return value if isinstance(value, int | float) and value > 0 else None
 
 
-def _percent(share: float | None) -> str:
-    return format.number(share) if share is None else f"{format.number(share, 100)} %"
-
-
 COLUMNS = (  # of a record and its counts
     table.shown("Renderer", lambda line: line[0]["renderer"]),
     *table.through(lambda line: line[0], *table.IDENTITY, table.Column("epsilon", "Epsilon", _epsilon)),
     *table.through(lambda line: line[1], *map(table.Column, gallery.COUNTED)),
     *table.through(
         lambda line: line[1],
-        table.Column("lost_share", "Erosion", show=_percent),
-        table.Column("false_share", "Dilation", show=_percent),
+        table.Column("lost_share", "Erosion", show=table.small_percent),
+        table.Column("false_share", "Dilation", show=table.small_percent),
     ),
     *table.through(lambda line: line[0], table.metric("depth_error_median", "Median depth error")),
 )

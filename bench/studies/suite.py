@@ -70,7 +70,7 @@ def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Colu
         table.Column("at_dist", "At DIST's cost", show=table.percent),
         of_interval("ratio", "Field values over DIST's"),
         of_interval("seconds", "Seconds over DIST's"),
-        table.Column("wrong", "Wrong pixels", show=_percent),
+        table.Column("wrong", "Wrong pixels", show=table.small_percent),
         table.text("failed", "Failed"),
         table.PRESET,
     ]
@@ -88,10 +88,6 @@ def _points(line: Any) -> str:
     gain = line["gain"]
     told = gain and f"{100 * gain.value:+.0f} {gain.ends(100)}, {format.plural(line['problems'], 'problem')}"
     return told or format.MISSING
-
-
-def _percent(share: float | None) -> str:
-    return format.MISSING if share is None else f"{format.number(100 * share)} %"
 
 
 def _better(standing: Standing, row: str, of_set: str | None) -> str:

@@ -32,6 +32,11 @@ def percent(share: float | None) -> str:
     return format.number(share) if share is None else f"{100 * share:.0f} %"
 
 
+def small_percent(share: float | None) -> str:
+    """A share of 1 in per cent, with the digits that a small one needs."""
+    return format.number(share) if share is None else f"{format.number(share, 100)} %"
+
+
 def counted(part: float, whole: int, rate: Interval) -> str:
     """A count with the interval of its share in per cent, or else the number of shapes, such as 3 of 4 (n = 2)."""
     return f"{part:g} of {whole} {rate.ends(100)}{' %' if rate.known else ''}"
