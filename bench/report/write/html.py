@@ -1,4 +1,8 @@
-"""Writes `index.html`, and beside it in the folder `page` its scripts and the data that they show."""
+"""Writes `index.html`, and beside it in the folder `page` its scripts and the data that they show.
+
+The page names its scripts in the order in which they need each other. By its policy scripts and pictures come from
+beside it, styles may be set by scripts, and nothing is asked of a network.
+"""
 
 import json
 import os
@@ -25,20 +29,7 @@ ASSETS = Path(__file__).parents[1] / "page"
 FOLDER = "page"  # of the results folder
 PATIENCE = 1.0  # seconds to wait in silence
 LIBRARY = "plotly.min.js"
-STYLES = ("style.css",)
-SCRIPTS = (  # in the order in which they need each other
-    *("base/dom.js", "base/format.js", "base/store.js", "base/address.js", "base/runs.js"),
-    *("parts/theme.js", "parts/choose.js", "parts/table.js", "parts/chart.js", "parts/curve.js", "parts/mesh.js"),
-    *("views/papers.js", "views/renderer.js", "views/board.js", "views/atlas.js", "views/run.js", "views/compare.js"),
-)
-START = "app.js"  # after the data
-LISTS = ("about", "papers", "runs")  # the data that are loaded at the start
 MOST_MESHES = 100  # of the newest runs; `bench.report meshes=all` makes all
-# Scripts and pictures come from beside the page, styles may be set by scripts, and nothing is asked of a network.
-POLICY = (
-    "default-src 'none'; script-src 'self' file:; style-src 'self' file: 'unsafe-inline'; img-src 'self' file: data:; "
-    "base-uri 'none'; form-action 'none'"
-)
 
 # Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
 UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
@@ -102,7 +93,7 @@ def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: 
     }
     for name, content in lists.items():
         write_script(data, "list", name, content)
-    write_text(page, shell())
+    write_text(page, (ASSETS / "index.html").read_text(encoding="utf-8"))
     return page
 
 
@@ -150,23 +141,9 @@ def _is_newer(path: Path, source: Path, key: str) -> bool:
         return False
 
 
-def shell() -> str:
-    """The page without its data."""
-    names = [*SCRIPTS, *(f"data/list/{name}.js" for name in LISTS), START]
-    parts = {
-        "policy": POLICY,
-        "styles": "\n".join(f'<link rel="stylesheet" href="{FOLDER}/{name}">' for name in STYLES),
-        "scripts": "\n".join(f'<script src="{FOLDER}/{name}"></script>' for name in names),
-    }
-    text = (ASSETS / "index.html").read_text(encoding="utf-8")
-    for name, part in parts.items():
-        text = text.replace(f"{{{{ {name} }}}}", part)
-    return text
-
-
 def _copy_assets(folder: Path) -> None:
-    for name in (*STYLES, *SCRIPTS, START):
-        write_file(folder / name, (ASSETS / name).read_bytes())
+    for path in (*ASSETS.rglob("*.css"), *ASSETS.rglob("*.js")):
+        write_file(folder / path.relative_to(ASSETS), path.read_bytes())
     write_file(folder / LIBRARY, (Path(find_spec("plotly").origin).parent / "package_data" / LIBRARY).read_bytes())
 
 
