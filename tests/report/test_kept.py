@@ -1,6 +1,5 @@
 """Shipped tables are drawn anew from their rows, without run folders, and grow by later runs."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from bench.records.read import read_record, read_records
 from bench.report.__main__ import main
 from bench.report.data.kept import HERE, KEPT, join, read_rows, write_rows
 from bench.report.data.records import family
-from bench.report.write import paper
 from tests.report.test_report_paper import DYNAMIC, NAIVE, PARALLEL, bands, costs, write_curve, write_run
 
 
@@ -100,10 +98,3 @@ def test_rows_that_cannot_be_read_are_told_and_not_lost(tmp_path, capsys, text):
     assert main([f"results_dir={tmp_path / 'own'}", f"ship={tmp_path}"]) == 2
     assert "table1.runs.csv cannot be read, mend it or move it away" in capsys.readouterr().err
     assert path.read_text() == text and not (tmp_path / "paper" / "table1.csv").exists()
-
-
-def test_rows_are_no_page(tmp_path):
-    write_run(tmp_path, "table1", NAIVE, metrics=costs())
-    paper.ship(read_records(tmp_path)[0], tmp_path, tmp_path)
-    assert [found.name for found in paper.find_paper(tmp_path) if not found.shipped] == ["table1"]
-    assert json.loads((tmp_path / "paper" / "table1.json").read_text())

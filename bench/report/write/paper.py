@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from bench.records.read import PLAN
 from bench.records.record import leads_out, write_text
-from bench.report.data.kept import KEPT, SUFFIX, join, read_rows, write_rows
+from bench.report.data.kept import KEPT, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
 from bench.report.write.caption import SMOKE
 from bench.report.write.result import Result, Shown, as_markdown, markdown, read_shown, write
@@ -153,19 +153,14 @@ def find_paper(results_dir: Path) -> list[Found]:
     own = _in(results_dir)
     names = {one.name for one in own}
     others = [] if results_dir.resolve() == SHIPPED else _in(SHIPPED)
-    shipped = [one for one in others if one.name not in names and one.shown.title]
+    shipped = [one for one in others if one.name not in names]
     return own + [replace(one, picture=None, files={}, shipped=True) for one in shipped]
 
 
 def _in(results_dir: Path) -> list[Found]:
     """The tables and figures of a results folder in their order; those that no study made stand last."""
-    folder = results_dir / FOLDER
-    kinds = (*SUFFIXES, ".png", ".json")
-    files = (path for path in folder.glob("[!.]*") if path.suffix in kinds and not path.name.endswith(SUFFIX))
-    seen = {path.stem for path in files if path.is_file()}
-    found = [found_at(folder / name, results_dir) for name in seen]
-    known = [one for one in found if one.files or one.picture or one.shown.title]
-    return sorted(known, key=lambda one: (one.shown.place or 10**6, one.name))
+    found = [found_at(path.with_suffix(""), results_dir) for path in (results_dir / FOLDER).glob("[!.]*.json")]
+    return sorted((one for one in found if one.shown.title), key=lambda one: (one.shown.place or 10**6, one.name))
 
 
 def find_sweeps(results_dir: Path) -> list[Found]:
@@ -218,7 +213,7 @@ def write_readme(results_dir: Path) -> Path | None:
 
     Gives its path; None where `results_dir/paper` has no table or figure.
     """
-    pages = [page for page in _in(results_dir) if page.shown.title]
+    pages = _in(results_dir)
     if not pages:
         return None
     contents = ["| question | answer |", "|---|---|", *map(_answer, pages)]
