@@ -8,24 +8,6 @@ import pytest
 from bench.report.__main__ import main as report
 from tests.run.driving import command
 
-CODE = """
-from renderers import IDR, Capabilities, Kind
-
-
-class Mine:
-    capabilities = Capabilities(needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True)
-
-    def __init__(self, steps):
-        self.tracer = IDR(
-            steps=steps, epsilon=1e-4, least_slope=1e-3, mask_sharpness=50.0, mask_weight=100.0, sphere_radius=1.0
-        )
-
-    def render(self, field, rays):
-        return self.tracer.render(field, rays)
-
-    def silhouette_loss(self, field, rays, rendering, mask):
-        return self.tracer.silhouette_loss(field, rays, rendering, mask)
-"""
 SMALL = (
     "scale=smoke", "isolation=off", "threads=1", "evaluation.picture=null", "evaluation.grid=16",
     "evaluation.points=200",
@@ -52,16 +34,14 @@ def results(tmp_path_factory) -> Path:
     """What the runs of a renderer of a user's own left, with its report."""
     folder = tmp_path_factory.mktemp("own")
     (folder / "conf" / "renderer").mkdir(parents=True)
-    (folder / "conf" / "renderer" / "mine.yaml").write_text("_target_: mypkg_of_tests.Mine\n_label_: Mine\nsteps: 40\n")
-    (folder / "mypkg_of_tests.py").write_text(CODE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(folder)
-        for overrides in RUNS:
-            done = command(
-                f"--config-dir={folder / 'conf'}", *overrides, *SMALL, "renderer=mine", "packages=[mypkg_of_tests]",
-                f"results_dir={folder / 'results'}",
-            )  # fmt: skip
-            assert done.code == 0, done.err
+    mine = "_target_: tests.user_renderer.Mine\n_label_: Mine\nsteps: 40\n"
+    (folder / "conf" / "renderer" / "mine.yaml").write_text(mine)
+    for overrides in RUNS:
+        done = command(
+            f"--config-dir={folder / 'conf'}", *overrides, *SMALL, "renderer=mine", "packages=[tests]",
+            f"results_dir={folder / 'results'}",
+        )  # fmt: skip
+        assert done.code == 0, done.err
     report([f"results_dir={folder / 'results'}"])
     return folder / "results"
 
