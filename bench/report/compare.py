@@ -8,18 +8,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from bench.pictures import style
 from bench.records import format
 from bench.records.read import read_plans
 from bench.report.data import statistics
-from bench.report.data.records import SCALE, SHAPENET, RunKey, by_shape, error, setting, shape
+from bench.report.data.records import SCALE, SHAPENET, Row, RunKey, by_shape, error, row_of, setting, shape
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, geometric_mean
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import Column, estimate, text
+from bench.report.write.table import Column, ends, estimate, text
 
 EVERY = "all families"
 COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
@@ -96,29 +94,29 @@ class Compared:
     @cached_property
     def families(self) -> list[str]:
         """The families, in the order of the runs."""
-        return list(self.cells.family.unique())
+        return list(self.runs.families())
 
     @cached_property
-    def rows(self) -> list[tuple[str, str]]:
-        """The preset and the name of each row, in the order of the runs."""
-        return list(dict.fromkeys(zip(self.cells.preset, self.cells.row, strict=True)))
+    def rows(self) -> list[Row]:
+        """The rows, in the order of the runs."""
+        return list(self.runs.rows())
 
     @cached_property
-    def planned(self) -> list[tuple[str, str]]:
+    def planned(self) -> list[Row]:
         """The rows in the order of the sweep that planned most of the runs; others last, in that of the runs.
 
         It reads all plans, and is asked only where one of several rows is to be chosen.
         """
-        of_run = {record["folder"]: (row.preset, row.name) for row, of in self.runs.rows().items() for record in of}
+        of_run = {record["folder"]: row_of(record) for record in self.runs.records}
         plans, _ = read_plans(self.runs.results_dir)
         found = [[of_run[cell.id] for cell in plan.cells if cell.id in of_run] for plan in plans]
         ordered = [row for rows in sorted(found, key=len, reverse=True) for row in rows]
         return list(dict.fromkeys([*ordered, *self.rows]))
 
-    def reference_of(self, row: tuple[str, str]) -> tuple[str, str]:
+    def reference_of(self, row: Row) -> Row:
         """The row that a row is divided by; itself where there is no other."""
-        wanted = row[1] if self.reference is None else self.reference(row[0])
-        found = [other for other in self.rows if other[1] == wanted] or [r for r in self.rows if r[0] == wanted]
+        wanted = row.name if self.reference is None else self.reference(row.preset)
+        found = [r for r in self.rows if r.name == wanted] or [r for r in self.rows if r.preset == wanted]
         return min(found, key=self.planned.index) if len(found) > 1 else next(iter(found), row)
 
     @cached_property
@@ -126,18 +124,18 @@ class Compared:
         """The values of the condition, in their order."""
         return ordered({str(value) for value in self.cells["at"]})
 
-    def part(self, family: str, row: tuple[str, str], at: str | None = None) -> pd.DataFrame:
+    def part(self, family: str, row: Row, at: str | None = None) -> pd.DataFrame:
         """The lines of a family, or of `EVERY`, and of a row, at one condition or at all."""
-        cells = self.cells[(self.cells.preset == row[0]) & (self.cells.row == row[1])]
+        cells = self.cells[(self.cells.preset == row.preset) & (self.cells.row == row.name)]
         cells = cells if family == EVERY else cells[cells.family == family]
         return cells if at is None else cells[cells["at"] == at]
 
-    def median(self, family: str, row: tuple[str, str], at: str) -> float | None:
+    def median(self, family: str, row: Row, at: str) -> float | None:
         """The median error over shapes and seeds; None where nothing was planned."""
         errors = self.part(family, row, at).error
         return float(statistics.median(errors.to_numpy())) if len(errors) else None
 
-    def means(self, family: str, row: tuple[str, str]) -> dict[RunKey, float]:
+    def means(self, family: str, row: Row) -> dict[RunKey, float]:
         """The geometric mean of the scores over all conditions, of each shape, view and seed of a row.
 
         Left out are those without a run at a condition of their family, and those on which every row failed.
@@ -145,26 +143,26 @@ class Compared:
         return {run: mean for run, mean in self._means[row].items() if family in (EVERY, run[0][0])}
 
     @cached_property
-    def _means(self) -> dict[tuple[str, str], dict[RunKey, float]]:
+    def _means(self) -> dict[Row, dict[RunKey, float]]:
         wanted = self.cells.groupby("family", sort=False)["at"].nunique()
-        found: dict[tuple[str, str], dict[RunKey, float]] = {row: {} for row in self.rows}
+        found: dict[Row, dict[RunKey, float]] = {row: {} for row in self.rows}
         places = ["preset", "row", "family", "solid", "view", "seed"]
         for (preset, row, family, solid, view, seed), own in self.cells.groupby(places, sort=False, dropna=False):
             mean = float(geometric_mean(own.score.to_numpy()))
             if len(own) == wanted[family] and math.isfinite(mean):
-                found[preset, row][(family, solid), view, seed] = mean
+                found[Row(preset, row)][(family, solid), view, seed] = mean
         return found
 
-    def lacking(self, family: str, row: tuple[str, str]) -> int:
+    def lacking(self, family: str, row: Row) -> int:
         """The number of shapes, views and seeds that another row has at all conditions and this one has not."""
         return len({run for other in self.rows for run in self.means(family, other)} - {*self.means(family, row)})
 
-    def error(self, family: str, row: tuple[str, str]) -> Interval:
+    def error(self, family: str, row: Row) -> Interval:
         """The median of a row's errors over shapes, each a mean over conditions and seeds; nan without a shape."""
         groups = by_shape(self.means(family, row))
         return statistics.typical(groups) if groups else Interval(math.nan, math.nan, math.nan)
 
-    def gap(self, family: str, first: list[tuple[str, str]], second: list[tuple[str, str]]) -> Gap | None:
+    def gap(self, family: str, first: list[Row], second: list[Row]) -> Gap | None:
         """The gap between two groups of rows, by the geometric means of their rows; None without a common shape."""
         if not {*first, *second} <= {*self.rows}:
             return None
@@ -187,11 +185,11 @@ class Compared:
         names = [EVERY, *self.families] if len(self.families) > 1 else self.families
         return [line for name in names for line in self._front([self._line(name, row) for row in self.rows])]
 
-    def _line(self, family: str, row: tuple[str, str]) -> Line:
+    def _line(self, family: str, row: Row) -> Line:
         mine, reference, lacking = self.part(family, row), self.reference_of(row), self.lacking(family, row)
         costs = {cost: mine[cost][mine.ok].dropna().median() for cost in COSTS}
         return {
-            **{"family": family, "row": row[1], "preset": row[0]},
+            **{"family": family, "row": row.name, "preset": row.preset},
             **{at: self.median(family, row, at) for at in self.conditions},
             "error": self.error(family, row),
             "ratio": None if reference == row else self.gap(family, [row], [reference]),
@@ -242,7 +240,7 @@ class Compared:
             *(Column(at, heading(at)) for at in self.conditions),
             *estimate("error", "Median over shapes"),
             text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
-            *(Column(f"ratio_{end}", value=lambda line, end=end: _end(line["ratio"], end)) for end in ("low", "high")),
+            *ends("ratio", lambda line: line["ratio"] and line["ratio"].ratio),
             *(Column("evaluations", "Values", show=format.count), Column("seconds", "Loop", show=format.seconds)),
             *(text(f"front_{cost}") for cost in COSTS),
             *(text("failed", "Failed"), text("preset")),
@@ -272,11 +270,6 @@ class Compared:
         if "figure" not in parts:
             parts["figure"] = chart.draw(panels, 3.2, sharey=True, legend=3)
         return Result(self.runs, title, question=question, chart={"panels": panels}, **parts)
-
-    def shapes(self) -> str:
-        """The number of shapes per cell, as a note."""
-        counts = self.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
-        return f"Shapes per cell: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
 
     def best(self, least_of: str) -> str:
         """The row with the least mean error and the quickest one, as a verdict; empty where there is none.
@@ -315,27 +308,6 @@ class Compared:
             panels.append(chart.panel_data("", label, self.label, points))
         return panels
 
-    def draw_conditions(self, rows: Sequence[tuple[str, str]], marks: dict[str, float], mark: str) -> Figure:
-        """Draws a panel per family: the median of each of the rows over the conditions.
-
-        Args:
-            marks: a value of each family, drawn as a line; none for others.
-        """
-        places, panels = range(len(self.conditions)), []
-        for name in self.families:
-            found = {row: [self.median(name, row, at) for at in self.conditions] for row in rows}
-            lines = [
-                chart.curve(row, preset, places, style.finite(medians))
-                for (preset, row), medians in found.items()
-                if any(median is not None for median in medians)
-            ]
-            if name in marks:
-                lines.append(chart.level(mark, places, marks[name]))
-                lines.append(chart.level("1.5 times that", places, 1.5 * marks[name], dash=":"))
-            panels.append(chart.panel_data(name, "", self.label, lines, ticks=self.conditions))
-        height = -(-len(panels) // 4)
-        return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
-
 
 def differing(ratios: Sequence[tuple[str, Gap | None]], of: str) -> str:
     """A sentence with how many of the known ratios differ from 1, see `statistics.differ`; empty without any."""
@@ -356,10 +328,6 @@ def ordered(conditions: Collection[str]) -> list[str]:
 def heading(condition: str) -> str:
     """The heading of a condition's column; a number counts depth points."""
     return f"{condition} pts" if condition.isdigit() else condition or "Median"
-
-
-def _end(found: Gap | None, end: str) -> float:
-    return math.nan if found is None else getattr(found.ratio, end)
 
 
 def oracles(runs: Runs, metric: str) -> dict[str, float]:

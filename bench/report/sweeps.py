@@ -19,7 +19,7 @@ from bench.report.write.caption import FEW, OVER
 from bench.report.write.chart import Panel, panel_data, series
 from bench.report.write.paper import BROKEN, SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
-from bench.report.write.table import Column, counted, text
+from bench.report.write.table import Column, counted, ends, text
 
 ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # behind a heading: which direction is better
 MOST_VALUES = 6  # of a swept key that the caption lists
@@ -257,7 +257,7 @@ def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> lis
         *_estimate("ratio", ratio),
         Column("runs"),
         Column("failed", "Failed", words=_failed),
-        *_ends("failed", "rate"),
+        *ends("failed", lambda line: line["rate"]),
         text("reasons"),
         Column("loop_seconds", "Loop", show=format.seconds),
         Column("value_evaluations", "Field values", show=format.count),
@@ -274,11 +274,7 @@ def _estimate(key: str, shown: Metric) -> list[Column]:
         return str(found) if found.known else found.alone()  # the caption has n once
 
     heading, value = f"{shown.label}{ARROWS[shown.better]}", lambda line: getattr(line[key], "value", None)
-    return [Column(key, heading, value, words=words, better=shown.better), *_ends(key, key)]
-
-
-def _ends(key: str, of: str) -> list[Column]:
-    return [Column(f"{key}_{end}", value=lambda line, end=end: getattr(line[of], end, None)) for end in ("low", "high")]
+    return [Column(key, heading, value, words=words, better=shown.better), *ends(key, lambda line: line[key])]
 
 
 def _listed(sweep: Sweep) -> str:

@@ -45,7 +45,7 @@ class Crossed:
     """
 
     found: compare.Compared
-    rows: dict[Setting, tuple[str, str]]
+    rows: dict[Setting, records.Row]
     labels: dict[str, str]
     own: dict[str, str]
 
@@ -61,7 +61,7 @@ class Crossed:
 
     def gap(self, family: str, first: list[Setting], second: list[Setting]) -> compare.Gap | None:
         """The gap between two groups of settings; None where one of them was not run."""
-        absent = ("", "")
+        absent = records.Row("", "")
         return self.found.gap(family, *([self.rows.get(key, absent) for key in of] for of in (first, second)))
 
 
@@ -69,12 +69,12 @@ def crossed(runs: Runs) -> Crossed:
     """The settings of the runs."""
     found = compare.Compared(runs)
     rows, labels, own = {}, {}, {}
-    for record, preset, row in zip(runs.records, found.cells.preset, found.cells.row, strict=True):
+    for record in runs.records:
         target, mask = (
             str(records.setting(record["config"], part, "_target_") or "") for part in ("renderer", "silhouette")
         )
         renderer, loss = record["renderer"], mask.rpartition(".")[2]
-        rows[renderer, loss] = preset, row
+        rows[renderer, loss] = records.row_of(record)
         for name, part in ((renderer, "renderer"), (loss, "silhouette")):
             labels[name] = str(records.setting(record["config"], part, "_label_") or name)
         if target in OWN:

@@ -201,10 +201,7 @@ COLUMNS = (  # of a line
     table.Column("seconds", "Time", show=format.seconds),
     table.Column("evaluations", "Evaluations", show=format.count),
     *(table.Column("error", "Error × 1000"), table.Column("error_iqm", value=lambda line: line["middle"].value)),
-    *(
-        table.Column(f"error_{end}", value=lambda line, end=end: getattr(line["middle"], end))
-        for end in ("low", "high")
-    ),
+    *table.ends("error", lambda line: line["middle"]),
     *map(table.Column, ("failed", "runs", "missing")),
     table.shown("Failed", _failed),
     *(table.Column("on_front", "P(on the front)"), table.Column("dominated")),

@@ -1,6 +1,8 @@
 """Table 2 and Figs. 20 to 22 of DIST: shape completion over the sparsity of the depth image."""
 
-from bench.report.study import Result, Runs, Selection, compare, gallery, records, table
+from matplotlib.figure import Figure
+
+from bench.report.study import Result, Runs, Selection, chart, compare, gallery, records, style, table
 
 PLACE = 20
 READS = (Selection("table2", ("task.points",)),)
@@ -56,12 +58,34 @@ def make(runs: Runs) -> Result:
         "Which method completes a shape best from sparse depth?",
         plotted="Median error over {shapes and seeds} at each number of given depth points, and over all.",
         verdict=found.best("errors × 1000 over all numbers of points"),
-        remarks=(compare.ERROR, " ".join((found.shapes(), _iterations(runs))), *NOTES),
+        remarks=(compare.ERROR, f"{_shapes(found)} {_iterations(runs)}", *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
         lines=found.beside({compare.ORACLE: oracle}, published),
         run_columns=RUNS,
-        figure=found.draw_conditions([r for r in found.rows if not r[0].endswith(VARIANTS)], oracle, compare.ORACLE),
+        figure=draw(found, oracle),
     )
+
+
+def draw(found: compare.Compared, oracle: dict[str, float]) -> Figure:
+    """Draws a panel per family: the median of each row over the number of points, and the oracle."""
+    places, panels = range(len(found.conditions)), []
+    for family in found.families:
+        lines = []
+        for row in found.rows:
+            medians = [found.median(family, row, at) for at in found.conditions]
+            if not row.preset.endswith(VARIANTS) and any(median is not None for median in medians):
+                lines.append(chart.curve(row.name, row.preset, places, style.finite(medians)))
+        if family in oracle:
+            lines.append(chart.level(compare.ORACLE, places, oracle[family]))
+            lines.append(chart.level("1.5 times that", places, 1.5 * oracle[family], dash=":"))
+        panels.append(chart.panel_data(family, "", compare.LABEL, lines, ticks=found.conditions))
+    height = -(-len(panels) // 4)
+    return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
+
+
+def _shapes(found: compare.Compared) -> str:
+    counts = found.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
+    return f"Shapes per cell: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
 
 
 def _iterations(runs: Runs) -> str:

@@ -6,6 +6,7 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.compare import COSTS, EVERY, HOLM, Compared, ordered
+from bench.report.data.records import Row
 from bench.report.data.runs import choose
 from bench.studies import one_loss, tuned
 from tests.report.test_report_paper import write_run
@@ -140,7 +141,7 @@ def test_the_reference_is_the_first_row_of_the_plan_not_the_oldest_of_its_preset
     found = one_loss.make(runs)
     assert line(found, "Newton", "car")["ratio"].startswith("0.500 ")
     assert line(found, "DIST", "car")["ratio"] == ""
-    assert Compared(runs, lambda _: "tried before").reference_of(("newton_mask", "Newton"))[1] == "tried before"
+    assert Compared(runs, lambda _: "tried before").reference_of(Row("newton_mask", "Newton")).name == "tried before"
 
 
 def test_rows_of_other_families_with_other_evaluations_are_told(tmp_path):

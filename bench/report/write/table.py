@@ -109,6 +109,13 @@ def estimate(key: str, heading: str) -> tuple[Column, ...]:
     return value, *(Column(end, value=lambda line, end=end: getattr(line[key], end)) for end in ("low", "high"))
 
 
+def ends(key: str, of: Callable[[Any], Interval | None]) -> tuple[Column, ...]:
+    """The ends of an interval that a line may lack, in the CSV only."""
+    return tuple(
+        Column(f"{key}_{end}", value=lambda line, end=end: getattr(of(line), end, None)) for end in ("low", "high")
+    )
+
+
 def shown(heading: str, words: Callable[[Any], str]) -> Column:
     """A column of the readable table only."""
     return Column("", heading, words=words)
