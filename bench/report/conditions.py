@@ -45,7 +45,7 @@ def run_columns(conditions: Sequence[Condition], *others: str) -> tuple[Column, 
 
 def middle(records: Sequence[Record], metric: str = ONE_WAY) -> Interval:
     """The median of a metric x 1000 over shapes and seeds, in which a run that failed is infinite."""
-    return bootstrap(by_shape({run_key(run): SCALE * error(run, metric) for run in records}), median, seed=0)
+    return bootstrap(by_shape({run_key(run): SCALE * error(run, metric) for run in records}), median)
 
 
 def lines_of(records: Sequence[Record], conditions: Sequence[Condition], metric: str = ONE_WAY) -> list[dict[str, Any]]:

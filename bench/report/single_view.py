@@ -41,7 +41,7 @@ def lines_of(runs: Runs, family: str, presets: Iterable[str]) -> list[dict[str, 
     others = {row: values for row, values in errors.items() if row.preset in presets}
     return [
         line
-        | {"family": family, "interval": bootstrap(by_shape(errors[row]), median, seed=0)}
+        | {"family": family, "interval": bootstrap(by_shape(errors[row]), median)}
         | {"training": _of_training(records, "seconds"), "training_values": _of_training(records, "evaluations")}
         | {other.preset: over(errors[row], values) for other, values in others.items() if other != row}
         for line, (row, records) in zip(medians(own, NAMES), own.rows().items(), strict=True)

@@ -61,10 +61,10 @@ class Sweep:
         return found if 1 < len(found) <= MOST_DATASETS else []
 
 
-def write_sweeps(known: list[Record], results_dir: Path, problems: list[str] | None = None) -> list[Path]:
+def write_sweeps(known: list[Record], results_dir: Path, problems: list[str]) -> list[Path]:
     """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; gives the CSVs' paths.
 
-    `problems` gets a line for each sweep that no table can be made of; without it, its error is raised.
+    `problems` gets a line for each sweep that no table can be made of.
     """
     by_folder, studied, written = {record["folder"]: record for record in known}, _studied(), []
     for plan in read_plans(results_dir)[0]:
@@ -73,8 +73,6 @@ def write_sweeps(known: list[Record], results_dir: Path, problems: list[str] | N
                 continue
             written.append(_write(of_plan(plan, by_folder), results_dir / SWEEPS / plan.name)[0])
         except BROKEN as error:
-            if problems is None:
-                raise
             problems.append(f"not made: {SWEEPS}/{plan.name} ({type(error).__name__}: {error})")
     return written
 
@@ -162,7 +160,7 @@ def median_of(runs: list[Record], metric: str) -> Interval | None:
 
 
 def _middle(values: dict[RunKey, float]) -> Interval:
-    return bootstrap(by_shape(values), median, seed=0)
+    return bootstrap(by_shape(values), median)
 
 
 def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | None:
@@ -170,7 +168,7 @@ def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | N
     mine, theirs = ({run_key(run): error(run, metric) for run in row} for row in (runs, first))
     if not metric or runs is first or set(mine) != set(theirs):
         return None
-    return paired_bootstrap(by_shape(mine), by_shape({key: theirs[key] for key in mine}), median, seed=0)
+    return paired_bootstrap(by_shape(mine), by_shape({key: theirs[key] for key in mine}), median)
 
 
 def table_of(sweep: Sweep) -> Result:

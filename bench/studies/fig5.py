@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.data.records import SCALE, Row, setting
+from bench.report.data.records import SCALE, Row, median_of_known, setting
 from bench.report.data.runs import shared_loss
 from bench.report.study import Result, Runs, Selection, chart, curves, format, style, table
 
@@ -46,8 +46,8 @@ def make(runs: Runs) -> Result:
         failed = [record["status"] != "ok" for record in records]
         medians[row] = {name: curves.median(own, failed, name) for name in QUANTITIES}
         found = [curves.spearman(curve.dropna(subset=[*QUANTITIES]), *QUANTITIES) for curve in own]
-        known = [value for value in found if value is not None]  # each of one run: losses of shapes do not compare
-        correlation = {"spearman": float(np.median(known)) if known else None, "n": len(known)}
+        # Each of one run: losses of shapes do not compare.
+        correlation = {"spearman": median_of_known(found), "n": len(found) - found.count(None)}
         seconds = medians[row]["chamfer_l2"]["seconds"]
         about = {"row": row.name, "runs": len(records), "seconds": seconds.iloc[-1] if len(seconds) else None}
         lines.append({**about, **_end(own, failed), **correlation})

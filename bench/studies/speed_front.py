@@ -15,7 +15,6 @@ from bench.report.write.caption import undefined
 
 PLACE = 80
 READS = (Selection("speed_completion"), Selection("speed_rendering", alike=("view",)))
-SEED = 0  # of the bootstrap
 QUANTITIES = ("seconds", "error", "evaluations")  # of a run
 LEAST = 1e-9  # smaller errors are raised to this, so that their logarithms are bounded
 NOTES = (
@@ -82,14 +81,14 @@ def points(runs: Runs, trial: Trial) -> list[Line]:
     }
     medians = np.array([[float(statistics.median(statistics.flat(g))) for g in of_row] for of_row in groups.values()])
     beaten = statistics.dominated(*medians.T[:2])
-    chances = statistics.front([of_row[:2] for of_row in groups.values()], seed=SEED)
+    chances = statistics.front([of_row[:2] for of_row in groups.values()])
     lines = []
     for i, (row, own) in enumerate(runs.rows().items()):
         config, errors = own[0]["config"], groups[row.name][1]
         lines.append(
             {"trial": trial.title, "setting": row.name, "renderer": records.base_renderer(own[0])}
             | dict(zip(QUANTITIES, medians[i].tolist(), strict=True))
-            | {"middle": statistics.bootstrap(errors, statistics.interquartile_mean, seed=SEED), "shapes": len(errors)}
+            | {"middle": statistics.bootstrap(errors, statistics.interquartile_mean), "shapes": len(errors)}
             | {"failed": sum(record["status"] != "ok" for record in own), "runs": len(own)}
             | {"missing": len(keys) - len({*map(records.run_key, own)})}
             | {"on_front": chances[i], "dominated": bool(beaten[i])}

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 from bench.report.study import Result, Runs, Selection, format, records, table
-from bench.report.write.table import metric
 
 PLACE = 10
 READS = (Selection("table1", alike=("dataset", "view", "prior", "task")),)
@@ -123,10 +122,10 @@ COLUMNS = (  # of a record, for readers; metrics are those of the largest size t
     table.shown(
         "Queries", lambda r: format.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries"))
     ),
-    metric("forward_seconds", "Forward", format.seconds),
-    metric("backward_seconds", "Backward", format.seconds),
+    table.metric("forward_seconds", "Forward", format.seconds),
+    table.metric("backward_seconds", "Backward", format.seconds),
     table.shown("Step", _step),
-    metric("hits", "Hits", table.whole),
+    table.metric("hits", "Hits", table.whole),
     table.shown(
         "Missed / spurious / wrong depth", table.together(records.measured, table.whole, "lost", "false", "wrong")
     ),
@@ -134,7 +133,7 @@ COLUMNS = (  # of a record, for readers; metrics are those of the largest size t
         "Depth error median / max",
         table.together(records.measured, format.number, "depth_error_median", "depth_error_max"),
     ),
-    metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
+    table.metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
     table.shown("Published queries", lambda record: str(_published(record, 2) or "")),
     table.shown("Published time", lambda record: str(_published(record, 3) or "")),
 )

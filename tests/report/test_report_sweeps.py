@@ -40,7 +40,8 @@ def swept(results: Path, cells: list[PlannedCell], name: str = "completion-1") -
 
 
 def table(results: Path, name: str = "completion-1") -> pd.DataFrame:
-    write_sweeps(read_records(results)[0], results)
+    write_sweeps(read_records(results)[0], results, problems := [])
+    assert problems == []
     return pd.read_csv(results / "sweeps" / name / "table.csv").set_index("row")
 
 
@@ -168,7 +169,7 @@ def test_a_sweep_of_an_experiment_with_a_page_needs_no_table(tmp_path):
         for one in cells:
             one.config["experiment"] = experiment
         swept(tmp_path, cells, experiment)
-    write_sweeps(read_records(tmp_path)[0], tmp_path)
+    write_sweeps(read_records(tmp_path)[0], tmp_path, [])
     assert [found.name for found in find_sweeps(tmp_path)] == ["of_mine"]
 
 

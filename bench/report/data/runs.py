@@ -17,7 +17,6 @@ from bench.report.data.kept import KEPT, NO_ATTEMPTS
 from bench.report.data.records import SCALE, Record, Row, doubtful, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
-COMPILED = "compiled"  # kernels, as a record of the environment has it; others say torch, and why
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ class Runs:
 
         def machine_of(record: Record) -> tuple[Any, ...]:
             said = record["environment"]
-            return (*(said.get(key) for key in MACHINE), said.get("kernels") == COMPILED)
+            return (*(said.get(key) for key in MACHINE), said.get("kernels") == "compiled")
 
         machines = grouped([record for record in self.named() if record["environment"]], machine_of)
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}

@@ -88,7 +88,7 @@ def better(first: Groups, second: Groups) -> float:
     return float(((a < b) + 0.5 * (a == b)).sum())
 
 
-def bootstrap(groups: Groups, statistic: Statistic, *, seed: int, draws: int = 2000) -> Interval:
+def bootstrap(groups: Groups, statistic: Statistic, *, seed: int = 0, draws: int = 2000) -> Interval:
     """The statistic of all runs with its hierarchical bootstrap interval over shapes, views and seeds.
 
     A draw takes shapes with replacement, of each drawn shape views with replacement, and of each drawn view seeds with
@@ -137,17 +137,10 @@ def differ(ratios: Sequence[Interval]) -> list[bool]:
 
     Ratios of fewer shapes than `FEWEST_SHAPES` do not, and are not counted.
     """
-    known = [place for place, found in enumerate(ratios) if found.known]
-    differing = dict(zip(known, holm([_sign_test(ratios[place].points) for place in known]), strict=True))
-    return [differing.get(place, False) for place in range(len(ratios))]
-
-
-def holm(chances: Sequence[float]) -> list[bool]:
-    """Which of a family of probabilities are too small for chance, by Holm's step-down at 5 % in all."""
-    ordered = sorted((chance, place) for place, chance in enumerate(chances))
-    sure = [chance <= (1 - LEVEL) / (len(chances) - before) for before, (chance, _) in enumerate(ordered)]
-    rejected = {place for (_, place), _ in zip(ordered, takewhile(bool, sure), strict=False)}
-    return [place in rejected for place in range(len(chances))]
+    chances = sorted((_sign_test(found.points), place) for place, found in enumerate(ratios) if found.known)
+    sure = [chance <= (1 - LEVEL) / (len(chances) - before) for before, (chance, _) in enumerate(chances)]
+    rejected = {place for (_, place), _ in zip(chances, takewhile(bool, sure), strict=False)}
+    return [place in rejected for place in range(len(ratios))]
 
 
 def _sign_test(points: Sequence[float]) -> float:
@@ -173,7 +166,9 @@ def _of_median(points: np.ndarray) -> Interval:
     return Interval(middle, float(ordered[beyond]), float(ordered[-1 - beyond]), tuple(points.tolist()))
 
 
-def paired_bootstrap(first: Groups, second: Groups, statistic: Statistic, *, seed: int, draws: int = 2000) -> Interval:
+def paired_bootstrap(
+    first: Groups, second: Groups, statistic: Statistic, *, seed: int = 0, draws: int = 2000
+) -> Interval:
     """The ratio of the first's statistic to the second's, with its interval over the same draws of both.
 
     Equal statistics have the ratio 1, also if both are +inf or 0: where both fail, neither is better.
@@ -236,7 +231,7 @@ def rank(table: dict[Any, dict[Any, float | None]]) -> dict[Any, Interval]:
 
 
 def _mean_of(values: np.ndarray) -> Interval:
-    return bootstrap([*values[:, None]], lambda drawn: np.mean(drawn, axis=-1), seed=0)
+    return bootstrap([*values[:, None]], lambda drawn: np.mean(drawn, axis=-1))
 
 
 def as_good(ranks: dict[Any, Interval], best: Any) -> list[Any]:
@@ -262,7 +257,7 @@ def on_front(costs: Sequence[float | None], errors: Sequence[float]) -> list[boo
     return [has and not next(beaten) for has in both]
 
 
-def front(points: Sequence[Point], *, seed: int, draws: int = 2000) -> list[float]:
+def front(points: Sequence[Point], *, seed: int = 0, draws: int = 2000) -> list[float]:
     """The probability of each setting to be on the Pareto front of medians, over bootstrap draws of shapes and seeds.
 
     All settings get the same shapes and seeds in a draw. A setting whose median is infinite is not on the front. One

@@ -354,4 +354,4 @@ def _over_scenes(reached: np.ndarray, every: np.ndarray) -> Interval:
         shares = np.divide(*of, out=np.zeros_like(of[0]), where=known)
         return shares.sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
 
-    return statistics.bootstrap([np.array([place]) for place in range(len(every))], mean, seed=0)
+    return statistics.bootstrap([np.array([place]) for place in range(len(every))], mean)
