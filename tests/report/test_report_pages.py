@@ -67,14 +67,6 @@ def test_the_base_of_a_preset_is_its_class_or_a_users_preset(renderer, target, b
     assert base_renderer(record(renderer=renderer, config={"renderer": {"_target_": target}})) == base
 
 
-def test_another_label_changes_neither_look_nor_published_numbers(tmp_path):
-    write_run(tmp_path, "table1", "quick", metrics=costs(), renderer="dist_dynamic")
-    write_run(tmp_path, "table1", None, metrics=costs(), renderer="a_new_one")
-    made = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path))
-    assert list(made.table["Strategy"]) == ["quick", "a_new_one"]
-    assert list(made.table["Published queries"]) == ["1.99M", ""]
-
-
 def test_two_presets_under_one_label_are_two_rows(tmp_path):
     for preset, queries in (("dist", 5), ("mine", 7)):
         write_run(tmp_path, "table1", "same", metrics=costs(queries), renderer=preset)

@@ -57,13 +57,6 @@ def test_a_failure_is_infinite_and_a_refusal_does_not_count(tmp_path, status, me
     assert status in result.data["status"].tolist()
 
 
-def test_where_both_failed_neither_is_better(tmp_path):
-    for index, status in enumerate(("ok", "diverged")):
-        made(tmp_path, "exact", 1.0, index=index, status=status)
-        made(tmp_path, "measured", 4.0, index=index, status=status)
-    assert row(tmp_path)["Depth error, ratio"] == "2.00"  # of 4 and 1
-
-
 def test_without_a_pair_there_is_no_ratio(tmp_path):
     made(tmp_path, "exact", 1.0)
     assert row(tmp_path)["Depth error, ratio"] == "–" and page_of(tmp_path, "scans").verdict == ""

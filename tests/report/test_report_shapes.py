@@ -1,7 +1,5 @@
 """The pages on shapes from photographs, made from run folders whose numbers are known."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from bench.report.data.runs import choose
 from bench.report.medians import scene_of
 from bench.studies import dvr_table2
 from tests.report.test_report_galleries import cells, notes
-from tests.report.test_report_paper import page_of, told, write_run
+from tests.report.test_report_paper import page_of, told, write_lines, write_run
 
 NEWTON, IDR, NEUS, HULL, STEREO = "Newton, RGB", "IDR, RGB", "NeuS, RGB", "Visual hull", "Stereo, Poisson"
 POISSON = "Depth, Poisson"
@@ -52,8 +50,7 @@ def made(results, row, metrics, *, dataset="sofa", experiment="dvr_table2", seco
 
 def curve(folder, name, values):
     """Writes a run's curve, of one quantity."""
-    lines = [{"iteration": n, "seconds": n / 10, name: value} for n, value in values.items()]
-    (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_lines(folder, [{"iteration": n, "seconds": n / 10, name: value} for n, value in values.items()])
 
 
 def chosen(results, page=dvr_table2):

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from bench.studies import speed_curves
-from tests.report.test_report_paper import page_of, told, write_run
+from tests.report.test_report_paper import page_of, told, write_curve, write_run
 
 
 def completed(results, label, errors, **changed):
@@ -26,17 +26,8 @@ def completed(results, label, errors, **changed):
         settings={"task": {"points": "50"}, "renderer": {"steps": 50}, "split": "test"},
         **{"notes": []} | changed,
     )
-    lines = [
-        {
-            "iteration": i,
-            "seconds": i + 1.0,
-            "value_evaluations": 100 * (i + 1),
-            "total": 5.0 - i,
-            "chamfer_l2": e / 1000,
-        }
-        for i, e in enumerate(errors[:-1])
-    ]
-    (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    seen = {i: error / 1000 for i, error in enumerate(errors[:-1])}
+    write_curve(folder, [5.0 - i for i in seen], seen, seconds=1.0)
     return folder
 
 

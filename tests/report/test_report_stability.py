@@ -1,12 +1,10 @@
 """The stability atlas as tables and figures, made from run folders whose numbers are known."""
 
-import json
-
 import pytest
 
 from bench.report.data.records import row_of
 from bench.report.data.runs import named_rows, shared_loss
-from tests.report.test_report_paper import page_of, told, write_run
+from tests.report.test_report_paper import page_of, told, write_lines, write_run
 
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 
@@ -35,10 +33,8 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", crit
         },
     )
     if status == "ok":
-        lines = [
-            {"trial": i, "level": i / 10, "severity": 0.01 ** (i / 10), "success": i / 10 < level} for i in range(11)
-        ]
-        (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        tried = [i / 10 for i in range(11)]
+        write_lines(folder, [{"level": at, "severity": 0.01**at, "success": at < level} for at in tried])
     return folder
 
 

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from bench.pictures import style
 from bench.report import compare
 from tests.report.test_report_paper import page_of, told, write_run
 
@@ -166,7 +165,6 @@ def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):
     assert all(math.isnan(y) for y in lines[OTHER])
     assert lines["1.5 times that"][0] == pytest.approx(0.3)
     assert axis.get_title() == "sofa"
-    assert style.look("dist_mask") != style.look("naive_mask")
 
 
 def fitted(results, chamfer, **changed):

@@ -1,7 +1,6 @@
 """The suite: what an attempt has reached and when, how rows stand, and that results outlive their run folders."""
 
 import csv
-import json
 from dataclasses import replace
 from itertools import permutations
 from math import inf
@@ -20,7 +19,7 @@ from bench.studies.suite import _doubts, _panel
 from bench.suite import _sweeps, main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.composing import composed
-from tests.report.test_report_paper import write_run
+from tests.report.test_report_paper import write_lines, write_run
 
 DIST = choice("renderer", "dist")["_label_"]
 RESULTS = Path(__file__).resolve().parents[2] / "results"  # what is shipped
@@ -68,7 +67,7 @@ def write_completion(results: Path, errors: list[float], **changed) -> Path:
         {"iteration": n, "seconds": n + 1.0, "cost": 1000.0 * (n + 1), "total": 1.0, "chamfer_l1": error}
         for n, error in enumerate(errors[:-1])
     ]
-    (folder / "curve.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_lines(folder, lines)
     return folder
 
 
