@@ -10,8 +10,8 @@ from bench.records import format
 from bench.records.metrics import HIGHER, LOWER, SHOWN, Metric, better
 from bench.records.names import differences
 from bench.records.read import Plan, not_run, read_plans, read_run
-from bench.records.record import NOT_RUN, RunStatus
 from bench.report.data import records
+from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
@@ -29,7 +29,6 @@ FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
-NOT_ENDED = (NOT_RUN, RunStatus.KILLED)  # they say nothing of a row
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
 
@@ -100,7 +99,7 @@ def of_plan(plan: Plan, known: dict[str, Record]) -> Sweep:
     names = differences(runs, apart=_apart, asked=[{k: one[k] for k in one if k in swept} for one in asked])
     named = [run | {"row": name} for run, name in zip(runs, names, strict=True)]
     selection = Selection(plan.cells[0].config.get("experiment") or "", setup=("scenes", "pixels", "machine"))
-    ended = [run for run in named if run["status"] not in NOT_ENDED]
+    ended = [run for run in named if run["status"] not in UNFINISHED]
     return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or named), len(named) - len(ended))
 
 
@@ -172,7 +171,6 @@ def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | N
 
 
 def table_of(sweep: Sweep) -> Result:
-    """The table of a sweep."""
     found, names = lines(sweep), sweep.metrics
     headings = {name: SHOWN[name] for name in names if name in SHOWN}
     headings = headings or {name: Metric(name) for name in names[:MOST_METRICS]}
@@ -181,7 +179,8 @@ def table_of(sweep: Sweep) -> Result:
     known = [line[name].known for line in found for name in headings if line[name] is not None]
     kinds = ["95 % bootstrap intervals over shapes" if any(known) else "", "" if all(known) else f"{FEW}: no interval"]
     lead = names[0] if names and names[0] in headings and better(names[0]) else ""
-    panels = [_panel(found, key, title, headings[lead]) for key, title in _shown(sweep, lead).items()] if lead else []
+    places = {_on(lead, dataset): dataset for dataset in sweep.datasets} or {lead: ""}
+    panels = [_panel(found, key, title, headings[lead]) for key, title in places.items()] if lead else []
     return Result(
         sweep.runs,
         f"Sweep {sweep.name}.",
@@ -200,11 +199,6 @@ def table_of(sweep: Sweep) -> Result:
         columns=_columns(sweep, headings, several=any(line["ratio"] is not None for line in found)),
         lines=found,
     )
-
-
-def _shown(sweep: Sweep, metric: str) -> dict[str, str]:
-    """Where lines have a metric, with the title of its panel: on each data set, or on the one that there is."""
-    return {_on(metric, dataset): dataset for dataset in sweep.datasets} or {metric: ""}
 
 
 def _panel(found: list[dict[str, Any]], key: str, title: str, shown: Metric) -> Panel:

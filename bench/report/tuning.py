@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 
 from bench.records.names import flat
-from bench.records.record import NEUTRAL_KEYS, NOT_RUN
+from bench.records.record import NEUTRAL_KEYS
+from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import (
     SCALE,
     Record,
@@ -34,7 +35,6 @@ SPACE, TUNED = "space/", "tuned/"  # before the names of methods whose settings 
 VALIDATION, TEST = "validation", "test"
 BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
 OTHER = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are no drawn settings
-UNFINISHED = (NOT_RUN, "killed")  # statuses of runs that say nothing of their draw
 
 
 @dataclass(frozen=True)

@@ -51,12 +51,10 @@ class Crossed:
 
     @property
     def renderers(self) -> list[str]:
-        """All renderers."""
         return list(dict.fromkeys(renderer for renderer, _ in self.rows))
 
     @property
     def losses(self) -> list[str]:
-        """All losses."""
         return list(dict.fromkeys(loss for _, loss in self.rows))
 
     def gap(self, family: str, first: list[Setting], second: list[Setting]) -> compare.Gap | None:

@@ -27,6 +27,7 @@ NOTES = (
     "that compute the same share their times.",
 )
 POINT = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
+RUNS = "#/runs?task=all&view=runs&"  # the page's list of runs
 Line = dict[str, Any]  # of a setting
 
 
@@ -169,17 +170,13 @@ def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
     for (renderer, dominated), own in records.grouped(
         _finite(panel), lambda p: (p["renderer"], p["dominated"])
     ).items():
-        look = {"text": [*map(_hover, own)], "link": [_runs_of(p["setting"]) for p in own], "size": 11}
+        links = [RUNS + urlencode({"q": p["setting"]}) for p in own]
+        look = {"text": [*map(_hover, own)], "link": links, "size": 11}
         look |= {"hollow": True} if dominated else {}
         drawn.append(chart.series(renderer, renderer, *([p[key] for p in own] for key in at), **look))
     line = {"colour": chart.GREY, "symbol": "", "dash": "-", "step": True, "quiet": True}
     drawn.append(chart.series("front", "", *([p[key] for p in _front(panel)] for key in at), **line))
     return chart.panel_data(trial.title, "time (seconds)", trial.heading, drawn, height=440)
-
-
-def _runs_of(setting: str) -> str:
-    """The address of the runs of a setting in the page's list."""
-    return "#/runs?" + urlencode({"task": "all", "view": "runs", "q": setting})
 
 
 def _hover(line: Line) -> list[str]:

@@ -91,7 +91,8 @@ def _texts(name: str, values: list[Any]) -> tuple[Callable[[list[Any]], list[str
     kind, kinds = _type(name, values), {type(value) for value in values if value is not None}
     if kind in PLAIN and kinds <= PLAIN[kind]:
         return _words, values
-    if kind == NUMBER and kinds <= {int, float} and not any(map(_huge, values)):
+    huge = (type(value) is int and abs(value) > sys.float_info.max for value in values)  # fits into no float
+    if kind == NUMBER and kinds <= {int, float} and not any(huge):
         return _numbers, values
     form = {"index": False, "header": False, "lineterminator": "\n", "quoting": csv.QUOTE_ALL}
     written = pd.DataFrame({name: _series(values, kind)}).to_csv(**form)
@@ -104,11 +105,6 @@ def _words(values: list[Any]) -> list[str]:
 
 def _numbers(values: list[Any]) -> list[str]:
     return ["" if value is None or value != value else repr(float(value)) for value in values]
-
-
-def _huge(value: Any) -> bool:
-    """Whether a number fits into no float."""
-    return type(value) is int and abs(value) > sys.float_info.max
 
 
 def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import decoded, plain, started, write_text
-from bench.report.data.records import Record, grouped
+from bench.report.data.records import Record, grouped, setting
 from bench.tables import nested
 
 SUFFIX = ".runs.csv"
 KEPT = "kept"  # marks a record that was read here
-NO_ATTEMPTS = ("not_run", "killed", "refused")  # statuses of runs that say nothing of what they were to measure
+UNFINISHED = ("not_run", "killed")  # statuses of runs that say nothing of a row
+NO_ATTEMPTS = (*UNFINISHED, "refused")  # those of runs that did not measure what they were to measure
 HERE = ("log", "overrides", "environment.diff", "environment.platform", KEPT)
 HERE += ("config.results_dir", "config.priors_dir")  # what is of the machine, or can be looked up
 SAME, NONE = "", "-"
@@ -32,7 +33,9 @@ def join(records: Iterable[Record], kept: Iterable[Record]) -> list[Record]:
 
 def write_rows(records: Iterable[Record], experiments: Iterable[str], folder: Path) -> list[Path]:
     """Writes the runs of each experiment to a folder, but planned ones and those of scale=smoke; gives the files."""
-    of = grouped((one for one in records if _counts(one)), lambda record: record["config"].get("experiment"))
+    measured = (one for one in records if one["status"] not in NO_ATTEMPTS)
+    sound = (one for one in measured if setting(one["config"], "scale", "name") != "smoke")
+    of = grouped(sound, lambda record: record["config"].get("experiment"))
     return [_write(folder / f"{name}{SUFFIX}", of[name]) for name in dict.fromkeys(experiments) if name in of]
 
 
@@ -50,10 +53,6 @@ def read_rows(folder: Path) -> list[Record]:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
             raise ValueError(f"{path} cannot be read, mend it or move it away: {error!r}") from error
     return found
-
-
-def _counts(record: Record) -> bool:
-    return record["status"] not in NO_ATTEMPTS and (record["config"].get("scale") or {}).get("name") != "smoke"
 
 
 def _cells(value: Any, name: str = "") -> dict[str, str]:

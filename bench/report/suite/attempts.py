@@ -257,13 +257,10 @@ def _write(path: Path, attempts: list[Attempt]) -> Path:
     table = csv.DictWriter(text, [one.name for one in fields(Attempt)], lineterminator="\n")
     table.writeheader()
     for attempt in sorted(attempts, key=lambda one: one.key):
-        table.writerow({name: _cell(value) for name, value in asdict(attempt).items()})
+        cells = asdict(attempt).items()
+        table.writerow({name: one if isinstance(one, str) else json.dumps(plain(one)) for name, one in cells})
     write_text(path, text.getvalue())
     return path
-
-
-def _cell(value: Any) -> Any:
-    return value if isinstance(value, str) else json.dumps(plain(value))
 
 
 def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
