@@ -196,7 +196,7 @@ class Compared:
     largest: float
 
 
-def compared(runs: Runs, names: Sequence[str], most: int) -> Compared:
+def compared(runs: Runs, most: int) -> Compared:
     """Compares the runs of one scene with its reference: normals above, differences below, at most so many columns.
 
     The scale of angles ends at the 99th percentile over all pixels, rounded up. The reference is of the largest
@@ -211,7 +211,7 @@ def compared(runs: Runs, names: Sequence[str], most: int) -> Compared:
     largest = style.rounded_up(float(np.percentile(known, 99))) if known.size else 90.0
     sizes = [one.get("size", 0) for one in counts]
     best = sorted(zip(sizes, range(len(records)), strict=True), key=lambda pair: (-pair[0], pair[1]))
-    heads = [f"{n}, {s} px" if 0 < s < best[0][0] else n for n, s in zip(names, sizes, strict=True)]
+    heads = [f"{n}, {s} px" if 0 < s < best[0][0] else n for n, s in zip(runs.names(), sizes, strict=True)]
     true = scene.shared([records[place] for _, place in best], normals("reference_"))
     rows = {
         "normals": [true, *(scene.cell(record, normals()) for record in records)],

@@ -19,7 +19,7 @@ COLUMNS = (  # of a record and the counts of its picture
 def make(runs: Runs) -> Result:
     """The reference and a column per row; rows without pictures keep their place."""
     chosen = runs.of_newest_scene()
-    found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
+    found = gallery.compared(chosen, MOST_COLUMNS)
     data = table.to_data(COLUMNS, zip(chosen.records, found.counts, strict=True))
     wrong = dict(zip(chosen.names(), (data["lost"] + data["false"]).astype(float), strict=True))
     return Result(

@@ -21,7 +21,7 @@ def make(runs: Runs) -> Result:
     """A column of pictures and a line per epsilon, the largest first."""
     chosen = runs.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
-    found = gallery.compared(chosen, chosen.names(), MOST_COLUMNS)
+    found = gallery.compared(chosen, MOST_COLUMNS)
     lines = [(record, _counts(record, drawn)) for record, drawn in zip(chosen.records, found.counts, strict=True)]
     wrong = {
         f"epsilon = {_epsilon(record):g}": counts["lost_share"] + counts["false_share"]

@@ -134,7 +134,7 @@ def _verdict(standing: Standing) -> str:
     else:
         said.append(f"{less or 'None'} of the {len(others)} others can be told to reach less.")
         said.append(f"{scenes} tell differences of some {100 * standing.resolution:.0f} points.")
-    at = sorted(((standing.share_at(row, 1.0), row) for row in standing.ranked), reverse=True)[:3]
+    at = sorted(((standing.share_at_dist(row), row) for row in standing.ranked), reverse=True)[:3]
     if standing.reference in standing.ranked:
         listed = ", ".join(f"{row} *{table.percent(share)}*" for share, row in at)
         said.append(f"At the cost of one run of DIST: {listed}.")

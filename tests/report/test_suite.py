@@ -95,7 +95,7 @@ def test_a_rendering_has_its_cost_and_its_pixel_errors(tmp_path):
 
 def test_rows_are_compared_where_all_that_have_the_least_size_have_an_attempt(monkeypatch):
     least = [("complete", f"{scene}, 20 points", 0) for scene in SCENES[:6]]
-    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda _: {*least})
+    monkeypatch.setattr("bench.report.suite.standing.least_problems", lambda: {*least})
     whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)]).everything
     mine = [one for one in whole if one.row not in ("Mine", "Part") or one.key[:3] in least]
     standing = Standing([one for one in mine if one.row != "Part" or one.scene == SCENES[0]])
@@ -319,7 +319,7 @@ def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_comparison(monke
     rows = [("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Lost", 0.5, 1.0)]
     for_all = field(rows).everything
     for_all += [replace(one, set="pose") for one in for_all]
-    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda _: {one.key[:3] for one in for_all})
+    monkeypatch.setattr("bench.report.suite.standing.least_problems", lambda: {one.key[:3] for one in for_all})
     tuned = [
         attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings="own", preset=row.lower())
         for row, final in (("Dist", 0.01), ("B", 0.5), ("Lost", 0.5))

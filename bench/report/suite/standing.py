@@ -19,11 +19,10 @@ from scipy.special import stdtrit
 from bench.report.data import statistics
 from bench.report.data.records import grouped
 from bench.report.data.statistics import Interval
-from bench.report.suite.attempts import APART, BY_ITSELF, Attempt, joined, problems_of, suite
+from bench.report.suite.attempts import APART, BY_ITSELF, Attempt, joined, least_problems, suite
 from bench.tables import choice
 
 REFERENCE = "dist"  # the preset of the row by whose costs others are divided
-LEAST_SIZE = "quick"  # a row that has its problems is judged
 COST, SECONDS = 0, 1  # places in what a target was reached at
 FLIPS = 16  # most scenes of which all signs are tried; of more, as many random ones as there are of these
 POWER = 0.8  # the share of cases in which a difference of the resolution is found
@@ -77,7 +76,7 @@ class Standing:
     def _needed(self) -> set[tuple[Any, ...]]:
         """The problems and seeds that a row must have: the least size's, or all if the reference lacks one."""
         known = self._known.get(str(self.reference)) or set().union(*self._known.values())
-        least = problems_of(LEAST_SIZE)
+        least = least_problems()
         return least if least <= known else known
 
     @cached_property
@@ -228,7 +227,7 @@ class Standing:
             **{"against": self.against(row), "row": row, "preset": self.preset(row), "share": self.share(row)},
             **{name: self.share(row, name).value for name in self.sets},
             **{"ratio": self.ratio(row), "gain": self.gain(row), "wrong": self.wrong(row)},
-            "at_dist": nan if row.endswith(BY_ITSELF) else self.share_at(row, 1.0),
+            "at_dist": nan if row.endswith(BY_ITSELF) else self.share_at_dist(row),
             "problems": len(self.of(row)),
             "seconds": seconds if seconds and seconds.known else None,
             "failed": ", ".join([*failed, *([f"{lacking} not run"] if lacking else [])]),
@@ -251,9 +250,9 @@ class Standing:
         shares = np.cumsum([steps[cost] for cost in costs]).round(12).tolist()
         return [costs[0] if costs else last, *costs, last], [0.0, *shares, shares[-1] if shares else 0.0]
 
-    def share_at(self, row: str, cost: float) -> float:
-        """The share that a row has reached at a cost over the reference's."""
-        return max((share for at, share in zip(*self.profile(row), strict=True) if at <= cost), default=0.0)
+    def share_at_dist(self, row: str) -> float:
+        """The share that a row has reached at the cost of the reference's run."""
+        return max((share for at, share in zip(*self.profile(row), strict=True) if at <= 1), default=0.0)
 
     def ratio(self, row: str, of: int = COST) -> Interval | None:
         """The ratio of a row's cost to the reference's over the targets that both reach: the median over scenes.
