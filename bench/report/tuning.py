@@ -78,7 +78,6 @@ class Tuning:
 
     @property
     def best(self) -> int:
-        """The place of the best draw."""
         return int(self.order[0])
 
     @property

@@ -14,7 +14,6 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from bench.report.data.statistics import (
-    FEWEST_SHAPES,
     Interval,
     bootstrap,
     clopper_pearson,
@@ -143,10 +142,3 @@ def test_shares_of_independent_trials_for_every_rate():
         found = [clopper_pearson(k / n, n) for k in range(n + 1)]
         holds = np.array([(one.low <= rates) & (rates <= one.high) for one in found])
         assert ((stats.binom.pmf(np.arange(n + 1)[:, None], n, rates) * holds).sum(axis=0) >= 0.95 - 1e-9).all()
-
-
-def test_the_extremes_of_fewer_shapes_cover_too_little():
-    """Why no interval is drawn below six: the widest that a bootstrap can give, over the least and the largest."""
-    errors = np.random.default_rng(0).lognormal(size=(20_000, FEWEST_SHAPES))
-    reach = [((errors[:, :n].min(axis=1) <= 1) & (errors[:, :n].max(axis=1) >= 1)).mean() for n in (2, 4, 5, 6)]
-    assert reach == pytest.approx([0.5, 0.875, 0.9375, 0.96875], abs=0.01)

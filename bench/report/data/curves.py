@@ -36,10 +36,6 @@ def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.Da
     After the end of a failed run its value counts as infinite, so that no row improves by failed runs. Iterations at
     which another run has no value are left out.
 
-    Args:
-        failed: for each run, whether it did not end ok.
-        quantity: a column of the curves.
-
     Returns:
         Columns iteration, seconds, median, low, high.
     """

@@ -35,7 +35,6 @@ class Row:
 
 
 def row_of(record: Record) -> Row:
-    """The row of a record."""
     config = record["config"]
     name = str(record.get("row") or row_name(config, record["renderer"]))
     return Row(record.get("method") or record["renderer"], name)

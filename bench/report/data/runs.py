@@ -125,11 +125,9 @@ class Runs:
         return self.records[0]["config"]
 
     def rows(self) -> dict[Row, list[Record]]:
-        """The records of each row."""
         return grouped(self.records, row_of)
 
     def families(self) -> dict[str, list[Record]]:
-        """The records of each family."""
         return grouped(self.records, family)
 
     def named(self) -> list[Record]:

@@ -19,14 +19,8 @@ OVER = "{shapes and seeds}"  # stands in texts for that over which the runs of a
 FEW = "fewer than six shapes"  # statistics.FEWEST_SHAPES
 
 
-def caption(runs: Runs, plotted: str, *, n: str = "", interval: str = "") -> str:
-    """The caption of a page, in four sentences, behind a warning where its runs are of scale=smoke.
-
-    Args:
-        plotted: what is plotted, as a sentence; `OVER` in it becomes that over which runs vary.
-        n: the sample as text; by default the numbers of runs, shapes and seeds.
-        interval: the kind of interval, likewise; empty for none.
-    """
+def caption(runs: Runs, plotted: str, *, n: str, interval: str) -> str:
+    """The caption of a `Result`, in four sentences, behind a warning where its runs are of scale=smoke."""
     sample = (n or _sample(runs)) + (f"; {said(runs, interval)}" if interval else "") + "."
     setup = _setup(runs)
     first = [SMOKE if tried(runs) else "", said(runs, plotted)]
@@ -47,11 +41,7 @@ def said(runs: Runs, text: str) -> str:
 
 
 def kind(interval: str, shown: Iterable[Interval], *, drawn: bool) -> str:
-    """The kind of interval of the estimates that are shown; that there is none where shapes are fewer than six.
-
-    Args:
-        drawn: whether a figure draws points in place of intervals.
-    """
+    """The kind of interval of the estimates that are shown; that there is none, or points if drawn, of few shapes."""
     known = [estimate.known for estimate in shown]
     none = f"{FEW}: {'points, ' if drawn else ''}no interval; n in brackets counts shapes"
     if all(known):

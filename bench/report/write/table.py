@@ -99,7 +99,6 @@ def best(columns: Sequence[Column], lines: Sequence[Any]) -> list[list[int]]:
 
 
 def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None) -> Column:
-    """A column of text."""
     return Column(key, heading, value, show=word)
 
 
