@@ -4,6 +4,7 @@
 `gallery` draw, `style` has the looks of rows and `format` the texts of numbers.
 """
 
+# ruff: noqa: F401 - what is imported here is passed on
 from bench.pictures import style
 from bench.records import format
 from bench.report import compare, conditions, gallery, medians, single_view
@@ -11,21 +12,3 @@ from bench.report.data import curves, records, statistics
 from bench.report.data.runs import Runs, Selection
 from bench.report.write import chart, table
 from bench.report.write.result import Result
-
-__all__ = [
-    "Result",
-    "Runs",
-    "Selection",
-    "chart",
-    "compare",
-    "conditions",
-    "curves",
-    "format",
-    "gallery",
-    "medians",
-    "records",
-    "single_view",
-    "statistics",
-    "style",
-    "table",
-]
