@@ -247,14 +247,6 @@ def drawn(axis, label: str, letter: str = "y") -> list[float]:
     return [float(value) for value in getattr(line, f"get_{letter}data")()]
 
 
-def assert_labelled(figure, x_labels: bool = True) -> None:
-    """Axes that have numbers say of what, with a unit or why there is none."""
-    charts = [axis for axis in figure.axes if axis.axison and axis.lines]
-    assert charts
-    for axis in charts:
-        assert axis.get_ylabel() and (axis.get_xlabel() or not x_labels)
-
-
 @pytest.fixture
 def completions(tmp_path: Path) -> Path:
     write_curve(write_run(tmp_path, "fig5", PARALLEL), [4, 3, 2, 1], {0: 0.4, 2: 0.1, 3: 0.2})
@@ -313,7 +305,7 @@ def test_fig5_plots_the_numbers_of_its_csv(completions):
     assert "× 1000" in axes[2].get_ylabel()
     line = made.table.set_index("Method").loc[PARALLEL]
     assert (line["End"], line["ρ"]) == ("200", "0.500")
-    assert_labelled(made.figure)
+    assert all(axis.get_xlabel() and axis.get_ylabel() for axis in axes)
     for words in ("no curve.jsonl", "infinite"):
         assert words in told(made)
     for words in ("2 of 5 runs did not end ok", "diverged (loss rose)", "n = 5 runs (1 shape, 3 seeds)"):

@@ -211,17 +211,12 @@ def test_a_sweep_with_an_odd_record_costs_no_other_table(tmp_path, capsys):
     assert "not made: sweeps/odd (TypeError: " in told.err and told.out.endswith("index.html\n")
 
 
-def costing(seconds: float) -> dict:
-    """The costs of a run whose loop takes some seconds, a tenth of all, and asks as many thousand values."""
-    spent = {"forward": seconds, "backward": 0.0, "total": 10 * seconds}
-    return {"seconds": spent, "evaluations": {"value": 1000 * seconds}}
-
-
 def test_a_row_has_medians_not_means_of_its_ended_runs(tmp_path):
     cells = [cell("dist", seed=s) for s in range(5)]
     swept(tmp_path, cells)
     for one, chamfer, seconds in zip(cells, (0.001, 0.002, 0.003, 0.020, None), (1, 2, 3, 20, 500), strict=True):
-        ran(tmp_path, one, chamfer, **costing(seconds))
+        spent = {"forward": seconds, "backward": 0.0, "total": 10 * seconds}
+        ran(tmp_path, one, chamfer, seconds=spent, evaluations={"value": 1000 * seconds})
     found = table(tmp_path).loc["DIST"]
     assert found["chamfer_l2"] == pytest.approx(0.003)  # of five, one of them infinite
     assert (found["loop_seconds"], found["value_evaluations"]) == (2.5, 2500)  # of the four that ended ok

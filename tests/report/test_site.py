@@ -350,13 +350,10 @@ def test_a_variant_has_the_settings_of_what_it_builds_on():
     built, own = (dict(found) for found in (_node("neus"), _node("neus_budget")))
     assert own["samples"] == 24 and {*built} <= {*own} and _node("no_such") == {}
     assert _source("mypkg.Mine") == ("mypkg.Mine", "")
-    for name in suite_rows():
+    suite_rows = [name for name in choices("renderer") if "core" in choice("renderer", name).get("_rows_", {})]
+    for name in suite_rows:
         file, said = _source(_node(name)["_target_"])
         assert (ROOT / file).is_file() and "Source:" in said, name
-
-
-def suite_rows() -> list[str]:
-    return [name for name in choices("renderer") if "core" in choice("renderer", name).get("_rows_", {})]
 
 
 def test_an_odd_run_of_the_suite_costs_no_page(tmp_path):
