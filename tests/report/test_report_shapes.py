@@ -61,22 +61,16 @@ def line_of(result, row):
     return result.table.set_index("Method").loc[row]
 
 
-def test_rows_that_still_rise_are_named(tmp_path):
-    for row, psnr in ((NEWTON, [10.0, 20.0, 20.4]), (IDR, [10.0, 14.0, 19.0])):
-        curve(made(tmp_path, row, scored(0.01)), "psnr", {1: psnr[0], 200: psnr[1], 399: psnr[2]})
-    made(tmp_path, HULL, scored(0.05))
-    (note,) = [note for note in page_of(tmp_path, "dvr_table2").notes if note.startswith("Not at their end")]
-    assert note.endswith(f"iterations: {IDR}.")
-
-
 def test_curves_are_medians_of_scenes_that_end_at_the_errors_of_the_table(tmp_path):
     for scene, factor in (("sofa", 1), ("car", 3)):
         folder = made(tmp_path, NEWTON, scored(0.01 * factor), dataset=scene)
-        curve(folder, "seen_chamfer_l1", {0: 0.05 * factor, 200: 0.02 * factor, 399: None})
+        curve(folder, "seen_chamfer_l1", {0: 0.05 * factor, 20: 0.03 * factor, 180: 0.02 * factor, 399: None})
         made(tmp_path, HULL, scored(0.04 * factor), dataset=scene)
     result = page_of(tmp_path, "dvr_curves")
     of = {row: lines.set_index("iteration")["seen_chamfer_l1"].to_dict() for row, lines in result.data.groupby("row")}
-    assert of[NEWTON] == pytest.approx({0: 0.1, 200: 0.04, 400: 0.02}) and of[HULL] == pytest.approx({0: 0.08})
+    assert of[NEWTON] == pytest.approx({20: 0.06, 180: 0.04, 400: 0.02}) and of[HULL] == pytest.approx({0: 0.08})
+    assert result.table.values.tolist() == [[NEWTON, "400", "40.0", "20.0", "50 %"]]
+    assert "in the second half: *50 %* (Newton, RGB); n = 2 scenes." in result.verdict
 
 
 def test_a_line_has_the_medians_over_scenes_with_failed_runs_worst(tmp_path):
