@@ -1,5 +1,6 @@
 """Table 2 and Figs. 6 to 8 of DVR: shape and colour from rendered photographs."""
 
+import math
 from typing import Any
 
 import pandas as pd
@@ -154,21 +155,23 @@ def _course(runs: Runs, row: Row, records: list[Record]) -> pd.Series:
     course = curves.median(own, [record["status"] != "ok" for record in records], SEEN)
     course = course.set_index("iteration")["median"]
     mine = (runs.frame.row == row.name) & (runs.frame.preset == row.preset)
-    last = max(int(curve["iteration"].max()) + 1 for curve in own) if len(course) else 0
+    last = max(int(curve["iteration"].max()) + 1 for curve in own if len(curve)) if len(course) else 0
     return pd.concat([course[course.index > 0], pd.Series({last: medians.scored(runs, SEEN)[mine].median()})])
 
 
 def _fall(row: Row, course: pd.Series) -> dict[str, Any]:
-    """A row's line: by how much its error fell in the second half."""
-    *measured, last = course.index
-    half, end = course[min(measured, key=lambda at: abs(at - last / 2))], course[last]
+    """A row's line: by how much its error fell in the second half; nan where that is infinite or not measured."""
+    *before, last = course.index
+    middle = [at for at in before if abs(at - last / 2) <= last / 4]
+    half = course[min(middle, key=lambda at: abs(at - last / 2))] if middle else math.nan
+    end = course[last]
     return {
         "method": row.name,
         "preset": row.preset,
         "iterations": last,
         "half": half,
         "end": end,
-        "fell": 1 - end / half,
+        "fell": 1 - end / half if 0 < half < math.inf and end < math.inf else math.nan,
     }
 
 

@@ -73,6 +73,28 @@ def test_curves_are_medians_of_scenes_that_end_at_the_errors_of_the_table(tmp_pa
     assert "in the second half: *50 %* (Newton, RGB); n = 2 scenes." in result.verdict
 
 
+@pytest.mark.parametrize(
+    ("last", "curves", "expected"),
+    [
+        ("crashed", ({20: 0.03, 180: 0.02, 399: None}, {}), ["400", "∞", "∞", "–"]),  # without a curve
+        ("diverged", ({20: 0.03, 180: 0.02, 399: None}, {0: 0.05, 30: None}), ["400", "∞", "∞", "–"]),
+        ("diverged", ({0: 0.05},), ["1", "–", "∞", "–"]),  # in its first iteration
+        ("diverged", ({20: 0.03, 130: 0.02, 250: None},), ["251", "20.0", "∞", "–"]),
+        ("ok", ({0: 0.05, 399: 0.01},), ["400", "–", "10.0", "–"]),  # without a checkpoint in the middle
+        ("ok", ({0: 0.05, 20: 0.03, 180: 0.02, 399: 0.01}, {0: 0.05, 20: 0.03, 99: None}), ["400", "–", "10.0", "–"]),
+    ],
+)
+def test_what_no_fall_is_known_of_is_missing_and_costs_no_page(tmp_path, last, curves, expected):
+    for place, values in enumerate(curves):
+        status = last if place == len(curves) - 1 else "ok"
+        folder = made(tmp_path, NEWTON, scored(0.01), dataset=("sofa", "car")[place], status=status)
+        if values:
+            curve(folder, "seen_chamfer_l1", values)
+    made(tmp_path, HULL, scored(0.05))
+    result = page_of(tmp_path, "dvr_curves")
+    assert result.table.values.tolist() == [[NEWTON, *expected]] and result.verdict == ""
+
+
 def test_a_line_has_the_medians_over_scenes_with_failed_runs_worst(tmp_path):
     for dataset, chamfer, psnr in (("sofa", 0.02, 20.0), ("car", 0.01, 24.0), ("plane", 0.04, 22.0)):
         made(tmp_path, NEWTON, scored(chamfer, psnr), dataset=dataset, seconds=100 * chamfer)
