@@ -70,7 +70,7 @@ def size_doubt(cameras: Sequence[Camera]) -> str:
     """What is said of cameras whose principal point lies as if their images had another size; "" of others."""
     middles = [(one.intrinsics[0, 2] / one.width, one.intrinsics[1, 2] / one.height) for one in cameras]
     across, down = 2 * np.median(np.array(middles), axis=0)
-    if abs(across / down - 1) > ALIKE or max(across, 1 / across) < RESIZED or across <= 0:
+    if min(across, down) <= 0 or abs(across / down - 1) > ALIKE or max(across, 1 / across) < RESIZED:
         return ""
     return (
         f"the principal point lies where it would be in images about {across:.2g} times as wide and high: scale the "

@@ -90,6 +90,11 @@ def test_intrinsics_of_an_image_of_another_size_are_noted(made):
     assert len(right) == 1 and "in images about 1.9 times as wide and high" in twice[1]
 
 
+def test_a_principal_point_at_a_corner_says_nothing_of_sizes(made):
+    for corner in ([0.0, 0.0], [70.3, 0.0]):
+        assert len(depth_image(made, intrinsics=[*CAMERA[:2], *corner]).placed(40).mesh.repairs) == 1
+
+
 def test_files_without_depths_are_refused(made, tmp_path):
     stored, mask = {"a": np.zeros((4, 4, 3)), "b": np.zeros((9, 9)), "c": np.ones((9, 9))}, str(made[0] / "mask.png")
     for (name, numbers), says in zip(stored.items(), ("one number", "no object", "120 and 9 x 9"), strict=True):
