@@ -244,7 +244,7 @@ def build(
     arguments = {str(key): value for key, value in node.items() if key not in RESERVED}
     names = _argument_names(cls)
     for key in (key for key, value in node.items() if value == MISSING):
-        raise ValueError(_missing(cls, name, key))
+        raise ValueError(_missing(cls, name, str(key)))
     for key in arguments:
         if names is not None and key not in names:
             raise ValueError(f"{name} has no key {key!r}{nearest(str(key), names)}")
@@ -388,7 +388,7 @@ def _typed(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[s
 
 def _missing(cls: type, name: str, key: str) -> str:
     """What is said of a key without a value, with what the docstring of its class says of it."""
-    meaning = re.search(rf"^( *){key}: (.+?)(?=^\1\S|^$|\Z)", getdoc(cls) or "", re.MULTILINE | re.DOTALL)
+    meaning = re.search(rf"^( *){re.escape(key)}: (.+?)(?=^\1\S|^$|\Z)", getdoc(cls) or "", re.MULTILINE | re.DOTALL)
     said = f", {' '.join(meaning[2].split()).rstrip('.')}" if meaning else ""
     return f"{name}.{key} must be given: set {name}.{key}=...{said}"
 

@@ -96,7 +96,7 @@ class OwnPhotographs:
     """Photographs of one object with their cameras, in a folder; see `datasets/README.md` for the formats.
 
     Args:
-        path: the folder.
+        path: the folder that has the photographs and their cameras.
         masks: False reads none, as if there were none.
         axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
         images: the folder of COLMAP's images; None for the usual ones in `path`.
