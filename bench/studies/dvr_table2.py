@@ -22,7 +22,7 @@ NOTES = (
     "All rows but DVR's own share one field, rate and iterations; volumes have the cross entropy of their opacity for "
     "the masks and a budget of samples a ray.",
     "DVR's own rows have their paper's rate and no more iterations than others, but the one that has ten times both; "
-    "none of these rows is at its end, see “Error over the iterations on photographs”.",
+    "“Error over the iterations on photographs” shows whether a row is at its end.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
     "measured rows.",
 )
@@ -46,7 +46,8 @@ PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN, "psnr"))
 COURSE = (
     table.text("method", "Method"),
     table.Column("iterations", "Iterations", show=table.whole),
-    table.Column("half", "At half", show=table.thousandfold),
+    table.Column("at", "Nearest to half", show=table.whole),
+    table.Column("half", "Error there", show=table.thousandfold),
     table.Column("end", "At the end", show=table.thousandfold),
     table.Column("fell", "Fell by", show=table.percent),
 )
@@ -130,7 +131,7 @@ def convergence(runs: Runs) -> Result:
         "of the iterations and at the end; in the figure, at all checkpoints.",
         question="Which rows are at their end?",
         verdict=format.ends(
-            "Fall of the error in the second half",
+            "Fall of the error from the checkpoint nearest to half of the iterations to the end",
             {line["method"]: line["fell"] for line in lines},
             _scenes(runs),
             show=table.percent,
@@ -160,16 +161,16 @@ def _course(runs: Runs, row: Row, records: list[Record]) -> pd.Series:
 
 
 def _fall(row: Row, course: pd.Series) -> dict[str, Any]:
-    """A row's line: by how much its error fell in the second half; nan where that is infinite or not measured."""
+    """A row's line: by how much its error fell at last; nan where that is infinite or not measured."""
     *before, last = course.index
-    middle = [at for at in before if abs(at - last / 2) <= last / 4]
-    half = course[min(middle, key=lambda at: abs(at - last / 2))] if middle else math.nan
-    end = course[last]
+    at = min(before, key=lambda at: abs(at - last / 2), default=0)
+    known = 4 * abs(at - last / 2) <= last
+    half, end = course[at] if known else math.nan, course[last]
     return {
         "method": row.name,
         "preset": row.preset,
         "iterations": last,
-        "half": half,
+        **({"at": at, "half": half} if known else {}),
         "end": end,
         "fell": 1 - end / half if 0 < half < math.inf and end < math.inf else math.nan,
     }

@@ -69,19 +69,23 @@ def test_curves_are_medians_of_scenes_that_end_at_the_errors_of_the_table(tmp_pa
     result = page_of(tmp_path, "dvr_curves")
     of = {row: lines.set_index("iteration")["seen_chamfer_l1"].to_dict() for row, lines in result.data.groupby("row")}
     assert of[NEWTON] == pytest.approx({20: 0.06, 180: 0.04, 400: 0.02}) and of[HULL] == pytest.approx({0: 0.08})
-    assert result.table.values.tolist() == [[NEWTON, "400", "40.0", "20.0", "50 %"]]
-    assert "in the second half: *50 %* (Newton, RGB); n = 2 scenes." in result.verdict
+    assert result.table.values.tolist() == [[NEWTON, "400", "180", "40.0", "20.0", "50 %"]]
+    assert "to the end: *50 %* (Newton, RGB); n = 2 scenes." in result.verdict
 
 
 @pytest.mark.parametrize(
     ("last", "curves", "expected"),
     [
-        ("crashed", ({20: 0.03, 180: 0.02, 399: None}, {}), ["400", "∞", "∞", "–"]),  # without a curve
-        ("diverged", ({20: 0.03, 180: 0.02, 399: None}, {0: 0.05, 30: None}), ["400", "∞", "∞", "–"]),
-        ("diverged", ({0: 0.05},), ["1", "–", "∞", "–"]),  # in its first iteration
-        ("diverged", ({20: 0.03, 130: 0.02, 250: None},), ["251", "20.0", "∞", "–"]),
-        ("ok", ({0: 0.05, 399: 0.01},), ["400", "–", "10.0", "–"]),  # without a checkpoint in the middle
-        ("ok", ({0: 0.05, 20: 0.03, 180: 0.02, 399: 0.01}, {0: 0.05, 20: 0.03, 99: None}), ["400", "–", "10.0", "–"]),
+        ("crashed", ({20: 0.03, 180: 0.02, 399: None}, {}), ["400", "180", "∞", "∞", "–"]),  # without a curve
+        ("diverged", ({20: 0.03, 180: 0.02, 399: None}, {0: 0.05, 30: None}), ["400", "180", "∞", "∞", "–"]),
+        ("diverged", ({0: 0.05},), ["1", "–", "–", "∞", "–"]),  # in its first iteration
+        ("diverged", ({20: 0.03, 130: 0.02, 250: None},), ["251", "130", "20.0", "∞", "–"]),
+        ("ok", ({0: 0.05, 399: 0.01},), ["400", "–", "–", "10.0", "–"]),  # without a checkpoint in the middle
+        (
+            "ok",
+            ({0: 0.05, 20: 0.03, 180: 0.02, 399: 0.01}, {0: 0.05, 20: 0.03, 99: None}),
+            ["400", "–", "–", "10.0", "–"],
+        ),
     ],
 )
 def test_what_no_fall_is_known_of_is_missing_and_costs_no_page(tmp_path, last, curves, expected):
