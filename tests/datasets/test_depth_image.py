@@ -88,6 +88,8 @@ def test_intrinsics_of_an_image_of_another_size_are_noted(made):
         for factor in (1, 2)
     )
     assert len(right) == 1 and "in images about 1.9 times as wide and high" in twice[1]
+    copied = depth_image(made, intrinsics=[60, 60, 24, 24]).placed(40).mesh.repairs
+    assert "principal point (24, 24) is far from the middle of the 150 x 120 pixels" in copied[1]
 
 
 def test_a_principal_point_at_a_corner_says_nothing_of_sizes(made):
