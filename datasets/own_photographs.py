@@ -146,7 +146,7 @@ class OwnPhotographs:
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """Raises BadInput: photographs have no true shape."""
-        raise BadInput("photographs have no true shape: set task=reconstruction, or another dataset")
+        raise BadInput("photographs have no true shape: set task=reconstruction, task=multiview or another dataset")
 
     def identity(self) -> dict[str, Any]:
         """The folder; runs are told apart by the contents of its files."""

@@ -85,9 +85,12 @@ class RunInputs:
     def check_prior(self) -> None:
         """Raises BadInput for an object of one's own, which has no prior, where none is named."""
         if not self.has_prior:
+            without = "field=auto completes a depth image without one"
+            if self.photographed is not None:
+                without = "photographs take one with task=multiview, and none with task=reconstruction"
             raise BadInput(
                 f"{self.scene_name} has no prior of its own: set prior.of=sofa, plane, table or car, or prior=deepsdf "
-                "prior.path=FOLDER; a depth image is completed without one by field=auto"
+                f"prior.path=FOLDER; {without}"
             )
 
     def check_fitted(self) -> int:

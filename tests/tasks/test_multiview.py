@@ -185,7 +185,8 @@ def test_gradients_reach_the_pixels():
 def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is_put_there(tmp_path):
     idr(tmp_path)
     given = ("task=multiview", "dataset=photos", f"dataset.path={tmp_path}", "scale=smoke", "threads=1")
-    assert "set prior.of=sofa" in command(*given, f"results_dir={tmp_path}").err
+    said = command(*given, f"results_dir={tmp_path}").err
+    assert "set prior.of=sofa" in said and "none with task=reconstruction" in said and "depth image" not in said
     small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=40", "evaluation.grid=24")
     done = command(*given, *small, "prior.of=car", "isolation=off", f"results_dir={tmp_path}")
     record, folder = record_of(done.out), Path(done.out.splitlines()[-1])
