@@ -92,7 +92,7 @@ def resolved(config: DictConfig, runtime: DictConfig) -> dict[str, Any]:
     check_draw(config)
     for part in ("task", "renderer", "dataset"):
         if part not in runtime.choices:
-            raise ValueError(f"every run needs a {part}: remove ~{part} from the command line")
+            raise ValueError(f"every run needs one {part}: remove ~{part} or a list; several are -m {part}=A,B")
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     if isinstance(values.get("renderer"), dict):
         values["renderer"] = own_row(values["renderer"], str(runtime.choices["renderer"]), runtime)

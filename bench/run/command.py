@@ -143,6 +143,9 @@ def options_first(arguments: list[str]) -> list[str]:
     given, unknown = parser.parse_known_intermixed_args(arguments)
     if unknown:
         known = sorted(name for action in parser._actions for name in action.option_strings)
+        key = unknown[0].lstrip("-").partition("=")[0]
+        if key and (names(key) or type_of(key) is not None):
+            raise ValueError(f"unknown option {unknown[0]!r}: settings have no dashes, write {key}=VALUE")
         raise ValueError(f"unknown option {unknown[0]!r}{nearest(unknown[0], known)}")
     options = list(arguments)
     for override in given.overrides:
@@ -260,6 +263,8 @@ def _explain(error: Exception) -> str:
         return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
     if found := re.match(r"Ambiguous value for argument '(.*?)=(.*)' 1\.", message):
         key, values = found.groups()
+        if names(key):
+            return f"{key} has several values: add -m for a run of each"
         quoted = f"or quote it where it is one value: '{key}=\"{values}\"'"
         return f"{key} has several values: add -m for a run of each, write {key}=[{values}] for a list, {quoted}"
     if isinstance(error, ConfigCompositionException):

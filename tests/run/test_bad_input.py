@@ -64,6 +64,9 @@ def assert_one_line(err: str, *words: str) -> None:
     ("newton", ("'newton' is no setting: write renderer=newton",)),
     ("renderer=dist,,dvr", ("'renderer=dist,,dvr' has a comma without a value beside it",)),
     ("--mutlirun", ("unknown option '--mutlirun'", "did you mean --multirun")),
+    ("--renderer=dist", ("unknown option '--renderer=dist'", "write renderer=VALUE")),
+    ("--seed", ("settings have no dashes, write seed=VALUE",)),
+    ("renderer=[dist,dvr]", ("one renderer", "-m renderer=A,B")),
 ])  # fmt: skip
 def test_an_invalid_command_line_is_an_error_with_the_nearest_name(monkeypatch, argument, words):
     assert_one_line(explained(monkeypatch, argument), *words)
@@ -81,7 +84,7 @@ def explained(monkeypatch, *arguments: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["renderer=dist,dvr"], "renderer has several values: add -m for a run of each, write renderer=[dist,dvr]"),
+        (["index=0,1"], "index has several values: add -m for a run of each, write index=[0,1]"),
         (["renderer.steps=0"], "steps must be at least 1, not 0"),
         (["-m", "index=0,-1"], "cell 2 of 2 (index=-1): index must be at least 0"),
         (["memory_limit=-1"], "memory_limit must be positive"),
