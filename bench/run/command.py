@@ -271,6 +271,8 @@ def _explain(error: Exception) -> str:
         if found := re.search(r"Could not override '([^']+)'", message):
             if names(found[1]):
                 return f"{found[1]} is not chosen by default: write +{found[1]}=NAME, with a plus"
+            if found[1].startswith("renderer.") and "renderer=custom" in sys.argv:
+                return f"unknown key {found[1]!r}: an argument of your class is set by +{found[1]}=VALUE, with a plus"
             return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
         if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
             return f"unknown {found[1]} {found[2]!r}" + nearest(found[2], _choices(found[1]))

@@ -104,6 +104,10 @@ def test_unknown_kernels_are_refused_before_a_run(bench, tmp_path, no_prior, mon
     assert_one_line(err, "IMPLICIT_BENCH_KERNELS must be torch or compiled, not 'quick'")
 
 
+def test_an_argument_of_ones_own_renderer_takes_a_plus(monkeypatch):
+    assert_one_line(explained(monkeypatch, "renderer=custom", "renderer.steps=3"), "+renderer.steps=VALUE")
+
+
 @each("arguments", [("task.colour_weight=1",), ("task.colour_weight=1", "prior=textured", "field=grid_8")])
 def test_colours_are_asked_of_a_prior_that_has_some(monkeypatch, arguments):
     assert_one_line(explained(monkeypatch, *arguments), "set prior=textured field=prior")
