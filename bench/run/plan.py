@@ -137,7 +137,7 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     if reused:
         parts.append(f"{len(reused)} reused")
     if unknown := sum(not like for like in taken.values()):
-        parts.append(f"{unknown} of unknown time")
+        parts.append(f"{unknown} of unknown time (no run like them has finished here)")
     text = ", ".join(parts) + ("" if taken else "; nothing is left to do")
     if each := [median(like) for like in taken.values() if like]:
         at_once = min(workers, len(taken))

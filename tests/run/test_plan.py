@@ -60,7 +60,7 @@ def test_a_sweep_is_listed_and_nothing_is_left(results):
     *cells, whole = done.out.splitlines()
     assert [line.split("  ")[-1] for line in cells] == ["time unknown"] * 4
     assert "renderer=dvr seed=1  completion, DVR, n = 128, sofa" in cells[3]
-    assert whole == "4 planned: 4 to run, 4 of unknown time"
+    assert whole == "4 planned: 4 to run, 4 of unknown time (no run like them has finished here)"
     assert not results.exists()
 
 
@@ -75,7 +75,8 @@ def test_what_is_there_is_reused_and_tells_of_like_runs(results):
         *["time unknown"] * 2,
     ]
     assert whole == (
-        "4 planned: 3 to run, 1 reused, 2 of unknown time; about 30.0 s, 1 at a time, without the 2 of unknown time; "
+        "4 planned: 3 to run, 1 reused, 2 of unknown time (no run like them has finished here); about 30.0 s, "
+        "1 at a time, without the 2 of unknown time; "
         "the training of a missing prior is not counted"
     )
     assert sorted(results.rglob("*")) == before
