@@ -156,7 +156,9 @@ def _doubts(standing: Standing) -> list[str]:
     versions = len({one.code for one in standing.attempts})
     machines = len({one.machine for one in standing.attempts})
     loaded = sum(not one.timed for one in standing.attempts)
+    fewer = [f"{row} ({count} not run)" for row in standing.rows if (count := standing.not_run(row))]
     told = {
+        f"Of fewer problems than the others, so neither its number nor its line compares: {', '.join(fewer)}.": fewer,
         f"Not shown, since their set has other settings: runs of {', '.join(other)}.": other,
         f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have.": alone,
         "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes, where there is "

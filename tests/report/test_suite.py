@@ -337,6 +337,8 @@ def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_comparison(monke
     assert {line["name"] for line in _panel(standing, None)["series"]} == {"B", "Dist", "Lost"}
     assert {line["name"] for line in _panel(standing, "complete")["series"]} == {"B", "Dist, tuned", "Lost"}
     assert "tuned: complete of Dist." in "".join(_doubts(standing))
+    assert "its line compares: Lost, tuned (1 not run)." in "".join(_doubts(standing))
+    assert not any("fewer problems" in doubt for doubt in _doubts(before))
 
 
 def test_a_tuned_setting_is_free_in_its_weights_and_rate_alone(tmp_path):
