@@ -94,7 +94,8 @@ class Filmstrip:
         if not self.frames:
             return
         truth = self._truth()
-        strip = _strip(self._shown(chosen), truth, f"{title}; {self.over}", chosen)
+        name = "measured" if self.true is None and self.inputs.scene.part else "truth"
+        strip = _strip(self._shown(chosen), {name: truth}, f"{title}; {self.over}", chosen)
         save(strip, folder / "strip.png")
         if self.inputs.evaluation.film is not None:
             _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
@@ -118,12 +119,13 @@ class Filmstrip:
         return {names[place]: self.frames[names[place]] for place in places}
 
 
-def _strip(frames: dict[int | str, Shown], truth: Shown, title: str, chosen: str | None) -> Figure:
-    """A figure with a column per frame and one for the truth: colours, normals, silhouette error, where known.
+def _strip(frames: dict[int | str, Shown], true: dict[str, Shown], title: str, chosen: str | None) -> Figure:
+    """A figure with a column per frame and one for the truth, with its name: colours, normals, outlines, where known.
 
     It is one image on one axis, since a figure of twenty axes takes a second to draw.
     """
-    shown = {str(name).replace("_", " "): frame for name, frame in frames.items()} | {"truth": truth}
+    shown = {str(name).replace("_", " "): frame for name, frame in frames.items()} | true
+    (truth,) = true.values()
     part = window([frame.view.mask.numpy() for frame in shown.values()])
     columns = [frame.cells(truth) for frame in shown.values()]
     rows = list(columns[0])

@@ -86,6 +86,13 @@ def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, drawn
         assert sorted(names[:-1], key=lambda name: int(name.split()[1])) == names[:-1]
 
 
+def test_a_part_of_the_surface_is_called_measured(inputs, tmp_path, drawn):
+    filmstrip = Filmstrip(replace(inputs, make_scene=lambda: replace(inputs.scene, part=True)))
+    filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
+    filmstrip.save(tmp_path, "a ball")
+    assert [tick.label2.get_text() for tick in drawn[-1].axes[0].xaxis.get_major_ticks()] == ["0", "measured"]
+
+
 def test_nothing_is_drawn_where_pictures_are_off(inputs, tmp_path):
     filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=None, film="gif")))
     filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
