@@ -65,13 +65,17 @@ def run_once(overrides: Sequence[str], choices: Mapping[str, Any]) -> Record:
             f"bench.run takes a list of overrides, not {overrides!r}: bench.run(['task=completion']), "
             "or bench.run(task='completion')"
         )
-    done = _command([*(_override(key, value) for key, value in choices.items()), *overrides])
+    given = [*(_override(key, value) for key, value in choices.items()), *overrides]
+    done = _command(given)
     last = Path(done.out.rstrip("\n").rpartition("\n")[2] or ".")
     if (last / "record.json").is_file():
         record = Record.of(read_record(last))
         record.config["results_dir"] = str(last.absolute().parents[1])
         return record
     said = [line.removeprefix("error: ") for line in done.err.splitlines() if line.startswith("error: ")]
+    if done.code == 0:
+        line = " ".join(given)
+        raise ValueError(f"bench.run makes one run, and {line!r} does not: leave out plan=true and options such as -m")
     why = said[-1] if said else f"the command ended with exit status {done.code}: {done.err.strip()[-2000:]}"
     raise (ValueError if done.code == 2 else OSError)(why)
 

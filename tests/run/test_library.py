@@ -72,6 +72,12 @@ def test_what_is_no_run_is_an_error_with_the_line_of_the_command(monkeypatch, co
         bench.run("completion")
 
 
+def test_a_plan_is_no_run(monkeypatch):
+    monkeypatch.setattr(library, "_command", lambda _: Outcome(0, "1 planned: 1 to run\n", ""))
+    with pytest.raises(ValueError, match="'renderer=dist plan=true' does not: leave out plan=true"):
+        bench.run(renderer="dist", plan=True)
+
+
 def test_a_run_that_failed_is_a_record(within):
     failing = {"renderer._target_": "tests.failing.Failing"}
     record = bench.run(["+renderer.how=raise"], renderer="custom", scale="smoke", **failing)
