@@ -316,7 +316,8 @@ def _checked(capture: Capture, frames: Sequence[Frame]) -> tuple[Capture, list[s
     told = {
         f"the visual hull of the masks overlaps with them by {overlap:.0%} (median): cameras may be those of other "
         f"images; {LOOK}": overlap,
-        f"the photographs show {shown:.0%} of the object (median): cameras may look elsewhere; {LOOK}": shown,
+        f"the photographs show {shown:.0%} of the object (median): cameras may look elsewhere, or the focal length "
+        "is another": shown,
     }
     notes = [text for text, share in told.items() if WRONG <= share < DOUBTFUL]
     return replace(capture, notes=(*capture.notes, *notes)), [text for text, share in told.items() if share < WRONG]

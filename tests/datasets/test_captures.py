@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
 from bench.photos import main
+from datasets import own_photographs
 from datasets.captures.formats import find_layout
 from datasets.captures.frames import OPENGL
-from datasets.captures.hull import carve, hull_mesh
+from datasets.captures.hull import carve, fit_of, hull_mesh
 from datasets.captures.rows import _from_angles
 from datasets.captures.take import _alike, read_image, take
 from datasets.own_photographs import Reading, read_capture
@@ -253,6 +255,13 @@ def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "note: least in 000007.png" in out and out.splitlines()[-1] == str(tmp_path / "a" / "b.png")
     assert (tmp_path / "a" / "b.png").is_file()
+
+
+def test_photographs_that_show_a_part_of_the_hull_are_told(tmp_path, capsys, monkeypatch):
+    nerf(tmp_path)
+    monkeypatch.setattr(own_photographs, "fit_of", lambda *given: replace(fit_of(*given), shown=(0.7,)))
+    assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
+    assert "note: the photographs show 70% of the object (median): cameras" in capsys.readouterr().out
 
 
 def test_cameras_of_other_images_are_refused_unless_that_is_asked_for(tmp_path):
