@@ -255,7 +255,7 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
     inches = min((style.WIDTH - bar - names) / (columns * across), LARGEST_COMPARED if bar else LARGEST)
     wide = max(round(inches * across * LETTERS_PER_INCH), 6)
     blocks = [replace(block, columns=[_wrapped(name, wide) for name in block.columns]) for block in blocks]
-    heads = [0.36 + 0.12 * max((name.count("\n") for name in block.columns), default=0) for block in blocks]
+    heads = [0.33 + 0.12 * max((name.count("\n") for name in block.columns), default=0) for block in blocks]
     lines = [max(len(block.rows), 1) * inches for block in blocks]
     height = sum(heads) + sum(lines) + (0.1 if largest is None else 0.4)
     figure = Figure(figsize=(names + columns * across * inches + bar, height), layout="constrained")
@@ -265,6 +265,7 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
         fill(axis, block, inches, across)
     if largest is not None:
         _explain(figure, axes, largest)
+    figure.draw_without_rendering()  # the first layout does not know that titles stand above the columns' names
     return figure
 
 
