@@ -129,7 +129,7 @@ def convergence(runs: Runs) -> Result:
         "Error over the iterations on photographs.",
         f"Median over {_scenes(runs)} of the Chamfer-L1 of what the photographs see, at the checkpoint nearest to half "
         "of the iterations and at the end; in the figure, at all checkpoints.",
-        question="Which rows are at their end?",
+        question="Would more iterations help on photographs?",
         verdict=format.ends(
             "Fall of the error from the checkpoint nearest to half of the iterations to the end",
             {line["method"]: line["fell"] for line in lines},
