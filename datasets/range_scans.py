@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -149,7 +149,7 @@ class RangeScans:
         return self.scans[index]
 
 
-def joined(places: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]) -> Mesh:
+def joined(places: Real[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]) -> Mesh:
     """The open surface of points that are neighbours at their places in a view, but for those that are far apart."""
     faces = Delaunay(places).simplices
     corners = points[faces]

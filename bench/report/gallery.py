@@ -259,7 +259,7 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
     lines = [max(len(block.rows), 1) * inches for block in blocks]
     height = sum(heads) + sum(lines) + (0.1 if largest is None else 0.4)
     figure = Figure(figsize=(names + columns * across * inches + bar, height), layout="constrained")
-    axes = figure.subplots(max(len(blocks), 1), 1, squeeze=False, height_ratios=lines or [1])[:, 0]
+    axes = figure.subplots(max(len(blocks), 1), 1, squeeze=False, height_ratios=lines or [1])[:, 0].tolist()
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03, wspace=0.01, hspace=0.01)
     for axis, block in zip(axes, blocks, strict=False):
         fill(axis, block, inches, across)

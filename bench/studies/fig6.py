@@ -89,7 +89,7 @@ def _rate(found: pd.DataFrame) -> statistics.Interval:
 
 
 def _share(found: pd.DataFrame | None) -> str:
-    return "" if found is None else table.counted(found.found.sum(), len(found), _rate(found))
+    return "" if found is None else table.counted(float(found.found.sum()), len(found), _rate(found))
 
 
 def draw(rows: dict[tuple[str, str], pd.DataFrame]) -> Figure:

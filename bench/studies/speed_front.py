@@ -82,7 +82,7 @@ def points(runs: Runs, trial: Trial) -> list[Line]:
     }
     medians = np.array([[float(statistics.median(statistics.flat(g))) for g in of_row] for of_row in groups.values()])
     beaten = statistics.dominated(*medians.T[:2])
-    chances = statistics.front([of_row[:2] for of_row in groups.values()])
+    chances = statistics.front([(costs, errors) for costs, errors, *_ in groups.values()])
     lines = []
     for i, (row, own) in enumerate(runs.rows().items()):
         config, errors = own[0]["config"], groups[row.name][1]
