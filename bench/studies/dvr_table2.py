@@ -115,13 +115,13 @@ def _conditions(runs: Runs) -> str:
 def convergence(runs: Runs) -> Result:
     """The error on what is seen over the iterations, as the median of a row's scenes; a level without iterations."""
     runs = runs.made
-    courses = {row: _course(runs, row, records) for row, records in runs.rows().items()}
+    ends = {Row(line["preset"], line["method"]): line[SEEN] for line in medians.medians(runs, (SEEN,))}
+    courses = {row: _course(runs, records, ends[row]) for row, records in runs.rows().items()}
     longest = max(course.index[-1] for course in courses.values())
     levels = {row: pd.Series([course[0]] * 2, [1, longest]) for row, course in courses.items() if 0 in course}
+    shown = courses | levels
     drawn = [
-        chart.curve(row.name, row.preset, course.index, style.finite(SCALE * course))
-        for row, course in (courses | levels).items()
-        if row in _unlike(runs)
+        chart.curve(row.name, row.preset, shown[row].index, style.finite(SCALE * shown[row])) for row in _unlike(runs)
     ]
     lines = [_fall(row, course) for row, course in courses.items() if row not in levels]
     return Result(
@@ -150,14 +150,13 @@ def convergence(runs: Runs) -> Result:
     )
 
 
-def _course(runs: Runs, row: Row, records: list[Record]) -> pd.Series:
-    """The error by the iteration, from the first one to the end of the row's runs; that at 0 alone without any."""
+def _course(runs: Runs, records: list[Record], end: float | None) -> pd.Series:
+    """The error of a row by the iteration, from the first one to its end; that at 0 alone without any."""
     own = [curves.read(runs.folder(record), ("iteration", "seconds", SEEN))[0] for record in records]
     course = curves.median(own, [record["status"] != "ok" for record in records], SEEN)
     course = course.set_index("iteration")["median"]
-    mine = (runs.frame.row == row.name) & (runs.frame.preset == row.preset)
     last = max(int(curve["iteration"].max()) + 1 for curve in own if len(curve)) if len(course) else 0
-    return pd.concat([course[course.index > 0], pd.Series({last: medians.scored(runs, SEEN)[mine].median()})])
+    return pd.concat([course[course.index > 0], pd.Series({last: end}, dtype=float)])
 
 
 def _fall(row: Row, course: pd.Series) -> dict[str, Any]:
