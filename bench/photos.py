@@ -43,13 +43,15 @@ def draw(capture: Capture) -> Figure:
     shots = [capture.shots[place] for place in chosen]
     figure = Figure(figsize=(1.6 * len(shots), 3.6 if overlaps else 2.0), layout="constrained")
     axes = figure.subplots(2 if overlaps else 1, len(shots), squeeze=False)
-    figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs; the line is the unit sphere")
+    outlined = ""
     for axis, shot in zip(axes[0], shots, strict=True):
         bare(axis).imshow(shot.colours.numpy())
         axis.set_title(Path(shot.name).stem)
         within = sphere_span(shot.camera.rays())[2].numpy()
         if within.any() and not within.all():
             axis.contour(within, [0.5], colors=OUTLINE, linewidths=0.8)
+            outlined = "; the line is the unit sphere"
+    figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs{outlined}")
     if overlaps:
         for axis, place in zip(axes[1], chosen, strict=True):
             picture = silhouette_image(silhouettes[place], np.asarray(capture.shots[place].mask))

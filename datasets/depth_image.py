@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from datasets.captures.frames import opened
-from datasets.captures.sphere import size_doubt
 from datasets.captures.take import opened_mask, stored_depths
 from datasets.mesh import Mesh
 from datasets.meshes import load_mesh
@@ -29,7 +28,7 @@ TRIMMED = 0.01  # share of the points on each side that do not count for it, suc
 DOWN = 25.0  # degrees by which a camera of unknown place is taken to look down
 MARGIN = 0.1  # share of the object's extent in the image that is shown around it
 FEWEST = 20  # pixels with a depth
-OFF = 0.5  # of half the image: a principal point that lies farther from its middle is told
+OFF = 0.3  # of half the image: a principal point that lies farther from its middle is told
 APART = 0.15  # scene units: median distance of what is seen from a truth, beyond which it is that of something else
 FORMS = "write [fx,fy,cx,cy] or [[fx,0,cx],[0,fy,cy],[0,0,1]], and [4, 4] numbers for a rigid motion"
 
@@ -104,7 +103,7 @@ class DepthImage:
         if mask.shape != depth.shape:
             sizes = " and ".join(f"{width} x {height}" for height, width in (mask.shape, depth.shape))
             raise BadInput(f"{self.mask_path} and {self.path} must have one size, not {sizes} pixels")
-        doubt = size_doubt([replace(self.camera, height=len(depth), width=len(depth.T))]) or self._off(*depth.shape)
+        doubt = self._off(*depth.shape)
         depth, mask, intrinsics = _cut_out(depth, mask, self.camera.intrinsics.numpy(), resolution)
         known = (depth > 0) & mask
         if known.sum() < FEWEST:
@@ -138,7 +137,7 @@ class DepthImage:
             return ""
         return (
             f"the principal point ({across:.4g}, {down:.4g}) is far from the middle of the {width} x {height} pixels: "
-            "unless the image was cut so, give its own dataset.intrinsics, as [fx,fy,cx,cy]"
+            "unless it was cut so, give dataset.intrinsics=[fx,fy,cx,cy] of an image of this size"
         )
 
     def _placed(

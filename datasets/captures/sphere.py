@@ -63,10 +63,10 @@ def doubt_of(shots: Sequence[Shot]) -> str:
     if white := [name for name, four in sides if all(bool(side.float().mean() > 0.5) for side in four)]:
         which = f"{len(white)} of the masks, such as that of {white[0]}, are"
         return f"{which} white along the border, as inverted ones: make the object white, and the rest black"
-    return size_doubt([shot.camera for shot in shots])
+    return _size_doubt([shot.camera for shot in shots])
 
 
-def size_doubt(cameras: Sequence[Camera]) -> str:
+def _size_doubt(cameras: Sequence[Camera]) -> str:
     """What is said of cameras whose principal point lies as if their images had another size; "" of others."""
     middles = [(one.intrinsics[0, 2] / one.width, one.intrinsics[1, 2] / one.height) for one in cameras]
     across, down = 2 * np.median(np.array(middles), axis=0)
