@@ -4,7 +4,7 @@ from bench.report.data.records import SHAPENET, Record, Row, error, grouped, row
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, single_view, table
 
 PLACE = 41
-READS = (Selection("dvr_table1", setup=("machine",)),)
+READS = (Selection("dvr_table1", setup=("machine",), conditions=("task.training.seed",)),)
 TRAINED = (
     "RGB",
     "Depth",

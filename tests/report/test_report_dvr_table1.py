@@ -51,6 +51,14 @@ def test_a_line_has_medians_costs_and_ratios_to_both_baselines_over_the_same_sha
     assert found["sofa", "published: DVR, depth"]["Published"] == "0.221"
 
 
+def test_several_trainings_of_a_row_are_one_row(tmp_path):
+    for seed, index in product(range(3), range(2)):
+        made(tmp_path, "RGB", 0.1 * (1 + seed), index=index, seed=seed, settings={"task": {"training": {"seed": seed}}})
+    made(tmp_path, "Mean shape", 0.4, index=0, settings={"task": {"training": {"seed": 0}}})
+    rgb = lines(tmp_path)["car", "RGB"]
+    assert (rgb["Chamfer-L1"], rgb["Failed"], rgb["Over the mean shape"]) == ("20.0", "0 of 6", "0.250 (n = 1)")
+
+
 def test_renderers_that_teach_are_compared_with_newton_and_with_retrieval(tmp_path):
     teaches = {"experiment": "single_view_renderers"}
     for index in range(3):
