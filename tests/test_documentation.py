@@ -122,11 +122,6 @@ def test_every_link_leads_to_a_file_and_a_heading():
         assert not anchor or anchor[1:] in anchors(target.read_text(encoding="utf-8")), (file, path, anchor)
 
 
-def test_every_question_has_a_link():
-    questions = re.findall(r"^\| (.+\?) \| (.+) \|$", text_of("README.md"), re.MULTILINE)
-    assert len(questions) >= 5 and all(answer.startswith("[") and "#" in answer for _, answer in questions)
-
-
 def test_every_extra_that_is_named_is_there():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = {name for file in FILES for name in re.findall(r"'[.\w-]+\[(\w+)\]'", text_of(file))}

@@ -10,6 +10,7 @@ from bench.pictures import style
 from bench.records.format import ends
 from bench.report.data.statistics import Interval
 from bench.report.write.chart import curve, draw, level, panel_data, series
+from tests.looped import each
 
 KNOWN = [Interval(2.0, 1.0, 4.0), Interval(20.0, 10.0, math.inf)]
 FEW = [Interval(2.0, math.nan, math.nan, (1.0, 3.0))]
@@ -74,7 +75,7 @@ def test_of_axes_that_are_shared_the_first_alone_is_named_and_places_without_a_p
     assert [axis.get_ylabel() for axis in axes] == ["y", "", "y", ""] and not axes[3].axison
 
 
-@pytest.mark.parametrize(("shared", "edge"), [({"sharey": "row"}, 8.0), ({"sharey": True}, 200.0), ({}, 2.0)])
+@each("shared, edge", [({"sharey": "row"}, 8.0), ({"sharey": True}, 200.0), ({}, 2.0)])
 def test_what_is_infinite_is_above_all_that_its_axis_shows(shared, edge):
     values = [[1.0, math.inf], [1.0, 4.0], [1.0, 100.0]]
     panels = [panel_data("", "x", "y", [curve("a", "dist", [1, 2], own)]) for own in values]

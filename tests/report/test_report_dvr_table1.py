@@ -157,13 +157,6 @@ def test_the_verdict_on_budgets_counts_ratios_that_differ_from_the_largest_train
     assert page_of(tmp_path, "single_view_budget").verdict.startswith(said)
 
 
-def test_a_failed_run_is_the_worst(tmp_path):
-    for index, status in enumerate(("crashed", "empty", "ok")):
-        made(tmp_path, "RGB", 0.1, index=index, status=status)
-    line = lines(tmp_path)["car", "RGB"]
-    assert (line["IoU"], line["Chamfer-L1"], line["Failed"]) == ("0", "∞", "2 of 3")
-
-
 def test_its_figure_has_a_point_for_each_shape(tmp_path):
     for index in range(3):
         made(tmp_path, "RGB", 0.1 * index, index=index)

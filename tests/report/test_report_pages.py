@@ -123,10 +123,9 @@ def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path,
     assert rows == {"alike": [["mine", "1"], ["shipped: ours", "1"]], "other": [["mine", "1"]]}
 
 
-def test_every_study_has_pages_of_its_own():
-    names = [name for study in studies() for name in study.pages]
-    assert len(names) >= 23 and len(set(names)) == len(names)
-    assert all(study.reads for study in studies())
+def test_every_study_can_be_read_and_has_pages_of_its_own():
+    assert [study.problem for study in studies() if study.problem or not study.reads] == []
+    assert sum(len(study.pages) for study in studies()) >= 23
 
 
 def test_a_run_that_failed_stays_a_row_and_the_newest_of_a_cell_counts(tmp_path):

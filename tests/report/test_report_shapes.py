@@ -8,6 +8,7 @@ from bench.records.read import read_records
 from bench.report.data.runs import choose
 from bench.report.medians import scene_of
 from bench.studies import dvr_table2
+from tests.looped import each
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import page_of, told, write_lines, write_run
 
@@ -136,7 +137,7 @@ def test_published_lines_are_marked_and_cost_nothing_that_is_known(tmp_path):
     assert "cannot be compared directly" in told(result)
 
 
-@pytest.mark.parametrize("name", DVR_TABLE2)
+@each("name", [*DVR_TABLE2])
 def test_published_chamfer_is_the_mean_of_both_directions(name):
     """A wrong digit would stand out; published numbers are rounded."""
     accuracy, completeness, chamfer = DVR_TABLE2[name]

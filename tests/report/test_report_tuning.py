@@ -14,6 +14,7 @@ from bench.report.tuning import TUNING, tunings
 from bench.studies import tuning
 from bench.tables import CONF, read_rows, read_yaml
 from bench.tune import HEAD, WIDTH, main, write
+from tests.looped import each
 from tests.report.test_report_paper import told, write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
@@ -78,7 +79,7 @@ def test_what_families_differ_in_is_no_setting(tmp_path):
     assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
+@each("k", [1, 2, 4])
 def test_the_expected_error_is_the_mean_over_all_choices_of_draws(whole, k):
     (method,) = tunings(whole)
     chosen = [min(some, key=lambda draw: VALIDATION[draw]) for some in combinations(range(4), k)]

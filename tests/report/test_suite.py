@@ -19,13 +19,12 @@ from bench.studies.suite import _doubts, _panel
 from bench.suite import _sweeps, main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.composing import composed
+from tests.looped import each
 from tests.report.test_report_paper import write_lines, write_run
 
 DIST = choice("renderer", "dist")["_label_"]
-RESULTS = Path(__file__).resolve().parents[2] / "results"  # what is shipped
+SHIPPED = Path(__file__).resolve().parents[2] / "results"
 SCENES = tuple(f"{family} test {index}" for family in ("vase", "lamp") for index in range(4))  # not among references
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def attempt(row: str, scene: str, errors: dict[float, float], **changed) -> Attempt:
@@ -290,8 +289,8 @@ def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, m
     assert [one.row for one in read_attempts(tmp_path / "own")[0]] == ["Mine"]
 
 
-@pytest.mark.parametrize(
-    ("argument", "said"),
+@each(
+    "argument, said",
     [("suite=large", "unknown suite 'large'"), ("setting=tunde", "did you mean tuned"),
      ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
      ("verify=0", "verify must be"), ("task.optimiser.budget=1e9", "is stated by the suite"),
@@ -420,15 +419,15 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
 
 
 def test_the_shipped_page_is_that_of_the_shipped_rows():
-    standing = Standing(read_attempts(RESULTS)[0])
-    with (RESULTS / "paper" / "suite.csv").open(encoding="utf-8") as file:
+    standing = Standing(read_attempts(SHIPPED)[0])
+    with (SHIPPED / "paper" / "suite.csv").open(encoding="utf-8") as file:
         shown = {line["row"]: float(line["share"]) for line in csv.DictReader(file)}
     assert {row: standing.share(row).value for row in standing.rows} == pytest.approx(shown)
 
 
 def test_the_shipped_rows_are_of_todays_settings():
     """Else a fresh run would stand beside none of them: a new key of a task or a prior changes every hash."""
-    each = {(one.set, one.tuned): one for one in read_attempts(ROOT / "results")[0]}
+    each = {(one.set, one.tuned): one for one in read_attempts(SHIPPED)[0]}
     for (of_set, tuned), one in each.items():
         config = OmegaConf.to_container(composed(*one.overrides), resolve=True, throw_on_missing=False)
         assert one.settings == attempts.settings_of(config, of_set, tuned), of_set
