@@ -1,5 +1,6 @@
 """Networks whose field is known, and all that a task needs about them; nothing is trained."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,11 @@ def phases_of(run: RunContext, task: Any) -> list[str]:
     phases: dict[str, None] = {}
     task.execute(replace(run, progress=lambda phase, done, total, loss=None: phases.setdefault(phase)))
     return list(phases)
+
+
+def curve_of(folder: Path) -> list[dict[str, Any]]:
+    """The lines of a run's curve."""
+    return [json.loads(line) for line in (folder / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
 
 
 def plain(config: DictConfig) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from bench.merge import merge
@@ -28,6 +29,8 @@ from bench.report.write import html
 from bench.report.write.html import safe_json, to_script, write_index
 from bench.tables import choice
 from bench.tables import names as choices
+from datasets.field_files import FIELD, save_field
+from renderers.fields.grid import Grid
 from tests.browser import made
 from tests.looped import each
 from tests.report.page_data import Page
@@ -139,13 +142,14 @@ def test_a_planned_cell_has_the_command_that_its_sweep_planned():
 
 def test_the_lines_for_python_open_the_run(tmp_path):
     results = tmp_path / "it's mine"
-    made.write(results, 0)
+    save_field(Grid(torch.ones(3, 3, 3), 1.05), made.write(results, 0) / FIELD)
     made.write(results, 1)
     write_index(results)
     found: dict = {}
-    exec(Page(results).run("completion-0001")["python"], found)  # as a reader would paste them
-    assert found["run"].folder == "completion-0001" and found["run"].chamfer_l2 == 0.002
+    exec(Page(results).run("completion-0000")["python"], found)  # as a reader would paste them
+    assert found["run"].folder == "completion-0000" and found["run"].chamfer_l2 == 0.001
     assert len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+    assert found["field"](torch.zeros(1, 3)) == 1
 
 
 @each(

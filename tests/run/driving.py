@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import torch
@@ -17,6 +18,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from bench.__main__ import main
 from bench.machine.environment import using_threads
+from bench.records.read import PlannedCell
+from bench.records.record import Record, RunStatus
 from bench.run import process
 from bench.run.library import Outcome
 
@@ -41,6 +44,19 @@ def errors(err: str) -> list[str]:
 def record_of(out: str) -> dict:
     """The record in the run folder that is the last line of an output."""
     return json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
+
+
+def stored(results: Path, name: str, status: str = "ok", **changed: Any) -> Path:
+    """Writes a run folder with the record of a completion alone, and gives the folder."""
+    folder = results / "runs" / name
+    folder.mkdir(parents=True)
+    Record(name, "completion", "dist", "sofa", 0, {"seed": 0}, status=RunStatus(status), **changed).write(folder)
+    return folder
+
+
+def planned(*names: str) -> list[PlannedCell]:
+    """The cells of a plan with these names."""
+    return [PlannedCell(name, [], "completion", "dist", "sofa", 0, {"seed": 0}) for name in names]
 
 
 def command(*arguments: str, main: Callable[[], int] = main) -> Outcome:

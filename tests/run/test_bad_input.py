@@ -18,7 +18,7 @@ from bench.run.plan import refusal
 from bench.setup import inputs
 from tests.composing import identified
 from tests.looped import each
-from tests.run.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, wait_for
+from tests.run.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, record_of, wait_for
 
 TINY = ("scale=smoke", "view.resolution=16", "task.points=20", "evaluation.grid=16", "evaluation.points=100")
 
@@ -132,7 +132,7 @@ def test_an_experiment_without_its_first_line_is_told_what_it_is(bench, tmp_path
     assert_one_line(err, "must begin with the line # @package _global_")
 
 
-@pytest.mark.parametrize("word", ["list", "help", "--help"])
+@pytest.mark.parametrize("word", ["list", "help"])
 def test_a_word_lists_what_there_is(bench, word):
     code, out, err = bench(word)
     assert (code, err) == (0, "")
@@ -253,7 +253,7 @@ def test_a_disk_that_fills_up_during_a_run_is_an_error(bench, monkeypatch):
     assert code == 1
     assert "Traceback" not in out + err
     assert_one_line(err, "No space left on device")
-    record = json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
+    record = record_of(out)
     assert record["status"] == "crashed" and f"({Path(out.splitlines()[-1])}): free space" in record["reason"]
 
 

@@ -1,20 +1,17 @@
 """Whatever a user types gives one clear line or a run that holds it: never a traceback, never a silent default."""
 
-import json
 import math
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from bench.config import CONF, register
 from bench.run.command import USAGE, _dotted
-from tests.run.driving import FAILING, command
+from tests.composing import composed
+from tests.run.driving import FAILING, command, record_of
 
 LIMITS = ("time_limit=3", "memory_limit=2")
 FIXED = {"results_dir", "priors_dir", "isolation", "time_limit", "memory_limit", "rerun", "tracker", "verbose", "label"}
@@ -22,11 +19,7 @@ GROUPS = ("task", "renderer", "dataset", "prior", "scale")
 
 
 def keys() -> list[str]:
-    register()
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        found = _dotted(compose("config"))
-    return [key for key in found if key.split(".")[0] not in FIXED and "_target_" not in key]
+    return [key for key in _dotted(composed()) if key.split(".")[0] not in FIXED and "_target_" not in key]
 
 
 KEYS = keys()
@@ -54,7 +47,7 @@ def check(results: Path, overrides: list[str]) -> None:
         assert err.startswith("error: "), (overrides, err)
         return
     assert code in (0, 1), (overrides, code, err)
-    record = json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
+    record = record_of(out)
     assert record["status"] == "ok" or record["reason"], overrides
     assert "\n" not in record["reason"], overrides
     for override in OverridesParser.create().parse_overrides(overrides[-1:]):  # the last word on a key holds

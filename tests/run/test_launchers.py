@@ -17,6 +17,7 @@ from bench.records.read import read_records
 from bench.report.write.html import write_index
 from bench.run.pack import grouped
 from tests.composing import identified
+from tests.looped import each
 from tests.report.page_data import Page
 from tests.run.driving import FAILING, PATIENCE, ROOT, Outcome, command, driver, errors, wait_for
 from tests.run.test_process import CASES
@@ -193,7 +194,7 @@ def test_a_sweep_of_nothing_is_an_error(isolated):
     assert len(err.splitlines()) == 1
 
 
-@pytest.mark.parametrize(
+@each(
     "seconds, places",
     [
         ([], []),

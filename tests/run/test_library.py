@@ -9,9 +9,7 @@ import pytest
 
 import bench
 from bench.report.data import frame
-from bench.report.write.html import write_index
 from bench.run import library
-from tests.report.page_data import Page
 from tests.run.driving import ROOT, Outcome, command
 
 SMALL = (
@@ -83,15 +81,6 @@ def test_a_run_that_failed_is_a_record(within):
     record = bench.run(["+renderer.how=raise"], renderer="custom", scale="smoke", **failing)
     assert record.status == "crashed" and record.reason in str(record) and len(str(record)) < 300
     assert record.folder.parent == within / "results" / "local" / "runs"
-
-
-def test_the_lines_of_the_page_open_the_run(within):
-    made = bench.run(scale="smoke", renderer="newton", seed=3)
-    write_index(within / "results" / "local")
-    shown = Page(within / "results" / "local").run(made.id)
-    opened: dict = {}
-    exec(shown["python"], opened)
-    assert opened["run"].status == "ok" and opened["run"].seed == 3 and len(opened["curve"]) == 8
 
 
 def test_importing_bench_imports_nothing_that_is_slow():

@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.merge import main, merge
-from bench.records.read import read_records
-from bench.records.record import Record, RunStatus
-from bench.run.sweep import Plan, PlannedCell
+from bench.records.read import Plan, read_records
+from tests.run.driving import planned, stored
 
 CELLS = ("completion-dist-sofa-1", "completion-dist-sofa-2", "completion-dvr-car-3")
 
@@ -18,12 +17,7 @@ CELLS = ("completion-dist-sofa-1", "completion-dist-sofa-2", "completion-dvr-car
 def write_run(
     results: Path, cell: str, status: str = "ok", started: str = "2026-01-01T00:00:00+00:00", **changed
 ) -> Path:
-    folder = results / "runs" / cell
-    folder.mkdir(parents=True)
-    changed = {"started": started, "asked": started} | changed
-    record = Record(cell, "completion", "dist", "sofa", 0, {"seed": 0}, **changed)
-    record.status = RunStatus(status)
-    record.write(folder)
+    folder = stored(results, cell, status, **{"started": started, "asked": started} | changed)
     (folder / "curve.jsonl").write_text(f'{{"iteration": 0, "total": {len(started)}}}\n')
     return folder
 
@@ -97,8 +91,7 @@ def test_a_cell_that_was_run_twice_is_reported_and_both_are_kept(tmp_path, capsy
 
 
 def test_plans_are_joined_so_that_cells_of_no_machine_show(tmp_path):
-    cells = [PlannedCell(cell, [], "completion", "dist", "sofa", 0, {"seed": 0}) for cell in CELLS]
-    Plan("table-1", tmp_path / "a", cells, "2026-01-01T00:00:00+00:00").write()
+    Plan("table-1", tmp_path / "a", planned(*CELLS), "2026-01-01T00:00:00+00:00").write()
     write_run(tmp_path / "a", CELLS[0])
     write_run(tmp_path / "b", CELLS[1])
     merge([tmp_path / "a", tmp_path / "b"], tmp_path / "d")
@@ -110,8 +103,7 @@ def test_of_two_requests_of_one_run_or_sweep_the_later_one_is_kept(tmp_path):
     for name, day in (("a", 1), ("b", 2)):
         asked = f"2026-02-0{day}T00:00:00+00:00"
         write_run(tmp_path / name, CELLS[0], asked=asked)
-        cell = PlannedCell(CELLS[0], [], "completion", "dist", "sofa", 0, {"seed": 0})
-        Plan("table-1", tmp_path / name, [cell], asked).write()
+        Plan("table-1", tmp_path / name, planned(CELLS[0]), asked).write()
     for into, order in (("ab", "ab"), ("ba", "ba")):
         merge([tmp_path / name for name in order], tmp_path / into)
         found = [*(tmp_path / into).glob("*/*/record.json"), *(tmp_path / into).glob("*/*/plan.json")]

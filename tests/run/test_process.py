@@ -14,6 +14,7 @@ import pytest
 from bench.records.record import Record
 from bench.run import process
 from bench.run.process import Job, Step
+from tests.looped import each
 from tests.run.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -101,7 +102,7 @@ def test_the_server_has_what_runs_need_and_no_more():
     assert found >= {"torch", "open3d", "matplotlib"} and not found & {"dash", "plotly", "hydra", "pandas"}
 
 
-@pytest.mark.parametrize(("arguments", "early"), [
+@each("arguments, early", [
     ((), True),
     (("-m", "seed=0,1"), True),
     (("--help",), False),

@@ -26,10 +26,11 @@ from bench.solve import solve
 from bench.solve.optimise import History, OptimiserSettings
 from datasets.scene import Scene
 from renderers.rendering import Unsupported
+from tests.looped import each
 from tests.report.page_data import Page
 from tests.run.driving import PATIENCE, ROOT, Outcome
 from tests.solve.test_optimise import POINTS, Toy
-from tests.tiny import ball_prior, cell_from
+from tests.tiny import ball_prior, cell_from, curve_of
 
 TINY = (
     "scale=smoke", "task.optimiser.iterations=6", "view.resolution=16", "task.points=20",
@@ -65,9 +66,7 @@ def finished(tmp_path_factory) -> Finished:
     assert done.stdout, done.stderr
     folder = Path(done.stdout.splitlines()[-1])
     record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
-    lines = (folder / "curve.jsonl").read_text(encoding="utf-8").splitlines()
-    outcome = Outcome(done.returncode, done.stdout, done.stderr)
-    return Finished(outcome, results, folder, record, [json.loads(line) for line in lines])
+    return Finished(Outcome(done.returncode, done.stdout, done.stderr), results, folder, record, curve_of(folder))
 
 
 def test_it_ends_well_and_its_last_line_is_its_folder(finished):
@@ -191,8 +190,7 @@ def test_the_same_command_run_again_gives_the_same_numbers_and_sets_the_first_as
     assert first["environment"]["threads"] == 1
     for part in ("metrics", "metrics_start", "evaluations", "flops", "config", "status"):
         assert first[part] == second[part], part
-    lines = [(folder / "curve.jsonl").read_text().splitlines() for folder in folders]
-    curves = [[json.loads(line)["total"] for line in curve] for curve in lines]
+    curves = [[line["total"] for line in curve_of(folder)] for folder in folders]
     assert curves[0] == curves[1]
 
 
@@ -268,7 +266,7 @@ def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(cloc
     record.seconds["evaluation"] = 1.0
     settings = OptimiserSettings(iterations, 0.05, "constant")
     history = solve.descend(toy, settings, RunContext(stage, tmp_path, record, lambda *_: None), see)
-    curve = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    curve = curve_of(tmp_path)
     assert [line["iteration"] for line in curve] == list(range(iterations))
     assert [line["iteration"] for line in curve if "chamfer_l2" in line] == looks
     if every is not None:  # of the parameters that the line's loss is of
@@ -288,7 +286,7 @@ def test_a_run_that_looks_on_the_way_ends_as_one_that_does_not(bench):
         for every in ("null", 4)
     ]
     plain, looked = (json.loads((folder / "record.json").read_text()) for folder in folders)
-    curve = [json.loads(line) for line in (folders[1] / "curve.jsonl").read_text().splitlines()]
+    curve = curve_of(folders[1])
     assert [line["iteration"] for line in curve if "chamfer_l2" in line] == [0, 4, 5]
     assert curve[0]["chamfer_l2"] == looked["metrics_start"]["chamfer_l2"]
     assert looked["metrics"]["chamfer_l2"] == plain["metrics"]["chamfer_l2"]
@@ -311,8 +309,8 @@ def test_what_is_drawn_in_a_run_does_not_depend_on_whether_its_prior_was_there(c
     assert torch.rand(4).tolist() != drawn[0]
 
 
-@pytest.mark.parametrize(
-    ("history", "mesh", "status"),
+@each(
+    "history, mesh, status",
     [
         (History(curve=[{"total": 2.0}, {"total": 1.0}]), True, RunStatus.OK),
         (History(curve=[{"total": 2.0}]), True, RunStatus.OK),

@@ -10,12 +10,12 @@ import trimesh
 from bench.config import build, find_class, load
 from bench.merge import merge
 from bench.records import folder as run_folder
-from bench.records.read import Plan, PlannedCell, check_links, read_plans, read_records
-from bench.records.record import SCHEMA, Record, RunStatus
+from bench.records.read import Plan, check_links, read_plans, read_records
+from bench.records.record import SCHEMA
 from bench.report.write.html import write_index
 from bench.turntable import main as turntable
 from tests.looped import each
-from tests.run.driving import command, errors
+from tests.run.driving import command, errors, planned, stored
 
 MODULE = """
 from pathlib import Path
@@ -72,19 +72,10 @@ def test_a_class_of_a_package_that_is_named_must_be_what_its_place_asks_for(comp
         build({"_target_": f"{stranger}.Other"}, "prior", [stranger], PARTS["prior"])
 
 
-def write_run(results: Path, name: str) -> Path:
-    folder = results / "runs" / name
-    folder.mkdir(parents=True)
-    record = Record(name, "completion", "dist", "sofa", 0, {"seed": 0}, ended="2026-01-01T00:00:00+00:00")
-    record.status = RunStatus.OK
-    record.write(folder)
-    return folder
-
-
 @pytest.fixture
 def theirs(tmp_path) -> Path:
     """A results folder of somebody else's with a sound run, and beside it a folder that is none of theirs."""
-    write_run(tmp_path / "theirs", "sound")
+    stored(tmp_path / "theirs", "sound")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "secret.png").write_text("secret")
     return tmp_path / "theirs"
@@ -94,10 +85,10 @@ def theirs(tmp_path) -> Path:
 def test_a_run_with_a_link_that_leads_out_is_neither_read_nor_copied(theirs, tmp_path, what):
     outside = tmp_path / "mine"
     if what == "the run folder":
-        write_run(outside, "linked")
+        stored(outside, "linked")
         (theirs / "runs" / "linked").symlink_to(outside / "runs" / "linked")
     else:
-        folder = write_run(theirs, "linked")
+        folder = stored(theirs, "linked")
         (folder / "link.png").symlink_to(outside if what == "a folder within" else outside / "secret.png")
     records, problems = read_records(theirs)
     assert [record["folder"] for record in records] == ["sound"]
@@ -128,8 +119,8 @@ def test_nothing_is_written_through_a_link(theirs, tmp_path, name):
     (theirs / name).parent.mkdir(exist_ok=True, parents=True)
     (theirs / name).symlink_to(outside / ("secret.png" if "." in name[1:] else ""))
     before = sorted(path.name for path in outside.rglob("*"))
-    cell = PlannedCell("completion-1", [], "completion", "dist", "sofa", 0, {})
-    for write in (lambda: write_index(theirs), lambda: Plan("p", theirs, [cell]).write(), lambda: merge([], theirs)):
+    plan = Plan("p", theirs, planned("completion-1"))
+    for write in (lambda: write_index(theirs), plan.write, lambda: merge([], theirs)):
         with pytest.raises(ValueError, match="is a link out of the results folder: remove it"):
             write()
     assert sorted(path.name for path in outside.rglob("*")) == before

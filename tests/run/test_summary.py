@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from bench.records.read import RESULTS, Plan, PlannedCell
+from bench.records.read import RESULTS, Plan
 from bench.records.record import Record, RunStatus
 from bench.run import sweep
 from bench.run.summary import show, show_sweep
+from tests.looped import each
+from tests.run.driving import planned
 
 
 def ended(results: Path, name: str, status: str = "ok") -> Record:
@@ -55,8 +57,7 @@ def test_a_run_without_a_picture_in_the_usual_folder_has_shorter_lines(tmp_path,
 
 
 def test_a_sweep_ends_with_its_first_failure(tmp_path, capsys):
-    cells = [PlannedCell(name, [], "completion", "dist", "sofa", 0, {}) for name in ("a", "b", "c", "d")]
-    plan = Plan("p", tmp_path, cells, asked="2026-01-01T00:00:00+00:00")
+    plan = Plan("p", tmp_path, planned("a", "b", "c", "d"), asked="2026-01-01T00:00:00+00:00")
     for name, status in (("a", "ok"), ("b", "empty"), ("c", "crashed")):
         ended(tmp_path, name, status)
     assert show_sweep(plan, tmp_path / "index.html") == ["ok", "empty", "crashed", "not_run"]
@@ -69,19 +70,25 @@ def test_a_sweep_ends_with_its_first_failure(tmp_path, capsys):
     assert {f"table of this sweep: {plan.folder}/table.md", f"report: {tmp_path}/index.html"} <= {*out}
 
 
-def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_were_run(tmp_path, capsys, monkeypatch):
-    cells = [PlannedCell(name, [], "completion", "dist", "sofa", 0, {}) for name in ("a", "b", "c", "d")]
+@each(
+    "names, reused, said",
+    [("ab", {"a"}, ["[1/4] ok  ", "[2/4, 20.0 s left] ok  "]), ("a", {"c", "d"}, ["[1/4, 10.0 s left] ok  "])],
+)
+def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_are_run_not_reused(
+    tmp_path_factory, capsys, monkeypatch, names, reused, said
+):
+    results = tmp_path_factory.mktemp("results")
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     monkeypatch.setattr(sweep, "time", SimpleNamespace(monotonic=count(0.0, 10.0).__next__))
-    for name in ("a", "b"):
-        ended(tmp_path, name)
-    with sweep.followed(Plan("p", tmp_path, cells, asked="2026-01-01T00:00:00+00:00"), {"a"}):
+    for name in names:
+        ended(results, name)
+    with sweep.followed(Plan("p", results, planned("a", "b", "c", "d"), asked="2026-01-01T00:00:00+00:00"), reused):
         pass
-    first, second = capsys.readouterr().out.splitlines()
-    assert first.startswith("[1/4] ok  ") and second.startswith("[2/4, 20.0 s left] ok  ")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[: len(words)] for line, words in zip(lines, said, strict=True)] == said
 
 
-@pytest.mark.parametrize(
+@each(
     "launcher, workers",
     [({}, 1), ({"n_jobs": 3}, 3), ({"n_jobs": -1}, 7), ({"n_jobs": None}, 1), ({"array_parallelism": 256}, 256)],
 )
@@ -89,13 +96,3 @@ def test_a_sweep_says_how_many_runs_a_launcher_makes_at_a_time(launcher, workers
     """Joblib takes all processors for -1; submitit has a limit of its own."""
     monkeypatch.setattr("os.cpu_count", lambda: 7)
     assert sweep.workers_of(OmegaConf.create({"hydra": {"launcher": launcher}})) == workers
-
-
-def test_cells_that_are_reused_take_no_time_that_is_left(tmp_path, capsys, monkeypatch):
-    cells = [PlannedCell(name, [], "completion", "dist", "sofa", 0, {}) for name in ("a", "b", "c", "d")]
-    monkeypatch.delenv("FORCE_COLOR", raising=False)
-    monkeypatch.setattr(sweep, "time", SimpleNamespace(monotonic=count(0.0, 10.0).__next__))
-    ended(tmp_path, "a")
-    with sweep.followed(Plan("p", tmp_path, cells, asked="2026-01-01T00:00:00+00:00"), {"c", "d"}):
-        pass
-    assert capsys.readouterr().out.startswith("[1/4, 10.0 s left] ok  ")

@@ -1,6 +1,5 @@
 """How much model a shape needs, end to end; and tasks that take any field in the place of a prior's."""
 
-import json
 import re
 from dataclasses import replace
 
@@ -23,7 +22,7 @@ from bench.tasks.capacity import Capacity, saved
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of
-from tests.tiny import Blind, ball_prior, camera_of, plain, run_of, silent
+from tests.tiny import Blind, ball_prior, camera_of, curve_of, plain, run_of, silent
 
 TINY = (
     "scale=smoke", "view.resolution=16", "evaluation.picture=null", "evaluation.grid=24", "device=cpu",
@@ -79,7 +78,7 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     values = 100 * metrics["frugal.evaluations"] / metrics["rounded_box.evaluations"]
     assert saved.endswith(f", {values:.0f} % of the field values")
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
-    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    lines = curve_of(tmp_path)
     assert {line["candidate"] for line in lines} == {"sphere", "rounded_box"}
     shares = {part: {line["rays_share"] for line in lines if line["part"] == part and line["phase"] == "fit"}
               for part in ("fit_all", "frugal")}  # fmt: skip

@@ -1,6 +1,5 @@
 """Reconstruction from photographs on disk and of a mesh: it improves, leaves a coloured mesh, and tells mistakes."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +32,7 @@ from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE, RADIUS, nerf
 from tests.run.driving import SMALLEST, command, record_of
-from tests.tiny import Blind, altered, ball_prior, camera_of, icosphere, run_of, scene_of
+from tests.tiny import Blind, altered, ball_prior, camera_of, curve_of, icosphere, run_of, scene_of
 
 PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")
 SETTINGS = Reconstruction(
@@ -102,7 +101,7 @@ def test_a_rendered_mesh_is_learnt_with_its_colours(scene, tmp_path):
     for name in PICTURES:
         assert (tmp_path / name).stat().st_size > 2000, name
     assert "7 rendered photographs of 24 x 24 pixels; 2 of them are held out" in record.notes
-    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    lines = curve_of(tmp_path)
     assert len(lines) == 20 and {"colour", "silhouette", "eikonal"} < set(lines[0]) and "depth" not in lines[0]
     checked = [line for line in lines if "psnr" in line]
     assert [line["iteration"] for line in checked] == [0, 10, 19]
@@ -144,7 +143,7 @@ def test_fields_of_each_kind_are_learnt_by_renderers_that_take_them(scene, tmp_p
     more = {"losses.depth": 1.0, "losses.smoothness": 0.01, "losses.normals": 0.1, "losses.colour_gradient": 0.1}
     record = executed(run, depths=Depths("20%", 0.001), **more, **{"optimiser.iterations": 6})
     assert record.status in ("ok", "not_reached") and "mesh.ply" in {path.name for path in tmp_path.iterdir()}
-    line = json.loads((tmp_path / "curve.jsonl").read_text().splitlines()[0])
+    line = curve_of(tmp_path)[0]
     terms = {"colour", "colour_gradient", "depth", "silhouette", "smoothness", "normals"}
     assert terms < set(line) and ("eikonal" in line) == (field != "occupancy_32")
     assert record.evaluations["observed"] > 100

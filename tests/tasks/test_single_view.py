@@ -30,7 +30,7 @@ from tests.looped import each
 from tests.reconstruct.test_losses import PAINT, Ball, shot_of
 from tests.run.driving import Outcome, command, record_of
 from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401, a fixture
-from tests.tiny import ball_prior, camera_of, run_of, silent
+from tests.tiny import ball_prior, camera_of, curve_of, run_of, silent
 
 TINY = (
     "+method=single_view", "dataset=sphere", "scale=smoke", "isolation=off", "threads=1", "task.shapes=3",
@@ -108,7 +108,7 @@ def test_the_code_of_the_prior_is_found_by_the_mask(tmp_path):
     assert done.code == 0, done.err
     record = record_of(done.out)
     assert 0 < record["metrics"]["iou"] <= 1 and record["evaluations"]["value"] > 0
-    assert len((Path(done.out.splitlines()[-1]) / "curve.jsonl").read_text().splitlines()) == 8
+    assert len(curve_of(Path(done.out.splitlines()[-1]))) == 8
 
 
 @each("factor, radius", [(0.8, 0.4), (1.25, 0.625)])

@@ -1,6 +1,5 @@
 """Breakdowns known in closed form are found, planted faults move them, and a user's renderer is in the atlas."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from bench.tasks.stability import Stability
 from renderers import IDR
 from renderers.march import Stepping
 from tests.stress.test_stress import CRITERIA, FIT, stress_named
-from tests.tiny import ball_prior, camera_of, run_of
+from tests.tiny import ball_prior, camera_of, curve_of, run_of
 
 SEARCH = SearchSettings(levels=17, repeats=3)
 SHORT = replace(FIT, resolution=12, iterations=5)
@@ -74,7 +73,7 @@ def test_an_exception_of_a_trial_is_a_failure_and_the_search_continues(tmp_path)
     metrics = run(tmp_path, "far_camera", Fragile(**vars(load("renderer", "idr"))))
     assert within("far_camera", metrics, 50.0)
     assert metrics["failed_crashed"] >= 3
-    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    lines = curve_of(tmp_path)
     assert {line["message"] for line in lines if not line["success"]} == {"RuntimeError: too far"}
 
 
@@ -118,7 +117,7 @@ def test_success_that_rises_with_severity_is_noted(tmp_path):
 
 def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
     metrics = run(tmp_path, "empty_scene", load("renderer", "idr", epsilon=1e-3))
-    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    lines = curve_of(tmp_path)
     assert len(lines) == metrics["trials"]
     assert sum(not line["success"] for line in lines) == metrics["failed_false"] > 0
     mildest = min(line["level"] for line in lines if not line["success"])
