@@ -54,8 +54,11 @@ def test_points_along_the_rays_project_back_to_their_pixels_and_depth_is_camera_
     torch.testing.assert_close(view.distance(view.depth(distance)), distance)
     pixels = points @ INTRINSICS.T
     rows, columns = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(64) + 0.5, indexing="ij")
-    found = pixels[..., :2] / pixels[..., 2:]
-    torch.testing.assert_close(found, torch.stack([columns, rows], -1).double(), rtol=0, atol=1e-9)
+    centres = torch.stack([columns, rows], -1).double()
+    torch.testing.assert_close(pixels[..., :2] / pixels[..., 2:], centres, rtol=0, atol=1e-9)
+    found, depth = view.project(rays.at(distance))
+    torch.testing.assert_close(found, centres, rtol=0, atol=1e-9)
+    torch.testing.assert_close(depth, view.depth(distance), rtol=0, atol=1e-12)
     assert torch.equal(rays.origins, view.center.expand(40, 64, 3))
 
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 
-from bench.config import CONF, build, load, register
+from bench.config import build, load
 from bench.reconstruct.subject import Depths
 from bench.setup.fields import FieldChoice
 from bench.single_view.training import Lessons
@@ -15,6 +14,7 @@ from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
 from bench.tasks.pose import Pose, PoseProblem
 from datasets.scene import Scene
 from renderers.fields.analytic import sphere
+from tests.composing import composed
 from tests.single_view.test_training import NETWORK, RGB, SETTINGS, images  # noqa: F401, a fixture
 from tests.tiny import CPU, altered, ball_prior, camera_of, icosphere, run_of, scene_of, silent
 
@@ -38,9 +38,7 @@ def scene() -> Scene:
     ("name", "renderer"), [*((name, "newton") for name in CASES), ("completion", "dist"), ("completion", "dvr")]
 )
 def test_the_loop_stays_on_the_device_of_its_run(scene, name, renderer):
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", [f"task={name}", "scale=smoke", "task.optimiser.iterations=50", *CASES[name]])
+    config = composed(f"task={name}", "scale=smoke", "task.optimiser.iterations=50", *CASES[name])
     task, tested = build(config.task, "task"), load("renderer", renderer)
     if isinstance(task, Pose):
         problem = PoseProblem(task, tested, sphere(0.5), scene.view, task.cameras(scene.view.camera, 0), CPU)
@@ -51,10 +49,8 @@ def test_the_loop_stays_on_the_device_of_its_run(scene, name, renderer):
 
 @pytest.mark.parametrize("renderer", ["dvr", "newton"])
 def test_a_reconstruction_stays_on_the_device_of_its_run(scene, tmp_path, renderer):
-    register()
     weights = [f"task.losses.{name}=1" for name in ("colour_gradient", "depth", "smoothness", "normals")]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", ["task=reconstruction", "scale=smoke", "task.longest=24", "task.rays=64", *weights])
+    config = composed("task=reconstruction", "scale=smoke", "task.longest=24", "task.rays=64", *weights)
     task, tested = build(config.task, "task"), load("renderer", renderer)
     run = run_of(tmp_path, tested, ball_prior(), camera_of(24), make_scene=lambda: scene)
     run = altered(run, {"inputs.field": FieldChoice("network_2x16", None)})

@@ -154,14 +154,6 @@ def test_what_cannot_be_is_told(changed):
         replace(SETTINGS, **changed)
 
 
-def test_points_along_a_pixels_ray_are_seen_at_its_centre():
-    camera, distance = camera_of(12, angles=(20.0, 10.0)), torch.linspace(1.0, 3.0, 144).view(12, 12)
-    pixels, depth = camera.project(camera.rays().at(distance))
-    rows, columns = torch.meshgrid(torch.arange(12) + 0.5, torch.arange(12) + 0.5, indexing="ij")
-    assert torch.allclose(pixels, torch.stack([columns, rows], dim=-1), atol=1e-4)
-    assert torch.allclose(depth, camera.depth(distance), atol=1e-5)
-
-
 def test_a_linear_image_is_sampled_exactly_and_nothing_outside_is_read():
     rows, columns = torch.meshgrid(torch.arange(6) + 0.5, torch.arange(8) + 0.5, indexing="ij")
     image = (2 * columns + 3 * rows + 1)[..., None]

@@ -1,6 +1,5 @@
 """Camera poses of known shapes: how far off a start is, and that the way back is found."""
 
-import json
 from dataclasses import replace
 from math import radians
 
@@ -19,7 +18,7 @@ from renderers.fields.analytic import box
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.tiny import CPU, Blind, altered, ball_prior, camera_of, mesh_of, run_of, scene_of
+from tests.tiny import CPU, Blind, altered, ball_prior, camera_of, curve_of, mesh_of, run_of, scene_of
 
 SIZES = (0.5, 0.35, 0.2)
 CAMERA = camera_of(24, angles=(30.0, 20.0))
@@ -96,7 +95,7 @@ def test_the_true_pose_costs_nearly_nothing(scene):
     assert terms["total"] < 0.3 * off["total"]  # a pixel at an edge is off by a part of it
 
 
-@pytest.mark.parametrize("name", ["dist", "dvr", "idr"])
+@each("name", ["dist", "dvr", "idr"])
 def test_gradients_of_the_loss_point_back(scene, name):
     """Towards the truth the loss falls: along the twist that the start was moved by, against it."""
     problem = problem_of(scene, load("renderer", name), starts=1)
@@ -118,7 +117,7 @@ def test_it_finds_the_pose_and_leaves_a_record(run):
     assert record.metrics["mask_iou"] > 0.93
     assert set(record.metrics) <= set(record.definitions)
     assert record.evaluations["value"] > 0 and record.evaluations["gradient"] > 0
-    lines = [json.loads(line) for line in (run.folder / "curve.jsonl").read_text().splitlines()]
+    lines = curve_of(run.folder)
     assert len(lines) == 40
     assert {"depth", "silhouette", "total"} <= set(lines[0])
     assert (run.folder / "strip.png").stat().st_size > 1000
