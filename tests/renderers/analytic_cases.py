@@ -68,6 +68,11 @@ def beam(*origins: tuple[float, float, float]) -> Rays:
     return Rays(starts, vector((0, 0, 1)).expand_as(starts))
 
 
+def along_z(*heights: float) -> Rays:
+    """Rays along z in the plane x = 0."""
+    return beam(*((0.0, height, -2.0) for height in heights))
+
+
 def ground(offset: float | Tensor) -> Shape:
     """All below y = offset."""
     return plane((0.0, 1.0, 0.0), offset)

@@ -16,18 +16,13 @@ from renderers.gradients import implicit
 from renderers.rendering import Observed, Rendering, Status, at_iteration
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.renderers.analytic_cases import CASES, Case, vector
+from tests.renderers.analytic_cases import CASES, Case, along_z, vector
 
 DVR = load("renderer", "dvr", mask_weight=1.0)
 IDR = load("renderer", "idr", epsilon=1e-11, steps=300)
 EXACT = {"dvr": replace(DVR, refinement_steps=60), "idr": IDR}
 by_case = each("case", CASES)
 by_name = each("name", EXACT)
-
-
-def along_z(*heights: float) -> Rays:
-    origins = torch.stack([vector((0, y, -2)) for y in heights])
-    return Rays(origins, vector((0, 0, 1)).expand_as(origins))
 
 
 def slab(thickness: float) -> Shape:

@@ -10,6 +10,7 @@ from renderers.camera import rigid
 from renderers.field import Kind, Moved, autograd_gradients
 from renderers.fields.analytic import box, sphere
 from renderers.fields.grid import Grid
+from tests.looped import each
 
 REACH = 1.05
 
@@ -23,7 +24,7 @@ def points(count: int, reach: float) -> torch.Tensor:
     return reach * (2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) - 1)
 
 
-@pytest.mark.parametrize("samples", [17, 33])
+@each("samples", [17, 33])
 def test_inside_it_is_off_by_the_square_of_the_spacing(samples):
     near = points(2000, 0.9)
     near = near[(near.norm(dim=-1) - 0.6).abs() < 0.2]
@@ -50,7 +51,7 @@ def test_outside_it_is_a_bound_of_the_distance_and_continuous():
     assert field(edge * 1.0001).item() == pytest.approx(field(edge).item(), abs=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(3, 3, 4), (3, 3), (1, 1, 1)])
+@each("shape", [(3, 3, 4), (3, 3), (1, 1, 1)])
 def test_values_of_a_wrong_shape_are_an_error(shape):
     with pytest.raises((ValueError, TypeCheckError), match="values"):
         Grid(torch.zeros(shape), 1.0)

@@ -1,7 +1,6 @@
 """The slow judge against closed forms, in float64."""
 
 import pytest
-import torch
 
 from renderers.camera import Rays
 from renderers.field import steepest
@@ -9,16 +8,11 @@ from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.reference import trace
 from renderers.rendering import Status
 from tests.looped import each
-from tests.renderers.analytic_cases import CASES, sphere_hits, vector
+from tests.renderers.analytic_cases import CASES, along_z, sphere_hits, vector
 
 
 def evaluate(field: Shape, rays: Rays, *, lipschitz: float = 1.0, least_step: float = 2e-4):
     return trace(field, rays, lipschitz=lipschitz, least_step=least_step, radius=1.0)
-
-
-def along_z(*heights: float, start: float = -2.0) -> Rays:
-    origins = torch.stack([vector((0, y, start)) for y in heights]) if heights else torch.zeros(0, 3).double()
-    return Rays(origins, vector((0, 0, 1)).expand_as(origins))
 
 
 @each("case", CASES)
