@@ -10,6 +10,7 @@ from datasets import local as module
 from datasets.local import LocalMeshes
 from datasets.meshes import load_mesh
 from datasets.scene import Split
+from tests.looped import each
 
 ODD_NAME = "two words ünïcode 50% #1?"
 
@@ -86,7 +87,7 @@ def test_a_folder_gives_its_meshes_as_they_are_and_then_deforms_them(folder):
     assert not plain & set(beyond)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@each("count", [1, 2, 3])
 def test_few_files_are_enough(tmp_path, count):
     for index in range(count):
         write_box(tmp_path / f"{index}.ply", (1.0, 0.3 + 0.2 * index, 0.4))

@@ -67,7 +67,7 @@ def test_paths_that_hold_no_mesh_are_refused_with_a_remedy(tmp_path, name, messa
         load_mesh(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["a.obj", "a.ply", "a.stl", "a.off", "a.glb", "with space ü 網.obj"])
+@each("name", ["a.obj", "a.ply", "a.stl", "a.off", "a.glb", "with space ü 網.obj"])
 def test_a_closed_mesh_keeps_its_surface_in_every_format(name, tmp_path):
     box(at=(3, 0, 0)).export(tmp_path / name)
     mesh = load_mesh(tmp_path / name)

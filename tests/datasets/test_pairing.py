@@ -54,7 +54,7 @@ def test_where_the_ends_are_there_a_missing_image_is_known():
     assert by_order(left, 5, "file") == [{0: "IMG_10.png", 2: "IMG_12.png", 3: "IMG_8.png", 4: "IMG_9.png"}]
 
 
-@pytest.mark.parametrize("names", [["a.png", "c.png", "d.png"], ["5.png", "6.png", "8.png"], ["1.png", "02.png"]])
+@each("names", [["a.png", "c.png", "d.png"], ["5.png", "6.png", "8.png"], ["1.png", "02.png"]])
 def test_names_that_do_not_tell_what_is_missing_are_refused(names):
     with pytest.raises(BadInput, match=r"has 6 cameras, and there are \d images .* do not tell which"):
         by_order(names, 6, "file")

@@ -17,8 +17,7 @@ from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.reconstruct.test_losses import ball, shot_of
-from tests.reconstruct.test_subject import icosphere
-from tests.tiny import camera_of
+from tests.tiny import camera_of, icosphere
 
 RADIUS = 0.7
 PIXELS = 64
