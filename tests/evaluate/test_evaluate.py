@@ -14,6 +14,7 @@ from bench.solve.solve import note_result
 from datasets.scene import sample_surface
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
+from tests.looped import each
 from tests.tiny import ball_prior, camera_of, icosphere, run_of, scene_of
 
 RADIUS = 0.6
@@ -59,7 +60,7 @@ def test_a_field_is_not_evaluated_outside_the_unit_sphere(inputs):
     assert np.linalg.norm(spoilt.mesh.vertices, axis=1).max() < 1.0
 
 
-@pytest.mark.parametrize("value", [1.0, float("nan")])
+@each("value", [1.0, float("nan")])
 def test_a_field_without_a_surface_scores_worst(inputs, value):
     field = Shape(lambda p: torch.full_like(p[..., 0], value) + 0 * p.sum(-1))
     judgement = evaluate(State(field, inputs))
@@ -94,7 +95,7 @@ def test_the_truth_is_sampled_once_in_a_run(inputs, monkeypatch):
     assert scores[2] == evaluate(State(sphere(RADIUS), inputs)).metrics["chamfer_l2"]
 
 
-@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+@each("scale", [0.1, 1.0, 10.0])
 def test_pictures_are_of_the_fields_own_surface_also_where_it_is_no_distance(inputs, scale):
     squares = Shape(lambda p: scale * (p.square().sum(-1) - RADIUS**2), Kind.LEVEL)
     camera = inputs.scene.view.camera

@@ -12,6 +12,7 @@ import pytest
 from bench.records.folder import Identity
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus, digest, to_json, write_text
+from tests.looped import each
 
 
 def new_folder(results: Path) -> Path:
@@ -101,7 +102,7 @@ def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
     assert math.isnan(read["gemm_fraction"]) and read["flops"] is None
 
 
-@pytest.mark.parametrize("key", ["path", "image_path", "mask_path"])
+@each("key", ["path", "image_path", "mask_path"])
 def test_a_run_is_another_one_where_a_file_that_it_reads_has_changed(tmp_path, key):
     file, other = tmp_path / "file", tmp_path / "other"
     file.write_text("before")
