@@ -333,6 +333,7 @@ def load(group: str, name: str, **arguments: Any) -> Any:
     """
     if name not in names(group):
         raise ValueError(f"unknown {group} {name!r}{nearest(name, names(group))}")
+    register_resolvers()  # a program that uses the library has read no command line
     node = cast(DictConfig, OmegaConf.merge(_with_defaults(group, name), arguments))
     for key in RESERVED[1:]:
         node.pop(key, None)
