@@ -54,6 +54,12 @@ class Bracket:
         return Bracket(*(torch.cat(pair) for pair in zip(self.columns, other.columns, strict=True)))
 
 
+def evenly(entry: Float[Tensor, " n"], leave: Float[Tensor, " n"], count: int) -> Float[Tensor, "n count"]:
+    """Equally spaced distances from where rays enter to where they leave."""
+    shares = torch.linspace(0, 1, count, dtype=entry.dtype, device=entry.device)
+    return entry[:, None] + shares * (leave - entry)[:, None]
+
+
 def first_crossing(
     distance: Float[Tensor, "n samples"], value: Float[Tensor, "n samples"]
 ) -> tuple[Bool[Tensor, " n"], Bracket]:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from renderers.bracket import BLOCK, REFINEMENTS, first_crossing, refine
+from renderers.bracket import BLOCK, REFINEMENTS, evenly, first_crossing, refine
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field
@@ -108,8 +108,7 @@ class DVR:
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Tensor, ...]:
         """Of rays that meet the sphere: status, distance, and the sample of least magnitude, its distance and value."""
-        shares = torch.linspace(0, 1, self.n_ray_samples, dtype=entry.dtype, device=entry.device)
-        distance = entry[:, None] + shares * (leave - entry)[:, None]
+        distance = evenly(entry, leave, self.n_ray_samples)
         value = self._in_order(field, rays, distance) if self.early_stop else field(rays.at_each(distance))
         inside = value[:, 0] < 0
         found, bracket = first_crossing(distance, value)

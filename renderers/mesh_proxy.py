@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from renderers.bracket import BLOCK
+from renderers.bracket import BLOCK, evenly
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least
 from renderers.field import Field, carries_gradient
@@ -96,8 +96,7 @@ class MeshProxy(SurfaceRenderer):
         return torch.cat([self._closest_of(values, rays[some], entry[some], leave[some]) for some in blocks])
 
     def _closest_of(self, values: Tensor, rays: Rays, entry: Tensor, leave: Tensor) -> Float[Tensor, " n"]:
-        shares = torch.linspace(0, 1, self.ray_samples, dtype=entry.dtype, device=entry.device)
-        distance = entry[:, None] + shares * (leave - entry)[:, None]
+        distance = evenly(entry, leave, self.ray_samples)
         points = rays.at_each(distance).view(1, -1, 1, 1, 3).flip(-1) / self.sphere_radius  # grid_sample takes z first
         sampled = torch.nn.functional.grid_sample(values[None, None], points, align_corners=True, padding_mode="border")
         place = sampled.view(distance.shape).abs().argmin(dim=1, keepdim=True)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import BLOCK, Bracket, first_crossing, refine
+from renderers.bracket import BLOCK, Bracket, evenly, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import PATIENT, Coarse, Field, Kind, Values, Wrapper, carries_gradient, coarse_of, points_in_sphere
@@ -169,13 +169,12 @@ class Tracer:
         ray's beginning where the step leads behind that.
 
         Args:
-            furthest: longest step, in scene units; None for `LONGEST`.
+            furthest: longest step, in scene units.
         """
         towards_field = torch.is_grad_enabled() and carries_gradient(field, rays.origins)
         nothing = torch.zeros_like(guess)
         solved = Solved(index, guess, nothing, nothing, nothing, nothing, torch.zeros_like(index).bool())
         asked = torch.arange(len(index), device=index.device)
-        furthest = LONGEST if furthest is None else furthest
         for steps_before in range(self.newton_steps):
             ray, at = index[asked], solved.distance.detach()[asked]
             found = crossing(field, rays[ray], at, towards_field=towards_field)

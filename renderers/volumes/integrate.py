@@ -62,12 +62,6 @@ def scheduled(first: float, last: float, over: int, iteration: int) -> float:
     return last * (first / last) ** max(1 - iteration / over, 0) if over else last
 
 
-def evenly(entry: Float[Tensor, " n"], leave: Float[Tensor, " n"], count: int) -> Float[Tensor, "n count"]:
-    """Equally spaced distances from where rays enter to where they leave."""
-    shares = torch.linspace(0, 1, count, dtype=entry.dtype, device=entry.device)
-    return entry[:, None] + shares * (leave - entry)[:, None]
-
-
 def weights(passing: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     """The share of a ray's light that stays in each sample: what has passed all before, and does not pass this one."""
     return _before(passing).exp() * -torch.expm1(passing)

@@ -6,19 +6,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from renderers.bracket import evenly
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
 from renderers.rendering import Rendering, check_kind
-from renderers.volumes.integrate import (
-    Samples,
-    VolumeRenderer,
-    by_importance,
-    evenly,
-    render_volume,
-    scheduled,
-    weights,
-)
+from renderers.volumes.integrate import Samples, VolumeRenderer, by_importance, render_volume, scheduled, weights
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from renderers.bracket import first_crossing, refine
+from renderers.bracket import evenly, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, occupancy_logits
 from renderers.rendering import Rendering, check_kind
-from renderers.volumes.integrate import Samples, VolumeRenderer, evenly, render_volume, scheduled
+from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, scheduled
 
 
 @dataclass(frozen=True)

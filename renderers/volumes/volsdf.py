@@ -9,19 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from renderers.bracket import evenly
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind
 from renderers.rendering import Capabilities, Rendering, check_kind
-from renderers.volumes.integrate import (
-    Samples,
-    VolumeRenderer,
-    by_importance,
-    evenly,
-    render_volume,
-    scheduled,
-    weights,
-)
+from renderers.volumes.integrate import Samples, VolumeRenderer, by_importance, render_volume, scheduled, weights
 
 HALVINGS = 10  # of the interval in which the least width is searched, as in the paper
 MOST_LOG = 14.0  # of the error's exponential: larger ones are all the same

@@ -9,12 +9,13 @@ from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bench.config import load
+from renderers.bracket import evenly
 from renderers.camera import Rays, sphere_span
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.relaxed_boundary import _lowest
 from renderers.rendering import Blurred, Status, Volume, at_iteration
-from renderers.volumes.integrate import Samples, by_importance, evenly, weights
+from renderers.volumes.integrate import Samples, by_importance, weights
 from renderers.volumes.volsdf import Bound, _passing
 from tests.renderers.analytic_cases import CASES, Case, vector
 
