@@ -13,7 +13,7 @@ from torch.nn.functional import softplus
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Bounds, Field, Flops, Kind, OccupancyField, Wrapper, bounds_of
 from renderers.fields.grid import FLOPS, Grid
-from renderers.fields.mlp import BoundDecoder, Decoder, passes
+from renderers.fields.mlp import BoundDecoder, Decoder, flops_of, passes
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
 
 SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second derivative
@@ -96,11 +96,8 @@ class ColouredDistance(nn.Module):
 
     @property
     def flops(self) -> Flops:
-        """A multiplication and an addition per weight; as much again towards points, twice with weights."""
-        layers = nn.ModuleList([*self.hidden, self.last])
-        value = 2 * sum(weight.numel() for weight in layers.parameters() if weight.dim() > 1)
-        learnt = any(weight.requires_grad for weight in layers.parameters())
-        return Flops(value, 2 * value if learnt else value)
+        """Of a distance; see `flops_of`."""
+        return flops_of(nn.ModuleList([*self.hidden, self.last]))
 
     def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """The distances."""

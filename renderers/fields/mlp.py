@@ -257,6 +257,13 @@ class _FrozenDecoder(torch.autograd.Function):
         return None, towards_points, *towards_biases
 
 
+def flops_of(network: nn.Module) -> Flops:
+    """A multiplication and an addition per weight of matrices; as much again towards points, twice with weights."""
+    value = 2 * sum(weight.numel() for weight in network.parameters() if weight.dim() > 1)
+    trained = any(weight.requires_grad for weight in network.parameters())
+    return Flops(value, 2 * value if trained else value)
+
+
 def passes(
     points: Float[Tensor, "n 3"], width: int, dtype: torch.dtype | None = None
 ) -> Sequence[Float[Tensor, "some 3"]]:

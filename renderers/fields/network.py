@@ -23,7 +23,7 @@ from renderers.field import (
     points_in_sphere,
 )
 from renderers.fields.analytic import Shape
-from renderers.fields.mlp import Decoder, passes
+from renderers.fields.mlp import Decoder, flops_of, passes
 
 DRAWN = 2**14  # points in the unit sphere at which values and slopes are measured
 AROUND, FEW = 4096, 512  # points on the unit sphere; those for another code
@@ -192,13 +192,6 @@ def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None
         )
     flops = flops_of(network) if isinstance(network, nn.Module) else None
     return Shape(lambda points: meaning.factor * values(points), meaning.kind, meaning.lipschitz, flops)
-
-
-def flops_of(network: nn.Module) -> Flops:
-    """A multiplication and an addition per weight of matrices; as much again towards points, twice with weights."""
-    value = 2 * sum(weight.numel() for weight in network.parameters() if weight.dim() > 1)
-    trained = any(weight.requires_grad for weight in network.parameters())
-    return Flops(value, 2 * value if trained else value)
 
 
 class Coded(nn.Module):

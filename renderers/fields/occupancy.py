@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from renderers.checks import check_at_least
 from renderers.field import Flops
-from renderers.fields.mlp import passes
+from renderers.fields.mlp import flops_of, passes
 
 BLOCKS = 5  # DVR, Sec. 3.5
 
@@ -55,12 +55,8 @@ class BoundOccupancy:
 
     @property
     def flops(self) -> Flops:
-        """Of a logit: a multiplication and an addition per weight; as much again towards points, twice with weights."""
-        network = self.network
-        layers = nn.ModuleList([network.first, network.blocks, network.occupancy_head])
-        value = 2 * sum(weight.numel() for weight in layers.parameters() if weight.dim() > 1)
-        frozen = not any(weight.requires_grad for weight in layers.parameters())
-        return Flops(value, value if frozen else 2 * value)
+        """Of a logit; see `flops_of`."""
+        return flops_of(nn.ModuleList([self.network.first, self.network.blocks, self.network.occupancy_head]))
 
     def logits(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Logits of being inside; for a batch of codes [*shapes, length], of points [*shapes, n, 3]."""

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from renderers.checks import BadInput
+from renderers.fields.coloured import encoded
 from renderers.fields.mlp import Decoder
 from renderers.fields.network import Coded, Published
 
@@ -124,8 +125,7 @@ class Layered(nn.Module):
         self.norms = nn.ModuleDict({str(at): _of(nn.LayerNorm(len(of[0])), of) for at, of in (norms or {}).items()})
 
     def forward(self, points: Tensor, code: Tensor) -> Tensor:
-        waves = [part for n in range(self.frequencies) for part in ((points * 2**n).sin(), (points * 2**n).cos())]
-        whole = torch.cat([code.expand(len(points), -1), points, *waves], dim=-1)
+        whole = torch.cat([code.expand(len(points), -1), encoded(points, self.frequencies)], dim=-1)
         features, activation = whole, ACTIVATIONS[self.activation]
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             if index in self.again:
