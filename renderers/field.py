@@ -303,20 +303,17 @@ def autograd_gradients(field: Values, points: Float[Tensor, "*batch 3"]) -> Floa
     return gradient
 
 
-def steepest(
-    field: Field, *, radius: float, samples: int = 20_000, margin: float = STEEPEST_MARGIN, like: Tensor | None = None
-) -> float:
-    """An estimate of the field's Lipschitz bound: `margin` times the longest gradient at points drawn in the sphere.
+def steepest(field: Field, *, radius: float, samples: int = 20_000, like: Tensor | None = None) -> float:
+    """An estimate of the field's Lipschitz bound: the longest gradient at points drawn in the sphere, with a margin.
 
     Args:
         radius: of the sphere about the origin.
         samples: how many points, the same ones each time.
-        margin: see `STEEPEST_MARGIN`.
         like: a tensor of the dtype and device at which the field is evaluated; None for float64 on the CPU.
     """
     points = radius * points_in_sphere(samples, like)
     gradients = autograd_gradients(field, points)
-    return margin * float(torch.linalg.vector_norm(gradients, dim=-1).nan_to_num(0.0).max())
+    return STEEPEST_MARGIN * float(torch.linalg.vector_norm(gradients, dim=-1).nan_to_num(0.0).max())
 
 
 def points_in_sphere(count: int, like: Tensor | None = None) -> Float[Tensor, "count 3"]:

@@ -37,7 +37,7 @@ class MeshProxy(SurfaceRenderer):
         grid: samples on each side of the cube about the sphere.
         ray_samples: along a ray without a hit, of the grid's values, to find its closest place.
         least_slope: least length of the field's gradient at a vertex, in field units per scene unit.
-        least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
+        mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
     """
 
     grid: int

@@ -161,7 +161,7 @@ class Tracer:
         index: Int[Tensor, " m"],
         guess: Float[Tensor, " m"],
         *,
-        furthest: float | None = None,
+        furthest: float = LONGEST,
     ) -> "Solved":
         """Newton steps from `guess` along m of the rays; more than one only where the step is long.
 
@@ -226,8 +226,7 @@ class Tracer:
         self, field: Field, rays: Rays, start: Float[Tensor, " m"], end: Float[Tensor, " m"]
     ) -> tuple[Float[Tensor, "m samples"], Float[Tensor, "m samples"]]:
         """Equally spaced distances from `start` to `end`, and the field's values there."""
-        shares = torch.linspace(0, 1, self.search_samples, dtype=start.dtype, device=start.device)
-        distance = start[:, None] + shares * (end - start)[:, None]
+        distance = evenly(start, end, self.search_samples)
         points = rays.at_each(distance)
         return distance, torch.cat([field(some) for some in points.split(max(BLOCK // self.search_samples, 1))])
 

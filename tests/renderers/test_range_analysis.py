@@ -72,7 +72,7 @@ def around(count: int) -> Rays:
 def test_no_first_hit_of_a_network_is_missed(seed, lost):
     """Its values are no lengths, so that sphere tracing loses hits; the certificate loses none."""
     field, rays = network(seed), around(400)
-    truth = trace(field, rays, lipschitz=steepest(field, radius=1.0, margin=3.0), least_step=1e-4, radius=1.0)
+    truth = trace(field, rays, lipschitz=2.5 * steepest(field, radius=1.0), least_step=1e-4, radius=1.0)
     asked, marching = Counts(), Counts()
     found = RENDERER.render(Meter(field, asked), rays)
     hits = truth.status == Status.HIT
