@@ -21,7 +21,6 @@ from renderers.checks import BadInput, check_at_least, check_choice
 
 AXES = {"stated": np.eye(4), "flipped": OPENGL}
 FEWEST = 3  # photographs
-HULL_SAMPLES = 64  # per axis, of the hull that is compared with masks
 GOOD, DOUBTFUL, WRONG = 0.9, 0.8, 0.5  # overlap of hull and masks: cameras are right; hardly; photographs are refused
 LOOK = "python -m bench.photos shows it"
 ONE_PLACE = 1e-9  # most by which places of cameras may differ to be one, as a share of their coordinates
@@ -255,7 +254,7 @@ def _capture(layout: Layout, reading: Reading) -> Capture:
         sphere.found,
         layout.world @ to_world,
         (*layout.notes, *turns, *whole),
-        fit_of(within, HULL_SAMPLES) if masked else None,
+        fit_of(within) if masked else None,
     )
 
 

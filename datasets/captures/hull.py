@@ -17,6 +17,7 @@ from renderers.fields.analytic import Shape
 SEEN = 0.5  # share of the photographs that a point of the hull must lie in, since objects may leave some of them
 FAR = 0.01  # of a mask: what is that far outside of one is outside of the hull, whatever the others show
 CHUNK = 65_536  # points projected at once
+SAMPLES = 64  # per axis, of the hull that is compared with masks
 
 
 @torch.no_grad()
@@ -73,9 +74,9 @@ class Fit:
     shown: tuple[float, ...]
 
 
-def fit_of(shots: Sequence[Shot], samples: int) -> Fit:
-    """How well photographs with masks fit, by their visual hull in the unit sphere, `samples` per axis."""
-    hull, masks = hull_mesh(shots, samples), [np.asarray(shot.mask) for shot in shots]
+def fit_of(shots: Sequence[Shot]) -> Fit:
+    """How well photographs with masks fit, by their visual hull in the unit sphere."""
+    hull, masks = hull_mesh(shots, SAMPLES), [np.asarray(shot.mask) for shot in shots]
     if hull is None:
         return Fit(tuple(map(np.zeros_like, masks)), (0.0,) * len(shots), (0.0,) * len(shots))
     truth, points = Truth(hull, closed=False), torch.from_numpy(hull.vertices).float()
