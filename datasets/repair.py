@@ -295,10 +295,11 @@ def needed_meshlab(by: str) -> ModuleType:
 
 
 def mesh_set(mesh: Mesh):
-    """The mesh for filters of pymeshlab."""
-    lab = needed_meshlab("this filter")
-    meshes = lab.MeshSet()
-    meshes.add_mesh(lab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
+    """The mesh for filters of PyMeshLab, which must be installed."""
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
     return meshes
 
 
