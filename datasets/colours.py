@@ -10,10 +10,9 @@ from jaxtyping import Float
 from datasets.extras import named_files
 from datasets.mesh import Mesh, joined
 from datasets.meshes import read_mesh
+from datasets.readers.glb import GREY
 from datasets.scene import Truth
 from renderers.checks import BadInput
-
-GREY = 0.7  # of parts without colours, beside parts that have some
 
 
 class Piece(NamedTuple):
