@@ -8,11 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import as_number, started
+from bench.records.record import NUMERIC, as_number, started
 from datasets.extras import install
 
-LISTS = ("metrics", "metrics_start", "evaluations", "seconds")
-SINGLE = ("peak_memory_bytes", "flops", "gemm_fraction")
 METRICS, PARAMETERS, LONGEST = 1000, 100, 500  # most of them in a call of MLflow; characters of a parameter's value
 
 
@@ -104,8 +102,7 @@ def settings(config: dict[str, Any]) -> dict[str, str]:
 
 def values(record: dict[str, Any]) -> dict[str, float]:
     """All finite numbers of a record, such as `metrics.chamfer_l2`."""
-    listed = {f"{part}.{name}": value for part in LISTS for name, value in record[part].items()}
-    return _finite(listed | {name: record[name] for name in SINGLE})
+    return _finite(flat({name: record[name] for name in NUMERIC}))
 
 
 def curve(folder: Path) -> list[tuple[int, dict[str, float]]]:
