@@ -20,7 +20,7 @@ from renderers.fields.mlp import multiplies_faster
 from renderers.kernels.library import kernels
 
 ROOT = Path(__file__).resolve().parents[2]
-GEMM_SIZE = 1024  # of the square matrices whose product is timed
+GEMM_SIZE, GEMM_TIMES = 1024, 6  # of the square matrices whose product is timed; how often, a warm-up first
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
 CODE = ("--", ".", ":(exclude)results")  # for git: what a report writes is no code
 DENORMAL = 713_623  # the bits of 1e-39, a number too small for float32's full precision: as a number it may become 0
@@ -105,11 +105,11 @@ def _denormals_flushed() -> bool:
     return not bool((bits.view(torch.float32) * 0.5).view(torch.int32).any())  # compared as bits, for the same reason
 
 
-def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32, repeats: int = 5) -> float:
+def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32) -> float:
     """Best rate of a matrix product on this device with the current threads, in operations per second."""
     matrix = torch.rand(GEMM_SIZE, GEMM_SIZE, device=device).to(dtype)
     best = float("inf")
-    for _ in range(repeats + 1):  # one more, since the first one is a warm-up
+    for _ in range(GEMM_TIMES):
         stopwatch = Stopwatch(device)
         matrix @ matrix
         best = min(best, stopwatch.seconds())
