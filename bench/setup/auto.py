@@ -57,12 +57,7 @@ def footprint(focal_length: float, distance: float) -> float:
         distance: of the camera from the origin, in scene units.
     """
     check_positive("view.distance - 1", distance - RADIUS, "a pixel's size needs a camera outside of the unit sphere")
-    return half_pixel(focal_length, distance - RADIUS)
-
-
-def half_pixel(focal_length: float, depth: float) -> float:
-    """Half a pixel's width at a depth, on the optical axis (DIST, Eq. 10, at theta = 0), in scene units."""
-    return depth / (2 * focal_length)
+    return (distance - RADIUS) / (2 * focal_length)
 
 
 def steps(view: ViewSampler, renderer: Node, settings: AutoSettings) -> int:
