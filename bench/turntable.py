@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from bench.evaluate.state import painted
-from bench.pictures.run_figures import LIGHT, normals_image, picture_normals
+from bench.pictures.run_figures import normals_image, shaded
 from bench.records.record import leads_out, read_record
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import SUFFIXES, read_mesh
@@ -67,7 +67,7 @@ def turntable(mesh: Mesh, frames: int, size: int) -> list[UInt8[np.ndarray, "hei
     truth = Truth(mesh, closed=False)
     parts, depths = [], []
     for view in turned(truth, frames, size):
-        shown = _shaded(view) if mesh.colours is None else painted(mesh, truth, view.camera)
+        shown = np.repeat(shaded(view)[..., None], 3, -1) if mesh.colours is None else painted(mesh, truth, view.camera)
         parts.append([_written(np.where(view.mask[..., None], shown, 1.0)), _written(normals_image(view))])
         depths.append(torch.where(view.mask, view.depth, torch.nan))
     if not any(bool(depth.isfinite().any()) for depth in depths):
@@ -82,11 +82,6 @@ def _depth_images(depths: list[Float[Tensor, "fine_height fine_width"]]) -> list
     high = max(float(depth.max()) for depth in known if depth.numel())
     colours = colormaps["viridis_r"].with_extremes(bad="white")
     return [_written(colours(((depth - low) / max(high - low, THINNEST)).numpy())[..., :3]) for depth in depths]
-
-
-def _shaded(view: View) -> Float[np.ndarray, "height width 3"]:
-    shade = 0.25 + 0.75 * (picture_normals(view).numpy() @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
-    return np.repeat(shade[..., None], 3, axis=-1)
 
 
 def _written(image: Float[np.ndarray, "fine_height fine_width 3"]) -> UInt8[np.ndarray, "height width 3"]:

@@ -205,6 +205,11 @@ def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
     return (view.normals @ rotation.T) * torch.tensor([1, -1, -1])
 
 
+def shaded(view: View) -> Float[np.ndarray, "height width"]:
+    """The brightness of a grey surface under `LIGHT`, from 0 to 1; without meaning beside it."""
+    return 0.25 + 0.75 * (picture_normals(view).numpy() @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
+
+
 def _cameras(inputs: RunInputs, size: int) -> tuple[Camera, Camera]:
     """The scene's camera at so many pixels per side, and one behind the shape."""
     camera = inputs.scene.view.camera
@@ -260,8 +265,7 @@ def _show_normals(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any
 
 
 def _show_shaded(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
-    shade = 0.25 + 0.75 * (picture_normals(pair.back).numpy() @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
-    shown = np.where(pair.back.mask.numpy(), shade, 1.0)
+    shown = np.where(pair.back.mask.numpy(), shaded(pair.back), 1.0)
     part = window([other.back.mask.numpy() for other in pairs])
     return bare(axis).imshow(shown[part], cmap="gray", vmin=0, vmax=1)
 
