@@ -34,7 +34,7 @@ def make(*several: Runs | None) -> Result:
     standing = Standing([*attempts, *attempts_of(runs.records, runs.results_dir)])
     lines = [standing.line(row) for row in standing.rows]
     panels = [_panel(standing, None), *(_panel(standing, name) for name in standing.sets)]
-    figure = chart.draw_lead(panels, 5.4)
+    figure = chart.draw_lead(panels)
     return Result(
         replace(runs, records=[], left_out=0),  # what is kept counts, with or without its run
         "The suite.",

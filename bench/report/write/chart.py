@@ -94,9 +94,9 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
 
 
 @style.styled
-def draw_lead(panels: Sequence[Panel], height: float) -> Figure:
+def draw_lead(panels: Sequence[Panel]) -> Figure:
     """Draws the first panel large, with the names of its lines beside it, and the others small below, of equal axes."""
-    figure = Figure(figsize=(style.WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(style.WIDTH, 5.4), layout="constrained")
     grid = figure.add_gridspec(2, max(len(panels) - 1, 1), height_ratios=(1.7, 1))
     lead = figure.add_subplot(grid[0, :])
     _panel(lead, panels[0], 1.0)
