@@ -82,7 +82,7 @@ class Search:
         tried = [index for index, _ in self.trials]
         last = self.settings.levels - 1
         for end in (0, last):
-            if tried.count(end) < 1:
+            if end not in tried:
                 return end
         found, (low, high) = self.result(), self._interval()
         if high - low <= 2 / last or low > 1 or high < 0:
