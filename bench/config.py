@@ -15,7 +15,6 @@ from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hi
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.tables import CONF as CONF
 from bench.tables import LABEL, LOOK, ROWS, choice, names, nearest, register_resolvers, register_rows
 
 LEAST = {

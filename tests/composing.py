@@ -10,9 +10,10 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, register
+from bench.config import register
 from bench.records.folder import Identity, identify, resolved
 from bench.run.command import options_first
+from bench.tables import CONF
 
 _KEPT: dict[str, CachingConfigRepository] = {}
 

@@ -20,12 +20,13 @@ from omegaconf import DictConfig, OmegaConf
 import bench
 import bench.studies
 from bench import tables
-from bench.config import CONF, build, check_names, register
+from bench.config import build, check_names, register
 from bench.report.__main__ import main as report
 from bench.report.write import paper
 from bench.run import library
 from bench.run.command import with_network
 from bench.run.pack import register_slurm
+from bench.tables import CONF
 from tests import composing, documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
 from tests.run.driving import SMALLEST

@@ -18,13 +18,13 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.config import CONF, register, type_of, wrong_type
+from bench.config import register, type_of, wrong_type
 from bench.records.folder import Identity, identify, resolved
 from bench.run.pack import register_slurm
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
 from bench.run.sweep import Refused, Sweep
-from bench.tables import names, nearest, register_resolvers
+from bench.tables import CONF, names, nearest, register_resolvers
 from datasets.extras import install
 
 COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it

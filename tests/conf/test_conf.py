@@ -9,12 +9,12 @@ import yaml
 from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CONF, TARGETS, build, check_draw, check_names, load
+from bench.config import TARGETS, build, check_draw, check_names, load
 from bench.pictures import style
 from bench.pictures.style import look
 from bench.run.compose import combinations
 from bench.setup.inputs import Task
-from bench.tables import GROUPS, choice, names, read_yaml
+from bench.tables import CONF, GROUPS, choice, names, read_yaml
 from datasets.scene import Dataset
 from renderers import DIST, Naive
 from renderers.rendering import Renderer

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from bench.config import CONF, load
+from bench.config import load
 from bench.records.record import digest
-from bench.tables import read_rows
+from bench.tables import CONF, read_rows
 from datasets.families import BUILDERS, HALF_GRID, Family
 from datasets.scene import SPLIT_STRIDE, Split, seed_of
 from renderers.field import Kind, autograd_gradients
