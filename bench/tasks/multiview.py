@@ -270,10 +270,11 @@ class GivenPhotographs:
         """
         renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration)
         colours = self.blurred(iteration)
-        views, rays = [pair[0] for pair in pairs], self._together([pair[0] for pair in pairs])
+        views, neighbours = map(list, zip(*pairs, strict=True))
+        rays = self._together(views)
         mine = rendered(renderer, field, rays)
         with torch.no_grad():
-            others = rendered(renderer, field, self._together([pair[1] for pair in pairs]))
+            others = rendered(renderer, field, self._together(neighbours))
         differences = []
         for k, (view, other) in enumerate(pairs):
             pixels, depth = self.cameras[other].project(mine.points[k])
