@@ -65,7 +65,7 @@ class Watched(Wrapper):
     inner: Field
     limits: Limits
     memory: MemoryPeak
-    where: str = ""
+    where: str
     spent: int = 0
     memory_checked: float = 0.0
 

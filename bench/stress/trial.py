@@ -75,7 +75,7 @@ class Conditions:
     criteria: Criteria
     limits: Limits
     device: torch.device
-    prior: Prior | None = None
+    prior: Prior | None
 
 
 class Failure(StrEnum):

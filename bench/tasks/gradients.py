@@ -198,7 +198,7 @@ class Subject:
         return ((found - distance).abs() < NEAR) | falls
 
     def gradients(
-        self, pixels: Int[Tensor, " m"], paint: Paint | None = None
+        self, pixels: Int[Tensor, " m"], paint: Paint | None
     ) -> tuple[list[Float[Tensor, "m seen _"]], Float[Tensor, " m"], Bool[Tensor, " m"]]:
         """For each pixel the gradients of what is seen, the distance, and whether it hits.
 
