@@ -26,8 +26,8 @@ class DVR:
     Needs: any level set: only signs are searched. What is thinner along the ray than the spacing may be missed.
     Deviates from the paper: the first sample lies where the ray enters the volume (Eq. 9 from j = 0, as in the official
         code), which is the unit sphere; a ray that begins occupied has STARTED_INSIDE. Rays have a gradient, which the
-        official code leaves out, and the denominator keeps its sign unless `keep_slope_sign` is off, as in the official
-        clamp. `early_stop` is ours. L_occupancy (Eq. 15) is at a random point also where depth is given, unless
+        official code leaves out, and a flat crossing keeps its slope's sign; there it counts as entering.
+        `early_stop` is ours. L_occupancy (Eq. 15) is at a random point also where depth is given, unless
         `occupied_at` is "depth"; the depth of the visual hull, which the paper takes with several masks of one object,
         is such a depth where a task gives it (`task.guide=hull` of task=reconstruction).
 
@@ -38,7 +38,7 @@ class DVR:
         refinement_steps: field values per hit after the search.
         early_stop: evaluate the samples of a ray from front to back up to the first that is occupied; else all of them,
             as in the paper.
-        least_slope, keep_slope_sign: see `gradients.implicit`.
+        least_slope: see `gradients.implicit`.
         occupancy_width, mask_weight, occupied_at: of both mask losses; see `silhouette.Occupancy`.
         sphere_radius: of the volume of interest, a sphere about the origin.
     """
@@ -49,7 +49,6 @@ class DVR:
     refinement_steps: int
     early_stop: bool
     least_slope: float
-    keep_slope_sign: bool
     occupancy_width: float
     mask_weight: float
     occupied_at: str
@@ -85,7 +84,7 @@ class DVR:
         status, ended, least_distance, least = (torch.cat(part) for part in zip(*parts, strict=True))
         hit = queried[status == Status.HIT]
         distance = entry.index_put((queried,), ended)
-        found = implicit(field, flat[hit], distance[hit], least_slope=self.least_slope, keep_sign=self.keep_slope_sign)
+        found = implicit(field, flat[hit], distance[hit], least_slope=self.least_slope)
         return assemble(
             rays,
             self.sphere_radius,

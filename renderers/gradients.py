@@ -126,9 +126,7 @@ def crossing(field: Field, rays: Rays, distance: Float[Tensor, " n"], *, towards
     return Crossing(value.detach(), slope, change)
 
 
-def implicit(
-    field: Field, rays: Rays, distance: Float[Tensor, " n"], *, least_slope: float, keep_sign: bool = True
-) -> Float[Tensor, " n"]:
+def implicit(field: Field, rays: Rays, distance: Float[Tensor, " n"], *, least_slope: float) -> Float[Tensor, " n"]:
     """The gradient of the distance to a level set, by implicit differentiation.
 
     Source: DVR, Eqs. 8 and 11. On the ray o + d w, the level set stays under the ray's end if
@@ -141,7 +139,6 @@ def implicit(
         distance: where they cross the surface.
         least_slope: least magnitude of the field's slope along the ray, grad field . w, in field units per scene unit.
             A flatter crossing is divided by this, with the slope's own sign; rays enter, so zero counts as negative.
-        keep_sign: False takes flat crossings as if rays left there, as DVR's official code does.
     """
     if not torch.is_grad_enabled():
         return distance
@@ -150,10 +147,7 @@ def implicit(
         return distance
     at = crossing(field, rays, distance, towards_field=towards_field)
     slope = at.slope
-    if keep_sign:
-        slope = torch.where(slope > 0, slope.clamp_min(least_slope), slope.clamp_max(-least_slope))
-    else:
-        slope = torch.where(slope.abs() < least_slope, least_slope, slope)
+    slope = torch.where(slope > 0, slope.clamp_min(least_slope), slope.clamp_max(-least_slope))
     return distance.detach() - at.change / slope
 
 

@@ -83,7 +83,7 @@ def test_a_flat_slope_keeps_its_sign(slope, used):
     field = Shape(lambda p: slope * p[..., 2] + offset, Kind.LEVEL, None)
     distance = implicit(field, along_z(0.0), vector((2.0,)), least_slope=1e-3)
     (found,) = torch.autograd.grad(distance.sum(), offset)
-    assert found.item() == pytest.approx(-1 / used)  # Eq. 8; the official clamp makes -2e-4 to +1e-3
+    assert found.item() == pytest.approx(-1 / used)  # Eq. 8
 
 
 def masks(renderer, field, rays: Rays, mask: list[bool], seed: int = 0) -> tuple[Tensor, Rendering, Tensor]:
