@@ -91,7 +91,8 @@ def test_a_verdict_counts_the_shapes_that_it_is_of(tmp_path, study):
     for index in range(5):
         made(tmp_path, "Mean shape", 0.3, index=index, experiment=study)
     for index, row in product(range(3), ("RGB", "Newton", "IDR")):
-        made(tmp_path, row, 0.2, index=index, experiment=study)
+        seconds = {"forward": 1.0, "backward": 0.0, "training": 90.0}
+        made(tmp_path, row, 0.2, index=index, experiment=study, seconds=seconds)
     assert "n = 3 " in page_of(tmp_path, study).verdict
 
 
