@@ -54,8 +54,9 @@ class SingleView(nn.Module):
     Source: DVR (Niemeyer et al. 2020), Sec. 3.5: a ResNet-18 whose last layer gives a code of 256, and the network of
         `OccupancyNetwork`.
     Deviates: the ResNet is not trained before; it is given the mask as well; groups of channels are normalised, not
-        batches, since a step has few images; its last features keep 4 x 4 places, and a code is normalised; at desk it
-        has one block in each of four narrow stages; the shape begins as a sphere.
+        batches, since a step has few images, and before each convolution; nothing is pooled after the first one; its
+        last features keep 4 x 4 places, and a code is normalised; at desk it has one block in each of four narrow
+        stages; the shape begins as a sphere.
     """
 
     def __init__(self, settings: SingleViewNetwork) -> None:
