@@ -10,7 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import CachingConfigRepository
@@ -120,9 +120,10 @@ def swept_over(config: DictConfig) -> list[list[str]]:
         ValueError: where the sweep has no cell.
     """
     params = OmegaConf.select(config, "hydra.sweeper.params") or {}
-    swept = combinations([*(f"{key}={value}" for key, value in params.items()), *config.hydra.overrides.task])
+    typed = cast(list[str], OmegaConf.to_container(config.hydra.overrides.task))  # a cell's ${seed} is that of the cell
+    swept = combinations([*(f"{key}={value}" for key, value in params.items()), *typed])
     if not swept:
-        raise ValueError(f"the sweep has no cell: {' '.join(config.hydra.overrides.task)}")
+        raise ValueError(f"the sweep has no cell: {' '.join(typed)}")
     return swept
 
 

@@ -111,6 +111,11 @@ def test_a_cell_is_what_hydra_makes_of_it(results, monkeypatch, arguments):
     assert len({cell.id for cell in quick}) == len(quick)
 
 
+def test_a_value_may_refer_to_the_seed_of_its_cell(results):
+    cells = planned(results, "-m", "scale=smoke", "seed=1,2", "label=of ${seed}")
+    assert [cell.config["label"] for cell in cells] == ["of 1", "of 2"]
+
+
 def test_a_value_that_cannot_be_set_is_an_error_as_of_a_whole_cell(results):
     for arguments, words in (
         (("seed=0,1,x",), "seed must be a whole number, not 'x'"),
