@@ -17,7 +17,7 @@ NOTES = (
     "Trainings from images spend their first steps on the visual hull of the masks, without a renderer, and “Masks, "
     "hull” does nothing else.",
     "“DVR's own”: occupancy, DVR's renderer and losses from the first step; from RGB the hull is the depth of Eq. 15. "
-    "At desk a step has 4 images of 128 rays, at a rate of 1e-3; gradients are shortened to 1.",
+    "At desk a step has 4 images of 128 rays, at a rate of 1e-3; gradients are shortened to 1. A seed is a training.",
     "Without a training: the code of the prior that DIST finds by the mask, knowing the camera; the mean shape; the "
     "training shape with the nearest image; the one with the least Chamfer-L1, which no retrieval can beat.",
     f"{single_view.OVER} “Trained in” is once for the family, “Inference” the network with its mesh, or the search "
