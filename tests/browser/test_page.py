@@ -24,7 +24,23 @@ pytestmark = pytest.mark.browser
 
 RUNS = 7
 SOLVED = [attempt("Dist", f"car test {n}", {0: 0.8, 500: 0.0115, 600: 0.001}, preset="dist") for n in (0, 1)]
-NUMBERS = (0.0123456, 0.5, 9.996, 99.96, 1234.5, -12.34, 1.234e-5, 1.5e9, 0, 999.6, 1_430_000, 3e12, 7201, 0.0123, None)
+NUMBERS = (
+    0.0123456,
+    0.5,
+    9.996,
+    99.96,
+    1234.5,
+    -12.34,
+    1.234e-5,
+    1.5e9,
+    0.0,
+    999.6,
+    1.43e6,
+    3e12,
+    7201.0,
+    0.0123,
+    None,
+)
 
 
 @pytest.fixture(scope="module")
