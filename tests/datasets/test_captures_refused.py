@@ -19,6 +19,7 @@ from tests.made_photographs import (
     changed,
     colmap,
     idr,
+    llff,
     middlebury,
     moved,
     nerf,
@@ -106,6 +107,7 @@ REFUSED = {
         (cameras(lambda known: known | {"scale_mat_3": np.eye(4)}), "scale_mat_3 differs from scale_mat_0"),
         (cameras(lambda known: {key: WIDE @ one if key[0] == "w" else one for key, one in known.items()}), "2.1 times"),
     ],
+    llff: [(written("poses_bounds.npy", POINTER), FETCH)],
     nerf: [
         (written("transforms.json", POINTER), FETCH),
         (every(mask_path="train/r_0.png"), "train/r_0.png is the mask of several images"),

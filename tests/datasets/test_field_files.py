@@ -28,7 +28,7 @@ from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
 from renderers.fields.network import Coded, Published
 from renderers.fields.occupancy import OccupancyNetwork
-from renderers.fields.parts import formula
+from renderers.fields.parts import FORMULAS, formula
 from renderers.fields.published import Layered
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -60,7 +60,7 @@ FIELDS = {
     "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
     "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,
     "occupancy_at_code": lambda: ScaledOccupancyOf(OccupancyNetwork(width=8, code_length=3).at(numbers(3))),
-    "superquadric": lambda: formula("superquadric", numbers(PARTS["superquadric"].size), Flops(1, 2)),
+    **{name: lambda n=name: formula(n, numbers(PARTS[n].size), Flops(1, 2)) for name in FORMULAS if name != "union"},
     "union": lambda: formula("union", numbers(3, 10), Flops(3, 6)),
 }
 
