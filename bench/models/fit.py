@@ -125,22 +125,27 @@ class Fitter:
     def finish(self, fitted: Fitted, rounds: int) -> None:
         """Fits a candidate round by round, until a round lowers its held-out error by no standard error of the change.
 
-        A round that raises the error, or fails after another, is taken back. Where the error is still falling after the
-        last of all rounds, the evidence says so.
+        The first round is compared with none: a warm start imitates a field that may be better. A later one that raises
+        the error, or fails, is taken back, and its cost counts. Where the last of all rounds still lowered the error,
+        the evidence says so.
         """
         evidence = fitted.evidence
-        for _ in range(rounds):
-            before, kept = evidence.error, [one.detach().clone() for one in fitted.model.parameters]
+        self.fit(fitted, self.settings.iterations, checkpoints=True)
+        for _ in range(1, rounds):
+            before, done = evidence.error, evidence.iterations
+            if before is None:
+                return
+            kept = [one.detach().clone() for one in fitted.model.parameters]
             self.fit(fitted, self.settings.iterations, checkpoints=True)
-            gain = inf if before is None else before.mean - evidence.mean
-            noise = 0.0 if before is None or evidence.error is None else evidence.error.noise_of_difference(before)
-            evidence.falling = not fitted.failed and gain > noise
+            gain = before.mean - evidence.mean
+            evidence.falling = evidence.error is not None and gain > evidence.error.noise_of_difference(before)
             if not evidence.falling:
-                if before is not None and not gain > 0:  # the round is taken back, and its cost counts
+                if gain <= 0:
                     for parameter, old in zip(fitted.model.parameters, kept, strict=True):
                         parameter.data.copy_(old)
-                    evidence.error, evidence.status, evidence.reason = before, RunStatus.OK, ""
-                break
+                    evidence.error, evidence.iterations = before, done
+                    evidence.status, evidence.reason = RunStatus.OK, ""
+                return
 
     def _run(
         self, fitted: Fitted, problem: "FitProblem | WarmStart", settings: OptimiserSettings, *, checkpoints: bool

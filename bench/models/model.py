@@ -136,8 +136,8 @@ class Evidence:
         error: on held-out rays; None where the fit failed.
         status, reason: how the fit ended.
         seconds, evaluations, gradients, flops: of the fit with its warm start, without checkpoints.
-        iterations: of the fit, without its warm start.
-        falling: whether the last of all rounds still lowered the error; see `Fitter.finish`.
+        iterations: of the fit, without its warm start and a round that was taken back; see `Fitter.finish`.
+        falling: whether the last of several rounds still lowered the error.
         checkpoints: seconds, evaluations, gradients, flops and error at each checkpoint.
     """
 

@@ -12,8 +12,8 @@ READS = (Selection("parsimony", setup=("scenes", "pixels", "machine"), alike=("m
 COSTS = ("seconds", "flops", "evaluations")
 NOTES = (
     "All candidates are fitted to depth and silhouettes of the same views with the same rays, in rounds, until one "
-    "lowers the held-out error by no more than its noise. It is the mean distance along the normal over held-out rays, "
-    "most of them of other views.",
+    "lowers the held-out error by no more than its noise; costs are of all rounds. It is the mean distance along the "
+    "normal over held-out rays, most of them of other views.",
     "Recommended is the smallest candidate by {size} whose error is within one standard error (s.e.) of the best "
     "candidate's, or under half a pixel at the nearest distance: those are filled in the figure.",
     "Seeds held: the share of draws of further views on which the recommended candidate is within one standard error "
@@ -163,7 +163,7 @@ CANDIDATES = (  # of a run and a candidate
     *map(
         table.Column, ("rung", "kind", "recommended", "best", *SIZES, "sparse_bytes", FLOPS, "error", "standard_error")
     ),
-    *map(table.Column, ("seconds", "evaluations", "flops", "failed", *(f"{cost}_at_auto" for cost in COSTS))),
+    *map(table.Column, (*COSTS, "iterations", "falling", "failed", *(f"{cost}_at_auto" for cost in COSTS))),
 )
 COLUMNS = (  # of a run
     SCENE[0],

@@ -40,7 +40,8 @@ NEEDS = {
     "NAME.free, NAME.stored, NAME.bytes": SIZES,
     "NAME.sparse_bytes": "of a grid: size of a file with the fitted samples, a bit per sample that tells which they "
     "are, and the previous field, from which the other samples can be computed; no choice uses it",
-    "NAME.iterations, NAME.falling": "of its fit; whether the error still fell in its last round, task.rounds",
+    "NAME.iterations, NAME.falling": "of its fit, without a round that was taken back; whether the error still fell in "
+    "the last of task.rounds",
     "NAME.flops_per_query": "floating-point operations per value, an estimate for formulas",
     "NAME.seconds, NAME.evaluations, NAME.flops": "of its fit, with finding its start and the warm start, "
     "without checkpoints",

@@ -439,6 +439,14 @@ def test_a_fit_goes_on_while_its_error_falls_and_says_where_it_was_stopped(shape
     assert left.mean == pytest.approx(fitted.evidence.mean)
 
 
+def test_a_first_round_is_not_taken_back_for_a_warm_start_that_imitates_a_better_field():
+    fitter = fitter_of("ball", iterations=8, warm_iterations=200)
+    fitted = fitter.begin(candidate("network_2x32"), fitter.begin(candidate("sphere"), None).model)
+    imitation = fitted.evidence.mean
+    fitter.finish(fitted, 1)
+    assert fitted.evidence.mean > imitation and fitted.evidence.iterations == 8
+
+
 def test_the_clock_of_a_fit_goes_on_where_its_trial_ended():
     def line(candidate: str, phase: str, seconds: float) -> dict[str, object]:
         return {"candidate": candidate, "phase": phase, "part": "growth", "seconds": seconds, "total": seconds}
