@@ -23,8 +23,7 @@ NOTES = (
     "decide nothing.",
     "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
     "hit.",
-    "Behind the surface is the share of field values, of a rendering of at most 64 pixels per side, that are negative "
-    "(DIST, Fig. 14).",
+    "Behind the surface is the share of field values, coarse ones too, that are negative (DIST, Fig. 14).",
     "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: not to be compared with our rows.",
 )
 _TIMES = ("forward_seconds", "backward_seconds", "step_seconds")

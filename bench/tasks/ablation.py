@@ -7,7 +7,7 @@ are no CUDA graphs, since the shapes of a march change from one rendering to the
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import ceil
 from statistics import median
 from typing import Any
@@ -29,11 +29,11 @@ from datasets.scene import View
 from renderers.boundary import rendered, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Bounds, Counts, Field, Meter, Wrapper, autograd_normals, bounds_of
+from renderers.field import Bounds, Coarse, Counts, Field, Meter, Wrapper, autograd_normals, bounds_of, coarse_of
 from renderers.rendering import Observed, Renderer, Rendering, check_kind
+from renderers.waits import active_among
 
 BASE = "base"  # the run's renderer, where others are timed beside it
-SIGNED = 64  # most pixels per side of the rendering whose negative values are counted
 SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
 WARM_UP = 8  # pixels per side of the image that is rendered before the timing, on a CPU
 DEFINITIONS = {
@@ -58,8 +58,8 @@ DEFINITIONS = {
     "product, in float32 or, of coarse values, in bfloat16, over the median time",
     "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in a step; of no CPU, where it does not repeat",
     "lost, false": "missed pixels, which only the float64 reference hits; spurious ones, which only the renderer hits",
-    "behind": "share of the field values of one more rendering, untimed and of at most 64 pixels per side, that are "
-    "negative: samples behind the surface (DIST, Fig. 14)",
+    "behind": "share of the field values, coarse ones too, of one more rendering, untimed, that are negative: samples "
+    "behind the surface (DIST, Fig. 14)",
     "pixel_errors": "lost, false and wrong together; at the start: hits, those of an image in which nothing is hit",
     "cost": "of one rendering, in field values: a coarse one counts as an eighth",
     "rays, hits": "pixels of the image; pixels that the reference hits",
@@ -265,17 +265,26 @@ def ratios(mine: Clocked, base: Clocked, name: str) -> dict[str, float]:
 
 @dataclass
 class Signs(Wrapper):
-    """A Field that counts its values and the negative ones; it offers bounds, but no coarse values."""
+    """A Field that counts its values that are asked for, coarse ones too, and the negative ones among them."""
 
     inner: Field
     asked: int = 0
     negative: int = 0
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        values = self.inner(points)
-        self.asked += values.numel()
-        self.negative += int((values < 0).sum())
+        return self._noted(self.inner(points))
+
+    def _noted(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        flat, active = values.flatten(), active_among(values.numel())
+        asked = flat if active is None else flat[active]
+        self.asked += asked.numel()
+        self.negative += int((asked < 0).sum())
         return values
+
+    @property
+    def coarse(self) -> Coarse | None:
+        offered = coarse_of(self.inner)
+        return offered and replace(offered, values=lambda points: self._noted(offered.values(points)))
 
     @property
     def bounds(self) -> Bounds | None:
@@ -340,10 +349,10 @@ class Workbench:
         return numbers
 
     def behind(self) -> float:
-        """The share of the values of a small rendering that are negative."""
-        signs, side = Signs(self.decoder.at(self.code.detach())), min(SIGNED, self.camera.height)
+        """The share of the values of a rendering that are negative."""
+        signs = Signs(self.decoder.at(self.code.detach()))
         with torch.no_grad():
-            rendered(self.renderer, signs, self.camera.resized(side, side).rays().to(self.device))
+            rendered(self.renderer, signs, self.rays)
         return signs.negative / max(signs.asked, 1)
 
     def views(self, normal_width: float | None = None) -> tuple[View, View]:
