@@ -116,10 +116,12 @@ class Multiview(PhotographTask):
         return self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput without a prior, and ValueError where rotations use up the iterations."""
+        """Raises BadInput without a prior or with an encoder of made photographs, ValueError for too many rotations."""
         inputs.check_prior()
         if inputs.photographed is not None:
             _ = self._turning
+            if self.encoder is not None:
+                raise BadInput("an encoder learns the cameras of made photographs, not of yours: set task.encoder=null")
 
     @property
     def _turning(self) -> "Multiview":
