@@ -187,7 +187,6 @@ class Reading:
 
     def __post_init__(self) -> None:
         check_at_least("longest", self.longest, 8, "128 shows what there is")
-        check_choice("axes", self.axes, tuple(AXES))
 
 
 def read_capture(folder: Path, reading: Reading) -> Capture:

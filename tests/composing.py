@@ -41,9 +41,7 @@ def identified(*arguments: str) -> Identity:
     """The run that a command line describes."""
     overrides = options_first([*arguments])
     GlobalHydra.instance().clear()
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides, return_hydra_config=True)
+    config = deepcopy(composed(*overrides, hydra=True))
     runtime = config.hydra.runtime
     OmegaConf.set_struct(config, False)
     del config["hydra"]

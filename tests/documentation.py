@@ -153,9 +153,4 @@ def filled(command: Command, made: dict[str, str]) -> list[str]:
         named |= {"FOLDER": made["chairs/"], "FILE": made["YOURS.obj"]}
     own = ["--config-dir", "my_conf", "packages=[my_package]"] if command.arguments == ("renderer=mine",) else []
     kept = [argument for argument in (*own, *command.arguments) if argument not in ("...", "...,")]
-    return [key + is_ + named.get(value, value) for key, is_, value in map(_split, kept)]
-
-
-def _split(argument: str) -> tuple[str, str, str]:
-    key, is_, value = argument.rpartition("=")
-    return key, is_, value
+    return [key + is_ + named.get(value, value) for key, is_, value in (one.rpartition("=") for one in kept)]

@@ -16,9 +16,7 @@ def ball(radius: float = RADIUS, centre=CENTRE, subdivisions: int = 4) -> Mesh:
     return icosphere(radius, centre, subdivisions)
 
 
-def write_dtu(
-    folder: Path, points: np.ndarray, *, number: int = NUMBER, reach: float = 25.0, plane=(0, 0, 1, -590), centre=CENTRE
-):
+def write_dtu(folder: Path, points: np.ndarray, *, reach: float = 25.0, plane=(0, 0, 1, -590), centre=CENTRE):
     """Writes a scan whose observed cells of 2 mm are those within `reach` of the centre."""
     for name in ("Points/stl", "ObsMask"):
         (folder / name).mkdir(parents=True)
@@ -31,6 +29,6 @@ def write_dtu(
     savemat(folder / f"ObsMask/Plane{NUMBER}.mat", {"P": np.array(plane, dtype=float)[:, None]})
 
 
-def on_ball(count: int, radius: float = RADIUS, seed: int = 0) -> np.ndarray:
-    points = np.random.default_rng(seed).standard_normal((count, 3))
+def on_ball(count: int, radius: float = RADIUS) -> np.ndarray:
+    points = np.random.default_rng(0).standard_normal((count, 3))
     return CENTRE + radius * points / np.linalg.norm(points, axis=1, keepdims=True)

@@ -18,11 +18,3 @@ class Mine:
 
     def silhouette_loss(self, field, rays, rendering, mask):
         return self.tracer.silhouette_loss(field, rays, rendering, mask)
-
-
-class Wrong(Mine):
-    """One that holds what it should not: it says that every ray hits."""
-
-    def render(self, field: Field, rays: Rays) -> Rendering:
-        found = self.tracer.render(field, rays)
-        return Rendering(found.distance, found.status * 0, found.points, found.residual, found.closest)

@@ -97,11 +97,9 @@ def _ratio(cost: str) -> table.Column:
 
 
 COLUMNS = (
-    *(
-        table.Column("size", "Size", show=table.whole),
-        table.Column("threads", "Threads", show=table.whole),
-        table.text("renderer", "Renderer"),
-    ),
+    table.Column("size", "Size", show=table.whole),
+    table.Column("threads", "Threads", show=table.whole),
+    table.text("renderer", "Renderer"),
     *(*map(table.text, ("status", "reason", "folder")), table.Column("rounds")),
     table.Column(
         "queries", "Values", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))

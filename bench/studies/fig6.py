@@ -20,12 +20,10 @@ NOTES = (
     "Times and evaluations are those of the loop, over runs that ended ok.",
 )
 RUNS = (
-    *(
-        table.FAMILY,
-        table.configured("degrees", "task", "degrees"),
-        table.configured("starts", "task", "starts"),
-        *table.IDENTITY,
-    ),
+    table.FAMILY,
+    table.configured("degrees", "task", "degrees"),
+    table.configured("starts", "task", "starts"),
+    *table.IDENTITY,
     *table.metrics("success", "rotation_error_deg", "translation_error", "mask_iou", "depth_mae"),
     *table.LOOP,
 )

@@ -181,10 +181,8 @@ COLUMNS = (
     table.text("status", "Status"),
 )
 COLUMNS_VISIBLE = (
-    *(
-        table.text("name", "Renderer"),
-        table.Column("blur", "Blur (scene units)", show=lambda x: "" if x is None else f"{x:g}"),
-    ),
+    table.text("name", "Renderer"),
+    table.Column("blur", "Blur (scene units)", show=lambda x: "" if x is None else f"{x:g}"),
     *(table.Column(name, heading) for name, heading in VISIBLE.items()),
     table.text("status", "Status"),
 )

@@ -47,12 +47,10 @@ NUMBERS = (
 SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
 COSTS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
-    *(
-        table.text("at_once", "At once"),
-        table.text("never", "None"),
-        table.Column("cost", "Field values per ray"),
-        table.text("preset"),
-    ),
+    table.text("at_once", "At once"),
+    table.text("never", "None"),
+    table.Column("cost", "Field values per ray"),
+    table.text("preset"),
 )
 
 

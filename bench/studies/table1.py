@@ -113,11 +113,9 @@ RUNS = (
     ),
 )
 COLUMNS = (  # of a record, for readers; metrics are those of the largest size that was finished
-    *(
-        table.text("name", "Strategy"),
-        table.shown("Size", _size),
-        table.configured("", "renderer", "steps", heading="Steps"),
-    ),
+    table.text("name", "Strategy"),
+    table.shown("Size", _size),
+    table.configured("", "renderer", "steps", heading="Steps"),
     table.shown(
         "Queries", lambda r: format.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries"))
     ),

@@ -5,7 +5,6 @@ import statistics
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -19,10 +18,6 @@ CELL = ("renderer=custom", "renderer._target_=tests.failing.Failing", "+renderer
 RECORDS = 10_000
 
 
-def seconds_of(results: Path) -> list[dict[str, float]]:
-    return [json.loads(path.read_text())["seconds"] for path in results.glob("runs/*/record.json")]
-
-
 def test_a_run_costs_little_more_than_its_work(tmp_path, capsys):
     """Cells that take 10 s by themselves, in a sweep: what the sweep takes beyond them, a cell."""
     cells = 4
@@ -33,7 +28,7 @@ def test_a_run_costs_little_more_than_its_work(tmp_path, capsys):
         command = [sys.executable, "-m", "bench", "-m", *arguments, f"isolation={isolation}", f"results_dir={results}"]
         started = time.perf_counter()
         subprocess.run(command, cwd=ROOT, check=False, capture_output=True)
-        spent = sum(seconds["total"] for seconds in seconds_of(results))
+        spent = sum(json.loads(path.read_text())["seconds"]["total"] for path in results.glob("runs/*/record.json"))
         inside[isolation] = spent / cells
         outside[isolation] = (time.perf_counter() - started - spent) / cells
     with capsys.disabled():

@@ -38,8 +38,8 @@ def taken(sphere: Truth, *angles: tuple[float, float]) -> list[Shot]:
     return SETTINGS.take_from(sphere, cameras, seed=0)
 
 
-def points_of(shots: list[Shot], matching: Matching = ALL) -> np.ndarray:
-    return np.concatenate([cloud.points for cloud in stereo_clouds(shots, matching)])
+def points_of(shots: list[Shot]) -> np.ndarray:
+    return np.concatenate([cloud.points for cloud in stereo_clouds(shots, ALL)])
 
 
 def test_points_lie_on_the_sphere_where_photographs_see_it(sphere):

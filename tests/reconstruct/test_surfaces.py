@@ -32,8 +32,8 @@ def halves(points: np.ndarray, front=FRONT, back=BACK) -> list[Cloud]:
     return [Cloud(points[points[:, 2] > 0], front), Cloud(points[points[:, 2] <= 0], back)]
 
 
-def off_sphere(points: np.ndarray, radius: float = RADIUS) -> np.ndarray:
-    return np.abs(np.linalg.norm(points, axis=1) - radius)
+def off_sphere(points: np.ndarray) -> np.ndarray:
+    return np.abs(np.linalg.norm(points, axis=1) - RADIUS)
 
 
 def test_given_depths_become_points_of_the_surface():

@@ -21,8 +21,8 @@ def new_folder(results: Path) -> Path:
     return folder
 
 
-def make_record(name: str = "completion-dist-sofa", **changed) -> Record:
-    return Record(name, task="completion", renderer="dist", dataset="sofa", seed=0, config={"seed": 0}, **changed)
+def make_record(**changed) -> Record:
+    return Record("completion-dist-sofa", "completion", "dist", "sofa", seed=0, config={"seed": 0}, **changed)
 
 
 def test_a_new_record_says_killed_until_the_run_ends(tmp_path):

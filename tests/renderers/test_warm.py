@@ -44,10 +44,10 @@ def differing(found: Rendering, field: Field, rays: Rays = RAYS) -> int:
     return int(((found.hit != cold.hit) | (found.hit & apart)).sum())
 
 
-def most_differing(renderer, fields, rays=RAYS) -> int:
+def most_differing(renderer, fields) -> int:
     """In how many rays the worst of renderings in turn differs from one that begins anew."""
-    renderings = in_turn(renderer, fields, rays)
-    return max(differing(found, field, rays) for (found, _), field in zip(renderings, fields, strict=True))
+    renderings = in_turn(renderer, fields, RAYS)
+    return max(differing(found, field, RAYS) for (found, _), field in zip(renderings, fields, strict=True))
 
 
 def begun() -> int:

@@ -79,7 +79,7 @@ def test_published_numbers_of_pmo_stand_beside_the_mesh_row(tmp_path):
         ("published: DIST, random start", "0.919"),
     ]
     assert list(result.data["row"]) == ["DIST", "Mesh, 48³"]  # the CSV has measured rows alone
-    assert "“Mesh, 48³” moves the vertices" in told(result) and "read it beside “published: PMO, random" in told(result)
+    assert "“Mesh, 48³” has its gradients" in told(result) and "read it beside “published: PMO, random" in told(result)
 
 
 def test_an_encoders_start_is_a_line_of_its_own(tmp_path):

@@ -18,11 +18,7 @@ FIXED = {"results_dir", "priors_dir", "isolation", "time_limit", "memory_limit",
 GROUPS = ("task", "renderer", "dataset", "prior", "scale")
 
 
-def keys() -> list[str]:
-    return [key for key in _dotted(composed()) if key.split(".")[0] not in FIXED and "_target_" not in key]
-
-
-KEYS = keys()
+KEYS = [key for key in _dotted(composed()) if key.split(".")[0] not in FIXED and "_target_" not in key]
 NUMBERS = st.integers(-3, 40) | st.sampled_from([0.0, 0.5, -1.5, 1e-9, 1e9, 10**30, math.inf, -math.inf, math.nan])
 WORDS = st.sampled_from(
     ["true", "false", "null", "abc", "dist", "sofa", "''", "[]", "[1,2]", "{a:1}", "[0,360]", "10%"]

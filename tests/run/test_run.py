@@ -227,12 +227,6 @@ def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, 
     assert ("Traceback" in (folder / "log.txt").read_text()) is isinstance(error, RuntimeError)
 
 
-def blank_record() -> Record:
-    record = Record("id", "task", "renderer", "dataset", 0, {})
-    record.environment = {"gemm_peak_flops": 1e10}
-    return record
-
-
 def test_each_line_of_the_curve_is_json_and_on_the_disk_as_it_comes(tmp_path):
     with curve_file(tmp_path) as write:
         for number, total in enumerate((1.0, float("inf"), float("nan")), 1):
@@ -262,8 +256,8 @@ def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(cloc
         return {"chamfer_l2": radii[-1]}
 
     stage = Mock(spec=RunInputs, device=torch.device("cpu"), evaluation=EvaluationSettings(every=every))
-    record = blank_record()
-    record.seconds["evaluation"] = 1.0
+    record = Record("id", "task", "renderer", "dataset", 0, {}, seconds={"evaluation": 1.0})
+    record.environment = {"gemm_peak_flops": 1e10}
     settings = OptimiserSettings(iterations, 0.05, "constant")
     history = solve.descend(toy, settings, RunContext(stage, tmp_path, record, lambda *_: None), see)
     curve = curve_of(tmp_path)

@@ -49,8 +49,7 @@ _LATEX = {
     "≤": r"$\leq$",
     "µ": r"$\mu$",
 }
-_MARKDOWN = {character: f"&#{ord(character)};" for character in "|*_`[]\\"}
-_SPARED = "_"  # within words, where it has no meaning in Markdown
+_MARKDOWN = str.maketrans({character: f"&#{ord(character)};" for character in "|*`[]\\"})
 
 
 @dataclass(frozen=True)
@@ -258,13 +257,12 @@ def _of_words(shown: Shown) -> list[bool]:
 
 
 def _tex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in _flat(text))
+    return _flat(text).translate(str.maketrans(_LATEX))
 
 
 def as_markdown(text: str) -> str:
     """A text on one line, in which nothing has a meaning in Markdown or HTML."""
-    escaped = html.escape(_flat(text), quote=False)
-    return "".join(c if c in _SPARED else _MARKDOWN.get(c, c) for c in escaped)
+    return html.escape(_flat(text), quote=False).translate(_MARKDOWN)
 
 
 def _flat(text: str) -> str:
