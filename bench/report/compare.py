@@ -32,6 +32,7 @@ RATIO = (
     "A ratio is the median over shapes of that of their geometric means; after it stand the shapes on which the row is "
     "better, ties half."
 )
+LEGEND = 3  # its columns
 HOLM = "By the sign test over shapes with Holm's correction"
 METRIC, LABEL = "chamfer_l2", "Chamfer × 1000 (scene units²)"
 CONDITION = "task.points"  # over which tables have columns
@@ -268,7 +269,8 @@ class Compared:
             "lines": self.lines,
         } | changed
         if "figure" not in parts:
-            parts["figure"] = chart.draw(panels, 3.2, sharey=True, legend=3)
+            taller = 0.35 * max(-(-len(self.runs.rows()) // LEGEND) - 3, 0)  # inches, for a legend of over three lines
+            parts["figure"] = chart.draw(panels, 3.2 + taller, sharey=True, legend=LEGEND)
         return Result(self.runs, title, question=question, chart={"panels": panels}, **parts)
 
     def best(self, least_of: str) -> str:

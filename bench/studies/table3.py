@@ -40,7 +40,7 @@ MOST_SHAPES = 4  # of each family, in pictures
 
 def make(runs: Runs) -> Result:
     """A line per family and method, with the start, the oracle and published numbers beside each family."""
-    label = "Chamfer, truth to prediction × 1000 (scene units²)"
+    label = "Chamfer to prediction × 1000 (scene units²)"
     found = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, label)
     starts = records.SCALE * runs.number(f"start_{records.ONE_WAY}")
     encoded = runs.setting(ENCODED) != ""
