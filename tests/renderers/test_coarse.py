@@ -192,6 +192,14 @@ def wide(monkeypatch) -> Decoder:
     return Decoder(layers=4, width=256, code_length=8, skip=2, narrow=True).requires_grad_(False)
 
 
+def test_instructions_that_take_more_time_do_not_pay(monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    for seconds in (0.5, 2.0):
+        taken = {torch.float32: 1.0, torch.bfloat16: seconds}
+        monkeypatch.setattr(mlp, "_product_seconds", taken.get)
+        assert mlp.multiplies_faster.__wrapped__(torch.device("cpu")) is (seconds < 1)
+
+
 def points(count: int = 3000) -> Tensor:
     return 2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(1)) - 1
 
