@@ -74,7 +74,7 @@ def _value(cell: str) -> Any:
 
 def _write(path: Path, records: list[Record]) -> Path:
     lines = [_cells(record) for record in sorted(records, key=lambda record: (started(record), record["id"]))]
-    columns = list(dict.fromkeys(name for line in lines for name in line))
+    columns = sorted({name for line in lines for name in line})  # so that a file that is written again is the same
     first = {name: lines[0].get(name, NONE) for name in columns}
     text = StringIO()
     table = csv.writer(text, lineterminator="\n")
