@@ -180,7 +180,7 @@ def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is
     said = command(*given, f"results_dir={tmp_path}").err
     assert "set prior.of=sofa" in said and "none with task=reconstruction" in said and "depth image" not in said
     encoded = command(*given, "+method=multiview_encoder", "prior.of=car", f"results_dir={tmp_path}")
-    assert "set task.encoder=null" in encoded.err
+    assert "take +method=multiview_dist" in encoded.err
     small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=40", "evaluation.grid=24")
     done = command(*given, *small, "prior.of=car", "isolation=off", f"results_dir={tmp_path}")
     record, folder = record_of(done.out), Path(done.out.splitlines()[-1])
