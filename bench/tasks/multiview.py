@@ -121,7 +121,7 @@ class Multiview(PhotographTask):
         if inputs.photographed is not None:
             _ = self._turning
             if self.encoder is not None:
-                raise BadInput("an encoder learns the cameras of made photographs, not of yours: take +method=multiview_dist")
+                raise BadInput("an encoder learns made photographs, not yours: take +method=multiview_dist")
 
     @property
     def _turning(self) -> "Multiview":
