@@ -117,9 +117,12 @@ def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32) -> float
 
 
 def seconds_at_peak(environment: dict[str, Any], flops: int, coarse_flops: int) -> float:
-    """The seconds that operations take at the machine's peak rates; `coarse_flops` are those in bfloat16."""
-    seconds = flops / environment["gemm_peak_flops"]
-    return seconds + coarse_flops / environment["bfloat16_peak_flops"] if coarse_flops else seconds
+    """The seconds that operations take at the machine's peak rates; `coarse_flops` are those in bfloat16.
+
+    A field of one's own may offer coarse values where bfloat16 pays nothing: they are then at float32's rate.
+    """
+    peak = environment["gemm_peak_flops"]
+    return flops / peak + coarse_flops / (environment.get("bfloat16_peak_flops") or peak)
 
 
 class Stopwatch:

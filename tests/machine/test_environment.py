@@ -149,3 +149,8 @@ def test_a_stopwatch_reads_the_clock_on_a_cpu_and_events_of_a_gpu(monkeypatch):
     assert stopwatch.seconds() == 2.0
     wait, event = "wait for cuda:0", "event in stream of cuda:0"
     assert device.asked == [wait, event, "work", event, wait, "read"]
+
+
+def test_coarse_operations_take_float32s_rate_where_bfloat16_has_none():
+    assert environment.seconds_at_peak({"gemm_peak_flops": 10.0, "bfloat16_peak_flops": 30.0}, 20, 30) == 3.0
+    assert environment.seconds_at_peak({"gemm_peak_flops": 10.0, "bfloat16_peak_flops": None}, 20, 30) == 5.0
