@@ -18,13 +18,16 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from math import isclose, isnan
+from math import isclose
 from pathlib import Path
 from typing import Any
 
-from bench.records.format import number, plural
+import pandas as pd
+
+from bench.records.format import MISSING, number, plural
 from bench.records.read import RESULTS, read_records
 from bench.records.record import read_record
+from bench.report.suite import standing
 from bench.report.suite.attempts import (
     BY_ITSELF,
     EXPERIMENT,
@@ -33,13 +36,13 @@ from bench.report.suite.attempts import (
     TUNED,
     Attempt,
     attempts_of,
+    gather,
     place,
     portable,
     read_attempts,
     suite,
     write_attempts,
 )
-from bench.report.suite.standing import Standing
 from bench.report.write import paper
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -50,6 +53,7 @@ PAGE = "suite"  # its name in the folder `paper`
 GOES_ON = (0, 1)  # exit statuses of a sweep that has ended, though runs may have failed
 LABEL = f"label='${{renderer._label_}}{BY_ITSELF}'"
 FIXED = rf"[+~]*(({'|'.join([*STATED, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"  # keys that are the suite's
+FEW_PROBLEMS = 6  # whose errors are printed one by one
 SETTINGS = ("stated", "tuned")  # that of the set for all renderers, or the renderer's own
 
 
@@ -158,34 +162,53 @@ def _sweep(keys: list[str]) -> int:
 
 
 def show(results_dir: Path) -> int:
-    """Keeps the attempts of a results folder, writes the suite's page, and prints a line a row."""
+    """Keeps the attempts of a results folder, writes the suite's pages, and prints a line per row."""
     with page_lock(results_dir):
         records, unread = read_records(results_dir)
         write_attempts(attempts_of(records, results_dir), results_dir)
         written = paper.write_paper(records, results_dir, only=PAGE)
         index = write_page(records, unread, results_dir, MOST_MESHES)
-    (shipped, unread_shipped), (kept, unread_kept) = read_attempts(paper.SHIPPED), read_attempts(results_dir)
-    standing = Standing([*shipped, *kept])
-    for problem in [*unread_shipped, *unread_kept]:
+    gathered = gather(paper.SHIPPED, results_dir)
+    for problem in gathered.problems:
         print(f"not read: {problem}", file=sys.stderr)
-    own = {(*one.key, one.started) for one in kept}
-    mine = [one.row for one in standing.attempts if (*one.key, one.started) in own]
-    told = f"of which {len(mine)} stand in this table, in rows with a star"
-    print(f"{plural(len(kept), 'run')} of {results_dir}, {told}, beside shipped ones.")
-    if any(map(standing.not_run, standing.rows)):
-        print("A row that lacks runs is not compared: its shares are of fewer problems. suite=quick makes them.")
-    print(f"{'renderer':<32} share of targets reached, against the first; in each set; field values")
-    for line in map(standing.line, standing.rows):
-        parts = [f"{name} {percent(line[name])}" for name in standing.sets if not isnan(line[name])]
-        parts += [f"{100 * line['gain'].value:+.0f} points by tuning"] if line["gain"] else []
-        parts += [f"{number(line['ratio'].value)} of DIST's field values"] if line["ratio"] else []
-        parts += [line["failed"]] if line["failed"] else []
-        parts += [f"wrong pixels {number(100 * line['wrong'])} %"] if line["wrong"] is not None else []
-        share = "" if line["gain"] else percent(line["share"].value)  # a tuned row lacks sets
-        row = line["row"] + (" *" if line["row"] in mine else "")
-        print(f"{row:<32} {share:>5}  {line['against']:<8}  {', '.join(parts)}")
-    print(*(path.with_suffix(".png") for path in written), index, sep="\n")
+    runs = standing.reached(standing.compared(standing.frame_of(gathered.everything), gathered.size))
+    mine = {attempt.row for attempt in gathered.local}
+    print(f"{plural(len(gathered.local), 'run')} of {results_dir}, in rows with a star; the others are shipped.")
+    _print_standing(runs, mine)
+    problems = runs[standing.KEY].drop_duplicates()
+    if len(problems) <= FEW_PROBLEMS:
+        _print_errors(runs, mine)
+    print(*(path.with_suffix(".png") for path in written if path.with_suffix(".png").is_file()), index, sep="\n")
     return 0
+
+
+def _print_standing(runs: pd.DataFrame, mine: set[str]) -> None:
+    """The progress and the ranks of each row, and what its runs cost."""
+    names = {standing.AT_1: "at the cost of DIST", standing.AT_10: "at 10 times", standing.END: "at the end"}
+    rankings = {name: standing.ranking(runs, name) for name in names}
+    hidden = {name: standing.sparse(runs, name) for name in names}
+    problems = plural(len(runs[standing.KEY].drop_duplicates()), "problem")
+    print(
+        f"Progress on {problems} {', '.join(names.values())}, with possible ranks; cost of a run, DIST = 1; failed runs"
+    )
+    for row in rankings[standing.AT_1].progress:
+        own, cells = runs[runs["row"] == row], []
+        for name, ranked in rankings.items():
+            value = MISSING if row in hidden[name] else percent(ranked.progress[row])
+            cells.append(f"{value:>5} {'(' + '-'.join(map(str, ranked.rank(row))) + ')':<7}")
+        cost, failed = number(float((own["cost"] / own["unit"]).median())), (~own["ok"]).sum()
+        print(f"{row + (' *' if row in mine else ''):<28} {' '.join(cells)} {cost:>7} {failed:>3}")
+    for row, missing in runs[~runs["whole"] & ~runs["tuned"]].groupby("row")["missing"].first().items():
+        print(f"{row} lacks {plural(missing, 'problem')}, so it is not compared; the same command makes them.")
+
+
+def _print_errors(runs: pd.DataFrame, mine: set[str]) -> None:
+    """The errors of one's own runs, where the problems are few."""
+    best = runs[runs["whole"]].groupby(standing.KEY)["final"].min()
+    for run in runs[runs["row"].isin(mine)].itertuples():
+        errors = f"{number(run.initial)} before, {number(run.final)} after"
+        least = f"{number(best[run.set, run.problem, run.seed])} by the best renderer, {number(run.reference)} possible"
+        print(f"{run.row}, {run.set}, {run.problem}: error {errors}; {least}")
 
 
 def verify(results_dir: Path, count: int) -> int:

@@ -1,176 +1,271 @@
-"""The suite: the share of problems and targets that each renderer reaches over its cost, and the standing."""
+"""The suite: how much progress each renderer makes over its cost, which differ, and what a run costs in each set."""
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
+
+import numpy as np
+import pandas as pd
 
 from bench.report.data.runs import together
 from bench.report.study import Result, Runs, Selection, chart, format, table
-from bench.report.suite.attempts import BY_ITSELF, EXPERIMENT, GIVEN, attempts_of, place, read_attempts, suite
-from bench.report.suite.standing import Standing
+from bench.report.suite import standing
+from bench.report.suite.attempts import EXPERIMENT, GIVEN, gather, place, suite
+from bench.report.suite.standing import AREA, AT_1, AT_10, BUDGETS, END, OUTCOMES, Ranking, ranking
 from bench.report.write import paper
+from bench.report.write.table import percent
 
 PLACE = 1
-DIFFERING = tuple(given for given, _ in GIVEN.values())
+DIFFERING = tuple(key for key, _ in GIVEN.values())
 KEEPS = place
 READS = tuple(Selection(f"{EXPERIMENT}{name}", DIFFERING) for name in suite().errors)
-NOTES = (
-    "A target is a share of what separates a problem's start from its reference error, in the logarithm: "
-    f"{', '.join(f'{target:g}' for target in suite().targets)} of it may be left. It is reached at the first "
-    "checkpoint from which the error stays there to the end of the run. Each set weighs the same.",
-    "A run ends after the iterations of its set, or at the set's budget of field values; thin lines begin where the "
-    "row's runs have ended. A run that did not end ok reaches nothing. A set has one setting and one loss for all.",
-    "Ratios: over the targets that both rows reach, the median over scenes of the geometric mean. Less, or not told: "
-    "than the first row, by flipped signs over scenes, at 5 % over all pairs of rows (Bonferroni).",
-    "Wrong pixels: of the prior's own networks, over the object's; missed, spurious, or .02 scene units off in depth. "
-    "They do not count in what is reached.",
+HEADINGS = {AT_1: "At 1 ×", AT_10: "At 10 ×", END: "At the end", AREA: "Mean, 0.3 × to 30 ×"}
+COST = "field evaluations, over those of DIST's whole run at the same problem"
+LEAST_COST, POINTS = 0.05, 80  # of a line of the chart
+TEST = "signs of scenes' differences flipped, Holm's correction over all pairs, 5 %"
+WIDEST_BOUNDS = 1.25  # bounds on ratios of errors that lie further off say little
+PROGRESS = (
+    "Progress: 1 - log(error / best possible) / log(initial error / best possible), from 0 to 100 %. Each set weighs "
+    "the same. A failed run has made none.",
+    "Costs are field evaluations over those of DIST's whole run at the same problem; a gradient counts as two. No run "
+    "had such a cost as its budget: progress within a longer run is interpolated between checkpoints.",
 )
+NOTES = (
+    *PROGRESS,
+    f"In brackets: the ranks that a renderer can have, simultaneous at 95 % ({TEST}).",
+    "Best possible error: of complete and multiview the prior's fit to the truth, of pose 0.1 degrees. Of reconstruct "
+    "it is the best result of these renderers themselves.",
+    "Wrong pixels: of renderings of the prior's networks, over the object's pixels: missed, spurious, or 0.02 scene "
+    "units off in depth. They are no part of progress.",
+)
+
+
+class Standing:
+    """What both pages are made of: the attempts, the compared ones, their progress, and the rankings by it."""
+
+    def __init__(self, runs: Runs) -> None:
+        self.gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
+        self.everything = standing.frame_of(self.gathered.everything)
+        self.compared = standing.compared(self.everything, self.gathered.size)
+        self.reached = standing.reached(self.compared)
+        self.rankings = {outcome: ranking(self.reached, outcome) for outcome in OUTCOMES}
+        self.whole = self.reached[self.reached["whole"]]
+        self.rows = [*self.rankings[AT_1].progress]
+        self.sets = [name for name in suite().errors if name in {*self.whole["set"]}]
+
+    def sample(self) -> str:
+        """The numbers of problems, scenes, seeds, renderers and failures, for captions."""
+        problems = format.plural(len(self.whole.groupby(["set", "problem"])), "problem")
+        scenes, seeds = (format.plural(self.whole[name].nunique(), name) for name in ("scene", "seed"))
+        failed, runs = (~self.whole["ok"]).sum(), format.plural(len(self.whole), "run")
+        renderers = format.plural(len(self.rows), "renderer")
+        return f"{problems} ({scenes}, {seeds}) of {suite().id}, {renderers}; {failed or 'none'} of {runs} failed"
+
+    def lines(self) -> list[dict[str, Any]]:
+        """What the table has of each row."""
+        wrong, lines = standing.wrong_pixels(self.compared), []
+        hidden = {name: standing.sparse(self.whole, name) for name in BUDGETS}
+        for row, ranked in ((row, self.rankings) for row in self.rows):
+            own = self.whole[self.whole["row"] == row]
+            line = {f"{name}_rank": "–".join(dict.fromkeys(map(str, of.rank(row)))) for name, of in ranked.items()}
+            line |= {name: of.progress[row] for name, of in ranked.items() if row not in hidden.get(name, ())}
+            failed = own[~own["ok"]].groupby(["set", "status"]).size()
+            counts = [f"{n} of {(own['set'] == of).sum()} {of} ({status})" for (of, status), n in failed.items()]
+            line |= {"row": row, "preset": own["preset"].iloc[0], "wrong": wrong.get(row)}
+            lines.append(line | {"cost": (own["cost"] / own["unit"]).median(), "failed": ", ".join(counts)})
+        return lines
+
+    def panel(self, of_set: str | None) -> chart.Panel:
+        """The progress of each row over its cost, in one set or in all."""
+        runs = self.whole if of_set is None else self.whole[self.whole["set"] == of_set]
+        lines = [line for row in self.rows if (line := _line(runs[(runs["row"] == row) & (runs["unit"] > 0)]))]
+        title = f"{of_set or 'Progress over cost, all sets'}, {format.plural(runs['scene'].nunique(), 'scene')}"
+        panel = chart.panel_data(title, COST, "progress", lines)
+        panel["x"]["log"], panel["y"]["log"] = True, False
+        return panel
+
+
+def _line(runs: pd.DataFrame) -> chart.Series | None:
+    """The mean progress of a row's runs, to the median of their costs; none of runs that cost nothing."""
+    end = float((runs["cost"] / runs["unit"]).median()) if len(runs) else 0.0
+    if not end:
+        return None
+    costs = np.geomspace(min(LEAST_COST, end), end, POINTS)
+    courses = pd.Series([np.interp(costs, *standing.course(run)) for run in runs.itertuples()], runs.index)
+    mean = np.mean([np.mean([*group], axis=0) for _, group in courses.groupby(runs["set"])], axis=0)
+    mean[-1] = runs.groupby("set")[END].mean().mean()
+    return chart.curve(runs["row"].iloc[0], runs["preset"].iloc[0], costs, mean, symbol="")
 
 
 def make(*several: Runs | None) -> Result:
     """The chart of all sets and of each, and a line per row."""
     runs = together(*several)
-    attempts, problems = read_attempts(paper.SHIPPED, runs.results_dir)
-    standing = Standing([*attempts, *attempts_of(runs.records, runs.results_dir)])
-    lines = [standing.line(row) for row in standing.rows]
-    panels = [_panel(standing, None), *(_panel(standing, name) for name in standing.sets)]
-    figure = chart.draw_lead(panels)
+    made = Standing(runs)
+    panels = [made.panel(name) for name in (None, *made.sets)]
+    ranks = {title: made.rankings[name] for title, name in (("at 1 ×", AT_1), ("at 10 ×", AT_10), ("at the end", END))}
     return Result(
         replace(runs, records=[], left_out=0),  # what is kept counts, with or without its run
         "The suite.",
-        "Share of problems and targets that a renderer has reached over its field values, divided by those of DIST's "
-        "whole run at the same problem.",
-        question="Which renderer gets how much done, and at what cost?",
-        verdict=_verdict(standing),
-        n=_sample(standing),
-        interval="95 % intervals by the bootstrap over scenes",
-        estimates=[line["share"] for line in lines],
-        remarks=[*NOTES, *_doubts(standing), *(f"Not read: {problem}" for problem in problems)],
-        columns=_columns(standing, lines),
-        lines=lines,
-        figure=figure,
+        "Progress of each renderer from the initial to the best possible error over its cost, and the ranks that it "
+        "can have. A cross: all runs failed.",
+        question="Which renderer makes the most progress, and at what cost?",
+        verdict=verdict(made),
+        n=made.sample(),
+        interval=f"ranks simultaneous at 95 % ({TEST})",
+        remarks=[*NOTES, *_notes(made), *(f"Not read: {problem}" for problem in made.gathered.problems)],
+        columns=_columns(),
+        lines=made.lines(),
+        figure=chart.draw_lead(
+            panels, {title: {row: of.rank(row) for row in made.rows} for title, of in ranks.items()}
+        ),
         chart={"panels": panels},
     )
 
 
-def _columns(standing: Standing, lines: list[dict[str, Any]]) -> list[table.Column]:
-    """The columns; without those that may be known of no row."""
+def make_sets(*several: Runs | None) -> Result:
+    """A line per set and row, with what a whole run costs over DIST's."""
+    runs = together(*several)
+    made = Standing(runs)
+    groups = made.whole.groupby(["set", "row"])
+    lines = groups[[*BUDGETS]].mean().join(groups["preset"].first()).join(standing.costs(made.whole, made.everything))
+    for of_set, name in ((of_set, name) for of_set in made.sets for name in BUDGETS):
+        sparse = standing.sparse(made.whole[made.whole["set"] == of_set], name)
+        lines.loc[[(of_set, row) for row in sparse], name] = np.nan
+    lines = lines.reindex([(of_set, row) for of_set in made.sets for row in made.rows]).reset_index()
+    lines = lines.astype(object).where(lines.notna(), None)
+    timed = lines[lines["seconds"].notna()]
+    others = {line.row: line.seconds.value for line in timed.itertuples() if line.row != standing.unit_row(made.whole)}
+    sets = ", ".join(timed["set"].unique())
+    return Result(
+        replace(runs, records=[], left_out=0),
+        "The suite, set by set.",
+        "Progress of each renderer in each set, and what a whole run costs over DIST's at the same problem.",
+        question="What does a run of each renderer cost?",
+        verdict=format.ends(
+            "Seconds of a run over DIST's", others, f"{timed['scenes'].min():.0f} scenes or more of {sets}"
+        ),
+        n=made.sample(),
+        interval="medians over scenes with intervals of the sign test, 95 %",
+        estimates=[*lines["evaluations"].dropna()],
+        remarks=[
+            *PROGRESS,
+            f"Seconds are of runs on a machine that was not loaded, which only {sets or 'no set'} has. The field "
+            f"evaluations beside them are of the same runs. Engines: {', '.join(sorted({*made.whole['kernels']}))}.",
+        ],
+        columns=[
+            *(table.text("set", "Set"), table.text("row", "Renderer")),
+            *(table.Column(name, HEADINGS[name], show=percent) for name in BUDGETS),
+            *_interval("evaluations", "Field evaluations of a run, DIST = 1"),
+            *_interval("seconds", "Seconds of a run, DIST = 1"),
+            *(table.Column("scenes", "Scenes", show=table.whole), table.PRESET),
+        ],
+        lines=lines.to_dict("records"),
+    )
 
-    def of_interval(name: str, heading: str, words: Callable[[Any], str] | None = None) -> table.Column:
-        said = words or (lambda line: format.MISSING if line[name] is None else str(line[name]))
-        return table.Column(name, heading, lambda line: line[name] and line[name].value, words=said)
 
-    scenes = {name: format.plural(standing.scenes(name), "scene") for name in standing.sets}
-    every = [
-        table.text("row", "Renderer"),
-        of_interval("share", "Reached", _share),
-        table.text("against", "Against the first"),
-        *(table.Column(name, f"{name}, {count}", show=table.percent) for name, count in scenes.items()),
-        of_interval("gain", "Gain by tuning", _points),
-        table.Column("at_dist", "At DIST's cost", show=table.percent),
-        of_interval("ratio", "Field values over DIST's"),
-        of_interval("seconds", "Seconds over DIST's"),
-        table.Column("wrong", "Wrong pixels", show=table.small_percent),
-        table.text("failed", "Failed"),
-        table.PRESET,
+def _interval(key: str, heading: str) -> tuple[table.Column, ...]:
+    value = table.Column(key, heading, lambda line: line[key] and line[key].value)
+    words = replace(value, words=lambda line: str(line[key] or format.MISSING))
+    return words, *table.ends(key, lambda line: line[key])
+
+
+def _columns() -> list[table.Column]:
+    def words(line: dict[str, Any], outcome: str) -> str:
+        return f"{percent(line.get(outcome))} ({line[f'{outcome}_rank']})"
+
+    progress = (table.Column(name, heading, words=partial(words, outcome=name)) for name, heading in HEADINGS.items())
+    return [
+        *(table.text("row", "Renderer"), *progress, *(table.text(f"{name}_rank") for name in OUTCOMES)),
+        *(table.Column("cost", "Cost of a run"), table.Column("wrong", "Wrong pixels", show=table.small_percent)),
+        *(table.text("failed", "Failed"), table.PRESET),
     ]
-    unknown = [name for name in ("gain", "seconds", "wrong") if all(line[name] is None for line in lines)]
-    return [column for column in every if column.key not in unknown]
 
 
-def _share(line: Any) -> str:
-    """What a row reaches with its interval; nothing of one at tuned settings, which has other sets than the others."""
-    share = line["share"]
-    return format.MISSING if line["gain"] else f"{table.percent(share.value)} {share.ends(100)}".strip()
-
-
-def _points(line: Any) -> str:
-    gain = line["gain"]
-    told = gain and f"{100 * gain.value:+.0f} {gain.ends(100)}, {format.plural(line['problems'], 'problem')}"
-    return told or format.MISSING
-
-
-def _better(standing: Standing, row: str, of_set: str | None) -> str:
-    """Of a renderer's rows, at the set's setting and tuned, that which reaches more of all problems."""
-    stated = row.removesuffix(BY_ITSELF)
-    runs = {name: len(standing.of(name, of_set)) for name in (stated, stated + BY_ITSELF)}
-    whole = [name for name, count in runs.items() if count == max(runs.values())]
-    return max(whole, key=lambda name: standing.share(name, of_set).value)
-
-
-def _panel(standing: Standing, of_set: str | None) -> chart.Panel:
-    found = {row: standing.profile(row, of_set) for row in standing.rows}
-    lines = [
-        chart.curve(row, standing.preset(row), costs, shares, step=True)
-        for row, (costs, shares) in found.items()
-        if costs
-        and costs[-1] > 0  # of a row whose runs ended before they cost anything there is no line
-        and row == _better(standing, row, of_set)
-    ]
-    name = f"{of_set or 'all sets'}, {format.plural(standing.scenes(of_set), 'scene')}"
-    panel = chart.panel_data(name, "field values over DIST's run", "share reached", lines)
-    panel["x"]["log"] = True  # also where something is reached at the start, for nothing
-    return panel
-
-
-def _sample(standing: Standing) -> str:
-    problems = {(one.set, one.problem) for one in standing.judged}
-    seeds = {one.seed for one in standing.judged}
-    parts = [format.plural(standing.scenes(), "scene"), format.plural(len(seeds), "seed")]
-    sample = f"{format.plural(len(problems), 'problem')} ({', '.join(parts)}) of {suite().id}"
-    failed = sum(standing.failures(row).total() for row in standing.rows)
-    rows, runs = format.plural(len(standing.rows), "row"), format.plural(len(standing.attempts), "run")
-    return f"{sample}, {rows}; {failed or 'none'} of {runs} did not end ok"
-
-
-def _verdict(standing: Standing) -> str:
-    if len(standing.ranked) < 2 or not standing.share(standing.ranked[0]).value:
+def verdict(made: Standing) -> str:
+    """The answer by rule: which renderers lead at the cost of one run of DIST, which differ at the end, what failed."""
+    if len(made.rows) < 2:
         return ""
-    first, *others = standing.ranked
-    scenes, less = format.plural(standing.scenes(), "scene"), len(standing.told)
-    said = [f"{first} reaches *{table.percent(standing.share(first).value)}*."]
-    if standing.resolution is None:
-        said.append(f"{scenes} are too few to tell any row from it.")
-    else:
-        said.append(f"{less or 'None'} of the {len(others)} others can be told to reach less.")
-        said.append(f"{scenes} tell differences of some {100 * standing.resolution:.0f} points.")
-    at = sorted(((standing.share_at_dist(row), row) for row in standing.ranked), reverse=True)[:3]
-    if standing.reference in standing.ranked:
-        listed = ", ".join(f"{row} *{table.percent(share)}*" for share, row in at)
-        said.append(f"At the cost of one run of DIST: {listed}.")
+    if not made.rankings[END].decidable:
+        scenes = format.plural(made.rankings[END].scenes, "scene")
+        return f"{scenes} cannot decide between {len(made.rows)} renderers, whatever their results. {failures(made)}"
+    said = [leaders(made.rankings[AT_1]), at_end(made), failures(made)]
     return " ".join([*said, "All on a CPU, with small networks and images."])
 
 
-def _doubts(standing: Standing) -> list[str]:
-    """Notes on what may not be trusted: several codes or settings, attempts that are not judged."""
-    alike = {one.key for one in standing.alike}
-    other = sorted({one.row for one in standing.everything if one.key not in alike})
-    tuned = [row for row in standing.rows if row.endswith(BY_ITSELF)]
-    drawn = [
-        f"{name} of {row.removesuffix(BY_ITSELF)}"
-        for row in tuned
-        for name in standing.sets
-        if standing.of(row, name) and row == _better(standing, row, name)
-    ]
-    alone = len(standing.alike) - len(standing.attempts)
-    versions = len({one.code for one in standing.attempts})
-    machines = len({one.machine for one in standing.attempts})
-    loaded = sum(not one.timed for one in standing.attempts)
-    fewer = [f"{row} ({count} not run)" for row in standing.rows if (count := standing.not_run(row))]
-    told = {
-        f"Of fewer problems than the others, so neither its number nor its line compares: {', '.join(fewer)}.": fewer,
-        f"Not shown, since their set has other settings: runs of {', '.join(other)}.": other,
-        f"Not shown: {format.plural(alone, 'run')} at problems that not all rows have.": alone,
-        "Tuned: at the renderer's own setting and loss of conf/tuned.yaml, chosen on validation shapes, where there is "
-        "one for a set. Gain: points over its row at the set's setting, at the same problems. A set's chart has the "
-        f"better of two rows that have all its problems, tuned: {', '.join(drawn) or 'none'}.": tuned,
+def leaders(ranked: Ranking) -> str:
+    """The rows that none is significantly better than, if they are better than all others; else the first row."""
+    beaten, at = {second for _, second in ranked.better}, "At the cost of one run of DIST"
+    first, others = ([row for row in ranked.progress if (row in beaten) == is_beaten] for is_beaten in (False, True))
+    names = [f"{row} (*{percent(ranked.progress[row])}*)" for row in first]
+    if others and all((row, other) in ranked.better for row in first for other in others):
+        more = f"significantly more progress than the {format.plural(len(others), 'other')}"
+        if len(first) == 1:
+            return f"{at}, {names[0]} makes {more}."
+        return f"{at}, {', '.join(names[:-1])} and {names[-1]} make {more}; these cannot be distinguished."
+    behind = ", ".join(row for row in ranked.progress if (first[0], row) in ranked.better)
+    than = f"significantly more than {behind}" if behind else "and cannot be distinguished from any other"
+    return f"{at}, {names[0]} makes the most progress, {than}."
+
+
+def at_end(made: Standing) -> str:
+    """How many pairs differ at the end of the runs; if none does, the bounds on their errors; and what runs cost."""
+    ranked, unit = made.rankings[END], standing.unit_row(made.whole)
+    times = (made.whole["cost"] / made.whole["unit"]).groupby(made.whole["row"]).median()
+    said = [f"At the end of their runs, {len(ranked.better) or 'none'} of {ranked.pairs} pairs can be distinguished"]
+    for name in made.sets if not ranked.better else ():
+        low, high = standing.bounds(made.whole, name) or (0.0, np.inf)
+        if max(1 / max(low, 1e-9), high) <= WIDEST_BOUNDS:
+            said.append(f"in {name} all errors lie within *{low:.2f}* to *{high:.2f}* of that of {unit}")
+    ends = [f"*{times[row]:.2g}* ({row})" for row in (times.idxmin(), times.idxmax())]
+    return f"{'; '.join(said)}. A run costs {ends[0]} to {ends[1]} runs of DIST."
+
+
+def failures(made: Standing) -> str:
+    """The rows that failed in most problems of a set by name, the other failures as a sum."""
+    groups = made.whole.groupby(["row", "set"])["ok"].agg(runs="size", failed=lambda ok: (~ok).sum())
+    most = groups[2 * groups["failed"] > groups["runs"]]
+    said = [f"{row} failed in {line.failed} of {line.runs} problems of {name}" for (row, name), line in most.iterrows()]
+    failed, runs = groups["failed"].sum() - most["failed"].sum(), len(made.whole) - most["failed"].sum()
+    return (
+        "; ".join(
+            [*said, f"{failed or ('none' if said else 'None')} of {'the other ' if said else ''}{runs} runs failed"]
+        )
+        + "."
+    )
+
+
+def _notes(made: Standing) -> list[str]:
+    """Notes that depend on the runs: rows without a number, the order without each set, tuned rows, machines."""
+    runs, notes, pairs = made.whole, [], {name: len(ranked.better) for name, ranked in made.rankings.items()}
+    if rows := standing.sparse(runs, AT_1):
+        later = ranking(runs.assign(**{AT_1: runs[AT_1].where(~runs["row"].isin(rows), runs[f"{AT_1}_next"])}), AT_1)
+        notes.append(
+            f"A dash: fewer than {standing.FEWEST_CHECKPOINTS} checkpoints lie within that cost in some set, so the "
+            "rank is of interpolated progress. With that of their next checkpoint, which costs more, "
+            f"{len(later.better)} pairs differ at 1 ×, not {pairs[AT_1]}."
+        )
+    counts = ", ".join(f"{HEADINGS[name].lower()} {count}" for name, count in pairs.items())
+    notes.append(f"Pairs that differ significantly, of {made.rankings[END].pairs}: {counts}.")
+    for of_set in made.sets if len(made.sets) > 1 else ():
+        rest = {name: ranking(runs[runs["set"] != of_set], name) for name in (AT_1, END)}
+        orders = [f"{HEADINGS[name].lower()} {'; '.join(of.progress)} ({len(of.better)})" for name, of in rest.items()]
+        notes.append(f"The order without {of_set} (pairs that differ): {'. '.join(orders)}.")
+    if gains := [
+        f"{row} {100 * gain.value:+.0f} {gain.ends(100)}" for row, gain in standing.gains(made.reached).items()
+    ]:
+        notes.append(
+            "Percentage points of progress at the end by the settings of conf/tuned.yaml, chosen on validation shapes: "
+            f"{'; '.join(gains)}. With a setting the loss of the mask may change too; the two are not separated."
+        )
+    lacking = made.compared[(made.compared["missing"] > 0) & ~made.compared["tuned"]].groupby("row")["missing"].first()
+    versions, machines, loaded = runs["code"].nunique(), runs["machine"].nunique(), (~runs["timed"]).sum()
+    possible = {
+        f"Not compared, since problems lack: {', '.join(f'{row} ({n})' for row, n in lacking.items())}.": len(lacking),
         f"Runs of {versions} versions of the code.": versions > 1,
-        f"Runs of {machines} machines: seconds are compared with DIST's on the same one alone.": machines > 1,
-        f"Seconds of {loaded} of {len(standing.attempts)} runs are left out: the machine was loaded.": loaded,
-        "Not judged, since there is no start that is worse than the reference: "
-        f"{'; '.join(standing.left_out)}.": standing.left_out,
+        f"Runs of {machines} machines: seconds are compared on the same one.": machines > 1,
+        f"Seconds of {loaded} of {len(runs)} runs are left out: the machine was loaded.": loaded,
     }
-    return [text for text, holds in told.items() if holds]
+    return [*notes, *(text for text, holds in possible.items() if holds)]
 
 
-PAGES = {"suite": make}
+PAGES = {"suite": make, "suite_sets": make_sets}

@@ -12,7 +12,6 @@ from bench.records import format
 from bench.records.read import read_records
 from bench.report.__main__ import main
 from bench.report.suite.attempts import attempts_of, write_attempts
-from bench.report.suite.standing import Standing
 from bench.report.write import paper
 from bench.report.write.html import write_index
 from tests.browser import made
@@ -98,12 +97,12 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     write_tables(tmp_path)
     for number in range(2):
         made.write(tmp_path, number)
-    standing = Standing([*SOLVED, *(replace(one, row="Other", status="nan", reason="lost") for one in SOLVED)])
-    write_attempts(standing.attempts, tmp_path)
+    lost = [replace(one, row="Other", status="nan", reason="lost") for one in SOLVED]
+    write_attempts([*SOLVED, *lost], tmp_path)
     assert main([f"results_dir={tmp_path}"]) == 0
     page = tab(tmp_path).open()
-    assert page.locator("h1").inner_text() == "Which renderer gets how much done, and at what cost?"
-    assert "Dist reaches 100 %" in page.locator(".answer").inner_text()
+    assert page.locator("h1").inner_text() == "Which renderer makes the most progress, and at what cost?"
+    assert "2 scenes cannot decide between 2 renderers" in page.locator(".answer").inner_text()
     page.locator(".scatterlayer .trace").first.wait_for()
     assert page.locator(".panel").count() == 1
     page.get_by_role("group", name="Set of problems").get_by_role("button", name="complete").click()
@@ -120,10 +119,10 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     page.get_by_text("It fails in 2 of 2 runs.").wait_for()
     text = page.locator("main").inner_text()
     assert "complete: car test 0, 20 points, seed 0: lost." in text and "python -m bench.suite" in text
-    assert page.locator("table.list tbody tr").count() == 2 and "2 nan" in text
+    assert page.locator("table.list tbody tr").count() == 2 and "2 of 2 complete (nan)" in text
     page.get_by_role("link", name="Suite").first.click()
     page.get_by_role("link", name="Dist", exact=True).click()
-    page.get_by_text("It reaches every target in 2 runs.").wait_for()
+    page.get_by_text("No renderer makes more progress in any of 2 runs.").wait_for()
 
 
 def test_a_renderer_of_a_run_has_the_picture_of_its_first_failure(tmp_path, tab):

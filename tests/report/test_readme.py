@@ -40,8 +40,9 @@ def test_the_results_page_follows_its_tables(tmp_path):
     assert re.search(r"<details><summary>Notes</summary>\n\n- A note\n\n</details>", text)
 
 
-def test_the_table_of_the_readme_is_that_of_the_committed_results():
-    assert readme.table() in (ROOT / "README.md").read_text()
+def test_the_recommendation_and_the_table_of_the_readme_are_those_of_the_committed_results():
+    text = (ROOT / "README.md").read_text()
+    assert readme.table() in text and readme.recommendation() in text
 
 
 def test_the_readme_is_short():
@@ -51,7 +52,7 @@ def test_the_readme_is_short():
 def test_each_number_of_an_answer_is_in_the_table_that_it_names():
     readme = (ROOT / "README.md").read_text()
     answers = re.findall(r"^\| .+\? \| \[[^]]*\]\(results/README.md#(\w+)\)(.*) \|$", readme, re.MULTILINE)
-    assert len(answers) == len(re.findall(r"^\| .+\? \|", readme, re.MULTILINE)) >= 5  # each begins with its table
+    assert len(answers) == len(re.findall(r"^\| .+\? \|", readme, re.MULTILINE)) >= 3  # each begins with its table
     for name, text in answers:
         shown = read_shown(PAPER / f"{name}.json")
         known = [float(x) for x in re.findall(r"\d+\.\d+", shown.verdict + str(shown.rows))]

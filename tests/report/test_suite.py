@@ -1,21 +1,41 @@
 """The suite: what an attempt has reached and when, how rows stand, and that results outlive their run folders."""
 
-import csv
 from dataclasses import replace
-from itertools import permutations
+from itertools import combinations, permutations
 from math import inf
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
 from bench import merge
 from bench.records.read import read_records
-from bench.report.suite import attempts
+from bench.report.data.runs import Runs
+from bench.report.suite import attempts, standing
 from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
-from bench.report.suite.standing import SECONDS, Standing
-from bench.studies.suite import _doubts, _panel
+from bench.report.suite.standing import (
+    AREA,
+    AT_1,
+    AT_10,
+    END,
+    Ranking,
+    bounds,
+    by_scene,
+    chances,
+    compared,
+    costs,
+    frame_of,
+    gains,
+    holm,
+    ranking,
+    reached,
+    signs,
+    sparse,
+    wrong_pixels,
+)
+from bench.studies import suite as study
 from bench.suite import _sweeps, main, parsed, show
 from bench.tables import choice, read_yaml
 from tests.composing import composed
@@ -40,15 +60,22 @@ def attempt(row: str, scene: str, errors: dict[float, float], **changed) -> Atte
     return Attempt(**(known | changed))
 
 
-def field(of: list[tuple[str, float, float]]) -> Standing:
-    """Rows with their final error and what they pay for each step, on all scenes."""
-    return Standing(
-        [
-            attempt(row, scene, {0: 1.0, pay: max(final, 0.1), 2 * pay: final})
-            for row, final, pay in of
-            for scene in SCENES
-        ]
-    )
+def made(of: list[tuple[str, float, float]], scenes=SCENES) -> list[Attempt]:
+    """Attempts of rows with their final error and what they pay for each of two steps, on all scenes."""
+    return [
+        attempt(row, scene, {0: 1.0, pay: max(final, 0.1), 2 * pay: final})
+        for row, final, pay in of
+        for scene in scenes
+    ]
+
+
+def judged(attempts: list[Attempt]) -> pd.DataFrame:
+    """The compared attempts with their progress."""
+    return reached(compared(frame_of(attempts)))
+
+
+def progress(attempts: list[Attempt], outcome: str = END) -> dict[str, float]:
+    return ranking(judged(attempts), outcome).progress
 
 
 def write_completion(results: Path, errors: list[float], **changed) -> Path:
@@ -88,92 +115,126 @@ def test_a_rendering_has_its_cost_and_its_pixel_errors(tmp_path):
     (found,) = attempts_of(read_records(tmp_path)[0], tmp_path)
     assert (found.problem, found.start, found.curve) == ("car train 0, 64 pixels", 900, [[512, 0.25, 3]])
     failed = replace(found, problem="another", status="timeout", final=inf)
-    assert Standing([found]).wrong("Mine") == 3 / 900 and Standing([found]).judged == []
-    assert Standing([found, failed]).wrong("Mine") == pytest.approx((3 / 900 + 1) / 2)
+    assert wrong_pixels(compared(frame_of([found]))).to_dict() == {"Mine": 3 / 900} and judged([found]).empty
+    assert wrong_pixels(compared(frame_of([found, failed])))["Mine"] == pytest.approx((3 / 900 + 1) / 2)
 
 
-def test_rows_are_compared_where_all_that_have_the_least_size_have_an_attempt(monkeypatch):
-    least = [("complete", f"{scene}, 20 points", 0) for scene in SCENES[:6]]
-    monkeypatch.setattr("bench.report.suite.standing.least_problems", lambda: {*least})
-    whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)]).everything
-    mine = [one for one in whole if one.row not in ("Mine", "Part") or one.key[:3] in least]
-    standing = Standing([one for one in mine if one.row != "Part" or one.scene == SCENES[0]])
-    assert standing.compared == {*least} and {*standing.ranked} == {"B", "Dist", "Mine"}
-    assert standing.lacking("Part") == 5 and standing.rows[-1] == "Part"
-    assert len(Standing([one for one in standing.everything if one.row in ("B", "Dist")]).compared) == len(SCENES)
+def test_rows_are_compared_at_the_problems_that_all_whole_rows_have(monkeypatch):
+    least = {("complete", f"{scene}, 20 points", 0) for scene in SCENES[:6]}
+    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda _: least)
+    whole = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)])
+    some = [one for one in whole if one.row != "Mine" or one.key[:3] in least]
+    runs = judged([one for one in some if one.row != "Part" or one.scene == SCENES[0]])
+    assert {*runs["scene"]} == {*SCENES[:6]} and {*runs.loc[runs["whole"], "row"]} == {"B", "Dist", "Mine"}
+    assert {*runs.loc[runs["row"] == "Part", "missing"]} == {5} and "Part" not in ranking(runs, END).progress
+    assert {*judged(made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]))["scene"]} == {*SCENES}
 
 
-def test_each_set_weighs_the_same_and_a_run_under_other_settings_is_not_judged():
+def test_each_set_weighs_the_same_and_a_run_under_other_settings_is_not_compared():
     many = [attempt("Dist", scene, {0: 1.0, 10: 0.01}) for scene in SCENES]
-    few = [replace(attempt("Dist", "s", {0: 90.0, 10: 90.0}), set="pose", problem="s, 20 degrees")]
-    assert Standing(many + few).share("Dist").value == 0.5
-    assert Standing(many + few).profile("Dist") == ([1, 1, 1], [0, 0.5, 0.5])
+    lost = attempt("Dist", "s", {0: 90.0, 10: 90.0}, status="diverged", final=inf, set="pose", problem="s, 20 degrees")
+    assert progress([*many, lost]) == {"Dist": 0.5}
     other = replace(many[0], row="Other", settings="x")
-    assert Standing([*many, other]).rows == ["Dist"]
+    assert {*judged([*many, other])["row"]} == {"Dist"}
+    newer = replace(many[0], settings="x", started="2027-01-01T00:00:00+00:00", status="oom", final=inf)
+    assert progress([*many, newer]) == {"Dist": 1.0}
+
+
+def test_progress_is_that_of_the_logarithm_between_the_initial_error_and_the_reference():
+    """Of errors 100, 10, 1: none, half and all; a cost between checkpoints is interpolated, and the end is kept."""
+    runs = judged([attempt("Dist", "s", {0: 100, 2: 10, 4: 1}), attempt("B", "s", {0: 100, 8: 10, 80: 5})])
+    dist, b = (runs[runs["row"] == row].iloc[0] for row in ("Dist", "B"))
+    assert (dist[AT_1], dist[AT_10], dist[END]) == (1, 1, 1)  # at its own cost a run has its own progress
+    assert b[AT_1] == pytest.approx(0.25) and b[AT_10] == pytest.approx(0.5 + 32 / 72 * (b[END] - 0.5))
+    assert b[END] == pytest.approx(1 - np.log10(5) / 2)
+    fine = np.geomspace(0.3, 30, 200_001)
+    assert b[AREA] == pytest.approx(np.interp(fine, [0, 2, 20], [0, 0.5, b[END]]).mean(), abs=2e-3)
+    assert (b["at_1_checkpoints"], b["at_10_checkpoints"], b["at_1_next"]) == (1, 2, 0.5)
+    above = judged([attempt("Dist", "s", {0: 100, 2: 200, 4: 1}), attempt("B", "s", {0: 100, 1: 50, 4: 300})])
+    assert above[END].tolist() == [1, 0] and above["at_1_next"].tolist() == [1, 0]
+
+
+def test_a_failed_run_has_made_no_progress_and_moves_no_initial_error():
+    whole = made([("Dist", 0.01, 100.0), ("B", 0.02, 100.0)])
+    lost = [replace(one, row="Lost", start=50.0, final=inf, status="crashed", curve=[]) for one in whole[: len(SCENES)]]
+    runs = judged([*whole, *lost])
+    assert progress([*whole, *lost])["Lost"] == 0 and {*runs["initial"]} == {1.0}
+    assert {*runs.loc[runs["row"] == "Lost", AREA]} == {0.0}
+    unknown = replace(whole[0], start=inf, final=inf, status="crashed", curve=[[0.0, 0.0, inf]])
+    assert judged([unknown]).empty
+
+
+def test_the_stated_references_are_used_where_there_are_any():
+    scene, error = next(iter(suite().references["complete"].items()))
+    assert judged([attempt("A", scene, {0: 1.0, 1: 0.9})])["reference"].tolist() == [error]
+    assert judged([attempt("A", "s", {0: 1.0, 1: 0.9})])["reference"].tolist() == [0.9]
+    assert all(0 < error < 0.1 for error in suite().references["complete"].values())
+
+
+def test_few_checkpoints_within_a_cost_measure_no_progress_there():
+    steps = {cost: 0.5 ** (cost / 10) for cost in range(0, 100, 10)}
+    dear = {10 * cost: error for cost, error in steps.items()}
+    failed = [attempt("Lost", scene, {0: 1.0}, status="nan", final=inf) for scene in SCENES]
+    whole = [attempt(row, scene, of) for row, of in (("Dist", steps), ("B", dear)) for scene in SCENES]
+    runs = judged([*whole, *failed])
+    assert sparse(runs, AT_1) == {"B"} and sparse(runs, AT_10) == set() and sparse(runs, END) == set()
 
 
 def test_the_chance_of_a_difference_is_that_of_flipped_signs_over_scenes():
-    standing = field([("Dist", 0.01, 100.0), ("Lost", 0.5, 1.0)])
-    assert standing._chance("Dist", "Lost") == 2 / 2 ** len(SCENES)  # all scenes one way, or all the other way
-    assert standing._chance("Dist", "Dist") == 1 and standing.told == {"Lost"}
-    many = field([("Dist", 0.01, 100.0), *((f"L{n}", 0.5, 1.0) for n in range(7))])
-    assert many.told == set() and many.resolution is None  # 28 pairs at .0078
-    more = [attempt(row, f"{n}", {0: 1.0, 9: final}) for row, final in (("A", 0.01), ("B", 0.5)) for n in range(40)]
-    assert Standing(more)._chance("A", "B") == 1 / 2**16  # of random signs what was found is one
+    assert chances(np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])).tolist() == [0.25, 1.0, 1.0]
+    assert signs(3).shape == (8, 3) and signs(40).shape == (2**16, 40) and (signs(40)[0] == 1).all()
+    assert chances(np.ones((40, 1))) == 1 / 2**16  # of random signs the first are those of the data
+    assert holm(np.array([0.04, 0.01, 0.02])).tolist() == [True, True, True]
+    assert holm(np.array([0.04, 0.02, 0.02])).tolist() == [False, False, False]  # 0.05 / 3 is less than 0.02
 
 
-def test_the_resolution_is_what_is_told_in_four_cases_of_five(monkeypatch):
-    standing = Standing([attempt(row, f"{n}", {0: 1.0, 9: 0.1}) for row in "AB" for n in range(12)])
-    drawn = np.random.default_rng(0).normal(size=(400, 12))
-    monkeypatch.setattr(Standing, "_apart", lambda *_: drawn[0] / drawn[0].std(ddof=1))
-    shift, told = standing.resolution / 12, 0
-    for noise in drawn:
-        monkeypatch.setattr(Standing, "_apart", lambda *_, noise=noise: noise + shift)
-        told += standing._chance("A", "B") <= 0.05
-    assert 0.75 < told / len(drawn) < 0.85
+def test_rows_differ_by_the_correction_over_all_pairs_not_over_the_others_of_a_row():
+    """Of 11 rows one is worse everywhere: p is 2 / 2**10 with 10 scenes, between 5 % of 10 rows and of 55 pairs."""
+    rows = [("Dist", 0.01, 100.0), *((f"B{n}", 0.01, 100.0) for n in range(9)), ("Lost", 0.5, 100.0)]
+    ten, twelve = (ranking(judged(made(rows, [f"{n}" for n in range(scenes)])), END) for scenes in (10, 12))
+    assert 0.05 / 55 < 2 / 2**10 < 0.05 / 10 and ten.better == set() and not ten.decidable
+    assert twelve.better == {(row, "Lost") for row, *_ in rows[:-1]} and twelve.decidable
+    assert twelve.rank("Lost") == (11, 11) and twelve.rank("Dist") == (1, 10)
 
 
-def test_a_run_under_other_settings_takes_no_place_and_a_tuned_one_is_named(tmp_path):
-    runs = [attempt("A", scene, {0: 1.0, 9: 0.01}) for scene in SCENES]
-    other = replace(runs[0], settings="x", started="2027-01-01T00:00:00+00:00", status="oom", final=inf, curve=[])
-    assert Standing([*runs, other]).share("A").value == 1
-    write_attempts([*runs, other], tmp_path)
-    assert len(read_attempts(tmp_path)[0]) == len(runs) + 1
-    write_completion(tmp_path, [0.8, 0.2], method="tuned/dist_mask", settings={"label": "Mine"}, renderer="dist")
-    assert [one.row for one in attempts_of(read_records(tmp_path)[0], tmp_path)] == ["Mine, tuned"]
+def test_equal_rows_differ_in_at_most_one_of_twenty_draws():
+    """The level of the shipped design: rows are centred in each set, and scenes are drawn among those with its sets."""
+    runs = judged(read_attempts(SHIPPED)[0])
+    runs = runs[runs["whole"]]
+    for outcome in (AREA, AT_1):
+        rows = runs.groupby(["set", "row"])[outcome].transform("mean")
+        scores = by_scene(runs.assign(**{outcome: runs[outcome] - rows}), outcome)
+        sets = runs.groupby("scene")["set"].agg(lambda of: tuple(sorted({*of}))).reindex(scores.index)
+        kinds = [scores.to_numpy()[sets == kind] for kind in {*sets}]
+        rng, false, pairs = np.random.default_rng(1), 0, [*combinations(range(scores.shape[1]), 2)]
+        for _ in range(500):
+            drawn = np.concatenate([kind[rng.integers(len(kind), size=len(kind))] for kind in kinds])
+            flips = rng.choice((1.0, -1.0), (2047, len(drawn)))
+            differences = np.stack([drawn[:, a] - drawn[:, b] for a, b in pairs], axis=1)
+            sums = np.abs(differences.sum(axis=0))
+            rarer = (np.abs(flips @ differences) >= sums - 1e-12).sum(axis=0)
+            false += holm((1 + rarer) / 2048).any()
+        assert false / 500 <= 0.055, outcome
 
 
-def test_an_error_is_reached_where_it_stays_reached():
-    one = attempt("A", "s", {0: 8, 10: 1, 20: 4, 30: 2, 40: 1})
-    assert one.reached(5) == (10, 0.01)
-    assert one.reached(3) == (30, 0.03)  # it was below at 10, and above again at 20
-    assert one.reached(0.5) is None
-    assert replace(one, status="nan").reached(5) is None
-
-
-def test_targets_are_shares_of_the_logarithm_between_start_and_reference():
-    standing = Standing([attempt("Dist", "s", {0: 100, 7: 10, 9: 1}), attempt("B", "s", {0: 100, 3: 10.5})])
-    assert standing.references == {("complete", "s, 20 points"): 1}
-    assert standing.reached["complete", "s, 20 points", 0, "Dist", ""] == [(7, 0.007), *[(9, 0.009)] * 4]
-    assert standing.reached["complete", "s, 20 points", 0, "B", ""] == [(inf, inf)] * 5  # 10.5 is above the root of 100
-
-
-def test_the_shipped_references_are_used_where_there_are_any():
-    known = suite().references["complete"]
-    scene, error = next(iter(known.items()))
-    assert Standing([attempt("A", scene, {0: 1.0, 1: 0.9})]).references == {("complete", f"{scene}, 20 points"): error}
-    assert all(0 < error < 0.1 for error in known.values())
-
-
-def test_rows_stand_by_what_they_reach_and_are_told_from_the_first():
-    standing = field([("Dist", 0.011, 100.0), ("Exact", 0.01, 300.0), ("Same", 0.011, 100.0), ("Lost", 0.5, 1.0)])
-    assert standing.rows == ["Exact", "Dist", "Same", "Lost"]
-    assert [standing.share(row).value for row in standing.rows] == [1.0, 0.8, 0.8, 0.0]
-    assert [standing.against(row) for row in standing.rows] == ["first", *["less"] * 3]
-    assert standing.ratio("Exact").value == pytest.approx(3) and standing.ratio("Dist") is None
-    assert standing.ratio("Lost") is None  # no target that both reach
-    assert {*standing.units.values()} == {200}  # of a whole run of Dist
-    assert standing.profile("Exact") == ([1.5, 1.5, 3, 3], [0, 0.2, 1, 1])
+def test_bounds_hold_the_ratios_that_flipped_signs_do_not_reject():
+    scenes = [f"{n}" for n in range(10)]
+    noise = np.random.default_rng(0).normal(0, 0.05, 10)
+    b = [attempt("B", scene, {0: 1.0, 9: 0.2 * np.exp(shift)}) for scene, shift in zip(scenes, noise, strict=True)]
+    dist = [attempt("Dist", scene, {0: 1.0, 9: 0.1}) for scene in scenes]
+    low, high = bounds(judged([*dist, *b]), "complete")
+    assert low < 2 * np.exp(noise.mean()) < high
+    for end, inside in ((low, 1.001), (high, 0.999)):
+        values = np.log(2) + noise
+        assert (
+            chances((values - np.log(end * inside))[:, None])
+            > 0.05
+            >= chances((values - np.log(end / inside))[:, None])
+        )
+    assert bounds(judged([*dist[:5], *b[:5]]), "complete") is None  # 2 / 2**5 is more than 5 %
+    failed = [replace(one, row="Lost", status="nan", final=inf) for one in b]
+    assert bounds(judged([*dist, *b, *failed]), "complete") == (low, high)
+    assert bounds(judged(dist), "complete") is None
 
 
 def test_a_number_that_is_none_is_not_reached_and_a_changed_renderer_has_another_name(tmp_path):
@@ -187,51 +248,86 @@ def test_a_number_that_is_none_is_not_reached_and_a_changed_renderer_has_another
     assert problems == [] and found.row == "Mine, steps=9" and [error for *_, error in found.curve] == [0.8, inf, 0.2]
 
 
-def test_a_row_that_cost_nothing_has_no_line_and_leaves_the_axis_logarithmic():
-    standing = field([("Dist", 0.01, 100.0)])
-    late = [attempt("Late", scene, {0: 1.0}, status="timeout") for scene in SCENES]
-    panel = _panel(Standing([*standing.everything, *late]), None)
+def page(attempts: list[Attempt], folder: Path, monkeypatch) -> study.Standing:
+    """What the pages are made of, if these attempts are shipped and there are no others."""
+    write_attempts(attempts, folder / "shipped")
+    monkeypatch.setattr("bench.report.write.paper.SHIPPED", folder / "shipped")
+    return study.Standing(Runs(study.READS[0], folder / "none", []))
+
+
+def test_a_row_that_cost_nothing_has_no_line_and_leaves_the_axis_logarithmic(tmp_path, monkeypatch):
+    late = [attempt("Late", scene, {0: 1.0}, status="timeout", final=inf) for scene in SCENES]
+    panel = page([*made([("Dist", 0.01, 100.0)]), *late], tmp_path, monkeypatch).panel(None)
     assert [line["name"] for line in panel["series"]] == ["Dist"] and panel["x"]["log"]
+    assert (panel["series"][0]["x"][-1], panel["series"][0]["y"][-1]) == (1, 1)
 
 
-def test_a_row_without_a_problem_is_not_compared_and_a_failure_reaches_nothing():
-    whole = field([("Dist", 0.01, 100.0), ("Part", 0.01, 100.0)]).attempts
-    standing = Standing([replace(one, status="unsupported") if one.row == "Dist" else one for one in whole[:-1]])
-    assert standing.ranked == ["Dist"] and standing.lacking("Part") == 1 and standing.against("Part") == ""
-    assert standing.share("Dist").value == 0 and standing.failures("Dist") == {"unsupported": len(SCENES)}
-
-
-def test_problems_that_the_reference_row_lacks_are_not_judged():
-    whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]).attempts
+def test_problems_that_the_reference_row_lacks_are_not_compared():
+    whole = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
     of_b = next(one for one in whole if one.row == "B")
-    standing = Standing([*whole, replace(of_b, problem="another", scene="another")])
-    assert {*standing.ranked} == {"Dist", "B"} and len(standing.attempts) == len(whole)
+    assert len(judged([*whole, replace(of_b, problem="another", scene="another")])) == len(whole)
     tweaked = [replace(one, row="A tweak") for one in whole if one.row == "Dist"]
     named = [replace(one, row=DIST) if one.row == "Dist" else one for one in whole]
-    assert Standing([*tweaked, *named]).reference == DIST
+    assert standing.unit_row(frame_of([*tweaked, *named])) == DIST
 
 
-def test_a_start_that_was_not_measured_is_that_of_the_other_rows():
-    whole = field([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]).attempts
-    lost = [replace(one, start=inf, final=inf, status="crashed") if one.row == "B" else one for one in whole]
-    standing = Standing(lost)
-    assert standing.share("B").value == 0 and len(standing.of("B")) == len(SCENES)
-    without = replace(whole[0], start=inf, final=inf, curve=[[0.0, 0.0, inf], [5.0, 1.0, inf]])
-    assert Standing([without]).judged == [] and without.reached(inf) is None
+def test_seconds_are_compared_on_one_machine_and_field_evaluations_of_the_same_runs():
+    whole = made([("Dist", 0.01, 100.0), ("Mine", 0.01, 200.0)])
+
+    def cost(of: list[Attempt]) -> tuple[float, float | None, int]:
+        line = costs(judged(of), frame_of(of)).loc["complete", "Mine"]
+        return line["evaluations"].value, line["seconds"] and line["seconds"].value, line["scenes"]
+
+    unknown = pytest.approx(2), None, 8
+    mine = [replace(one, seconds=3.0) if one.row == "Mine" else one for one in whole]
+    assert cost(mine) == pytest.approx((2, 3, 8))
+    moved = [replace(one, cpu="another") if one.row == "Mine" else one for one in mine]
+    assert cost(moved) == unknown
+    elsewhere = [
+        replace(one, cpu="another", seconds=6.0, cost=400.0, started="2025") for one in whole if one.row == "Dist"
+    ]
+    assert cost([*moved, *elsewhere]) == pytest.approx((1, 0.5, 8))  # both are of the runs on that machine
+    assert cost([*moved, *(replace(one, waited=0.2) for one in elsewhere)]) == unknown
+    assert cost([*moved, *elsewhere[:5]]) == unknown  # of too few scenes
+    settings = [replace(one, settings="x") for one in elsewhere[:6]]
+    assert cost([*moved, *settings]) == unknown
+    compiled = [replace(one, kernels="native", seconds=1.0, started="2027") for one in whole if one.row == "Dist"]
+    assert cost([*mine, *compiled]) == unknown  # DIST's newest runs have another engine
 
 
-def test_seconds_are_compared_on_the_same_machine_alone():
-    whole = field([("Dist", 0.01, 100.0), ("Mine", 0.01, 200.0)]).attempts
-    assert Standing(whole).ratio("Mine", SECONDS).value == pytest.approx(2)
-    moved = [replace(one, cpu="another") if one.row == "Mine" else one for one in whole]
-    assert Standing(moved).ratio("Mine", SECONDS) is None and Standing(moved).ratio("Mine").value == pytest.approx(2)
-    slow = [[cost, 4 * seconds, error] for cost, seconds, error in whole[0].curve]
-    there = [replace(one, cpu="another", curve=slow) for one in whole if one.row == "Dist"]
-    loaded = [replace(one, waited=0.2) for one in there]
-    assert Standing([*moved, *loaded]).ratio("Mine", SECONDS) is None
-    assert Standing([*moved, *there]).ratio("Mine", SECONDS).value == pytest.approx(0.5)
-    others = [replace(one, settings="x", started="2027", curve=[[0, 0, 1.0], [1, 1e-9, 0.01]]) for one in there[1:]]
-    assert Standing([*moved, *there, *others]).ratio("Mine", SECONDS).value == pytest.approx(0.5)
+@each(
+    "better, said",
+    [
+        (
+            "AC AD BC BD",
+            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others; these cannot be",
+        ),
+        ("AB AC AD", "A (*90 %*) makes significantly more progress than the 3 others."),
+        ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than C, D."),
+        ("", "A (*90 %*) makes the most progress, and cannot be distinguished from any other."),
+    ],
+)
+def test_the_answer_names_who_leads_by_a_rule(better, said):
+    pairs = {tuple(pair) for pair in better.split()}
+    ranked = Ranking(dict(zip("ABCD", (0.9, 0.8, 0.7, 0.6), strict=True)), pairs, 6, 16)
+    assert study.leaders(ranked).removeprefix("At the cost of one run of DIST, ").startswith(said)
+
+
+def test_the_answer_says_what_differs_at_the_end_what_failed_and_what_scenes_cannot_decide(tmp_path, monkeypatch):
+    rows = [("Dist", 0.0101, 100.0), ("B", 0.01, 300.0)]
+    lost = [attempt("Lost", scene, {0: 1.0, 50: 1.0}, status="diverged", final=inf) for scene in SCENES]
+    answer = study.verdict(page([*made(rows), *lost], tmp_path / "three", monkeypatch))
+    assert "At the end of their runs, 3 of 3 pairs can be distinguished" in answer and "lie within" not in answer
+    assert "Lost failed in 8 of 8 problems of complete; none of the other 16 runs failed." in answer
+    mixed = [
+        replace(one, curve=[*one.curve[:2], [2e2, 0.2, 0.0099]], final=0.0099, started="2027")
+        for one in made(rows[:1])[:3]
+    ]
+    answer = study.verdict(page([*made(rows), *mixed], tmp_path / "two", monkeypatch))
+    assert "none of 1 pairs can be distinguished; in complete all errors lie within *0.99* to *1.01*" in answer
+    assert "A run costs *1* (Dist) to *3* (B) runs of DIST. None of 16 runs failed." in answer
+    few = [one for one in made(rows) if one.scene in SCENES[:3]]
+    assert study.verdict(page(few, tmp_path / "few", monkeypatch)).startswith("3 scenes cannot decide between 2 ")
 
 
 def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
@@ -251,7 +347,7 @@ def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
 
 
 def test_two_halves_merged_are_the_whole(tmp_path):
-    whole = field([("Dist", 0.01, 100.0), ("B", 0.02, 50.0)]).attempts
+    whole = made([("Dist", 0.01, 100.0), ("B", 0.02, 50.0)])
     write_attempts(whole[:5], tmp_path / "one")
     write_attempts(whole[5:], tmp_path / "two")
     merge.merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
@@ -271,22 +367,27 @@ def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
         assert read_attempts(tmp_path / str(wrong))[0] == []
 
 
-def test_the_page_has_a_line_a_row_and_stands_beside_what_is_shipped(tmp_path, monkeypatch, capsys):
-    shipped = tmp_path / "shipped"
-    write_completion(tmp_path / "own", [0.8, 0.4, 0.05])
-    (mine,) = attempts_of(read_records(tmp_path / "own")[0], tmp_path / "own")
-    dist = attempt("Dist", "car test 0", {0: 0.8, 500: 0.011, 600: 0.01}, settings=mine.settings)
-    write_attempts([dist], shipped)
+def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alone(tmp_path, monkeypatch, capsys):
+    shipped, own = tmp_path / "shipped", tmp_path / "own"
+    smoke = {("complete", "car test 0, 20 points", 0)}
+    monkeypatch.setattr("bench.report.suite.attempts.problems_of", lambda size: smoke if size == "smoke" else {"none"})
+    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda size: smoke if size == "smoke" else {"none"})
+    write_completion(own, [0.8, 0.4, 0.05])
+    (mine,) = attempts_of(read_records(own)[0], own)
+    known = {0: 0.8, 500: 0.0125, 600: 0.0124}
+    dist = [attempt("Dist", scene, known, settings=mine.settings) for scene in ("car test 0", "car test 1")]
+    write_attempts(dist, shipped)
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
-    assert show(tmp_path / "own") == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("1 run of ") and "which 1 stand" in said[0]
-    assert said[2].split()[:3] == ["Dist", "100", "%"] and said[3].startswith("Mine * ") and Path(said[-2]).is_file()
-    data = "".join(path.read_text() for path in (Path(said[-1]).parent / "page" / "data").rglob("*.js"))
+    assert show(own) == 0
+    said = capsys.readouterr().out
+    assert "Progress on 1 problem at the cost" in said and "Mine * " in said and "Dist *" not in said
+    assert "Mine, complete, car test 0, 20 points: error 0.800 before, 0.0500 after; 0.0124 by the best" in said
+    data = "".join(path.read_text() for path in (own / "page" / "data").rglob("*.js"))
     assert "Mine" in data and "Dist" in data  # the page, too, is of the table that was written
-    table = (tmp_path / "own" / "paper" / "suite.md").read_text()
-    assert "| Dist |" in table and "| Mine |" in table and "reaches 100 %" in table
-    assert [one.row for one in read_attempts(tmp_path / "own")[0]] == ["Mine"]
+    table = (own / "paper" / "suite.md").read_text()
+    assert "| Dist |" in table and "| Mine |" in table and "n = 1 problem" in table
+    assert "1 scene cannot decide between 2 renderers" in table
+    assert [one.row for one in read_attempts(own)[0]] == ["Mine"]
 
 
 @each(
@@ -314,30 +415,18 @@ def test_every_set_is_an_experiment_with_each_size():
         assert {*sizes} - {"chosen"} == {*suite().sizes.values()}
 
 
-def test_a_tuned_row_stands_behind_its_renderers_and_changes_no_comparison(monkeypatch):
-    rows = [("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Lost", 0.5, 1.0)]
-    for_all = field(rows).everything
-    for_all += [replace(one, set="pose") for one in for_all]
-    monkeypatch.setattr("bench.report.suite.standing.least_problems", lambda: {one.key[:3] for one in for_all})
+def test_a_tuned_row_changes_no_comparison_and_its_gain_is_at_the_same_problems():
+    stated = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
     tuned = [
         attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings="own", preset=row.lower())
-        for row, final in (("Dist", 0.01), ("B", 0.5), ("Lost", 0.5))
-        for scene in SCENES
+        for row, final in (("Dist", 0.01), ("B", 0.1), ("None", 0.1))
+        for scene in SCENES[:7]
     ]
-    before, standing = Standing(for_all), Standing(for_all + tuned[:-1])
-    assert standing.rows == ["B", "B, tuned", "Dist", "Dist, tuned", "Lost", "Lost, tuned"]
-    assert standing.ranked == before.ranked and standing.told == before.told
-    assert standing.resolution == before.resolution
-    assert standing.references == before.references and standing.not_run("Lost, tuned") == 1
-    assert standing.lacking("Dist, tuned") == len(SCENES) and standing.not_run("Dist, tuned") == 0
-    gains = [standing.gain(row) for row in standing.rows[:4]]
-    assert gains[0] is None and [gain and round(gain.value, 9) for gain in gains[1:]] == [-1.0, None, 0.2]
-    assert standing.line("Lost, tuned")["failed"] == "1 not run" and standing.line("B, tuned")["gain"] == gains[1]
-    assert {line["name"] for line in _panel(standing, None)["series"]} == {"B", "Dist", "Lost"}
-    assert {line["name"] for line in _panel(standing, "complete")["series"]} == {"B", "Dist, tuned", "Lost"}
-    assert "tuned: complete of Dist." in "".join(_doubts(standing))
-    assert "its line compares: Lost, tuned (1 not run)." in "".join(_doubts(standing))
-    assert not any("fewer problems" in doubt for doubt in _doubts(before))
+    runs = judged([*stated, *tuned])
+    assert ranking(runs, END) == ranking(judged(stated), END) and {*ranking(runs, END).progress} == {"Dist", "B"}
+    found = gains(runs)
+    assert {*found} == {"Dist", "B"} and found["B"].value == pytest.approx(-0.5) and found["Dist"].value > 0.01
+    assert {*runs["reference"]} == {0.01}
 
 
 def test_a_tuned_setting_is_free_in_its_weights_and_rate_alone(tmp_path):
@@ -402,11 +491,12 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
     own = {"Exact": "tests.user_renderer.Mine", "Shifted": "odd.Shifted", "Slow": "odd.Slow"}
     for label, target in own.items():
         assert main([*asked, "renderer=custom", f"renderer._target_={target}", f"label={label}"]) == 0
-    standing = Standing(read_attempts(results)[0])
-    assert standing.share("Shifted").value < standing.share("Exact").value == standing.share("Slow").value
-    spent = {row: [(one.cost, one.seconds) for one in standing.of(row)] for row in standing.rows}
-    assert [cost for cost, _ in spent["Slow"]] == [cost for cost, _ in spent["Exact"]]
-    assert all(slow > 5 + exact / 2 for (_, slow), (_, exact) in zip(spent["Slow"], spent["Exact"], strict=True))
+    runs = judged(read_attempts(results)[0])
+    ends = runs.groupby("row")[END].mean()
+    assert ends["Shifted"] < ends["Exact"] == ends["Slow"]
+    spent = {row: own.sort_values("problem")[["cost", "seconds"]].to_numpy() for row, own in runs.groupby("row")}
+    assert (spent["Slow"][:, 0] == spent["Exact"][:, 0]).all()
+    assert (spent["Slow"][:, 1] > 5 + spent["Exact"][:, 1] / 2).all()
     assert main(["verify=1", f"results_dir={results}"]) == 0
     halves = [
         (one, [[*spent, float(f"{error / 2:.5g}")] for *spent, error in one.curve]) for one in read_attempts(results)[0]
@@ -419,10 +509,15 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
 
 
 def test_the_shipped_page_is_that_of_the_shipped_rows():
-    standing = Standing(read_attempts(SHIPPED)[0])
-    with (SHIPPED / "paper" / "suite.csv").open(encoding="utf-8") as file:
-        shown = {line["row"]: float(line["share"]) for line in csv.DictReader(file)}
-    assert {row: standing.share(row).value for row in standing.rows} == pytest.approx(shown)
+    runs = judged(read_attempts(SHIPPED)[0])
+    shown = pd.read_csv(SHIPPED / "paper" / "suite.csv").set_index("row")
+    for outcome in (AT_1, AT_10, END, AREA):
+        ranked = ranking(runs, outcome)
+        empty = sparse(runs, outcome) if outcome != AREA else set()
+        values = {row: np.nan if row in empty else value for row, value in ranked.progress.items()}
+        assert shown[outcome].to_dict() == pytest.approx(values, nan_ok=True, rel=1e-9)
+        ranks = {row: "–".join(dict.fromkeys(map(str, ranked.rank(row)))) for row in values}
+        assert shown[f"{outcome}_rank"].astype(str).to_dict() == ranks
 
 
 def test_the_shipped_rows_are_of_todays_settings():

@@ -1,4 +1,4 @@
-"""What the page shows of each renderer of the suite: the targets that it reaches, its failures, settings and source."""
+"""What the page shows of each renderer of the suite: its progress at each problem, failures, settings and source."""
 
 import inspect
 import re
@@ -8,10 +8,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from bench.records.names import flat
 from bench.report.data.records import OURS, Record
-from bench.report.suite.attempts import TUNED, Attempt, attempts_of, read_attempts, suite
-from bench.report.suite.standing import COST, Standing
+from bench.report.suite import standing
+from bench.report.suite.attempts import TUNED, Attempt, attempts_of, gather, suite
 from bench.report.write import paper
 from bench.tables import METHOD, choice, names
 
@@ -19,38 +21,51 @@ SET_BY_SUITE = ("index=", "dataset=", "seed=", "task.", "sizes.", "experiment=")
 
 
 def renderers(records: list[Record], results_dir: Path) -> dict[str, Any]:
-    """The problems of the suite, and for each of its rows what it reaches of each, shipped rows beside one's own.
+    """The problems of the suite, and for each of its rows the progress at each, shipped rows beside one's own.
 
     Without rows where a record is odd or foreign: then the suite has no page either, and the report says why.
     """
     try:
         return _found(records, results_dir)
     except paper.BROKEN:
-        return {"targets": 0, "problems": [], "rows": []}
+        return {"problems": [], "rows": []}
 
 
 def _found(records: list[Record], results_dir: Path) -> dict[str, Any]:
-    own = [(one, record["folder"]) for record in records for one in attempts_of([record], results_dir)]
-    standing = Standing([*read_attempts(paper.SHIPPED, results_dir)[0], *(one for one, _ in own)])
+    folders = {
+        (*attempt.key, attempt.started): record["folder"]
+        for record in records
+        for attempt in attempts_of([record], results_dir)
+    }
+    gathered = gather(paper.SHIPPED, results_dir, records)
+    runs = standing.reached(standing.compared(standing.frame_of(gathered.everything), gathered.size))
+    attempts = {(*attempt.key, attempt.started): attempt for attempt in gathered.everything}
     order = [*suite().errors]
-    problems = sorted({one.key[:3] for one in standing.judged}, key=lambda key: (order.index(key[0]), *key[1:]))
-    folders = {(*one.key, one.started): folder for one, folder in own}
-    rows = [_row(standing, row, problems, folders) for row in standing.rows]
-    return {"targets": len(suite().targets), "problems": problems, "rows": rows}
+    keys = {tuple(key) for key in runs[standing.KEY].itertuples(index=False)}
+    problems = sorted(keys, key=lambda key: (order.index(key[0]), *key[1:]))
+    ranked = [*standing.ranking(runs, standing.AT_1).progress]
+    rows = sorted(runs.groupby("row"), key=lambda pair: ranked.index(pair[0]) if pair[0] in ranked else len(ranked))
+    return {
+        "problems": problems,
+        "rows": [_row(row, own, problems, attempts, folders) for row, own in rows],
+    }
 
 
-def _row(standing: Standing, row: str, problems: list[Any], folders: dict[Any, str]) -> dict[str, Any]:
-    """A row: how many targets of each problem it reaches, None where it has no attempt; its failures, and the rest."""
-    attempts = {one.key[:3]: one for one in standing.attempts if one.row == row}
-    found = [attempts.get(problem) for problem in problems]
-    first = next(iter(attempts.values()))
-    settings = _node(first.preset) | _asked(first) | _tuned(attempts.values())
+def _row(
+    row: str, runs: pd.DataFrame, problems: list[Any], attempts: dict[Any, Attempt], folders: dict[Any, str]
+) -> dict[str, Any]:
+    """A row: its progress at the end of each problem, None where it has no attempt; its failures, and the rest."""
+    by_problem = {(run.set, run.problem, run.seed): run for run in runs.itertuples()}
+    own = [by_problem.get(problem) for problem in problems]
+    keys = [run and (run.set, run.problem, run.seed, run.row, run.settings, run.started) for run in own]
+    first = next(attempts[key] for key in keys if key)
+    settings = _node(first.preset) | _asked(first) | _tuned(attempts[key] for key in keys if key)
     file, source = _source(str(settings.get("_target_", "")))
     return {
         "row": row,
-        "reached": [one and sum(at[COST] < float("inf") for at in standing.reached[one.key]) for one in found],
-        "failed": [[place, one.status, one.reason] for place, one in enumerate(found) if one and not one.ok],
-        "runs": [folders.get((*one.key, one.started)) if one else None for one in found],
+        "progress": [run and round(run.end, 4) for run in own],
+        "failed": [[place, run.status, run.reason] for place, run in enumerate(own) if run and not run.ok],
+        "runs": [folders.get(key) for key in keys],
         "settings": [
             [key, str(value)]
             for key, value in settings.items()

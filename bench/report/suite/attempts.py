@@ -12,13 +12,13 @@ from dataclasses import asdict, dataclass, fields
 from functools import cache
 from io import StringIO
 from itertools import product
-from math import inf, isfinite, isnan
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import WAITED, RunStatus, as_number, decoded, digest, plain, renderer_name, write_text
+from bench.records.record import RunStatus, as_number, decoded, digest, plain, renderer_name, write_text
 from bench.report.data.kept import NO_ATTEMPTS
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
@@ -43,7 +43,6 @@ class Suite:
     name: str
     version: int
     sizes: dict[str, str]
-    targets: list[float]
     errors: dict[str, str]
     references: dict[str, dict[str, float]]
 
@@ -60,12 +59,12 @@ def suite() -> Suite:
 
 
 @cache
-def least_problems() -> set[tuple[Any, ...]]:
-    """The set, problem and seed of all cells of the suite's least size: a row that has them is judged."""
+def problems_of(size: str) -> set[tuple[Any, ...]]:
+    """The set, problem and seed of all cells of a size of the suite: a row that has them is compared."""
     found: set[tuple[Any, ...]] = set()
     for name in suite().errors:
         node = read_yaml(CONF / "experiment" / f"{EXPERIMENT}{name}.yaml")
-        chosen = {key: str(value).split(",") for key, value in node["sizes"][suite().sizes["quick"]].items()}
+        chosen = {key: str(value).split(",") for key, value in node["sizes"][suite().sizes[size]].items()}
         parts = [chosen.pop(key) for key in ("families", "shapes", "seeds")]
         text = GIVEN.get(name, ("", ""))[1]
         for name_of, index, seed, *given in product(*parts, *chosen.values()):
@@ -129,28 +128,6 @@ class Attempt:
     def tuned(self) -> bool:
         """Whether it is at the renderer's own setting, not at the one of the set."""
         return self.row.endswith(BY_ITSELF)
-
-    @property
-    def timed(self) -> bool:
-        """Whether its seconds count; those on a loaded machine do not."""
-        return self.waited is None or self.waited <= WAITED
-
-    @property
-    def machine(self) -> tuple[Any, ...]:
-        """What its seconds depend on."""
-        return self.cpu, self.device, self.threads, self.kernels
-
-    def reached(self, error: float) -> tuple[float, float] | None:
-        """The cost and the seconds from which on the error stays at or below this one; None where it does not."""
-        found, after = None, None  # after a cost of 0 comes the first step, which shows the error
-        if not isfinite(error):
-            return None
-        for cost, seconds, at in reversed(self.curve if self.ok else []):
-            if not at <= error:
-                break
-            found = (cost, seconds) if cost or after is None else after
-            after = cost, seconds
-        return found
 
 
 def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
@@ -273,6 +250,31 @@ def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
         except (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error) as error:
             problems.append(f"{path.name}: {error!r}")
     return found, problems
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """All attempts in any order, the `local` ones of a results folder, and a message for each file that is unread."""
+
+    everything: list[Attempt]
+    local: list[Attempt]
+    problems: list[str]
+
+    @property
+    def size(self) -> str:
+        """The largest size of the suite whose problems all rows of the results folder have; else the least size."""
+        rows = grouped((attempt for attempt in self.local if not attempt.tuned), lambda attempt: attempt.row).values()
+        sizes = [*suite().sizes] if rows else ["quick"]
+        common = set.intersection(*({attempt.key[:3] for attempt in row} for row in rows)) if rows else set()
+        return next((size for size in reversed(sizes) if problems_of(size) <= common), sizes[0])
+
+
+def gather(shipped: Path, results_dir: Path, records: Iterable[Record] = ()) -> Gathered:
+    """The attempts that are shipped; and local ones, which a results folder keeps or which are among its records."""
+    kept, problems = read_attempts(shipped)
+    local, unread = ([], []) if results_dir.resolve() == shipped.resolve() else read_attempts(results_dir)
+    local += attempts_of(records, results_dir)
+    return Gathered([*kept, *local], local, [*problems, *unread])
 
 
 def _read(line: dict[str, str]) -> Attempt:

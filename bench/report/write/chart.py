@@ -1,7 +1,7 @@
 """Charts as data: panels of series, drawn here as a figure, and by the page so that they answer the mouse."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from bench.pictures import style
 from bench.report.data.statistics import Interval
 
 GREY = "#777777"  # of lines that belong to no row
-NAMES = 14  # that have room beside a panel, one below the other
 Series = dict[str, Any]
 Panel = dict[str, Any]
 
@@ -94,50 +93,73 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
 
 
 @style.styled
-def draw_lead(panels: Sequence[Panel]) -> Figure:
-    """Draws the first panel large, with the names of its lines beside it, and the others small below, of equal axes."""
-    figure = Figure(figsize=(style.WIDTH, 5.4), layout="constrained")
-    grid = figure.add_gridspec(2, max(len(panels) - 1, 1), height_ratios=(1.7, 1))
-    lead = figure.add_subplot(grid[0, :])
-    _panel(lead, panels[0], 1.0)
-    _name_ends(lead, _shown(panels[0]))
-    first = None
-    for number, panel in enumerate(panels[1:]):
-        first = first or figure.add_subplot(grid[1, 0])
-        axis = first if not number else figure.add_subplot(grid[1, number], sharex=first, sharey=first)
-        _panel(axis, panel | {"series": [each | {"symbol": ""} for each in panel["series"]]}, 1.0)
-        axis.label_outer()
-        axis.set_xlabel("")
-    if first and panels[0]["x"]["log"]:  # they are too narrow for more
-        low, high = first.get_xlim()
-        tens = [10.0**power for power in range(-6, 7) if low <= 10.0**power <= high]
-        first.minorticks_off()
-        first.set_xticks(tens, [f"{ten:g}" for ten in tens])
-    lead.set_xlabel("")
-    figure.supxlabel(panels[0]["x"]["title"], fontsize=lead.yaxis.label.get_size())
+def draw_lead(panels: Sequence[Panel], ranks: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
+    """Draws the first panel large, with the names of its lines, the ranks to its right, and the other panels below.
+
+    Args:
+        panels: fractions from 0 to 1 over costs, on a logarithmic axis.
+        ranks: by their titles, the least and the largest rank of each row.
+    """
+    figure = Figure(figsize=(style.WIDTH, 5.6), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1.55, 1))
+    lead, *others = above.subplots(1, 1 + len(ranks), width_ratios=(5.6, *[1.0] * len(ranks)))
+    _fractions(lead, panels[0])
+    lead.set_title(panels[0]["title"], loc="left", pad=46)  # points, above the names
+    _name_lines(lead, panels[0]["series"])
+    for axis, (title, rows) in zip(others, ranks.items(), strict=True):
+        _ranks(axis, title, rows, panels[0]["series"], named=axis is others[0])
+    small = below.subplots(1, max(len(panels) - 1, 1), sharey=True, squeeze=False)[0]
+    for axis, panel in zip(small, panels[1:], strict=False):
+        _fractions(axis, panel)
+        axis.set_title(panel["title"], loc="left")
+    below.supxlabel(panels[0]["x"]["title"], fontsize=lead.yaxis.label.get_size())
     return figure
 
 
-def _name_ends(axis: Axes, lines: list[Series]) -> None:
-    """Writes the name of each line to the right of the axes, as near to its end as the other names leave room."""
-    ends = sorted((each for each in lines if each["x"]), key=lambda each: each["y"][-1])
-    right = max((each["x"][-1] for each in ends), default=None)
-    axis.set_xlim(right=right)
-    low, high = axis.get_ylim()
-    gap, places = 1 / max(len(ends), NAMES), list[float]()
-    for place in ((each["y"][-1] - low) / (high - low) for each in ends):
-        places.append(max(place, places[-1] + gap) if places else place)
-    over = max(places[-1] - 1 + gap / 2, 0.0) if places else 0.0
-    for each, place in zip(ends, places, strict=True):
-        axis.plot([each["x"][-1], right], [each["y"][-1]] * 2, color=each["colour"], lw=0.6, ls=":")
-        axis.annotate(
-            each["name"],
-            (right, each["y"][-1]),
-            (1.04, place - over),
-            **{"textcoords": "axes fraction", "va": "center", "color": each["colour"]},
-            arrowprops={"arrowstyle": "-", "color": each["colour"], "lw": 0.6, "relpos": (0, 0.5)}
-            | {"shrinkA": 0, "shrinkB": 0},
-        )
+def _fractions(axis: Axes, panel: Panel) -> None:
+    """Draws lines of fractions, with a point at the end of each, or a cross if it ends at 0."""
+    for line in panel["series"]:
+        axis.plot(line["x"], line["y"], color=line["colour"], ls=line["dash"])
+        end = {"marker": "o" if line["y"][-1] else "x", "color": line["colour"], "clip_on": False, "zorder": 3}
+        axis.plot(line["x"][-1], line["y"][-1], **end)
+    costs = [cost for line in panel["series"] for cost in (line["x"][0], 1.6 * line["x"][-1])]
+    axis.set(xscale="log", xlim=(min(costs, default=0.1), max(costs, default=10.0)), ylim=(0, 1))
+    axis.minorticks_off()
+    axis.xaxis.set_major_formatter(lambda cost, _: f"{cost:g} ×")
+    axis.set_yticks([0, 0.25, 0.5, 0.75, 1], ["initial error", "25 %", "50 %", "75 %", "best possible"])
+
+
+def _name_lines(axis: Axes, lines: Sequence[Series]) -> None:
+    """Writes the name of each line above the axes, joined to its end; behind its end where that is below a half."""
+    above, across = axis.get_xaxis_transform(), axis.transScale + axis.transLimits
+    position = -1.0
+    for line in sorted(lines, key=lambda line: line["x"][-1]):
+        end, name = (line["x"][-1], line["y"][-1]), line["name"].partition(",")[0]
+        look = {"color": line["colour"], "fontsize": style.RC["legend.fontsize"]}
+        if end[1] < 0.5:
+            axis.annotate(name, end, (4, 0), textcoords="offset points", va="center", **look)
+            continue
+        position = max(across.transform(end)[0], position + 0.08)  # of the width of the axes, between two names
+        cost = across.inverted().transform((position, 0))[0]
+        axis.plot([end[0], cost], [end[1], 1.02], transform=above, lw=0.6, color=line["colour"], clip_on=False)
+        axis.text(cost, 1.03, name, transform=above, rotation=40, rotation_mode="anchor", **look)
+
+
+def _ranks(
+    axis: Axes, title: str, rows: Mapping[str, tuple[int, int]], lines: Sequence[Series], *, named: bool
+) -> None:
+    """Draws the ranks that each row can have as a bar."""
+    for number, line in enumerate(lines):
+        low, high = rows[line["name"]]
+        axis.barh(number, high - low + 0.7, left=low - 0.35, height=0.55, color=line["colour"])
+    count = len(lines)
+    axis.set(xlim=(0.3, count + 0.7), ylim=(count - 0.4, -0.6), xticks=[1, count], xlabel="rank")
+    axis.set_title(title, loc="left")
+    axis.set_yticks(range(count), [line["name"].partition(",")[0] if named else "" for line in lines])
+    for label, line in zip(axis.get_yticklabels(), lines, strict=True):
+        label.set_color(line["colour"])
+    axis.tick_params(axis="y", length=0)
+    axis.grid(False, axis="y")
 
 
 def _shown(panel: Panel) -> list[Series]:

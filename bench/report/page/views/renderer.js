@@ -1,4 +1,4 @@
-/* A renderer's own page: its standing in each set, where it fails and what it does not reach, its settings and source. */
+/* A renderer's own page: its standing in each set, where it fails and where others make more progress, its settings and source. */
 (function (bench) {
   "use strict";
 
@@ -23,7 +23,7 @@
     return [
       element("div.two", null, facts(standing), failure(own, data)),
       table.chart && bench.chart(table.chart, {label: `${own.row} in each set`, focus: own.row}),
-      section("What it does not reach", missed(own, data)),
+      section("Where others make more progress", behind(own, data)),
       section("Run it", copied(own.command, "Copy the command")),
       section("Source", element("p", null, code(own.file || MISSING)), own.source && element("pre.source", null, own.source)),
       own.settings.length > 0 && details(`Its ${plural(own.settings.length, "setting")}`, facts(own.settings)),
@@ -33,8 +33,8 @@
   const named = ([of, problem, seed]) => `${of}: ${problem}, seed ${seed}`;
 
   /* How often it fails; the first failure, with its picture where its run is among these results. */
-  function failure({failed, reached, runs}, {problems}) {
-    const tried = reached.filter((each) => each !== null).length;
+  function failure({failed, progress, runs}, {problems}) {
+    const tried = progress.filter((each) => each !== null).length;
     if (!failed.length) return element("p", null, `It fails in none of ${plural(tried, "run")}.`);
     const [place, status, reason] = failed[0];
     const run = bench.runs.place(runs[place]);
@@ -47,23 +47,23 @@
       }));
   }
 
-  /* The problems of which it misses a target, beside what the best renderer reaches: the largest gap first. */
-  function missed(own, {problems, rows, targets}) {
-    const most = problems.map((_, place) => Math.max(...rows.map(({reached}) => reached[place] ?? 0)));
+  /* Its progress at each problem and that of the best renderer: the largest gap first. */
+  function behind(own, {problems, rows}) {
+    const most = problems.map((_, place) => Math.max(...rows.map(({progress}) => progress[place] ?? 0)));
     const failed = new Map(own.failed.map(([place, said]) => [place, said]));
-    const gap = (place) => most[place] - own.reached[place];
-    const tried = problems.map((_, place) => place).filter((place) => own.reached[place] !== null);
-    const places = tried.filter((place) => own.reached[place] < targets).sort((a, b) => gap(b) - gap(a));
-    const count = (key, label, get) =>
-      ({key, label, kind: "number", unit: `of ${targets} targets`, get, cell: (place) => String(get(place))});
+    const gap = (place) => most[place] - own.progress[place];
+    const tried = problems.map((_, place) => place).filter((place) => own.progress[place] !== null);
+    const places = tried.filter((place) => gap(place) > 0).sort((a, b) => gap(b) - gap(a));
+    const share = (key, label, get) =>
+      ({key, label, kind: "number", unit: "% of the way to the best possible error", get, cell: (place) => (100 * get(place)).toFixed(0)});
     const columns = [
       {key: "problem", label: "Problem", head: true, get: (place) => named(problems[place]), cell: (place) => named(problems[place])},
-      count("reached", "Reached", (place) => own.reached[place]),
-      count("most", "By the best", (place) => most[place]),
+      share("progress", "Progress", (place) => own.progress[place]),
+      share("most", "Of the best", (place) => most[place]),
       {label: "Run", cell: (place) => [bench.badge(failed.get(place) || "ok"), " ", run(own.runs[place])]},
     ];
-    if (!places.length) return element("p", null, `It reaches every target in ${plural(tried.length, "run")}.`);
-    return bench.table(columns, places, {caption: "What it does not reach"});
+    if (!places.length) return element("p", null, `No renderer makes more progress in any of ${plural(tried.length, "run")}.`);
+    return bench.table(columns, places, {caption: "Where others make more progress"});
   }
 
   function run(folder) {
