@@ -14,7 +14,16 @@ from bench import merge
 from bench.records.read import read_records
 from bench.report.data.runs import Runs
 from bench.report.suite import attempts, standing
-from bench.report.suite.attempts import Attempt, attempts_of, joined, place, read_attempts, suite, write_attempts
+from bench.report.suite.attempts import (
+    Attempt,
+    Gathered,
+    attempts_of,
+    joined,
+    place,
+    read_attempts,
+    suite,
+    write_attempts,
+)
 from bench.report.suite.standing import (
     AREA,
     AT_1,
@@ -145,6 +154,7 @@ def test_progress_is_that_of_the_logarithm_between_the_initial_error_and_the_ref
     runs = judged([attempt("Dist", "s", {0: 100, 2: 10, 4: 1}), attempt("B", "s", {0: 100, 8: 10, 80: 5})])
     dist, b = (runs[runs["row"] == row].iloc[0] for row in ("Dist", "B"))
     assert (dist[AT_1], dist[AT_10], dist[END]) == (1, 1, 1)  # at its own cost a run has its own progress
+    assert (dist["at_1_checkpoints"], dist["at_1_next"]) == (3, 1)
     assert b[AT_1] == pytest.approx(0.25) and b[AT_10] == pytest.approx(0.5 + 32 / 72 * (b[END] - 0.5))
     assert b[END] == pytest.approx(1 - np.log10(5) / 2)
     fine = np.geomspace(0.3, 30, 200_001)
@@ -156,7 +166,11 @@ def test_progress_is_that_of_the_logarithm_between_the_initial_error_and_the_ref
 
 def test_a_failed_run_has_made_no_progress_and_moves_no_initial_error():
     whole = made([("Dist", 0.01, 100.0), ("B", 0.02, 100.0)])
-    lost = [replace(one, row="Lost", start=50.0, final=inf, status="crashed", curve=[]) for one in whole[: len(SCENES)]]
+    lost = [
+        replace(one, row=row, start=50.0, final=inf, status="crashed", curve=[])
+        for row in ("Lost", "Gone", "Dead")
+        for one in whole[: len(SCENES)]
+    ]
     runs = judged([*whole, *lost])
     assert progress([*whole, *lost])["Lost"] == 0 and {*runs["initial"]} == {1.0}
     assert {*runs.loc[runs["row"] == "Lost", AREA]} == {0.0}
@@ -288,6 +302,7 @@ def test_seconds_are_compared_on_one_machine_and_field_evaluations_of_the_same_r
     ]
     assert cost([*moved, *elsewhere]) == pytest.approx((1, 0.5, 8))  # both are of the runs on that machine
     assert cost([*moved, *(replace(one, waited=0.2) for one in elsewhere)]) == unknown
+    assert cost([replace(one, waited=0.2) if one.row == "Mine" else one for one in [*moved, *elsewhere]]) == unknown
     assert cost([*moved, *elsewhere[:5]]) == unknown  # of too few scenes
     settings = [replace(one, settings="x") for one in elsewhere[:6]]
     assert cost([*moved, *settings]) == unknown
@@ -326,6 +341,9 @@ def test_the_answer_says_what_differs_at_the_end_what_failed_and_what_scenes_can
     answer = study.verdict(page([*made(rows), *mixed], tmp_path / "two", monkeypatch))
     assert "none of 1 pairs can be distinguished; in complete all errors lie within *0.99* to *1.01*" in answer
     assert "A run costs *1* (Dist) to *3* (B) runs of DIST. None of 16 runs failed." in answer
+    wide = [replace(one, curve=[*one.curve[:2], [2e2, 0.2, 0.002]], final=0.002) for one in mixed]
+    answer = study.verdict(page([*made(rows), *wide], tmp_path / "wide", monkeypatch))
+    assert "none of 1 pairs can be distinguished. A run costs" in answer  # bounds from 0.2 on say nothing
     few = [one for one in made(rows) if one.scene in SCENES[:3]]
     assert study.verdict(page(few, tmp_path / "few", monkeypatch)).startswith("3 scenes cannot decide between 2 ")
 
@@ -365,6 +383,21 @@ def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
     for wrong in ({"final": -1.0}, {"final": 0.4}, {"set": "none"}, {"status": "fine"}):
         write_attempts([replace(found[0], **wrong)], tmp_path / str(wrong))
         assert read_attempts(tmp_path / str(wrong))[0] == []
+
+
+def test_the_largest_size_that_all_rows_of_ones_own_have_is_compared(monkeypatch):
+    sizes = {"smoke": SCENES[:1], "quick": SCENES[:4], "core": SCENES}
+    keys = {size: {("complete", f"{scene}, 20 points", 0) for scene in scenes} for size, scenes in sizes.items()}
+    monkeypatch.setattr("bench.report.suite.attempts.problems_of", keys.get)
+
+    def size(*rows: tuple[str, int]) -> str:
+        local = [one for row, count in rows for one in made([(row, 0.1, 1.0)], SCENES[:count])]
+        return Gathered([], local, []).size
+
+    assert size() == "quick" and size(("A", 8)) == "core" and size(("A", 5)) == "quick" and size(("A", 3)) == "smoke"
+    assert (
+        size(("A", 8), ("B", 1)) == "smoke" and size(("A", 8), ("B, tuned", 1)) == "core" and size(("A", 0)) == "quick"
+    )
 
 
 def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alone(tmp_path, monkeypatch, capsys):
@@ -419,7 +452,7 @@ def test_a_tuned_row_changes_no_comparison_and_its_gain_is_at_the_same_problems(
     stated = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
     tuned = [
         attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings="own", preset=row.lower())
-        for row, final in (("Dist", 0.01), ("B", 0.1), ("None", 0.1))
+        for row, final in (("Dist", 0.005), ("B", 0.1), ("None", 0.1))
         for scene in SCENES[:7]
     ]
     runs = judged([*stated, *tuned])
