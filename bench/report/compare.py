@@ -14,7 +14,7 @@ from bench.records.read import read_plans
 from bench.report.data import statistics
 from bench.report.data.records import SCALE, SHAPENET, Row, RunKey, by_shape, error, row_of, setting, shape
 from bench.report.data.runs import Runs, Selection
-from bench.report.data.statistics import Interval, geometric_mean
+from bench.report.data.statistics import Interval, Verdict, geometric_mean
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import Column, ends, estimate, text
@@ -54,6 +54,11 @@ class Gap:
     def __str__(self) -> str:
         """The ratio with its interval, and the shapes."""
         return f"{self.ratio}; {self.better:g} of {self.shapes}"
+
+
+def ratio_of(gap: Gap | None) -> Interval | None:
+    """The ratio of a gap; None without one."""
+    return None if gap is None else gap.ratio
 
 
 @dataclass(frozen=True)
@@ -241,7 +246,7 @@ class Compared:
             *(Column(at, heading(at)) for at in self.conditions),
             *estimate("error", "Median over shapes"),
             text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
-            *ends("ratio", lambda line: line["ratio"] and line["ratio"].ratio),
+            *ends("ratio", lambda line: ratio_of(line["ratio"])),
             *(Column("evaluations", "Values", show=format.count), Column("seconds", "Loop", show=format.seconds)),
             *(text(f"front_{cost}") for cost in COSTS),
             *(text("failed", "Failed"), text("preset")),
@@ -256,7 +261,7 @@ class Compared:
         """
         ratio = changed.pop("ratio", "Ratio to the reference")
         panels = self.front(changed.pop("filled", None))
-        whole = [(line["row"], line["ratio"]) for line in self.pooled if not line["lacking"]]
+        whole = [(line["row"], ratio_of(line["ratio"])) for line in self.pooled if not line["lacking"]]
         sure = differing(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
             "plotted": "Median error under each condition, that over shapes of their geometric means, and the median "
@@ -311,13 +316,29 @@ class Compared:
         return panels
 
 
-def differing(ratios: Sequence[tuple[str, Gap | None]], of: str) -> str:
-    """A sentence with how many of the known ratios differ from 1, see `statistics.differ`; empty without any."""
-    known = [(name, found) for name, found in ratios if found is not None and found.ratio.known]
-    differ = statistics.differ([found.ratio for _, found in known])
-    sure = [f"{name} {found.ratio}" for (name, found), other in zip(known, differ, strict=True) if other]
-    named = f": {'; '.join(sure)}" if sure else ""
-    return f"{HOLM}, *{len(sure)} of {len(known)}* ratios {of} differ from 1{named}." if known else ""
+def differing(ratios: Sequence[tuple[str, Interval | None]], of: str) -> str:
+    """The verdict on a family of named ratios, see `statistics.differ`; empty where none has an interval."""
+    tested = [(name, ratio) for name, ratio in ratios if ratio is not None and ratio.known]
+    if not tested:
+        return ""
+    verdicts = statistics.differ([ratio for _, ratio in tested])
+    undecided, equal = (verdicts.count(kind) for kind in (Verdict.NOT_DECIDABLE, Verdict.NOT_DISTINGUISHED))
+    sizes = sorted({len(ratio.points) for _, ratio in tested})
+    if undecided == len(tested):
+        few = f"cannot be decided with {' or '.join(map(str, sizes))} shapes"
+        needed = f"{format.plural(undecided, 'ratio')} need {statistics.shapes_needed(undecided)} shapes or more"
+        return f"Whether ratios {of} differ from 1 *{few}*: by the sign test with Holm's correction {needed}."
+    sure = [
+        f"{name} {ratio}" for (name, ratio), verdict in zip(tested, verdicts, strict=True) if verdict is Verdict.DIFFERS
+    ]
+    parts = [
+        f"*{len(sure)} of {len(tested)}* ratios {of} differ from 1{': ' if sure else ''}{'; '.join(sure)}",
+        f"{equal} cannot be distinguished from 1" if equal else "",
+        f"{undecided} cannot be decided with {sizes[0]} shapes" if undecided else "",
+    ]
+    agreeing = f"{statistics.shapes_agreeing(sizes[-1], len(tested))} of {sizes[-1]} shapes"
+    step = "" if sure else f" The test needs {agreeing} on one side of 1."
+    return f"{HOLM}, {'; '.join(filter(None, parts))}.{step}"
 
 
 def ordered(conditions: Collection[str]) -> list[str]:

@@ -169,7 +169,11 @@ def _verdict(settings: Crossed, pooled: list[Line]) -> str:
     """The largest gap with its parts, and how many gaps under one loss differ from 1."""
     known = [line for line in pooled if line["own"] is not None and line["loss"] is not None]
     names = settings.labels
-    under_one = [(f"{x['compared']} under {names[loss]}", x[loss]) for x in pooled for loss in settings.losses]
+    under_one = [
+        (f"{line['compared']} under {names[loss]}", compare.ratio_of(line[loss]))
+        for line in pooled
+        for loss in settings.losses
+    ]
     said = [compare.differing(under_one, "under one loss")]
     if known:
         line = max(known, key=lambda line: line["own"].ratio.value)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from bench.report.study import Result, Runs, Selection, compare, conditions, records, single_view, statistics, table
+from bench.report.study import Result, Runs, Selection, compare, conditions, records, single_view, table
 
 PLACE = 43
 READS = (Selection("single_view_budget", ("task.shapes", "task.views"), setup=("machine",)),)
@@ -36,7 +36,7 @@ def make(runs: Runs) -> Result:
         "Shape from one image, by the size of the training.",
         "Chamfer-L1 in scene units, times 1000, medians over shapes.",
         question="How many shapes, and images of each, does a training need?",
-        verdict=_verdict([line["ratio"] for line in lines if line["ratio"] is not None], largest),
+        verdict=_verdict(lines, largest),
         interval=single_view.INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
@@ -57,16 +57,12 @@ def _judged(line: dict[str, Any], largest: dict[str, int], whole: list[records.R
     }
 
 
-def _verdict(ratios: list[Any], largest: dict[str, int]) -> str:
-    """How many ratios to the largest training of a family differ from 1."""
-    known = [ratio for ratio in ratios if ratio.known]
-    if not known:
-        return ""
-    sure, n = sum(statistics.differ(known)), max(len(ratio.points) for ratio in known)
-    return (
-        f"{compare.HOLM}, *{sure} of {len(known)}* ratios to the training on {largest['shapes']} shapes "
-        f"with {largest['views']} images each differ from 1; n = {n} shapes, one training each."
-    )
+def _verdict(lines: list[dict[str, Any]], largest: dict[str, int]) -> str:
+    """Which errors differ from those of the largest training of a family."""
+    ratios = [(f"{line['family']}, {line['condition']}", line["ratio"]) for line in lines]
+    size = f"to the training on {largest['shapes']} shapes with {largest['views']} images each"
+    said = compare.differing(ratios, size)
+    return said and f"{said} One training each, so that the test is of shapes and not of trainings."
 
 
 PAGES = {"single_view_budget": make}

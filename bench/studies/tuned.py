@@ -27,7 +27,7 @@ def make(runs: Runs) -> Result:
     found = compare.Compared(runs, default_of)
     lines = [line for line in found.lines if line["family"] in found.families]
     tuned = [line for line in lines if line["preset"].startswith(TUNED)]
-    ratios = [(f"{line['row']} on {line['family']}", line["ratio"]) for line in tuned]
+    ratios = [(f"{line['row']} on {line['family']}", compare.ratio_of(line["ratio"])) for line in tuned]
     return found.result(
         "Methods at their defaults, tuned, and at their papers' settings.",
         "Are our defaults as good as tuned settings?",

@@ -153,9 +153,18 @@ def test_the_verdict_on_budgets_counts_ratios_that_differ_from_the_largest_train
         for (shapes, views), factor in {(96, 24): 1.0, (96, 1): 2.0, (12, 24): 1.5 if index % 2 else 0.7}.items():
             budget(tmp_path, shapes, views, (0.02 + 0.001 * index) * factor, index)
     said = (
-        f"{compare.HOLM}, *1 of 2* ratios to the training on 96 shapes with 24 images each differ from 1; n = 8 shapes"
+        f"{compare.HOLM}, *1 of 2* ratios to the training on 96 shapes with 24 images each differ from 1: car, images"
     )
-    assert page_of(tmp_path, "single_view_budget").verdict.startswith(said)
+    verdict = page_of(tmp_path, "single_view_budget").verdict
+    assert verdict.startswith(said) and "; 1 cannot be distinguished from 1." in verdict
+
+
+def test_a_verdict_on_budgets_that_no_data_could_give_is_none(tmp_path):
+    for index in range(8):
+        for views, error in zip((24, 1, 2, 3, 4, 5, 6, 8), (0.02, *[0.04] * 7), strict=True):
+            budget(tmp_path, 96, views, error, index)
+    verdict = page_of(tmp_path, "single_view_budget").verdict
+    assert "*cannot be decided with 8 shapes*" in verdict and "7 ratios need 9 shapes or more" in verdict
 
 
 def test_its_figure_has_a_point_for_each_shape(tmp_path):

@@ -7,6 +7,7 @@ from scipy import stats
 from bench.report.data.statistics import (
     FEWEST_SHAPES,
     Interval,
+    Verdict,
     as_good,
     bootstrap,
     clopper_pearson,
@@ -18,6 +19,8 @@ from bench.report.data.statistics import (
     paired_bootstrap,
     rank,
     ratio,
+    shapes_agreeing,
+    shapes_needed,
     share,
     typical,
 )
@@ -273,10 +276,25 @@ def test_holm_takes_the_least_chance_first_and_stops_at_the_first_that_does_not_
     def of(below: int, shapes: int = 12) -> Interval:
         return ratio([np.array([0.5])] * below + [np.array([2.0])] * (shapes - below), [np.array([1.0])] * shapes)
 
-    assert differ([of(10), of(12)]) == [True, True]  # .0005 <= .05 / 2, then .039 <= .05
-    assert differ([of(12), of(10), of(10), of(6)]) == [True, False, False, False]  # .039 > .05 / 3
-    assert differ([of(0), of(5, shapes=5)]) == [True, False]  # five shapes have no interval, and are not counted
+    yes, no = Verdict.DIFFERS, Verdict.NOT_DISTINGUISHED
+    assert differ([of(10), of(12)]) == [yes, yes]  # .0005 <= .05 / 2, then .039 <= .05
+    assert differ([of(12), of(10), of(10), of(6)]) == [yes, no, no, no]  # .039 > .05 / 3
+    assert differ([of(0), of(5, shapes=5)]) == [yes, Verdict.NOT_DECIDABLE]  # five shapes are not counted
     assert differ([]) == []
+
+
+def test_a_family_that_no_data_could_reject_cannot_be_decided():
+    def family(shapes: int, ratios: int) -> list[Interval]:
+        return [ratio(singles(*[0.5] * shapes), singles(*[1.0] * shapes))] * ratios
+
+    assert differ(family(6, 1)) == [Verdict.DIFFERS]  # 2 / 2^6 = .031
+    assert differ(family(6, 2)) == [Verdict.NOT_DECIDABLE] * 2  # > .05 / 2
+    assert differ(family(8, 7)) == [Verdict.NOT_DECIDABLE] * 7  # .0078 > .05 / 7
+    assert differ(family(9, 7)) == [Verdict.DIFFERS] * 7
+    mixed = differ([*family(6, 1), *family(12, 1)])  # .0005 <= .05 / 2, then .031 <= .05
+    assert mixed == [Verdict.DIFFERS] * 2
+    assert [shapes_needed(n) for n in (1, 7, 14)] == [6, 9, 10]
+    assert [shapes_agreeing(12, 11), shapes_agreeing(12, 1), shapes_agreeing(8, 7)] == [12, 10, 9]
 
 
 def test_a_ratio_is_paired_by_shape():

@@ -11,7 +11,8 @@ shapes stand in `Interval.points` to be shown instead. From one run alone no pro
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
+from enum import Enum
+from itertools import count, takewhile
 from typing import Any
 
 import numpy as np
@@ -132,15 +133,48 @@ def ratio(first: Groups, second: Groups) -> Interval:
     return _of_median(_ratio(_of_shapes(first), _of_shapes(second)))
 
 
-def differ(ratios: Sequence[Interval]) -> list[bool]:
-    """Which of a family of ratios differ from 1, by the sign test over shapes with Holm's step-down at 5 % in all.
+class Verdict(Enum):
+    """The result of a test whether a ratio differs from 1."""
 
-    Ratios of fewer shapes than `FEWEST_SHAPES` do not, and are not counted.
+    DIFFERS = "differs"
+    NOT_DISTINGUISHED = "cannot be distinguished"  # tested, and not rejected; this is not the same as equal
+    NOT_DECIDABLE = "cannot be decided"  # no data of so few shapes could be rejected
+
+
+def differ(ratios: Sequence[Interval]) -> list[Verdict]:
+    """The verdict on each ratio of a family: the sign test over shapes with Holm's step-down at 5 % in all.
+
+    A ratio is not decidable if the test would reject nothing even where all shapes of all ratios agree. Ratios of fewer
+    shapes than `FEWEST_SHAPES` are not decidable, and are not counted.
     """
-    chances = sorted((_sign_test(found.points), place) for place, found in enumerate(ratios) if found.known)
-    sure = [chance <= (1 - LEVEL) / (len(chances) - before) for before, (chance, _) in enumerate(chances)]
-    rejected = {place for (_, place), _ in zip(chances, takewhile(bool, sure), strict=False)}
-    return [place in rejected for place in range(len(ratios))]
+    counted = [index for index, ratio in enumerate(ratios) if ratio.known]
+    rejected = _holm({index: _sign_test(ratios[index].points) for index in counted})
+    decidable = _holm({index: _least_chance(len(ratios[index].points)) for index in counted})
+    open_verdicts = [Verdict.NOT_DISTINGUISHED if i in decidable else Verdict.NOT_DECIDABLE for i in range(len(ratios))]
+    return [Verdict.DIFFERS if i in rejected else verdict for i, verdict in enumerate(open_verdicts)]
+
+
+def _holm(chances: dict[int, float]) -> set[int]:
+    """The keys of those chances that Holm's step-down rejects at 5 % in all."""
+    ordered = sorted(chances.items(), key=lambda item: item[1])
+    rejected = [chance <= (1 - LEVEL) / (len(ordered) - before) for before, (_, chance) in enumerate(ordered)]
+    return {key for (key, _), _ in zip(ordered, takewhile(bool, rejected), strict=False)}
+
+
+def shapes_needed(ratios: int) -> int:
+    """The fewest shapes with which the sign test can reject anything in a family of so many ratios."""
+    return next(n for n in count(1) if _least_chance(n) <= (1 - LEVEL) / ratios)
+
+
+def shapes_agreeing(shapes: int, ratios: int) -> int:
+    """How many of the shapes must be on one side of 1 for Holm's first step to reject; one more than all if none do."""
+    chances = 2 * special.bdtr(np.arange(shapes), shapes, 0.5)  # of at most so many on the other side
+    return shapes + 1 - int(np.searchsorted(chances, (1 - LEVEL) / ratios, side="right"))
+
+
+def _least_chance(shapes: int) -> float:
+    """The probability of the sign test if all shapes are on one side of 1."""
+    return 2.0 * 0.5**shapes
 
 
 def _sign_test(points: Sequence[float]) -> float:
