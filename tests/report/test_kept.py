@@ -46,11 +46,16 @@ def test_a_page_that_needs_run_folders_stays_until_there_are_some(tmp_path):
     own, into = tmp_path / "own", tmp_path / "shipped"
     write_curve(write_run(own, "fig5", PARALLEL, id="a"), [4, 3, 2, 1], {0: 0.4, 2: 0.1})
     first = ship(own, into)
-    assert ship(own, into) == first
+    stayed = ship(own, into)
+    assert {name for name in first if stayed[name] != first[name]} == {"fig5.json", "fig5.md"}
+    head, _, rest = stayed["fig5.md"].partition("\n\n")
+    assert head.startswith("Drawn by version unknown, with its statistics") and rest == first["fig5.md"]
+    assert "(drawn by unknown)" in (into / "README.md").read_text() and ship(own, into) == stayed
     for run, minute in (("b", 5), ("c", 6), ("d", 7)):
         write_curve(write_run(own, "fig5", DYNAMIC, id=run, minute=minute), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
     later = ship(own, into)
     assert PARALLEL in later["fig5.runs.csv"] and PARALLEL not in later["fig5.csv"] and DYNAMIC in later["fig5.csv"]
+    assert "Drawn by version" not in later["fig5.md"]
     write_curve(write_run(own, "fig5", NAIVE, id="e", minute=9), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
     last = ship(own, into)  # one run says less than those that the page shows
     assert NAIVE in last["fig5.runs.csv"] and last["fig5.csv"] == later["fig5.csv"]

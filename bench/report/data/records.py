@@ -82,9 +82,9 @@ def error(record: Record, name: str) -> float:
 
 
 def loop_seconds(record: Record) -> float | None:
-    """The seconds in the optimisation loop; None where the record does not have them."""
+    """The seconds in the optimisation loop; None where the record does not have them. A restored row has their sum."""
     spent = [record["seconds"].get(name) for name in ("forward", "backward")]
-    return None if None in spent else sum(spent)
+    return record["seconds"].get("loop") if None in spent else sum(spent)
 
 
 def value_evaluations(record: Record) -> float | None:

@@ -65,14 +65,14 @@ class Runs:
         rows = [row_of(record) for record in self.records]
         coarse = table.evaluations_coarse.fillna(0) if "evaluations_coarse" in table else 0
         missing = pd.Series(pd.NA, table.index, dtype="Float64")
-        spent = [table.get(f"seconds_{part}", missing) for part in ("forward", "backward")]
+        forward, backward, loop = (table.get(f"seconds_{part}", missing) for part in ("forward", "backward", "loop"))
         return table.assign(
             row=[row.name for row in rows],
             preset=[row.preset for row in rows],
             family=[family(record) for record in self.records],
             solid=[str(solid(record)[1]) for record in self.records],
             view=[view(record) for record in self.records],
-            loop=(spent[0] + spent[1]).astype(float),
+            loop=(forward + backward).fillna(loop).astype(float),
             values=(table.get("evaluations_value", missing) + coarse).astype(float),
         )
 

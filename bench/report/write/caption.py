@@ -8,6 +8,7 @@ from operator import itemgetter
 from typing import Any
 
 from bench.records.format import plural
+from bench.report.data import age
 from bench.report.data.records import Record, doubtful, setting, solid, view
 from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
@@ -56,8 +57,9 @@ def undefined(values: Iterable[float]) -> str:
 
 
 def warnings(runs: Runs) -> list[str]:
-    """Notes on settings that differ, on times that do not compare or are doubtful, and on runs that are not shown."""
-    return [note for note in (_mixed(runs), _compared(runs), _loaded(runs), _omitted(runs)) if note]
+    """Notes on settings that differ, on times that do not compare or are doubtful, on old runs and on missing ones."""
+    said = (_mixed(runs), _compared(runs), _loaded(runs), *age.notes(runs.records), _omitted(runs))
+    return [note for note in said if note]
 
 
 def _sample(runs: Runs) -> str:

@@ -14,10 +14,11 @@ from urllib.parse import quote
 
 from bench.records.read import PLAN
 from bench.records.record import leads_out, write_text
+from bench.report.data import age
 from bench.report.data.kept import KEPT, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
 from bench.report.write.caption import SMOKE
-from bench.report.write.result import Result, Shown, as_markdown, markdown, read_shown, write
+from bench.report.write.result import Result, Shown, as_markdown, markdown, read_shown, write, write_shown
 
 FOLDER = "paper"
 SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
@@ -180,7 +181,7 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
         texts["sweep"] = found.base.name == TABLE and found.base.parents[1].name == SWEEPS
         entries.append({"name": found.name, "key": key, "title": (shown.title or found.name).rstrip("."), **texts})
         wholes[key] = {
-            **{"caption": shown.caption, "notes": shown.notes, "header": shown.columns},
+            **{"caption": f"{shown.head} {shown.caption}".strip(), "notes": shown.notes, "header": shown.columns},
             **{"rows": shown.rows + _beside(found, results_dir), "files": found.files, "picture": found.picture},
             **{"chart": shown.chart, "atlas": shown.atlas, "best": shown.best},
         }
@@ -200,12 +201,19 @@ def _beside(found: Found, results_dir: Path) -> list[list[str]]:
 def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[Path]:
     """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
 
+    A page that cannot be drawn stays as it is, and its head says which version drew it.
+
     Raises:
         ValueError: where rows that are there cannot be read, and would be lost.
     """
     every = join(records, read_rows(into / FOLDER))
     read = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
-    return [*write_rows(every, read, into / FOLDER), *write_paper(every, results_dir, into)]
+    rows, drawn = write_rows(every, read, into / FOLDER), write_paper(every, results_dir, into)
+    for page in _in(into):
+        table = page.base.with_suffix(".csv")
+        if table not in drawn and not page.shown.drawn_by:
+            write_shown(replace(page.shown, drawn_by=age.drawn_by(table)), page.base)
+    return [*rows, *drawn]
 
 
 def write_readme(results_dir: Path) -> Path | None:
@@ -252,7 +260,8 @@ def key_of(name: str) -> str:
 def _answer(page: Found) -> str:
     """A page's line in the table of all answers."""
     asked = page.shown.question or page.shown.title.rstrip(".")
-    return f"| [{as_markdown(asked)}](#{page.name}) | {as_markdown(page.shown.answer)} |"
+    drawn = f" (drawn by {page.shown.drawn_by})" if page.shown.drawn_by else ""
+    return f"| [{as_markdown(asked)}](#{page.name}) | {as_markdown(page.shown.answer + drawn)} |"
 
 
 def _section(page: Found) -> str:

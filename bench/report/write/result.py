@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from bench.pictures.style import RC
 from bench.records.record import plain
+from bench.report.data import age
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval
 from bench.report.write import caption
@@ -150,6 +151,12 @@ class Shown:
     drawn: bool = False
     chart: dict[str, Any] | None = None
     atlas: dict[str, Any] | None = None
+    drawn_by: str = ""  # the version that drew it, where that is not this one
+
+    @property
+    def head(self) -> str:
+        """By which version it was drawn, where this one cannot draw it."""
+        return age.head(self.drawn_by)
 
     @property
     def answer(self) -> str:
@@ -192,23 +199,35 @@ def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[P
     LaTeX has the label `tab:NAME`, by default that of the files.
     """
     base.parent.mkdir(parents=True, exist_ok=True)
-    texts = {".csv": result.data.to_csv(index=False), ".json": shown.to_json(), ".md": markdown(shown, base.name)}
-    if shown.columns:
-        texts[".tex"] = latex(shown, name or base.name)
-    for suffix, text in texts.items():
-        base.with_suffix(suffix).write_bytes(text.encode("utf-8", "backslashreplace"))
+    table = base.with_suffix(".csv")
+    _write_text(table, result.data.to_csv(index=False))
     drawn = [base.with_suffix(suffix) for suffix in (".png", ".pdf")] if result.figure is not None else []
     with rc_context(RC):
         for path in drawn:
             # Without a date, so that the same records give the same file.
             result.figure.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
-    return [base.with_suffix(suffix) for suffix in texts] + drawn
+    return [table, *write_shown(shown, base, name=name), *drawn]
+
+
+def write_shown(shown: Shown, base: Path, *, name: str = "") -> list[Path]:
+    """Writes what a page says: `base.json`, `.md`, and where there is a table `.tex`; gives the paths."""
+    texts = {".json": shown.to_json(), ".md": markdown(shown, base.name)}
+    if shown.columns:
+        texts[".tex"] = latex(shown, name or base.name)
+    for suffix, text in texts.items():
+        _write_text(base.with_suffix(suffix), text)
+    return [base.with_suffix(suffix) for suffix in texts]
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def markdown(shown: Shown, name: str) -> str:
-    """The Markdown text of a page: question and verdict, title, caption, table, picture and notes."""
+    """The Markdown text of a page: head, question and verdict, title, caption, table, picture and notes."""
+    head = [as_markdown(shown.head)] if shown.head else []
     asked = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
-    parts = [*asked, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
+    parts = [*head, *asked, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
     if shown.columns:
         head, rows = map(as_markdown, shown.columns), _emphasised(shown, as_markdown, "**{}**")
         rule = ["---" if of_words else "---:" for of_words in _of_words(shown)]
@@ -228,7 +247,7 @@ def latex(shown: Shown, name: str) -> str:
     lines = [
         r"\begin{table*}",
         r"\centering",
-        rf"\caption{{{_tex(shown.title)} {_tex(shown.caption)}}}",
+        rf"\caption{{{_tex(shown.title)} {_tex(f'{shown.head} {shown.caption}')}}}",
         rf"\label{{tab:{name}}}",
         r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
         rf"\begin{{tabular}}{{{aligned}}}",

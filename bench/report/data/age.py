@@ -1,0 +1,94 @@
+"""What of a run or a page is of an earlier version: settings that are gone, the engine of its times, its statistics."""
+
+import subprocess
+from functools import cache
+from pathlib import Path
+
+from bench.report.data.records import Record, grouped, row_of
+from bench.tables import CONF, LABEL, read_yaml
+
+RESTORED = "restored"  # of a row: the page and the version from whose CSV it was made, as its run folder is gone
+CHANGED = "2026-11-26"  # the day since which compiled code computes field values on one thread of a CPU
+UNKNOWN = "unknown"
+GONE = {  # settings of renderers: the value at which this version does the same, and what another value did
+    "keep_slope_sign": (True, "which turned the sign of the gradient at flat crossings"),
+}
+ENGINE = (
+    f"PyTorch computed all field values; since {CHANGED} compiled code computes those without a gradient on one thread "
+    "of a CPU, and times and their ratios are others"
+)
+
+
+def notes(records: list[Record]) -> list[str]:
+    """Notes on what of the runs is of an earlier version; none where nothing is."""
+    return [note for note in (_old_rows(records), _engine(records), _restored(records)) if note]
+
+
+def gone_settings(record: Record) -> list[str]:
+    """The recorded settings of our renderers that this version does not have, such as KEY=VALUE; such a row is old."""
+    settings = record["config"].get("renderer") or {}
+    arguments = _arguments().get(settings.get("_target_"), settings)
+    return [
+        f"{key}={value}{', ' if key in GONE else ''}{GONE.get(key, ('', ''))[1]}"
+        for key, value in settings.items()
+        if key not in arguments and (key not in GONE or GONE[key][0] != value)
+    ]
+
+
+@cache
+def _arguments() -> dict[str, set[str]]:
+    """The settings of each class of conf/renderer."""
+    files = [read_yaml(path) for path in sorted((CONF / "renderer").glob("*.yaml"))]
+    return {str(of[0]["_target_"]): {LABEL}.union(*of) for of in grouped(files, lambda file: file["_target_"]).values()}
+
+
+def _old_rows(records: list[Record]) -> str:
+    old = [(setting, row_of(record).name) for record in records for setting in gone_settings(record)]
+    told = [
+        f"{', '.join(dict.fromkeys(row for _, row in pairs))} ({len(pairs)} runs with {setting})"
+        for setting, pairs in grouped(old, lambda pair: pair[0]).items()
+    ]
+    return f"Old rows, with settings that this version does not have: {'; '.join(told)}." if told else ""
+
+
+def _engine(records: list[Record]) -> str:
+    """A note where the engine of times is not the default one of today: runs of before a record named its engine."""
+    known = [record["environment"] for record in records if record["environment"]]
+    before = [
+        said for said in known if "kernels" not in said and (said.get("device"), said.get("threads")) == ("cpu", 1)
+    ]
+    if not before:
+        return ""
+    whose = "Times" if len(before) == len(known) else f"Times of {len(before)} of {len(known)} runs"
+    return f"{whose} are of earlier versions: {ENGINE}."
+
+
+def _restored(records: list[Record]) -> str:
+    sources = sorted({record[RESTORED] for record in records if RESTORED in record})
+    if not sources:
+        return ""
+    return (
+        f"Rows are restored from {', '.join(sources)}, as their run folders are gone: of settings they have what that "
+        "page shows."
+    )
+
+
+def drawn_by(path: Path) -> str:
+    """The version of the code that drew a file, with its date: the commit that changed it last."""
+    command = ["git", "log", "-1", "--format=%h of %cs", "--", path.name]
+    try:
+        done = subprocess.run(command, cwd=path.parent, capture_output=True, text=True, check=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return UNKNOWN
+    return done.stdout.strip() or UNKNOWN
+
+
+def head(version: str) -> str:
+    """What stands at the head of a page that this version cannot draw; empty without the version that drew it."""
+    if not version:
+        return ""
+    day = version.rpartition(" ")[2]
+    engine = f" Then {ENGINE}." if version != UNKNOWN and day < CHANGED else ""
+    return (
+        f"Drawn by version {version}, with its statistics; this version cannot draw it without the run folders.{engine}"
+    )
