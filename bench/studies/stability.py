@@ -32,6 +32,7 @@ COST_NOTES = (
     "Axes are those that evaluate renderings and that every renderer supports; rank 1 is the best, and equal "
     "breakdowns share their mean rank.",
     "A run that did not end ok, or is missing, has the worst rank; 95 % bootstrap intervals over axes.",
+    "A renderer has one row, that of its own preset or else its first one; “stability” has its variants.",
     "At once: axes on which it breaks at the mildest severity; none: on which it does not break at the severest.",
 )
 CURVE_NOTES = (
@@ -39,6 +40,7 @@ CURVE_NOTES = (
     "Pearson), where repeats could differ.",
     "A cell of the page's atlas opens the curves of its axis.",
 )
+TARGET = ("renderer", "_target_")
 CRITERIA = ("hits", "false_hits", "cosine", "scale", "surface_error")
 NUMBERS = (
     *("level", "breakdown", "breakdown_low", "breakdown_high", "trials", "grid_trials", "evaluations_per_ray"),
@@ -93,6 +95,7 @@ def make_cost(runs: Runs) -> Result:
     """A line and a point per renderer: its mean rank over the axes, and its field values per ray."""
     runs = runs.of_newest_scene()
     cells = cells_of(runs)
+    cells = cells[cells["row"].isin(_ranked(runs))]
     rendered = cells[cells["measure"] == "rendering"]
     lacking = set(rendered.loc[rendered["status"] == "unsupported", "axis"])
     shared = rendered[~rendered["axis"].isin(lacking)]
@@ -280,14 +283,30 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
     return figure
 
 
+def _ranked(runs: Runs) -> list[str]:
+    """The name of one row of each of our renderers: its own preset's, or else its first one; and all rows of others."""
+    firsts = [own[0] for own in runs.rows().values()]
+    is_ours = {
+        record["row"]: str(records.setting(record["config"], *TARGET)).startswith(records.OURS) for record in firsts
+    }
+    of_renderer = records.grouped([one for one in firsts if is_ours[one["row"]]], records.base_renderer)
+    chosen = [
+        next((one for one in own if one["renderer"].replace("_", "") == renderer), own[0])["row"]
+        for renderer, own in of_renderer.items()
+    ]
+    return [name for name, ours in is_ours.items() if not ours or name in chosen]
+
+
 def _alike(ranks: dict[str, statistics.Interval]) -> str:
-    """Which rows cannot be told from the one of the best rank; empty without intervals, which all have or none."""
+    """Which rows cannot be distinguished from that of the best rank; empty without intervals: all have one or none."""
     best = min(ranks, key=lambda row: ranks[row].value)
     if not ranks[best].known:
         return ""
     found = statistics.as_good(ranks, best)
-    named = f": {', '.join(found)}" if found else ""
-    return f"The interval of the difference to {best} holds 0 for *{len(found)}* of the others{named}."
+    if not found:
+        return f"All others differ from {best} by the interval of the difference of ranks."
+    listed = f"*{len(found)}* of the {len(ranks) - 1} others ({', '.join(found)})"
+    return f"By the interval of the difference of ranks, {listed} cannot be distinguished from {best}."
 
 
 def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:

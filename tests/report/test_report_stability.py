@@ -9,7 +9,7 @@ from tests.report.test_report_paper import page_of, told, write_lines, write_run
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 
 
-def broke(results, axis, label, level, *, status="ok", measure="rendering", criteria=None, repeats=None, **metrics):
+def broke(results, axis, label, level, *, status="ok", measure="rendering", criteria=None, repeats=None, **more):
     """A run of the atlas whose breakdown lies at a level; with a curve of ten trials, or one trial at each end."""
     off, trials = (None, 1) if repeats == 1 else (0.05, 5)
     ends = {"": level, "_low": off and level - off, "_high": off and level + off}
@@ -17,7 +17,9 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", crit
     known |= {f"breakdown{end}": 0.01**at if at is not None and 0 <= at <= 1 else None for end, at in ends.items()}
     known |= {"trials": 10, "grid_trials": 40, "evaluations_per_ray": 4.0, "failed_lost": 3, "failed_false": 1}
     known |= {f"{end}_trials": trials for end in ("mild", "severe")}
-    known |= {"mild_successes": trials * (level > 0), "severe_successes": trials * (level > 1)} | metrics
+    renderer = {name: more.pop(name) for name in ("renderer",) if name in more}
+    settings = {"renderer": {"_target_": more.pop("target")}} if "target" in more else {}
+    known |= {"mild_successes": trials * (level > 0), "severe_successes": trials * (level > 1)} | more
     stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP, "repeats": repeats}
     search = {"levels": 11, "repeats": 4}
     folder = write_run(
@@ -27,7 +29,9 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", crit
         status=status,
         reason="" if status == "ok" else "why",
         metrics=known if status == "ok" else {},
-        settings={
+        **renderer,
+        settings=settings
+        | {
             "task": {"stress": stress, "search": search, "fit_search": search, "criteria": criteria or {}},
             "stress": stress,
         },
@@ -108,6 +112,21 @@ def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
     assert rows.loc["DIST", columns].tolist() == [3, 1, 0, 3.0]
     assert rows.loc["DVR", columns].tolist() == [3, 0, 1, 4.0]
     assert rows["rank"].to_dict() == {"DIST": pytest.approx(5.5 / 3), "DVR": pytest.approx(3.5 / 3)}
+
+
+def test_the_ranking_has_one_row_a_renderer(tmp_path):
+    rows = {"+ capped": "dist_capped", "DIST, our default": "dist", "VolSDF, 136 samples": "volsdf_budget"}
+    for axis in ("wires", "gap", "thin_plate", "bumps", "nested_shells", "csg_difference"):
+        for label, preset in rows.items():
+            target = "renderers.VolSDF" if preset == "volsdf_budget" else "renderers.DIST"
+            broke(tmp_path, axis, label, 0.5, renderer=preset, target=target)
+        for label, level in (("Mine", 0.5), ("Mine, slow", 0.9)):
+            broke(tmp_path, axis, label, level, renderer="custom", target="mypkg.Mine")
+    page = page_of(tmp_path, "stability_cost")
+    assert set(page.data["row"]) == {"DIST, our default", "VolSDF, 136 samples", "Mine", "Mine, slow"}
+    assert "4 renderers" in page.caption and "(Mine, slow, 4.00 field values per ray)" in page.verdict
+    assert "All others differ from Mine, slow by the interval of the difference of ranks" in page.verdict
+    assert "+ capped" in page_of(tmp_path, "stability").table
 
 
 @pytest.mark.parametrize("status", ["timeout", "missing"])
