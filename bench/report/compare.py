@@ -261,7 +261,7 @@ class Compared:
         """
         ratio = changed.pop("ratio", "Ratio to the reference")
         panels = self.front(changed.pop("filled", None))
-        whole = [(line["row"], ratio_of(line["ratio"])) for line in self.pooled if not line["lacking"]]
+        whole = [(line["row"], ratio_of(line["ratio"])) for line in self.comparable]
         sure = differing(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
             "plotted": "Median error under each condition, that over shapes of their geometric means, and the median "
@@ -278,21 +278,33 @@ class Compared:
             parts["figure"] = chart.draw(panels, 3.2 + taller, sharey=True, legend=LEGEND)
         return Result(self.runs, title, question=question, chart={"panels": panels}, **parts)
 
-    def best(self, least_of: str) -> str:
-        """The row with the least mean error and the quickest one, as a verdict; empty where there is none.
+    @property
+    def comparable(self) -> list[Line]:
+        """The pooled lines that a verdict is on: of rows that lack no shape and have the settings that most runs have.
 
-        Rows that lack a shape of another row are left out: they are not of the same shapes.
+        The settings are those of `Runs.mixed`, of which a note says that rows with other values do not compare.
         """
-        known = [line for line in self.pooled if math.isfinite(line["error"].value) and line["seconds"] is not None]
-        whole = [line for line in known if not line["lacking"]]
+        usual = np.ones(len(self.runs.records), dtype=bool)
+        for key in self.runs.mixed():
+            values = self.runs.setting(key)
+            usual &= (values == values.mode()[0]).to_numpy()
+        same = self.runs.where(pd.Series(usual)).rows()
+        return [line for line in self.pooled if not line["lacking"] and Row(line["preset"], line["row"]) in same]
+
+    def best(self, least_of: str) -> str:
+        """The row with the least mean error and the quickest one, as a verdict; empty where there is none."""
+        lines = self.comparable
+        whole = [line for line in lines if math.isfinite(line["error"].value) and line["seconds"] is not None]
         if not whole:
             return ""
         n = len(whole[0]["error"].points)
         best, quick = (min(whole, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
-        told = [f"({line['row']}, {format.seconds(line['seconds'])})" for line in (best, quick)]
-        least, other = (format.number(line["error"].value) for line in (best, quick))
-        quickest = f"the quickest row has {other} {told[1]}; n = {format.plural(n, 'shape')}."
-        return f"The least median of {least_of} is *{least}* {told[0]}; {quickest}"
+        least, other = (
+            f"{format.number(line['error'].value)}{mark} ({line['row']}, {format.seconds(line['seconds'])}"
+            for line, mark in ((best, "*"), (quick, ""))
+        )
+        quickest = ", which is the quickest row too)" if best is quick else f"); the quickest row has {other})"
+        return f"The least median of {least_of} is *{least}{quickest}; n = {format.plural(n, 'shape')}."
 
     def front(self, filled: Callable[[str], bool] | None = None) -> list[chart.Panel]:
         """Panels of the mean error of each row over each cost, over all families.

@@ -70,11 +70,13 @@ def _successes(records: Sequence[Record]) -> str:
 
 
 def _verdict(runs: Runs) -> str:
-    """The share of successes of each row, over all conditions but known places."""
-    off = [record for record in runs.records if not place_known(record)]
+    """The share of successes of each row, over the runs that did not begin in place."""
+    off = [record for record in runs.records if any(one.of(record) != one.neutral for one in CONDITIONS)]
     shares = {row.name: sum(map(_succeeded, own)) / len(own) for row, own in grouped(off, row_of).items()}
     shapes = format.plural(len({solid(record) for record in off}), "shape")
-    return format.ends(f"Runs with an error below {SUCCESS:g}", shares, shapes, show=table.percent, most=True)
+    return format.ends(
+        f"Misplaced runs that end with an error below {SUCCESS:g}", shares, shapes, show=table.percent, most=True
+    )
 
 
 def pictures(runs: Runs) -> Result:

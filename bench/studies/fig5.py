@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.data.records import SCALE, Row, median_of_known, setting
+from bench.report.data.records import SCALE, Row, grouped, median_of_known, setting
 from bench.report.data.runs import shared_loss
 from bench.report.study import Result, Runs, Selection, chart, curves, format, style, table
 
@@ -66,10 +66,13 @@ def make(runs: Runs) -> Result:
 
 
 def _verdict(lines: list[dict[str, Any]]) -> str:
-    """In which rows loss and error fall together; the paper says that they are highly correlated."""
-    known = {line["row"]: line["spearman"] for line in lines if line["spearman"] is not None}
+    """In which rows loss and error fall together, of rows equal in every digit once; the paper says in all."""
+    numbers = ("end", "low", "high", "spearman")
+    with_rank = [line for line in lines if line["spearman"] is not None]
+    same = grouped(with_rank, lambda line: tuple(line.get(name) for name in numbers)).values()
+    known = {" = ".join(line["row"] for line in of): of[0]["spearman"] for of in same}  # one computation counts once
     apart = [f"{row} (*{value:.2f}*)" for row, value in known.items() if value < HIGH]
-    alike = f"{len(known) - len(apart)} of {format.plural(len(known), 'row')} (ρ of {HIGH} or more)"
+    alike = f"{len(known) - len(apart)} of {format.plural(len(known), 'different row')} (ρ of {HIGH} or more)"
     said = f"not in {', '.join(apart)}, against the paper" if apart else "as in the paper"
     return f"Loss and error fall together in {alike}; {said}." if known else ""
 

@@ -46,13 +46,7 @@ def make(runs: Runs) -> Result:
         "Camera pose from a depth image and a silhouette of a known shape.",
         PLOTTED.format(**settings),
         question="From how far off is the camera of a known shape found?",
-        verdict=format.ends(
-            f"Cameras found from {angles[-1]:g} degrees",
-            {row: own.found[own.degrees == angles[-1]].mean() for (row, _), own in rows.items()},
-            format.plural(len(found[["family", "solid"]].drop_duplicates()), "shape"),
-            show=table.percent,
-            most=True,
-        ),
+        verdict=_verdict(found),
         interval="95 % intervals over shapes (Clopper and Pearson)",
         estimates=[_rate(own) for _, own in found.groupby(["row", "preset", "degrees"])],
         remarks=[note.format(**settings) for note in NOTES],
@@ -68,10 +62,21 @@ def _poses(runs: Runs) -> pd.DataFrame:
     ok = (runs.frame.status == "ok").to_numpy(bool)
     return runs.frame[["row", "preset", "family", "solid"]].assign(
         degrees=runs.number("config.task.degrees"),
+        starts=runs.number("config.task.starts").fillna(1),
         found=ok & (runs.number("success") == 1).to_numpy(),
         seconds=runs.frame.loop.where(ok),
         evaluations=runs.frame["values"].where(ok),
     )
+
+
+def _verdict(found: pd.DataFrame) -> str:
+    """The most and the fewest cameras found from the largest angle, by the number of starts, which costs apart."""
+    farthest, shapes = found.degrees.max(), format.plural(len(found[["family", "solid"]].drop_duplicates()), "shape")
+    said = []
+    for starts, own in found[found.degrees == farthest].groupby("starts"):
+        what = f"Cameras found from {farthest:g} degrees by {format.plural(int(starts), 'start')}"
+        said.append(format.ends(what, own.groupby("row").found.mean(), shapes, show=table.percent, most=True))
+    return " ".join(said)
 
 
 def _line(row: str, own: pd.DataFrame) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from bench.report.study import Result, Runs, Selection, format, gallery, records, table
+from bench.report.study import Result, Runs, Selection, gallery, records, table
 
 PLACE = 230
 READS = (Selection("fig7", alike=("dataset", "view", "prior", "task")),)
@@ -23,22 +23,34 @@ def make(runs: Runs) -> Result:
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
     found = gallery.compared(chosen, MOST_COLUMNS)
     lines = [(record, _counts(record, drawn)) for record, drawn in zip(chosen.records, found.counts, strict=True)]
-    wrong = {
-        f"epsilon = {_epsilon(record):g}": counts["lost_share"] + counts["false_share"]
-        for record, counts in lines
-        if record["status"] == "ok" and "lost_share" in counts and _epsilon(record) is not None
-    }
     return Result(
         chosen,
         "Erosion and dilation of the image by the convergence threshold.",
         "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
         "blue) above the angle to the reference's.",
         question="Which threshold of convergence shows the true outline?",
-        verdict=format.ends("Missed and spurious pixels over the hits", wrong, "one shape", show=table.small_percent),
+        verdict=_verdict(
+            [counts | {"epsilon": _epsilon(record)} for record, counts in lines if record["status"] == "ok"]
+        ),
         remarks=(*found.missing, *NOTES),
         columns=COLUMNS,
         lines=lines,
         figure=gallery.draw(found.blocks, largest=found.largest),
+    )
+
+
+def _verdict(counts: list[dict[str, Any]]) -> str:
+    """The least share of wrong pixels, and the thresholds whose number of them is within its standard deviation."""
+    known = [one for one in counts if "lost_share" in one and one["epsilon"] is not None]
+    if not known:
+        return ""
+    wrong = {one["epsilon"]: one["lost"] + one["false"] for one in known}
+    least, (worst, most) = min(wrong.values()), max(wrong.items(), key=lambda item: item[1])
+    alike = [f"{epsilon:g}" for epsilon, pixels in wrong.items() if pixels - least <= math.sqrt(least)]
+    share, largest = (table.small_percent(pixels / known[0]["hits"]) for pixels in (least, most))
+    return (
+        f"Missed and spurious pixels are fewest, *{share}* of the hits, at epsilon = {' or '.join(alike)}, and at "
+        f"{worst:g} they are {largest}; n = one shape."
     )
 
 

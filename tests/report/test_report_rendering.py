@@ -237,7 +237,14 @@ def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
     shown = page.table[["Epsilon", "Erosion", "Dilation"]].to_numpy().tolist()
     assert shown[0] == ["0.0500", "1.00 %", "25.0 %"] and shown[1][1:] == ["–", "–"]
     assert "killed (stopped)" in told(page)
-    assert "*0.250 %* (epsilon = 5e-05) to 26.0 % (epsilon = 0.05)" in page.verdict
+    assert "fewest, *0.250 %* of the hits, at epsilon = 5e-05, and at 0.05 they are 26.0 %" in page.verdict
+
+
+def test_counts_of_wrong_pixels_within_their_noise_are_named_together(tmp_path):
+    for epsilon, lost in ((5e-4, 208), (5e-5, 209), (5e-3, 425)):
+        metrics = costs(lost=lost, false=0, hits=14167)
+        write_images(write_run(tmp_path, "fig7", None, metrics=metrics, settings={"renderer": {"epsilon": epsilon}}))
+    assert "fewest, *1.47 %* of the hits, at epsilon = 0.0005 or 5e-05, and" in page_of(tmp_path, "fig7").verdict
 
 
 def test_pictures_are_of_one_scene(tmp_path):

@@ -29,9 +29,9 @@ def test_ratios_are_of_pairs_of_one_scan(tmp_path):
         made(tmp_path, "measured", measured, index=index)
     made(tmp_path, "exact", 1000.0, index=3)  # without a partner
     line = row(tmp_path)
-    assert (line["Depth error, exact"], line["Depth error, measured"]) == ("4.00", "2.00")  # medians
-    assert line["Depth error, ratio"] == "2.00"  # of 2, 1/2 and 8
-    assert line["Chamfer, exact"] == "12.0" and line["Truth to prediction, exact"] == "8.00"
+    assert (line["Chamfer, exact"], line["Chamfer, measured"]) == ("4.00", "2.00")  # medians
+    assert line["Chamfer, ratio"] == "2.00"  # of 2, 1/2 and 8
+    assert line["Depth error, exact"] == "12.0" and line["Truth to prediction, exact"] == "8.00"
     assert line["Failed"] == "0 of 7"
 
 
@@ -52,7 +52,7 @@ def test_a_failure_is_infinite_and_a_refusal_does_not_count(tmp_path, status, me
     made(tmp_path, "measured", 2.0, index=1, status=status)
     line, result = row(tmp_path), page_of(tmp_path, "scans")
     assert (f": *{ratio}* (newton); n = " in result.verdict) is (status == "refused")
-    assert (line["Depth error, measured"], line["Depth error, ratio"]) == (measured, ratio)
+    assert (line["Chamfer, measured"], line["Chamfer, ratio"]) == (measured, ratio)
     assert line["Failed"] == failed
     assert status in result.data["status"].tolist()
 
@@ -68,4 +68,4 @@ def test_where_each_failed_alone_the_ratio_is_unknown_and_not_in_the_verdict(tmp
             made(tmp_path, other, 1.0, index=index, status="ok" if other == depths else "diverged")
             made(tmp_path, other, 2.0 if other == "exact" else 3.0, index=index, renderer="dist")
     assert [line["Depth error, ratio"] for line in page_of(tmp_path, "scans").table.to_dict("records")] == ["–", "1.50"]
-    assert page_of(tmp_path, "scans").verdict.endswith(": *1.50* (dist); n = 2 scans.")
+    assert page_of(tmp_path, "scans").verdict.endswith(": *1.50* (dist); n = 2 scans of 1 object, without an interval.")

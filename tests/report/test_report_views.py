@@ -29,7 +29,7 @@ def found(results, experiment, label, chamfer, *, start=8.0, renderer="dist", me
     )
 
 
-def posed(results, label, degrees, success, *, task="pose", dataset=None, **changed):
+def posed(results, label, degrees, success, *, task="pose", dataset=None, starts=1, **changed):
     """A run of camera pose; None as its success is a run that failed, though its pose is right."""
     return write_run(
         results,
@@ -40,7 +40,8 @@ def posed(results, label, degrees, success, *, task="pose", dataset=None, **chan
         metrics={"success": 1.0 if success is None else float(success)},
         seconds={"forward": 1.5, "backward": 0.5} if task == "pose" else {"forward": 0.25, "backward": 0.0},
         settings={
-            "task": {"degrees": degrees, "shift": 0.1, "success_degrees": 5.0, "success_distance": 0.05, "starts": 1},
+            "task": {"degrees": degrees, "shift": 0.1, "starts": starts}
+            | {"success_degrees": 5.0, "success_distance": 0.05},
             "dataset": dataset or {"name": "car"},
         },
         **changed,
@@ -174,6 +175,33 @@ def test_six_shapes_have_an_interval_that_does_not_count_their_views(tmp_path):
     (band,) = result.figure.axes[0].collections
     ends = band.get_paths()[0].vertices[:, 1]
     assert [ends.min(), ends.max()] == pytest.approx([100 * low, 100 * high], rel=1e-4)
+
+
+def test_cameras_are_compared_at_one_number_of_starts(tmp_path):
+    for label, starts, success in (("DIST", 1, 0), ("ICP", 1, 1), ("ICP, 16 starts", 16, 1)):
+        posed(tmp_path, label, 90, success, starts=starts)
+    verdict = page_of(tmp_path, "fig6").verdict
+    assert "by 1 start: *100 %* (ICP) to 0 % (DIST)" in verdict and "by 16 starts: *100 %* (ICP, 16" in verdict
+
+
+def test_runs_that_begin_in_place_are_no_successes_of_misplaced_ones(tmp_path):
+    placed = {"shift": 0.0, "degrees": 0.0, "scale": 1.0, "similarity": True}
+    found(tmp_path, "fig12", "DIST", 0.2, **placed)
+    for index, chamfer in enumerate((0.5, 2.0)):
+        found(tmp_path, "fig12", "DIST", chamfer, index=index, **placed | {"degrees": 20.0})
+    assert "below 1: *50 %* (DIST)" in page_of(tmp_path, "fig12").verdict
+
+
+def test_a_row_of_another_resolution_is_in_no_headline(tmp_path):
+    for index in range(6):
+        for label, error in (("DIST", 2.0), ("IDR", 1.0)):
+            found(tmp_path, "table3", label, error, index=index, method=f"multiview_{label.lower()}")
+        small = {"metrics": {ENDS: 5e-4}, "seconds": {"forward": 0.5, "backward": 0.1}, "index": index}
+        view = {"view": {"resolution": 32}, "task": {"focal": 1.0, "start_scale": 1.0}}
+        write_run(tmp_path, "table3", "DVR", task="multiview", method="multiview_dvr", settings=view, **small)
+    result = page_of(tmp_path, "table3")
+    assert "DVR" not in result.verdict and "*1.00* (IDR" in result.verdict
+    assert row(result, "DVR")["Median"] == "0.500" and "rows with other values do not compare" in told(result)
 
 
 def test_a_single_run_of_one_condition_has_a_page(tmp_path):
