@@ -5,16 +5,36 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.data.records import Record, RunKey, by_shape, error, median_of_known, run_key, setting
+from bench.report.data.records import (
+    Record,
+    RunKey,
+    by_shape,
+    error,
+    median_of_known,
+    row_of,
+    run_key,
+    setting,
+    shared_settings,
+)
 from bench.report.data.runs import Runs
-from bench.report.data.statistics import Interval, bootstrap, median, ratio
+from bench.report.data.statistics import Interval, ratio, typical
 from bench.report.medians import draw_runs, medians, scored
 from bench.report.write.table import FAMILY, IDENTITY, LOOP, Column, metrics, shown, text, thousandfold
 
 NAMES = ("iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr")
 BASELINES = {"single_view_mean": "Over the mean shape", "single_view_nearest": "Over the nearest image"}  # presets
 OVER = "“Over ...”: the median over shapes of the ratio of Chamfer-L1 to that row's; below 1 is better."
-INTERVALS = "95 % intervals over shapes, bootstrapped of medians and of the sign test for ratios"
+INTERVALS = "95 % intervals over shapes (of the sign test)"
+SETTINGS = {  # of a training, by their names in notes
+    "training shapes": ("task", "shapes"),
+    "images of each shape": ("task", "views"),
+    "steps": ("task", "training", "steps"),
+    "shapes per step": ("task", "training", "shapes_per_step"),
+    "rays": ("task", "training", "rays"),
+    "learning rate": ("task", "training", "learning_rate"),
+    "weight of the mask": ("supervision", "losses", "silhouette_weight"),
+    "visual hull": ("supervision", "hull"),
+}
 RUNS = (FAMILY, *IDENTITY, *metrics(*NAMES, "chamfer_l2", "mask_iou_least"), *LOOP)
 
 
@@ -41,11 +61,17 @@ def lines_of(runs: Runs, family: str, presets: Iterable[str]) -> list[dict[str, 
     others = {row: values for row, values in errors.items() if row.preset in presets}
     return [
         line
-        | {"family": family, "interval": bootstrap(by_shape(errors[row]), median)}
+        | {"family": family, "interval": typical(by_shape(errors[row]))}
         | {"training": _of_training(records, "seconds"), "training_values": _of_training(records, "evaluations")}
         | {other.preset: over(errors[row], values) for other, values in others.items() if other != row}
         for line, (row, records) in zip(medians(own, NAMES), own.rows().items(), strict=True)
     ]
+
+
+def trainings(runs: Runs) -> str:
+    """A note on the settings that the trainings share, and on those in which they differ."""
+    taught = [record for record in runs.records if row_of(record).preset not in BASELINES]
+    return shared_settings(taught, SETTINGS)
 
 
 def _of_training(records: list[Record], cost: str) -> float | None:

@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 
 from bench.records.metrics import DVR_TABLE2
-from bench.report.data.records import SCALE, Record, Row, grouped, row_of, setting
+from bench.report.data.records import SCALE, Record, Row, grouped, row_of, setting, shared_settings
 from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
 from bench.report.tuning import TUNED
 
@@ -19,13 +19,19 @@ NOTES = (
     "units, times 1000, and two samplings of one surface by 30,000 points have a Chamfer-L1 of 5.7 to 7.1.",
     "Colours are compared at hits on held-out photographs; with volumes and the relaxed boundary on all rays of the "
     "foreground, in front of black.",
-    "All rows but DVR's own share one field, rate and iterations; volumes have the cross entropy of their opacity for "
-    "the masks and a budget of samples a ray.",
-    "DVR's own rows have their paper's rate and no more iterations than others, but the one that has ten times both; "
+    "Volumes have the cross entropy of their opacity for the masks and a budget of samples a ray.",
     "“Error over the iterations on photographs” shows whether a row is at its end.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
     "measured rows.",
 )
+SETTINGS = {  # of rows that are optimised, by their names in the note
+    "field": ("field",),
+    "learning rate": ("task", "optimiser", "learning_rate"),
+    "iterations": ("task", "optimiser", "iterations"),
+    "rays": ("task", "rays"),
+    "weight of the mask": ("task", "losses", "silhouette_weight"),
+    "eikonal weight": ("task", "losses", "eikonal"),
+}
 COLUMNS = (
     table.text("method", "Method"),
     table.Column("seen_accuracy", "Accuracy", show=table.thousandfold),
@@ -40,6 +46,7 @@ RUNS = (
     *table.IDENTITY,
     *table.metrics(*NAMES, "seen_fscore", "mask_iou_least", "own_psnr", "own_mask_iou"),
     *table.LOOP,
+    *(table.configured(name.replace(" ", "_"), *path) for name, path in SETTINGS.items()),
 )
 PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN, "psnr"))
 
@@ -66,6 +73,7 @@ def make(runs: Runs) -> Result:
         {"method": f"published: {name}", **dict(zip(NAMES, (value / SCALE for value in values), strict=False))}
         for name, values in DVR_TABLE2.items()
     ]
+    optimised = [record for record in runs.records if setting(record["config"], "task", "optimiser")]
     panels = {
         f"{SEEN_LABEL} (scene units)": SCALE * medians.scored(runs, SEEN),
         **medians.cost(runs),
@@ -82,7 +90,7 @@ def make(runs: Runs) -> Result:
             scenes,
             show=table.thousandfold,
         ),
-        remarks=NOTES,
+        remarks=(shared_settings(optimised, SETTINGS), *NOTES),
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,

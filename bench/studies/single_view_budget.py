@@ -2,14 +2,14 @@
 
 from typing import Any
 
-from bench.report.study import Result, Runs, Selection, compare, conditions, records, single_view, table
+from bench.report.study import Result, Runs, Selection, compare, conditions, records, single_view, statistics, table
 
 PLACE = 43
 READS = (Selection("single_view_budget", ("task.shapes", "task.views"), setup=("machine",)),)
 LABELS = {"shapes": "training shapes", "views": "images of each shape"}
 NOTES = (
-    "One of the two numbers varies, the other is the largest. Each point is a training of its own, with the same "
-    "number of steps; all are judged by the same shapes, and a failed run counts as infinite.",
+    "One of the two numbers varies, the other is the largest. Each point is a training of its own; all are "
+    "judged by the same shapes, and a failed run counts as infinite.",
     "“Over the largest”: the median over shapes of the ratio of Chamfer-L1 to that of the largest training; "
     "above 1 is worse.",
 )
@@ -39,7 +39,7 @@ def make(runs: Runs) -> Result:
         verdict=_verdict(lines, largest),
         interval=single_view.INTERVALS,
         estimates=[line["error"] for line in lines],
-        remarks=NOTES,
+        remarks=(single_view.trainings(runs), *NOTES),
         columns=COLUMNS,
         lines=lines,
         run_columns=RUNS,
@@ -48,11 +48,12 @@ def make(runs: Runs) -> Result:
 
 
 def _judged(line: dict[str, Any], largest: dict[str, int], whole: list[records.Record] | None) -> dict[str, Any]:
-    """What failed at a budget, and its ratio to the runs of the largest one; None for that itself."""
+    """What failed at a budget, its median error, and its ratio to the runs of the largest one; None for that itself."""
     own, errors = line["runs"], single_view.errors_of
     same = whole is None or line["at"] == largest[line["key"]]
     return {
         "failed": f"{sum(record['status'] != 'ok' for record in own)} of {len(own)}",
+        "error": statistics.typical(records.by_shape(errors(own))).times(records.SCALE),
         "ratio": None if same else single_view.over(errors(own), errors(whole)),
     }
 

@@ -8,8 +8,6 @@ PLACE = 39
 READS = (Selection("single_view_renderers", setup=("machine",)),)
 FIRST = "single_view_by_newton"  # the row that others are compared with
 NOTES = (
-    "The same network, shapes, images, rays, number of steps and losses, IDR's cross entropy of the mask included; no "
-    "step learns from the visual hull.",
     f"{single_view.OVER} A failed run counts as infinite.",
     "“Trained in” and “field values”: of the training, once for the family, beside another training.",
 )
@@ -34,7 +32,7 @@ def make(runs: Runs) -> Result:
         verdict=" ".join(filter(None, map(_verdict, of_family))),
         interval=single_view.INTERVALS,
         estimates=[line["interval"] for line in lines],
-        remarks=NOTES,
+        remarks=(single_view.trainings(runs), *NOTES),
         columns=COLUMNS,
         lines=lines,
         run_columns=single_view.RUNS,

@@ -9,8 +9,7 @@ DEFINED = {"seen_roughness": "Roughness", "unseen_roughness": "Roughness", "own_
 SCENES = 3  # of the figure
 BACK = "back_"  # prefix of arrays of the view from behind
 NOTES = (
-    "All photographs are from within 45 degrees of one direction, and pictures from the opposite one; all rows share "
-    "one field.",
+    "All photographs are from within 45 degrees of one direction, and pictures from the opposite one.",
     "A row's name says its loss of the mask, and without one it is the renderer's own: read a renderer under two "
     "losses, or two renderers under one.",
 )
@@ -48,7 +47,10 @@ def make(runs: Runs) -> Result:
             medians.whole(lines, "unseen_roughness"),
             format.plural(len(every), "scene"),
         ),
-        remarks=(*NOTES, *records.definitions(runs.records, DEFINED), *gallery.missing(scenes.values())),
+        remarks=(
+            *(*NOTES, records.shared_settings(runs.records, {"field": ("field",)})),
+            *(*records.definitions(runs.records, DEFINED), *gallery.missing(scenes.values())),
+        ),
         columns=COLUMNS,
         lines=lines,
         run_columns=RUNS,

@@ -100,6 +100,16 @@ def test_what_no_fall_is_known_of_is_missing_and_costs_no_page(tmp_path, last, c
     assert result.table.values.tolist() == [[NEWTON, *expected]] and result.verdict == ""
 
 
+def test_a_note_on_equal_settings_is_that_of_the_records(tmp_path):
+    for row, rate, field in ((NEWTON, 0.01, "prior"), (IDR, 0.004, "prior"), (NEUS, 0.01, "auto")):
+        task = {"_target_": "reconstruction", "optimiser": {"iterations": 400, "learning_rate": rate}}
+        settings = {"task": task, "field": field}
+        write_run(tmp_path, "dvr_table2", row, task="reconstruction", metrics=scored(0.01), settings=settings)
+    made(tmp_path, HULL, scored(0.05))  # without an optimiser
+    note = next(note for note in page_of(tmp_path, "dvr_table2").notes if "Rows share" in note)
+    assert note == "Rows share: iterations 400. Rows differ in: field (auto, prior), learning rate (0.004, 0.01)."
+
+
 def test_a_line_has_the_medians_over_scenes_with_failed_runs_worst(tmp_path):
     for dataset, chamfer, psnr in (("sofa", 0.02, 20.0), ("car", 0.01, 24.0), ("plane", 0.04, 22.0)):
         made(tmp_path, NEWTON, scored(chamfer, psnr), dataset=dataset, seconds=100 * chamfer)

@@ -107,6 +107,27 @@ def setting(config: dict[str, Any], *path: str) -> Any:
     return node
 
 
+def shared_settings(records: list[Record], names: dict[str, tuple[str, ...]]) -> str:
+    """A note on which settings all records share, and in which they differ; empty where no record has any.
+
+    Args:
+        names: the path of each setting in a configuration, by the name that the note has for it.
+    """
+    values = {
+        name: {str(value): value for one in records if (value := setting(one["config"], *path)) is not None}
+        for name, path in names.items()
+    }
+    shared = [f"{name} {next(iter(found))}" for name, found in values.items() if len(found) == 1]
+    differ = [f"{name} ({', '.join(_ordered(found.values()))})" for name, found in values.items() if len(found) > 1]
+    parts = [("Rows share: ", shared), ("Rows differ in: ", differ)]
+    return " ".join(f"{word}{', '.join(listed)}." for word, listed in parts if listed)
+
+
+def _ordered(values: Iterable[Any]) -> list[str]:
+    """Values as text, numbers by their size and before words."""
+    return [str(value) for value in sorted(values, key=lambda x: (1, str(x)) if as_number(x) is None else (0, x))]
+
+
 def shape(record: Record) -> tuple[str, Any]:
     """The shape of a run: its family and its number there."""
     return family(record), index(record)
