@@ -1,6 +1,8 @@
 """Compiled code beside plain PyTorch, which does the same up to rounding: built once per machine, where possible.
 
-It computes values of fields only, for all renderers alike, so that no comparison is one of engines.
+Compiled are the values of float32 ReLU networks without a gradient, on one thread of a CPU. PyTorch computes all else:
+values with a gradient, coarse values, and those of softplus networks, grids and formulas. Renderers ask for these in
+different shares, so that a ratio of their seconds depends on the engine: a record names it under `kernels`.
 `IMPLICIT_BENCH_KERNELS=torch` leaves all to PyTorch.
 """
 
