@@ -14,8 +14,8 @@ GONE = {  # settings of renderers: the value at which this version does the same
     "keep_slope_sign": (True, "which turned the sign of the gradient at flat crossings"),
 }
 ENGINE = (
-    f"PyTorch computed all field values; since {CHANGED} compiled code computes those without a gradient on one thread "
-    "of a CPU, and times and their ratios are others"
+    f"PyTorch computed all field values; since {CHANGED} compiled code computes those of ReLU networks without a "
+    "gradient, on one thread of a CPU, so that times and their ratios are others"
 )
 
 

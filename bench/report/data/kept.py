@@ -3,6 +3,9 @@
 A line is a record without what its folder alone has (curves, pictures). A column is a field by its dotted name, a cell
 its value as JSON, or as it is where that is no JSON. An empty cell is that of the first line, and `-` says that the run
 has no such field.
+
+A row with the field `restored` was made from the CSV of a page whose run folders are gone. It has of the settings what
+that page shows, starts at the time of the page's commit, and has one number for the seconds of its loop.
 """
 
 import csv

@@ -209,9 +209,10 @@ def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[P
     every = join(records, read_rows(into / FOLDER))
     read = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
     rows, drawn = write_rows(every, read, into / FOLDER), write_paper(every, results_dir, into)
+    own_rows = {name for study in studies() if study.keeps is not None for name in study.pages}
     for page in _in(into):
         table = page.base.with_suffix(".csv")
-        if table not in drawn and not page.shown.drawn_by:
+        if table not in drawn and page.name not in own_rows and not page.shown.drawn_by:
             write_shown(replace(page.shown, drawn_by=age.drawn_by(table)), page.base)
     return [*rows, *drawn]
 
