@@ -33,8 +33,9 @@ HEAD = """# Results
 
 Written by `make results` from [{folder}]({folder}): do not edit. Each table is there as CSV (raw numbers, in scene
 units), JSON, Markdown and LaTeX, each figure as PNG and PDF. `EXPERIMENT.runs.csv` has the runs of an experiment as
-rows: later runs are added, and tables drawn from them. `python -m bench -m +experiment=NAME` makes the runs of
-the experiment that a page names; the README of `conf` lists the experiments and how long they take.
+rows: later runs are added, and tables drawn from them. A page that cannot be drawn from rows names the version that
+drew it. `python -m bench -m +experiment=NAME` makes the runs of the experiment that a page names; the README of `conf`
+lists the experiments and how long they take.
 
 """
 
