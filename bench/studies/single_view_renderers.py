@@ -2,13 +2,14 @@
 
 from typing import Any
 
-from bench.report.study import Result, Runs, Selection, format, single_view, table
+from bench.report.study import Result, Runs, Selection, compare, format, single_view, table
 
 PLACE = 39
 READS = (Selection("single_view_renderers", setup=("machine",)),)
 FIRST = "single_view_by_newton"  # the row that others are compared with
 NOTES = (
     f"{single_view.OVER} A failed run counts as infinite.",
+    "Each network was trained once, so that a test over shapes says nothing of another training.",
     "“Trained in” and “field values”: of the training, once for the family, beside another training.",
 )
 COLUMNS = (
@@ -46,7 +47,8 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
     known = {line["method"]: line[FIRST] for line in taught if line.get(FIRST) and line[FIRST].value > 0}
     n = format.plural(max((len(ratio.points) for ratio in known.values()), default=0), "unseen shape")
     ratios = {name: ratio.value for name, ratio in known.items()}
-    return format.ends(f"Chamfer-L1 over that of Newton's network, {lines[0]['family']}", ratios, n)
+    ends = format.ends(f"Chamfer-L1 over that of Newton's network, {lines[0]['family']}", ratios, n)
+    return f"{ends} {compare.differing(list(known.items()), 'to Newton')}".strip()
 
 
 PAGES = {"single_view_renderers": make}

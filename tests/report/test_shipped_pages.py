@@ -26,6 +26,10 @@ def test_a_page_says_where_no_data_could_give_a_verdict(name: str, ratios: int, 
     assert f"{ratios} ratios need {needed} shapes or more" in PAGES[name].answer
 
 
+def test_a_ratio_with_seven_of_eight_shapes_is_no_difference():
+    assert "0 of 2 ratios to Newton differ from 1; 2 cannot be distinguished" in PAGES["single_view_renderers"].answer
+
+
 def test_the_shipped_ranking_has_one_row_a_renderer():
     rows = [row for row in read_rows(SHIPPED / FOLDER) if row["config"]["experiment"] == "stability"]
     classes = {row["renderer"]: setting(row["config"], "renderer", "_target_") for row in rows}
