@@ -41,13 +41,13 @@ def make(runs: Runs) -> Result:
 
 def _verdict(counts: list[dict[str, Any]]) -> str:
     """The least share of wrong pixels, and the thresholds whose number of them is within its standard deviation."""
-    known = [one for one in counts if "lost_share" in one and one["epsilon"] is not None]
-    if not known:
+    measured = [line for line in counts if "lost_share" in line and line["epsilon"] is not None]
+    if not measured:
         return ""
-    wrong = {one["epsilon"]: one["lost"] + one["false"] for one in known}
+    wrong = {line["epsilon"]: line["lost"] + line["false"] for line in measured}
     least, (worst, most) = min(wrong.values()), max(wrong.items(), key=lambda item: item[1])
     alike = [f"{epsilon:g}" for epsilon, pixels in wrong.items() if pixels - least <= math.sqrt(least)]
-    share, largest = (table.small_percent(pixels / known[0]["hits"]) for pixels in (least, most))
+    share, largest = (table.small_percent(pixels / measured[0]["hits"]) for pixels in (least, most))
     return (
         f"Missed and spurious pixels are fewest, *{share}* of the hits, at epsilon = {' or '.join(alike)}, and at "
         f"{worst:g} they are {largest}; n = one shape."

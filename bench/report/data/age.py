@@ -44,22 +44,24 @@ def _arguments() -> dict[str, set[str]]:
 
 def _old_rows(records: list[Record]) -> str:
     old = [(setting, row_of(record).name) for record in records for setting in gone_settings(record)]
-    told = [
+    listed = [
         f"{', '.join(dict.fromkeys(row for _, row in pairs))} ({len(pairs)} runs with {setting})"
         for setting, pairs in grouped(old, lambda pair: pair[0]).items()
     ]
-    return f"Old rows, with settings that this version does not have: {'; '.join(told)}." if told else ""
+    return f"Old rows, with settings that this version does not have: {'; '.join(listed)}." if listed else ""
 
 
 def _engine(records: list[Record]) -> str:
     """A note where the engine of times is not the default one of today: runs of before a record named its engine."""
-    known = [record["environment"] for record in records if record["environment"]]
+    environments = [record["environment"] for record in records if record["environment"]]
     before = [
-        said for said in known if "kernels" not in said and (said.get("device"), said.get("threads")) == ("cpu", 1)
+        each
+        for each in environments
+        if "kernels" not in each and (each.get("device"), each.get("threads")) == ("cpu", 1)
     ]
     if not before:
         return ""
-    whose = "Times" if len(before) == len(known) else f"Times of {len(before)} of {len(known)} runs"
+    whose = "Times" if len(before) == len(environments) else f"Times of {len(before)} of {len(environments)} runs"
     return f"{whose} are of earlier versions: {ENGINE}."
 
 

@@ -114,11 +114,11 @@ def shared_settings(records: list[Record], names: dict[str, tuple[str, ...]]) ->
         names: the path of each setting in a configuration, by the name that the note has for it.
     """
     values = {
-        name: {str(value): value for one in records if (value := setting(one["config"], *path)) is not None}
+        name: {str(value): value for record in records if (value := setting(record["config"], *path)) is not None}
         for name, path in names.items()
     }
-    shared = [f"{name} {next(iter(found))}" for name, found in values.items() if len(found) == 1]
-    differ = [f"{name} ({', '.join(_ordered(found.values()))})" for name, found in values.items() if len(found) > 1]
+    shared = [f"{name} {next(iter(each))}" for name, each in values.items() if len(each) == 1]
+    differ = [f"{name} ({', '.join(_ordered(each.values()))})" for name, each in values.items() if len(each) > 1]
     parts = [("Rows share: ", shared), ("Rows differ in: ", differ)]
     return " ".join(f"{word}{', '.join(listed)}." for word, listed in parts if listed)
 
