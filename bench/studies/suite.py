@@ -16,13 +16,11 @@ from bench.report.write import paper
 from bench.report.write.table import percent
 
 PLACE = 1
-DIFFERING = tuple(key for key, _ in GIVEN.values())
 KEEPS = place
-READS = tuple(Selection(f"{EXPERIMENT}{name}", DIFFERING) for name in suite().errors)
+READS = tuple(Selection(f"{EXPERIMENT}{name}", tuple(key for key, _ in GIVEN.values())) for name in suite().errors)
 HEADINGS = {AT_1: "At 1 ×", AT_10: "At 10 ×", END: "At the end", AREA: "Mean, 0.3 × to 30 ×"}
 COST = "field evaluations, over those of DIST's whole run at the same problem"
 LEAST_COST, POINTS = 0.05, 80  # of a line of the chart
-TEST = "signs of scenes' differences flipped, Holm's correction over all pairs, 5 %"
 WIDEST_BOUNDS = 1.25  # bounds on ratios of errors that lie further off say little
 PROGRESS = (
     "Progress: 1 - log(error / best possible) / log(initial error / best possible), from 0 to 100 %. Each set weighs "
@@ -32,11 +30,10 @@ PROGRESS = (
 )
 NOTES = (
     *PROGRESS,
-    f"In brackets: the ranks that a renderer can have, simultaneous at 95 % ({TEST}).",
     "Best possible error: of complete and multiview the prior's fit to the truth, of pose 0.1 degrees. Of reconstruct "
     "it is the best result of these renderers themselves.",
     "Wrong pixels: of renderings of the prior's networks, over the object's pixels: missed, spurious, or 0.02 scene "
-    "units off in depth. They are no part of progress.",
+    "units off in depth. They are no part of progress. All runs are on a CPU, with small networks and images.",
 )
 
 
@@ -65,10 +62,11 @@ class Standing:
         """What the table has of each row."""
         wrong, lines = standing.wrong_pixels(self.compared), []
         hidden = {name: standing.sparse(self.whole, name) for name in BUDGETS}
-        for row, ranked in ((row, self.rankings) for row in self.rows):
-            own = self.whole[self.whole["row"] == row]
-            line = {f"{name}_rank": "–".join(dict.fromkeys(map(str, of.rank(row)))) for name, of in ranked.items()}
-            line |= {name: of.progress[row] for name, of in ranked.items() if row not in hidden.get(name, ())}
+        for row in self.rows:
+            own, line = self.whole[self.whole["row"] == row], dict[str, Any]()
+            for name, ranked in self.rankings.items():
+                line[f"{name}_rank"] = "–".join(dict.fromkeys(map(str, ranked.rank(row))))
+                line[name] = None if row in hidden.get(name, ()) else ranked.progress[row]
             failed = own[~own["ok"]].groupby(["set", "status"]).size()
             counts = [f"{n} of {(own['set'] == of).sum()} {of} ({status})" for (of, status), n in failed.items()]
             line |= {"row": row, "preset": own["preset"].iloc[0], "wrong": wrong.get(row)}
@@ -102,22 +100,20 @@ def make(*several: Runs | None) -> Result:
     runs = together(*several)
     made = Standing(runs)
     panels = [made.panel(name) for name in (None, *made.sets)]
-    ranks = {title: made.rankings[name] for title, name in (("at 1 ×", AT_1), ("at 10 ×", AT_10), ("at the end", END))}
+    ranks = {HEADINGS[name]: {row: made.rankings[name].rank(row) for row in made.rows} for name in BUDGETS}
     return Result(
         replace(runs, records=[], left_out=0),  # what is kept counts, with or without its run
         "The suite.",
-        "Progress of each renderer from the initial to the best possible error over its cost, and the ranks that it "
-        "can have. A cross: all runs failed.",
+        "Progress of each renderer from the initial to the best possible error over its cost, with the ranks that it "
+        "can have (in brackets). A cross: all runs failed.",
         question="Which renderer makes the most progress, and at what cost?",
         verdict=verdict(made),
         n=made.sample(),
-        interval=f"ranks simultaneous at 95 % ({TEST})",
+        interval="ranks simultaneous at 95 % (flipped signs of scenes' differences, Holm's correction over all pairs)",
         remarks=[*NOTES, *_notes(made), *(f"Not read: {problem}" for problem in made.gathered.problems)],
         columns=_columns(),
         lines=made.lines(),
-        figure=chart.draw_lead(
-            panels, {title: {row: of.rank(row) for row in made.rows} for title, of in ranks.items()}
-        ),
+        figure=chart.draw_lead(panels, ranks),
         chart={"panels": panels},
     )
 
@@ -128,13 +124,13 @@ def make_sets(*several: Runs | None) -> Result:
     made = Standing(runs)
     groups = made.whole.groupby(["set", "row"])
     lines = groups[[*BUDGETS]].mean().join(groups["preset"].first()).join(standing.costs(made.whole, made.everything))
-    for of_set, name in ((of_set, name) for of_set in made.sets for name in BUDGETS):
-        sparse = standing.sparse(made.whole[made.whole["set"] == of_set], name)
-        lines.loc[[(of_set, row) for row in sparse], name] = np.nan
+    for of_set, own in made.whole.groupby("set"):
+        for name in BUDGETS:
+            lines.loc[lines.index.isin([(of_set, row) for row in standing.sparse(own, name)]), name] = np.nan
     lines = lines.reindex([(of_set, row) for of_set in made.sets for row in made.rows]).reset_index()
     lines = lines.astype(object).where(lines.notna(), None)
     timed = lines[lines["seconds"].notna()]
-    others = {line.row: line.seconds.value for line in timed.itertuples() if line.row != standing.unit_row(made.whole)}
+    others = {line.row: line.seconds.value for line in timed.itertuples() if line.preset != standing.UNIT}
     sets = ", ".join(timed["set"].unique())
     return Result(
         replace(runs, records=[], left_out=0),
@@ -183,13 +179,12 @@ def _columns() -> list[table.Column]:
 
 def verdict(made: Standing) -> str:
     """The answer by rule: which renderers lead at the cost of one run of DIST, which differ at the end, what failed."""
+    scenes = format.plural(made.rankings[END].scenes, "scene")
     if len(made.rows) < 2:
         return ""
     if not made.rankings[END].decidable:
-        scenes = format.plural(made.rankings[END].scenes, "scene")
         return f"{scenes} cannot decide between {len(made.rows)} renderers, whatever their results. {failures(made)}"
-    said = [leaders(made.rankings[AT_1]), at_end(made), failures(made)]
-    return " ".join([*said, "All on a CPU, with small networks and images."])
+    return " ".join([leaders(made.rankings[AT_1]), at_end(made), failures(made)])
 
 
 def leaders(ranked: Ranking) -> str:
@@ -201,23 +196,18 @@ def leaders(ranked: Ranking) -> str:
         more = f"significantly more progress than the {format.plural(len(others), 'other')}"
         if len(first) == 1:
             return f"{at}, {names[0]} makes {more}."
-        return f"{at}, {', '.join(names[:-1])} and {names[-1]} make {more}; these cannot be distinguished."
+        return f"{at}, {', '.join(names[:-1])} and {names[-1]} make {more}, and cannot be distinguished."
     behind = ", ".join(row for row in ranked.progress if (first[0], row) in ranked.better)
     than = f"significantly more than {behind}" if behind else "and cannot be distinguished from any other"
     return f"{at}, {names[0]} makes the most progress, {than}."
 
 
 def at_end(made: Standing) -> str:
-    """How many pairs differ at the end of the runs; if none does, the bounds on their errors; and what runs cost."""
-    ranked, unit = made.rankings[END], standing.unit_row(made.whole)
+    """How many pairs differ at the end of the runs, and what a run costs."""
     times = (made.whole["cost"] / made.whole["unit"]).groupby(made.whole["row"]).median()
-    said = [f"At the end of their runs, {len(ranked.better) or 'none'} of {ranked.pairs} pairs can be distinguished"]
-    for name in made.sets if not ranked.better else ():
-        low, high = standing.bounds(made.whole, name) or (0.0, np.inf)
-        if max(1 / max(low, 1e-9), high) <= WIDEST_BOUNDS:
-            said.append(f"in {name} all errors lie within *{low:.2f}* to *{high:.2f}* of that of {unit}")
-    ends = [f"*{times[row]:.2g}* ({row})" for row in (times.idxmin(), times.idxmax())]
-    return f"{'; '.join(said)}. A run costs {ends[0]} to {ends[1]} runs of DIST."
+    ends = " to ".join(f"*{times[row]:.2g}* ({row})" for row in (times.idxmin(), times.idxmax()))
+    pairs = f"{len(made.rankings[END].better) or 'none'} of {made.rankings[END].pairs} pairs"
+    return f"At the end, {pairs} can be distinguished. A run costs {ends} runs of DIST."
 
 
 def failures(made: Standing) -> str:
@@ -225,7 +215,7 @@ def failures(made: Standing) -> str:
     groups = made.whole.groupby(["row", "set"])["ok"].agg(runs="size", failed=lambda ok: (~ok).sum())
     most = groups[2 * groups["failed"] > groups["runs"]]
     said = [f"{row} failed in {line.failed} of {line.runs} problems of {name}" for (row, name), line in most.iterrows()]
-    failed, runs = groups["failed"].sum() - most["failed"].sum(), len(made.whole) - most["failed"].sum()
+    failed, runs = (total - most["failed"].sum() for total in (groups["failed"].sum(), len(made.whole)))
     return (
         "; ".join(
             [*said, f"{failed or ('none' if said else 'None')} of {'the other ' if said else ''}{runs} runs failed"]
@@ -246,6 +236,13 @@ def _notes(made: Standing) -> list[str]:
         )
     counts = ", ".join(f"{HEADINGS[name].lower()} {count}" for name, count in pairs.items())
     notes.append(f"Pairs that differ significantly, of {made.rankings[END].pairs}: {counts}.")
+    for of_set in made.sets:
+        low, high = standing.bounds(runs, of_set) or (0.0, np.inf)
+        if max(1 / max(low, 1e-9), high) <= WIDEST_BOUNDS:
+            within = f"{low:.2f} to {high:.2f} times the error of DIST"
+            notes.append(
+                f"All errors in {of_set} lie at the end within {within} (flipped signs, simultaneous at 95 %)."
+            )
     for of_set in made.sets if len(made.sets) > 1 else ():
         rest = {name: ranking(runs[runs["set"] != of_set], name) for name in (AT_1, END)}
         orders = [f"{HEADINGS[name].lower()} {'; '.join(of.progress)} ({len(of.better)})" for name, of in rest.items()]
@@ -257,12 +254,11 @@ def _notes(made: Standing) -> list[str]:
             "Percentage points of progress at the end by the settings of conf/tuned.yaml, chosen on validation shapes: "
             f"{'; '.join(gains)}. With a setting the loss of the mask may change too; the two are not separated."
         )
-    lacking = made.compared[(made.compared["missing"] > 0) & ~made.compared["tuned"]].groupby("row")["missing"].first()
+    lacking = made.compared[~made.compared["whole"] & ~made.compared["tuned"]].groupby("row")["missing"].first()
     versions, machines, loaded = runs["code"].nunique(), runs["machine"].nunique(), (~runs["timed"]).sum()
     possible = {
         f"Not compared, since problems lack: {', '.join(f'{row} ({n})' for row, n in lacking.items())}.": len(lacking),
-        f"Runs of {versions} versions of the code.": versions > 1,
-        f"Runs of {machines} machines: seconds are compared on the same one.": machines > 1,
+        f"Runs of {versions} versions of the code and of {machines} machines.": versions * machines > 1,
         f"Seconds of {loaded} of {len(runs)} runs are left out: the machine was loaded.": loaded,
     }
     return [*notes, *(text for text, holds in possible.items() if holds)]

@@ -12,7 +12,9 @@ from omegaconf import OmegaConf
 
 from bench import merge
 from bench.records.read import read_records
+from bench.report.data.flips import chances, signs
 from bench.report.data.runs import Runs
+from bench.report.data.statistics import holm
 from bench.report.suite import attempts, standing
 from bench.report.suite.attempts import (
     Attempt,
@@ -32,15 +34,12 @@ from bench.report.suite.standing import (
     Ranking,
     bounds,
     by_scene,
-    chances,
     compared,
     costs,
     frame_of,
     gains,
-    holm,
     ranking,
     reached,
-    signs,
     sparse,
     wrong_pixels,
 )
@@ -276,6 +275,16 @@ def test_a_row_that_cost_nothing_has_no_line_and_leaves_the_axis_logarithmic(tmp
     assert (panel["series"][0]["x"][-1], panel["series"][0]["y"][-1]) == (1, 1)
 
 
+def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch):
+    rendered = replace(attempt("Mine", "a", {0: 1.0}), set="render", problem="a, 64 pixels")
+    for name, shipped in {"none": [], "render": [rendered]}.items():
+        page(shipped, tmp_path / name, monkeypatch)
+        runs = [None] * (len(study.READS) - 1)
+        for make in study.PAGES.values():
+            result = make(Runs(study.READS[0], tmp_path / "none", []), *runs)
+            assert (result.verdict, len(result.lines)) == ("", 0)
+
+
 def test_problems_that_the_reference_row_lacks_are_not_compared():
     whole = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
     of_b = next(one for one in whole if one.row == "B")
@@ -315,7 +324,7 @@ def test_seconds_are_compared_on_one_machine_and_field_evaluations_of_the_same_r
     [
         (
             "AC AD BC BD",
-            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others; these cannot be",
+            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others, and cannot be",
         ),
         ("AB AC AD", "A (*90 %*) makes significantly more progress than the 3 others."),
         ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than C, D."),
@@ -332,18 +341,19 @@ def test_the_answer_says_what_differs_at_the_end_what_failed_and_what_scenes_can
     rows = [("Dist", 0.0101, 100.0), ("B", 0.01, 300.0)]
     lost = [attempt("Lost", scene, {0: 1.0, 50: 1.0}, status="diverged", final=inf) for scene in SCENES]
     answer = study.verdict(page([*made(rows), *lost], tmp_path / "three", monkeypatch))
-    assert "At the end of their runs, 3 of 3 pairs can be distinguished" in answer and "lie within" not in answer
+    assert "At the end, 3 of 3 pairs can be distinguished" in answer and "lie within" not in answer
     assert "Lost failed in 8 of 8 problems of complete; none of the other 16 runs failed." in answer
     mixed = [
         replace(one, curve=[*one.curve[:2], [2e2, 0.2, 0.0099]], final=0.0099, started="2027")
         for one in made(rows[:1])[:3]
     ]
-    answer = study.verdict(page([*made(rows), *mixed], tmp_path / "two", monkeypatch))
-    assert "none of 1 pairs can be distinguished; in complete all errors lie within *0.99* to *1.01*" in answer
-    assert "A run costs *1* (Dist) to *3* (B) runs of DIST. None of 16 runs failed." in answer
+    shown = page([*made(rows), *mixed], tmp_path / "two", monkeypatch)
+    assert "in complete lie at the end within 0.99 to 1.01 times the error of DIST" in " ".join(study._notes(shown))
+    assert "none of 1 pairs can be distinguished. A run costs *1* (Dist) to *3* (B)" in study.verdict(shown)
+    assert study.verdict(shown).endswith("None of 16 runs failed.")
     wide = [replace(one, curve=[*one.curve[:2], [2e2, 0.2, 0.002]], final=0.002) for one in mixed]
-    answer = study.verdict(page([*made(rows), *wide], tmp_path / "wide", monkeypatch))
-    assert "none of 1 pairs can be distinguished. A run costs" in answer  # bounds from 0.2 on say nothing
+    shown = page([*made(rows), *wide], tmp_path / "wide", monkeypatch)
+    assert "All errors" not in " ".join(study._notes(shown))  # bounds from 0.2 on say nothing
     few = [one for one in made(rows) if one.scene in SCENES[:3]]
     assert study.verdict(page(few, tmp_path / "few", monkeypatch)).startswith("3 scenes cannot decide between 2 ")
 

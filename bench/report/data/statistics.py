@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from itertools import count, takewhile
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -148,17 +148,22 @@ def differ(ratios: Sequence[Interval]) -> list[Verdict]:
     shapes than `FEWEST_SHAPES` are not decidable, and are not counted.
     """
     counted = [index for index, ratio in enumerate(ratios) if ratio.known]
-    rejected = _holm({index: _sign_test(ratios[index].points) for index in counted})
-    decidable = _holm({index: _least_chance(len(ratios[index].points)) for index in counted})
+    tests = (
+        [_sign_test(ratios[index].points) for index in counted],
+        [_least_chance(len(ratios[index].points)) for index in counted],
+    )
+    rejected, decidable = ({index for index, sure in zip(counted, holm(test), strict=True) if sure} for test in tests)
     open_verdicts = [Verdict.NOT_DISTINGUISHED if i in decidable else Verdict.NOT_DECIDABLE for i in range(len(ratios))]
     return [Verdict.DIFFERS if i in rejected else verdict for i, verdict in enumerate(open_verdicts)]
 
 
-def _holm(chances: dict[int, float]) -> set[int]:
-    """The keys of those chances that Holm's step-down rejects at 5 % in all."""
-    ordered = sorted(chances.items(), key=lambda item: item[1])
-    rejected = [chance <= (1 - LEVEL) / (len(ordered) - before) for before, (_, chance) in enumerate(ordered)]
-    return {key for (key, _), _ in zip(ordered, takewhile(bool, rejected), strict=False)}
+def holm(probabilities: Values) -> np.ndarray:
+    """Which of several hypotheses are rejected at 5 % in all, by the step-down of Holm (1979)."""
+    ordered = np.argsort(probabilities, kind="stable")
+    passed = np.asarray(probabilities)[ordered] <= (1 - LEVEL) / (len(ordered) - np.arange(len(ordered)))
+    rejected = np.zeros(len(ordered), dtype=bool)
+    rejected[ordered] = np.logical_and.accumulate(passed)
+    return rejected
 
 
 def shapes_needed(ratios: int) -> int:

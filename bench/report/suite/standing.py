@@ -7,8 +7,6 @@ cost is DIST's whole run at the same problem. Each set of problems weighs the sa
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
-from itertools import product
 from math import inf
 from typing import Any
 
@@ -16,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from bench.records.record import WAITED, RunStatus
-from bench.report.data import statistics
+from bench.report.data import flips, statistics
 from bench.report.data.statistics import Interval
 from bench.report.suite.attempts import APART, BY_ITSELF, Attempt, problems_of, suite
 from bench.tables import choice
@@ -27,7 +25,6 @@ BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # the costs at which progress is r
 AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # over whose logarithm progress is averaged
 FEWEST_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
 LEAST_ERROR = 1e-12  # in a logarithm
-MOST_EXACT = 16  # scenes of which all signs are tried; of more, 2**16 random signs
 ALPHA = 1 - statistics.LEVEL
 KEY = ["set", "problem", "seed"]
 
@@ -38,17 +35,18 @@ def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
     It has the fields of the attempt, `ok`, `tuned`, `machine`, and `timed`, unless the machine was busy. Left out are
     attempts under other settings than most of their set's; tuned rows have their own settings.
     """
-    frame = pd.DataFrame(map(vars, attempts), columns=[*Attempt.__dataclass_fields__]).sort_values(["started", "final"])
-    frame = frame.assign(
+    lines = pd.DataFrame(map(vars, attempts), columns=[*Attempt.__dataclass_fields__], dtype=object)
+    frame = lines.astype(dict.fromkeys(("start", "final", "cost", "waited", "seconds"), float))
+    frame = frame.sort_values(["started", "final"]).assign(
         ok=(frame["status"] == RunStatus.OK).astype(bool),
         tuned=frame["row"].map(lambda row: row.endswith(BY_ITSELF)).astype(bool),
-        timed=~(frame["waited"].astype(float) > WAITED),
-        machine=[*zip(*(frame[name] for name in ("cpu", "device", "threads", "kernels")), strict=True)],
+        timed=~(frame["waited"] > WAITED),
+        machine=frame["cpu"] + "; " + frame["device"] + "; " + frame["threads"].map(str) + "; " + frame["kernels"],
     )
     counts = frame.drop_duplicates([*KEY, "row", "settings"]).groupby(["set", "tuned", "settings"]).size()
     usual = {key[:2]: key[2] for key in counts.sort_values(kind="stable").index}  # the last is the most frequent
     keys = zip(frame["set"], frame["tuned"], frame["settings"], strict=True)
-    return frame[[usual[of_set, tuned] == settings for of_set, tuned, settings in keys]]
+    return frame.loc[np.array([usual[of_set, tuned] == settings for of_set, tuned, settings in keys], dtype=bool)]
 
 
 def unit_row(runs: pd.DataFrame) -> str:
@@ -185,7 +183,7 @@ def ranking(runs: pd.DataFrame, outcome: str) -> Ranking:
     first, second = np.triu_indices(scores.shape[1], 1)
     differences = scores.to_numpy()[:, first] - scores.to_numpy()[:, second]
     pairs = zip(scores.columns[first], scores.columns[second], strict=True)
-    significant = zip(pairs, differences.sum(axis=0), holm(chances(differences)), strict=True)
+    significant = zip(pairs, differences.sum(axis=0), statistics.holm(flips.chances(differences)), strict=True)
     better = {pair if difference > 0 else pair[::-1] for pair, difference, sure in significant if sure}
     progress = scores.sum().sort_values(ascending=False, kind="stable")
     return Ranking(progress.to_dict(), better, len(first), len(scores))
@@ -197,31 +195,6 @@ def by_scene(runs: pd.DataFrame, outcome: str) -> pd.DataFrame:
     sizes = runs.groupby(["set", "row"]).size().groupby("set").max()
     parts = runs.assign(part=runs[outcome] / runs["set"].map(sizes) / max(len(sizes), 1))
     return parts.pivot_table(index="scene", columns="row", values="part", aggfunc="sum")
-
-
-def chances(differences: np.ndarray) -> np.ndarray:
-    """Of differences [scenes, pairs] the probability [pairs] of as large a sum if each scene's had either sign."""
-    sums = np.abs(differences.sum(axis=0))
-    return (np.abs(signs(len(differences)) @ differences) >= sums - 1e-12).mean(axis=0)
-
-
-def holm(probabilities: np.ndarray) -> np.ndarray:
-    """Which of several hypotheses are rejected at 5 % in all (Holm 1979)."""
-    order = np.argsort(probabilities, kind="stable")
-    passed = probabilities[order] <= ALPHA / (len(order) - np.arange(len(order)))
-    rejected = np.zeros(len(order), dtype=bool)
-    rejected[order] = np.logical_and.accumulate(passed)
-    return rejected
-
-
-@cache
-def signs(scenes: int) -> np.ndarray:
-    """The signs of scenes [flips, scenes], of which the first are all positive."""
-    if scenes <= MOST_EXACT:
-        return np.array([*product((1.0, -1.0), repeat=scenes)])
-    drawn = np.random.default_rng(0).choice((1.0, -1.0), (2**MOST_EXACT, scenes))
-    drawn[0] = 1
-    return drawn
 
 
 def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
@@ -238,22 +211,8 @@ def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
     alpha = ALPHA / max(ratios.shape[1], 1)
     if ratios.empty or 2 / 2 ** len(ratios) > alpha:
         return None
-    low, high = zip(*(_not_rejected(ratios[row].to_numpy(), alpha) for row in ratios), strict=True)
+    low, high = zip(*(flips.not_rejected(ratios[row].to_numpy(), alpha) for row in ratios), strict=True)
     return float(np.exp(min(low))), float(np.exp(max(high)))
-
-
-def _not_rejected(values: np.ndarray, alpha: float) -> tuple[float, float]:
-    """The ends of the means that flipped signs do not reject, by bisection."""
-    flips, ends = signs(len(values)), []
-    sums, counts = flips @ values, flips.sum(axis=1)
-    for end in (values.min(), values.max()):
-        kept, lost = values.mean(), 2 * end - values.mean()
-        for _ in range(50):
-            mean = (kept + lost) / 2
-            chance = np.mean(np.abs(sums - mean * counts) >= np.abs(sums[0] - mean * counts[0]) - 1e-12)
-            kept, lost = (mean, lost) if chance > alpha else (kept, mean)
-        ends.append(kept)
-    return ends[0], ends[1]
 
 
 def costs(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
