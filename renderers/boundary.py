@@ -1,7 +1,7 @@
 """Checks what a renderer returns, so that a broken contract gives one clear message.
 
-The values are data, NaN among them, and are not checked. The check of a valid rendering costs a few comparisons of
-shapes and types, and no evaluation of the field.
+The values are data, NaN among them, and are not checked here; those of hits are in `hits`. The check of a valid
+rendering costs a few comparisons of shapes and types, and no evaluation of the field.
 """
 
 import torch
@@ -9,16 +9,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import Rays
+from renderers.checks import BrokenContract
 from renderers.field import Field, Meter, carries_gradient
+from renderers.hits import keep
 from renderers.rendering import Guided, Observed, Renderer, Rendering
 from renderers.waits import Late
 
 PARTS = ("distance", "status", "points", "residual", "closest")
 TOWARDS = {"field_gradient": "the field's parameters", "ray_gradient": "the rays"}
-
-
-class BrokenContract(ValueError):
-    """A renderer returned what it must not; the message says what, and what to return instead."""
 
 
 def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
@@ -40,6 +38,7 @@ def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
         raise _no_gradient(renderer, lacked, "the distances of its hits carry")
     if isinstance(field, Meter):
         Late.add(field.counts, "hits", rendering.hit.sum())
+    keep(renderer, field, rays, rendering)
     return rendering
 
 

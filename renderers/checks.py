@@ -7,6 +7,10 @@ class BadInput(ValueError):
     """What a user gave cannot be used, as is found only while it is used; the message names the remedy."""
 
 
+class BrokenContract(ValueError):
+    """A renderer returned what it must not; the message says what, and what to return instead."""
+
+
 def check_positive(name: str, value: float, remedy: str) -> None:
     """Raises ValueError unless `value` is finite and above zero."""
     if not isfinite(value) or value <= 0:

@@ -1,0 +1,171 @@
+"""What hits must be: every shipped renderer holds to it, and wrong distances are found, in any kind of field."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bench.config import load
+from bench.tables import names
+from renderers.boundary import rendered
+from renderers.checks import BrokenContract
+from renderers.field import Counts, Field, Kind, Meter
+from renderers.fields.analytic import Shape, box, sphere
+from renderers.hits import MOST, Hits, kept_hits, without_distance
+from renderers.rendering import Renderer, Rendering, at_iteration
+from tests.looped import each
+from tests.renderers.test_renderer_contract import stated
+from tests.tiny import ball_prior, camera_of
+from tests.wrong_hits import ENDLESS, WRONG, WrongHits
+
+RAYS = camera_of(20, angles=(30.0, 20.0)).rays()
+PLATE = box((0.45, 0.5, 0.1))  # thin, with edges
+NETWORK = ball_prior().decoder.at(torch.zeros(4))
+
+
+class Other(WrongHits):
+    """A shipped renderer whose renderings a function changes."""
+
+    def __init__(self, name: str, change) -> None:
+        super().__init__(name=name)
+        self.change = change
+
+    def render(self, field: Field, rays) -> Rendering:
+        return self.change(field, rays, self.inner.render(field, rays))
+
+
+def hits_of(renderer: Renderer, field: Field, rays=RAYS) -> Hits:
+    with kept_hits() as kept, torch.no_grad():
+        rendered(renderer, field, rays)
+    (hits,) = kept
+    return hits
+
+
+@pytest.mark.parametrize("name", [name for name in names("renderer") if name != "custom"])
+def test_the_hits_of_no_shipped_renderer_are_flagged(name):
+    """At the first iteration, where volumes are most blurred, and sharp."""
+    renderer = load("renderer", name)
+    rays = camera_of(4, angles=(30.0, 20.0)).rays() if getattr(renderer, "serial", False) else RAYS
+    fields = [stated(shape, kind) for kind in renderer.capabilities.needs for shape in (PLATE, sphere(0.5))]
+    first = at_iteration(renderer, 0)
+    for made in [renderer] if first == renderer else [first, renderer]:
+        for field in [*fields, *([NETWORK] if NETWORK.kind in renderer.capabilities.needs else [])]:
+            hits = hits_of(made, field, rays)
+            hits.check()
+            assert bool(hits.hit.any()) and hits.off_surface() == ""
+
+
+def test_hits_within_the_largest_shipped_epsilon_are_not_flagged():
+    """That of Figure 7: such a hit is as far off as its residual says."""
+    hits = hits_of(replace(load("renderer", "dist"), epsilon=0.05), PLATE)
+    assert float(PLATE(RAYS.at(hits.distance)[hits.hit]).max()) > 0.02
+    assert hits.off_surface() == ""
+
+
+@each("name", ["dist", "dvr", "newton", "mesh_proxy", "relaxed_boundary", "neus", "unisurf", "volsdf"])
+def test_distances_that_are_5_percent_short_are_noted_in_each_kind_of_field(name):
+    for kind in load("renderer", name).capabilities.needs:
+        note = hits_of(WrongHits("short", name), stated(PLATE, kind)).off_surface()
+        assert note.startswith("WrongHits.render: ") and "hits are not on the surface" in note, kind
+        assert "return the distance along the unit direction, in scene units" in note
+
+
+def test_a_note_says_how_many_hits_are_off_by_how_much():
+    facing, ball = camera_of(20).rays(), sphere(0.5)
+    hits = hits_of(WrongHits("short"), ball, facing)
+    off, count = float(ball(facing.at(hits.distance))[hits.hit].median()), int(hits.hit.sum())
+    note = hits.off_surface()
+    assert off == pytest.approx(0.08, abs=0.02)
+    assert note == (
+        f"WrongHits.render: {count} of {count} hits are not on the surface: at origin + distance * direction they are "
+        f"{off:.2g} scene units off in the median, and 0.02 more than the residual is allowed: return the distance "
+        "along the unit direction, in scene units"
+    )
+
+
+@each("kind", [Kind.DISTANCE, Kind.BOUND])
+def test_a_surface_that_admits_its_error_is_noted_all_the_same(kind):
+    """The residual is the field's value where the hit is: it accounts for the blur of a volume alone."""
+
+    def admits(field, rays, rendering):
+        short = 0.92 * rendering.distance
+        return replace(rendering, distance=short, residual=field(rays.at(short)))
+
+    assert "hits are not on the surface" in hits_of(Other("idr", admits), stated(PLATE, kind)).off_surface()
+    assert hits_of(Other("neus", admits), stated(PLATE, kind)).off_surface() == ""
+
+
+@each("missed, noted", [(0.05, False), (0.3, True)])
+def test_a_few_hits_may_lie_off(missed, noted):
+    def change(field, rays, rendering):
+        wrong = torch.arange(rendering.distance.numel()).view_as(rendering.distance) % 100 < 100 * missed
+        return replace(rendering, distance=torch.where(wrong, 0.9 * rendering.distance, rendering.distance))
+
+    rays = camera_of(60).rays()
+    assert bool(hits_of(Other("idr", change), sphere(0.5), rays).off_surface()) is noted
+
+
+def test_a_negative_distance_breaks_the_contract():
+    hits = hits_of(WrongHits("behind"), PLATE)
+    count, least = int(hits.hit.sum()), float(hits.distance[hits.hit].min())
+    with pytest.raises(BrokenContract) as error:
+        hits.check()
+    assert str(error.value) == (
+        f"WrongHits.render: {count} of {count} hits have a negative distance, down to {least:.3g}, so they lie behind "
+        "the camera: return the distance from the origin along the direction, or another Status"
+    )
+
+
+@each("value", [torch.nan, torch.inf])
+def test_a_hit_without_a_finite_distance_breaks_the_contract(value):
+    def change(field, rays, rendering):
+        return replace(rendering, distance=WRONG["endless"](rendering).nan_to_num(value))
+
+    words = rf"{ENDLESS} of 400 rays have a hit without a finite distance \(the field is finite on them, so the "
+    with pytest.raises(BrokenContract, match=rf"Other\.render: {words}renderer is at fault\): return a finite"):
+        hits_of(Other("dist", change), PLATE).check()
+
+
+def test_a_field_without_finite_values_is_named():
+    broken = Shape(lambda p: torch.where(p[..., 0] > 0, torch.nan, PLATE(p)))
+    hits = replace(hits_of(WrongHits("endless"), PLATE), field=broken)
+    said = without_distance([hits])
+    assert "the field has values that are not finite on" in said and "the renderer is at fault" not in said
+    assert without_distance([hits_of(load("renderer", "dist"), PLATE)]) == without_distance([]) == ""
+
+
+def test_a_miss_may_have_any_distance():
+    def change(field, rays, rendering):
+        return replace(rendering, distance=rendering.distance.where(rendering.hit, -torch.inf))
+
+    hits = hits_of(Other("idr", change), PLATE)
+    hits.check()
+    assert hits.off_surface() == ""
+    nothing = hits_of(load("renderer", "idr"), sphere(0.5).translate((5.0, 0.0, 0.0)))
+    nothing.check()
+    assert not nothing.hit.any() and nothing.off_surface() == ""
+
+
+def test_a_check_evaluates_the_field_once_and_is_not_counted():
+    asked = []
+    field = Shape(lambda p: (asked.append(p.numel() // 3), PLATE(p))[1])
+    counts = Counts()
+    hits = hits_of(load("renderer", "idr"), Meter(field, counts), camera_of(200, angles=(30.0, 20.0)).rays())
+    before = counts.value
+    asked.clear()
+    hits.check()
+    assert hits.off_surface() == ""
+    assert len(asked) == 1 and MOST / 2 < asked[0] <= MOST < hits.hit.sum()
+    assert counts.value == before
+
+
+def test_hits_are_kept_within_the_innermost_block_alone():
+    renderer = load("renderer", "idr")
+    with kept_hits() as outer:
+        with kept_hits() as inner:
+            rendered(renderer, PLATE, RAYS)
+        rendered(renderer, PLATE, RAYS)
+        rendered(renderer, PLATE, RAYS)
+    rendered(renderer, PLATE, RAYS)
+    assert (len(outer), len(inner)) == (2, 1)
+    assert not any(part.requires_grad for part in (inner[0].distance, inner[0].residual))
