@@ -2,7 +2,9 @@
 
 import shlex
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -13,6 +15,9 @@ from bench.records.format import count, number, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import RESULTS, Plan
 from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
+
+CUSTOM = "custom"  # the choice of renderer that is a class of the user's own
+CONTRACT = "python -m pytest tests/renderers/test_renderer_contract.py -k custom --renderer="  # as in CONTRIBUTING.md
 
 
 def show(folder: Path, record: Record) -> None:
@@ -40,6 +45,7 @@ def show(folder: Path, record: Record) -> None:
         print(f"note: {note}")
     for picture in [path for name in PICTURES if (path := folder / name).is_file()][:1]:
         print(f"picture: {picture}")
+    _print_contract(folder.parent, [] if record.reused else [vars(record)])
     _print_next(folder.parents[1])
     if record.reused:
         print(f"reused: the run of {record.started}; rerun=all runs it again")
@@ -65,9 +71,19 @@ def show_sweep(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
     if table is not None:
         print(f"table of this sweep: {table}")
     print(f"report: {index}")
+    records = [record for cell in plan.cells if (record := plan.record(cell)) and not record["reused"]]
+    _print_contract(index.parent / "runs", records)
     _print_next(index.parent)
     print(plan.folder)
     return statuses
+
+
+def _print_contract(runs: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """Prints the command of the contract test, where the first runs of `renderer=custom` are among these new ones."""
+    first = {record["id"]: record["config"] for record in records if record["renderer"] == CUSTOM}
+    if first and {path.parent.name for path in runs.glob(f"*-{CUSTOM}-*/record.json")} <= {*first}:
+        target = next(iter(first.values()))["renderer"]["_target_"]
+        print(f"does the renderer hold its contract? in a clone: {CONTRACT}{shlex.quote(target)}")
 
 
 def _print_next(results_dir: Path) -> None:

@@ -12,11 +12,14 @@ from bench.records.record import Record, RunStatus
 from bench.run import sweep
 from bench.run.summary import show, show_sweep
 from tests.looped import each
-from tests.run.driving import planned
+from tests.run.driving import ROOT, planned
+
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 
 
-def ended(results: Path, name: str, status: str = "ok") -> Record:
-    record = Record(name, "completion", "dist", "sofa", 0, {"label": "DIST, a name that is long"}, scene="sofa test 0")
+def ended(results: Path, name: str, status: str = "ok", renderer: str = "dist") -> Record:
+    config = {"label": "DIST, a name that is long", "renderer": {"_target_": "mypkg.Mine"}}
+    record = Record(name, "completion", renderer, "sofa", 0, config, scene="sofa test 0")
     record.status, record.reason, record.ended = RunStatus(status), "" if status == "ok" else "why", record.started
     record.metrics = record.metrics_start = {"chamfer_l2": 0.0125, "normal_consistency": 0.7}
     (results / "runs" / name).mkdir(parents=True)
@@ -45,6 +48,39 @@ def test_a_metric_of_the_end_alone_is_shown_too(tmp_path, capsys):
     show(tmp_path / "runs" / "a", record)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "DTU overall (mm)" in line]
     assert line.split()[-3:] == ["–", "0.700", "lower"]
+
+
+def contract_lines(out: str) -> list[str]:
+    return [line for line in out.splitlines() if "contract" in line]
+
+
+def test_the_first_run_of_a_renderer_of_ones_own_names_the_contract_test(tmp_path, capsys):
+    def shown(name, **changed):
+        record = ended(tmp_path, name, **changed)
+        show(tmp_path / "runs" / name, record)
+        return contract_lines(capsys.readouterr().out)
+
+    assert shown("completion-dist-sofa-a") == []
+    first = (
+        "does the renderer hold its contract? in a clone: python -m pytest "
+        "tests/renderers/test_renderer_contract.py -k custom --renderer=mypkg.Mine"
+    )
+    assert shown("completion-custom-sofa-b", renderer="custom", status="crashed") == [first]
+    assert first.removeprefix("does the renderer hold its contract? in a clone: ") in CONTRIBUTING.read_text()
+    assert shown("pose-custom-sofa-c", renderer="custom") == []  # the second run
+
+
+def test_a_sweep_with_the_first_runs_of_a_renderer_of_ones_own_names_the_contract_test(tmp_path, capsys):
+    plan = Plan("p", tmp_path, planned("a-dist-b", "a-custom-b", "b-custom-b"), asked="2026-01-01T00:00:00+00:00")
+    ended(tmp_path, "a-dist-b")
+    ended(tmp_path, "a-custom-b", renderer="custom")
+    show_sweep(plan, tmp_path / "index.html")
+    assert len(contract_lines(capsys.readouterr().out)) == 1
+    reused = ended(tmp_path, "b-custom-b", renderer="custom")
+    reused.reused = True
+    reused.write(tmp_path / "runs" / "b-custom-b")
+    show_sweep(plan, tmp_path / "index.html")
+    assert contract_lines(capsys.readouterr().out) == []
 
 
 def test_a_run_without_a_picture_in_the_usual_folder_has_shorter_lines(tmp_path, capsys, monkeypatch):
