@@ -3,7 +3,7 @@
 Several starts share one budget of iterations: successive halving keeps the better ones, and the last gets the rest.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from math import cos, inf, isfinite, isnan, pi
 from typing import Any, Protocol, runtime_checkable
@@ -17,6 +17,7 @@ from bench.machine.environment import MemoryPeak, Stopwatch
 from bench.records.record import RunStatus
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
+from renderers.hits import Hits, kept_hits, without_distance
 
 DIVERGED = 100.0  # a loss above this many times its first value, or `least_reference`, has diverged
 KEPT = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
@@ -104,7 +105,7 @@ def optimise(
         problem: gives the loss; its parameters are changed in place.
         device: that is synchronised when the clock is read.
         history: an empty one, filled during the loop, so that it is complete if the loop is stopped. A loss that
-            becomes NaN or diverges ends the loop and sets its status.
+            becomes NaN or diverges ends the loop and sets its status. A step is not taken where the loss is NaN.
         least_reference: for divergence, a smaller first loss counts as this; for starts that are nearly right.
         on_step: called with each line of the curve, to which it may add; off the clock, and its memory is not counted.
     """
@@ -115,23 +116,27 @@ def optimise(
     for iteration in range(settings.iterations):
         optimiser.forget_gradients()
         rate, terms = settings.rate(iteration), dict[str, Tensor]()
-        forward = _timed(device, lambda i=iteration, terms=terms: terms.update(problem.loss(i)))
-        backward = _timed(device, lambda rate=rate, terms=terms: (terms["total"].backward(), optimiser.step(rate)))
-        history.seconds["forward"] += forward
-        history.seconds["backward"] += backward
+        with kept_hits() as kept:
+            history.seconds["forward"] += _timed(device, lambda i=iteration, t=terms: t.update(problem.loss(i)))
+        numbers = dict(zip(terms, _read([*terms.values()]), strict=True))
+        if isnan(numbers["total"]):
+            history.status, history.reason = RunStatus.NAN, _not_a_number(numbers, iteration, kept)
+        else:
+            history.seconds["backward"] += _timed(
+                device, lambda rate=rate, loss=terms["total"]: (loss.backward(), optimiser.step(rate))
+            )
         history.counts = problem.counts - before
-        *numbers, largest = _read([*terms.values(), _largest(problem.parameters)])
         line = {
             "iteration": iteration,
             "seconds": history.seconds["forward"] + history.seconds["backward"],
             "value_evaluations": history.counts.value + history.counts.coarse,
             "gradient_evaluations": history.counts.gradient,
             "cost": history.counts.cost,
-            **dict(zip(terms, numbers, strict=True)),
+            **numbers,
         }
         history.curve.append(line)
         history.peak_memory_bytes = memory.repeatable()
-        over = _failed(history, largest, least_reference) or line["cost"] >= (settings.budget or inf)
+        over = _failed(history, problem.parameters, least_reference) or line["cost"] >= (settings.budget or inf)
         with memory.pause():
             on_step(line)
         if over:
@@ -171,13 +176,21 @@ def _read(numbers: list[Tensor]) -> list[float]:
     return torch.stack([number.detach().double() for number in numbers]).tolist()
 
 
-def _failed(history: History, largest: float, least_reference: float) -> bool:
-    """Whether the loop must end; notes the reason in the history. `largest` is the magnitude of any parameter."""
+def _not_a_number(numbers: dict[str, float], iteration: int, kept: Sequence[Hits]) -> str:
+    """Why the loss of an iteration is not a number: its terms that are not, and the hits without a distance."""
+    wrong = [name for name, number in numbers.items() if isnan(number) and name != "total"]
+    what = f"the {' and the '.join(wrong)} term{'s are' if len(wrong) > 1 else ' is'}" if wrong else "the loss is"
+    endless = without_distance(kept)
+    return f"{what} not a number at iteration {iteration}{f': {endless}' if endless else ''}"
+
+
+def _failed(history: History, parameters: list[Tensor], least_reference: float) -> bool:
+    """Whether the loop must end; notes the reason in the history."""
     loss, first = history.curve[-1]["total"], max(history.curve[0]["total"], least_reference)
     iteration = history.curve[-1]["iteration"]
-    if loss != loss or not isfinite(largest):
-        what = "the loss" if loss != loss else "a parameter"
-        history.status, history.reason = RunStatus.NAN, f"{what} is not a number at iteration {iteration}"
+    (largest,) = _read([_largest(parameters)])
+    if history.status is RunStatus.OK and not isfinite(largest):
+        history.status, history.reason = RunStatus.NAN, f"a parameter is not a number at iteration {iteration}"
     elif loss > DIVERGED * first:
         history.status = RunStatus.DIVERGED
         begun = history.curve[0]["total"]

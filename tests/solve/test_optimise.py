@@ -1,6 +1,8 @@
 """The optimisation loop on problems small enough to know the answer."""
 
 from dataclasses import dataclass, field, replace
+from math import isnan
+from typing import Any
 
 import pytest
 import torch
@@ -8,13 +10,17 @@ import torch
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import RunStatus
 from bench.solve.optimise import DIVERGED, History, OptimiserSettings, Starts, StartSettings, optimise
+from renderers.boundary import rendered
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
 from tests.looped import each
 from tests.operations import Operations
+from tests.tiny import camera_of
+from tests.wrong_hits import WrongHits
 
 CPU = torch.device("cpu")
 POINTS = 7  # evaluations that a toy's loss makes
+RAYS = camera_of(16).rays()
 
 
 @dataclass
@@ -129,7 +135,7 @@ def test_the_warm_up_is_neither_counted_nor_part_of_the_first_step():
     assert gradients[0] == pytest.approx(-4.0)  # d/dr (3 - r)^2 at 1, not twice that
 
 
-def test_terms_and_parameters_are_read_in_one_wait():
+def test_terms_are_read_in_one_wait_and_parameters_in_another():
     class Many(Toy):
         def __post_init__(self):
             super().__post_init__()
@@ -160,8 +166,56 @@ def test_the_time_of_on_step_is_not_counted(clock):
 def test_a_loss_that_is_no_number_ends_the_loop_and_says_where():
     history = go(Toy(spoil={4: float("nan")}))
     assert history.status is RunStatus.NAN
-    assert history.reason == "the loss is not a number at iteration 3"
+    assert history.reason == "the square term is not a number at iteration 3"
     assert len(history.curve) == 4
+
+
+@each(
+    "spoilt, what",
+    [
+        ((), "the loss is"),
+        (("depth",), "the depth term is"),
+        (("depth", "mask"), "the depth and the mask terms are"),
+    ],
+)
+def test_a_loss_that_is_no_number_names_its_terms_and_no_step_is_taken(spoilt, what):
+    class Spoilt(Toy):
+        def loss(self, iteration):
+            terms = {name: self.radius.square() for name in ("depth", "code", "mask")}
+            if iteration == 2:
+                terms |= {name: term * torch.nan for name, term in terms.items() if name in spoilt}
+                return {"total": self.radius * torch.nan, **terms}
+            return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    toy, radii = Spoilt(), []
+    history = go(toy, on_step=lambda line: radii.append(toy.radius.item()))
+    assert (history.status, history.reason) == (RunStatus.NAN, f"{what} not a number at iteration 2")
+    assert radii[0] > radii[1] == radii[2] == toy.radius.item()
+    assert [line["iteration"] for line in history.curve] == [0, 1, 2] and isnan(history.curve[-1]["total"])
+
+
+@dataclass
+class Seen(Toy):
+    """The radius of a sphere, by the mean distance of hits that a renderer gives."""
+
+    renderer: Any = None
+
+    def loss(self, iteration):
+        shape = sphere(self.radius / 2)
+        rendering = rendered(self.renderer, Meter(shape, self.counts), RAYS)
+        self.calls += 1
+        depth = ((rendering.distance - 1.8).square() * rendering.hit).sum() / rendering.hit.sum().clamp_min(1)
+        return {"total": depth, "depth": depth}
+
+
+def test_a_loss_without_a_number_says_how_many_hits_have_no_distance():
+    seen = Seen(renderer=WrongHits("endless"))
+    history = go(seen)
+    assert history.status is RunStatus.NAN and seen.radius.item() == 1.0
+    assert history.reason == (
+        "the depth term is not a number at iteration 0: 11 of 256 rays have a hit without a finite distance (the field "
+        "is finite on them, so the renderer is at fault)"
+    )
 
 
 def test_a_parameter_that_is_no_number_ends_the_loop():
