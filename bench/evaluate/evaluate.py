@@ -25,6 +25,7 @@ from renderers.fields.coloured import Coloured
 from renderers.rendering import Rendering
 
 OWN = "own_"  # prefix of the metrics of what the renderer under test sees
+TIMES, LEAST_GAP = 3.0, 0.02  # how far apart two depth errors are noted: as a ratio, and in scene units
 BEHIND = 2.0  # spacings of the samples that give the mesh: a hit so far behind a part of it is of another part
 OF_MESH = "By exact first hits of the mesh that evaluation.grid gives within the unit sphere, for every renderer."
 IMAGE = {
@@ -172,6 +173,21 @@ def unrendered(state: State, own: Sequence[View]) -> tuple[str, ...]:
     sizes = [replace(state.mesh, faces=state.mesh.faces[parts == part]).diagonal for part in lost]
     what = f"{len(lost)} part{'s' * (len(lost) > 1)} of the mesh, at most {max(sizes):.2g} scene units across,"
     return (f"the renderer misses {what} which {meant[lost].sum()} of its rays should hit; the pictures show the mesh",)
+
+
+def differing(metrics: dict[str, Any]) -> tuple[str, ...]:
+    """A note where the depth error of the renderer's own image is `TIMES` that of the field's mesh; else none.
+
+    Errors that differ by less than `LEAST_GAP` are not noted: a pixel at an outline may decide them.
+    """
+    error, of_renderer = metrics.get("depth_mae", np.inf), metrics.get(f"{OWN}depth_mae", 0.0)
+    if not of_renderer >= max(TIMES * error, error + LEAST_GAP) or np.isinf(error):
+        return ()
+    return (
+        f"the depth error of the renderer's own image is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene "
+        "units: the renderer does not show the surface of the field, and the contract test of CONTRIBUTING.md checks "
+        "its hits",
+    )
 
 
 def view_metrics(seen: View, true: View, prefix: str = "") -> dict[str, float]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.evaluate.evaluate import DEFINITIONS, chamfer_only, evaluate, render_view
+from bench.evaluate.evaluate import DEFINITIONS, chamfer_only, differing, evaluate, render_view
 from bench.evaluate.state import State
 from bench.setup.inputs import RunInputs
 from bench.solve.solve import note_result
@@ -137,6 +137,25 @@ def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inp
     rays = int((state.seen(camera).mask & ~scene.view.mask).sum())
     assert "misses 1 part of the mesh, at most 0.1" in note and f"{rays} of its rays" in note
     assert evaluate(State(sphere(RADIUS) | sphere(0.1, (0.8, 0.3, 0.1)), fine)).notes == ()
+
+
+@each(
+    "of_renderer, error, noted",
+    [
+        (3.95, 0.126, True),
+        (np.inf, 0.126, True),
+        (0.31, 0.1, True),
+        (0.29, 0.1, False),
+        (0.0094, 0.003, False),  # of a plane by a shipped renderer: less than a pixel decides it
+        (0.5, 0.0, True),
+        (np.inf, np.inf, False),
+    ],
+)
+def test_a_renderers_own_image_that_shows_another_surface_is_noted(of_renderer, error, noted):
+    notes = differing({"depth_mae": error, "own_depth_mae": of_renderer, "own_mask_iou": 0.1, "mask_iou": 0.9})
+    both = f"is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene units: the renderer does not"
+    assert [note.startswith(f"the depth error of the renderer's own image {both}") for note in notes] == [True] * noted
+    assert differing({"psnr": 20.0, "own_psnr": 3.0}) == differing({}) == ()
 
 
 def test_a_rendered_view_is_that_of_the_mesh(inputs):
