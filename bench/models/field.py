@@ -62,7 +62,7 @@ def solve_by_growth(observations: RayObservations, given: Given, run: RunContext
     with run.off_clock():
         first, last = State(growth.first, inputs), State(growth.fitted.model.frozen(), inputs)
         record.metrics_start, after = evaluate(first).metrics, evaluate(last)
-        metrics, notes = after.metrics | ended(growth), (*growth.summary(choice.name), *after.notes)
+        metrics, notes = after.metrics | ended(growth), (*growth.summary(choice.name), *fitter.notes[:1], *after.notes)
         note_result(run, replace(after, metrics=metrics, failure=failure_of(growth, after), notes=notes))
         curve = rendered(lines, growth.fitted.evidence.candidate)
         filmstrip = Filmstrip(inputs, "by candidate")

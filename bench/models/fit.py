@@ -19,7 +19,7 @@ from bench.setup.fields import FitSettings
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import slopes_at
-from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
+from bench.solve.optimise import FirstChecked, History, NotReached, OptimiserSettings, optimise
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, Unsupported, check_kind, fresh
 
@@ -65,6 +65,7 @@ class Fitter:
     on_line: Callable[[str, dict[str, Any]], None]
     part: str = "growth"  # of the run that the lines belong to
     spent: dict[str, float] = field(default_factory=dict)  # seconds of all fits, by phase
+    notes: list[str] = field(default_factory=list)  # on the hits of first renderings; see `FirstChecked`
 
     def begin(self, candidate: Candidate, previous: Model | None, *, evaluate: bool = True) -> Fitted:
         """A candidate's model after its warm start; with `evaluate`, its held-out error is computed as well."""
@@ -167,7 +168,8 @@ class Fitter:
             self.on_line(evidence.candidate, {**line, **where, **share})
 
         try:
-            optimise(problem, settings, self.device, history=history, on_step=on_step, least_reference=NEAR_ENOUGH)
+            checked = FirstChecked(problem, self.notes)
+            optimise(checked, settings, self.device, history=history, on_step=on_step, least_reference=NEAR_ENOUGH)
         except NotReached as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
         for name, seconds in history.seconds.items():

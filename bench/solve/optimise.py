@@ -78,6 +78,49 @@ class Objective(Protocol):
 
 
 @dataclass
+class FirstChecked:
+    """An objective whose first loss, the warm-up of `optimise`, checks the hits of its renderings.
+
+    The check evaluates the field once, which is neither counted nor on the clock.
+
+    Args:
+        problem: the objective.
+        notes: gets a note where hits lie off the surface; a run goes on with them.
+    """
+
+    problem: Objective
+    notes: list[str]
+    checked: bool = False
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The objective's parameters."""
+        return self.problem.parameters
+
+    @property
+    def counts(self) -> Counts:
+        """The objective's counts."""
+        return self.problem.counts
+
+    def loss(self, iteration: int) -> dict[str, Tensor]:
+        """The objective's loss.
+
+        Raises:
+            BrokenContract: where the first loss is a number, but some hit has no finite distance or a negative one.
+        """
+        if self.checked:
+            return self.problem.loss(iteration)
+        self.checked = True
+        with kept_hits() as kept:
+            terms = self.problem.loss(iteration)
+        if not bool(terms["total"].isnan()):  # else `optimise` ends before the step, and says why
+            for hits in kept:
+                hits.check()
+            self.notes += [f"at the first iteration, {note}" for hits in kept if (note := hits.off_surface())][:1]
+        return terms
+
+
+@dataclass
 class History:
     """The course and the costs of an optimisation."""
 

@@ -19,7 +19,7 @@ from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.optimise import History, NotReached, Objective, OptimiserSettings, optimise
+from bench.solve.optimise import FirstChecked, History, NotReached, Objective, OptimiserSettings, optimise
 from datasets.field_files import FIELD, save_field
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
@@ -39,7 +39,8 @@ COSTS = {
     "evaluations.per_ray": "value evaluations divided by rays times iterations",
     "evaluations.work_over_bound": "the operations of all evaluations, divided by those of one value and one gradient "
     "per hit; absent without hits",
-    "seconds.warmup": "one step's forward and backward pass before the clock starts; its evaluations are not counted",
+    "seconds.warmup": "one step's forward and backward pass before the clock starts, with the check of its hits; its "
+    "evaluations are not counted",
     "seconds.forward": "rendering and loss, over all iterations; the device is synchronised at both ends",
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
     "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
@@ -236,6 +237,7 @@ def descend(
     history = History()
     checkpoints = checkpoints_of(run.inputs.evaluation.every, settings.iterations)
     known: dict[int, dict[str, float]] = {}
+    notes: list[str] = []
 
     def check(iteration: int) -> None:
         with run.off_clock():
@@ -258,13 +260,15 @@ def descend(
             check(0)
         try:
             note_objective()
+            checked = FirstChecked(problem, notes)
             optimise(
-                problem, settings, run.inputs.device, history=history, on_step=on_step, least_reference=least_reference
+                checked, settings, run.inputs.device, history=history, on_step=on_step, least_reference=least_reference
             )
             note_objective()
         except NotReached as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
         finally:
+            run.record.notes = [*run.record.notes, *notes]
             _note_history(run.record, problem, history)
     return history
 

@@ -7,10 +7,12 @@ from typing import Any
 import pytest
 import torch
 
+from bench.config import load
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import RunStatus
-from bench.solve.optimise import DIVERGED, History, OptimiserSettings, Starts, StartSettings, optimise
+from bench.solve.optimise import DIVERGED, FirstChecked, History, OptimiserSettings, Starts, StartSettings, optimise
 from renderers.boundary import rendered
+from renderers.checks import BrokenContract
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
 from tests.looped import each
@@ -216,6 +218,45 @@ def test_a_loss_without_a_number_says_how_many_hits_have_no_distance():
         "the depth term is not a number at iteration 0: 11 of 256 rays have a hit without a finite distance (the field "
         "is finite on them, so the renderer is at fault)"
     )
+
+
+def checked(how: str, problem: type[Seen] = Seen) -> tuple[Seen, History, list[str]]:
+    """A loop whose first loss has its hits checked; the problem, the loop's history and its notes."""
+    notes: list[str] = []
+    seen = problem(renderer=WrongHits(how) if how else load("renderer", "dist"))
+    return seen, go(FirstChecked(seen, notes), 3), notes
+
+
+def test_the_first_hits_are_checked_once_and_neither_counted_nor_changed():
+    seen, history, notes = checked("")
+    plain = Seen(renderer=seen.renderer)
+    alone = go(plain, 3)
+    assert notes == [] and history.counts == alone.counts and history.counts.value > 0
+    assert [line["total"] for line in history.curve] == [line["total"] for line in alone.curve]
+    assert seen.radius.item() == plain.radius.item() and seen.calls == 4
+
+
+def test_hits_off_the_surface_are_noted_once_and_the_loop_goes_on():
+    _, history, notes = checked("short")
+    assert history.status is RunStatus.OK and len(history.curve) == 3
+    (note,) = notes
+    assert note.startswith("at the first iteration, WrongHits.render: ") and "not on the surface" in note
+
+
+def test_hits_that_break_the_contract_end_the_loop_unless_the_loss_says_more():
+    class Blind(Seen):
+        """Its loss does not look at the distances."""
+
+        def loss(self, iteration):
+            super().loss(iteration)
+            return {"total": self.radius.square()}
+
+    with pytest.raises(BrokenContract, match="hits have a negative distance"):
+        checked("behind")
+    with pytest.raises(BrokenContract, match="11 of 256 rays have a hit without a finite distance"):
+        checked("endless", Blind)
+    _, history, notes = checked("endless")
+    assert (history.status, notes) == (RunStatus.NAN, [])
 
 
 def test_a_parameter_that_is_no_number_ends_the_loop():

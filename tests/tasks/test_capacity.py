@@ -136,6 +136,14 @@ def test_a_choice_is_checked_by_the_best_candidate_of_each_draw():
     assert shares(chosen, [chosen, other], settings, footprint=0.04, seed=0)["held_out_seeds_held"] == 1
 
 
+def test_hits_off_the_surface_are_noted_once_of_all_candidates(compose_config, tmp_path):
+    short = ("renderer=custom", "renderer._target_=tests.wrong_hits.WrongHits", "task.optimiser.iterations=4")
+    asked = ("task=completion", "dataset=sphere", "field=sphere", "task.points=50")
+    record = run(tmp_path, compose_config, *asked, *BETTER, *short)
+    (note,) = [note for note in record.notes if "hits are not on the surface" in note]
+    assert note.startswith("at the first iteration, WrongHits.render: ")
+
+
 @pytest.mark.parametrize(
     ("overrides", "ends"),
     [
