@@ -70,6 +70,14 @@ def test_distances_that_are_5_percent_short_are_noted_in_each_kind_of_field(name
         assert "return the distance along the unit direction, in scene units" in note
 
 
+@each("factor", [0.01, 100.0])
+def test_how_far_off_hits_are_does_not_depend_on_the_fields_scale(factor):
+    field = Shape(lambda p: factor * PLATE(p), Kind.LEVEL)
+    right, short = hits_of(load("renderer", "dvr"), field), hits_of(WrongHits("short", "dvr"), field)
+    assert right.off_surface() == ""
+    assert short.off_surface() == hits_of(WrongHits("short", "dvr"), PLATE).off_surface() != ""
+
+
 def test_a_note_says_how_many_hits_are_off_by_how_much():
     facing, ball = camera_of(20).rays(), sphere(0.5)
     hits = hits_of(WrongHits("short"), ball, facing)
