@@ -1,27 +1,32 @@
 """Colours of a mesh file's own surface, by its textures, materials or vertices, on the shapes that are made of it."""
 
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from PIL import Image
 
-from datasets.extras import named_files
-from datasets.mesh import Mesh, joined
-from datasets.meshes import read_mesh
+from datasets.extras import material_files, named_files
+from datasets.mesh import Mesh
+from datasets.meshes import read_surface
 from datasets.readers.glb import GREY
+from datasets.readers.polygons import Material, Polygons
+from datasets.readers.text import read_mtl
 from datasets.scene import Truth
 from renderers.checks import BadInput
 
 
-class Piece(NamedTuple):
-    """A part of a file's surface; `values` are colours of its vertices, or their u, v and 0 in an image."""
+class Paint(NamedTuple):
+    """A file's triangles, each with vertices of its own, and what is painted on these."""
 
     mesh: Mesh
-    values: Float[np.ndarray, "v 3"]
-    image: Any = None
-    known: bool = True  # whether the file gives it a colour
+    colours: Float[np.ndarray, "v 3"]  # to be multiplied by those of the images
+    coordinates: Float[np.ndarray, "v 2"]
+    image: Int[np.ndarray, " v"]  # -1 where there is none
+    images: list[Any]
 
 
 class FileColours:
@@ -37,60 +42,67 @@ class FileColours:
     """
 
     def __init__(self, path: Path, rest: Mesh, shape: Mesh) -> None:
-        self._rest, self._shape, self._pieces = rest.vertices, Truth(shape), _pieces(path, path.stat().st_mtime_ns)
-        self._own = Truth(joined([piece.mesh for piece in self._pieces]), closed=False)
-        self._values = np.concatenate([piece.values for piece in self._pieces])
-        self._piece = np.repeat(range(len(self._pieces)), [len(piece.values) for piece in self._pieces])
+        self._rest, self._shape = rest.vertices, Truth(shape, closed=False)
+        self._paint = _paint(path, path.stat().st_mtime_ns)
+        self._file = Truth(self._paint.mesh, closed=False)
 
     @property
     def texels(self) -> int:
         """Pixels of the file's images."""
-        images = {id(piece.image): piece.image for piece in self._pieces if piece.image is not None}
-        return sum(image.width * image.height for image in images.values())
+        return sum(image.width * image.height for image in self._paint.images)
 
     def __call__(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> np.ndarray:
         from trimesh.visual.color import uv_to_interpolated_color
 
         weights, corners = self._shape.nearest(points)
-        weights, corners = self._own.nearest(np.einsum("nk,nkd->nd", weights, self._rest[corners]))
-        colours, piece = np.einsum("nk,nkd->nd", weights, self._values[corners]), self._piece[corners[:, 0]]
-        for number, one in enumerate(self._pieces):
-            if one.image is not None:
-                here = piece == number
-                colours[here] = uv_to_interpolated_color(colours[here, :2], one.image)[:, :3] / 255
+        weights, corners = self._file.nearest(np.einsum("nk,nkd->nd", weights, self._rest[corners]))
+        colours, coordinates = (
+            np.einsum("nk,nkd->nd", weights, values[corners])
+            for values in (self._paint.colours, self._paint.coordinates)
+        )
+        for number, image in enumerate(self._paint.images):
+            painted = self._paint.image[corners[:, 0]] == number
+            colours[painted] *= uv_to_interpolated_color(coordinates[painted], image)[:, :3] / 255
         return colours.clip(0, 1)
 
 
 @lru_cache(maxsize=64)
-def _pieces(path: Path, changed: int) -> list[Piece]:
-    """The parts of a file, read again when it has changed."""
-    import trimesh
-
-    mesh, named, pieces = read_mesh(path), named_files(path), []
-    if missing := [file for file in named if not file.is_file()]:
+def _paint(path: Path, changed: int) -> Paint:
+    """The surface of a file and its colours, read again when the file has changed."""
+    mesh, polygons = read_surface(path)
+    if missing := [file for file in named_files(path) if not file.is_file()]:
         raise BadInput(f"mesh file '{path}' names '{missing[0].name}', which is not there: put it at '{missing[0]}'")
-    if named or path.suffix.lower() == ".glb":
-        try:
-            parts = trimesh.load_scene(path, process=False).dump()
-            pieces = [_piece(part) for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-        except Exception as error:  # of trimesh, whatever it does with a file that our readers read
-            raise BadInput(f"the materials of mesh file '{path}' cannot be read: {error}") from error
-    if any(piece.known for piece in pieces):
-        return pieces
-    if mesh.colours is None:
+    cuts, owner = polygons.cuts
+    materials = [*_materials(path, polygons), Material()]  # the last, number -1, is that of polygons without one
+    number = np.full(len(cuts), -1) if polygons.material is None else polygons.material[owner]
+    coordinates = np.full((*cuts.shape, 2), np.nan) if polygons.coordinates is None else polygons.coordinates[cuts]
+    images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
+    image = np.array([-1 if material.image is None else images.index(material.image) for material in materials])[number]
+    image[~np.isfinite(coordinates).all(axis=(1, 2))] = -1
+    colours = np.full((*cuts.shape, 3), np.nan) if mesh.colours is None else mesh.colours[mesh.faces]
+    flat = np.array([material.colour or (np.nan,) * 3 for material in materials])[number, None]
+    colours = np.where(np.isnan(flat), colours, flat)
+    if np.isnan(colours).all():
         what = "neither a texture nor those of materials or vertices: export it with its materials"
         raise BadInput(f"mesh file '{path}' has no colours, {what}")
-    return [Piece(mesh, mesh.colours)]
+    return Paint(
+        Mesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(cuts.size).reshape(-1, 3)),
+        np.where(np.isnan(colours), GREY, colours).reshape(-1, 3),
+        coordinates.reshape(-1, 2),
+        np.repeat(image, 3),
+        [_opened(path, image) for image in images],
+    )
 
 
-def _piece(part: Any) -> Piece:
-    mesh, visual = Mesh(np.array(part.vertices), np.array(part.faces)), part.visual
-    material = getattr(visual, "material", None)
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and visual.uv is not None:
-        return Piece(mesh, np.pad(visual.uv, ((0, 0), (0, 1))), image)
-    if visual.kind in ("vertex", "face"):
-        return Piece(mesh, visual.vertex_colors[:, :3] / 255)
-    known = material is not None and getattr(material, "baseColorFactor", material) is not None
-    colour = material.main_color[:3] / 255 if known else np.full(3, GREY)
-    return Piece(mesh, np.tile(colour, (len(mesh.vertices), 1)), known=known)
+def _materials(path: Path, polygons: Polygons) -> list[Material]:
+    """The materials of the polygons, those that are only named by the .mtl files that have them."""
+    library = {name: material for file in material_files(path) for name, material in read_mtl(file).items()}
+    return [library.get(material.name, material) for material in polygons.materials]
+
+
+def _opened(path: Path, image: bytes | Path) -> Any:
+    try:
+        with Image.open(BytesIO(image) if isinstance(image, bytes) else path.parent / image) as stored:
+            return stored.convert("RGBA")
+    except (OSError, ValueError, SyntaxError) as error:  # the last of a damaged PNG
+        raise BadInput(f"an image of mesh file '{path}' cannot be read: {error}") from None

@@ -31,13 +31,22 @@ def install(extra: str, root: Path = ROOT) -> str:
 
 def named_files(path: Path) -> list[Path]:
     """The .mtl files that an .obj names, and the images that these name, whether they are there or not."""
-    libraries = _named(path, "mtllib") if path.suffix.lower() == ".obj" else []
+    libraries = material_files(path)
     return [*libraries, *(image for file in libraries if file.is_file() for image in _named(file, "map_Kd"))]
 
 
+def material_files(path: Path) -> list[Path]:
+    """The .mtl files that an .obj names, whether they are there or not."""
+    return _named(path, "mtllib") if path.suffix.lower() == ".obj" else []
+
+
+def named_image(path: Path, line: str) -> Path:
+    """The file that a line `map_Kd FILE` of the file `path` names; options such as `-s 1 1 1` stand before it."""
+    name = line.strip().split(None, 1)[1]
+    return path.parent / (name.split()[-1] if name.startswith("-") else name).replace("\\", "/")
+
+
 def _named(path: Path, key: str) -> list[Path]:
-    """The files that lines of a key name, beside `path`; an option such as `-s 1 1 1` stands before the name."""
-    line = rf"^[ \t]*{key}[ \t]+(.+?)[ \t]*$"  # of no blank lines, of which a file may have many
-    lines = re.findall(line, path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
-    names = [line.split()[-1] if line.startswith("-") else line for line in dict.fromkeys(lines)]
-    return [path.parent / name.replace("\\", "/") for name in names]
+    lines = rf"^[ \t]*{key}[ \t]+.*\S"  # of no blank lines, of which a file may have many
+    found = re.findall(lines, path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
+    return [named_image(path, line) for line in dict.fromkeys(found)]

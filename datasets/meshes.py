@@ -76,6 +76,11 @@ def read_mesh(path: str | Path) -> Mesh:
     Raises:
         ValueError: the file is missing, empty, truncated or broken, or holds no surface.
     """
+    return read_surface(path)[0]
+
+
+def read_surface(path: str | Path) -> tuple[Mesh, Polygons]:
+    """A mesh as `read_mesh` reads it, and the polygons that were cut into its faces."""
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"must be one mesh file, found the folder '{path}'; list it with find_meshes")
@@ -134,19 +139,19 @@ def _polygons(path: Path) -> Polygons:
         return READERS[path.suffix.lower()](content)
 
 
-def _read(path: Path) -> Mesh:
+def _read(path: Path) -> tuple[Mesh, Polygons]:
     polygons, suffix = _polygons(path), path.suffix.lower()
     with np.errstate(all="ignore"):  # of numbers that Mesh refuses
-        triangles, owner = polygons.triangles()
+        triangles = polygons.triangles
     if not len(triangles):
         count = len(polygons.vertices)
         held = f"{count} vertices, as points or lines" if count else f"at most points or lines, as {suffix} writes them"
         remedy = "reconstruct a surface from them (Poisson), or export it as one" if count else "export it as a surface"
         raise ValueError(f"must have faces, found none: it holds {held}; {remedy}")
-    mesh = Mesh(polygons.vertices, triangles, colours=polygons.shaded(triangles, owner))
+    mesh = Mesh(polygons.vertices, triangles, colours=polygons.shaded)
     if mesh.area <= FLAT * mesh.diagonal**2:
         raise ValueError(
             f"must have an area, found {mesh.area:.3g} in a box {mesh.diagonal:.3g} across; "
             "look for a stray vertex, or export it again"
         )
-    return mesh
+    return mesh, polygons

@@ -1,17 +1,19 @@
-"""Reads the triangles of .glb files (binary glTF 2.0), placed as their scene has them at rest."""
+"""Reads triangles and colours of .glb files (binary glTF 2.0), placed as their scene has them at rest."""
 
 import base64
 import json
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from datasets.readers.polygons import Polygons, cut_strips
+from datasets.readers.polygons import WHITE, Material, Polygons, cut_strips
 from renderers.checks import BadInput
 
 CODES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -20,11 +22,23 @@ TRIANGLES, STRIP, FAN = 4, 5, 6  # modes; those below are points and lines
 READ = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing")
 READ += ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_", "KHR_xmp")  # not of shape
 GREY = 0.7  # of parts without colours, beside parts that have some
-Part = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"], Float[np.ndarray, "v 3"] | None]
+SPECULAR = "KHR_materials_pbrSpecularGlossiness"  # where older files have the colour
+
+
+class Primitive(NamedTuple):
+    """Triangles of one material, with the colours of their vertices, and texture coordinates, NaN without any."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    triangles: Int[np.ndarray, "t 3"]
+    colours: Float[np.ndarray, "v 3"] | None
+    coordinates: Float[np.ndarray, "v 2"]
+    material: int  # -1 without one
 
 
 def read_glb(content: bytes) -> Polygons:
-    """The triangles of a .glb file's scene, with the colours of its vertices. Materials and textures are not read.
+    """The triangles of a .glb file's scene, with colours and textures.
+
+    A vertex has the product of its colour and its material's. Other effects of materials are not read.
 
     Raises:
         ValueError: where it is damaged, compressed, names other files, or needs an extension that is not read.
@@ -34,22 +48,31 @@ def read_glb(content: bytes) -> Polygons:
         if not name.startswith(READ):
             raise ValueError(f"must be a .glb that is read without '{name}'; export it without that, uncompressed")
     try:
-        parts = list(Scene(stored, binary).parts())
+        scene = Scene(stored, binary)
+        parts, materials = list(scene.parts()), tuple(map(scene.painted, stored.get("materials", ())))
     except BadInput:
         raise
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError, MemoryError) as error:
         why = f"{type(error).__name__}: {error}"
         raise ValueError(f"must be a whole .glb file, but it is damaged ({why}); export or copy it again") from None
-    offsets = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts)])
-    corners = [triangles + offset for (_, triangles, _), offset in zip(parts, offsets, strict=False)]
-    bare = all(colours is None for _, _, colours in parts)
-    shades = [np.full(vertices.shape, GREY) if colours is None else colours for vertices, _, colours in parts]
-    return Polygons(
-        np.concatenate([np.empty((0, 3)), *(vertices for vertices, _, _ in parts)]),
+    return _joined(parts, materials)
+
+
+def _joined(parts: list[Primitive], materials: tuple[Material, ...]) -> Polygons:
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    corners = [part.triangles + offset for part, offset in zip(parts, offsets, strict=False)]
+    bare = all(part.colours is None for part in parts)
+    shades = [np.full(part.vertices.shape, GREY) if part.colours is None else part.colours for part in parts]
+    polygons = Polygons(
+        np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)]),
         np.full(sum(map(len, corners)), 3),
         np.concatenate([np.empty(0, np.int64), *map(np.ravel, corners)]),
         None if bare else np.concatenate(shades),
+        materials=materials,
+        material=np.repeat([part.material for part in parts], [len(part.triangles) for part in parts]).astype(np.int64),
     )
+    coordinates = np.concatenate([np.empty((0, 2)), *(part.coordinates for part in parts)])
+    return replace(polygons, coordinates=coordinates[polygons.corners])
 
 
 def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -76,8 +99,8 @@ class Scene:
     stored: dict[str, Any]
     binary: bytes
 
-    def parts(self) -> Iterator[Part]:
-        """Vertices, triangles and colours of each primitive of triangles, in the scene, as often as it is there."""
+    def parts(self) -> Iterator[Primitive]:
+        """Each primitive of triangles, in the scene, as often as it is there."""
         world = self._placed()
         for i, matrix in world.items():
             node = self.stored["nodes"][i]
@@ -88,15 +111,13 @@ class Scene:
                     continue
                 attributes = primitive["attributes"]
                 vertices = self._shape(primitive, node.get("weights") or mesh.get("weights") or ())
-                colours = None
-                if "COLOR_0" in attributes:
-                    colours = self._numbers(attributes["COLOR_0"], shares=True)[:, :3].clip(0, 1)
-                    colours = np.broadcast_to(colours, vertices.shape)
+                count, material = len(vertices), primitive.get("material", -1)
+                paint = self._colours(primitive, count), self._coordinates(primitive, count), material
                 skin = "skin" in node
                 for place in [self._bent(node["skin"], attributes, world)] if skin else self._copies(node, matrix):
                     turn = place[..., :3, :3]
                     moved = (turn @ vertices[..., None])[..., 0] + place[..., :3, 3]
-                    yield moved, triangles[:, :: -1 if np.linalg.det(turn).sum() < 0 else 1], colours
+                    yield Primitive(moved, triangles[:, :: -1 if np.linalg.det(turn).sum() < 0 else 1], *paint)
 
     def _triangles(self, primitive: dict[str, Any]) -> Int[np.ndarray, "t 3"] | None:
         """None for points and lines."""
@@ -120,6 +141,49 @@ class Scene:
             if weight and "POSITION" in target:
                 vertices = vertices + weight * self._numbers(target["POSITION"])
         return vertices
+
+    def painted(self, material: dict[str, Any]) -> Material:
+        """A material's image of its base colour; without one its factor is in the colours of the vertices."""
+        texture = _base(material)[1]
+        if texture is None:
+            return Material()
+        texture = self.stored["textures"][texture["index"]]
+        sources = [texture, *texture.get("extensions", {}).values()]  # such as a WebP image
+        number = next((entry["source"] for entry in sources if "source" in entry), None)
+        if number is None:
+            return Material()
+        image = self.stored["images"][number]
+        if "bufferView" in image:
+            view = self.stored["bufferViews"][image["bufferView"]]
+            content = self._rows(image, view["byteLength"], np.dtype("u1"), 1).tobytes()
+        else:
+            uri = image["uri"]
+            content = _inline(uri) if uri.startswith("data:") else Path(unquote(uri))
+        return Material("", WHITE, content)
+
+    def _colours(self, primitive: dict[str, Any], count: int) -> Float[np.ndarray, "v 3"] | None:
+        """The colours of its vertices times its material's factor, unless that has an image too."""
+        factor, texture = _base(self._material(primitive))
+        factor = factor[:3] if factor and not texture else None
+        if "COLOR_0" not in primitive["attributes"]:
+            return None if factor is None else np.tile(np.asarray(factor, np.float64), (count, 1)).clip(0, 1)
+        colours = self._numbers(primitive["attributes"]["COLOR_0"], shares=True)[:, :3] * (factor or WHITE)
+        return np.broadcast_to(colours.clip(0, 1), (count, 3))
+
+    def _coordinates(self, primitive: dict[str, Any], count: int) -> Float[np.ndarray, "v 2"]:
+        """The texture coordinates of its vertices, v upward, in the image of its material."""
+        texture = _base(self._material(primitive))[1] or {}
+        transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        name = f"TEXCOORD_{transform.get('texCoord', texture.get('texCoord', 0))}"
+        if not texture or name not in primitive["attributes"]:
+            return np.full((count, 2), np.nan)
+        coordinates = self._numbers(primitive["attributes"][name]) * transform.get("scale", (1, 1))
+        turn = transform.get("rotation", 0)  # anticlockwise as one sees it, where v points down
+        turned = coordinates @ [(np.cos(turn), -np.sin(turn)), (np.sin(turn), np.cos(turn))]
+        return (turned + transform.get("offset", (0, 0))) * (1, -1) + (0, 1)
+
+    def _material(self, primitive: dict[str, Any]) -> dict[str, Any]:
+        return self.stored["materials"][primitive["material"]] if "material" in primitive else {}
 
     def _bent(self, skin: int, attributes: dict[str, int], world: dict[int, np.ndarray]) -> Float[np.ndarray, "v 4 4"]:
         """The matrix of each vertex of a skin, by its joints; its own node's is not used."""
@@ -181,7 +245,7 @@ class Scene:
     def _buffer(self, i: int) -> bytes:
         uri = self.stored["buffers"][i].get("uri", "")
         if uri.startswith("data:"):
-            return base64.b64decode(uri.partition(",")[2])
+            return _inline(uri)
         if i == 0 and not uri:
             return self.binary
         raise BadInput(f"must hold its numbers, but buffer {i} is elsewhere, '{uri[:40]}' {self._extensions}")
@@ -190,6 +254,18 @@ class Scene:
     def _extensions(self) -> str:
         used = ", ".join(self.stored.get("extensionsUsed", ())) or "none"
         return f"(extensions: {used}); export it as one file, uncompressed"
+
+
+def _base(material: dict[str, Any]) -> tuple[list[float] | None, dict[str, Any] | None]:
+    """The factor and the texture of a material's base colour, where it has them."""
+    older = material.get("extensions", {}).get(SPECULAR, {})
+    base = material.get("pbrMetallicRoughness", {})
+    factor = older.get("diffuseFactor", base.get("baseColorFactor"))
+    return factor, older.get("diffuseTexture", base.get("baseColorTexture"))
+
+
+def _inline(uri: str) -> bytes:
+    return base64.b64decode(uri.partition(",")[2])
 
 
 def _matrix(given: dict[str, Any]) -> Float[np.ndarray, "*n 4 4"]:

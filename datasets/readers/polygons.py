@@ -1,11 +1,29 @@
-"""Polygons in space as files have them, concave ones too, and their triangles."""
+"""Polygons in space as files have them, concave ones too, their triangles, and their materials."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
 FLAT = 1e-12  # of a polygon's area: a triangle with less is flat, and a point by so much outside is on the edge
+WHITE = (1.0, 1.0, 1.0)  # beside an image, which has the colour
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a file says of the colour of some polygons.
+
+    Args:
+        name: in the .mtl files that an .obj names; "" where the file itself has the material.
+        colour: RGB from 0 to 1, in place of the vertices' colours; None without one.
+        image: the content of an image file, or where that file is; the image multiplies the colour.
+    """
+
+    name: str = ""
+    colour: tuple[float, float, float] | None = None
+    image: bytes | Path | None = None
 
 
 @dataclass(frozen=True)
@@ -18,6 +36,9 @@ class Polygons:
         corners: the vertices of all polygons, one polygon after the other.
         vertex_colours: RGB from 0 to 1.
         face_colours: RGB from 0 to 1.
+        coordinates: of each corner in the image of its material, u to the right and v upward; NaN without any.
+        materials: of the file.
+        material: the number of each polygon's material; -1 without one.
 
     Raises:
         ValueError: where a corner is no vertex.
@@ -28,6 +49,9 @@ class Polygons:
     corners: Int[np.ndarray, " c"]
     vertex_colours: Float[np.ndarray, "v 3"] | None = None
     face_colours: Float[np.ndarray, "p 3"] | None = None
+    coordinates: Float[np.ndarray, "c 2"] | None = None
+    materials: tuple[Material, ...] = ()
+    material: Int[np.ndarray, " p"] | None = None
 
     def __post_init__(self) -> None:
         wrong = self.corners[(self.corners < 0) | (self.corners >= len(self.vertices))]
@@ -37,8 +61,14 @@ class Polygons:
                 f"counted from 0, {wrong[0] + 1} from 1; export or copy it again"
             )
 
-    def triangles(self) -> tuple[Int[np.ndarray, "t 3"], Int[np.ndarray, " t"]]:
-        """Triangles that fill the polygons, in their order, and the polygon of each.
+    @property
+    def triangles(self) -> Int[np.ndarray, "t 3"]:
+        """The vertices of the triangles that fill the polygons."""
+        return self.corners[self.cuts[0]]
+
+    @cached_property
+    def cuts(self) -> tuple[Int[np.ndarray, "t 3"], Int[np.ndarray, " t"]]:
+        """Triangles that fill the polygons, in their order, by places in `corners`, and the polygon of each.
 
         A polygon that is a fan about its first corner becomes that fan, others are cut at ears. Corners on a straight
         edge are kept, since a neighbour may use them. What has fewer than three corners is left out.
@@ -47,10 +77,10 @@ class Polygons:
         triangles, owners = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
         for count in np.unique(self.counts[self.counts >= 3]).tolist():
             alike = np.flatnonzero(self.counts == count)
-            loops = self.corners[starts[alike, None] + np.arange(count)]
+            loops = starts[alike, None] + np.arange(count)
             cut = loops[:, fan(count)]
             if count > 3:
-                places = self.vertices[loops]
+                places = self.vertices[self.corners[loops]]
                 others = np.flatnonzero(~_is_fan(places))
                 cut[others] = loops[others[:, None, None], ears(_in_plane(places[others]))]
             triangles.append(cut.reshape(-1, 3))
@@ -59,12 +89,12 @@ class Polygons:
         order = np.argsort(owner, kind="stable")
         return np.concatenate(triangles)[order], owner[order]
 
-    def shaded(
-        self, triangles: Int[np.ndarray, "t 3"], owner: Int[np.ndarray, " t"]
-    ) -> Float[np.ndarray, "v 3"] | None:
+    @property
+    def shaded(self) -> Float[np.ndarray, "v 3"] | None:
         """RGB of each vertex, if it or its faces have some: then the mean of its triangles'."""
         if self.vertex_colours is not None or self.face_colours is None:
             return self.vertex_colours
+        triangles, owner = self.triangles, self.cuts[1]
         counts = np.bincount(triangles.ravel(), minlength=len(self.vertices)).clip(1)
         bands = np.repeat(self.face_colours[owner], 3, axis=0).T
         sums = [np.bincount(triangles.ravel(), weights=band, minlength=len(self.vertices)) for band in bands]

@@ -1,14 +1,18 @@
-"""Reads the polygons of .obj, .off and .stl files, and knows files of other kinds by how they begin."""
+"""Reads the polygons of .obj, .off and .stl files and the materials of .mtl files; detects files of other kinds."""
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from datasets.readers.polygons import Polygons, shades
+from datasets.extras import named_image
+from datasets.readers.polygons import WHITE, Material, Polygons, shades
 
 UNREAD = {"surf": "a free-form surface", "call": "another file that it includes"}  # of .obj: would be missing
 FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])  # of a binary .stl
@@ -21,11 +25,12 @@ MISTAKEN = {  # how other files begin, in lower case: what they are, and the rem
     b"<html": "is a web page; download the file itself",
 }
 WIDE = b"\xff\xfe", b"\xfe\xff"  # how a text of UTF-16 begins
+NAMING = re.compile(r"\s*(?:usemtl|newmtl|map_kd)\s", re.IGNORECASE)  # lines with a name, which may have a #
 BROKEN_LINE = re.compile(r"^[ \t]*[vf][ \t](?:[^\\\n]|\\[ \t]*\n)*", re.MULTILINE)  # \ at the end: the next one goes on
 
 
 def read_obj(content: bytes) -> Polygons:
-    """The polygons of a Wavefront file. Lines, points, textures, normals and materials are not read.
+    """The polygons of a Wavefront file, with texture coordinates and the names of materials, without normals.
 
     Raises:
         ValueError: where a line is not as the format has it.
@@ -34,6 +39,7 @@ def read_obj(content: bytes) -> Polygons:
     if "\\" in text:
         text = BROKEN_LINE.sub(lambda line: re.sub(r"\\[ \t]*\n", " ", line[0]), text)
     vertices, colours, counts, corners = [], [], [], []
+    coordinates, texels, material, names, number = [], [], [], {"": 0}, 0
     for line in text.split("\n"):
         key, *words = line.split() or [""]
         try:
@@ -41,15 +47,44 @@ def read_obj(content: bytes) -> Polygons:
                 vertices.append(_three(words))
                 colours += [_three(words[3:])] if len(words) > 5 else []
             elif key in ("f", "fo"):
-                numbers = [int(word.partition("/")[0]) for word in words]
-                corners += [_from_zero(number, len(vertices)) for number in numbers]
-                counts.append(len(numbers))
+                pairs = [word.split("/") for word in words]
+                corners += [_from_zero(int(pair[0]), len(vertices)) for pair in pairs]
+                texels += [int(pair[1]) if len(pair) > 1 and pair[1] else 0 for pair in pairs]
+                counts.append(len(pairs))
+                material.append((number, len(coordinates)))
+            elif key == "vt":
+                coordinates.append(_two(words))
+            elif key == "usemtl":
+                number = names.setdefault(" ".join(words), len(names))
         except ValueError:
             what = "'v x y z'" if key == "v" else f"'f a b c', numbers from 1, or from -{len(vertices)} to -1"
             raise ValueError(f"a line must be {what}, found '{line.strip()[:60]}'; export it again") from None
         if key in UNREAD:
             raise ValueError(f"must hold polygons, but has {UNREAD[key]} ('{key}'); export it as triangles")
-    return _polygons(vertices, counts, corners, colours)
+    material, so_far = np.array(material, dtype=np.int64).reshape(-1, 2).T
+    return replace(
+        _polygons(vertices, counts, corners, colours),
+        coordinates=_at_corners(coordinates, texels, np.repeat(so_far, counts)),
+        materials=tuple(map(Material, names)),
+        material=material,
+    )
+
+
+def read_mtl(path: Path) -> dict[str, Material]:
+    """The materials of an .mtl file by their names: of each the image, or else the diffuse colour."""
+    materials, name = {}, ""
+    for line in decoded(path.read_bytes()).split("\n"):
+        key, *words = line.split() or [""]
+        if key.lower() == "newmtl":
+            name = " ".join(words)
+            materials[name] = Material(name)
+        elif key.lower() == "kd" and name in materials and materials[name].image is None:
+            with suppress(ValueError):  # a spectrum
+                red, green, blue = _three(words * 3 if len(words) == 1 else words)
+                materials[name] = Material(name, (red, green, blue))
+        elif key.lower() == "map_kd" and name in materials and words:
+            materials[name] = Material(name, WHITE, named_image(path.absolute(), line))
+    return materials
 
 
 def read_off(content: bytes) -> Polygons:
@@ -128,13 +163,20 @@ def mistaken(path: Path) -> str:
 
 
 def decoded(content: bytes) -> str:
-    """The text of a file with plain ends of lines, without comments and the mark that some editors write first."""
+    """The text of a file with plain ends of lines, without comments and the mark that some editors write first.
+
+    A `#` in the name of a material or of its image begins no comment.
+    """
     text = (
         content.decode("utf-16" if content.startswith(WIDE) else "utf-8-sig", "replace")
         .replace("\r\n", "\n")
         .replace("\r", "\n")
     )
-    return re.sub(r"#[^\n]*", "", text)
+
+    def kept(comment: re.Match) -> str:
+        return comment[0] if NAMING.match(text, text.rfind("\n", 0, comment.start()) + 1) else ""
+
+    return re.sub(r"#[^\n]*", kept, text)
 
 
 def _in_rows(lines: list[list[str]], vertex_count: int, face_count: int, width: int) -> list[list[str]]:
@@ -151,6 +193,24 @@ def _in_rows(lines: list[list[str]], vertex_count: int, face_count: int, width: 
 def _three(words: Sequence[str]) -> list[float]:
     x, y, z = words[:3]
     return [float(x), float(y), float(z)]
+
+
+def _two(words: Sequence[str]) -> list[float]:
+    """Texture coordinates, NaN where they are no numbers."""
+    try:
+        return [float(word) for word in (*words, "0", "0")[:2]]
+    except ValueError:
+        return [np.nan, np.nan]
+
+
+def _at_corners(
+    coordinates: list[list[float]], texels: list[int], so_far: Int[np.ndarray, " c"]
+) -> Float[np.ndarray, "c 2"]:
+    """The texture coordinates of corners by numbers from 1, or back from the last so far; NaN where there are none."""
+    numbers = np.array(texels, dtype=np.int64)
+    index = numbers + np.where(numbers < 0, so_far, -1)
+    index[(index < 0) | (index >= len(coordinates))] = len(coordinates)
+    return np.array([*coordinates, (np.nan, np.nan)])[index]
 
 
 def _from_zero(number: int, vertex_count: int) -> int:

@@ -8,7 +8,9 @@ import trimesh
 from PIL import Image
 
 from bench.records.folder import Identity
+from datasets.colours import FileColours
 from datasets.local import LocalMeshes
+from datasets.meshes import read_mesh
 from datasets.scene import Split, sample_surface
 from renderers.checks import BadInput
 from tests.looped import each
@@ -65,6 +67,29 @@ def test_without_an_image_the_colours_are_those_of_vertices_or_of_the_material(t
         assert texture.texels == 0
 
 
+def test_an_obj_has_each_face_in_its_material_also_where_polygons_are_concave(tmp_path):
+    image = np.zeros((256, 256, 3), np.uint8)
+    image[..., 0], image[..., 1] = RAMP, RAMP[::-1, None]
+    Image.fromarray(image).save(tmp_path / "map #1.png")
+    (tmp_path / "a.mtl").write_text("newmtl Paint #1\nKd 0 1 0\nnewmtl Paint #2\nKd 0 0 0\nmap_Kd map #1.png\n")
+    (tmp_path / "b.mtl").write_text("newmtl blue\nKd 0 0 1\n")
+    arrow = "v 0 0 0\nv 1 1 0\nv 0 .25 0\nv -1 1 0\n"  # concave at its third corner
+    pinned = "vt .5 0\nvt 1 1\nvt .5 .25\nvt 0 1\n"
+    lines = ["mtllib a.mtl", "mtllib b.mtl", arrow, pinned, "usemtl Paint #2", "f -4/-4 -3/-3 -2/-2 -1/-1"]
+    for number, name in enumerate(("Paint #1", "blue", "Paint #2")):  # the last has no texture coordinates
+        lines += [arrow.replace(" 0\n", f" {number + 1}\n"), f"usemtl {name}", "f -4 -3 -2 -1"]
+    path = tmp_path / "arrows.obj"
+    path.write_text("\n".join(lines))
+    mesh = read_mesh(path)
+    texture = FileColours(path, mesh, mesh)
+    places = np.array([(0.0, 0.1, 0), (0.5, 0.6, 0), (-0.5, 0.6, 0), (-0.9, 0.92, 0)])
+    across = np.c_[places[:, 0] / 2 + 0.5, places[:, 1], np.zeros(4)]
+    assert texture(places, places) == pytest.approx(across, abs=0.005)
+    for height, colour in enumerate([(0, 1, 0), (0, 0, 1), (1, 1, 1)], start=1):
+        assert texture(places + np.array([0, 0, height]), places) == pytest.approx(np.tile(colour, (4, 1)))
+    assert texture.texels == 256 * 256
+
+
 def test_what_has_no_colours_or_lacks_a_file_is_an_error_that_says_so(tmp_path):
     trimesh.creation.box().export(tmp_path / "plain.ply")
     with pytest.raises(BadInput, match=r"plain.ply' has no colours.* export it with its materials"):
@@ -72,6 +97,11 @@ def test_what_has_no_colours_or_lacks_a_file_is_an_error_that_says_so(tmp_path):
     path = textured(tmp_path, "obj")
     whole = shapes(path).identity()
     (image,) = tmp_path.glob("*.png")
+    content = image.read_bytes()
+    image.write_bytes(content[:100])
+    with pytest.raises(BadInput, match=r"an image of mesh file '.*box\.obj' cannot be read"):
+        shapes(path).texture(Split.TRAIN, 0)
+    image.write_bytes(content)
     image.rename(tmp_path / "elsewhere")
     with pytest.raises(BadInput, match=f"names '{image.name}', which is not there: put it at"):
         shapes(path).texture(Split.TRAIN, 0)

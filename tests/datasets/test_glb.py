@@ -1,12 +1,17 @@
 """What a .glb file may hold: numbers in every coding, placed in every way. Each file has one tetrahedron, or two."""
 
+import base64
+import io
 import json
 import struct
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from datasets.colours import FileColours
+from datasets.meshes import read_mesh
 from datasets.readers.glb import read_glb
 from tests.looped import each
 
@@ -14,7 +19,7 @@ VERTICES = np.array([(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)], np.float32)
 FACES = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], np.uint16)
 CORNERS = FACES.ravel()
 CODES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
 def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), parts=({},), **more) -> bytes:
@@ -47,6 +52,11 @@ def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), parts
     stored = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes}
     stored |= {"meshes": [{"primitives": primitives}], "accessors": accessors, "bufferViews": views}
     stored |= {"buffers": [{"byteLength": len(binary)}], **more}
+    return packed(stored, bytes(binary))
+
+
+def packed(stored: dict, binary: bytes) -> bytes:
+    """A file of a table of contents and the numbers."""
     text = json.dumps(stored).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
@@ -138,13 +148,76 @@ def test_each_triangle_is_where_it_is_shown_and_winds_outward(name):
     read = read_glb(content)
     inward = [np.linalg.det(solid[1:] - solid[0]) < 0 for solid in solids]
     expected = [solid[FACES[:, ::-1] if turned else FACES] for solid, turned in zip(solids, inward, strict=True)]
-    assert ordered(read.vertices[read.triangles()[0]]) == pytest.approx(ordered(np.concatenate(expected)), abs=1e-5)
+    assert ordered(read.vertices[read.triangles]) == pytest.approx(ordered(np.concatenate(expected)), abs=1e-5)
+
+
+COLOURS = np.float32([(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, 0.25, 1)])
+
+
+def coloured(content: bytes) -> bytes:
+    """The file with four colours, of the vertices of each tetrahedron."""
+    (size,) = struct.unpack_from("<I", content, 12)
+    stored, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    uri = "data:;base64," + base64.b64encode(COLOURS.tobytes()).decode()
+    buffers = [*stored["buffers"], {"byteLength": COLOURS.nbytes, "uri": uri}]
+    views = [*stored["bufferViews"], {"buffer": 1, "byteLength": COLOURS.nbytes}]
+    accessor = {"componentType": 5126, "count": 4, "type": "VEC3", "bufferView": len(views) - 1}
+    for primitive in stored["meshes"][0]["primitives"]:
+        primitive["attributes"]["COLOR_0"] = len(stored["accessors"])
+    stored |= {"buffers": buffers, "bufferViews": views, "accessors": [*stored["accessors"], accessor]}
+    return packed(stored, binary)
+
+
+@each("name", [*READ])
+def test_each_vertex_has_its_colour_where_it_is_shown(tmp_path, name):
+    path = tmp_path / f"{name}.glb"
+    path.write_bytes(coloured(READ[name][0]))
+    mesh = read_mesh(path)
+    assert mesh.colours is not None and np.array_equal(mesh.colours[:4], COLOURS)
+    seen = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
+    assert seen == pytest.approx(mesh.colours, abs=1e-5)
+
+
+def test_a_texture_is_laid_on_as_its_coordinates_are_stored_and_transformed(tmp_path):
+    ramp, picture = np.arange(256, dtype=np.uint8), io.BytesIO()
+    across, down = np.meshgrid(ramp, ramp)
+    Image.fromarray(np.stack([across, down, 0 * down], axis=2)).save(picture, "png")
+    stored = np.array([(0, 0), (0.5, 0), (0, 0.5), (0.5, 0.75)])
+    transform = {"scale": [0.8, 0.4], "rotation": np.pi / 6, "offset": [0.1, 0.35]}
+    texture = {"index": 0, "extensions": {"KHR_texture_transform": transform}}
+    path = tmp_path / "textured.glb"
+    path.write_bytes(
+        glb(
+            (LARGE, SHARE),
+            CORNERS,
+            ((stored * 65535).round().astype(np.uint16), SHARE),
+            parts=({"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "material": 0},),
+            materials=[{"pbrMetallicRoughness": {"baseColorTexture": texture}}],
+            textures=[{"source": 0}],
+            images=[{"uri": "data:image/png;base64," + base64.b64encode(picture.getvalue()).decode()}],
+        )
+    )
+    mesh = read_mesh(path)
+    turned = ((stored * transform["scale"]) @ (1, -1j)) * np.exp(1j * transform["rotation"])  # v points down
+    expected = np.stack([turned.real + 0.1, 0.35 - turned.imag, np.zeros(4)], axis=1)
+    seen = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
+    assert seen == pytest.approx(expected, abs=0.005)
+
+
+def test_the_colour_of_a_material_multiplies_those_of_vertices(tmp_path):
+    path, factor = tmp_path / "factor.glb", [0.5, 1.0, 0.25, 1.0]
+    red = {"parts": ({"material": 0},), "materials": [{"pbrMetallicRoughness": {"baseColorFactor": factor}}]}
+    for content, expected in ((glb(**red), np.ones((4, 3))), (coloured(glb(**red)), COLOURS)):
+        path.write_bytes(content)
+        mesh = read_mesh(path)
+        seen = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
+        assert seen == pytest.approx(expected * factor[:3], abs=1e-5)
 
 
 def test_without_indices_vertices_are_taken_in_their_order():
     corners, part = VERTICES[FACES].reshape(-1, 3), {"attributes": {"POSITION": 0}}
     read = read_glb(glb(corners, meshes=[{"primitives": [part]}]))
-    assert (read.vertices[read.triangles()[0]] == VERTICES[FACES]).all()
+    assert (read.vertices[read.triangles] == VERTICES[FACES]).all()
 
 
 DRACO = ({"extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {}}}},)

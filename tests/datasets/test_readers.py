@@ -76,7 +76,7 @@ def prism(seed: int) -> Solid:
 
 def check(read: Polygons, solid: Solid) -> None:
     """What was read is the solid: closed, with its volume and its area, which folded triangles would exceed."""
-    mesh = Mesh(read.vertices, read.triangles()[0])
+    mesh = Mesh(read.vertices, read.triangles)
     assert mesh.watertight
     assert mesh.volume == pytest.approx(solid.volume, rel=1e-9)
     assert mesh.area == pytest.approx(solid.area, rel=1e-9)
@@ -227,7 +227,7 @@ def test_a_tetrahedron_is_read_in_unusual_spellings(name):
     reader, content = TETRAHEDRA[name]
     read = reader(content if isinstance(content, bytes) else content.encode())
     welded, vertex = np.unique(read.vertices, axis=0, return_inverse=True)
-    mesh = Mesh(welded, vertex.ravel()[read.triangles()[0]])
+    mesh = Mesh(welded, vertex.ravel()[read.triangles])
     assert mesh.watertight and mesh.volume == pytest.approx(1 / 6)
 
 
