@@ -12,10 +12,10 @@ from PIL import Image
 from torch import Tensor
 
 from bench.evaluate.state import State
-from bench.pictures.run_figures import at_size, normals_image, window
+from bench.pictures.run_figures import at_size, enlarged, in_size, normals_image, true_view, window
 from bench.pictures.style import SCREEN, bare, save, silhouette_image
 from bench.setup.inputs import RunInputs
-from datasets.scene import View, see
+from datasets.scene import View
 from renderers.camera import Camera
 
 MOST = 9  # columns of a strip
@@ -52,11 +52,8 @@ class Shown:
 
     def enlarged(self, camera: Camera) -> "Shown":
         """The same pixels in another size, that of a camera."""
-        rows = torch.arange(camera.height) * self.view.camera.height // camera.height
-        columns = torch.arange(camera.width) * self.view.camera.width // camera.width
-        parts = [part[rows][:, columns] for part in (self.view.depth, self.view.normals, self.view.mask)]
-        colours = None if self.colours is None else self.colours[rows][:, columns]
-        return Shown(View(camera, *parts), colours, self.masked)
+        colours = None if self.colours is None else in_size(self.colours, camera)
+        return Shown(enlarged(self.view, camera), colours, self.masked)
 
 
 class Filmstrip:
@@ -103,7 +100,7 @@ class Filmstrip:
     def _truth(self) -> Shown:
         size = self.inputs.evaluation.picture
         if self.true is None:
-            return Shown(see(self.inputs.scene.cast_on, at_size(self.inputs.scene.view.camera, size)))
+            return Shown(true_view(self.inputs.scene, at_size(self.inputs.scene.view.camera, size)))
         return self.true.enlarged(at_size(self.true.view.camera, size))
 
     def _shown(self, chosen: str | None) -> dict[int | str, Shown]:

@@ -23,7 +23,7 @@ from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, 
 from bench.records.read import ERRORS, NO_TERMS
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
-from datasets.scene import Truth, View, see
+from datasets.scene import Scene, Truth, View, see
 from renderers.camera import Camera
 
 LIGHT = np.array([-0.35, 0.6, 0.72])  # from the camera's upper left; axes to the right, up, towards the camera
@@ -35,11 +35,18 @@ GIVEN_INCHES = 2.0  # width of the axes with what is given
 
 @dataclass(frozen=True)
 class ViewPair:
-    """Two views of one shape: by the given camera, and by one from behind."""
+    """Views of one shape.
+
+    Args:
+        front: by the given camera, in the size of pictures.
+        back: by a camera behind; None of a shape of which only the front is known, without its normals.
+        mask: the silhouette for the given camera, in the size in which metrics compare silhouettes.
+    """
 
     title: str
     front: View
-    back: View
+    back: View | None
+    mask: Bool[Tensor, "height width"]
 
 
 @dataclass(frozen=True)
@@ -73,14 +80,18 @@ class Given:
 def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: list[dict[str, Any]], title: str) -> None:
     """Writes summary.png and curve.png of a run's states before and after, at a higher resolution than in the run."""
     inputs = states[0].inputs
-    front, back = _cameras(inputs, inputs.evaluation.picture)
-    truth = inputs.scene.cast_on
+    scene, (front, back) = inputs.scene, _cameras(inputs, inputs.evaluation.picture)
     pairs = (
         *(
-            ViewPair(name, state.pictured(front), state.pictured(back))
+            ViewPair(name, state.pictured(front), state.pictured(back), state.seen(scene.view.camera).mask)
             for name, state in zip(("before", "after"), states, strict=True)
         ),
-        ViewPair("measured" if inputs.scene.part else "truth", see(truth, front), see(truth, back)),
+        ViewPair(
+            "measured" if scene.part else "truth",
+            true_view(scene, front),
+            None if scene.part else see(scene.cast_on, back),
+            scene.view.mask,
+        ),
     )
     save(_summary(pairs, given, title), folder / "summary.png")
     draw_curve(folder / "curve.png", curve)
@@ -108,7 +119,7 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
 @rc_context(SCREEN)
 def draw_against(path: Path, found: View, true: View, *, title: str) -> None:
     """Writes a picture that compares a view with the true one: normals of both, missed and spurious pixels."""
-    both = ViewPair("rendered", found, found), ViewPair("reference", true, true)
+    both = ViewPair("rendered", found, None, found.mask), ViewPair("reference", true, None, true.mask)
     figure = Figure(figsize=(9.2, 3.5), layout="constrained")
     axes = figure.subplots(1, 3)
     for axis, pair in zip(axes, both, strict=False):
@@ -199,6 +210,30 @@ def save_arrays(folder: Path, arrays: dict[str, Tensor]) -> None:
     np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
 
 
+def true_view(scene: Scene, camera: Camera) -> View:
+    """The true shape in a size of the scene's image; the given pixels, without normals, where they are all of it.
+
+    Depths are NaN at pixels of the silhouette that have none.
+    """
+    if not scene.part:
+        return see(scene.cast_on, camera)
+    view, known = scene.given()
+    return enlarged(replace(view, depth=view.depth.where(known, torch.nan), normals=0 * view.normals), camera)
+
+
+def enlarged(view: View, camera: Camera) -> View:
+    """The same pixels in another size, that of a camera."""
+    parts = [in_size(part, camera) for part in (view.depth, view.normals, view.mask)]
+    return View(camera, *parts)
+
+
+def in_size(image: Tensor, camera: Camera) -> Tensor:
+    """The pixels of an image [height, width, ...] in the size of a camera."""
+    rows = torch.arange(camera.height) * image.shape[0] // camera.height
+    columns = torch.arange(camera.width) * image.shape[1] // camera.width
+    return image[rows][:, columns]
+
+
 def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
     """Normals with axes to the right, up and towards the camera, as pictures show them."""
     rotation = view.camera.world_to_camera[:3, :3].to(view.normals.dtype)
@@ -239,6 +274,8 @@ def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
             if pair is pairs[2] and name == "silhouette error":
                 _show_given(axis, given)
                 axis.set_xlabel(f"given: {given.summary}")
+            elif pair.back is None and name in ("normals", "from behind"):
+                axis.set_axis_off()
             else:
                 image = show(axis, pair, pairs)
             if pair is pairs[0]:
@@ -253,7 +290,7 @@ def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
 
 def _show_depth(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
     depths = np.concatenate([other.front.depth.numpy()[other.front.mask.numpy()] for other in pairs])
-    low, high = (depths.min(), depths.max()) if depths.size else (0.0, 1.0)
+    low, high = (np.nanmin(depths), np.nanmax(depths)) if depths.size else (0.0, 1.0)
     shown = np.where(pair.front.mask.numpy(), pair.front.depth.numpy(), np.nan)
     part = window([other.front.mask.numpy() for other in pairs])
     return bare(axis).imshow(shown[part], cmap="viridis_r", vmin=low, vmax=high, interpolation="nearest")
@@ -265,16 +302,17 @@ def _show_normals(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any
 
 
 def _show_shaded(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
-    shown = np.where(pair.back.mask.numpy(), shaded(pair.back), 1.0)
-    part = window([other.back.mask.numpy() for other in pairs])
+    views = {other.title: other.back for other in pairs if other.back is not None}
+    shown = np.where(views[pair.title].mask.numpy(), shaded(views[pair.title]), 1.0)
+    part = window([view.mask.numpy() for view in views.values()])
     return bare(axis).imshow(shown[part], cmap="gray", vmin=0, vmax=1)
 
 
 def _show_silhouette(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> None:
     """Compares a silhouette with that of the truth, the last of the pairs."""
-    found, true = pair.front.mask.numpy(), pairs[-1].front.mask.numpy()
+    found, true = pair.mask.numpy(), pairs[-1].mask.numpy()
     missed, spurious = (100 * part.sum() / max(true.sum(), 1) for part in (true & ~found, found & ~true))
-    part = window([other.front.mask.numpy() for other in pairs])
+    part = window([other.mask.numpy() for other in pairs])
     bare(axis).imshow(silhouette_image(found, true)[part], interpolation="nearest")
     label = {"transform": axis.transAxes, "fontsize": 8, "bbox": {"facecolor": "white", "lw": 0, "pad": 1.5}}
     axis.text(0.02, 0.10, f"missed {missed:.1f} %", color=MISSED, **label)

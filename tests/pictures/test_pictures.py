@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bench.config import load
+from bench.evaluate.evaluate import view_metrics
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
-from bench.pictures.run_figures import ViewPair, _show_depth, draw_curve, save_gallery
+from bench.pictures.run_figures import Given, ViewPair, _show_depth, draw_curve, draw_run, save_gallery
 from bench.pictures.style import legend_below
 from bench.reconstruct.problem import ReconstructionProblem
 from bench.report.site.files import ALT
@@ -188,10 +189,28 @@ def test_shapes_are_seen_by_two_cameras_and_depths_where_they_are_given(inputs, 
 
 def test_depths_are_coloured_from_the_nearest_to_the_farthest():
     view = see(Truth(half_ball(0.6), closed=False), CAMERA)
-    pair = ViewPair("truth", view, view)
+    pair = ViewPair("truth", view, view, view.mask)
     image = _show_depth(Figure().subplots(), pair, (pair,))
     known = view.depth[view.mask]
     assert image.get_clim() == (known.min(), known.max()) and known.min() < known.max()
+
+
+def test_a_picture_and_the_metric_compare_silhouettes_alike_where_the_mesh_is_what_is_seen(inputs, tmp_path, drawn):
+    """The mesh of a depth image joins the centres of pixels: it is half a pixel smaller than the mask all around."""
+    scene = inputs.scene
+    unmeasured = torch.arange(256).view(16, 16) == 8 * 16 + 8
+    part = replace(scene, mesh=half_ball(0.5), part=True, measured=scene.view.depth.where(~unmeasured, 0.0))
+    inputs = replace(inputs, make_scene=lambda: part)
+    states = State(sphere(0.3), inputs), State(sphere(0.65), inputs)
+    draw_run(tmp_path, states, Given(scene.view, scene.view.mask.numpy()), [], "a depth image")
+    summary = drawn[0].axes[:12]
+    for state, axis in zip(states, summary[2:8:4], strict=True):
+        missed, spurious = (float(text.get_text().split()[1]) / 100 for text in axis.texts)
+        overlap = view_metrics(state.seen(scene.view.camera), part.view)["mask_iou"]
+        assert (1 - missed) / (1 + spurious) == pytest.approx(overlap, abs=0.001)
+    assert [axis.axison for axis in summary[8:]] == [True, False, True, False]  # no normals, and no view from behind
+    (measured,) = summary[8].get_images()
+    assert np.isfinite(measured.get_clim()).all()
 
 
 def test_a_run_writes_them_where_they_are_asked_for(tmp_path):
