@@ -82,11 +82,12 @@ def narrow(field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: in
     """Narrows brackets about the root, with one field value per step and ray.
 
     Args:
-        field: where it has no finite value it counts as occupied.
+        field: where it has no finite value it counts as occupied, except at a bracket's near end.
         rays: n rays, as many as the bracket has.
         method: "secant", where the line through both ends meets zero, or "bisection", the middle.
     """
-    near, far, near_value, far_value = bracket.near, bracket.far, bracket.near_value, bracket.far_value
+    near, far = bracket.near, bracket.far
+    near_value, far_value = bracket.near_value.nan_to_num(1.0), bracket.far_value.nan_to_num()
     for _ in range(steps):
         middle = _GUESSES[method](Bracket(near, far, near_value, far_value))
         value = field(rays.at(middle))

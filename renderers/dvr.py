@@ -122,7 +122,6 @@ class DVR:
         magnitude[:, 1:].masked_fill_(inside[:, None], torch.inf)  # such a ray ended at its first sample
         index = magnitude.argmin(dim=1, keepdim=True)
         least_distance, least = distance.gather(1, index).squeeze(1), value.gather(1, index).squeeze(1)
-        least = torch.where(least.isfinite(), least, 1.0)  # a ray that met no finite value passes by
         ended[hit], least_distance[hit], least[hit] = root, root, remaining
         return status, ended, least_distance, least
 

@@ -122,8 +122,13 @@ def crossing(field: Field, rays: Rays, distance: Float[Tensor, " n"], *, towards
     if reached.requires_grad:
         change = (gradient * (reached - reached.detach())).sum(-1)
     if towards_field:
-        change = change + value - value.detach()
+        change = change + change_of(value)
     return Crossing(value.detach(), slope, change)
+
+
+def change_of(value: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Zero, with the derivative of a value; without one where the value is not finite."""
+    return (value - value.detach()).nan_to_num(0.0)
 
 
 def implicit(field: Field, rays: Rays, distance: Float[Tensor, " n"], *, least_slope: float) -> Float[Tensor, " n"]:

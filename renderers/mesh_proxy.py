@@ -14,10 +14,10 @@ from renderers.bracket import BLOCK, evenly
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least
 from renderers.field import Field, carries_gradient
-from renderers.rendering import OF_LEVELS, Capabilities, Rendering, Status, assemble
+from renderers.gradients import change_of
+from renderers.rendering import OF_LEVELS, OUTSIDE, Capabilities, Rendering, Status, assemble
 from renderers.silhouette import SurfaceRenderer
 
-OUTSIDE = 1.0  # value that stands for one that is not finite, of a grid point
 LEAST_COSINE = 1e-3  # between a ray and the normal of the triangle that it hits; flatter ones are divided by this
 
 
@@ -129,7 +129,7 @@ class MeshProxy(SurfaceRenderer):
             (gradient,) = torch.autograd.grad(value.sum(), leaf, retain_graph=True)
         gradient = gradient.nan_to_num(0.0)
         square = gradient.square().sum(-1, keepdim=True).clamp_min(self.least_slope**2)
-        return vertices - (value - value.detach())[:, None] * gradient / square
+        return vertices - change_of(value)[:, None] * gradient / square
 
 
 @dataclass(frozen=True)

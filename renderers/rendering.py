@@ -11,6 +11,8 @@ from torch import Tensor
 from renderers.camera import Rays, distance_to_origin
 from renderers.field import Field, Kind
 
+OUTSIDE = 1.0  # stands for a value that is not finite: far from any surface
+
 
 class Status(IntEnum):
     """How a ray ended. A ray that fails is data."""
@@ -249,6 +251,8 @@ def assemble(
 ) -> Rendering:
     """The rendering of rays of any leading shape, from one answer per ray in one row.
 
+    A field value that is not finite decides nothing: as a residual it is 0, and as `closest` it is `OUTSIDE`.
+
     Args:
         rays: all n of them.
         radius: of the sphere about the origin that holds the shape.
@@ -263,6 +267,6 @@ def assemble(
         distance=shaped,
         status=status.view(rays.shape),
         points=rays.at(shaped),
-        residual=residual.detach().view(rays.shape),
-        closest=passing_by.index_put((queried,), least).view(rays.shape),
+        residual=residual.detach().nan_to_num(0.0, 0.0, 0.0).view(rays.shape),
+        closest=passing_by.index_put((queried,), least.nan_to_num(OUTSIDE, OUTSIDE, OUTSIDE)).view(rays.shape),
     )

@@ -186,6 +186,7 @@ class Occupancy:
 
     On the background, the hit or else a point drawn on the ray should be free (L_freespace); on the foreground without
     a hit, a point of the ray should be occupied (L_occupancy). Points are drawn evenly, from PyTorch's own generator.
+    A point where the field is not finite has no part in the loss.
 
     Args:
         width: length in scene units over which a distance turns from occupied to free; see `field.occupancy_logits`.
@@ -224,6 +225,7 @@ class Occupancy:
         distance = torch.where(hit, rendering.distance.detach().flatten(), place)
         judged = meets & ~(wanted & hit)
         values = field(flat[judged].at(distance[judged]))
-        logits = occupancy_logits(field, values, width=self.width)
-        total = softplus(torch.where(wanted[judged], -logits, logits)).sum()
+        finite = values.isfinite()
+        logits = occupancy_logits(field, values[finite], width=self.width)
+        total = softplus(torch.where(wanted[judged][finite], -logits, logits)).sum()
         return self.weight * total / max(wanted.numel(), 1)

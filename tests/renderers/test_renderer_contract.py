@@ -21,6 +21,7 @@ from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Blurred, Renderer, Rendering, Status, Unsupported, closest_values
+from tests.looped import each
 from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 
 # Those with code of their own; the others have other numbers.
@@ -240,6 +241,24 @@ def test_gradients_are_finite_on_every_kind_of_ray(renderer):
     for output in (rendering.distance.sum(), rendering.closest.sum(), rendering.points.sum(), loss):
         for gradient in torch.autograd.grad(output, wanted, retain_graph=True, allow_unused=True):
             assert gradient is None or gradient.isfinite().all()
+
+
+@each("value", [torch.nan, torch.inf, -torch.inf])
+def test_a_field_that_is_not_finite_in_half_of_space_has_a_finite_rendering(renderer, value):
+    for axis, rays in ((0, mixed(60)), (2, pinhole(16, 16, torch.float64).rays())):
+        radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+        origins = rays.origins.requires_grad_(True)
+        shape = sphere(radius)
+        field = Shape(lambda p: torch.where(p[..., axis] > 0.07, value, shape(p)), Kind.DISTANCE, 1.0)  # noqa: B023
+        rays = Rays(origins, rays.directions, rays.image)
+        rendering = renderer.render(field, rays)
+        check_rendering(rendering, rays)
+        mask = torch.arange(rays.shape.numel()).view(rays.shape) % 2 == 0
+        loss = renderer.silhouette_loss(field, rays, rendering, mask)
+        assert loss.isfinite()
+        for output in (rendering.distance.sum(), rendering.closest.sum(), loss):
+            for gradient in torch.autograd.grad(output, (radius, origins), retain_graph=True, allow_unused=True):
+                assert gradient is None or gradient.isfinite().all()
 
 
 def test_gradients_of_hits_point_the_right_way(renderer):
