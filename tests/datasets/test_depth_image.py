@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bench.config import load
-from datasets.depth_image import PLACED
+from datasets.depth_image import PLACED, _cut_out
 from datasets.meshes import read_mesh
 from datasets.scene import Split, Truth, see
 from datasets.views import look_at
@@ -66,6 +66,23 @@ def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, change, pi
     assert Truth(read_mesh(folder / "sofa.ply")).distance(world).max() < 2 * STEP
     facing = (scene.view.normals * view.camera.rays().directions).sum(-1)[scene.view.mask]
     assert (facing <= 0).all()
+
+
+@each("most", [32, 5])
+def test_an_object_of_an_odd_extent_is_cut_out_as_a_square_whose_pixels_see_the_same_points(most):
+    """Each depth is another one, so that a pixel of the cut-out is found in the image."""
+    depth = np.zeros((20, 30))
+    depth[5:12, 8:12] = 2 + 0.01 * np.arange(28).reshape(7, 4)
+    pinhole = np.array([[40.0, 0, 14.3], [0, 35.0, 10.6], [0, 0, 1]])
+    cut, mask, moved = _cut_out(depth, depth > 0, pinhole, most)
+    assert cut.shape == mask.shape and len(set(cut.shape)) == 1 and max(cut.shape) <= most
+    assert np.array_equal(mask, cut > 0) and mask.sum() >= 4
+    for row, column in np.argwhere(mask):
+        ((y, x),) = np.argwhere(depth == cut[row, column])
+        before, after = (pinhole @ (a, b, 1) for pinhole, a, b in (
+            (np.linalg.inv(pinhole), x + 0.5, y + 0.5), (np.linalg.inv(moved), column + 0.5, row + 0.5)
+        ))  # fmt: skip
+        assert after == pytest.approx(before)
 
 
 @each(
