@@ -248,5 +248,6 @@ def test_work_over_the_bound_is_that_over_one_value_and_one_gradient_a_hit():
     shape = Shape(A.function, Kind.LEVEL, 2.5, flops=Flops(10, 20))
     assert Counts(12, 3, hits=3).over_bound(shape) == (12 * 10 + 3 * 20) / (3 * 30)
     assert Counts(12, 3, hits=3).over_bound(A) == 15 / 6  # where operations are not stated, a gradient is as a value
+    assert Counts(12, 3, hits=3, coarse=6).over_bound(shape) == ((12 + 6) * 10 + 3 * 20) / (3 * 30)
     assert Counts(12, 3).over_bound(shape) is None
     assert (Counts(12, 3, hits=9) - Counts(2, 1, hits=4)).hits == 5

@@ -111,6 +111,18 @@ def test_what_hides_between_two_samples_is_found_beside_the_least():
     torch.testing.assert_close(rendering.distance, truth.distance, rtol=0, atol=1e-6)
 
 
+@each("share", [0.3, 0.45])
+def test_a_plate_between_two_samples_of_the_search_is_found_where_values_are_less_than_half_their_spacing(share):
+    rays, number = beam((0.0, 0.0, -2.0)), torch.tensor([0])
+    spacing = 2 / (NEWTON.search_samples - 1)
+    middle = -1 + 7.5 * spacing
+    plate = Shape(lambda p: (p[..., 2] - middle).abs() - (0.5 - share) * spacing, Kind.DISTANCE, 1.0)
+    found, bracket = NEWTON.tracer._search(plate, rays, Reached.on_sphere(rays, 1.0), number)
+    assert found.tolist() == [0]
+    front = 2 + middle - (0.5 - share) * spacing
+    assert bracket.near.item() < front < bracket.far.item() < front + spacing / 8
+
+
 WRONG = {  # fields with the zero set of a distance d, and the most values that they take per ray
     "weak": (lambda d: 0.25 * d, 18),
     "strong": (lambda d: 1.5 * d, 4.5),

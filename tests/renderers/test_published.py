@@ -9,9 +9,11 @@ from torch import Tensor
 from torch.nn.functional import batch_norm, layer_norm, linear, softplus
 
 from renderers.checks import BadInput
-from renderers.field import bounds_of, coarse_of, points_in_sphere
+from renderers.field import Coarse, Kind, bounds_of, coarse_of, points_in_sphere
 from renderers.fields import published
+from renderers.fields.analytic import Shape
 from renderers.fields.mlp import BoundDecoder
+from renderers.fields.network import Adjusted
 from tests.looped import each
 
 POINTS = points_in_sphere(64, torch.zeros(()))
@@ -104,6 +106,27 @@ def test_a_tanh_keeps_what_a_decoder_offers():
         assert ((low <= values) & (values <= high)).all()
     assert (high - low).max() < 4 and field.flops == network.inner.at(CODE).flops
     assert coarse_of(field) is None  # a narrow one has none
+
+
+def test_an_adjusted_field_has_coarse_values_and_bounds_that_are_adjusted_as_its_values():
+    class Inner(Shape):
+        coarse = Coarse(lambda points: points[..., 0] + 0.01, 0.01)
+
+        def bounds(self, middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+            return middle[..., 0] - half[..., 0].abs(), middle[..., 0] + half[..., 0].abs()
+
+    for factor in (3.0, -3.0):
+        inner = Inner(lambda points: points[..., 0], Kind.LEVEL, None)
+        field = Adjusted(inner, 0, torch.tensor(factor), torch.tensor(0.2), Kind.LEVEL, None)
+        coarse = coarse_of(field)
+        assert coarse is not None
+        assert coarse.error == pytest.approx(0.03)
+        torch.testing.assert_close(coarse.values(POINTS), factor * (POINTS[:, 0] + 0.01 - 0.2))
+        assert ((coarse.values(POINTS) - field(POINTS)).abs() <= coarse.error + 1e-6).all()
+        low, high = bounds_of(field)(POINTS, 0.1 * POINTS.flip(0))
+        for t in (-1.0, 0.0, 0.5, 1.0):
+            values = field(POINTS + t * 0.1 * POINTS.flip(0))
+            assert ((low - 1e-6 <= values) & (values <= high + 1e-6)).all()
 
 
 def implicit(prefix: str, frequencies: int, written: Any) -> tuple[State, Tensor]:

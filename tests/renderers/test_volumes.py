@@ -1,6 +1,6 @@
 """Renderers that see a volume or a band: the claim of each one's paper, in numbers, and what their users report."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import pi
 
 import pytest
@@ -16,7 +16,7 @@ from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.relaxed_boundary import _lowest
 from renderers.rendering import Blurred, Status, Volume, at_iteration
 from renderers.volumes.integrate import Samples, by_importance, weights
-from renderers.volumes.volsdf import Bound, _passing
+from renderers.volumes.volsdf import Bound, _clearance, _passing
 from tests.renderers.analytic_cases import CASES, Case, vector
 
 NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "unisurf"))
@@ -84,6 +84,40 @@ def test_the_width_at_which_volsdf_begins_bounds_the_error_of_any_field():
     field = Shape(lambda p: torch.where((20 * p[..., 2]).round() % 2 == 0, 0.7, -0.001), sphere(0.5).kind)
     for _, found, width in renderer.bounded(field, rays[meets], entry[meets], leave[meets]):
         assert (Bound.of(found).greatest(width) <= renderer.error).all()
+
+
+def test_the_least_width_of_volsdf_is_within_ten_halvings_of_that_which_bounds_the_error():
+    @dataclass(frozen=True)
+    class Falling:
+        """Its error is 0.1 at the width `least`."""
+
+        least: Tensor
+
+        def greatest(self, width: Tensor) -> Tensor:
+            return (0.1 * self.least / width).squeeze(1)
+
+        def of_rays(self, index: Tensor) -> "Falling":
+            return Falling(self.least[index])
+
+    renderer = replace(VOLSDF, error=0.1).with_blur(0.001)
+    bound, first = Falling(vector((0.123, 0.0005, 2.0))[:, None]), vector((1.001, 1.001, 1.001))[:, None]
+    # Of 1024 steps of 1 / 1024 from 0.001 on the first that is at least 0.123; the least width; the greatest.
+    expected = vector((0.001 + 125 / 1024, 0.001, 1.001))[:, None]
+    torch.testing.assert_close(renderer._least_width(bound, first), expected, rtol=0, atol=1e-12)
+
+
+def test_the_clearance_of_volsdf_is_that_of_the_empty_spheres_about_both_ends():
+    """VolSDF, Eq. 12, against a dense search of the outline of two circles for the place nearest to the segment."""
+    for side, first, second in ((1.0, 0.9, 0.6), (0.3, 0.7, 0.5), (0.5, 0.8, 0.35), (1.0, 0.4, 0.5)):
+        for radii in ((first, second), (second, first)):
+            found = Samples(vector((0.0, side))[None], vector(radii)[None])
+            angle = torch.linspace(0, pi, 200_001, dtype=torch.float64)
+            ends = zip((0.0, side), radii, strict=True)
+            circles = [torch.stack([end + radius * angle.cos(), radius * angle.sin()]) for end, radius in ends]
+            across, up = torch.cat(circles, dim=1)
+            outside = (across.hypot(up) >= radii[0] - 1e-9) & ((across - side).hypot(up) >= radii[1] - 1e-9)
+            truth = (across - across.clamp(0, side)).hypot(up)[outside].min().item()
+            assert _clearance(found).item() == pytest.approx(truth, abs=1e-5), (side, radii)
 
 
 @pytest.mark.slow
