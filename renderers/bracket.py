@@ -86,8 +86,7 @@ def narrow(field: Field, rays: Rays, bracket: Bracket, *, method: str, steps: in
         rays: n rays, as many as the bracket has.
         method: "secant", where the line through both ends meets zero, or "bisection", the middle.
     """
-    near, far = bracket.near, bracket.far
-    near_value, far_value = bracket.near_value.nan_to_num(1.0), bracket.far_value.nan_to_num()
+    near, far, near_value, far_value = bracket.near, bracket.far, bracket.near_value.nan_to_num(1.0), bracket.far_value
     for _ in range(steps):
         middle = _GUESSES[method](Bracket(near, far, near_value, far_value))
         value = field(rays.at(middle))
