@@ -14,7 +14,7 @@ from bench.config import load
 from bench.evaluate.evaluate import view_metrics
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
-from bench.pictures.run_figures import Given, ViewPair, _show_depth, draw_curve, draw_run, save_gallery
+from bench.pictures.run_figures import Given, ViewPair, _show_depth, draw_curve, draw_run, enlarged, save_gallery
 from bench.pictures.style import legend_below
 from bench.reconstruct.problem import ReconstructionProblem
 from bench.report.site.files import ALT
@@ -210,6 +210,8 @@ def test_a_picture_and_the_metric_compare_silhouettes_alike_where_the_mesh_is_wh
         assert (1 - missed) / (1 + spurious) == pytest.approx(overlap, abs=0.001)
     assert [axis.axison for axis in summary[8:]] == [True, False, True, False]  # no normals, and no view from behind
     (measured,) = summary[8].get_images()
+    given = enlarged(replace(scene.view, mask=scene.view.mask & ~unmeasured), CAMERA.resized(24, 24)).mask
+    assert np.isfinite(np.ma.filled(measured.get_array(), np.nan)).sum() == given.sum()
     assert np.isfinite(measured.get_clim()).all()
 
 
