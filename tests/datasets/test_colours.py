@@ -76,6 +76,7 @@ def test_an_obj_has_each_face_in_its_material_also_where_polygons_are_concave(tm
     arrow = "v 0 0 0\nv 1 1 0\nv 0 .25 0\nv -1 1 0\n"  # concave at its third corner
     pinned = "vt .5 0\nvt 1 1\nvt .5 .25\nvt 0 1\n"
     lines = ["mtllib a.mtl", "mtllib b.mtl", arrow, pinned, "usemtl Paint #2", "f -4/-4 -3/-3 -2/-2 -1/-1"]
+    lines += ["vt 0 0"]  # numbers below zero count back from the last one so far
     for number, name in enumerate(("Paint #1", "blue", "Paint #2")):  # the last has no texture coordinates
         lines += [arrow.replace(" 0\n", f" {number + 1}\n"), f"usemtl {name}", "f -4 -3 -2 -1"]
     path = tmp_path / "arrows.obj"
