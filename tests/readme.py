@@ -1,9 +1,12 @@
 """`python -m tests.readme`, a part of `make lint`: whether README.md is short, has few numbers and short sentences."""
 
 import csv
+import json
 import re
 import sys
 from pathlib import Path
+
+from bench.report.data.statistics import Interval, Verdict, differ
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAPER = README.parent / "results" / "paper"
@@ -70,6 +73,36 @@ def table() -> str:
         numbers = [cell if cell.endswith(("%", "–")) else f"{float(cell):.2g}" for cell in cells]
         rows.append(f"| `{line['preset']}` | {' | '.join(numbers)} | {failed} |")
     return HEAD + "\n".join(rows)
+
+
+def answers() -> str:
+    """README's table of questions: each answer is a test of committed numbers, by the statistics of this version."""
+    error, ranks = _lowest_error(), json.loads((PAPER / "stability_cost.json").read_text(encoding="utf-8"))
+    tied = re.search(
+        r"n = (\d+) axes\. .* of the \d+ others \((.*)\) cannot be distinguished from (.*)\.", ranks["verdict"]
+    )
+    if tied is None:
+        raise ValueError(f"the verdict of stability_cost has changed: {ranks['verdict']}")
+    hard = f"{tied[3]} has the best mean rank over {tied[1]} kinds of stress. {tied[2]} cannot be distinguished from it"
+    return (
+        "| question | answer |\n|---|---|\n"
+        f"| lowest error under one loss and setting? | [{error}](results/README.md#one_loss). |\n"
+        f"| hard scenes? | [{hard}](results/README.md#stability_cost). |"
+    )
+
+
+def _lowest_error() -> str:
+    """Which ratios of errors to DIST's differ from 1: the sign test over shapes, with Holm's correction."""
+    lines = [line for line in _lines("one_loss") if line["family"] == "all families" and line["ratio"]]
+    counts = [re.search(r"; (\d+) of (\d+)$", line["ratio"]) for line in lines]
+    if None in counts:
+        raise ValueError("a ratio of one_loss.csv does not say on how many shapes it is below 1")
+    below = [(int(count[1]), int(count[2])) for count in counts if count]
+    ratios = [Interval(1.0, 0.5, 2.0, (0.5,) * k + (2.0,) * (n - k)) for k, n in below]
+    verdicts = {*differ(ratios)}
+    if verdicts != {Verdict.NOT_DISTINGUISHED}:
+        raise ValueError(f"the verdicts on one_loss are {verdicts}: write another answer")
+    return f"None of {len(ratios)} renderers can be distinguished from DIST (sign test over {below[0][1]} shapes)"
 
 
 def _lines(page: str) -> list[dict[str, str]]:

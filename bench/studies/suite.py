@@ -255,7 +255,11 @@ def _notes(made: Standing) -> list[str]:
             f"{'; '.join(gains)}. With a setting the loss of the mask may change too; the two are not separated."
         )
     lacking = made.compared[~made.compared["whole"] & ~made.compared["tuned"]].groupby("row")["missing"].first()
-    versions, machines, loaded = runs["code"].nunique(), runs["machine"].nunique(), (~runs["timed"]).sum()
+    versions, machines, loaded = (
+        runs["code"].nunique(),
+        runs.loc[runs["cpu"] != "", "machine"].nunique(),
+        (~runs["timed"]).sum(),
+    )
     possible = {
         f"Not compared, since problems lack: {', '.join(f'{row} ({n})' for row, n in lacking.items())}.": len(lacking),
         f"Runs of {versions} versions of the code and of {machines} machines.": versions * machines > 1,
