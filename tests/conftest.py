@@ -6,10 +6,10 @@ import bench  # noqa: F401, before all else: it sets the OpenMP variables, which
 import gc
 import os
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
@@ -105,15 +105,24 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-@pytest.fixture(autouse=True)
-def forgotten_modules() -> Iterator[None]:
-    """A module of a user's that a test wrote is not imported any more in the next test, which may have its own."""
+@contextmanager
+def forgetting_modules(folder: Path) -> Iterator[None]:
+    """Modules of a folder that the block imports are no longer imported after it."""
     before = {*sys.modules}
     yield
-    written = str(Path(tempfile.gettempdir()).resolve())
     for name in sys.modules.keys() - before:
-        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(written):
+        if Path(getattr(sys.modules[name], "__file__", None) or "").is_relative_to(folder):
             del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
+def forgotten_modules(tmp_path_factory) -> Iterator[None]:
+    """A user's module that a test wrote is no longer imported in the next test, which may write another of that name.
+
+    Modules elsewhere stay: half of PyTorch, imported a second time, fails.
+    """
+    with forgetting_modules(tmp_path_factory.getbasetemp().resolve()):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

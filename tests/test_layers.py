@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
 
-from tests.conftest import checked
+from tests.conftest import checked, forgetting_modules
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("renderers", "datasets", "bench", "conf", "tests")
@@ -201,6 +202,16 @@ def test_types_and_shapes_are_checked_of_arguments_and_of_results():
             _first(*arguments)
     with pytest.raises(TypeCheckError, match="return value"):  # of shape (4, 3), where n is (4,)
         _first(torch.zeros(4, 3), 1)
+
+
+def test_only_modules_that_a_test_wrote_are_forgotten_after_it(tmp_path):
+    """PyTorch itself may lie under the system's temporary folder, with the virtual environment of a clone there."""
+    with forgetting_modules(tmp_path):
+        for name, folder in (("written_by_a_test", tmp_path), ("of_an_environment", tmp_path.parent)):
+            sys.modules[name] = ModuleType(name)
+            sys.modules[name].__file__ = str(folder / f"{name}.py")
+    assert "written_by_a_test" not in sys.modules
+    assert sys.modules.pop("of_an_environment").__file__
 
 
 @pytest.mark.slow
