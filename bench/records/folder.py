@@ -21,8 +21,9 @@ from datasets.extras import named_files, version
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (
-    *("bench/report", "bench/studies", "bench/trackers", "bench/progress.py"),
-    *(f"bench/{name}.py" for name in ("judge", "merge", "suite", "tune", "train", "photos", "turntable")),
+    *("bench/report", "bench/studies"),
+    *(f"bench/{name}.py" for name in ("judge", "merge", "photos", "prior", "progress", "suite", "trackers", "train")),
+    *(f"bench/{name}.py" for name in ("tune", "turntable", "verify")),
     *(f"bench/run/{name}.py" for name in ("compose", "library", "pack", "plan", "summary", "sweep")),
     *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
