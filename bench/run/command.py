@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import register, type_of, wrong_type
 from bench.records.folder import Identity, identify, resolved
+from bench.run.compose import parsed
 from bench.run.pack import register_slurm
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
@@ -28,6 +29,7 @@ from bench.tables import CONF, names, nearest, register_resolvers
 from datasets.extras import install
 
 COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
+SETTING = re.compile(r"(\+*(\w+))=(.+)", re.DOTALL)  # of the top level: before its value, its key, its value
 CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
 GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale")  # that `list` shows
 HELP = """
@@ -80,7 +82,7 @@ def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
     Sweep.runs, typed = runs, AS_TYPED if "field=file" in sys.argv else {}
     program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
     try:
-        sys.argv[1:] = with_network(options_first(sys.argv[1:]))
+        sys.argv[1:] = [text_as_typed(argument) for argument in with_network(options_first(sys.argv[1:]))]
         register(*own_folders(sys.argv[1:]))
         register_slurm()
         with mode_of_options(sys.argv[1:]):
@@ -174,6 +176,22 @@ def with_network(arguments: list[str]) -> list[str]:
     for pattern, text in places.items():
         arguments = [re.sub(pattern, text, argument) for argument in arguments]
     return arguments
+
+
+def text_as_typed(argument: str) -> str:
+    """The argument, with quotes around what Hydra would read as a number where the key's value is a text.
+
+    Without them, `label=1e3` would become 1000.0, `label=Nan` nan, and `label=true` True.
+    """
+    setting = SETTING.fullmatch(argument)
+    if setting is None or type_of(setting[2]) not in (str, str | None):
+        return argument
+    try:
+        values = [(text, parsed(f"text={text}").value()) for text in setting[3].split(",")]
+    except HydraException:  # a comma within quotes or brackets, or no value
+        return argument
+    typed = [f"'{text.strip()}'" if isinstance(value, int | float) else text for text, value in values]
+    return f"{setting[1]}={','.join(typed)}"
 
 
 def own_folders(arguments: list[str]) -> list[Path]:

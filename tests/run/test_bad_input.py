@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.records import folder as run_folder
-from bench.run.command import _explain, options_first
+from bench.run.command import _explain, options_first, text_as_typed
 from bench.run.plan import refusal
 from bench.setup import inputs
 from tests.composing import identified
@@ -154,6 +154,24 @@ def test_a_word_lists_what_there_is(bench, word):
 )
 def test_options_may_stand_anywhere(given, arranged):
     assert options_first(given) == arranged
+
+
+@each("text, label", [
+    ("Nan", "Nan"), ("1e3", "1e3"), ("true", "true"), ("007", "007"), ("'1'", "1"), ("null", None), ("A b", "A b"),
+    ("'a,1'", "a,1"), ("${seed}", "5"),
+])  # fmt: skip
+def test_a_label_is_the_text_that_was_typed(text, label):
+    assert identified(text_as_typed(f"label={text}"), "seed=5").config["label"] == label
+
+
+def test_the_command_keeps_labels_as_typed_in_a_sweep_too(bench, no_prior):
+    code, out, _ = bench("-m", "label=Nan,1e3,Mine", "plan=true")
+    assert code == 0 and all(f"completion, {label}, sofa" in out for label in ("Nan", "1e3", "Mine")), out
+
+
+def test_a_number_stays_one_where_the_key_asks_for_one():
+    for argument in ("seed=1", "time_limit=1e3", "verbose=true", "renderer.label=1", "label=", "-m"):
+        assert text_as_typed(argument) == argument
 
 
 def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior):
