@@ -39,8 +39,9 @@ def record(**changed) -> Record:
         ({"beside": 4}, []),  # each has processors of its own
         ({"device": "a GPU"}, []),
         ({"beside": 4, "device": "a GPU"}, ["shared device: 4 runs at a time on it"]),
-        ({"gemm_fraction": 3.0}, ["missing synchronisation: 3.0 times the machine's matrix product rate"]),
-        ({"share": 0.5, "gemm_fraction": 3.0}, ["loaded machine", "missing synchronisation"]),
+        ({"gemm_fraction": 3.0, "device": "a GPU"}, ["missing synchronisation: 3.0 times the machine's matrix"]),
+        ({"share": 0.5, "gemm_fraction": 3.0, "device": "a GPU"}, ["loaded machine", "missing synchronisation"]),
+        ({"gemm_fraction": 3.0}, []),  # of a CPU, whose compiled code is faster than PyTorch's product
     ],
 )
 def test_it_warns_where_there_is_a_reason(changed, words):
