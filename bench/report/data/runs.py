@@ -152,13 +152,16 @@ class Runs:
         return [(name, value) for name, value in found.items() if isinstance(value, str | int | float)]
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
-        """The names of the runs by what their times depend on: processor, accelerator, threads, compiled kernels."""
+        """The names of the runs by what their times depend on: processor, accelerator, threads, compiled kernels.
+
+        A run that ended before it knew its processor has no machine.
+        """
 
         def machine_of(record: Record) -> tuple[Any, ...]:
             said = record["environment"]
             return (*(said.get(key) for key in MACHINE), said.get("kernels") == "compiled")
 
-        machines = grouped([record for record in self.named() if record["environment"]], machine_of)
+        machines = grouped([record for record in self.named() if record["environment"].get("cpu")], machine_of)
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:
