@@ -1,6 +1,6 @@
 """What is known of metrics by their names: heading, factor of printed numbers, and which direction is better."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 PREFIXES = ("own_", "seen_")  # of the same metric of the renderer's own image, and of what photographs see
 LOWER, HIGHER = "lower", "higher"
@@ -83,4 +83,18 @@ def better(name: str) -> str:
             return SHOWN[known].better
         if known in FURTHER:
             return FURTHER[known]
+    return ""
+
+
+def unsound(metrics: dict[str, Any]) -> str:
+    """What is wrong with the first metric of a known direction that is not a possible number; empty where none is.
+
+    A metric of which lower values are better is a distance or a share: it is never negative.
+    """
+    for name, value in metrics.items():
+        direction = better(name) if value is not None else ""
+        if direction and not isinstance(value, int | float):
+            return f"{name} must be a number, found {value!r}"
+        if direction == LOWER and value < 0:
+            return f"{name} must be at least 0, found {value}"
     return ""

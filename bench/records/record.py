@@ -17,6 +17,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from filelock import FileLock
 
+from bench.records.metrics import unsound
+
 SCHEMA = 1
 # Keys of a configuration that change no result, and are left out of its hash.
 NEUTRAL_KEYS = frozenset(
@@ -181,7 +183,7 @@ def started(record: dict[str, Any]) -> datetime:
 
 
 def _check(record: dict[str, Any]) -> None:
-    """Raises ValueError where a field of `Record` has another type, or is missing and not in `LATER`, or no status."""
+    """Raises ValueError where a field of `Record` has a wrong type or value, or is missing and not in `LATER`."""
     for name, classes in _fields().items():
         if name not in record:
             if name in LATER:
@@ -189,6 +191,9 @@ def _check(record: dict[str, Any]) -> None:
             raise ValueError(f"record.json must have the field {name!r}, found none")
         if not isinstance(record[name], classes):
             raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
+    for name in ("metrics", "metrics_start"):
+        if wrong := unsound(record[name]):
+            raise ValueError(f"{name} in record.json: {wrong}")
     if record["status"] not in _STATUSES:
         raise ValueError(f"status in record.json must be one of {', '.join(RunStatus)}, found {record['status']!r}")
 

@@ -89,13 +89,13 @@ def test_a_reader_never_meets_half_of_a_record(tmp_path):
 
 
 def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
-    odd = {"chamfer_l2": math.inf, "depth_mae": math.nan, "accuracy": -math.inf, "fscore": 0.5}
+    odd = {"chamfer_l2": math.inf, "depth_mae": math.nan, "psnr": -math.inf, "fscore": 0.5}
     record = make_record(metrics=odd, metrics_start=dict(odd), flops=None, gemm_fraction=math.nan)
     record.seconds = {"total": 1.5}
     folder = new_folder(tmp_path)
     record.write(folder)
     written = json.loads((folder / "record.json").read_text(), parse_constant=pytest.fail)
-    assert written["metrics"] == {"chamfer_l2": "inf", "depth_mae": "nan", "accuracy": "-inf", "fscore": 0.5}
+    assert written["metrics"] == {"chamfer_l2": "inf", "depth_mae": "nan", "psnr": "-inf", "fscore": 0.5}
     (read,), problems = read_records(tmp_path)
     assert problems == []
     assert str([read["metrics"], read["metrics_start"]]) == str([odd, odd])  # where nan is equal to nan

@@ -151,6 +151,9 @@ FOREIGN = {
     json.dumps({"run": 1}): "must have schema 1, found None",
     json.dumps({"schema": 1}): "must have the field 'id'",
     json.dumps(record("x", metrics=None)): "metrics in record.json has the wrong type",
+    json.dumps(record("x", metrics={"chamfer_l2": "0.1 mm"})): "metrics in record.json: chamfer_l2 must be a number",
+    json.dumps(record("x", metrics={"own_depth_mae": [1, 2]})): "own_depth_mae must be a number, found [1, 2]",
+    json.dumps(record("x", metrics_start={"accuracy": -1})): "accuracy must be at least 0, found -1",
     json.dumps(record("x", status="splendid")): "status in record.json must be one of ok, ",
     json.dumps(record("x", started="yesterday")): "Invalid isoformat",
 }
@@ -158,12 +161,12 @@ FOREIGN = {
 
 def test_foreign_records_are_named_and_not_fatal(tmp_path):
     for number, content in enumerate(FOREIGN):
-        write_run(tmp_path, content, f"foreign{number}")
+        write_run(tmp_path, content, f"foreign{number:02}")
     write_run(tmp_path, crashed("broken"), "broken")
     records, problems = read_records(tmp_path)
     assert [found["folder"] for found in records] == ["broken"]
     for number, (problem, why) in enumerate(zip(problems, FOREIGN.values(), strict=True)):
-        assert problem.startswith(f"foreign{number}: ") and why in problem
+        assert problem.startswith(f"foreign{number:02}: ") and why in problem
     page = page_of(tmp_path)
     assert page.about["problems"] == problems and page.runs["reason"] == ["no reason recorded"]
 
