@@ -12,18 +12,22 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.folder import content_of, put_into, set_aside
-from bench.records.read import check_links, run_folders
+from bench.records.read import check_links, read_plans, read_run, run_folders
 from bench.records.record import file_lock, leads_out, link_out, read_record, write_text
 from bench.report.suite.attempts import place, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
+UNREADABLE = "copied, but it cannot be read and no table shows it: "
 UNFINISHED = ("killed", "crashed", "refused")  # these rank below every other status, and ok above
 
 
-def merge(sources: list[Path], into: Path) -> list[str]:
-    """Copies all runs and plans of the sources to `into`; gives a line for each run that another one replaced.
+def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
+    """Copies all runs and plans of the sources to `into`.
 
-    A run with a link that leads out of its results folder is not copied, and has a line too.
+    A run with a link that leads out of its results folder is not copied. A run whose record cannot be read is copied.
+
+    Returns:
+        a line for each run that another one replaced, and a message for each that is not copied or cannot be read.
 
     Raises:
         ValueError: for a source that is not a results folder, or that is or contains `into`; where `into` is a file.
@@ -37,24 +41,26 @@ def merge(sources: list[Path], into: Path) -> list[str]:
         raise ValueError(f"{into} is a file: --into must be a folder, or a new name")
     check_links(into)
     (into / "runs").mkdir(parents=True, exist_ok=True)
-    lines: list[str] = []
+    lines, problems = list[str](), list[str]()
     for source in sources:
-        kept, problems = read_attempts(source)
-        lines += [f"{source}: not copied: {problem}" for problem in problems]
+        kept, unread = read_attempts(source)
+        problems += [f"{source}: not copied: {problem}" for problem in unread]
         if kept:
             write_attempts(kept, into)
         for folder in [*run_folders(source), *sorted((source / "earlier").glob("[!.]*/"))]:
             if link := link_out(folder, source):
-                lines.append(f"{folder}: not copied, since {link} is a link out of its results folder")
+                problems.append(f"{folder}: not copied, since {link} is a link out of its results folder")
             elif folder.parent.name == "earlier":
                 put_into(into / "earlier" / folder.name, folder)
-            elif line := _join(folder, into):
-                lines.append(line)
+            else:
+                lines += _join(folder, into)
+                problems += [f"{source}: {UNREADABLE}{problem}" for problem in [read_run(folder, source)[1]] if problem]
+        problems += [f"{source}: {UNREADABLE}{problem}" for problem in read_plans(source)[1]]
         for plan in sorted((source / "sweeps").glob("*/plan.json")):  # of one name: of the same cells
             if not leads_out(plan, source):
                 (into / "sweeps" / plan.parent.name).mkdir(parents=True, exist_ok=True)
                 _keep_later(into / "sweeps" / plan.parent.name / plan.name, plan)
-    return lines
+    return lines, problems
 
 
 def _keep_later(place: Path, path: Path) -> None:
@@ -70,24 +76,24 @@ def _asked(path: Path) -> str:
         return ""
 
 
-def _join(folder: Path, into: Path) -> str:
+def _join(folder: Path, into: Path) -> list[str]:
     """Copies a run; gives a line where there is another run of its cell, which one is kept and which set aside."""
     place, earlier = into / "runs" / folder.name, into / "earlier"
     with file_lock(into, folder.name):
         if not place.exists():
             put_into(place, folder)
-            return ""
+            return []
         (mine, kept), (theirs, other) = _ranked(place), _ranked(folder)
         if mine[-1] == theirs[-1]:  # the same run
             _keep_later(place / "record.json", folder / "record.json")
-            return ""
+            return []
         if theirs > mine:
             kept, other = other, kept
             set_aside(place, earlier)
             put_into(place, folder)
         else:
             put_into(earlier / f"{folder.name}-{theirs[-1]}", folder)
-    return f"{folder.name}: kept {kept}, set aside in earlier: {other}"
+    return [f"{folder.name}: kept {kept}, set aside in earlier: {other}"]
 
 
 def _ranked(folder: Path) -> tuple[tuple[Any, ...], str]:
@@ -102,19 +108,24 @@ def _ranked(folder: Path) -> tuple[tuple[Any, ...], str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Merges, prints a line for each run that another one replaced, and the report's path last."""
+    """Merges; prints a line for each run that another one replaced, what is wrong, and the report's path last.
+
+    Returns:
+        the exit status: 1 where a run is not copied or cannot be read, 2 where nothing can be merged.
+    """
     parser = argparse.ArgumentParser(prog="python -m bench.merge", description="Joins results folders.")
     parser.add_argument("sources", nargs="+", type=Path, metavar="FOLDER", help="results folders to join")
     parser.add_argument("--into", required=True, type=Path, metavar="FOLDER", help="where all of them go; may exist")
     options = parser.parse_args(arguments)
     try:
-        for line in merge(options.sources, options.into):
-            print(line)
-        print(write_index(options.into))
+        lines, problems = merge(options.sources, options.into)
+        for problem in problems:
+            print(f"warning: {problem}", file=sys.stderr)
+        print(*lines, write_index(options.into), sep="\n")
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return 0
+    return 1 if problems else 0
 
 
 if __name__ == "__main__":

@@ -173,7 +173,7 @@ def test_rows_stand_beside_runs_and_are_merged(files, capsys):
     for _ in range(2):  # the second time they are replaced
         assert main([*map(str, (files / "found", *common, "--into", results))]) == 1
     assert capsys.readouterr().out.splitlines()[-1] == str(results / "index.html")
-    assert merge([results], files / "all") == []
+    assert merge([results], files / "all") == ([], [])
     runs = bench.load(files / "all").set_index("scene")
     assert set(runs.name) == {"My net"} and set(runs.index) == {"small", "large", "plate"}
     assert runs.status.to_dict() == {"small": "ok", "plate": "ok", "large": "empty"}

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from bench.merge import main, merge
 from bench.records.read import Plan, read_records
+from tests.looped import each
 from tests.run.driving import planned, stored
 
 CELLS = ("completion-dist-sofa-1", "completion-dist-sofa-2", "completion-dvr-car-3")
@@ -87,7 +88,7 @@ def test_a_cell_that_was_run_twice_is_reported_and_both_are_kept(tmp_path, capsy
     assert line.startswith(f"{CELLS[0]}: kept ok of 2026-01-01")
     assert "set aside in earlier: timeout of 2026-01-02" in line
     assert len(list((tmp_path / "d" / "earlier").iterdir())) == 1
-    assert merge([tmp_path / "d"], tmp_path / "e") == [] and content(tmp_path / "e") == content(tmp_path / "d")
+    assert merge([tmp_path / "d"], tmp_path / "e") == ([], []) and content(tmp_path / "e") == content(tmp_path / "d")
 
 
 def test_plans_are_joined_so_that_cells_of_no_machine_show(tmp_path):
@@ -120,6 +121,26 @@ def test_a_damaged_record_is_kept_but_never_before_a_whole_one(tmp_path):
         assert [record["status"] for record in read_records(here / "d")[0]] == ["killed"]
         (kept,) = (here / "d" / "earlier").iterdir()
         assert (kept / "record.json").read_text() == damage
+
+
+@each("damage, words", [
+    ("", "record.json is not JSON"),
+    ('{"metrics": {"chamfer_l2": "0.1 mm"}}', "chamfer_l2 must be a number, found '0.1 mm'"),
+    ('{"metrics": {"chamfer_l2": -1}}', "chamfer_l2 must be at least 0, found -1"),
+])  # fmt: skip
+def test_a_run_that_cannot_be_read_is_named_and_is_in_no_table(tmp_path_factory, capsys, damage, words):
+    results = tmp_path_factory.mktemp("results")
+    write_run(results / "a", CELLS[0])
+    path = write_run(results / "a", CELLS[1]) / "record.json"
+    path.write_text(damage and json.dumps(json.loads(path.read_text()) | json.loads(damage)))
+    Plan("table-1", results / "a", planned(*CELLS)).write()
+    (results / "a" / "sweeps" / "table-1" / "plan.json").write_text("{")
+    assert main([str(results / "a"), "--into", str(results / "b")]) == 1
+    run, plan = capsys.readouterr().err.splitlines()
+    assert run.startswith(f"warning: {results / 'a'}: copied, but it cannot be read")
+    assert CELLS[1] in run and words in run
+    assert "sweeps/table-1/plan.json" in plan
+    assert [record["folder"] for record in read_records(results / "b")[0]] == [CELLS[0]]
 
 
 def test_what_cannot_be_joined_is_an_error_and_changes_nothing(tmp_path, capsys):
