@@ -56,8 +56,12 @@ class Identity:
 
     @cached_property
     def config_hash(self) -> str:
-        """Hash of the configuration without the keys that change no result; the order of keys does not matter."""
-        return digest({key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS})
+        """Hash of the configuration without the keys that change no result; the order of keys does not matter.
+
+        Packages change no result of a run that uses no class of the user's.
+        """
+        hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
+        return digest(hashed if self._users else {**hashed, "packages": []})
 
     @property
     def name(self) -> str:
@@ -66,11 +70,15 @@ class Identity:
         return "-".join([*named, self.config_hash])
 
     @cached_property
+    def _users(self) -> set[str]:
+        """The user's packages of which the run uses a class."""
+        return {target.split(".")[0] for target in _values(self.config, "_target_")} - {*OURS}
+
+    @cached_property
     def code(self) -> str:
         """Hash of our code and the user's, of the versions of libraries, and of the files that `FILE_KEYS` name."""
-        named = [str(package) for package in self.config.get("packages") or []]
-        named += [target.split(".")[0] for target in _values(self.config, "_target_")]
-        users = tuple(sorted(set(named) - set(OURS)))
+        named = [str(package) for package in self.config.get("packages") or []] if self._users else []
+        users = sorted({*named, *self._users} - {*OURS})  # a class of one may import another that is named
         dataset = self.config.get("dataset") or {}
         read = [path for key in FILE_KEYS for path in _values(self.config, key)]
         for split in map(Path, _values(dataset, "split")):  # a list of shapes, beside which are others

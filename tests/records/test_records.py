@@ -119,6 +119,19 @@ def test_a_run_is_another_one_where_a_file_that_it_reads_has_changed(tmp_path, k
     assert code() != before
 
 
+def test_a_package_is_in_the_identity_of_runs_that_use_a_class_of_the_users_alone():
+    names = {"task": "completion", "renderer": "dist", "dataset": "sofa"}
+
+    def identity(target: str, *packages: str) -> tuple[str, str]:
+        run = Identity(names, {"renderer": {"_target_": target}, "packages": [*packages]})
+        return run.config_hash, run.code
+
+    shipped, users = "renderers.dist.Dist", "tests.user_renderer.Mine"
+    assert identity(shipped, "tests") == identity(shipped)
+    for ours, theirs in zip(identity(users, "tests"), identity(users, "tests", "hydra"), strict=True):
+        assert ours != theirs
+
+
 def test_a_digest_knows_data_and_not_the_order_of_its_keys():
     data = {"a": 1, "b": {"c": [1, 2.5, None], "d": "x"}}
     assert digest(data) == digest({"b": {"d": "x", "c": [1, 2.5, None]}, "a": 1})
