@@ -87,7 +87,6 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
     finally:
         record.environment["waited_share"] = environment.waited_share(before)
         record.notes += environment.doubts(record)
-        _note(folder, f"{record.status} {record.reason}")
 
 
 class _Progress:

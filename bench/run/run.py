@@ -31,7 +31,7 @@ from bench.run.process import (
     signals_delayed,
     stopped_by,
 )
-from bench.run.summary import show
+from bench.run.summary import show, write_log
 from bench.trackers import Nothing, Tracker
 
 LOST = "lost"  # the status that the driver gets of a run whose record could not be written
@@ -153,6 +153,7 @@ def _run_anew(job: Job) -> Record:
                 record.log = _last_lines(folder / "log.txt")
             release(folder)
             record.write(folder)
+            write_log(folder, record)
     if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:
         _export(tracker, folder, record)
     if stopped:

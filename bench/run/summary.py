@@ -1,8 +1,9 @@
-"""Prints the summary of a run or a sweep at its end."""
+"""The summary of a run or a sweep at its end: printed, and that of a run in its log."""
 
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bench.records.format import count, number, seconds
+from bench.records.format import count, number, plural, seconds
 from bench.records.metrics import SHOWN, Metric
 from bench.records.read import RESULTS, Plan
 from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
@@ -26,21 +27,14 @@ def show(folder: Path, record: Record) -> None:
     table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
     for heading in ("", "before", "after", "better"):
         table.add_column(heading, justify="left" if heading in ("", "better") else "right")
-    for name, metric in SHOWN.items():
-        if record.metrics_start and name in {*record.metrics_start, *record.metrics}:
-            before, after = record.metrics_start.get(name), record.metrics.get(name)
-            table.add_row(metric.label, number(before, metric.factor), number(after, metric.factor), metric.better)
+    for row in _compared(record):
+        table.add_row(*row)
     if table.row_count:
         console.print(table)
     elif record.metrics:
-        console.print(_measured(record))
+        console.print(_table(record))
     if "iterations" in record.evaluations:
-        loop = record.seconds["forward"] + record.seconds["backward"]
-        console.print(
-            f"{seconds(loop)} in the loop, {seconds(record.seconds['total'])} in all; field evaluations: "
-            f"{count(record.evaluations['value'])} values, {count(record.evaluations['gradient'])} gradients, "
-            f"{number(record.evaluations['per_ray'])} values per ray and iteration"
-        )
+        console.print(_costs(record))
     for note in record.notes:
         print(f"note: {note}")
     for picture in [path for name in PICTURES if (path := folder / name).is_file()][:1]:
@@ -92,13 +86,64 @@ def _print_next(results_dir: Path) -> None:
     print(f"page and tables: python -m bench.report{where}")
 
 
-def _measured(record: Record) -> Table:
+def write_log(folder: Path, record: Record) -> None:
+    """Adds what became of a run to its `log.txt`, behind its output; on a full disk it is left out."""
+    with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
+        log.writelines(f"{line}\n" for line in _logged(record))
+
+
+def _logged(record: Record) -> Iterator[str]:
+    """The command, the machine, the errors before and after, the times, the notes and the status, line by line."""
+    machine = record.environment
+    yield record.title
+    yield f"command: {shlex.join(('python', '-m', 'bench', *record.overrides))}"
+    if machine.get("cpu"):
+        yield (
+            f"machine: {machine['cpu']}; device {machine['device']}; {plural(machine['threads'], 'thread')}; "
+            f"torch {machine['torch']}; kernels {machine['kernels']}"
+        )
+    compared = list(_compared(record))
+    yield from (f"{label}: {before} before, {after} after" for label, before, after, _ in compared)
+    if not compared:
+        yield from (f"{label}: {value}" for label, value in _measured(record))
+    if "iterations" in record.evaluations:
+        yield _costs(record)
+    yield f"started {record.started}, ended {record.ended}, {seconds(record.seconds['total'])} in all"
+    yield from (f"note: {note}" for note in record.notes)
+    yield f"status: {record.status}{f' ({record.reason})' if record.reason else ''}"
+
+
+def _compared(record: Record) -> Iterator[tuple[str, str, str, str]]:
+    """The errors of a task that optimises: heading, before, after, and which direction is better."""
+    for name, metric in SHOWN.items():
+        if record.metrics_start and name in {*record.metrics_start, *record.metrics}:
+            before, after = record.metrics_start.get(name), record.metrics.get(name)
+            yield metric.label, number(before, metric.factor), number(after, metric.factor), metric.better
+
+
+def _measured(record: Record) -> Iterator[tuple[str, str]]:
     """The metrics of a task that measures without optimising; of one that recommends a field, what it recommends."""
+    recommended = [name for name in record.metrics if name.startswith("recommended")]
+    for name in recommended or record.metrics:
+        metric = SHOWN.get(name, Metric(name))
+        yield metric.label, number(record.metrics[name], metric.factor)
+
+
+def _table(record: Record) -> Table:
+    """The table of what a run measured."""
     table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
     table.add_column("")
     table.add_column("measured", justify="right")
-    recommended = [name for name in record.metrics if name.startswith("recommended")]
-    for name in recommended or record.metrics:
-        metric, value = SHOWN.get(name, Metric(name)), record.metrics[name]
-        table.add_row(metric.label, number(value, metric.factor))
+    for row in _measured(record):
+        table.add_row(*row)
     return table
+
+
+def _costs(record: Record) -> str:
+    """The time and the field evaluations of an optimisation."""
+    loop, spent = record.seconds["forward"] + record.seconds["backward"], record.evaluations
+    return (
+        f"{seconds(loop)} in the loop, {seconds(record.seconds['total'])} in all; field evaluations: "
+        f"{count(spent['value'])} values, {count(spent['gradient'])} gradients, "
+        f"{number(spent['per_ray'])} values per ray and iteration"
+    )

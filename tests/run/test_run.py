@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from omegaconf import OmegaConf
 
 from bench.config import EvaluationSettings
 from bench.evaluate.evaluate import Evaluation
+from bench.records.format import number, seconds
 from bench.records.record import Record, RunStatus, curve_file
 from bench.report.write.html import write_index
 from bench.run import execute
@@ -85,12 +87,23 @@ def test_it_ends_well_and_its_last_line_is_its_folder(finished):
     assert page.read("mesh", page.runs["key"][0])["shown"][0] > 0
 
 
+def test_its_log_says_what_was_run_where_and_how_it_ended(finished):
+    record, log = finished.record, (finished.folder / "log.txt").read_text(encoding="utf-8")
+    command, *lines = log[log.index("command: ") :].splitlines()
+    assert shlex.split(command)[1:] == ["python", "-m", "bench", *record["overrides"]]
+    assert lines[0].startswith(f"machine: {record['environment']['cpu']}; device {record['environment']['device']}; ")
+    before, after = (number(record[name]["chamfer_l2"], 1000) for name in ("metrics_start", "metrics"))
+    assert f"Chamfer (x1000): {before} before, {after} after" in lines
+    assert f"ended {record['ended']}, {seconds(record['seconds']['total'])} in all" in log and "in the loop" in log
+    assert [line for line in lines if line.startswith("note: ")] == [f"note: {note}" for note in record["notes"]]
+    assert lines[-1] == "status: ok"
+
+
 def test_the_folder_holds_what_others_script_against(finished):
     names = {path.name for path in finished.folder.iterdir()}
     assert {"record.json", "curve.jsonl", "config.yaml", "log.txt", "mesh.ply"} <= names
     assert names >= {f"{name}.png" for name in PICTURES}
     assert not [name for name in names if name.startswith(".")]
-    assert "ok" in (finished.folder / "log.txt").read_text()
     for path in finished.folder.glob("*.png"):
         image = imread(path)
         assert min(image.shape[:2]) > 100 and image[..., :3].std() > 0.02, path.name
