@@ -57,6 +57,12 @@ FURTHER = {  # that tables do not show, but whose direction is known
     **dict.fromkeys(("dtu_accuracy", "dtu_completeness"), LOWER),
     "mask_iou_least": HIGHER,
 }
+NOT_NEGATIVE = frozenset(  # distances and angles; roughness is a logarithm
+    (
+        *("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness", "depth_mae", "colour_error"),
+        *("dtu_overall", "dtu_accuracy", "dtu_completeness", "rotation_error_deg", "translation_error"),
+    )
+)
 # DVR (Niemeyer et al. 2020), Table 2: accuracy, completeness and Chamfer-L1, means over three scans of DTU, in mm.
 DVR_SCANS = (65, 106, 118)
 DVR_TABLE2 = {
@@ -78,7 +84,7 @@ FIRST = {
 
 def better(name: str) -> str:
     """Which direction of a metric is better: lower, higher, or empty where that is not known."""
-    for known in (name, *(name.removeprefix(prefix) for prefix in PREFIXES)):
+    for known in _names(name):
         if known in SHOWN:
             return SHOWN[known].better
         if known in FURTHER:
@@ -87,14 +93,20 @@ def better(name: str) -> str:
 
 
 def unsound(metrics: dict[str, Any]) -> str:
-    """What is wrong with the first metric of a known direction that is not a possible number; empty where none is.
+    """What is wrong with the first metric that cannot have its value; empty where all can.
 
-    A metric of which lower values are better is a distance or a share: it is never negative.
+    A metric of which one direction is better is a number, and a distance or an angle is not negative.
     """
     for name, value in metrics.items():
-        direction = better(name) if value is not None else ""
-        if direction and not isinstance(value, int | float):
+        if value is None or not better(name):
+            continue
+        if not isinstance(value, int | float):
             return f"{name} must be a number, found {value!r}"
-        if direction == LOWER and value < 0:
+        if value < 0 and not NOT_NEGATIVE.isdisjoint(_names(name)):
             return f"{name} must be at least 0, found {value}"
     return ""
+
+
+def _names(name: str) -> tuple[str, ...]:
+    """The name of a metric, and its names without a prefix."""
+    return (name, *(name.removeprefix(prefix) for prefix in PREFIXES))
