@@ -113,7 +113,7 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     page.get_by_role("link", name="What does accuracy cost?").wait_for()
     assert page.locator(".answers strong").all_inner_texts()[:2] == ["0.5", "0.1"]
     page.get_by_role("link", name="What does accuracy cost?").click()
-    assert page.locator("h1").inner_text() == "What does accuracy cost?"
+    page.get_by_role("heading", level=1, name="What does accuracy cost?").wait_for()
     page.get_by_role("link", name="Suite").click()
     page.get_by_role("link", name="Other", exact=True).click()
     page.get_by_text("It fails in 2 of 2 runs.").wait_for()
