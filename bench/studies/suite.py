@@ -19,7 +19,7 @@ PLACE = 1
 KEEPS = place
 READS = tuple(Selection(f"{EXPERIMENT}{name}", tuple(key for key, _ in GIVEN.values())) for name in suite().errors)
 HEADINGS = {AT_1: "At 1 ×", AT_10: "At 10 ×", END: "At the end", AREA: "Mean, 0.3 × to 30 ×"}
-COST = "field evaluations, over those of DIST's whole run at the same problem"
+COST = "field evaluations, DIST's run = 1"
 LEAST_COST, POINTS = 0.05, 80  # of a line of the chart
 WIDEST_BOUNDS = 1.25  # bounds on ratios of errors that lie further off say little
 PROGRESS = (
