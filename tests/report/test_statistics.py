@@ -100,6 +100,16 @@ def test_interval_of_a_mean_is_that_of_student():
     assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
 
 
+def test_of_six_shapes_an_interval_leaves_out_a_quarter_of_a_per_cent_of_draws_on_each_side():
+    # Hesterberg 2015: at the normal's tail beyond sqrt(n / (n - 1)) times Student's quantile with n - 1 degrees.
+    noting, noted = seen(mean)
+    interval = bootstrap(list(np.random.default_rng(0).normal(size=(6, 40))), noting, seed=0, draws=10_000)
+    tail = stats.norm.cdf(math.sqrt(6 / 5) * stats.t.ppf(0.025, df=5))
+    assert tail == pytest.approx(0.00243, abs=5e-6)
+    assert np.mean(np.array(noted) < interval.low) == pytest.approx(tail, abs=1.1e-4)
+    assert np.mean(np.array(noted) > interval.high) == pytest.approx(tail, abs=1.1e-4)
+
+
 @each("n", [1, 4, 5])
 def test_fewer_than_six_shapes_have_points_and_no_interval(n):
     groups = [np.array([i, i + 2.0]) for i in range(n)]
@@ -295,6 +305,14 @@ def test_a_family_that_no_data_could_reject_cannot_be_decided():
     assert mixed == [Verdict.DIFFERS] * 2
     assert [shapes_needed(n) for n in (1, 7, 14)] == [6, 9, 10]
     assert [shapes_agreeing(12, 11), shapes_agreeing(12, 1), shapes_agreeing(8, 7)] == [12, 10, 9]
+
+
+def test_shapes_with_equal_errors_are_no_trials_of_the_sign_test():
+    ones = [np.array([1.0])] * 12
+    better, tied = ratio([np.array([0.5])] * 6 + ones[6:], ones), ratio(ones, ones)
+    assert differ([better]) == [Verdict.DIFFERS]  # 6 of 6 trials: p = 2 / 64 = .031
+    assert differ([better, better]) == [Verdict.NOT_DISTINGUISHED] * 2  # above .05 / 2; of 12 trials p would be .0005
+    assert differ([tied]) == [Verdict.NOT_DISTINGUISHED]
 
 
 def test_a_ratio_is_paired_by_shape():
