@@ -44,6 +44,13 @@ def test_the_truth_itself_scores_best(inputs):
     assert np.linalg.norm(judgement.mesh.vertices, axis=1) == pytest.approx(RADIUS, abs=2e-3)
 
 
+def test_the_true_mesh_has_the_distance_of_two_independent_samplings(inputs):
+    state = State(sphere(RADIUS), inputs)
+    vars(state)["mesh"] = inputs.scene.mesh  # in place of the extracted one
+    expected = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the nearest of so many even samples
+    assert chamfer_only(state)["chamfer_l1"] == pytest.approx(expected, rel=0.15)
+
+
 def test_no_renderer_judges_itself(inputs):
     """One that sees a fattened outline, as a large epsilon does, changes its own metrics and no other."""
     fat = replace(inputs, renderer=load("renderer", "idr", epsilon=0.05))
