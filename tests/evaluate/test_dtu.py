@@ -8,7 +8,7 @@ import torch
 from scipy.io import loadmat, savemat
 from scipy.spatial.distance import cdist
 
-from bench.evaluate.dtu import DILATION, NAMES, WORST, culled, dtu_metrics, published, read_scan, thinned
+from bench.evaluate.dtu import DILATION, NAMES, WORST, DtuScan, culled, dtu_metrics, published, read_scan, thinned
 from datasets.mesh import Mesh
 from datasets.shot import Shot
 from renderers.checks import BadInput
@@ -80,6 +80,18 @@ def test_thinning_keeps_the_first_of_points_that_are_near():
         if not kept or np.linalg.norm(np.array(kept) - point, axis=1).min() > 0.11:
             kept.append(point)
     assert np.array_equal(thinned(points, 0.11), kept) and 200 < len(kept) < 1500
+
+
+def test_the_box_reaches_60_mm_before_the_grid_and_120_mm_beyond_it():
+    grid = np.array([[0.0, 0, 0], [10, 10, 10]])
+    for axis in range(3):
+        for at, counts in ((-61.0, False), (-59.0, True), (129.0, True), (131.0, False)):
+            place = np.full(3, 5.0)
+            place[axis] = at
+            scan = DtuScan(place[None], np.array([0.0, 0, 0, 1]), np.ones((6, 6, 6), dtype=bool), grid, 2.0)
+            speck = Mesh(place + 0.01 * np.eye(3), np.array([[0, 1, 2]]))
+            completeness = dtu_metrics(speck, scan, seed=0)["dtu_completeness"]
+            assert completeness == (pytest.approx(0.01) if counts else math.inf)
 
 
 def test_without_a_mesh_or_far_from_the_scan_it_is_infinitely_wrong(folder):
