@@ -9,12 +9,14 @@ import trimesh
 
 import bench
 from bench.evaluate.dtu import NAMES, dtu_metrics, read_scan
+from bench.evaluate.evaluate import surface_metrics
 from bench.judge import main
 from bench.merge import merge
 from bench.records.record import Record, read_record
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
 from datasets.own_photographs import Reading, read_capture
+from datasets.scene import sample_surface
 from tests.made_dtu import CENTRE, ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE as PHOTOGRAPHED
 from tests.made_photographs import RADIUS, idr
@@ -98,6 +100,19 @@ def test_in_the_unit_sphere_the_size_of_the_files_does_not_count(files, capsys):
     second = judged(capsys, files / "small.ply", "--truth", files / "a.ply", *FEW, "--unit-sphere")
     assert second["small"] == pytest.approx(first["small"], rel=1e-3)
     assert first["small"]["accuracy"] == pytest.approx(0.97 * 0.2 / 2, abs=0.007)
+    ball(4.0, (30.0, 0, 0)).save(files / "twice.ply")  # twice as large, and elsewhere
+    ball(2.0, (0, 0, 0)).save(files / "at origin.ply")
+    twice = judged(capsys, files / "twice.ply", "--truth", files / "at origin.ply", *FEW, "--unit-sphere")["twice"]
+    assert twice["accuracy"] == pytest.approx(0.97 * (30 - 1) / 2, rel=0.1)
+
+
+def test_the_best_possible_distance_is_that_of_two_independent_samplings_of_the_truth(files, capsys):
+    notes = judged(capsys, *pair(files, "small"))["notes"]
+    (distance,) = (float(note.rpartition(" ")[2]) for note in notes if note.startswith("two samplings of the truth"))
+    truth = read_mesh(files / "truth/small.ply")
+    first, second = (sample_surface(truth, 4000, seed) for seed in (7, 8))
+    assert distance == pytest.approx(surface_metrics(first, second, threshold=1.0)["chamfer_l1"], rel=0.05)
+    assert distance == pytest.approx(0.5 * (4 * np.pi * 2.0**2 / 4000) ** 0.5, rel=0.15)
 
 
 def test_other_units_are_told_as_a_likely_mistake(files, capsys):
