@@ -305,6 +305,12 @@ def test_a_cosine_falls_from_the_rate_to_nearly_zero():
     assert steps == pytest.approx([0.2] * 6 + [0.04] * 2 + [0.008] * 2)
 
 
+def test_a_ramp_rises_over_the_first_tenth_from_its_first_step_to_the_cosine():
+    ramped, cosine = (OptimiserSettings(40, 0.2, name) for name in ("ramped", "cosine"))
+    assert [ramped.rate(i) for i in range(4)] == pytest.approx([0.05, 0.09985, 0.14908, 0.19724], abs=1e-5)
+    assert [ramped.rate(i) for i in range(4, 40)] == [cosine.rate(i) for i in range(4, 40)]
+
+
 def play(count: int, trial: int, iterations: int, loss) -> list[tuple[int, int]]:
     starts = Starts(StartSettings(count, trial))
     turns = []

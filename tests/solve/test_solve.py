@@ -1,0 +1,21 @@
+"""When the state of a run is evaluated."""
+
+from bench.solve.solve import checkpoints_of
+from tests.looped import each
+
+
+@each(
+    "every, iterations, expected",
+    [
+        (5, 12, {0, 5, 10, 11}),
+        (5, 11, {0, 5, 10}),
+        (100, 12, {0, 11}),
+        (1, 1, {0}),
+        ("doubling", 12, {0, 1, 2, 4, 8, 11}),
+        ("doubling", 9, {0, 1, 2, 4, 8}),
+        ("doubling", 1, {0}),
+        (None, 12, set()),
+    ],
+)
+def test_checkpoints_begin_with_the_first_iteration_and_end_with_the_last(every, iterations, expected):
+    assert checkpoints_of(every, iterations) == expected
