@@ -61,6 +61,12 @@ def test_runs_that_nobody_touched_agree(runs, capsys):
     assert out.count("agrees: ") == len(RUNS) and f"{len(RUNS)} of {len(RUNS)} agree" in out
 
 
+def scale(folder: Path, metric: str, factor: float) -> None:
+    """Multiplies a metric of a record."""
+    value = json.loads((folder / "record.json").read_text())["metrics"][metric]
+    edit(folder, metrics={metric: factor * value})
+
+
 F = "f" * 40  # a code that is not today's
 
 
@@ -68,6 +74,8 @@ F = "f" * 40  # a code that is not today's
     (lambda run: edit(run, code=F), ("agrees: copy, from its field",)),  # no difference where metrics agree
     (lambda run: edit(run, metrics={"chamfer_l1": 1e-3}), ("differs: copy", "chamfer_l1 is 0.00100 in", "edited?")),
     (lambda run: edit(run, metrics={"fscore": 0.5}, code=F), ("fscore is 0.500", "the code differs: ffffffffffff")),
+    (lambda run: scale(run, "chamfer_l1", 1.001), ("differs: copy", "chamfer_l1 is ", "edited?")),
+    (lambda run: scale(run, "chamfer_l1", 1.00001), ("agrees: copy, from its field",)),  # sums in another order
     (lambda run: edit(run, metrics={"fscore": GONE}), ("fscore is not there in the record, now", "edited?")),
     (lambda run: edit(run, metrics={"fscore": 0.5}, environment={}), ("fscore is 0.500", "cpu differs: None then")),
     (lambda run: (run / FIELD).unlink(), (f"left out: copy, from its field: it has no {FIELD}",)),
