@@ -33,7 +33,9 @@ from renderers.checks import BadInput
 POINTS = choice("scale", "desk")["points"]  # sampled on each surface, as in runs
 RADIUS = choice("dataset", "mesh")["radius"]  # of the sphere into which runs move a mesh
 THRESHOLD = "1%"  # of F, of the truth's extent: in runs 0.02, of shapes about 2 across
-UNLIKE = 10.0  # a mesh so many times as large as its truth, or as small, is told as a likely mistake
+LIKE_A_SCAN = (10.0, 0.0)  # of a mesh, which may have more than what was scanned; see `_unlike`
+LIKE_A_SHAPE = (1.2, 0.5)  # of a mesh of the same shape
+FLAT = 0.02  # of the diagonal: boxes are enlarged by it on each side, so that those of plates have a volume
 LONGEST = 800  # pixels of a photograph whose mask culls a mesh
 POWERS = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None, "normal_consistency": None}  # of the unit
 WORLD = "mesh_world.ply"  # of a run on photographs, in the world of their cameras
@@ -103,7 +105,7 @@ class Judge:
         if isinstance(item.truth, Path):
             return self._by_surface(item.name, mesh, item.truth)
         scan = dtu.read_scan(self.folder or Path(), item.truth)
-        notes = [*_unlike(mesh, scan.above()), *dtu.published(item.truth)]
+        notes = [*_unlike(mesh, scan.above(), *LIKE_A_SCAN), *dtu.published(item.truth)]
         metrics = dtu.dtu_metrics(mesh, scan, seed=self.seed)
         if metrics["dtu_accuracy"] == inf:
             raise BadInput(
@@ -129,7 +131,7 @@ class Judge:
         cloud = read_points(truth)
         surface = None if cloud is not None else read_mesh(truth)
         places = surface.used if surface is not None else cloud
-        notes = _unlike(mesh, places)
+        notes = _unlike(mesh, places, *LIKE_A_SHAPE)
         if self.unit_sphere:
             centre, factor = fit_in_sphere(places, RADIUS)
             mesh, surface = (one and replace(one, vertices=(one.vertices - centre) * factor) for one in (mesh, surface))
@@ -153,11 +155,25 @@ def _photographs(folder: Path) -> Capture:
     return read_capture(folder, Reading(LONGEST, unchecked=True))
 
 
-def _unlike(mesh: Mesh, places: Float[np.ndarray, "n 3"]) -> list[str]:
-    """A warning about a mesh that is far larger or smaller than its truth."""
-    ratio = mesh.diagonal / max(float(np.linalg.norm(np.ptp(places, axis=0))), 1e-300)
-    told = f"warning: the mesh is {ratio:.3g} times as large as the truth: are both in the same units?"
-    return [] if 1 / UNLIKE <= ratio <= UNLIKE else [told]
+def _unlike(mesh: Mesh, places: Float[np.ndarray, "n 3"], most: float, least: float) -> list[str]:
+    """A warning about a mesh that is probably in another world or in other units than its truth.
+
+    Args:
+        most: times as large as the truth, or as small, without a warning.
+        least: overlap of their boxes without a warning, as a share of the volume that both fill.
+    """
+    extent = float(np.linalg.norm(np.ptp(places, axis=0)))
+    ratio, slack = mesh.diagonal / max(extent, 1e-300), FLAT * max(mesh.diagonal, extent)
+    boxes = [(points.min(axis=0) - slack, points.max(axis=0) + slack) for points in (mesh.used, places)]
+    low, high = np.stack(boxes, axis=1)
+    shared = (high.min(axis=0) - low.max(axis=0)).clip(0).prod()
+    overlap = shared / ((high - low).prod(axis=1).sum() - shared)
+    if 1 / most <= ratio <= most and overlap >= least:
+        return []
+    return [
+        f"warning: the mesh is {ratio:.3g} times as large as the truth, and their boxes overlap by {overlap:.0%}: are "
+        "both in the same world and units? The mesh of a run is in its unit sphere"
+    ]
 
 
 def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:

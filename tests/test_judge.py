@@ -115,10 +115,31 @@ def test_the_best_possible_distance_is_that_of_two_independent_samplings_of_the_
     assert distance == pytest.approx(0.5 * (4 * np.pi * 2.0**2 / 4000) ** 0.5, rel=0.15)
 
 
-def test_other_units_are_told_as_a_likely_mistake(files, capsys):
-    ball(2000.0, (0, 0, 0)).save(files / "mm.ply")
-    told = judged(capsys, files / "mm.ply", "--truth", files / "truth/small.ply", *FEW)["notes"]
-    assert "warning: the mesh is 1e+03 times as large as the truth: are both in the same units?" in told
+def test_a_mesh_of_another_size_or_place_than_its_truth_is_a_likely_mistake(files, capsys):
+    def warned(radius: float, centre: tuple) -> list[str]:
+        ball(radius, centre).save(files / "mesh.ply")
+        notes = judged(capsys, files / "mesh.ply", "--truth", files / "truth.ply", *FEW)["notes"]
+        return [note for note in notes if note.startswith("warning")]
+
+    ball(2.0, (0, 0, 0)).save(files / "truth.ply")
+    for radius, apart in ((2.0, 1.35), (2.36, 0.0), (1.69, 0.0)):  # overlaps of 2.9 / 5.6, and of .61
+        assert warned(radius, (apart, 0, 0)) == warned(radius, (0, apart, 0)) == []
+    for radius, apart, words in (
+        (2.0, 1.45, "1 times as large as the truth, and their boxes overlap by 49%"),  # 2.83 / 5.73
+        (2.0, 9.0, "1 times as large as the truth, and their boxes overlap by 0%"),
+        (2.44, 0.0, "1.22 times as large as the truth"),
+        (1.64, 0.0, "0.82 times as large as the truth"),
+        (2000.0, 0.0, "1e+03 times as large as the truth"),
+    ):
+        (warning,) = warned(radius, (0, 0, apart))
+        assert words in warning and warning.endswith("The mesh of a run is in its unit sphere")
+
+
+def test_a_plate_is_compared_by_its_box_though_it_has_no_volume(files, capsys):
+    for height, count in ((0.0, 0), (0.05, 0), (1.0, 1)):
+        plate(height).save(files / "found/plate.ply")
+        notes = judged(capsys, *pair(files, "plate"))["notes"]
+        assert sum(note.startswith("warning") for note in notes) == count
 
 
 def test_a_folder_has_a_row_for_each_truth_and_medians(files, capsys):
