@@ -1,14 +1,23 @@
 """What a field is worth against a scene whose truth is known."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
 from bench.config import load
-from bench.evaluate.evaluate import DEFINITIONS, chamfer_only, differing, evaluate, render_view
-from bench.evaluate.state import State
+from bench.evaluate import state as state_module
+from bench.evaluate.evaluate import (
+    DEFINITIONS,
+    WORST_SURFACE,
+    chamfer_only,
+    differing,
+    evaluate,
+    render_view,
+    unrendered,
+)
+from bench.evaluate.state import REACH, State, colours_at
 from bench.setup.inputs import RunInputs
 from bench.solve.solve import note_result
 from datasets.scene import sample_surface
@@ -49,6 +58,48 @@ def test_the_true_mesh_has_the_distance_of_two_independent_samplings(inputs):
     vars(state)["mesh"] = inputs.scene.mesh  # in place of the extracted one
     expected = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the nearest of so many even samples
     assert chamfer_only(state)["chamfer_l1"] == pytest.approx(expected, rel=0.15)
+
+
+def test_a_part_of_the_truth_only_judges_whether_it_is_in_the_prediction(inputs):
+    whole = inputs.scene.mesh
+    half = replace(whole, faces=whole.faces[(whole.vertices[whole.faces][..., 2] > 0).all(axis=1)])
+    scene = replace(inputs.scene, mesh=half, part=True)
+    state = State(sphere(RADIUS), replace(inputs, make_scene=lambda: scene))
+    metrics = evaluate(state).metrics
+    assert metrics.keys() & WORST_SURFACE.keys() == {"completeness", "chamfer_gt_to_pred"} and chamfer_only(state) == {}
+    assert metrics["completeness"] == pytest.approx(0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5, rel=0.15)
+
+
+def test_samples_of_the_field_are_one_spacing_apart(inputs):
+    state = State(sphere(RADIUS), inputs)
+    steps = (state.mesh.vertices + REACH) / state.spacing
+    on_samples = np.abs(steps - steps.round()) < 1e-3
+    assert (on_samples.sum(axis=1) >= 2).all()  # a vertex of marching cubes lies on an edge between two samples
+
+
+@dataclass(frozen=True)
+class Painted(Shape):
+    """A shape whose red is x of the view direction, and whose green is y of the place; both lie in -1 to 1."""
+
+    def colours(self, points, normals, directions):
+        return torch.stack([directions[:, 0], points[:, 1], torch.zeros(len(points))], dim=-1) / 2 + 0.5
+
+
+def test_colours_are_those_seen_along_each_ray_or_from_straight_above(monkeypatch):
+    monkeypatch.setattr(state_module, "CHUNK", 4)
+    points = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    field, device = Painted(sphere(1.0).function), torch.device("cpu")
+    for directions in (points.roll(1, dims=0), None):
+        seen = -points if directions is None else directions  # from above: inwards
+        expected = torch.stack([seen[:, 0], points[:, 1], torch.zeros(10)], dim=-1) / 2 + 0.5
+        torch.testing.assert_close(colours_at(field, points, directions, device), expected)
+
+
+def test_the_colour_error_is_the_mean_absolute_difference_over_the_true_surface(inputs):
+    scene = replace(inputs.scene, texture=lambda points, normals: np.full_like(points, 0.5))
+    painted = Painted(sphere(RADIUS).function)
+    error = evaluate(State(painted, replace(inputs, make_scene=lambda: scene))).metrics["colour_error"]
+    assert error == pytest.approx((1 / 4 + RADIUS / 4) / 3, rel=0.05)  # |x| of a unit sphere has the mean 1/2
 
 
 def test_no_renderer_judges_itself(inputs):
@@ -163,6 +214,15 @@ def test_a_renderers_own_image_that_shows_another_surface_is_noted(of_renderer, 
     both = f"is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene units: the renderer does not"
     assert [note.startswith(f"the depth error of the renderer's own image {both}") for note in notes] == [True] * noted
     assert differing({"psnr": 20.0, "own_psnr": 3.0}) == differing({}) == ()
+
+
+def test_a_part_that_lies_just_before_another_is_missed_where_the_renderer_sees_the_other(inputs):
+    camera = inputs.scene.view.camera
+    towards = torch.nn.functional.normalize(camera.center, dim=0)
+    state = State(sphere(RADIUS) | sphere(0.1, tuple((0.85 * towards).tolist())), inputs)
+    assert unrendered(state, [state.seen(camera)]) == ()
+    (note,) = unrendered(state, [State(sphere(RADIUS), inputs).seen(camera)])  # 0.15 to 0.35 behind
+    assert "misses 1 part of the mesh" in note
 
 
 def test_a_rendered_view_is_that_of_the_mesh(inputs):

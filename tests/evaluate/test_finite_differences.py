@@ -183,14 +183,15 @@ def test_the_steps_at_an_outline_move_the_surface_by_parts_of_a_pixel():
 
 
 def test_rays_within_pixels_lie_on_a_regular_grid_about_the_pixels_own():
-    view, pixels = Camera(camera_of(4).intrinsics, camera_of(4).world_to_camera, 4, 4).double(), torch.tensor([5, 12])
+    # 4 rows of 6 pixels: number 7 is in row 1, column 1, and number 18 in row 3, column 0.
+    view, pixels = Camera(camera_of(4).intrinsics, camera_of(4).world_to_camera, 4, 6).double(), torch.tensor([7, 18])
     rays = subrays(view, pixels, 3)
     assert rays.shape == (2, 9)
     assert torch.allclose(rays.directions[:, 4], view.rays().flat()[pixels].directions)  # the middle one of nine
     in_camera = rays.directions @ view.world_to_camera[:3, :3].T
     image = (in_camera / in_camera[..., 2:]) @ view.intrinsics.T
     inner = (torch.arange(3) + 0.5) / 3
-    columns = torch.stack([1 + inner.repeat(3), 0 + inner.repeat(3)]).double()  # pixel 5 is in row 1, column 1
+    columns = torch.stack([1 + inner.repeat(3), 0 + inner.repeat(3)]).double()
     rows = torch.stack([1 + inner.repeat_interleave(3), 3 + inner.repeat_interleave(3)]).double()
     assert torch.allclose(image[..., 0], columns)
     assert torch.allclose(image[..., 1], rows)

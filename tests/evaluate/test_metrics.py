@@ -6,7 +6,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.evaluate.evaluate import DEFINITIONS, IMAGE, OWN_DEFINITIONS, WORST_SURFACE, surface_metrics, view_metrics
+from bench.evaluate.evaluate import (
+    DEFINITIONS,
+    IMAGE,
+    OWN_DEFINITIONS,
+    WORST_SURFACE,
+    drawn,
+    surface_metrics,
+    view_metrics,
+)
 from datasets.scene import Surface, View
 from tests.tiny import camera_of
 
@@ -115,6 +123,15 @@ def test_image_edges():
     assert measured(depth, none, every) == (np.inf, 0)
     assert measured(depth, none, none) == (np.inf, 1)
     assert measured(depth * np.nan, every, every) == (np.inf, 1)
+    unknown = np.array([[1.0, 0, 0], [1, 1, 1]])  # 0 is no depth
+    assert view_metrics(view(depth, every), view(unknown, every)) == {"depth_mae": 0, "mask_iou": 1}
+
+
+def test_drawn_points_are_different_ones():
+    points = np.arange(300.0).reshape(100, 3)
+    some = drawn(points, 60, seed=0)
+    assert len(np.unique(some, axis=0)) == 60 and np.isin(some, points).all()
+    assert np.array_equal(drawn(points, 100, seed=0), points)
 
 
 def test_every_metric_has_one_sentence():

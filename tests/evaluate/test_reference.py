@@ -8,6 +8,7 @@ import torch
 from bench.evaluate import reference as reference_store
 from bench.evaluate.reference import Reference, in_float64, make_reference, reference_for
 from bench.shape_prior import Prior
+from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.analytic import Shape
 from tests.looped import each
@@ -86,6 +87,7 @@ def other_code(row: int) -> Prior:
         (other_code(0), CAMERA, True),
         (other_code(1), CAMERA, False),  # it is the first shape's
         (PRIOR, CAMERA.resized(13, 12), True),
+        (PRIOR, Camera(CAMERA.intrinsics, CAMERA.world_to_camera, 12, 13), True),  # the same rays, and one more column
         (PRIOR, camera_of(12, angles=(70.1, 20.0)), True),
         (PRIOR, camera_of(12, angles=(70.0, 20.0), field_of_view=49.0), True),
         (ball_prior(), camera_of(12, angles=(70.0, 20.0)), False),
