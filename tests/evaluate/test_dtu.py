@@ -11,6 +11,7 @@ from scipy.spatial.distance import cdist
 from bench.evaluate.dtu import DILATION, NAMES, WORST, DtuScan, culled, dtu_metrics, published, read_scan, thinned
 from datasets.mesh import Mesh
 from datasets.shot import Shot
+from renderers.camera import Camera
 from renderers.checks import BadInput
 from tests.made_dtu import CENTRE, NUMBER, ball, on_ball, write_dtu
 from tests.tiny import camera_of
@@ -102,15 +103,17 @@ def test_without_a_mesh_or_far_from_the_scan_it_is_infinitely_wrong(folder):
 
 
 def test_culling_takes_the_faces_that_a_mask_excludes_but_for_its_dilation():
-    """A row of triangles to the right of a camera's axis, whose mask is the left half of the image."""
-    camera = camera_of(64, angles=(0.0, 0.0))
+    """A row of triangles to the right of a camera's axis, whose mask is the left half of an image of 40 x 64 pixels."""
+    square = camera_of(64, angles=(0.0, 0.0))
+    pinhole = square.intrinsics - torch.tensor([[0, 0, 0], [0, 0, 12], [0, 0, 0]])
+    camera = Camera(pinhole, square.world_to_camera, 40, 64)
     right = camera.camera_to_world[:3, 0].double().numpy()
     up = camera.camera_to_world[:3, 1].double().numpy()
     steps = np.linspace(-1.2, 1.2, 97)
     corners = steps[:, None, None] * right + 0.01 * np.stack([0 * up, up, right])
     mesh = Mesh(corners.reshape(-1, 3), np.arange(len(steps) * 3).reshape(-1, 3))
-    half = torch.arange(64).expand(64, 64) < 32
-    colours = torch.zeros(64, 64, 3)
+    half = torch.arange(64).expand(40, 64) < 32
+    colours = torch.zeros(40, 64, 3)
     kept = culled(mesh, [Shot("half", camera, colours, half), Shot("all", camera, colours, torch.ones_like(half))])
     assert kept is not None
     pixels = camera.project(torch.from_numpy(kept.vertices).float())[0][:, 0].numpy()
@@ -118,6 +121,8 @@ def test_culling_takes_the_faces_that_a_mask_excludes_but_for_its_dilation():
     shown = camera.shows(torch.from_numpy(mesh.vertices).float()).numpy().reshape(-1, 3)
     assert not shown[-1].any() and (kept.vertices @ right).max() == pytest.approx(1.21)  # beyond the image: kept
     assert culled(mesh, [Shot("none", camera, colours, torch.zeros_like(half))]) is not None
+    across = Mesh(np.stack([-0.5 * right, 0.5 * right, 0.1 * up - 0.5 * right]), np.array([[0, 1, 2]]))
+    assert culled(across, [Shot("half", camera, colours, half)]) is None  # one corner is outside
     seen = Mesh(mesh.vertices, mesh.faces[shown.all(axis=1)])
     assert culled(seen, [Shot("none", camera, colours, torch.zeros_like(half))]) is None
     with pytest.raises(BadInput, match="culling needs a mask of each photograph, and bare has none"):
