@@ -9,8 +9,8 @@ import trimesh
 
 import bench
 from bench.evaluate.dtu import NAMES, dtu_metrics, read_scan
-from bench.evaluate.evaluate import surface_metrics
-from bench.judge import main
+from bench.evaluate.evaluate import DEFINITIONS, surface_metrics
+from bench.judge import Judge, main, units
 from bench.merge import merge
 from bench.records.record import Record, read_record
 from datasets.mesh import Mesh
@@ -143,6 +143,9 @@ def test_a_plate_is_compared_by_its_box_though_it_has_no_volume(files, capsys):
 
 
 def test_a_folder_has_a_row_for_each_truth_and_medians(files, capsys):
+    whole = judged(capsys, files / "found", "--truth", files / "truth", *FEW)
+    for metric, middle in whole.pop("median").items():
+        assert middle == sorted(whole[name][metric] for name in ("large", "plate", "small"))[1]
     (files / "found/large.ply").unlink()
     (files / "found/plate.ply").write_bytes(b"")
     found = judged(capsys, files / "found", "--truth", files / "truth", *FEW, code=1)
@@ -201,6 +204,22 @@ def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path,
     assert "leave nothing of the mesh" in error
     ball(1.0, PHOTOGRAPHED + 500).save(tmp_path / "far65.ply")
     assert "nothing of the mesh lies within 20 mm of scan 65" in refused(capsys, tmp_path / "far65.ply", *where)
+
+
+def test_of_the_run_folder_of_photographs_the_mesh_in_their_world_is_judged(files, capsys):
+    (files / "run").mkdir()
+    (files / "run/record.json").write_text("{}")
+    ball(9.0).save(files / "run/mesh.ply")
+    judge = (files / "run", "--truth", files / "truth/small.ply", *FEW)
+    assert judged(capsys, *judge)["run"]["accuracy"] > 5
+    ball(2.2).save(files / "run/mesh_world.ply")
+    assert judged(capsys, *judge)["run"]["accuracy"] == pytest.approx(0.2, rel=0.1)
+
+
+def test_the_printed_unit_of_a_metric_is_that_of_its_definition():
+    for name, unit in units(Judge(None, "1%", 1, 0, False, None, None)).items():
+        kinds = {"from 0 to 1": "", "in squared scene units": "unit²", "in scene units": "unit"}
+        assert unit == next(kinds[words] for words in kinds if words in DEFINITIONS[name]), name
 
 
 def test_rows_stand_beside_runs_and_are_merged(files, capsys):
