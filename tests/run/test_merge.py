@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from bench.merge import main, merge
 from bench.records.read import Plan, read_records
+from bench.report.suite.attempts import place
 from tests.looped import each
 from tests.run.driving import planned, stored
 
@@ -47,7 +48,7 @@ def test_runs_of_different_cells_are_joined(tmp_path, capsys):
 @st.composite
 def machines(draw):
     """What three machines have of two cells: nothing, or a run with one of a few ends and times."""
-    ends = st.sampled_from(["ok", "timeout", "killed", "crashed"])
+    ends = st.sampled_from(["ok", "timeout", "killed", "crashed", "refused"])
     times = st.sampled_from(["2026-01-01T00:00:00+00:00", "2026-01-02T00:00:00+00:00"])
     run = st.none() | st.tuples(ends, times, st.sampled_from([1.0, 2.0]))
     return [[draw(run) for _ in range(2)] for _ in range(3)]
@@ -76,8 +77,9 @@ def test_the_order_does_not_matter_and_a_second_time_changes_nothing(tmp_path_fa
     for number, cell in enumerate(CELLS[:2]):
         runs = {cells[number] for cells in found if cells[number] is not None}
         assert len([name for name in results[0] if name.endswith("record.json") and cell in name]) == len(runs)
-        if any(run[0] == "ok" for run in runs):
-            assert json.loads(results[0][f"runs/{cell}/record.json"])["status"] == "ok"
+        for ends in ({"ok"}, {"ok", "timeout"}):  # finished runs rank above others
+            if any(run[0] in ends for run in runs):
+                assert json.loads(results[0][f"runs/{cell}/record.json"])["status"] in ends
 
 
 def test_a_cell_that_was_run_twice_is_reported_and_both_are_kept(tmp_path, capsys):
@@ -141,6 +143,14 @@ def test_a_run_that_cannot_be_read_is_named_and_is_in_no_table(tmp_path_factory,
     assert CELLS[1] in run and words in run
     assert "sweeps/table-1/plan.json" in plan
     assert [record["folder"] for record in read_records(results / "b")[0]] == [CELLS[0]]
+
+
+def test_attempts_at_the_suite_that_cannot_be_read_are_named(tmp_path):
+    folder = place(tmp_path / "a")
+    folder.mkdir(parents=True)
+    (folder / "newton.csv").write_text("set,problem\ncomplete,a sofa\n")
+    _, (problem,) = merge([tmp_path / "a"], tmp_path / "d")
+    assert problem.startswith(f"{tmp_path / 'a'}: not copied: newton.csv: ")
 
 
 def test_what_cannot_be_joined_is_an_error_and_changes_nothing(tmp_path, capsys):
