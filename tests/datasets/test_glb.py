@@ -25,7 +25,8 @@ TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), parts=({},), **more) -> bytes:
     """A file whose accessors are the arrays, each alone or with keys that it also has, and whose mesh has the parts.
 
-    Of an array's keys, `sparse` is a pair of indices and values, `stride` is in bytes, and `empty` leaves it out.
+    Of an array's keys, `sparse` is a pair of indices and values, `empty` leaves it out, and `stride` is in bytes, in
+    each row of which the array begins at `byteOffset`.
     """
     views, accessors, binary = [], [], bytearray()
 
@@ -43,11 +44,12 @@ def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), parts
             accessor["sparse"] = {"count": len(index), "indices": places, "values": {"bufferView": view(values)}}
         if "stride" in keys:
             padded = np.zeros((len(array), keys["stride"]), np.uint8)
-            padded[:, : array[0].nbytes] = array.view(np.uint8)
+            start = keys.get("byteOffset", 0)
+            padded[:, start : start + array[0].nbytes] = array.view(np.uint8)
             accessor["bufferView"] = view(padded, byteStride=keys["stride"])
         elif "empty" not in keys:
             accessor["bufferView"] = view(array)
-        accessors.append(accessor | {key: keys[key] for key in ("normalized", "count") if key in keys})
+        accessors.append(accessor | {key: keys[key] for key in ("normalized", "count", "byteOffset") if key in keys})
     primitives = [{"attributes": {"POSITION": 0}, "indices": 1} | part for part in parts]
     stored = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes}
     stored |= {"meshes": [{"primitives": primitives}], "accessors": accessors, "bufferViews": views}
@@ -82,6 +84,8 @@ BIND[1, 3, :3] = -1, 0, 0  # a column
 BONES = np.array([(0, 1, 0, 0)] * 4, np.uint8), (np.array([(127, 128, 0, 0)] * 4, np.uint8), SHARE), BIND
 SKINNED = [{"mesh": 0, "skin": 0, "translation": [50, 0, 0]}, {"translation": [0, 0, 4]}, {"translation": [3, 0, 4]}]
 SKIN = {"skins": [{"joints": [1, 2], "inverseBindMatrices": 4}], "scenes": [{"nodes": [0, 1, 2]}]}
+EXTRA = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "JOINTS_1": 5, "WEIGHTS_1": 6}
+HALF = np.float32([(0.5, 0, 0, 0)] * 4)
 BENT = np.array([2 * 128 / 255, 0, 4])  # one joint moves by (0, 0, 4), the other by (2, 0, 4)
 
 READ = {  # a file, and the vertices of its tetrahedra
@@ -91,6 +95,8 @@ READ = {  # a file, and the vertices of its tetrahedra
     "normalised": (glb((LARGE, SHARE)), LARGE / 32767),
     "normalised bytes below zero": (glb((SMALL, SHARE | {"stride": 4})), SMALL / 127),
     "with strides": (glb((VERTICES, {"stride": 32})), VERTICES),
+    "interleaved with others": (glb((VERTICES, {"stride": 28, "byteOffset": 12})), VERTICES),
+    "normalised bytes below -1": (glb((np.where(SMALL == -127, -128, SMALL).astype(np.int8), SHARE)), SMALL / 127),
     "sparse": (glb((FLAT, {"sparse": (np.array([3], np.uint8), VERTICES[3:])})), VERTICES),
     "sparse over zeros": (
         glb((VERTICES, {"empty": True, "sparse": (np.arange(1, 4, dtype=np.uint16), VERTICES[1:])})),
@@ -121,6 +127,32 @@ READ = {  # a file, and the vertices of its tetrahedra
         1.5 * VERTICES,
     ),
     "a morph target at zero": (glb(VERTICES, CORNERS, VERTICES, parts=TARGET), VERTICES),
+    "a morph target by the node before the mesh": (
+        glb(
+            *(VERTICES, CORNERS, VERTICES),
+            nodes=[{"mesh": 0, "weights": [0.5]}],
+            meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, **TARGET[0]}], "weights": [1.0]}],
+        ),
+        1.5 * VERTICES,
+    ),
+    "a skin with weights of any sum": (
+        glb(
+            *(VERTICES, CORNERS, BONES[0], 4 * np.float32([(127, 128, 0, 0)] * 4), BIND),
+            nodes=SKINNED,
+            parts=({"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}},),
+            **SKIN,
+        ),
+        VERTICES + BENT,
+    ),
+    "a skin with more than four joints": (
+        glb(
+            *(VERTICES, CORNERS, np.zeros((4, 4), np.uint8), HALF, BIND, np.ones((4, 4), np.uint8), HALF),
+            nodes=SKINNED,
+            parts=({"attributes": EXTRA},),
+            **SKIN,
+        ),
+        VERTICES + np.array([1, 0, 4]),
+    ),
     "a skin": (
         glb(
             *(VERTICES, CORNERS, *BONES),

@@ -231,6 +231,40 @@ def test_a_tetrahedron_is_read_in_unusual_spellings(name):
     assert mesh.watertight and mesh.volume == pytest.approx(1 / 6)
 
 
+def ply_of(kind: str, numbers: str) -> str:
+    bands = "".join(f"property {kind} {band}\n" for band in ("red", "green", "blue"))
+    faces = "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
+    return HEAD + bands + faces + "\n".join([f"{place} {numbers}" for place in PLACES] + ROWS.split("\n")[4:])
+
+
+COLOURED = {  # the same colours of four vertices
+    "bytes of .ply": (read_ply, ply_of("uchar", "255 51 0")),
+    "16 bits of .ply": (read_ply, ply_of("ushort", "65535 13107 0")),
+    "shares of .ply": (read_ply, ply_of("float", "1 0.2 0")),
+    "bytes of .obj": (read_obj, V.replace("\n", " 255 51 0\n") + F),
+    "shares of .obj": (read_obj, V.replace("\n", " 1 0.2 0\n") + F),
+    "bytes of .off": (read_off, "COFF\n4 4 6\n" + ROWS.replace("\n", " 255 51 0 255\n", 4)),
+    "shares of .off, with normals": (read_off, "CNOFF\n4 4 6\n" + ROWS.replace("\n", " 0 0 1 1 0.2 0 1\n", 4)),
+}
+
+
+@each("name", COLOURED)
+def test_colours_are_shares_of_the_brightest_however_they_are_written(name):
+    reader, content = COLOURED[name]
+    assert reader(content.encode()).vertex_colours == pytest.approx(np.tile([1, 0.2, 0], (4, 1)))
+
+
+def test_a_vertex_has_the_mean_colour_of_its_triangles():
+    square = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (9, 9, 9)]
+    polygons = Polygons(
+        np.array(square, float), np.array([3, 4]), np.array([1, 4, 2, 0, 1, 2, 3]),
+        face_colours=np.array([(0.0, 0, 1), (1, 0, 0)]),
+    )  # fmt: skip
+    colours = polygons.shaded(*polygons.triangles())
+    red, both, of_three = (1, 0, 0), (0.5, 0, 0.5), (2 / 3, 0, 1 / 3)
+    assert colours == pytest.approx(np.array([red, both, of_three, red, (0, 0, 1), (0, 0, 0)]))
+
+
 REFUSED = {  # the name of a file, its content, and what is said of it
     "longer.stl": ("x".ljust(80) + "\4\0\0\0" + "\0" * 201, "284 bytes for the 4 faces that it claims, found 285"),
     "endless.stl": (SOLID[:-11], "from 'solid' to 'endsolid', found 'solid a facet norma' to "),
