@@ -62,7 +62,8 @@ def _tidy(mesh: Mesh) -> Mesh:
     Two faces back to back cancel, unless their whole part is double-sided: then one side is kept.
     """
     mesh = mesh.compact()
-    weld = {"threshold": lab.PercentageValue(100 * WELD)} if (lab := meshlab()) else {}
+    # A percentage would be one of a hundredth of the diagonal: that is the largest threshold of this filter.
+    weld = {"threshold": lab.PureValue(WELD * mesh.diagonal)} if (lab := meshlab()) else {}
     mesh = apply(mesh, ("meshing_merge_close_vertices", weld))
     faces = mesh.faces
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
@@ -87,9 +88,9 @@ def _copies(mesh: Mesh, again: Int[np.ndarray, " f"]) -> tuple[int, int]:
     if not (again > 0).any():
         return 0, 0
     twice, again = replace(mesh, faces=mesh.faces[again > 0]), again[again > 0]
-    closed = ~np.isin(twice.parts, twice.parts[twice.open_faces])
-    copies = sum(again[twice.parts == part].min() for part in np.unique(twice.parts[closed]))
-    return int(copies), int(again[closed].sum())
+    closed = np.setdiff1d(twice.parts, twice.parts[twice.open_faces])
+    members = [again[twice.parts == part] for part in closed]  # a part is there as often as its rarest face
+    return int(sum(part.min() for part in members)), int(sum(part.min() * len(part) for part in members))
 
 
 def _close(mesh: Mesh) -> Mesh:

@@ -2,6 +2,8 @@
 
 import re
 import sys
+from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ import trimesh
 from bench.reconstruct.surfaces import poisson
 from datasets.mesh import Mesh
 from datasets.mesh import joined as as_one
-from datasets.meshes import find_meshes, load_mesh, read_points, repair
+from datasets.meshes import find_meshes, load_mesh, read_mesh, read_pieces, read_points, repair
+from datasets.repair import UNSEEN
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.looped import each
@@ -100,6 +103,22 @@ def test_a_scene_is_placed_by_its_transforms_and_its_lines_ignored(tmp_path):
     assert mesh.vertices[:, 0].max() == pytest.approx(6)
 
 
+@each("scale", [1e-6, 1.0, 1e6])
+def test_whether_a_mesh_has_an_area_does_not_depend_on_its_scale(tmp_path, scale):
+    path = tmp_path / "sliver.obj"
+    for width, is_flat in ((1e-11, False), (1e-13, True)):
+        path.write_text(f"v 0 0 0\nv {scale} 0 0\nv 0 {width * scale} 0\nf 1 2 3\n")
+        with pytest.raises(ValueError, match="must have an area") if is_flat else nullcontext():
+            assert len(read_mesh(path).faces) == 1
+
+
+def test_the_pieces_of_a_folder_are_all_of_one_mesh(tmp_path):
+    for name, size in (("a.ply", 1), ("b.obj", 2), ("c.stl", 3)):
+        box(size=size).export(tmp_path / name)
+    assert read_pieces(tmp_path).area == pytest.approx(6 * (1 + 4 + 9))
+    assert read_pieces(tmp_path / "c.stl").area == pytest.approx(6 * 9)
+
+
 BALL = trimesh.creation.icosphere(2)  # 162 vertices, 320 faces
 WHOLE = {
     "ply": BALL.export(file_type="ply"),
@@ -137,6 +156,11 @@ REPAIRED = {  # a mesh, its volume then, and the notes, without a warning
     "two faces twice": (with_faces(box().faces[:2]), 1, ("2 doubled faces dropped",)),
     "a part twice": (joined(box(), box(at=(2, 0, 0)), box()), 2, (f"1 part {DROPPED}",)),
     "thrice, and one beside": (joined(box(), box(), box(), box(at=(1, 0, 0))), 2, (f"2 parts {DROPPED}",)),
+    "a part twice, and two of its faces thrice": (
+        with_faces(np.concatenate([box().faces, box().faces[:2]])),
+        1,
+        (f"1 part {DROPPED}", "2 doubled faces dropped"),
+    ),
     "apart": (joined(box(), box(at=(2, 0, 0))), 2, ()),
     "overlapping": (joined(box(), box(at=(0.1, 0.1, 0.1))), 2 - 0.9**3, ("2 overlapping parts merged into 1",)),
     "nested": (joined(box(), box(size=0.4)), 1, ("2 overlapping parts merged into 1",)),
@@ -151,6 +175,28 @@ def test_a_repair_gives_the_solid_that_was_meant_and_a_note(name):
     repaired = repair(mesh)
     assert repaired.watertight and repaired.volume == pytest.approx(volume)
     assert repaired.repairs == notes
+
+
+@each("scale", [1e-6, 1e3])
+@each("name", REPAIRED)
+def test_a_repair_does_not_depend_on_the_scale(name, scale):
+    mesh, volume, notes = REPAIRED[name]
+    repaired = repair(replace(mesh, vertices=scale * mesh.vertices))
+    assert repaired.watertight and repaired.volume / scale**3 == pytest.approx(volume) and repaired.repairs == notes
+
+
+@each("backend", ["pymeshlab", None])
+@each("scale", [1e-3, 1e3])
+def test_corners_less_than_a_millionth_of_the_diagonal_apart_are_one(scale, backend, monkeypatch):
+    if backend is None:
+        pytest.importorskip("manifold3d")
+        monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    corners = box().triangles.reshape(-1, 3)  # each face has its own three vertices
+    shifts = 2e-7 * np.random.default_rng(0).uniform(-1, 1, corners.shape)
+    repaired = repair(Mesh(scale * (corners + shifts), np.arange(36).reshape(-1, 3)))
+    assert (len(repaired.vertices), repaired.watertight) == (8, True)
+    assert repaired.volume == pytest.approx(scale**3, rel=1e-5)
+    assert repaired.repairs == (() if backend else (UNSEEN,))
 
 
 @each("name", REPAIRED)
@@ -185,7 +231,8 @@ def test_overlapping_boxes_are_inside_where_either_is(inverted):
 
 def test_a_sheet_is_wrapped_closely_with_a_note_and_a_warning():
     thin = sheet(lambda x: 0.1 * np.sin(9 * x))
-    mesh = repair(thin)
+    mesh = repair(replace(thin, vertices=0.01 * thin.vertices))  # shares of the diagonal are not units of the file
+    mesh = replace(mesh, vertices=100 * mesh.vertices)
     assert mesh.watertight
     assert 0 < mesh.volume < 0.01
     assert mesh.repairs[-1].startswith("wrapped: ") and "cut away" in mesh.repairs[-1]
@@ -197,6 +244,7 @@ def test_a_sheet_is_wrapped_closely_with_a_note_and_a_warning():
 def test_walls_around_a_room_have_a_volume_and_a_torn_sphere_is_not_hollow():
     sides = box().triangles + 0.02 * box().face_normals[:, None]  # they do not touch
     ball = trimesh.creation.icosphere(2)
+    ball.apply_scale(0.01)
     torn = ball.faces[np.random.default_rng(0).random(len(ball.faces)) < 0.7]
     walls = Mesh(sides.reshape(-1, 3), np.arange(36).reshape(-1, 3))
     for broken, volume in ((walls, 1.04**3), (Mesh(ball.vertices, torn), ball.volume)):
@@ -233,6 +281,19 @@ def test_a_repair_that_changes_area_or_volume_much_says_by_how_much():
     assert numbers[1] == pytest.approx(half.area + np.pi, rel=0.02)  # the disc that closes it
     assert numbers[2] == pytest.approx(100 * (numbers[1] / numbers[0] - 1), abs=1)
     assert numbers[4] == pytest.approx(2 / 3 * np.pi, rel=0.03)
+
+
+@each("odd", [np.nan, np.inf])
+def test_points_that_are_not_finite_are_refused(tmp_path, odd):
+    points = np.eye(3)
+    trimesh.PointCloud(points).export(tmp_path / "points.ply")
+    assert np.array_equal(read_points(tmp_path / "points.ply"), points)
+    points[1, 2] = odd
+    np.savez(tmp_path / "points.npz", points=points)
+    trimesh.PointCloud(points).export(tmp_path / "points.ply")
+    for name in ("points.npz", "points.ply"):
+        with pytest.raises(BadInput, match="must hold points that are finite"):
+            read_points(tmp_path / name)
 
 
 def test_the_clouds_of_dvrs_data_are_points_and_its_occupancies_are_not(tmp_path):
