@@ -14,8 +14,10 @@ from datasets.meshes import read_mesh
 from datasets.scene import Split, Truth, see
 from datasets.views import look_at
 from renderers.camera import Camera
+from renderers.checks import BadInput
 from tests.looped import each
 from tests.run.driving import command, record_of
+from tests.tiny import icosphere
 
 STEP = 0.002  # units of the world for a step of the stored numbers
 CAMERA = [150.0, 140.0, 70.3, 52.8]
@@ -104,6 +106,46 @@ def test_a_principal_point_far_from_the_middle_is_noted(made):
     for focal, at in (((300, 280), [140.6, 105.6]), ((150, 140), [0, 0]), ((60, 60), [24, 24])):
         _, note = depth_image(made, intrinsics=[*focal, *at]).placed(40).mesh.repairs
         assert f"({at[0]}, {at[1]}) is far from the middle of the 150 x 120 pixels" in note
+
+
+def test_a_principal_point_is_compared_with_the_middle_of_its_own_axis(made):
+    for at in ([75.0, 47.0], [58.0, 60.0], [92.0, 60.0]):  # at most .23 of half the image from its middle
+        assert len(depth_image(made, intrinsics=[150, 140, *at]).placed(40).mesh.repairs) == 1
+
+
+def test_a_camera_of_unknown_place_looks_down_by_25_degrees(made):
+    forward = depth_image(made, camera_to_world=None).placed(40).view.camera.camera_to_world[:3, 2]
+    assert forward.tolist() == pytest.approx([0.0, -np.sin(np.radians(25)), -np.cos(np.radians(25))], abs=1e-6)
+
+
+def test_the_object_is_shown_with_a_tenth_of_its_extent_around_it(made):
+    mask = depth_image(made).placed(200).view.mask.numpy()  # each pixel of the file
+    rows, columns = np.nonzero(mask)
+    extent = max(np.ptp(rows), np.ptp(columns)) + 1
+    for side, places in zip(mask.shape, (rows, columns), strict=True):
+        assert side == pytest.approx(1.2 * extent, abs=1)
+        assert places.min() == pytest.approx(side - 1 - places.max(), abs=1)  # in the middle
+    assert min(rows.min(), columns.min()) == pytest.approx(0.1 * extent, abs=1)
+
+
+def test_depths_outside_of_the_mask_are_not_given(made, tmp_path):
+    stored = np.array(Image.open(made[0] / "mask.png"))
+    stored[:, np.nonzero(stored)[1].mean().astype(int) :] = 0
+    Image.fromarray(stored).save(tmp_path / "half.png")
+    scene = depth_image(made, mask_path=str(tmp_path / "half.png")).placed(200)
+    assert torch.equal(scene.measured > 0, scene.view.mask) and scene.view.mask.sum() == (stored > 0).sum()
+
+
+def test_too_few_depths_are_refused(made):
+    with pytest.raises(BadInput, match=r"has \d+ depths on the object at view.resolution=4, and 20 are the fewest"):
+        depth_image(made).placed(4)
+
+
+def test_a_truth_that_only_touches_what_is_seen_is_refused(made, tmp_path):
+    seen = depth_image(made).placed(40)
+    icosphere(0.1, seen.mesh.vertices[0]).moved(seen.to_world).save(tmp_path / "speck.ply")
+    with pytest.raises(BadInput, match=r"of its radius from dataset.truth \(median\): give both in one world"):
+        depth_image(made, truth=str(tmp_path / "speck.ply")).placed(40)
 
 
 def test_files_without_depths_are_refused(made, tmp_path):
