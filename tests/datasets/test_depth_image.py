@@ -48,8 +48,12 @@ def depth_image(made, **changed):
     return load("dataset", "depth_image", **keys | {"camera_to_world": camera.camera_to_world.tolist()} | changed)
 
 
-@each("change", [{}, {"suffix": ".npy"}, {"suffix": ".npz"}, {"suffix": ".exr"}, {"pixels": 200}, {"unknown": True}])
-def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, change, pixels=40, suffix=".png", unknown=False):
+@pytest.mark.parametrize(
+    "suffix, pixels, unknown",
+    [(".png", 40, False), (".npy", 40, False), (".npz", 40, False), (".exr", 40, False), (".png", 200, False),
+     (".png", 40, True)],
+)  # fmt: skip
+def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, suffix, pixels, unknown):
     folder, camera = made
     if suffix == ".exr":
         os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
@@ -130,10 +134,31 @@ def test_the_object_is_shown_with_a_tenth_of_its_extent_around_it(made):
 
 def test_depths_outside_of_the_mask_are_not_given(made, tmp_path):
     stored = np.array(Image.open(made[0] / "mask.png"))
-    stored[:, np.nonzero(stored)[1].mean().astype(int) :] = 0
-    Image.fromarray(stored).save(tmp_path / "half.png")
-    scene = depth_image(made, mask_path=str(tmp_path / "half.png")).placed(200)
+    stored[:, ::3] = 0
+    Image.fromarray(stored).save(tmp_path / "stripes.png")
+    scene = depth_image(made, mask_path=str(tmp_path / "stripes.png")).placed(200)
     assert torch.equal(scene.measured > 0, scene.view.mask) and scene.view.mask.sum() == (stored > 0).sum()
+
+
+@each("odd", [-3.0, np.inf, np.nan])
+def test_a_number_that_is_no_depth_is_none_also_on_the_object(made, tmp_path, odd):
+    folder, _ = made
+    depths, mask = np.load(folder / "depth.npy"), np.array(Image.open(folder / "mask.png")) > 0
+    depths[::2] = odd
+    np.save(tmp_path / "odd.npy", depths)
+    scene = depth_image(made, path=str(tmp_path / "odd.npy"), mask_path=str(folder / "mask.png")).placed(200)
+    assert (scene.measured >= 0).all() and scene.given()[1].sum() == mask[1::2].sum()
+
+
+def test_a_pixel_that_flies_behind_the_outline_does_not_shrink_the_object(made, tmp_path):
+    depths = np.load(made[0] / "depth.npy")
+    depths[tuple(np.argwhere(depths > 0)[0])] *= 3
+    np.save(tmp_path / "flies.npy", depths)
+    sizes = [
+        np.linalg.norm(depth_image(made, path=str(path)).placed(200).to_world[:3, 0])
+        for path in (made[0] / "depth.npy", tmp_path / "flies.npy")
+    ]
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.02)
 
 
 def test_too_few_depths_are_refused(made):
