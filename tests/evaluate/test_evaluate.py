@@ -17,10 +17,11 @@ from bench.evaluate.evaluate import (
     render_view,
     unrendered,
 )
-from bench.evaluate.state import REACH, State, colours_at
+from bench.evaluate.state import REACH, State, colours_at, newton_step
 from bench.setup.inputs import RunInputs
 from bench.solve.solve import note_result
 from datasets.scene import sample_surface
+from renderers.camera import Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
 from tests.looped import each
@@ -223,6 +224,21 @@ def test_a_part_that_lies_just_before_another_is_missed_where_the_renderer_sees_
     assert unrendered(state, [state.seen(camera)]) == ()
     (note,) = unrendered(state, [State(sphere(RADIUS), inputs).seen(camera)])  # 0.15 to 0.35 behind
     assert "misses 1 part of the mesh" in note
+    seen = state.seen(camera)
+    odd = seen.mask & (torch.arange(seen.mask.numel()).view_as(seen.mask) % 2 == 1)
+    assert unrendered(state, [replace(seen, mask=odd)]) == ()  # of each part some rays hit
+
+
+@each("scale", [0.01, 1.0, 100.0])
+def test_a_hit_moves_to_the_surface_at_most_the_longest_step_but_where_it_grazes(scale):
+    plane = Shape(lambda points: scale * points[..., 2], Kind.LEVEL)
+    directions = torch.nn.functional.normalize(torch.tensor([[0, 0, -1.0], [1, 0, -1], [1, 0, -0.04]]), dim=-1)
+    for off in (0.05, -0.05, 2.0, -2.0):  # before the surface or behind it
+        rays = Rays(-3 * directions, directions)
+        moved, gradients = newton_step(plane, rays, torch.full((3,), 3.0 - off), longest=0.1)
+        step = min(max(off, -0.1), 0.1)
+        torch.testing.assert_close(moved - (3.0 - off), torch.tensor([step, step, 0.0]), rtol=0, atol=2e-6)
+    torch.testing.assert_close(gradients, scale * torch.tensor([[0.0, 0, 1]]).expand(3, 3))
 
 
 def test_a_rendered_view_is_that_of_the_mesh(inputs):

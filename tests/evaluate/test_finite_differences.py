@@ -101,7 +101,7 @@ def test_a_ray_along_a_plane_that_steps_may_lift_into_its_way_is_left_out(height
     front = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     decoder = union_decoder((beside, (beside @ origin).item() - height), (front, 0.0))
     decoder.hidden[0].weight[2, 0] = 0.0  # the code moves both planes, by 1e-6 in a step
-    code, directions = torch.zeros(1).double(), torch.ones(1, 1).double()
+    code, directions = torch.zeros(1).double(), torch.tensor([[1.0, 0.0]]).double()  # the second moves nothing
     distance = (-origin[2] / along[2])[None]
     found = differences(decoder, code, directions, camera=camera(), pixels=pixels, distance=distance)
     assert found.code[0, 0, 0].item() == pytest.approx(-1 / along[2].item(), rel=1e-6)
