@@ -199,6 +199,10 @@ def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path,
     plain = judged(capsys, tmp_path / "both65.ply", *where)["both65"]
     culled = judged(capsys, tmp_path / "both65.ply", *where, "--cull", tmp_path / "photos")["both65"]
     assert plain["dtu_accuracy"] > 1.1 * culled["dtu_accuracy"] and culled == pytest.approx(expected, rel=0.05)
+    both = read_mesh(tmp_path / "both65.ply").moved(np.linalg.inv(capture.to_world))
+    both.save(tmp_path / "moved65.ply")
+    more = ("--to-world", tmp_path / "photos", "--cull", tmp_path / "photos")
+    assert judged(capsys, tmp_path / "moved65.ply", *where, *more)["moved65"] == pytest.approx(culled, rel=1e-3)
     away.save(tmp_path / "away65.ply")
     error = refused(capsys, tmp_path / "away65.ply", *where, "--cull", tmp_path / "photos")
     assert "leave nothing of the mesh" in error
