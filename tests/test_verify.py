@@ -93,6 +93,7 @@ def test_an_edited_metric_is_found_and_the_cause_told(copied, capsys, spoil, wor
 @pytest.mark.parametrize("changed, code, words", [
     ({}, 0, "agrees: copy, run again"),
     ({"metrics": {"fscore": 0.5}}, 1, "fscore is 0.500 in the record, now"),
+    ({"metrics_start": {"fscore": 0.5}}, 1, "fscore at the start is 0.500 in the record, now"),
     ({"evaluations": {"value": 1}}, 1, "value evaluations is 1 in the record, now"),
     ({"metrics": {"invented": 0.5}}, 1, "invented is 0.500 in the record, now not there"),
     ({"config_hash": "other"}, 1, "its overrides give another configuration today"),
