@@ -65,3 +65,25 @@ def test_runs_of_several_experiments_together_leave_out_what_each_leaves_out(tmp
     both = together(read(tmp_path), None, read(tmp_path, "other"))
     assert (len(both.records), both.left_out) == (2, 3)
     assert [record["config"]["experiment"] for record in both.records] == ["mine", "other"]
+
+
+def test_only_the_split_of_the_run_requested_last_is_read_unless_it_is_a_condition(tmp_path):
+    for split in ("validation", "test"):
+        write_run(tmp_path, "mine", "A", settings={"split": split})
+    assert [record["config"]["split"] for record in read(tmp_path).records] == ["test"]
+    assert len(read(tmp_path, conditions=("split",)).records) == 2
+
+
+def test_the_newest_scene_is_one_shape_at_one_seed(tmp_path):
+    for index, seed in ((0, 1), (1, 0), (1, 1), (0, 0), (1, 1)):
+        write_run(tmp_path, "mine", f"A {index} {seed} {len(list(tmp_path.glob('runs/*')))}", index=index, seed=seed)
+    newest = read(tmp_path).of_newest_scene()
+    assert [(record["config"]["index"], record["seed"]) for record in newest.records] == [(1, 1), (1, 1)]
+    assert newest.left_out == 3
+
+
+def test_runs_of_other_processors_threads_or_engines_are_of_other_machines(tmp_path):
+    base = {"cpu": "One", "device": "cpu", "threads": 1, "kernels": "compiled"}
+    for name, changed in (("A", {}), ("B", {"commit": "x"}), ("C", {"threads": 2}), ("D", {"kernels": "PyTorch"})):
+        write_run(tmp_path, "mine", name, environment=base | changed)
+    assert [*read(tmp_path).machines().values()] == [["A", "B"], ["C"], ["D"]]
