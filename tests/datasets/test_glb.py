@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from datasets.colours import FileColours
 from datasets.meshes import read_mesh
-from datasets.readers.glb import read_glb
+from datasets.readers.glb import GREY, read_glb
 from tests.looped import each
 
 VERTICES = np.array([(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)], np.float32)
@@ -244,6 +244,16 @@ def test_the_colour_of_a_material_multiplies_those_of_vertices(tmp_path):
         mesh = read_mesh(path)
         seen = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
         assert seen == pytest.approx(expected * factor[:3], abs=1e-5)
+
+
+def test_colours_are_shares_of_1_and_parts_without_are_grey_beside_others():
+    bytes_of = np.array([(255, 51, 0, 255)] * 4, np.uint8)
+    painted = {"attributes": {"POSITION": 0, "COLOR_0": 2}}
+    for keys in ({}, SHARE):
+        read = read_glb(glb(VERTICES, CORNERS, (bytes_of, keys), parts=(painted, {})))
+        expected = np.repeat([(1, 0.2, 0), (GREY, GREY, GREY)], 4, axis=0)
+        assert read.vertex_colours == pytest.approx(expected)
+    assert read_glb(glb()).vertex_colours is None
 
 
 def test_without_indices_vertices_are_taken_in_their_order():

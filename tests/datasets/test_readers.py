@@ -206,6 +206,7 @@ TETRAHEDRA = {
     "no header": (read_off, "4 4 6\n" + ROWS),
     "one line": (read_off, " ".join(f"OFF 4 4 6 {ROWS}".split())),
     "normals, in one line": (read_off, " ".join(f"NOFF 4 4 6 {' 0 0 1 '.join(PLACES)} 0 0 1 {ROWS[23:]}".split())),
+    "textures, in one line": (read_off, " ".join(f"STOFF 4 4 6 {' 0 1 '.join(PLACES)} 0 1 {ROWS[23:]}".split())),
     "a binary .stl named solid": (read_stl, b"solid facet normal".ljust(80) + struct.pack("<I", 4) + BINARY),
     "a text of .stl": (read_stl, SOLID),
     "two solids, in one line of capitals": (
@@ -263,6 +264,15 @@ def test_a_vertex_has_the_mean_colour_of_its_triangles():
     colours = polygons.shaded(*polygons.triangles())
     red, both, of_three = (1, 0, 0), (0.5, 0, 0.5), (2 / 3, 0, 1 / 3)
     assert colours == pytest.approx(np.array([red, both, of_three, red, (0, 0, 1), (0, 0, 0)]))
+
+
+def test_faces_have_no_colours_beside_strips_which_have_none():
+    face = "element face 1\nproperty list uchar int vertex_indices\nproperty uchar red\nproperty uchar green\n"
+    strips = "property uchar blue\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    places = "\n".join(PLACES)
+    read = read_ply(f"{HEAD}{face}{strips}{places}\n3 0 2 1 255 0 0\n5 0 1 3 2 0\n".encode())
+    triangles, owner = read.triangles()
+    assert len(triangles) == 4 and read.shaded(triangles, owner) is None
 
 
 REFUSED = {  # the name of a file, its content, and what is said of it
