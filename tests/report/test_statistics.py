@@ -236,6 +236,8 @@ def test_a_rank_has_an_interval_over_shapes_and_those_that_do_not_differ_from_th
     assert found["last"].value == found["last"].low == found["last"].high == 3
     assert found["tied"].low < found["tied"].value == 1.5 < found["tied"].high
     assert as_good(found, "best") == ["tied"]
+    paired = {"best": Interval(5, 1, 9, (1, 9) * 6), "next": Interval(6, 2, 10, (2, 10) * 6)}  # worse on each shape
+    assert as_good(paired, "best") == []
 
 
 def test_a_shape_at_which_both_are_equally_good_is_half_a_success():
