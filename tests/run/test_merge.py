@@ -145,6 +145,18 @@ def test_a_run_that_cannot_be_read_is_named_and_is_in_no_table(tmp_path_factory,
     assert [record["folder"] for record in read_records(results / "b")[0]] == [CELLS[0]]
 
 
+def test_a_run_or_a_plan_that_is_a_link_out_of_its_folder_is_not_read(tmp_path):
+    outside = write_run(tmp_path / "other", CELLS[0])
+    Plan("table-1", tmp_path / "other", planned(*CELLS), "2026-01-01T00:00:00+00:00").write()
+    for folder in ("runs", "sweeps"):
+        (tmp_path / "a" / folder).mkdir(parents=True)
+    (tmp_path / "a/runs" / outside.name).symlink_to(outside)
+    (tmp_path / "a/sweeps/table-1").symlink_to(tmp_path / "other/sweeps/table-1")
+    _, (line,) = merge([tmp_path / "a"], tmp_path / "d")
+    assert "not copied, since" in line and "is a link out of its results folder" in line
+    assert content(tmp_path / "d") == {}
+
+
 def test_attempts_at_the_suite_that_cannot_be_read_are_named(tmp_path):
     folder = place(tmp_path / "a")
     folder.mkdir(parents=True)
