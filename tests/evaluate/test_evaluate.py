@@ -14,13 +14,14 @@ from bench.evaluate.evaluate import (
     chamfer_only,
     differing,
     evaluate,
+    render_image,
     render_view,
     unrendered,
 )
-from bench.evaluate.state import REACH, State, colours_at, newton_step
+from bench.evaluate.state import GREY, REACH, State, coloured_image, colours_at, newton_step, painted
 from bench.setup.inputs import RunInputs
 from bench.solve.solve import note_result
-from datasets.scene import sample_surface
+from datasets.scene import Truth, sample_surface
 from renderers.camera import Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, sphere
@@ -94,6 +95,21 @@ def test_colours_are_those_seen_along_each_ray_or_from_straight_above(monkeypatc
         seen = -points if directions is None else directions  # from above: inwards
         expected = torch.stack([seen[:, 0], points[:, 1], torch.zeros(10)], dim=-1) / 2 + 0.5
         torch.testing.assert_close(colours_at(field, points, directions, device), expected)
+
+
+def test_a_volume_shows_the_colours_of_its_surface_where_they_are(inputs):
+    field, camera = Painted(sphere(RADIUS).function), inputs.scene.view.camera
+    view, image = render_image(field, camera, replace(inputs, renderer=load("renderer", "neus")))
+    apart = (image - coloured_image(field, view, torch.device("cpu")))[view.mask].abs()
+    assert view.mask.sum() > 50 and apart.mean() < 0.05
+
+
+def test_a_painted_mesh_has_the_colours_of_its_vertices_and_is_grey_without(inputs):
+    mesh, view = inputs.scene.mesh, inputs.scene.view
+    image = painted(replace(mesh, colours=mesh.vertices / 2 + 0.5), Truth(mesh), view.camera)
+    mask, points = view.mask.numpy(), view.camera.rays().at(view.camera.distance(view.depth)).numpy()
+    assert image[mask] == pytest.approx(points[mask] / 2 + 0.5, abs=1e-5) and not image[~mask].any()
+    assert (painted(mesh, Truth(mesh), view.camera)[mask] == GREY).all()
 
 
 def test_the_colour_error_is_the_mean_absolute_difference_over_the_true_surface(inputs):
