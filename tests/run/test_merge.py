@@ -93,6 +93,16 @@ def test_a_cell_that_was_run_twice_is_reported_and_both_are_kept(tmp_path, capsy
     assert merge([tmp_path / "d"], tmp_path / "e") == ([], []) and content(tmp_path / "e") == content(tmp_path / "d")
 
 
+def test_of_two_runs_that_ended_alike_the_later_one_is_kept(tmp_path):
+    for name, day in (("a", 1), ("b", 2), ("c", 3)):
+        write_run(tmp_path / name, CELLS[0], "ok", f"2026-01-0{day}T00:00:00+00:00", metrics={"chamfer_l2": float(day)})
+    for order in permutations("abc"):
+        into = tmp_path / "".join(order)
+        merge([tmp_path / name for name in order], into)
+        (record,) = read_records(into)[0]
+        assert record["metrics"] == {"chamfer_l2": 3.0}
+
+
 def test_plans_are_joined_so_that_cells_of_no_machine_show(tmp_path):
     Plan("table-1", tmp_path / "a", planned(*CELLS), "2026-01-01T00:00:00+00:00").write()
     write_run(tmp_path / "a", CELLS[0])
