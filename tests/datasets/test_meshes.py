@@ -4,6 +4,7 @@ import re
 import sys
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,12 +43,15 @@ def sheet(height) -> Mesh:
     return Mesh(np.stack([x, y, height(x)], axis=-1).reshape(-1, 3), faces)
 
 
-def test_a_folder_gives_its_meshes_sorted_and_a_file_itself(tmp_path):
+def test_a_folder_gives_its_meshes_sorted_and_a_file_itself(tmp_path, monkeypatch):
     for name in ("b.OBJ", "a ü.ply", "notes.txt"):
         (tmp_path / name).write_text("x")
     (tmp_path / "._b.OBJ").write_bytes(b"\x00\x05\x16\x07")
     (tmp_path / "folder.stl").mkdir()
-    assert [path.name for path in find_meshes(tmp_path)] == ["a ü.ply", "b.OBJ"]
+    listed = sorted(tmp_path.iterdir())
+    for order in (listed, listed[::-1]):  # of the file system
+        monkeypatch.setattr(Path, "iterdir", lambda _, order=order: iter(order))
+        assert [path.name for path in find_meshes(tmp_path)] == ["a ü.ply", "b.OBJ"]
     assert find_meshes(str(tmp_path / "b.OBJ")) == [tmp_path / "b.OBJ"]
 
 
