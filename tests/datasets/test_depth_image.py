@@ -107,7 +107,8 @@ def test_what_is_no_camera_or_file_is_refused(made, key, value, says):
 
 def test_a_principal_point_far_from_the_middle_is_noted(made):
     assert len(depth_image(made).placed(40).mesh.repairs) == 1
-    for focal, at in (((300, 280), [140.6, 105.6]), ((150, 140), [0, 0]), ((60, 60), [24, 24])):
+    both = [((300, 280), [140.6, 105.6]), ((150, 140), [0, 0]), ((60, 60), [24, 24])]
+    for focal, at in [*both, ((150, 140), [20, 60]), ((150, 140), [75, 100])]:
         _, note = depth_image(made, intrinsics=[*focal, *at]).placed(40).mesh.repairs
         assert f"({at[0]}, {at[1]}) is far from the middle of the 150 x 120 pixels" in note
 
