@@ -55,7 +55,7 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
             else:
                 lines += _join(folder, into)
                 problems += [f"{source}: {UNREADABLE}{problem}" for problem in [read_run(folder, source)[1]] if problem]
-        problems += [f"{source}: {UNREADABLE}{problem}" for problem in read_plans(source)[1]]
+        problems += [f"{source}: this plan cannot be read: {problem}" for problem in read_plans(source)[1]]
         for plan in sorted((source / "sweeps").glob("*/plan.json")):  # of one name: of the same cells
             if not leads_out(plan, source):
                 (into / "sweeps" / plan.parent.name).mkdir(parents=True, exist_ok=True)

@@ -162,7 +162,8 @@ def test_a_run_or_a_plan_that_is_a_link_out_of_its_folder_is_not_read(tmp_path):
         (tmp_path / "a" / folder).mkdir(parents=True)
     (tmp_path / "a/runs" / outside.name).symlink_to(outside)
     (tmp_path / "a/sweeps/table-1").symlink_to(tmp_path / "other/sweeps/table-1")
-    _, (line,) = merge([tmp_path / "a"], tmp_path / "d")
+    _, (line, plan) = merge([tmp_path / "a"], tmp_path / "d")
+    assert "this plan cannot be read: sweeps/table-1/plan.json" in plan
     assert "not copied, since" in line and "is a link out of its results folder" in line
     assert content(tmp_path / "d") == {}
 
