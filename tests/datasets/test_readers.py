@@ -261,9 +261,8 @@ def test_a_vertex_has_the_mean_colour_of_its_triangles():
         np.array(square, float), np.array([3, 4]), np.array([1, 4, 2, 0, 1, 2, 3]),
         face_colours=np.array([(0.0, 0, 1), (1, 0, 0)]),
     )  # fmt: skip
-    colours = polygons.shaded(*polygons.triangles())
     red, both, of_three = (1, 0, 0), (0.5, 0, 0.5), (2 / 3, 0, 1 / 3)
-    assert colours == pytest.approx(np.array([red, both, of_three, red, (0, 0, 1), (0, 0, 0)]))
+    assert polygons.shaded == pytest.approx(np.array([red, both, of_three, red, (0, 0, 1), (0, 0, 0)]))
 
 
 def test_faces_have_no_colours_beside_strips_which_have_none():
@@ -271,8 +270,7 @@ def test_faces_have_no_colours_beside_strips_which_have_none():
     strips = "property uchar blue\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
     places = "\n".join(PLACES)
     read = read_ply(f"{HEAD}{face}{strips}{places}\n3 0 2 1 255 0 0\n5 0 1 3 2 0\n".encode())
-    triangles, owner = read.triangles()
-    assert len(triangles) == 4 and read.shaded(triangles, owner) is None
+    assert len(read.triangles) == 4 and read.shaded is None
 
 
 REFUSED = {  # the name of a file, its content, and what is said of it
