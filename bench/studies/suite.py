@@ -11,14 +11,20 @@ from bench.report.data.runs import together
 from bench.report.study import Result, Runs, Selection, chart, format, table
 from bench.report.suite import standing
 from bench.report.suite.attempts import EXPERIMENT, GIVEN, gather, place, suite
-from bench.report.suite.standing import AREA, AT_1, AT_10, BUDGETS, END, OUTCOMES, Ranking, ranking
+from bench.report.suite.standing import AREA, AT_1, AT_10, AT_SECONDS, BUDGETS, END, OUTCOMES, Ranking, ranking
 from bench.report.write import paper
 from bench.report.write.table import percent
 
 PLACE = 1
 KEEPS = place
 READS = tuple(Selection(f"{EXPERIMENT}{name}", tuple(key for key, _ in GIVEN.values())) for name in suite().errors)
-HEADINGS = {AT_1: "At 1 ×", AT_10: "At 10 ×", END: "At the end", AREA: "Mean, 0.3 × to 30 ×"}
+HEADINGS = {
+    AT_1: "At 1 ×",
+    AT_10: "At 10 ×",
+    END: "At the end",
+    AREA: "Mean, 0.3 × to 30 ×",
+    AT_SECONDS: "In DIST's time",
+}
 COST = "field evaluations, DIST's run = 1"
 LEAST_COST, POINTS = 0.05, 80  # of a line of the chart
 WIDEST_BOUNDS = 1.25  # bounds on ratios of errors that lie further off say little
@@ -119,38 +125,43 @@ def make(*several: Runs | None) -> Result:
 
 
 def make_sets(*several: Runs | None) -> Result:
-    """A line per set and row, with what a whole run costs over DIST's."""
+    """A line per set and row, with what a whole run costs over DIST's; tuned rows too."""
     runs = together(*several)
     made = Standing(runs)
-    groups = made.whole.groupby(["set", "row"])
-    lines = groups[[*BUDGETS]].mean().join(groups["preset"].first()).join(standing.costs(made.whole, made.everything))
-    for of_set, own in made.whole.groupby("set"):
-        for name in BUDGETS:
-            lines.loc[lines.index.isin([(of_set, row) for row in standing.sparse(own, name)]), name] = np.nan
-    lines = lines.reindex([(of_set, row) for of_set in made.sets for row in made.rows]).reset_index()
-    lines = lines.astype(object).where(lines.notna(), None)
-    timed = lines[lines["seconds"].notna()]
-    others = {line.row: line.seconds.value for line in timed.itertuples() if line.preset != standing.UNIT}
-    sets = ", ".join(timed["set"].unique())
+    reached = made.reached[made.reached["whole"] | made.reached["tuned"]]
+    pairs, groups = standing.timed(made.whole, made.everything), reached.groupby(["set", "row"])
+    lines = groups[[*BUDGETS]].mean().join(groups["preset"].first()).join(standing.costs(reached, pairs))
+    lines = lines.join(pairs.groupby(["set", "row"])[AT_SECONDS].mean())
+    for of_set, name in ((of_set, name) for of_set in made.sets for name in (*BUDGETS, AT_SECONDS)):
+        measured = pairs if name == AT_SECONDS else reached
+        rows = standing.sparse(measured[measured["set"] == of_set], name)
+        lines.loc[lines.index.isin([(of_set, row) for row in rows]), name] = np.nan
+    lines = lines.sort_index(key=lambda index: index.map([*made.sets, *made.rows, *reached["row"].unique()].index))
+    lines = lines.reset_index().astype(object).where(lines.reset_index().notna(), None)
+    ranked, sets = ranking(pairs, AT_SECONDS), " and ".join(pairs["set"].unique())
+    seconds = {row: cost.value for row, cost in zip(lines["row"], lines["seconds"], strict=True) if cost}
     return Result(
         replace(runs, records=[], left_out=0),
         "The suite, set by set.",
         "Progress of each renderer in each set, and what a whole run costs over DIST's at the same problem.",
-        question="What does a run of each renderer cost?",
-        verdict=format.ends(
-            "Seconds of a run over DIST's", others, f"{timed['scenes'].min():.0f} scenes or more of {sets}"
-        ),
+        question="What does a run of each renderer cost, and what progress does the time of one run of DIST give?",
+        verdict=sets
+        and f"{leaders(ranked, f'In {sets}, in the time of one run of DIST')} "
+        + format.ends("Seconds of a run over DIST's", seconds, format.plural(ranked.scenes, "scene")),
         n=made.sample(),
         interval="medians over scenes with intervals of the sign test, 95 %",
         estimates=[*lines["evaluations"].dropna()],
         remarks=[
             *PROGRESS,
-            f"Seconds are of runs on a machine that was not loaded, which only {sets or 'no set'} has. The field "
-            f"evaluations beside them are of the same runs. Engines: {', '.join(sorted({*made.whole['kernels']}))}.",
+            f"All renderers were timed on a machine that was not loaded only in {sets or 'no set'}; field evaluations "
+            f"and seconds there are of the same runs. Their engine: {', '.join(pairs['kernels'].unique()) or 'none'}.",
+            f"In the time of one run of DIST {len(ranked.better)} of {ranked.pairs} pairs differ significantly.",
+            "Tuned: with the setting of conf/tuned.yaml, chosen on validation shapes, and its loss of the mask, which "
+            "may be another one. The two are not separated.",
         ],
         columns=[
             *(table.text("set", "Set"), table.text("row", "Renderer")),
-            *(table.Column(name, HEADINGS[name], show=percent) for name in BUDGETS),
+            *(table.Column(name, HEADINGS[name], show=percent) for name in (*BUDGETS, AT_SECONDS)),
             *_interval("evaluations", "Field evaluations of a run, DIST = 1"),
             *_interval("seconds", "Seconds of a run, DIST = 1"),
             *(table.Column("scenes", "Scenes", show=table.whole), table.PRESET),
@@ -169,7 +180,11 @@ def _columns() -> list[table.Column]:
     def words(line: dict[str, Any], outcome: str) -> str:
         return f"{percent(line.get(outcome))} ({line[f'{outcome}_rank']})"
 
-    progress = (table.Column(name, heading, words=partial(words, outcome=name)) for name, heading in HEADINGS.items())
+    progress = (
+        table.Column(name, heading, words=partial(words, outcome=name))
+        for name, heading in HEADINGS.items()
+        if name in OUTCOMES
+    )
     return [
         *(table.text("row", "Renderer"), *progress, *(table.text(f"{name}_rank") for name in OUTCOMES)),
         *(table.Column("cost", "Cost of a run"), table.Column("wrong", "Wrong pixels", show=table.small_percent)),
@@ -187,19 +202,21 @@ def verdict(made: Standing) -> str:
     return " ".join([leaders(made.rankings[AT_1]), at_end(made), failures(made)])
 
 
-def leaders(ranked: Ranking) -> str:
+def leaders(ranked: Ranking, when: str = "At the cost of one run of DIST") -> str:
     """The rows that none is significantly better than, if they are better than all others; else the first row."""
-    beaten, at = {second for _, second in ranked.better}, "At the cost of one run of DIST"
+    if not ranked.decidable:
+        return f"{when}: {format.plural(ranked.scenes, 'scene')} cannot decide."
+    beaten = {second for _, second in ranked.better}
     first, others = ([row for row in ranked.progress if (row in beaten) == is_beaten] for is_beaten in (False, True))
     names = [f"{row} (*{percent(ranked.progress[row])}*)" for row in first]
     if others and all((row, other) in ranked.better for row in first for other in others):
         more = f"significantly more progress than the {format.plural(len(others), 'other')}"
         if len(first) == 1:
-            return f"{at}, {names[0]} makes {more}."
-        return f"{at}, {', '.join(names[:-1])} and {names[-1]} make {more}, and cannot be distinguished."
+            return f"{when}, {names[0]} makes {more}."
+        return f"{when}, {', '.join(names[:-1])} and {names[-1]} make {more}, and cannot be distinguished."
     behind = ", ".join(row for row in ranked.progress if (first[0], row) in ranked.better)
     than = f"significantly more than {behind}" if behind else "and cannot be distinguished from any other"
-    return f"{at}, {names[0]} makes the most progress, {than}."
+    return f"{when}, {names[0]} makes the most progress, {than}."
 
 
 def at_end(made: Standing) -> str:
@@ -247,13 +264,6 @@ def _notes(made: Standing) -> list[str]:
         rest = {name: ranking(runs[runs["set"] != of_set], name) for name in (AT_1, END)}
         orders = [f"{HEADINGS[name].lower()} {'; '.join(of.progress)} ({len(of.better)})" for name, of in rest.items()]
         notes.append(f"The order without {of_set} (pairs that differ): {'. '.join(orders)}.")
-    if gains := [
-        f"{row} {100 * gain.value:+.0f} {gain.ends(100)}" for row, gain in standing.gains(made.reached).items()
-    ]:
-        notes.append(
-            "Percentage points of progress at the end by the settings of conf/tuned.yaml, chosen on validation shapes: "
-            f"{'; '.join(gains)}. With a setting the loss of the mask may change too; the two are not separated."
-        )
     lacking = made.compared[~made.compared["whole"] & ~made.compared["tuned"]].groupby("row")["missing"].first()
     versions, machines, loaded = (
         runs["code"].nunique(),

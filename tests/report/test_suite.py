@@ -30,6 +30,7 @@ from bench.report.suite.standing import (
     AREA,
     AT_1,
     AT_10,
+    AT_SECONDS,
     END,
     Ranking,
     bounds,
@@ -37,10 +38,10 @@ from bench.report.suite.standing import (
     compared,
     costs,
     frame_of,
-    gains,
     ranking,
     reached,
     sparse,
+    timed,
     wrong_pixels,
 )
 from bench.studies import suite as study
@@ -298,7 +299,8 @@ def test_seconds_are_compared_on_one_machine_and_field_evaluations_of_the_same_r
     whole = made([("Dist", 0.01, 100.0), ("Mine", 0.01, 200.0)])
 
     def cost(of: list[Attempt]) -> tuple[float, float | None, int]:
-        line = costs(judged(of), frame_of(of)).loc["complete", "Mine"]
+        runs = judged(of)
+        line = costs(runs, timed(runs, frame_of(of))).loc["complete", "Mine"]
         return line["evaluations"].value, line["seconds"] and line["seconds"].value, line["scenes"]
 
     unknown = pytest.approx(2), None, 8
@@ -458,18 +460,30 @@ def test_every_set_is_an_experiment_with_each_size():
         assert {*sizes} - {"chosen"} == {*suite().sizes.values()}
 
 
-def test_a_tuned_row_changes_no_comparison_and_its_gain_is_at_the_same_problems():
+def test_progress_in_the_time_of_dist_is_that_at_its_seconds_on_the_same_machine():
+    """A second is 1000 field evaluations of a curve; DIST's run takes one second."""
+    dist = [attempt("Dist", scene, {0: 1.0, 1000: 0.01}) for scene in SCENES]
+    slow = [attempt("Slow", scene, {0: 1.0, 500: 0.5, 900: 0.1, 2000: 0.01}) for scene in SCENES]
+    lost = [replace(one, row="Lost", status="nan", final=inf) for one in slow]
+    few = [attempt("Few", scene, {0: 1.0, 2000: 0.1}) for scene in SCENES]
+    pairs = timed(judged([*dist, *slow, *lost, *few]), frame_of([*dist, *slow, *lost, *few]))
+    means = pairs.groupby("row")[AT_SECONDS].mean()
+    assert means.to_dict() == pytest.approx({"Dist": 1, "Slow": 0.5 + 0.5 * 100 / 1100, "Lost": 0, "Few": 0.25})
+    assert sparse(pairs, AT_SECONDS) == {"Dist", "Few"}  # two checkpoints in that time
+    some = [replace(one, waited=0.3) if one.scene == SCENES[0] and one.row == "Slow" else one for one in [*dist, *slow]]
+    assert {*timed(judged(some), frame_of(some))["scene"]} == {*SCENES[1:]}  # where all rows were timed
+
+
+def test_a_tuned_row_changes_no_comparison_and_has_lines_in_its_sets(tmp_path, monkeypatch):
     stated = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
-    tuned = [
-        attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings="own", preset=row.lower())
-        for row, final in (("Dist", 0.005), ("B", 0.1), ("None", 0.1))
-        for scene in SCENES[:7]
-    ]
+    tuned = [attempt("Dist, tuned", scene, {0: 1.0, 9: 0.005}, settings="own", preset="dist") for scene in SCENES[:7]]
     runs = judged([*stated, *tuned])
     assert ranking(runs, END) == ranking(judged(stated), END) and {*ranking(runs, END).progress} == {"Dist", "B"}
-    found = gains(runs)
-    assert {*found} == {"Dist", "B"} and found["B"].value == pytest.approx(-0.5) and found["Dist"].value > 0.01
     assert {*runs["reference"]} == {0.01}
+    page([*stated, *tuned], tmp_path, monkeypatch)
+    nothing = [None] * (len(study.READS) - 1)
+    lines = study.make_sets(Runs(study.READS[0], tmp_path / "none", []), *nothing).lines
+    assert [line["row"] for line in lines] == ["B", "Dist", "Dist, tuned"] and lines[2][END] == 1
 
 
 def test_a_tuned_setting_is_free_in_its_weights_and_rate_alone(tmp_path):

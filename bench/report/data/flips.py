@@ -36,3 +36,15 @@ def not_rejected(values: np.ndarray, alpha: float) -> tuple[float, float]:
             kept, lost = (mean, lost) if chance > alpha else (kept, mean)
         ends.append(float(kept))
     return ends[0], ends[1]
+
+
+def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
+    """The ends of the means of all columns of values [units, columns] that are not rejected, at alpha in all.
+
+    None where there are too few units to reject any mean, or no column.
+    """
+    units, columns = values.shape
+    if not columns or 2 / 2**units > alpha / columns:
+        return None
+    low, high = zip(*(not_rejected(column, alpha / columns) for column in values.T), strict=True)
+    return min(low), max(high)

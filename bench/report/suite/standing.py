@@ -21,6 +21,7 @@ from bench.tables import choice
 
 UNIT = "dist"  # the preset of the row by whose costs all costs are divided
 AT_1, AT_10, END, AREA = OUTCOMES = ("at_1", "at_10", "end", "area")
+AT_SECONDS = "at_seconds"  # of one run of DIST
 BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # the costs at which progress is read
 AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # over whose logarithm progress is averaged
 FEWEST_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
@@ -134,7 +135,8 @@ def reached(runs: pd.DataFrame) -> pd.DataFrame:
         for name, budget in BUDGETS.items():
             within = int((costs <= budget).sum())
             line[name] = np.interp(min(budget, costs[-1]), costs, progress)
-            line[f"{name}_checkpoints"] = within if run.ok else FEWEST_CHECKPOINTS  # a failed run has made no progress
+            measured = budget == inf or not run.ok  # the end is known, and so is the progress of a failed run
+            line[f"{name}_checkpoints"] = FEWEST_CHECKPOINTS if measured else within
             line[f"{name}_next"] = max(line[name], progress[min(within, len(costs) - 1)])
         lines.append(line)
     columns = [*OUTCOMES, *(f"{name}_{what}" for name in BUDGETS for what in ("checkpoints", "next"))]
@@ -198,63 +200,62 @@ def by_scene(runs: pd.DataFrame, outcome: str) -> pd.DataFrame:
 
 
 def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
-    """The bounds of all rows' final errors over DIST's in a set: the ratios that flipped signs do not reject.
+    """The bounds of the final errors of all rows over DIST's in a set, without rows that failed in most problems.
 
-    They are of geometric means over scenes and simultaneous at 95 %, without rows that failed in most problems. None
-    where the set has too few scenes for bounds.
+    They are of geometric means over scenes, see `flips.bounds`; None where the set has too few scenes for them.
     """
     runs = runs[(runs["set"] == of_set) & runs["whole"]]
     runs = runs[runs.groupby("row")["ok"].transform("mean") >= 0.5]
     errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=LEAST_ERROR))
     table = errors.groupby([runs["scene"], runs["row"]]).mean().unstack("row")
     ratios = table.drop(columns=unit_row(runs), errors="ignore").sub(table.get(unit_row(runs)), axis=0)
-    alpha = ALPHA / max(ratios.shape[1], 1)
-    if ratios.empty or 2 / 2 ** len(ratios) > alpha:
-        return None
-    low, high = zip(*(flips.not_rejected(ratios[row].to_numpy(), alpha) for row in ratios), strict=True)
-    return float(np.exp(min(low))), float(np.exp(max(high)))
+    ends = flips.bounds(ratios.to_numpy(), ALPHA)
+    return ends and (float(np.exp(ends[0])), float(np.exp(ends[1])))
 
 
-def costs(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
+def timed(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
+    """The attempts of `reached` at problems at which all whole rows were timed on a machine that timed DIST's run too.
+
+    Returns:
+        Their lines, where `unit` and `unit_seconds` are of DIST's newest run on that machine, with the engine of the
+        newest of all. `at_seconds` is the progress at DIST's seconds, `at_seconds_checkpoints` as in `reached`.
+    """
+    units = everything[(everything["row"] == unit_row(runs)) & everything["timed"] & everything["ok"]]
+    units = units[units["kernels"].isin(units["kernels"].iloc[-1:])].drop_duplicates([*KEY, "machine"], keep="last")
+    units = units[[*KEY, "machine", "cost", "seconds"]].rename(columns={"cost": "unit", "seconds": "unit_seconds"})
+    pairs = runs[runs["whole"] & runs["timed"]].drop(columns="unit").merge(units, on=[*KEY, "machine"])
+    rows = pairs.groupby(KEY)["row"].transform("nunique")
+    pairs, lines = pairs[rows == runs.loc[runs["whole"], "row"].nunique()].reset_index(drop=True), []
+    for run in pairs.itertuples():
+        seconds, progress = np.array(run.curve)[:, 1] if run.ok else np.zeros(1), course(run)[1]
+        count = (seconds <= run.unit_seconds).sum() if run.ok else FEWEST_CHECKPOINTS
+        lines.append((np.interp(run.unit_seconds, seconds, progress), count))
+    return pairs.join(pd.DataFrame(lines, pairs.index, [AT_SECONDS, f"{AT_SECONDS}_checkpoints"], dtype=float))
+
+
+def costs(runs: pd.DataFrame, pairs: pd.DataFrame) -> pd.DataFrame:
     """The costs of whole runs that ended ok over DIST's at the same problems.
+
+    Args:
+        pairs: as of `timed`.
 
     Returns:
         Of each set and row, the index, the medians over scenes of the ratios of `evaluations` and of `seconds`, and the
-        number of `scenes`. Both ratios are of the same pairs of runs, timed on one machine with the engine that DIST's
-        newest run has. Where these have too few scenes, there are no seconds, and the evaluations are of all pairs.
+        number of `scenes`. Both are of the timed pairs; where these have too few scenes, there are no seconds, and the
+        evaluations are of all runs.
     """
-    sound, unit, lines = runs[runs["judged"] & runs["ok"] & (runs["cost"] > 0)], unit_row(runs), []
-    timed = everything[(everything["row"] == unit) & everything["timed"] & everything["ok"]]
-    timed = timed[timed["kernels"].isin(timed["kernels"].iloc[-1:])]
-    newest = timed.drop_duplicates([*KEY, "machine"], keep="last")
-    for key, own in sound.groupby(["set", "row"]):
-        pairs = own[own["timed"]].merge(newest, on=[*KEY, "scene", "machine"])
-        enough = pairs["scene"].nunique() >= statistics.FEWEST_SHAPES
-        pairs = pairs if enough else own.merge(sound[sound["row"] == unit], on=[*KEY, "scene"])
-        evaluations, seconds = (
-            _ratio(pairs, "cost") if len(pairs) else None,
-            _ratio(pairs, "seconds") if enough else None,
-        )
-        lines.append([*key, evaluations, seconds, pairs["scene"].nunique()])
+    scenes, lines = pairs.groupby("set")["scene"].nunique(), []
+    enough = scenes.index[scenes >= statistics.FEWEST_SHAPES]
+    chosen = pd.concat([runs[~runs["set"].isin(enough)], pairs[pairs["set"].isin(enough)]])
+    for key, own in chosen[chosen["ok"] & (chosen["cost"] > 0) & (chosen["unit"] > 0)].groupby(["set", "row"]):
+        seconds = _ratio(own, "seconds", "unit_seconds") if key[0] in enough else None
+        lines.append([*key, _ratio(own, "cost", "unit"), seconds, own["scene"].nunique()])
     return pd.DataFrame(lines, columns=["set", "row", "evaluations", "seconds", "scenes"]).set_index(["set", "row"])
 
 
-def _ratio(pairs: pd.DataFrame, column: str) -> Interval:
-    groups = [group for _, group in pairs.groupby("scene")]
-    first, second = ([group[f"{column}_{end}"].to_numpy(float) for group in groups] for end in "xy")
-    return statistics.ratio(first, second)
-
-
-def gains(runs: pd.DataFrame) -> dict[str, Interval]:
-    """Of each tuned row the progress at the end less that of its renderer at the set's setting, at the same problems.
-
-    The mean over problems, with the bootstrap's interval over scenes.
-    """
-    stated, tuned = runs[~runs["tuned"]], runs[runs["tuned"]]
-    pairs = tuned.assign(row=tuned["row"].str.removesuffix(BY_ITSELF)).merge(stated, on=[*KEY, "row", "scene"])
-    pairs["gain"] = pairs[f"{END}_x"] - pairs[f"{END}_y"]
-    scenes = {row: [group["gain"].to_numpy() for _, group in own.groupby("scene")] for row, own in pairs.groupby("row")}
-    return {row: statistics.bootstrap(own, lambda drawn: np.mean(drawn, axis=-1)) for row, own in scenes.items()}
+def _ratio(runs: pd.DataFrame, *columns: str) -> Interval:
+    groups = [group for _, group in runs.groupby("scene")]
+    return statistics.ratio(*([group[name].to_numpy(float) for group in groups] for name in columns))
 
 
 def wrong_pixels(runs: pd.DataFrame) -> pd.Series:
