@@ -1,13 +1,13 @@
 """`python -m bench.suite`: the suite, every renderer on the same problems; what has been run is not run again.
 
     python -m bench.suite                                       the quick size, all renderers that the suite lists
-    python -m bench.suite renderer=newton                       one, beside the results that are shipped
+    python -m bench.suite renderer=newton                       one, with the shipped results
     python -m bench.suite renderer=custom renderer._target_=mypkg.Mine label=Mine       your own
     python -m bench.suite suite=core hydra/launcher=slurm       the large size, on a cluster
     python -m bench.suite set=pose,complete                     some sets of problems
     python -m bench.suite setting=tuned renderer=newton         at its own setting of conf/tuned.yaml, as a second row
     python -m bench.suite plan=true                             what would run, and for how long
-    python -m bench.suite verify=3                              three of the results, drawn anew: which agree
+    python -m bench.suite verify=3                              runs three of the results again: do they agree?
 
 Any other KEY=VALUE is that of `python -m bench`.
 """
@@ -22,12 +22,9 @@ from math import isclose
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from bench.records.format import MISSING, number, plural
 from bench.records.read import RESULTS, read_records
 from bench.records.record import read_record
-from bench.report.suite import standing
 from bench.report.suite.attempts import (
     BY_ITSELF,
     EXPERIMENT,
@@ -43,6 +40,7 @@ from bench.report.suite.attempts import (
     suite,
     write_attempts,
 )
+from bench.report.suite.standing import BUDGETS, KEY, Standing
 from bench.report.write import paper
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -90,6 +88,8 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
             own[key] = value
         elif re.match(FIXED, key) and key not in [given for given, _ in GIVEN.values()]:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
+        elif key == "label" and (value in shipped_rows() or value.endswith(BY_ITSELF)):
+            raise ValueError(f"label={value} is the name of a shipped row, or ends in '{BY_ITSELF}': type another one")
         elif "=" in argument:
             passed.append(argument)
         else:
@@ -101,6 +101,11 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     if not own.get("verify", "1").isdecimal() or own.get("verify") == "0":
         raise ValueError(f"verify must be a number of results, such as verify=3, not {own['verify']!r}")
     return own, passed
+
+
+def shipped_rows() -> set[str]:
+    """The names of the rows that are shipped."""
+    return {attempt.row for attempt in read_attempts(paper.SHIPPED)[0]}
 
 
 def _sweeps(own: dict[str, str], passed: list[str]) -> list[tuple[str, list[str]]]:
@@ -171,44 +176,38 @@ def show(results_dir: Path) -> int:
     gathered = gather(paper.SHIPPED, results_dir)
     for problem in gathered.problems:
         print(f"not read: {problem}", file=sys.stderr)
-    runs = standing.reached(standing.compared(standing.frame_of(gathered.everything), gathered.size))
-    mine = {attempt.row for attempt in gathered.local}
+    mine, standing = {attempt.row for attempt in gathered.local}, Standing(gathered)
     print(f"{plural(len(gathered.local), 'run')} of {results_dir}, in rows with a star; the others are shipped.")
-    _print_standing(runs, mine)
-    problems = runs[standing.KEY].drop_duplicates()
-    if len(problems) <= FEW_PROBLEMS:
-        _print_errors(runs, mine)
+    _print_rows(standing, mine)
+    if standing.whole["problem"].nunique() <= FEW_PROBLEMS:
+        _print_errors(standing, mine)
     print(*(path.with_suffix(".png") for path in written if path.with_suffix(".png").is_file()), index, sep="\n")
     return 0
 
 
-def _print_standing(runs: pd.DataFrame, mine: set[str]) -> None:
-    """The progress and the ranks of each row, and what its runs cost."""
-    names = {standing.AT_1: "at the cost of DIST", standing.AT_10: "at 10 times", standing.END: "at the end"}
-    rankings = {name: standing.ranking(runs, name) for name in names}
-    hidden = {name: standing.sparse(runs, name) for name in names}
-    problems = plural(len(runs[standing.KEY].drop_duplicates()), "problem")
-    print(
-        f"Progress on {problems} {', '.join(names.values())}, with possible ranks; cost of a run, DIST = 1; failed runs"
-    )
-    for row in rankings[standing.AT_1].progress:
-        own, cells = runs[runs["row"] == row], []
-        for name, ranked in rankings.items():
-            value = MISSING if row in hidden[name] else percent(ranked.progress[row])
-            cells.append(f"{value:>5} {'(' + '-'.join(map(str, ranked.rank(row))) + ')':<7}")
-        cost, failed = number(float((own["cost"] / own["unit"]).median())), (~own["ok"]).sum()
-        print(f"{row + (' *' if row in mine else ''):<28} {' '.join(cells)} {cost:>7} {failed:>3}")
-    for row, missing in runs[~runs["whole"] & ~runs["tuned"]].groupby("row")["missing"].first().items():
-        print(f"{row} lacks {plural(missing, 'problem')}, so it is not compared; the same command makes them.")
+def _print_rows(standing: Standing, mine: set[str]) -> None:
+    """The progress and the possible ranks of each row at each cost, what its runs cost, and how many failed."""
+    every = plural(len(standing.everything[KEY].drop_duplicates()), "problem")
+    count = plural(len(standing.whole[KEY].drop_duplicates()), "problem")
+    print(f"progress on the {count} that all rows have, of {every} with results; with possible ranks:")
+    print(f"{'renderer':<28} {'at 1 x':<14}{'at 10 x':<14}{'at the end':<14} cost, DIST = 1  failed runs")
+    for row in standing.rows:
+        values = {name: standing.rankings[name].progress[row] for name in BUDGETS}
+        shown = {name: MISSING if row in standing.hidden[name] else percent(value) for name, value in values.items()}
+        cells = "".join(f"{f'{shown[name]:>5} ({standing.rankings[name].rank(row)})':<14}" for name in BUDGETS)
+        failed = (~standing.whole.loc[standing.whole["row"] == row, "ok"]).sum()
+        print(f"{row + (' *' if row in mine else ''):<28} {cells} {number(standing.costs[row]):>14}  {failed:>11}")
+    for row, missing in standing.lacking.items():
+        print(f"{row} lacks {plural(missing, 'problem')}, so it is not compared: run the suite for it without set=.")
 
 
-def _print_errors(runs: pd.DataFrame, mine: set[str]) -> None:
+def _print_errors(standing: Standing, mine: set[str]) -> None:
     """The errors of one's own runs, where the problems are few."""
-    best = runs[runs["whole"]].groupby(standing.KEY)["final"].min()
-    for run in runs[runs["row"].isin(mine)].itertuples():
-        errors = f"{number(run.initial)} before, {number(run.final)} after"
-        least = f"{number(best[run.set, run.problem, run.seed])} by the best renderer, {number(run.reference)} possible"
-        print(f"{run.row}, {run.set}, {run.problem}: error {errors}; {least}")
+    best = standing.whole.groupby(KEY)["final"].min()
+    for run in standing.reached[standing.reached["row"].isin(mine)].itertuples():
+        errors = f"initial error {number(run.initial)}, final error {number(run.final)}"
+        least = f"best renderer {number(best.get((run.set, run.problem, run.seed)))}"
+        print(f"{run.row}, {run.set}, {run.problem}: {errors}; {least}, best possible {number(run.reference)}")
 
 
 def verify(results_dir: Path, count: int) -> int:

@@ -104,5 +104,6 @@ def _opened(path: Path, image: bytes | Path) -> Any:
     try:
         with Image.open(BytesIO(image) if isinstance(image, bytes) else path.parent / image) as stored:
             return stored.convert("RGBA")
-    except (OSError, ValueError, SyntaxError) as error:  # the last of a damaged PNG
-        raise BadInput(f"an image of mesh file '{path}' cannot be read: {error}") from None
+    except (OSError, ValueError, SyntaxError) as error:  # PIL raises SyntaxError for a damaged PNG
+        name = "inside it" if isinstance(image, bytes) else f"'{image}'"
+        raise BadInput(f"image {name} of mesh file '{path}' cannot be read ({error}): save it again as PNG") from None

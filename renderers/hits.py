@@ -89,9 +89,9 @@ class Hits:
             return ""
         middle = float((value / slope)[off].nanmedian())
         return (
-            f"{self.name}: {count:,} of {len(index):,} hits are not on the surface: at origin + distance * direction "
-            f"they are {middle:.2g} scene units off in the median, and {NEAR:g} more than the residual is allowed: "
-            "return the distance along the unit direction, in scene units"
+            f"{self.name}: {count:,} of {len(index):,} hits are not on the surface at origin + distance * direction. "
+            f"Their median distance from it is {middle:.2g} scene units, and {NEAR:g} beyond the residual is allowed. "
+            "Return the distance along the unit direction, in scene units"
         )
 
     def _at(self, index: Int[Tensor, " m"]) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:

@@ -185,8 +185,8 @@ def differing(metrics: dict[str, Any]) -> tuple[str, ...]:
         return ()
     return (
         f"the depth error of the renderer's own image is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene "
-        "units: the renderer does not show the surface of the field, and the contract test of CONTRIBUTING.md checks "
-        "its hits",
+        "units. The renderer does not show the surface of the field; the contract test of CONTRIBUTING.md checks its "
+        "hits",
     )
 
 

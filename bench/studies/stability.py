@@ -305,7 +305,7 @@ def _alike(ranks: dict[str, statistics.Interval]) -> str:
     found = statistics.as_good(ranks, best)
     if not found:
         return f"All others differ from {best} by the interval of the difference of ranks."
-    listed = f"*{len(found)}* of the {len(ranks) - 1} others ({', '.join(found)})"
+    listed = f"*{len(found)}* of the {len(ranks) - 1} others ({'; '.join(found)})"
     return f"By the interval of the difference of ranks, {listed} cannot be distinguished from {best}."
 
 

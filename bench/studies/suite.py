@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 
 from bench.report.data.runs import together
+from bench.report.data.statistics import ALPHA
 from bench.report.study import Result, Runs, Selection, chart, format, table
 from bench.report.suite import standing
 from bench.report.suite.attempts import EXPERIMENT, GIVEN, gather, place, suite
-from bench.report.suite.standing import AREA, AT_1, AT_10, AT_SECONDS, BUDGETS, END, OUTCOMES, Ranking, ranking
+from bench.report.suite.standing import AREA, AT_1, AT_10, AT_SECONDS, BUDGETS, END, OUTCOMES, Ranking, Standing
 from bench.report.write import paper
 from bench.report.write.table import percent
 
@@ -27,86 +28,31 @@ HEADINGS = {
 }
 COST = "field evaluations, DIST's run = 1"
 LEAST_COST, POINTS = 0.05, 80  # of a line of the chart
-WIDEST_BOUNDS = 1.25  # bounds on ratios of errors that lie further off say little
 PROGRESS = (
-    "Progress: 1 - log(error / best possible) / log(initial error / best possible), from 0 to 100 %. Each set weighs "
-    "the same. A failed run has made none.",
-    "Costs are field evaluations over those of DIST's whole run at the same problem; a gradient counts as two. No run "
-    "had such a cost as its budget: progress within a longer run is interpolated between checkpoints.",
+    "Progress: 1 - log(error / best possible) / log(initial error / best possible), cut at 0 and 100 %. Each set "
+    "weighs the same. A failed run has made none.",
+    "Costs are field evaluations over those of DIST's whole run at the same problem; a gradient counts as two. "
+    "Progress at a cost is interpolated between the checkpoints of a run that may be longer, or is that of its end. A "
+    "run ends after its set's iterations, or at its set's cap of costs.",
+    "The best possible error is that of the prior's fit to the truth (complete, multiview), 0.1 degrees (pose), or the "
+    "best result of the shipped renderers themselves (reconstruct).",
 )
-NOTES = (
-    *PROGRESS,
-    "Best possible error: of complete and multiview the prior's fit to the truth, of pose 0.1 degrees. Of reconstruct "
-    "it is the best result of these renderers themselves.",
-    "Wrong pixels: of renderings of the prior's networks, over the object's pixels: missed, spurious, or 0.02 scene "
-    "units off in depth. They are no part of progress. All runs are on a CPU, with small networks and images.",
+WRONG_PIXELS = (
+    "Wrong pixels are missed, spurious, or more than 0.02 scene units off in depth, over the object's pixels, of the "
+    "prior's networks. They are no part of progress. All runs are on a CPU, with small networks and images."
 )
-
-
-class Standing:
-    """What both pages are made of: the attempts, the compared ones, their progress, and the rankings by it."""
-
-    def __init__(self, runs: Runs) -> None:
-        self.gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
-        self.everything = standing.frame_of(self.gathered.everything)
-        self.compared = standing.compared(self.everything, self.gathered.size)
-        self.reached = standing.reached(self.compared)
-        self.rankings = {outcome: ranking(self.reached, outcome) for outcome in OUTCOMES}
-        self.whole = self.reached[self.reached["whole"]]
-        self.rows = [*self.rankings[AT_1].progress]
-        self.sets = [name for name in suite().errors if name in {*self.whole["set"]}]
-
-    def sample(self) -> str:
-        """The numbers of problems, scenes, seeds, renderers and failures, for captions."""
-        problems = format.plural(len(self.whole.groupby(["set", "problem"])), "problem")
-        scenes, seeds = (format.plural(self.whole[name].nunique(), name) for name in ("scene", "seed"))
-        failed, runs = (~self.whole["ok"]).sum(), format.plural(len(self.whole), "run")
-        renderers = format.plural(len(self.rows), "renderer")
-        return f"{problems} ({scenes}, {seeds}) of {suite().id}, {renderers}; {failed or 'none'} of {runs} failed"
-
-    def lines(self) -> list[dict[str, Any]]:
-        """What the table has of each row."""
-        wrong, lines = standing.wrong_pixels(self.compared), []
-        hidden = {name: standing.sparse(self.whole, name) for name in BUDGETS}
-        for row in self.rows:
-            own, line = self.whole[self.whole["row"] == row], dict[str, Any]()
-            for name, ranked in self.rankings.items():
-                line[f"{name}_rank"] = "–".join(dict.fromkeys(map(str, ranked.rank(row))))
-                line[name] = None if row in hidden.get(name, ()) else ranked.progress[row]
-            failed = own[~own["ok"]].groupby(["set", "status"]).size()
-            counts = [f"{n} of {(own['set'] == of).sum()} {of} ({status})" for (of, status), n in failed.items()]
-            line |= {"row": row, "preset": own["preset"].iloc[0], "wrong": wrong.get(row)}
-            lines.append(line | {"cost": (own["cost"] / own["unit"]).median(), "failed": ", ".join(counts)})
-        return lines
-
-    def panel(self, of_set: str | None) -> chart.Panel:
-        """The progress of each row over its cost, in one set or in all."""
-        runs = self.whole if of_set is None else self.whole[self.whole["set"] == of_set]
-        lines = [line for row in self.rows if (line := _line(runs[(runs["row"] == row) & (runs["unit"] > 0)]))]
-        title = f"{of_set or 'Progress over cost, all sets'}, {format.plural(runs['scene'].nunique(), 'scene')}"
-        panel = chart.panel_data(title, COST, "progress", lines)
-        panel["x"]["log"], panel["y"]["log"] = True, False
-        return panel
-
-
-def _line(runs: pd.DataFrame) -> chart.Series | None:
-    """The mean progress of a row's runs, to the median of their costs; none of runs that cost nothing."""
-    end = float((runs["cost"] / runs["unit"]).median()) if len(runs) else 0.0
-    if not end:
-        return None
-    costs = np.geomspace(min(LEAST_COST, end), end, POINTS)
-    courses = pd.Series([np.interp(costs, *standing.course(run)) for run in runs.itertuples()], runs.index)
-    mean = np.mean([np.mean([*group], axis=0) for _, group in courses.groupby(runs["set"])], axis=0)
-    mean[-1] = runs.groupby("set")[END].mean().mean()
-    return chart.curve(runs["row"].iloc[0], runs["preset"].iloc[0], costs, mean, symbol="")
 
 
 def make(*several: Runs | None) -> Result:
     """The chart of all sets and of each, and a line per row."""
     runs = together(*several)
-    made = Standing(runs)
-    panels = [made.panel(name) for name in (None, *made.sets)]
-    ranks = {HEADINGS[name]: {row: made.rankings[name].rank(row) for row in made.rows} for name in BUDGETS}
+    gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
+    made = Standing(gathered)
+    panels = [_panel(made, name) for name in (None, *made.sets)]
+    ranks = {
+        HEADINGS[name].removeprefix("At "): {row: made.rankings[name].rank(row) for row in made.rows}
+        for name in BUDGETS
+    }
     return Result(
         replace(runs, records=[], left_out=0),  # what is kept counts, with or without its run
         "The suite.",
@@ -114,11 +60,17 @@ def make(*several: Runs | None) -> Result:
         "can have (in brackets). A cross: all runs failed.",
         question="Which renderer makes the most progress, and at what cost?",
         verdict=verdict(made),
-        n=made.sample(),
+        n=_sample(made),
         interval="ranks simultaneous at 95 % (flipped signs of scenes' differences, Holm's correction over all pairs)",
-        remarks=[*NOTES, *_notes(made), *(f"Not read: {problem}" for problem in made.gathered.problems)],
-        columns=_columns(),
-        lines=made.lines(),
+        remarks=[*PROGRESS, WRONG_PIXELS, *_notes(made), *(f"Not read: {problem}" for problem in gathered.problems)],
+        columns=[
+            table.text("row", "Renderer"),
+            *(table.Column(name, HEADINGS[name], words=partial(_progress, name=name)) for name in OUTCOMES),
+            *(table.text(f"{name}_rank") for name in OUTCOMES),
+            *(table.Column("cost", "Cost of a run"), table.Column("wrong", "Wrong pixels", show=table.small_percent)),
+            *(table.text("failed", "Failed"), table.PRESET),
+        ],
+        lines=_lines(made),
         figure=chart.draw_lead(panels, ranks),
         chart={"panels": panels},
     )
@@ -127,19 +79,21 @@ def make(*several: Runs | None) -> Result:
 def make_sets(*several: Runs | None) -> Result:
     """A line per set and row, with what a whole run costs over DIST's; tuned rows too."""
     runs = together(*several)
-    made = Standing(runs)
+    made = Standing(gather(paper.SHIPPED, runs.results_dir, runs.records))
     reached = made.reached[made.reached["whole"] | made.reached["tuned"]]
     pairs, groups = standing.timed(made.whole, made.everything), reached.groupby(["set", "row"])
     lines = groups[[*BUDGETS]].mean().join(groups["preset"].first()).join(standing.costs(reached, pairs))
     lines = lines.join(pairs.groupby(["set", "row"])[AT_SECONDS].mean())
     for of_set, name in ((of_set, name) for of_set in made.sets for name in (*BUDGETS, AT_SECONDS)):
         measured = pairs if name == AT_SECONDS else reached
-        rows = standing.sparse(measured[measured["set"] == of_set], name)
+        rows = standing.rows_with_few_checkpoints(measured[measured["set"] == of_set], name)
         lines.loc[lines.index.isin([(of_set, row) for row in rows]), name] = np.nan
-    lines = lines.sort_index(key=lambda index: index.map([*made.sets, *made.rows, *reached["row"].unique()].index))
-    lines = lines.reset_index().astype(object).where(lines.reset_index().notna(), None)
-    ranked, sets = ranking(pairs, AT_SECONDS), " and ".join(pairs["set"].unique())
+    order = [*made.sets, *made.rows, *reached["row"].unique()]
+    lines = lines.sort_index(key=lambda names: names.map(order.index)).reset_index()
+    lines = lines.astype(object).where(lines.notna(), None)
+    ranked, sets = standing.ranking(pairs, AT_SECONDS), " and ".join(pairs["set"].unique())
     seconds = {row: cost.value for row, cost in zip(lines["row"], lines["seconds"], strict=True) if cost}
+    scenes = format.plural(ranked.scenes, "scene")
     return Result(
         replace(runs, records=[], left_out=0),
         "The suite, set by set.",
@@ -147,8 +101,8 @@ def make_sets(*several: Runs | None) -> Result:
         question="What does a run of each renderer cost, and what progress does the time of one run of DIST give?",
         verdict=sets
         and f"{leaders(ranked, f'In {sets}, in the time of one run of DIST')} "
-        + format.ends("Seconds of a run over DIST's", seconds, format.plural(ranked.scenes, "scene")),
-        n=made.sample(),
+        + format.ends("Seconds of a run over DIST's", seconds, scenes),
+        n=_sample(made),
         interval="medians over scenes with intervals of the sign test, 95 %",
         estimates=[*lines["evaluations"].dropna()],
         remarks=[
@@ -156,48 +110,76 @@ def make_sets(*several: Runs | None) -> Result:
             f"All renderers were timed on a machine that was not loaded only in {sets or 'no set'}; field evaluations "
             f"and seconds there are of the same runs. Their engine: {', '.join(pairs['kernels'].unique()) or 'none'}.",
             f"In the time of one run of DIST {len(ranked.better)} of {ranked.pairs} pairs differ significantly.",
-            "Tuned: with the setting of conf/tuned.yaml, chosen on validation shapes, and its loss of the mask, which "
-            "may be another one. The two are not separated.",
+            "Tuned: with the setting of conf/tuned.yaml, chosen on validation shapes, and its silhouette loss, which "
+            "may be another one. The two effects are not separated.",
         ],
         columns=[
             *(table.text("set", "Set"), table.text("row", "Renderer")),
             *(table.Column(name, HEADINGS[name], show=percent) for name in (*BUDGETS, AT_SECONDS)),
-            *_interval("evaluations", "Field evaluations of a run, DIST = 1"),
-            *_interval("seconds", "Seconds of a run, DIST = 1"),
+            *table.estimate("evaluations", "Field evaluations of a run, DIST = 1", ends="evaluations_"),
+            *table.estimate("seconds", "Seconds of a run, DIST = 1", ends="seconds_"),
             *(table.Column("scenes", "Scenes", show=table.whole), table.PRESET),
         ],
         lines=lines.to_dict("records"),
     )
 
 
-def _interval(key: str, heading: str) -> tuple[table.Column, ...]:
-    value = table.Column(key, heading, lambda line: line[key] and line[key].value)
-    words = replace(value, words=lambda line: str(line[key] or format.MISSING))
-    return words, *table.ends(key, lambda line: line[key])
+def _lines(made: Standing) -> list[dict[str, Any]]:
+    wrong, lines = standing.wrong_pixels(made.compared), []
+    for row in made.rows:
+        runs = made.whole[made.whole["row"] == row]
+        line = {"row": row, "preset": runs["preset"].iloc[0], "cost": made.costs[row], "wrong": wrong.get(row)}
+        for name, ranked in made.rankings.items():
+            line[f"{name}_rank"] = ranked.rank(row)
+            line[name] = None if row in made.hidden[name] else ranked.progress[row]
+        failed = runs[~runs["ok"]].groupby(["set", "status"]).size()
+        counts = [f"{n} of {(runs['set'] == name).sum()} {name} ({status})" for (name, status), n in failed.items()]
+        lines.append(line | {"failed": ", ".join(counts)})
+    return lines
 
 
-def _columns() -> list[table.Column]:
-    def words(line: dict[str, Any], outcome: str) -> str:
-        return f"{percent(line.get(outcome))} ({line[f'{outcome}_rank']})"
+def _progress(line: dict[str, Any], name: str) -> str:
+    return f"{percent(line[name])} ({line[f'{name}_rank']})"
 
-    progress = (
-        table.Column(name, heading, words=partial(words, outcome=name))
-        for name, heading in HEADINGS.items()
-        if name in OUTCOMES
-    )
-    return [
-        *(table.text("row", "Renderer"), *progress, *(table.text(f"{name}_rank") for name in OUTCOMES)),
-        *(table.Column("cost", "Cost of a run"), table.Column("wrong", "Wrong pixels", show=table.small_percent)),
-        *(table.text("failed", "Failed"), table.PRESET),
-    ]
+
+def _sample(made: Standing) -> str:
+    """The numbers of problems, scenes, seeds, renderers and failures, for captions."""
+    problems = format.plural(len(made.whole.groupby(["set", "problem"])), "problem")
+    scenes, seeds = (format.plural(made.whole[name].nunique(), name) for name in ("scene", "seed"))
+    failed, runs = (~made.whole["ok"]).sum(), format.plural(len(made.whole), "run")
+    renderers = format.plural(len(made.rows), "renderer")
+    return f"{problems} ({scenes}, {seeds}) of {suite().id}, {renderers}; {failed or 'none'} of {runs} failed"
+
+
+def _panel(made: Standing, of_set: str | None) -> chart.Panel:
+    """The progress of each row over its cost, in one set or in all."""
+    runs = made.whole if of_set is None else made.whole[made.whole["set"] == of_set]
+    lines = [line for row in made.rows if (line := _line(runs[(runs["row"] == row) & (runs["unit"] > 0)]))]
+    title = f"{of_set or 'Progress over cost, all sets'}, {format.plural(runs['scene'].nunique(), 'scene')}"
+    panel = chart.panel_data(title, COST, "progress", lines)
+    panel["x"]["log"], panel["y"]["log"] = True, False
+    return panel
+
+
+def _line(runs: pd.DataFrame) -> chart.Series | None:
+    """The mean progress of a row's runs, to the median of their costs; none of runs that cost nothing."""
+    end = float((runs["cost"] / runs["unit"]).median()) if len(runs) else 0.0
+    if not end:
+        return None
+    costs = np.geomspace(min(LEAST_COST, end), end, POINTS)
+    curves = pd.Series([np.interp(costs, *standing.progress_curve(run)) for run in runs.itertuples()], runs.index)
+    mean = np.mean([np.mean([*group], axis=0) for _, group in curves.groupby(runs["set"])], axis=0)
+    mean[-1] = runs.groupby("set")[END].mean().mean()
+    failed = not runs["ok"].any()
+    return chart.curve(runs["row"].iloc[0], runs["preset"].iloc[0], costs, mean, symbol="", failed=failed)
 
 
 def verdict(made: Standing) -> str:
     """The answer by rule: which renderers lead at the cost of one run of DIST, which differ at the end, what failed."""
-    scenes = format.plural(made.rankings[END].scenes, "scene")
     if len(made.rows) < 2:
         return ""
     if not made.rankings[END].decidable:
+        scenes = format.plural(made.rankings[END].scenes, "scene")
         return f"{scenes} cannot decide between {len(made.rows)} renderers, whatever their results. {failures(made)}"
     return " ".join([leaders(made.rankings[AT_1]), at_end(made), failures(made)])
 
@@ -207,75 +189,74 @@ def leaders(ranked: Ranking, when: str = "At the cost of one run of DIST") -> st
     if not ranked.decidable:
         return f"{when}: {format.plural(ranked.scenes, 'scene')} cannot decide."
     beaten = {second for _, second in ranked.better}
-    first, others = ([row for row in ranked.progress if (row in beaten) == is_beaten] for is_beaten in (False, True))
+    first = [row for row in ranked.progress if row not in beaten]
     names = [f"{row} (*{percent(ranked.progress[row])}*)" for row in first]
-    if others and all((row, other) in ranked.better for row in first for other in others):
-        more = f"significantly more progress than the {format.plural(len(others), 'other')}"
+    if beaten and all((row, other) in ranked.better for row in first for other in beaten):
+        more = f"significantly more progress than the {format.plural(len(beaten), 'other')}"
         if len(first) == 1:
             return f"{when}, {names[0]} makes {more}."
-        return f"{when}, {', '.join(names[:-1])} and {names[-1]} make {more}, and cannot be distinguished."
-    behind = ", ".join(row for row in ranked.progress if (first[0], row) in ranked.better)
+        return f"{when}, {', '.join(names[:-1])} and {names[-1]} make {more}. These cannot be distinguished."
+    behind = "; ".join(row for row in ranked.progress if (first[0], row) in ranked.better)
     than = f"significantly more than {behind}" if behind else "and cannot be distinguished from any other"
     return f"{when}, {names[0]} makes the most progress, {than}."
 
 
 def at_end(made: Standing) -> str:
     """How many pairs differ at the end of the runs, and what a run costs."""
-    times = (made.whole["cost"] / made.whole["unit"]).groupby(made.whole["row"]).median()
-    ends = " to ".join(f"*{times[row]:.2g}* ({row})" for row in (times.idxmin(), times.idxmax()))
+    rows = min(made.costs, key=made.costs.__getitem__), max(made.costs, key=made.costs.__getitem__)
     pairs = f"{len(made.rankings[END].better) or 'none'} of {made.rankings[END].pairs} pairs"
-    return f"At the end, {pairs} can be distinguished. A run costs {ends} runs of DIST."
+    costs = " to ".join(f"*{made.costs[row]:.2g}* ({row})" for row in rows)
+    return f"At the end, {pairs} can be distinguished. A run costs {costs} runs of DIST."
 
 
 def failures(made: Standing) -> str:
     """The rows that failed in most problems of a set by name, the other failures as a sum."""
     groups = made.whole.groupby(["row", "set"])["ok"].agg(runs="size", failed=lambda ok: (~ok).sum())
     most = groups[2 * groups["failed"] > groups["runs"]]
-    said = [f"{row} failed in {line.failed} of {line.runs} problems of {name}" for (row, name), line in most.iterrows()]
     failed, runs = (total - most["failed"].sum() for total in (groups["failed"].sum(), len(made.whole)))
-    return (
-        "; ".join(
-            [*said, f"{failed or ('none' if said else 'None')} of {'the other ' if said else ''}{runs} runs failed"]
-        )
-        + "."
-    )
+    if most.empty:
+        return f"{failed or 'None'} of {runs} runs failed."
+    names = [
+        f"{row} failed in {line.failed} of {line.runs} problems of {name}" for (row, name), line in most.iterrows()
+    ]
+    return f"{'; '.join(names)}; {failed or 'none'} of the other {runs} runs failed."
 
 
 def _notes(made: Standing) -> list[str]:
-    """Notes that depend on the runs: rows without a number, the order without each set, tuned rows, machines."""
-    runs, notes, pairs = made.whole, [], {name: len(ranked.better) for name, ranked in made.rankings.items()}
-    if rows := standing.sparse(runs, AT_1):
-        later = ranking(runs.assign(**{AT_1: runs[AT_1].where(~runs["row"].isin(rows), runs[f"{AT_1}_next"])}), AT_1)
+    """Notes that depend on the runs: rows without a number, bounds, the order without each set, machines."""
+    runs, notes = made.whole, []
+    if (rows := made.hidden[AT_1]) and made.rankings[AT_1].decidable:
+        later = runs.assign(**{AT_1: runs[AT_1].where(~runs["row"].isin(rows), runs[f"{AT_1}_next"])})
+        ranked = standing.ranking(later, AT_1)
         notes.append(
             f"A dash: fewer than {standing.FEWEST_CHECKPOINTS} checkpoints lie within that cost in some set, so the "
-            "rank is of interpolated progress. With that of their next checkpoint, which costs more, "
-            f"{len(later.better)} pairs differ at 1 ×, not {pairs[AT_1]}."
+            "ranks rest on interpolated progress. With the progress of the next checkpoint, "
+            f"{len(ranked.better)} pairs differ at 1 ×, not {len(made.rankings[AT_1].better)}. "
+            f"{leaders(ranked, 'Then')}"
         )
-    counts = ", ".join(f"{HEADINGS[name].lower()} {count}" for name, count in pairs.items())
-    notes.append(f"Pairs that differ significantly, of {made.rankings[END].pairs}: {counts}.")
-    for of_set in made.sets:
-        low, high = standing.bounds(runs, of_set) or (0.0, np.inf)
-        if max(1 / max(low, 1e-9), high) <= WIDEST_BOUNDS:
-            within = f"{low:.2f} to {high:.2f} times the error of DIST"
+    counts = ", ".join(f"{len(ranked.better)} ({HEADINGS[name].lower()})" for name, ranked in made.rankings.items())
+    end = made.rankings[END]
+    least = f"{end.least_p:.2g}, and {ALPHA / max(end.pairs, 1):.2g} is the first step of the correction"
+    notes.append(f"Significantly different pairs, of {end.pairs}: {counts}. The least p at the end is {least}.")
+    for name in made.sets:
+        if ends := standing.bounds(runs, name):
             notes.append(
-                f"All errors in {of_set} lie at the end within {within} (flipped signs, simultaneous at 95 %)."
+                f"In {name}, every renderer's mean final error is {ends[0]:.2f} to {ends[1]:.2f} times that of DIST "
+                "(geometric means over scenes, simultaneous 95 % intervals by flipped signs)."
             )
-    for of_set in made.sets if len(made.sets) > 1 else ():
-        rest = {name: ranking(runs[runs["set"] != of_set], name) for name in (AT_1, END)}
-        orders = [f"{HEADINGS[name].lower()} {'; '.join(of.progress)} ({len(of.better)})" for name, of in rest.items()]
-        notes.append(f"The order without {of_set} (pairs that differ): {'. '.join(orders)}.")
-    lacking = made.compared[~made.compared["whole"] & ~made.compared["tuned"]].groupby("row")["missing"].first()
-    versions, machines, loaded = (
-        runs["code"].nunique(),
-        runs.loc[runs["cpu"] != "", "machine"].nunique(),
-        (~runs["timed"]).sum(),
-    )
-    possible = {
-        f"Not compared, since problems lack: {', '.join(f'{row} ({n})' for row, n in lacking.items())}.": len(lacking),
-        f"Runs of {versions} versions of the code and of {machines} machines.": versions * machines > 1,
-        f"Seconds of {loaded} of {len(runs)} runs are left out: the machine was loaded.": loaded,
-    }
-    return [*notes, *(text for text, holds in possible.items() if holds)]
+    for name in made.sets if len(made.sets) > 1 else ():
+        first, end = (standing.ranking(runs[runs["set"] != name], outcome) for outcome in (AT_1, END))
+        notes.append(
+            f"{leaders(first, f'Without {name}, at 1 ×')} The order is {'; '.join(first.progress)}. At the end it "
+            f"begins with {'; '.join([*end.progress][:3])}; pairs that differ there: {len(end.better)}."
+        )
+    if made.lacking:
+        rows = ", ".join(f"{row} ({format.plural(count, 'problem')})" for row, count in made.lacking.items())
+        notes.append(f"Not compared, because runs are missing: {rows}.")
+    machines, loaded = runs.loc[runs["cpu"] != "", "machine"].nunique(), (~runs["timed"]).sum()
+    code = f"Runs of {format.plural(runs['code'].nunique(), 'version')} of the code, on {machines} machines or engines"
+    notes.append(f"{code}; {loaded} of {len(runs)} were not timed, since the machine was loaded.")
+    return [note.replace("*", "") for note in notes]  # without the marks of numbers in verdicts
 
 
 PAGES = {"suite": make, "suite_sets": make_sets}

@@ -67,7 +67,7 @@ def test_distances_that_are_5_percent_short_are_noted_in_each_kind_of_field(name
     for kind in load("renderer", name).capabilities.needs:
         note = hits_of(WrongHits("short", name), stated(PLATE, kind)).off_surface()
         assert note.startswith("WrongHits.render: ") and "hits are not on the surface" in note, kind
-        assert "return the distance along the unit direction, in scene units" in note
+        assert "Return the distance along the unit direction, in scene units" in note
 
 
 @each("factor", [0.01, 100.0])
@@ -85,9 +85,9 @@ def test_a_note_says_how_many_hits_are_off_by_how_much():
     note = hits.off_surface()
     assert off == pytest.approx(0.08, abs=0.02)
     assert note == (
-        f"WrongHits.render: {count} of {count} hits are not on the surface: at origin + distance * direction they are "
-        f"{off:.2g} scene units off in the median, and 0.02 more than the residual is allowed: return the distance "
-        "along the unit direction, in scene units"
+        f"WrongHits.render: {count} of {count} hits are not on the surface at origin + distance * direction. Their "
+        f"median distance from it is {off:.2g} scene units, and 0.02 beyond the residual is allowed. Return the "
+        "distance along the unit direction, in scene units"
     )
 
 

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from bench import merge
 from bench.records.read import read_records
-from bench.report.data.flips import chances, signs
+from bench.report.data.flips import p_values, signs
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import holm
 from bench.report.suite import attempts, standing
@@ -20,6 +20,7 @@ from bench.report.suite.attempts import (
     Attempt,
     Gathered,
     attempts_of,
+    gather,
     joined,
     place,
     read_attempts,
@@ -33,15 +34,16 @@ from bench.report.suite.standing import (
     AT_SECONDS,
     END,
     Ranking,
+    Standing,
     bounds,
     by_scene,
     compared,
     costs,
     frame_of,
     ranking,
-    reached,
-    sparse,
+    rows_with_few_checkpoints,
     timed,
+    with_progress,
     wrong_pixels,
 )
 from bench.studies import suite as study
@@ -80,11 +82,16 @@ def made(of: list[tuple[str, float, float]], scenes=SCENES) -> list[Attempt]:
 
 def judged(attempts: list[Attempt]) -> pd.DataFrame:
     """The compared attempts with their progress."""
-    return reached(compared(frame_of(attempts)))
+    return with_progress(compared(frame_of(attempts)))
+
+
+def standing_of(attempts: list[Attempt], outcome: str = END) -> Ranking:
+    runs = judged(attempts)
+    return ranking(runs[runs["whole"]], outcome)
 
 
 def progress(attempts: list[Attempt], outcome: str = END) -> dict[str, float]:
-    return ranking(judged(attempts), outcome).progress
+    return standing_of(attempts, outcome).progress
 
 
 def write_completion(results: Path, errors: list[float], **changed) -> Path:
@@ -135,7 +142,7 @@ def test_rows_are_compared_at_the_problems_that_all_whole_rows_have(monkeypatch)
     some = [one for one in whole if one.row != "Mine" or one.key[:3] in least]
     runs = judged([one for one in some if one.row != "Part" or one.scene == SCENES[0]])
     assert {*runs["scene"]} == {*SCENES[:6]} and {*runs.loc[runs["whole"], "row"]} == {"B", "Dist", "Mine"}
-    assert {*runs.loc[runs["row"] == "Part", "missing"]} == {5} and "Part" not in ranking(runs, END).progress
+    assert {*runs.loc[runs["row"] == "Part", "missing"]} == {5}
     assert {*judged(made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]))["scene"]} == {*SCENES}
 
 
@@ -191,13 +198,17 @@ def test_few_checkpoints_within_a_cost_measure_no_progress_there():
     failed = [attempt("Lost", scene, {0: 1.0}, status="nan", final=inf) for scene in SCENES]
     whole = [attempt(row, scene, of) for row, of in (("Dist", steps), ("B", dear)) for scene in SCENES]
     runs = judged([*whole, *failed])
-    assert sparse(runs, AT_1) == {"B"} and sparse(runs, AT_10) == set() and sparse(runs, END) == set()
+    assert (
+        rows_with_few_checkpoints(runs, AT_1) == {"B"}
+        and rows_with_few_checkpoints(runs, AT_10) == set()
+        and rows_with_few_checkpoints(runs, END) == set()
+    )
 
 
 def test_the_chance_of_a_difference_is_that_of_flipped_signs_over_scenes():
-    assert chances(np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])).tolist() == [0.25, 1.0, 1.0]
+    assert p_values(np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])).tolist() == [0.25, 1.0, 1.0]
     assert signs(3).shape == (8, 3) and signs(40).shape == (2**16, 40) and (signs(40)[0] == 1).all()
-    assert chances(np.ones((40, 1))) == 1 / 2**16  # of random signs the first are those of the data
+    assert p_values(np.ones((40, 1))) == 1 / 2**16  # of random signs the first are those of the data
     assert holm(np.array([0.04, 0.01, 0.02])).tolist() == [True, True, True]
     assert holm(np.array([0.04, 0.02, 0.02])).tolist() == [False, False, False]  # 0.05 / 3 is less than 0.02
 
@@ -208,7 +219,7 @@ def test_rows_differ_by_the_correction_over_all_pairs_not_over_the_others_of_a_r
     ten, twelve = (ranking(judged(made(rows, [f"{n}" for n in range(scenes)])), END) for scenes in (10, 12))
     assert 0.05 / 55 < 2 / 2**10 < 0.05 / 10 and ten.better == set() and not ten.decidable
     assert twelve.better == {(row, "Lost") for row, *_ in rows[:-1]} and twelve.decidable
-    assert twelve.rank("Lost") == (11, 11) and twelve.rank("Dist") == (1, 10)
+    assert twelve.rank("Lost") == "11" and twelve.rank("Dist") == "1–10"
 
 
 def test_equal_rows_differ_in_at_most_one_of_twenty_draws():
@@ -241,9 +252,9 @@ def test_bounds_hold_the_ratios_that_flipped_signs_do_not_reject():
     for end, inside in ((low, 1.001), (high, 0.999)):
         values = np.log(2) + noise
         assert (
-            chances((values - np.log(end * inside))[:, None])
+            p_values((values - np.log(end * inside))[:, None])
             > 0.05
-            >= chances((values - np.log(end / inside))[:, None])
+            >= p_values((values - np.log(end / inside))[:, None])
         )
     assert bounds(judged([*dist[:5], *b[:5]]), "complete") is None  # 2 / 2**5 is more than 5 %
     failed = [replace(one, row="Lost", status="nan", final=inf) for one in b]
@@ -262,16 +273,16 @@ def test_a_number_that_is_none_is_not_reached_and_a_changed_renderer_has_another
     assert problems == [] and found.row == "Mine, steps=9" and [error for *_, error in found.curve] == [0.8, inf, 0.2]
 
 
-def page(attempts: list[Attempt], folder: Path, monkeypatch) -> study.Standing:
+def page(attempts: list[Attempt], folder: Path, monkeypatch) -> Standing:
     """What the pages are made of, if these attempts are shipped and there are no others."""
     write_attempts(attempts, folder / "shipped")
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", folder / "shipped")
-    return study.Standing(Runs(study.READS[0], folder / "none", []))
+    return Standing(gather(folder / "shipped", folder / "none"))
 
 
 def test_a_row_that_cost_nothing_has_no_line_and_leaves_the_axis_logarithmic(tmp_path, monkeypatch):
     late = [attempt("Late", scene, {0: 1.0}, status="timeout", final=inf) for scene in SCENES]
-    panel = page([*made([("Dist", 0.01, 100.0)]), *late], tmp_path, monkeypatch).panel(None)
+    panel = study._panel(page([*made([("Dist", 0.01, 100.0)]), *late], tmp_path, monkeypatch), None)
     assert [line["name"] for line in panel["series"]] == ["Dist"] and panel["x"]["log"]
     assert (panel["series"][0]["x"][-1], panel["series"][0]["y"][-1]) == (1, 1)
 
@@ -326,16 +337,16 @@ def test_seconds_are_compared_on_one_machine_and_field_evaluations_of_the_same_r
     [
         (
             "AC AD BC BD",
-            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others, and cannot be",
+            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others. These cannot be",
         ),
         ("AB AC AD", "A (*90 %*) makes significantly more progress than the 3 others."),
-        ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than C, D."),
+        ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than C; D."),
         ("", "A (*90 %*) makes the most progress, and cannot be distinguished from any other."),
     ],
 )
 def test_the_answer_names_who_leads_by_a_rule(better, said):
     pairs = {tuple(pair) for pair in better.split()}
-    ranked = Ranking(dict(zip("ABCD", (0.9, 0.8, 0.7, 0.6), strict=True)), pairs, 6, 16)
+    ranked = Ranking(dict(zip("ABCD", (0.9, 0.8, 0.7, 0.6), strict=True)), pairs, 6, 0.01, 16)
     assert study.leaders(ranked).removeprefix("At the cost of one run of DIST, ").startswith(said)
 
 
@@ -350,12 +361,9 @@ def test_the_answer_says_what_differs_at_the_end_what_failed_and_what_scenes_can
         for one in made(rows[:1])[:3]
     ]
     shown = page([*made(rows), *mixed], tmp_path / "two", monkeypatch)
-    assert "in complete lie at the end within 0.99 to 1.01 times the error of DIST" in " ".join(study._notes(shown))
+    assert "In complete, every renderer's mean final error is 0.99 to 1.01 times that" in " ".join(study._notes(shown))
     assert "none of 1 pairs can be distinguished. A run costs *1* (Dist) to *3* (B)" in study.verdict(shown)
     assert study.verdict(shown).endswith("None of 16 runs failed.")
-    wide = [replace(one, curve=[*one.curve[:2], [2e2, 0.2, 0.002]], final=0.002) for one in mixed]
-    shown = page([*made(rows), *wide], tmp_path / "wide", monkeypatch)
-    assert "All errors" not in " ".join(study._notes(shown))  # bounds from 0.2 on say nothing
     few = [one for one in made(rows) if one.scene in SCENES[:3]]
     assert study.verdict(page(few, tmp_path / "few", monkeypatch)).startswith("3 scenes cannot decide between 2 ")
 
@@ -392,12 +400,13 @@ def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
     assert len(found) == 1 and problems[0].startswith("b.csv")
     with pytest.raises(ValueError, match=r"b\.csv"):  # whose lines would be lost
         write_attempts(found, tmp_path)
-    for wrong in ({"final": -1.0}, {"final": 0.4}, {"set": "none"}, {"status": "fine"}):
+    back = [[0.0, 0.0, 1.0], [5.0, 0.005, 0.6], [4.0, 0.006, 0.5], [5.0, 0.007, 0.5]]
+    for wrong in ({"final": -1.0}, {"final": 0.4}, {"set": "none"}, {"status": "fine"}, {"curve": back}, {"curve": []}):
         write_attempts([replace(found[0], **wrong)], tmp_path / str(wrong))
         assert read_attempts(tmp_path / str(wrong))[0] == []
 
 
-def test_the_largest_size_that_all_rows_of_ones_own_have_is_compared(monkeypatch):
+def test_rows_are_compared_at_the_least_size_where_one_of_ones_own_lacks_more(monkeypatch):
     sizes = {"smoke": SCENES[:1], "quick": SCENES[:4], "core": SCENES}
     keys = {size: {("complete", f"{scene}, 20 points", 0) for scene in scenes} for size, scenes in sizes.items()}
     monkeypatch.setattr("bench.report.suite.attempts.problems_of", keys.get)
@@ -406,10 +415,25 @@ def test_the_largest_size_that_all_rows_of_ones_own_have_is_compared(monkeypatch
         local = [one for row, count in rows for one in made([(row, 0.1, 1.0)], SCENES[:count])]
         return Gathered([], local, []).size
 
-    assert size() == "quick" and size(("A", 8)) == "core" and size(("A", 5)) == "quick" and size(("A", 3)) == "smoke"
-    assert (
-        size(("A", 8), ("B", 1)) == "smoke" and size(("A", 8), ("B, tuned", 1)) == "core" and size(("A", 0)) == "quick"
-    )
+    assert size() == size(("A", 8)) == size(("A", 5)) == size(("A", 8), ("B, tuned", 1)) == "quick"
+    assert size(("A", 3)) == size(("A", 8), ("B", 1)) == "smoke"
+
+
+def test_more_problems_of_ones_own_and_of_dist_leave_the_shipped_rows_compared(monkeypatch):
+    monkeypatch.setattr(standing, "problems_of", lambda _: {("complete", f"{SCENES[0]}, 20 points", 0)})
+    whole = made([("Dist", 0.011, 100.0), ("Mine", 0.01, 100.0)]) + made([("Shipped", 0.02, 100.0)], SCENES[:6])
+    runs = judged(whole)
+    assert {*runs.loc[runs["whole"], "row"]} == {"Dist", "Mine", "Shipped"} and {*runs["scene"]} == {*SCENES[:6]}
+
+
+def test_a_set_in_which_dist_fails_is_measured_by_the_usual_cost():
+    lost = [
+        replace(one, status="nan", final=inf) if one.row == "Dist" else one
+        for one in made([("Dist", 0.01, 9.0), ("B", 0.01, 100.0)])
+    ]
+    assert progress(lost, AT_1) == {"B": 1.0, "Dist": 0.0}
+    exact = [attempt("Dist", scene, {0: 1.0, 5: 0.0}) for scene in SCENES]
+    assert progress(exact) == {"Dist": 1.0}  # a reference of 0 has no logarithm
 
 
 def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alone(tmp_path, monkeypatch, capsys):
@@ -425,8 +449,14 @@ def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alon
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
     assert show(own) == 0
     said = capsys.readouterr().out
-    assert "Progress on 1 problem at the cost" in said and "Mine * " in said and "Dist *" not in said
-    assert "Mine, complete, car test 0, 20 points: error 0.800 before, 0.0500 after; 0.0124 by the best" in said
+    assert (
+        "progress on the 1 problem that all rows have, of 2 problems with results" in said
+        and "Mine * " in said
+        and "Dist *" not in said
+    )
+    assert (
+        "Mine, complete, car test 0, 20 points: initial error 0.800, final error 0.0500; best renderer 0.0124," in said
+    )
     data = "".join(path.read_text() for path in (own / "page" / "data").rglob("*.js"))
     assert "Mine" in data and "Dist" in data  # the page, too, is of the table that was written
     table = (own / "paper" / "suite.md").read_text()
@@ -446,6 +476,14 @@ def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alon
 def test_a_wrong_argument_is_told(argument, said, capsys):
     assert main([argument]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_label_of_a_shipped_row_is_refused(tmp_path, monkeypatch):
+    write_attempts([attempt("Newton", "s", {0: 1.0, 5: 0.5})], tmp_path)
+    monkeypatch.setattr("bench.report.write.paper.SHIPPED", tmp_path)
+    for label in ("Newton", "Mine, tuned"):  # its runs would replace shipped ones, or would count as tuned
+        with pytest.raises(ValueError, match=f"label={label} is the name of a shipped row, or ends in ', tuned'"):
+            parsed(["renderer=custom", f"label={label}"])
 
 
 def test_what_is_not_its_own_is_passed_on():
@@ -469,7 +507,7 @@ def test_progress_in_the_time_of_dist_is_that_at_its_seconds_on_the_same_machine
     pairs = timed(judged([*dist, *slow, *lost, *few]), frame_of([*dist, *slow, *lost, *few]))
     means = pairs.groupby("row")[AT_SECONDS].mean()
     assert means.to_dict() == pytest.approx({"Dist": 1, "Slow": 0.5 + 0.5 * 100 / 1100, "Lost": 0, "Few": 0.25})
-    assert sparse(pairs, AT_SECONDS) == {"Dist", "Few"}  # two checkpoints in that time
+    assert rows_with_few_checkpoints(pairs, AT_SECONDS) == {"Dist", "Few"}  # two checkpoints in that time
     some = [replace(one, waited=0.3) if one.scene == SCENES[0] and one.row == "Slow" else one for one in [*dist, *slow]]
     assert {*timed(judged(some), frame_of(some))["scene"]} == {*SCENES[1:]}  # where all rows were timed
 
@@ -478,7 +516,7 @@ def test_a_tuned_row_changes_no_comparison_and_has_lines_in_its_sets(tmp_path, m
     stated = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
     tuned = [attempt("Dist, tuned", scene, {0: 1.0, 9: 0.005}, settings="own", preset="dist") for scene in SCENES[:7]]
     runs = judged([*stated, *tuned])
-    assert ranking(runs, END) == ranking(judged(stated), END) and {*ranking(runs, END).progress} == {"Dist", "B"}
+    assert standing_of([*stated, *tuned]) == standing_of(stated) and {*progress([*stated, *tuned])} == {"Dist", "B"}
     assert {*runs["reference"]} == {0.01}
     page([*stated, *tuned], tmp_path, monkeypatch)
     nothing = [None] * (len(study.READS) - 1)
@@ -567,14 +605,24 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
 
 def test_the_shipped_page_is_that_of_the_shipped_rows():
     runs = judged(read_attempts(SHIPPED)[0])
+    runs = runs[runs["whole"]]
     shown = pd.read_csv(SHIPPED / "paper" / "suite.csv").set_index("row")
     for outcome in (AT_1, AT_10, END, AREA):
         ranked = ranking(runs, outcome)
-        empty = sparse(runs, outcome) if outcome != AREA else set()
+        empty = rows_with_few_checkpoints(runs, outcome) if outcome != AREA else set()
         values = {row: np.nan if row in empty else value for row, value in ranked.progress.items()}
         assert shown[outcome].to_dict() == pytest.approx(values, nan_ok=True, rel=1e-9)
-        ranks = {row: "–".join(dict.fromkeys(map(str, ranked.rank(row)))) for row in values}
+        ranks = {row: ranked.rank(row) for row in values}
         assert shown[f"{outcome}_rank"].astype(str).to_dict() == ranks
+
+
+def test_the_shipped_costs_are_those_of_the_shipped_rows():
+    made_of = Standing(gather(SHIPPED, SHIPPED))
+    known = costs(made_of.whole, timed(made_of.whole, made_of.everything))
+    shown = pd.read_csv(SHIPPED / "paper" / "suite_sets.csv").set_index(["set", "row"])
+    for name in ("evaluations", "seconds"):
+        values = known[name].dropna().map(lambda ratio: ratio.value)
+        assert len(values) and shown[name].reindex(values.index).to_numpy() == pytest.approx(values.to_numpy(float))
 
 
 def test_the_shipped_rows_are_of_todays_settings():

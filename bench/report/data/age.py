@@ -14,8 +14,8 @@ GONE = {  # settings of renderers: the value at which this version does the same
     "keep_slope_sign": (True, "which turned the sign of the gradient at flat crossings"),
 }
 ENGINE = (
-    f"PyTorch computed all field values; since {CHANGED} compiled code computes those of ReLU networks without a "
-    "gradient, on one thread of a CPU, so that times and their ratios are others"
+    f"Before {CHANGED}, PyTorch computed all field values. Since then, compiled code computes those of ReLU networks "
+    "without a gradient, on one thread of a CPU. Times and their ratios therefore differ."
 )
 
 
@@ -62,7 +62,7 @@ def _engine(records: list[Record]) -> str:
     if not before:
         return ""
     whose = "Times" if len(before) == len(environments) else f"Times of {len(before)} of {len(environments)} runs"
-    return f"{whose} are of earlier versions: {ENGINE}."
+    return f"{whose} are of earlier versions. {ENGINE}"
 
 
 def _restored(records: list[Record]) -> str:
@@ -70,8 +70,8 @@ def _restored(records: list[Record]) -> str:
     if not sources:
         return ""
     return (
-        f"Rows are restored from {', '.join(sources)}, as their run folders are gone: of settings they have what that "
-        "page shows."
+        f"Rows are restored from {', '.join(sources)}, as their run folders are gone. They have only the settings "
+        "that this page shows."
     )
 
 
@@ -90,7 +90,7 @@ def head(version: str) -> str:
     if not version:
         return ""
     day = version.rpartition(" ")[2]
-    engine = f" Then {ENGINE}." if version != UNKNOWN and day < CHANGED else ""
+    engine = f" {ENGINE}" if version != UNKNOWN and day < CHANGED else ""
     return (
         f"Drawn by version {version}, with its statistics; this version cannot draw it without the run folders.{engine}"
     )

@@ -5,6 +5,8 @@ from itertools import product
 
 import numpy as np
 
+from bench.report.data.statistics import ALPHA, shapes_needed
+
 MOST_EXACT = 16  # units of which all signs are tried; of more, 2**16 random signs
 
 
@@ -18,33 +20,33 @@ def signs(units: int) -> np.ndarray:
     return drawn
 
 
-def chances(differences: np.ndarray) -> np.ndarray:
-    """Of differences [units, pairs] the probability [pairs] of as large a sum if each unit's had either sign."""
+def p_values(differences: np.ndarray) -> np.ndarray:
+    """The p values [pairs] of differences [units, pairs]: the share of flips whose sum is at least as large."""
     sums = np.abs(differences.sum(axis=0))
     return (np.abs(signs(len(differences)) @ differences) >= sums - 1e-12).mean(axis=0)
 
 
-def not_rejected(values: np.ndarray, alpha: float) -> tuple[float, float]:
-    """The ends of the means of values [units] that flipped signs do not reject, by bisection."""
+def bounds(values: np.ndarray) -> tuple[float, float] | None:
+    """The ends of the confidence intervals of the means of columns of values [units, columns], simultaneous at 95 %.
+
+    None where there are too few units to reject any mean, or no column.
+    """
+    units, columns = values.shape
+    if not columns or units < shapes_needed(columns):
+        return None
+    low, high = zip(*(interval(column, ALPHA / columns) for column in values.T), strict=True)
+    return min(low), max(high)
+
+
+def interval(values: np.ndarray, alpha: float) -> tuple[float, float]:
+    """The confidence interval of the mean of values [units] at level 1 - alpha: the means that are not rejected."""
     drawn, ends = signs(len(values)), []
     sums, counts = drawn @ values, drawn.sum(axis=1)
     for end in (values.min(), values.max()):
         kept, lost = values.mean(), 2 * end - values.mean()
         for _ in range(50):
             mean = (kept + lost) / 2
-            chance = np.mean(np.abs(sums - mean * counts) >= np.abs(sums[0] - mean * counts[0]) - 1e-12)
-            kept, lost = (mean, lost) if chance > alpha else (kept, mean)
+            p_value = np.mean(np.abs(sums - mean * counts) >= np.abs(sums[0] - mean * counts[0]) - 1e-12)
+            kept, lost = (mean, lost) if p_value > alpha else (kept, mean)
         ends.append(float(kept))
     return ends[0], ends[1]
-
-
-def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
-    """The ends of the means of all columns of values [units, columns] that are not rejected, at alpha in all.
-
-    None where there are too few units to reject any mean, or no column.
-    """
-    units, columns = values.shape
-    if not columns or 2 / 2**units > alpha / columns:
-        return None
-    low, high = zip(*(not_rejected(column, alpha / columns) for column in values.T), strict=True)
-    return min(low), max(high)

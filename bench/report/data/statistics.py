@@ -26,6 +26,7 @@ Groups = Sequence[Any]  # of each shape an array of its seeds, or a sequence of 
 Statistic = Callable[[np.ndarray], float | np.ndarray]  # reduces the last axis, as `interquartile_mean` does
 Point = tuple[Groups, Groups]  # the costs and the errors of one setting
 LEVEL = 0.95  # of all intervals
+ALPHA = 1 - LEVEL  # the probability of any false rejection among the tests of a page
 FEWEST_SHAPES = 6  # with an interval: the extremes of five enclose a median with a probability of 94 %, of four 88 %
 
 
@@ -157,10 +158,10 @@ def differ(ratios: Sequence[Interval]) -> list[Verdict]:
     return [Verdict.DIFFERS if i in rejected else verdict for i, verdict in enumerate(open_verdicts)]
 
 
-def holm(probabilities: Values) -> np.ndarray:
+def holm(p_values: Values) -> np.ndarray:
     """Which of several hypotheses are rejected at 5 % in all, by the step-down of Holm (1979)."""
-    ordered = np.argsort(probabilities, kind="stable")
-    passed = np.asarray(probabilities)[ordered] <= (1 - LEVEL) / (len(ordered) - np.arange(len(ordered)))
+    ordered = np.argsort(p_values, kind="stable")
+    passed = np.asarray(p_values)[ordered] <= ALPHA / (len(ordered) - np.arange(len(ordered)))
     rejected = np.zeros(len(ordered), dtype=bool)
     rejected[ordered] = np.logical_and.accumulate(passed)
     return rejected
@@ -168,13 +169,13 @@ def holm(probabilities: Values) -> np.ndarray:
 
 def shapes_needed(ratios: int) -> int:
     """The fewest shapes with which the sign test can reject anything in a family of so many ratios."""
-    return next(n for n in count(1) if _least_chance(n) <= (1 - LEVEL) / ratios)
+    return next(n for n in count(1) if _least_chance(n) <= ALPHA / ratios)
 
 
 def shapes_agreeing(shapes: int, ratios: int) -> int:
     """How many of the shapes must be on one side of 1 for Holm's first step to reject; one more than all if none do."""
     chances = 2 * special.bdtr(np.arange(shapes), shapes, 0.5)  # of at most so many on the other side
-    return shapes + 1 - int(np.searchsorted(chances, (1 - LEVEL) / ratios, side="right"))
+    return shapes + 1 - int(np.searchsorted(chances, ALPHA / ratios, side="right"))
 
 
 def _least_chance(shapes: int) -> float:
@@ -201,7 +202,7 @@ def _of_median(points: np.ndarray) -> Interval:
     if n < FEWEST_SHAPES:
         return Interval(middle, math.nan, math.nan, tuple(points.tolist()))
     chances = special.bdtr(np.arange(n), n, 0.5)  # of at most so many of n values below the median
-    beyond, ordered = int(np.searchsorted(chances, (1 - LEVEL) / 2)) - 1, np.sort(points)
+    beyond, ordered = int(np.searchsorted(chances, ALPHA / 2)) - 1, np.sort(points)
     return Interval(middle, float(ordered[beyond]), float(ordered[-1 - beyond]), tuple(points.tolist()))
 
 
@@ -246,7 +247,7 @@ def clopper_pearson(value: float, n: float) -> Interval:
     """A share among n independent trials with its exact interval (Clopper and Pearson 1934); n need not be whole."""
     if not 0 <= value <= 1 or n < 1:
         raise ValueError(f"the share must be in 0..1 and n at least 1, but they are {value} and {n}: count the trials")
-    k, tail = value * n, (1 - LEVEL) / 2
+    k, tail = value * n, ALPHA / 2
     low = 0.0 if value == 0 else float(special.betaincinv(k, n - k + 1, tail))
     high = 1.0 if value == 1 else float(special.betaincinv(k + 1, n - k, 1 - tail))
     return Interval(value, low, high)
@@ -379,6 +380,6 @@ def _interval(value: float | np.ndarray, drawn: np.ndarray, points: np.ndarray) 
     n, shapes = len(points), tuple(points.tolist())
     if n < FEWEST_SHAPES:
         return Interval(float(value), math.nan, math.nan, shapes)
-    tail = special.ndtr(math.sqrt(n / (n - 1)) * special.stdtrit(n - 1, (1 - LEVEL) / 2))
+    tail = special.ndtr(math.sqrt(n / (n - 1)) * special.stdtrit(n - 1, ALPHA / 2))
     low, high = np.quantile(drawn, tail, method="lower"), np.quantile(drawn, 1 - tail, method="higher")
     return Interval(float(value), float(low), float(high), shapes)

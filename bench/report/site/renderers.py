@@ -12,8 +12,8 @@ import pandas as pd
 
 from bench.records.names import flat
 from bench.report.data.records import OURS, Record
-from bench.report.suite import standing
 from bench.report.suite.attempts import TUNED, Attempt, attempts_of, gather, suite
+from bench.report.suite.standing import KEY, Standing
 from bench.report.write import paper
 from bench.tables import METHOD, choice, names
 
@@ -38,13 +38,13 @@ def _found(records: list[Record], results_dir: Path) -> dict[str, Any]:
         for attempt in attempts_of([record], results_dir)
     }
     gathered = gather(paper.SHIPPED, results_dir, records)
-    runs = standing.reached(standing.compared(standing.frame_of(gathered.everything), gathered.size))
+    made = Standing(gathered)
     attempts = {(*attempt.key, attempt.started): attempt for attempt in gathered.everything}
     order = [*suite().errors]
-    keys = {tuple(key) for key in runs[standing.KEY].itertuples(index=False)}
+    keys = {tuple(key) for key in made.reached[KEY].itertuples(index=False)}
     problems = sorted(keys, key=lambda key: (order.index(key[0]), *key[1:]))
-    ranked = [*standing.ranking(runs, standing.AT_1).progress]
-    rows = sorted(runs.groupby("row"), key=lambda pair: ranked.index(pair[0]) if pair[0] in ranked else len(ranked))
+    ranks = {row: rank for rank, row in enumerate(made.rows)}
+    rows = sorted(made.reached.groupby("row"), key=lambda pair: ranks.get(pair[0], len(ranks)))
     return {
         "problems": problems,
         "rows": [_row(row, own, problems, attempts, folders) for row, own in rows],

@@ -4,13 +4,10 @@ Attempts are made of runs, and kept as CSV files, a file a renderer and a line a
 run folders and are joined over days and machines.
 """
 
-import csv
-import json
 import re
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from functools import cache
-from io import StringIO
 from itertools import product
 from math import inf, isnan
 from pathlib import Path
@@ -18,8 +15,9 @@ from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import RunStatus, as_number, decoded, digest, plain, renderer_name, write_text
+from bench.records.record import RunStatus, as_number, digest, renderer_name
 from bench.report.data.kept import NO_ATTEMPTS
+from bench.report.data.lines import UNREADABLE, read_lines, write_lines
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
 
@@ -222,34 +220,38 @@ def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]
     folder, (kept, problems) = place(results_dir), read_attempts(results_dir)
     if problems:
         raise ValueError(f"{folder} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
-    files = grouped(
-        joined([*kept, *attempts]), lambda one: re.sub(r"[^a-z0-9]+", "_", one.row.lower()).strip("_") or "row"
-    )
+    ordered = sorted(joined([*kept, *attempts]), key=lambda attempt: attempt.key)
+    files = grouped(ordered, lambda attempt: re.sub(r"[^a-z0-9]+", "_", attempt.row.lower()).strip("_") or "row")
     folder.mkdir(parents=True, exist_ok=True)
-    return [_write(folder / f"{name}.csv", own) for name, own in sorted(files.items())]
-
-
-def _write(path: Path, attempts: list[Attempt]) -> Path:
-    text = StringIO()
-    table = csv.DictWriter(text, [one.name for one in fields(Attempt)], lineterminator="\n")
-    table.writeheader()
-    for attempt in sorted(attempts, key=lambda one: one.key):
-        cells = asdict(attempt).items()
-        table.writerow({name: one if isinstance(one, str) else json.dumps(plain(one)) for name, one in cells})
-    write_text(path, text.getvalue())
-    return path
+    return [write_lines(folder / f"{name}.csv", Attempt, group) for name, group in sorted(files.items())]
 
 
 def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
     """The attempts that results folders keep, and a message for each file that cannot be read."""
-    found, problems = list[Attempt](), list[str]()
+    attempts, problems = list[Attempt](), list[str]()
     for path in (path for folder in folders for path in sorted(place(folder).glob("[!.]*.csv"))):
         try:
-            with path.open(encoding="utf-8", newline="") as file:
-                found += [_read(line) for line in csv.DictReader(file)]
-        except (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error) as error:
+            attempts += [*map(_checked, read_lines(path, Attempt))]
+        except UNREADABLE as error:
             problems.append(f"{path.name}: {error!r}")
-    return found, problems
+    return attempts, problems
+
+
+def _checked(attempt: Attempt) -> Attempt:
+    """The attempt, if its numbers make sense.
+
+    Raises:
+        ValueError, TypeError: where they do not.
+    """
+    numbers = [attempt.start, attempt.final, attempt.cost, *(number for point in attempt.curve for number in point)]
+    costs, end = [point[:2] for point in attempt.curve], [[attempt.cost, float(f"{attempt.final:.5g}")]]
+    if any(as_number(number) is None or number < 0 for number in numbers) or any(len(p) != 3 for p in attempt.curve):
+        raise ValueError(f"{attempt.problem}: errors and costs must be numbers of 0 or more")
+    if costs != sorted(costs) or (attempt.ok and [[point[0], point[2]] for point in attempt.curve[-1:]] != end):
+        raise ValueError(f"{attempt.problem}: the curve does not rise in cost to the run's cost and final error")
+    if attempt.set not in suite().errors or attempt.status not in [*RunStatus]:
+        raise ValueError(f"{attempt.problem}: there is no set {attempt.set!r} or status {attempt.status!r}")
+    return attempt
 
 
 @dataclass(frozen=True)
@@ -262,11 +264,10 @@ class Gathered:
 
     @property
     def size(self) -> str:
-        """The largest size of the suite whose problems all rows of the results folder have; else the least size."""
+        """The size of the suite at which rows are compared: the least one if a local row lacks problems of quick."""
         rows = grouped((attempt for attempt in self.local if not attempt.tuned), lambda attempt: attempt.row).values()
-        sizes = [*suite().sizes] if rows else ["quick"]
-        common = set.intersection(*({attempt.key[:3] for attempt in row} for row in rows)) if rows else set()
-        return next((size for size in reversed(sizes) if problems_of(size) <= common), sizes[0])
+        whole = all(problems_of("quick") <= {attempt.key[:3] for attempt in row} for row in rows)
+        return "quick" if whole else "smoke"
 
 
 def gather(shipped: Path, results_dir: Path, records: Iterable[Record] = ()) -> Gathered:
@@ -275,25 +276,3 @@ def gather(shipped: Path, results_dir: Path, records: Iterable[Record] = ()) -> 
     local, unread = ([], []) if results_dir.resolve() == shipped.resolve() else read_attempts(results_dir)
     local += attempts_of(records, results_dir)
     return Gathered([*kept, *local], local, [*problems, *unread])
-
-
-def _read(line: dict[str, str]) -> Attempt:
-    """The attempt of a line.
-
-    Raises:
-        ValueError, TypeError, KeyError: where it has another number of cells, or a cell has another type.
-    """
-    texts = {one.name: one.type is str for one in fields(Attempt)}
-    values: dict[str, Any] = {
-        name: line[name] if is_text else decoded(json.loads(line[name])) for name, is_text in texts.items()
-    }
-    numbers = [values["start"], values["final"], values["cost"], *(n for point in values["curve"] for n in point)]
-    sound = all(as_number(number) is not None and number >= 0 for number in numbers)
-    if not sound or any(len(point) != 3 for point in values["curve"]):
-        raise ValueError(f"{values['problem']}: errors and costs must be numbers of 0 or more")
-    end, (last,) = [values["cost"], float(f"{values['final']:.5g}")], values["curve"][-1:] or [[None] * 3]
-    if values["status"] == RunStatus.OK and [last[0], last[2]] != end:
-        raise ValueError(f"{values['problem']}: the curve does not end at the cost and the final error")
-    if values["set"] not in suite().errors or values["status"] not in [*RunStatus]:
-        raise ValueError(f"{values['problem']}: there is no set {values['set']!r} or status {values['status']!r}")
-    return Attempt(**values)

@@ -7,16 +7,17 @@ cost is DIST's whole run at the same problem. Each set of problems weighs the sa
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from bench.records.record import WAITED, RunStatus
+from bench.records.record import WAITED
 from bench.report.data import flips, statistics
-from bench.report.data.statistics import Interval
-from bench.report.suite.attempts import APART, BY_ITSELF, Attempt, problems_of, suite
+from bench.report.data.statistics import Interval, shapes_needed
+from bench.report.suite.attempts import APART, Attempt, Gathered, problems_of, suite
 from bench.tables import choice
 
 UNIT = "dist"  # the preset of the row by whose costs all costs are divided
@@ -26,8 +27,32 @@ BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # the costs at which progress is r
 AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # over whose logarithm progress is averaged
 FEWEST_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
 LEAST_ERROR = 1e-12  # in a logarithm
-ALPHA = 1 - statistics.LEVEL
 KEY = ["set", "problem", "seed"]
+
+
+class Standing:
+    """The attempts of the suite, the compared ones, their progress, and the rankings by it."""
+
+    def __init__(self, gathered: Gathered) -> None:
+        self.everything = frame_of(gathered.everything)
+        self.compared = compared(self.everything, gathered.size)
+        self.reached = with_progress(self.compared)
+        self.whole = self.reached[self.reached["whole"]]
+        self.rankings = {outcome: ranking(self.whole, outcome) for outcome in OUTCOMES}
+        self.rows = [*self.rankings[AT_1].progress]
+        self.sets = [name for name in suite().errors if name in {*self.whole["set"]}]
+        self.hidden = {budget: rows_with_few_checkpoints(self.whole, budget) for budget in BUDGETS} | {AREA: set()}
+
+    @cached_property
+    def costs(self) -> dict[str, float]:
+        """The median cost of each row's runs over that of DIST's."""
+        return (self.whole["cost"] / self.whole["unit"]).groupby(self.whole["row"]).median().to_dict()
+
+    @cached_property
+    def lacking(self) -> dict[str, int]:
+        """The rows that are not compared, with the number of problems that they lack."""
+        rows = self.compared[~self.compared["whole"] & ~self.compared["tuned"]]
+        return rows.groupby("row")["missing"].first().to_dict()
 
 
 def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
@@ -36,11 +61,11 @@ def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
     It has the fields of the attempt, `ok`, `tuned`, `machine`, and `timed`, unless the machine was busy. Left out are
     attempts under other settings than most of their set's; tuned rows have their own settings.
     """
-    lines = pd.DataFrame(map(vars, attempts), columns=[*Attempt.__dataclass_fields__], dtype=object)
-    frame = lines.astype(dict.fromkeys(("start", "final", "cost", "waited", "seconds"), float))
-    frame = frame.sort_values(["started", "final"]).assign(
-        ok=(frame["status"] == RunStatus.OK).astype(bool),
-        tuned=frame["row"].map(lambda row: row.endswith(BY_ITSELF)).astype(bool),
+    lines = [vars(attempt) | {"ok": attempt.ok, "tuned": attempt.tuned} for attempt in attempts]
+    columns = [*Attempt.__dataclass_fields__, "ok", "tuned"]
+    frame = pd.DataFrame(lines, columns=columns, dtype=object).sort_values(["started", "final"])
+    frame = frame.astype(dict.fromkeys(("start", "final", "cost", "waited", "seconds"), float))
+    frame = frame.astype({"ok": bool, "tuned": bool}).assign(
         timed=~(frame["waited"] > WAITED),
         machine=frame["cpu"] + "; " + frame["device"] + "; " + frame["threads"].map(str) + "; " + frame["kernels"],
     )
@@ -67,21 +92,18 @@ def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
         everything: as of `frame_of`.
 
     Returns:
-        A line per attempt, with more columns: `missing`, the number of problems that its row lacks; `unit`, the cost of
-        DIST's run; `initial` and `reference`, the errors between which progress is measured; `whole`, whether its row
-        is compared; and `judged`, whether there is progress to make.
+        A line per attempt, with more columns: `missing`, the number of problems that its row lacks; `whole`, whether
+        its row is compared; `unit`, the cost of DIST's run, or where that failed the median in its set; `initial` and
+        `reference`, the errors between which progress is measured; and `has_progress`, whether there is any to make.
     """
     runs = everything.drop_duplicates([*KEY, "row"], keep="last")
     keys = pd.Series([*zip(*(runs[name] for name in KEY), strict=True)], runs.index, dtype=object)
     rows = {row: {*group} for row, group in keys.groupby(runs["row"])}
-    possible = rows.get(unit_row(runs), {*keys})
-    needed = problems_of(size) if problems_of(size) <= possible else possible
-    whole = [
-        problems & possible for row, problems in rows.items() if needed <= problems and not row.endswith(BY_ITSELF)
-    ]
-    common = set.intersection(*whole) if whole else needed
+    reachable = rows.get(unit_row(runs), {*keys})
+    needed = problems_of(size) if problems_of(size) <= reachable else reachable
     missing = runs["row"].map({row: len(needed - problems) for row, problems in rows.items()})
     runs = runs.assign(missing=missing, whole=(missing == 0) & ~runs["tuned"])
+    common = reachable.intersection(*(rows[row] for row in runs.loc[runs["whole"], "row"].unique()))
     return _with_errors(runs[keys.isin(common)].reset_index(drop=True))
 
 
@@ -92,16 +114,18 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
 
     finite = runs[np.isfinite(runs["start"])]
     sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any did
-    least = runs[~runs["tuned"]].groupby(["set", "problem"])["final"].min()
+    least = runs[~runs["tuned"]].groupby(["set", "problem"])["final"].min().clip(lower=LEAST_ERROR)
     stated = [_reference(*line) for line in zip(runs["set"], runs["problem"], runs["scene"], strict=True)]
-    units = runs[(runs["row"] == unit_row(runs)) & runs["ok"] & (runs["cost"] > 0)].groupby(KEY)["cost"].median()
+    paid = runs[runs["ok"] & (runs["cost"] > 0)]
+    units = paid[paid["row"] == unit_row(runs)].groupby(KEY)["cost"].median()
+    usual = units.groupby("set").median().combine_first(paid.groupby("set")["cost"].median())
     runs = runs.assign(
         initial=at_problem(sound.groupby(KEY)["start"].median()),
         reference=pd.Series(stated, runs.index, dtype=float).fillna(at_problem(least)),
-        unit=at_problem(units).fillna(runs["set"].map(units.groupby("set").median())),
+        unit=at_problem(units).fillna(runs["set"].map(usual)).fillna(1.0),
     )
     possible = (runs["initial"] > runs["reference"]) & (runs["reference"] > 0)
-    return runs.assign(judged=possible & ~runs["set"].isin(APART))
+    return runs.assign(has_progress=possible & ~runs["set"].isin(APART))
 
 
 def _reference(of_set: str, problem: str, scene: str) -> float | None:
@@ -110,7 +134,7 @@ def _reference(of_set: str, problem: str, scene: str) -> float | None:
     return errors.get(problem, errors.get(scene, errors.get("all")))
 
 
-def course(run: Any) -> tuple[np.ndarray, np.ndarray]:
+def progress_curve(run: Any) -> tuple[np.ndarray, np.ndarray]:
     """The costs of a run's checkpoints over the unit, and the progress at each."""
     if not run.ok:
         return np.zeros(1), np.zeros(1)
@@ -119,31 +143,30 @@ def course(run: Any) -> tuple[np.ndarray, np.ndarray]:
     return curve[:, 0] / run.unit, 1 - np.clip(left, 0, 1)
 
 
-def reached(runs: pd.DataFrame) -> pd.DataFrame:
-    """The judged attempts, with the progress of each outcome.
+def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
+    """The attempts that have progress to make, with the progress of each outcome.
 
     Between checkpoints progress is interpolated, and after its end a run keeps its last one.
 
     Returns:
-        A line per attempt with the columns `OUTCOMES`; for each of `BUDGETS`, `NAME_checkpoints` is the number of
-        checkpoints within it, and `NAME_next` the progress at the next checkpoint, or that within it if it is more.
+        A line per attempt with the columns `OUTCOMES`; `BUDGET_checkpoints`, the number of checkpoints within each of
+        `BUDGETS`; and `at_1_next`, the progress at the first checkpoint beyond `at_1`, or `at_1` if it is more.
     """
-    runs, lines = runs[runs["judged"]].reset_index(drop=True), []
+    runs, lines = runs[runs["has_progress"]].reset_index(drop=True), []
     for run in runs.itertuples():
-        costs, progress = course(run)
-        line = {AREA: np.interp(AREA_COSTS, costs, progress).mean()}
+        costs, progress = progress_curve(run)
+        line = {name: np.interp(min(budget, costs[-1]), costs, progress) for name, budget in BUDGETS.items()}
+        line[AREA] = np.interp(AREA_COSTS, costs, progress).mean()
         for name, budget in BUDGETS.items():
-            within = int((costs <= budget).sum())
-            line[name] = np.interp(min(budget, costs[-1]), costs, progress)
-            measured = budget == inf or not run.ok  # the end is known, and so is the progress of a failed run
-            line[f"{name}_checkpoints"] = FEWEST_CHECKPOINTS if measured else within
-            line[f"{name}_next"] = max(line[name], progress[min(within, len(costs) - 1)])
+            certain = budget == inf or not run.ok  # the end, or the progress of a failed run: 0
+            line[f"{name}_checkpoints"] = FEWEST_CHECKPOINTS if certain else (costs <= budget).sum()
+        line[f"{AT_1}_next"] = max(line[AT_1], progress[min((costs <= 1).sum(), len(costs) - 1)])
         lines.append(line)
-    columns = [*OUTCOMES, *(f"{name}_{what}" for name in BUDGETS for what in ("checkpoints", "next"))]
+    columns = [*OUTCOMES, *(f"{name}_checkpoints" for name in BUDGETS), f"{AT_1}_next"]
     return runs.join(pd.DataFrame(lines, runs.index, columns, dtype=float))
 
 
-def sparse(runs: pd.DataFrame, budget: str) -> set[str]:
+def rows_with_few_checkpoints(runs: pd.DataFrame, budget: str) -> set[str]:
     """The rows that have in some set fewer than `FEWEST_CHECKPOINTS` within a budget, in the median of problems."""
     counts = runs.groupby(["row", "set"])[f"{budget}_checkpoints"].median().groupby("row").min()
     return {*counts[counts < FEWEST_CHECKPOINTS].index}
@@ -157,77 +180,78 @@ class Ranking:
         progress: of each row the mean over sets of the mean over problems, the largest first.
         better: the significant pairs, the row with more progress first.
         pairs: the number of all pairs.
+        least_p: the least p value of all pairs; 1 without pairs.
         scenes: the number of scenes, which are the units of the test.
     """
 
     progress: dict[str, float]
     better: set[tuple[str, str]]
     pairs: int
+    least_p: float
     scenes: int
 
     @property
     def decidable(self) -> bool:
-        """Whether so many scenes can show a difference: the least p is 2 / 2**scenes, Holm's first step 5 % / pairs."""
-        return self.pairs > 0 and 2 / 2**self.scenes <= ALPHA / self.pairs
+        """Whether so many scenes can show any difference."""
+        return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs)
 
-    def rank(self, row: str) -> tuple[int, int]:
-        """The least and the largest rank that a row can have, simultaneous at 95 % (Mogstad et al. 2024)."""
+    def rank(self, row: str) -> str:
+        """The ranks that a row can have, such as 1–4, simultaneous at 95 % (Mogstad et al. 2024)."""
         above, below = (sum(pair[position] == row for pair in self.better) for position in (1, 0))
-        return 1 + above, len(self.progress) - below
+        return "–".join(dict.fromkeys((str(1 + above), str(len(self.progress) - below))))
 
 
 def ranking(runs: pd.DataFrame, outcome: str) -> Ranking:
-    """Ranks the whole rows of `reached` by an outcome.
+    """Ranks rows that have the same problems by an outcome.
 
     The signs of scenes' differences are flipped, with Holm's step-down correction over all pairs of rows at 5 %.
     """
     scores = by_scene(runs, outcome)
     first, second = np.triu_indices(scores.shape[1], 1)
     differences = scores.to_numpy()[:, first] - scores.to_numpy()[:, second]
-    pairs = zip(scores.columns[first], scores.columns[second], strict=True)
-    significant = zip(pairs, differences.sum(axis=0), statistics.holm(flips.chances(differences)), strict=True)
+    pairs, p_values = zip(scores.columns[first], scores.columns[second], strict=True), flips.p_values(differences)
+    significant = zip(pairs, differences.sum(axis=0), statistics.holm(p_values), strict=True)
     better = {pair if difference > 0 else pair[::-1] for pair, difference, sure in significant if sure}
     progress = scores.sum().sort_values(ascending=False, kind="stable")
-    return Ranking(progress.to_dict(), better, len(first), len(scores))
+    return Ranking(progress.to_dict(), better, len(first), p_values.min(initial=1.0), len(scores))
 
 
 def by_scene(runs: pd.DataFrame, outcome: str) -> pd.DataFrame:
-    """What each scene [scenes, rows] adds to the mean over sets of the mean over problems of a row; of whole rows."""
-    runs = runs[runs["whole"]]
+    """What each scene [scenes, rows] adds to the mean over sets of the mean over problems of a row."""
     sizes = runs.groupby(["set", "row"]).size().groupby("set").max()
-    parts = runs.assign(part=runs[outcome] / runs["set"].map(sizes) / max(len(sizes), 1))
-    return parts.pivot_table(index="scene", columns="row", values="part", aggfunc="sum")
+    shares = runs.assign(share=runs[outcome] / runs["set"].map(sizes) / max(len(sizes), 1))
+    return shares.pivot_table(index="scene", columns="row", values="share", aggfunc="sum")
 
 
 def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
-    """The bounds of the final errors of all rows over DIST's in a set, without rows that failed in most problems.
+    """The bounds of the mean final errors of all rows over DIST's in a set, without rows that failed in most problems.
 
     They are of geometric means over scenes, see `flips.bounds`; None where the set has too few scenes for them.
     """
-    runs = runs[(runs["set"] == of_set) & runs["whole"]]
+    runs = runs[runs["set"] == of_set]
     runs = runs[runs.groupby("row")["ok"].transform("mean") >= 0.5]
     errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=LEAST_ERROR))
     table = errors.groupby([runs["scene"], runs["row"]]).mean().unstack("row")
     ratios = table.drop(columns=unit_row(runs), errors="ignore").sub(table.get(unit_row(runs)), axis=0)
-    ends = flips.bounds(ratios.to_numpy(), ALPHA)
+    ends = flips.bounds(ratios.to_numpy())
     return ends and (float(np.exp(ends[0])), float(np.exp(ends[1])))
 
 
 def timed(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
-    """The attempts of `reached` at problems at which all whole rows were timed on a machine that timed DIST's run too.
+    """The attempts at problems at which all rows were timed on a machine that timed DIST's run too.
 
     Returns:
         Their lines, where `unit` and `unit_seconds` are of DIST's newest run on that machine, with the engine of the
-        newest of all. `at_seconds` is the progress at DIST's seconds, `at_seconds_checkpoints` as in `reached`.
+        newest of all. `at_seconds` is the progress at DIST's seconds, `at_seconds_checkpoints` as in `with_progress`.
     """
     units = everything[(everything["row"] == unit_row(runs)) & everything["timed"] & everything["ok"]]
     units = units[units["kernels"].isin(units["kernels"].iloc[-1:])].drop_duplicates([*KEY, "machine"], keep="last")
     units = units[[*KEY, "machine", "cost", "seconds"]].rename(columns={"cost": "unit", "seconds": "unit_seconds"})
-    pairs = runs[runs["whole"] & runs["timed"]].drop(columns="unit").merge(units, on=[*KEY, "machine"])
+    pairs = runs[runs["timed"]].drop(columns="unit").merge(units, on=[*KEY, "machine"])
     rows = pairs.groupby(KEY)["row"].transform("nunique")
-    pairs, lines = pairs[rows == runs.loc[runs["whole"], "row"].nunique()].reset_index(drop=True), []
+    pairs, lines = pairs[rows == runs["row"].nunique()].reset_index(drop=True), []
     for run in pairs.itertuples():
-        seconds, progress = np.array(run.curve)[:, 1] if run.ok else np.zeros(1), course(run)[1]
+        seconds, progress = np.array(run.curve)[:, 1] if run.ok else np.zeros(1), progress_curve(run)[1]
         count = (seconds <= run.unit_seconds).sum() if run.ok else FEWEST_CHECKPOINTS
         lines.append((np.interp(run.unit_seconds, seconds, progress), count))
     return pairs.join(pd.DataFrame(lines, pairs.index, [AT_SECONDS, f"{AT_SECONDS}_checkpoints"], dtype=float))
@@ -247,9 +271,9 @@ def costs(runs: pd.DataFrame, pairs: pd.DataFrame) -> pd.DataFrame:
     scenes, lines = pairs.groupby("set")["scene"].nunique(), []
     enough = scenes.index[scenes >= statistics.FEWEST_SHAPES]
     chosen = pd.concat([runs[~runs["set"].isin(enough)], pairs[pairs["set"].isin(enough)]])
-    for key, own in chosen[chosen["ok"] & (chosen["cost"] > 0) & (chosen["unit"] > 0)].groupby(["set", "row"]):
-        seconds = _ratio(own, "seconds", "unit_seconds") if key[0] in enough else None
-        lines.append([*key, _ratio(own, "cost", "unit"), seconds, own["scene"].nunique()])
+    for key, group in chosen[chosen["ok"] & (chosen["cost"] > 0) & (chosen["unit"] > 0)].groupby(["set", "row"]):
+        seconds = _ratio(group, "seconds", "unit_seconds") if key[0] in enough else None
+        lines.append([*key, _ratio(group, "cost", "unit"), seconds, group["scene"].nunique()])
     return pd.DataFrame(lines, columns=["set", "row", "evaluations", "seconds", "scenes"]).set_index(["set", "row"])
 
 

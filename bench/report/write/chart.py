@@ -93,12 +93,12 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
 
 
 @style.styled
-def draw_lead(panels: Sequence[Panel], ranks: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
+def draw_lead(panels: Sequence[Panel], ranks: Mapping[str, Mapping[str, str]]) -> Figure:
     """Draws the first panel large, with the names of its lines, the ranks to its right, and the other panels below.
 
     Args:
         panels: fractions from 0 to 1 over costs, on a logarithmic axis.
-        ranks: by their titles, the least and the largest rank of each row.
+        ranks: by their titles, the rank of each row, such as 5, or the ranks that it can have, such as 1–4.
     """
     figure = Figure(figsize=(style.WIDTH, 5.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.55, 1))
@@ -117,10 +117,10 @@ def draw_lead(panels: Sequence[Panel], ranks: Mapping[str, Mapping[str, tuple[in
 
 
 def _fractions(axis: Axes, panel: Panel) -> None:
-    """Draws lines of fractions, with a point at the end of each, or a cross if it ends at 0."""
+    """Draws lines of fractions, with a point at the end of each, or a cross at that of a row that failed."""
     for line in panel["series"]:
         axis.plot(line["x"], line["y"], color=line["colour"], ls=line["dash"])
-        end = {"marker": "o" if line["y"][-1] else "x", "color": line["colour"], "clip_on": False, "zorder": 3}
+        end = {"marker": "x" if line.get("failed") else "o", "color": line["colour"], "clip_on": False, "zorder": 3}
         axis.plot(line["x"][-1], line["y"][-1], **end)
     costs = [cost for line in panel["series"] for cost in (line["x"][0], 1.6 * line["x"][-1])]
     axis.set(xscale="log", xlim=(min(costs, default=0.1), max(costs, default=10.0)), ylim=(0, 1))
@@ -145,12 +145,10 @@ def _name_lines(axis: Axes, lines: Sequence[Series]) -> None:
         axis.text(cost, 1.03, name, transform=above, rotation=40, rotation_mode="anchor", **look)
 
 
-def _ranks(
-    axis: Axes, title: str, rows: Mapping[str, tuple[int, int]], lines: Sequence[Series], *, named: bool
-) -> None:
+def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[Series], *, named: bool) -> None:
     """Draws the ranks that each row can have as a bar."""
     for number, line in enumerate(lines):
-        low, high = rows[line["name"]]
+        low, *_, high = [int(rank) for rank in 2 * rows[line["name"]].split("–")]
         axis.barh(number, high - low + 0.7, left=low - 0.35, height=0.55, color=line["colour"])
     count = len(lines)
     axis.set(xlim=(0.3, count + 0.7), ylim=(count - 0.4, -0.6), xticks=[1, count], xlabel="rank")

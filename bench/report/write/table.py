@@ -15,6 +15,7 @@ from bench.report.data.records import SCALE, measured, row_of, setting
 from bench.report.data.statistics import Interval
 
 thousandfold = partial(format.number, scale=SCALE)
+ENDS = ("low", "high")  # of an interval
 
 
 def whole(value: float | None) -> str:
@@ -102,10 +103,19 @@ def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None)
     return Column(key, heading, value, show=word)
 
 
-def estimate(key: str, heading: str) -> tuple[Column, ...]:
-    """The column of an estimate that each line has under a key, with its interval for readers and `low`, `high`."""
-    value = Column(key, heading, lambda line: line[key].value, words=lambda line: str(line[key]))
-    return value, *(Column(end, value=lambda line, end=end: getattr(line[key], end)) for end in ("low", "high"))
+def estimate(key: str, heading: str, ends: str = "") -> tuple[Column, ...]:
+    """The column of an estimate under a key, which a line may lack, with its interval for readers and its ends.
+
+    Args:
+        ends: in front of `low` and `high`, the names of the ends in the CSV.
+    """
+
+    def words(line: Any) -> str:
+        return format.MISSING if line[key] is None else str(line[key])
+
+    value = Column(key, heading, lambda line: line[key] and line[key].value, words=words)
+    low, high = (Column(f"{ends}{end}", value=lambda line, end=end: getattr(line[key], end, None)) for end in ENDS)
+    return value, low, high
 
 
 def ends(key: str, of: Callable[[Any], Interval | None]) -> tuple[Column, ...]:

@@ -1,0 +1,40 @@
+"""A dataclass as a line of a CSV file: text as it is, other values as JSON."""
+
+import csv
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, fields
+from io import StringIO
+from pathlib import Path
+from typing import Any, TypeVar
+
+from bench.records.record import decoded, plain, write_text
+
+Item = TypeVar("Item")
+UNREADABLE = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)  # of a damaged file
+
+
+def write_lines(path: Path, kind: type, items: Iterable[Any]) -> Path:
+    """Writes items of a dataclass to a file, a line each."""
+    text = StringIO()
+    table = csv.DictWriter(text, [field.name for field in fields(kind)], lineterminator="\n")
+    table.writeheader()
+    for item in items:
+        cells = asdict(item).items()
+        table.writerow({name: cell if isinstance(cell, str) else json.dumps(plain(cell)) for name, cell in cells})
+    write_text(path, text.getvalue())
+    return path
+
+
+def read_lines(path: Path, kind: type[Item]) -> list[Item]:
+    """The items of a dataclass that a file holds.
+
+    Raises:
+        one of UNREADABLE: where the file is damaged, or a line has other cells than the dataclass has fields.
+    """
+    with path.open(encoding="utf-8", newline="") as file:
+        return [kind(**{f.name: _value(line[f.name], f.type) for f in fields(kind)}) for line in csv.DictReader(file)]
+
+
+def _value(cell: str, kind: Any) -> Any:
+    return cell if kind is str else decoded(json.loads(cell))
