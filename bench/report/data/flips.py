@@ -5,17 +5,20 @@ from itertools import product
 
 import numpy as np
 
-from bench.report.data.statistics import ALPHA, shapes_needed
+from bench.report.data.statistics import shapes_needed
 
-MOST_EXACT = 16  # units of which all signs are tried; of more, 2**16 random signs
+MOST_EXACT = 16  # units of which all signs are tried; of more, 2**15 random signs
 
 
 @cache
 def signs(units: int) -> np.ndarray:
-    """The signs of units [flips, units], of which the first are all positive."""
+    """The signs of units [flips, units]; that of the first unit is positive, and so are all in the first flip.
+
+    The other half of all flips has the same sums, with the other sign.
+    """
     if units <= MOST_EXACT:
-        return np.array([*product((1.0, -1.0), repeat=units)])
-    drawn = np.random.default_rng(0).choice((1.0, -1.0), (2**MOST_EXACT, units))
+        return np.array([(1.0, *others)[:units] for others in product((1.0, -1.0), repeat=max(units - 1, 0))])
+    drawn = np.random.default_rng(0).choice((1.0, -1.0), (2 ** (MOST_EXACT - 1), units))
     drawn[0] = 1
     return drawn
 
@@ -26,15 +29,15 @@ def p_values(differences: np.ndarray) -> np.ndarray:
     return (np.abs(signs(len(differences)) @ differences) >= sums - 1e-12).mean(axis=0)
 
 
-def bounds(values: np.ndarray) -> tuple[float, float] | None:
-    """The ends of the confidence intervals of the means of columns of values [units, columns], simultaneous at 95 %.
+def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
+    """The ends of the confidence intervals of the means of all columns of values [units, columns], at `alpha` in all.
 
     None where there are too few units to reject any mean, or no column.
     """
     units, columns = values.shape
-    if not columns or units < shapes_needed(columns):
+    if not columns or units < shapes_needed(columns, alpha):
         return None
-    low, high = zip(*(interval(column, ALPHA / columns) for column in values.T), strict=True)
+    low, high = zip(*(interval(column, alpha / columns) for column in values.T), strict=True)
     return min(low), max(high)
 
 

@@ -158,18 +158,18 @@ def differ(ratios: Sequence[Interval]) -> list[Verdict]:
     return [Verdict.DIFFERS if i in rejected else verdict for i, verdict in enumerate(open_verdicts)]
 
 
-def holm(p_values: Values) -> np.ndarray:
-    """Which of several hypotheses are rejected at 5 % in all, by the step-down of Holm (1979)."""
+def holm(p_values: Values, alpha: float = ALPHA) -> np.ndarray:
+    """Which of several hypotheses are rejected at `alpha` in all, by the step-down of Holm (1979)."""
     ordered = np.argsort(p_values, kind="stable")
-    passed = np.asarray(p_values)[ordered] <= ALPHA / (len(ordered) - np.arange(len(ordered)))
+    passed = np.asarray(p_values)[ordered] <= alpha / (len(ordered) - np.arange(len(ordered)))
     rejected = np.zeros(len(ordered), dtype=bool)
     rejected[ordered] = np.logical_and.accumulate(passed)
     return rejected
 
 
-def shapes_needed(ratios: int) -> int:
+def shapes_needed(ratios: int, alpha: float = ALPHA) -> int:
     """The fewest shapes with which the sign test can reject anything in a family of so many ratios."""
-    return next(n for n in count(1) if _least_chance(n) <= ALPHA / ratios)
+    return next(n for n in count(1) if _least_chance(n) <= alpha / ratios)
 
 
 def shapes_agreeing(shapes: int, ratios: int) -> int:

@@ -28,6 +28,7 @@ AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # over whose logarithm progress is ave
 FEWEST_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
 LEAST_ERROR = 1e-12  # in a logarithm
 KEY = ["set", "problem", "seed"]
+ALPHA = 0.02  # of tests in all, at which 5 % of simulated draws of equal rows have a false pair: scenes are skewed
 
 
 class Standing:
@@ -193,7 +194,7 @@ class Ranking:
     @property
     def decidable(self) -> bool:
         """Whether so many scenes can show any difference."""
-        return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs)
+        return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs, ALPHA)
 
     def rank(self, row: str) -> str:
         """The ranks that a row can have, such as 1–4, simultaneous at 95 % (Mogstad et al. 2024)."""
@@ -204,13 +205,13 @@ class Ranking:
 def ranking(runs: pd.DataFrame, outcome: str) -> Ranking:
     """Ranks rows that have the same problems by an outcome.
 
-    The signs of scenes' differences are flipped, with Holm's step-down correction over all pairs of rows at 5 %.
+    The signs of scenes' differences are flipped, with Holm's step-down correction over all pairs of rows.
     """
     scores = by_scene(runs, outcome)
     first, second = np.triu_indices(scores.shape[1], 1)
     differences = scores.to_numpy()[:, first] - scores.to_numpy()[:, second]
     pairs, p_values = zip(scores.columns[first], scores.columns[second], strict=True), flips.p_values(differences)
-    significant = zip(pairs, differences.sum(axis=0), statistics.holm(p_values), strict=True)
+    significant = zip(pairs, differences.sum(axis=0), statistics.holm(p_values, ALPHA), strict=True)
     better = {pair if difference > 0 else pair[::-1] for pair, difference, sure in significant if sure}
     progress = scores.sum().sort_values(ascending=False, kind="stable")
     return Ranking(progress.to_dict(), better, len(first), p_values.min(initial=1.0), len(scores))
@@ -233,7 +234,7 @@ def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
     errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=LEAST_ERROR))
     table = errors.groupby([runs["scene"], runs["row"]]).mean().unstack("row")
     ratios = table.drop(columns=unit_row(runs), errors="ignore").sub(table.get(unit_row(runs)), axis=0)
-    ends = flips.bounds(ratios.to_numpy())
+    ends = flips.bounds(ratios.to_numpy(), ALPHA)
     return ends and (float(np.exp(ends[0])), float(np.exp(ends[1])))
 
 
