@@ -100,7 +100,7 @@ def test_what_has_no_colours_or_lacks_a_file_is_an_error_that_says_so(tmp_path):
     (image,) = tmp_path.glob("*.png")
     content = image.read_bytes()
     image.write_bytes(content[:100])
-    with pytest.raises(BadInput, match=r"an image of mesh file '.*box\.obj' cannot be read"):
+    with pytest.raises(BadInput, match=r"image '.*' of mesh file '.*box\.obj' cannot be read"):
         shapes(path).texture(Split.TRAIN, 0)
     image.write_bytes(content)
     image.rename(tmp_path / "elsewhere")
