@@ -54,7 +54,8 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
                 put_into(into / "earlier" / folder.name, folder)
             else:
                 lines += _join(folder, into)
-                problems += [f"{source}: {UNREADABLE}{problem}" for problem in [read_run(folder, source)[1]] if problem]
+                if problem := read_run(folder, source)[1]:
+                    problems.append(f"{source}: {UNREADABLE}{problem}")
         problems += [f"{source}: this plan cannot be read: {problem}" for problem in read_plans(source)[1]]
         for plan in sorted((source / "sweeps").glob("*/plan.json")):  # of one name: of the same cells
             if not leads_out(plan, source):
