@@ -12,12 +12,8 @@ from bench.report.data.statistics import Interval, Verdict, differ
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAPER = README.parent / "results" / "paper"
 COLUMNS = (
-    "`renderer=`",
-    "progress at 1 ×",
-    "at the end",
-    "field evaluations of a run",
-    "seconds of a run",
-    "failed runs",
+    *("`renderer=`", "progress at 1 ×", "at the end", "failed runs"),
+    *("completion: field evaluations over DIST's", "completion: time over DIST's"),
 )
 HEAD = f"| {' | '.join(COLUMNS)} |\n|---|{'---:|' * (len(COLUMNS) - 1)}\n"
 LINES, NUMBERS, WORDS = 120, 60, 25  # at most, the last of a sentence
@@ -71,13 +67,14 @@ def recommendation() -> str:
     costs = {line["preset"]: float(line["cost"]) for line in lines}
     least, most = min(costs, key=costs.__getitem__), max(costs, key=costs.__getitem__)
     return (
-        f"**Start with `{hard[0]}`.** With the field evaluations of one DIST run (1 ×), `{hard[0]}` and `{other}` make "
-        "significantly more progress than all other renderers.\nThese two cannot be distinguished, but "
-        f"`{hard[0]}` is first with any problem set left out, and `{other}` is last on "
+        f"**Start with `{hard[0]}`.** With as many field evaluations as one whole DIST run (1 ×), `{hard[0]}` and "
+        f"`{other}` make significantly more progress than all other renderers.\nThe difference between these two is "
+        f"not significant. `{hard[0]}` stays first with any problem set left out, and `{other}` is last on "
         "[hard scenes](results/README.md#stability_cost).\nIn the time of one DIST run, in depth completion, "
-        f"{', '.join(near[:-1])} and {near[-1]} are not significantly behind `{hard[0]}`. All others are. "
-        "At the end of their runs, no two renderers can be distinguished. Over all problems, a run costs "
-        f"{costs[least]:.2g} (`{least}`) to {costs[most]:.2g} (`{most}`) times the field evaluations of a DIST run."
+        f"`{hard[0]}` is first, and {', '.join(near[:-1])} and {near[-1]} are not significantly behind. "
+        "All others are. At the end of their runs, no two renderers can be distinguished. "
+        f"Over all problems, a run costs {costs[least]:.2g} (`{least}`) to {costs[most]:.2g} (`{most}`) times the "
+        "field evaluations of a DIST run."
     )
 
 
@@ -93,9 +90,9 @@ def table() -> str:
     for line in _lines("suite"):
         cost = sets["complete", line["row"]]
         failed = sum(map(int, re.findall(r"(\d+) of \d+", line["failed"]))) or "none"
-        cells = [*(_percent(line[name]) for name in ("at_1", "end")), cost["evaluations"], cost["seconds"]]
-        numbers = [cell if cell.endswith(("%", "–")) else f"{float(cell):.2g}" for cell in cells]
-        rows.append(f"| `{line['preset']}` | {' | '.join(numbers)} | {failed} |")
+        progress = [_percent(line[name]) for name in ("at_1", "end")]
+        costs = [f"{float(cost[name]):.2g}" for name in ("evaluations", "seconds")]
+        rows.append(f"| `{line['preset']}` | {' | '.join([*progress, str(failed), *costs])} |")
     return HEAD + "\n".join(rows)
 
 
