@@ -48,5 +48,5 @@ def named_image(path: Path, line: str) -> Path:
 
 def _named(path: Path, key: str) -> list[Path]:
     lines = rf"^[ \t]*{key}[ \t]+.*\S"  # of no blank lines, of which a file may have many
-    found = re.findall(lines, path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
-    return [named_image(path, line) for line in dict.fromkeys(found)]
+    named = re.findall(lines, path.read_text(errors="replace"), re.MULTILINE | re.IGNORECASE)
+    return [named_image(path, line) for line in dict.fromkeys(named)]

@@ -175,7 +175,7 @@ def unrendered(state: State, own: Sequence[View]) -> tuple[str, ...]:
     return (f"the renderer misses {what} which {meant[lost].sum()} of its rays should hit; the pictures show the mesh",)
 
 
-def differing(metrics: dict[str, Any]) -> tuple[str, ...]:
+def depth_gap_note(metrics: dict[str, Any]) -> tuple[str, ...]:
     """A note where the depth error of the renderer's own image is `TIMES` that of the field's mesh; else none.
 
     Errors that differ by less than `LEAST_GAP` are not noted: a pixel at an outline may decide them.

@@ -217,8 +217,8 @@ def true_view(scene: Scene, camera: Camera) -> View:
     """
     if not scene.part:
         return see(scene.cast_on, camera)
-    view, known = scene.given()
-    return enlarged(replace(view, depth=view.depth.where(known, torch.nan), normals=0 * view.normals), camera)
+    view, measured = scene.given()
+    return enlarged(replace(view, depth=view.depth.where(measured, torch.nan), normals=0 * view.normals), camera)
 
 
 def enlarged(view: View, camera: Camera) -> View:

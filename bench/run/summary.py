@@ -87,7 +87,7 @@ def _print_next(results_dir: Path) -> None:
 
 
 def write_log(folder: Path, record: Record) -> None:
-    """Adds what became of a run to its `log.txt`, behind its output; on a full disk it is left out."""
+    """Adds the command, the machine and the results of a run to its `log.txt`; on a full disk they are left out."""
     with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
         log.writelines(f"{line}\n" for line in _logged(record))
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.config import DOUBLING
-from bench.evaluate.evaluate import COLOUR, DEFINITIONS, Evaluation, differing
+from bench.evaluate.evaluate import COLOUR, DEFINITIONS, Evaluation, depth_gap_note
 from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
@@ -201,7 +201,7 @@ def note_result(run: RunContext, after: Evaluation) -> None:
     record.metrics = after.metrics
     record.status, record.reason = after.failure or (RunStatus.OK, "")
     lost = None if after.field is None else save_field(after.field, run.folder / FIELD)
-    record.notes = [*record.notes, *([lost] if lost else []), *after.notes, *differing(after.metrics)]
+    record.notes = [*record.notes, *([lost] if lost else []), *after.notes, *depth_gap_note(after.metrics)]
     if after.mesh is not None:
         record.notes += after.mesh.repairs
         after.mesh.save(run.folder / "mesh.ply")

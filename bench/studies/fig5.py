@@ -70,11 +70,11 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
     numbers = ("end", "low", "high", "spearman")
     with_rank = [line for line in lines if line["spearman"] is not None]
     same = grouped(with_rank, lambda line: tuple(line.get(name) for name in numbers)).values()
-    known = {" = ".join(line["row"] for line in of): of[0]["spearman"] for of in same}  # one computation counts once
-    apart = [f"{row} (*{value:.2f}*)" for row, value in known.items() if value < HIGH]
-    alike = f"{len(known) - len(apart)} of {format.plural(len(known), 'different row')} (ρ of {HIGH} or more)"
+    ranks = {" = ".join(line["row"] for line in of): of[0]["spearman"] for of in same}  # one computation counts once
+    apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < HIGH]
+    alike = f"{len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')} (ρ of {HIGH} or more)"
     said = f"not in {', '.join(apart)}, against the paper" if apart else "as in the paper"
-    return f"Loss and error fall together in {alike}; {said}." if known else ""
+    return f"Loss and error fall together in {alike}; {said}." if ranks else ""
 
 
 def _ends(lines: list[dict[str, Any]]) -> str:

@@ -285,14 +285,14 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
 
 def _ranked(runs: Runs) -> list[str]:
     """The name of one row of each of our renderers: its own preset's, or else its first one; and all rows of others."""
-    firsts = [own[0] for own in runs.rows().values()]
+    firsts = [records_of_row[0] for records_of_row in runs.rows().values()]
     is_ours = {
         record["row"]: str(records.setting(record["config"], *TARGET)).startswith(records.OURS) for record in firsts
     }
     of_renderer = records.grouped([one for one in firsts if is_ours[one["row"]]], records.base_renderer)
     chosen = [
-        next((one for one in own if one["renderer"].replace("_", "") == renderer), own[0])["row"]
-        for renderer, own in of_renderer.items()
+        next((record for record in group if record["renderer"].replace("_", "") == renderer), group[0])["row"]
+        for renderer, group in of_renderer.items()
     ]
     return [name for name, ours in is_ours.items() if not ours or name in chosen]
 

@@ -12,7 +12,7 @@ from bench.evaluate.evaluate import (
     DEFINITIONS,
     WORST_SURFACE,
     chamfer_only,
-    differing,
+    depth_gap_note,
     evaluate,
     render_image,
     render_view,
@@ -227,10 +227,10 @@ def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inp
     ],
 )
 def test_a_renderers_own_image_that_shows_another_surface_is_noted(of_renderer, error, noted):
-    notes = differing({"depth_mae": error, "own_depth_mae": of_renderer, "own_mask_iou": 0.1, "mask_iou": 0.9})
+    notes = depth_gap_note({"depth_mae": error, "own_depth_mae": of_renderer, "own_mask_iou": 0.1, "mask_iou": 0.9})
     both = f"is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene units. The renderer does not"
     assert [note.startswith(f"the depth error of the renderer's own image {both}") for note in notes] == [True] * noted
-    assert differing({"psnr": 20.0, "own_psnr": 3.0}) == differing({}) == ()
+    assert depth_gap_note({"psnr": 20.0, "own_psnr": 3.0}) == depth_gap_note({}) == ()
 
 
 def test_a_part_that_lies_just_before_another_is_missed_where_the_renderer_sees_the_other(inputs):

@@ -47,7 +47,7 @@ def _found(records: list[Record], results_dir: Path) -> dict[str, Any]:
     rows = sorted(made.reached.groupby("row"), key=lambda pair: ranks.get(pair[0], len(ranks)))
     return {
         "problems": problems,
-        "rows": [_row(row, own, problems, attempts, folders) for row, own in rows],
+        "rows": [_row(row, runs, problems, attempts, folders) for row, runs in rows],
     }
 
 
@@ -56,15 +56,15 @@ def _row(
 ) -> dict[str, Any]:
     """A row: its progress at the end of each problem, None where it has no attempt; its failures, and the rest."""
     by_problem = {(run.set, run.problem, run.seed): run for run in runs.itertuples()}
-    own = [by_problem.get(problem) for problem in problems]
-    keys = [run and (run.set, run.problem, run.seed, run.row, run.settings, run.started) for run in own]
+    solved = [by_problem.get(problem) for problem in problems]
+    keys = [run and (run.set, run.problem, run.seed, run.row, run.settings, run.started) for run in solved]
     first = next(attempts[key] for key in keys if key)
     settings = _node(first.preset) | _asked(first) | _tuned(attempts[key] for key in keys if key)
     file, source = _source(str(settings.get("_target_", "")))
     return {
         "row": row,
-        "progress": [run and round(run.end, 4) for run in own],
-        "failed": [[place, run.status, run.reason] for place, run in enumerate(own) if run and not run.ok],
+        "progress": [run and round(run.end, 4) for run in solved],
+        "failed": [[place, run.status, run.reason] for place, run in enumerate(solved) if run and not run.ok],
         "runs": [folders.get(key) for key in keys],
         "settings": [
             [key, str(value)]
