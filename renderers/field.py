@@ -297,10 +297,18 @@ def autograd_normals(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[T
 
 def autograd_gradients(field: Values, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Gradients of the field by automatic differentiation, of any length; without a graph."""
+    return values_and_gradients(field, points)[1]
+
+
+def values_and_gradients(
+    field: Values, points: Float[Tensor, "*batch 3"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    """Values of the field and its gradients by automatic differentiation, of one evaluation; without a graph."""
     with torch.enable_grad():
         leaf = points.detach().requires_grad_(True)
-        (gradient,) = torch.autograd.grad(field(leaf).sum(), leaf)
-    return gradient
+        value = field(leaf)
+        (gradient,) = torch.autograd.grad(value.sum(), leaf)
+    return value.detach(), gradient
 
 
 def steepest(field: Field, *, radius: float, samples: int = 20_000, like: Tensor | None = None) -> float:

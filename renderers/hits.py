@@ -9,13 +9,13 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int, Int8
+from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from renderers.bracket import evenly
 from renderers.camera import Rays, sphere_span
 from renderers.checks import BrokenContract
-from renderers.field import Field, Meter
+from renderers.field import Field, Meter, values_and_gradients
 from renderers.rendering import Renderer, Rendering, Status
 
 # Scene units by which a hit may lie further off the surface than its residual says. Distances that are 5 % too short
@@ -80,7 +80,8 @@ class Hits:
         """
         index = self.hit.flatten().nonzero().squeeze(-1)
         index = index[:: max(-(-len(index) // MOST), 1)]
-        value, slope = self._at(index)
+        value, gradient = values_and_gradients(self.field, self.rays.flat()[index].at(self.distance.flatten()[index]))
+        value, slope = value.abs(), torch.linalg.vector_norm(gradient, dim=-1)
         residual = self.residual.flatten()[index].abs().nan_to_num(0.0)
         stated = residual if self.volume else torch.minimum(residual, STATED * slope)
         off = ~(value <= NEAR * slope + stated)  # as is a value that is not a number
@@ -93,14 +94,6 @@ class Hits:
             f"Their median distance from it is {middle:.2g} scene units, and {NEAR:g} beyond the residual is allowed. "
             "Return the distance along the unit direction, in scene units"
         )
-
-    def _at(self, index: Int[Tensor, " m"]) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
-        """The magnitude of the field's values at some of the hits, and the lengths of its gradients."""
-        with torch.enable_grad():
-            points = self.rays.flat()[index].at(self.distance.flatten()[index]).detach().requires_grad_(True)
-            value = self.field(points)
-            (gradient,) = torch.autograd.grad(value.sum(), points)
-        return value.detach().abs(), torch.linalg.vector_norm(gradient, dim=-1)
 
 
 _kept: ContextVar[list[Hits] | None] = ContextVar("kept", default=None)

@@ -12,7 +12,7 @@ from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh, extract
 from datasets.scene import Truth, View, see
 from renderers.camera import Camera, Rays
-from renderers.field import Field, autograd_gradients
+from renderers.field import Field, autograd_gradients, values_and_gradients
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.coloured import Coloured
 
@@ -81,13 +81,10 @@ def newton_step(
     Args:
         longest: most that a hit is moved, in scene units. One that grazes the surface, or has no number, is not moved.
     """
-    with torch.enable_grad():
-        points = rays.at(distance).detach().requires_grad_(True)
-        values = field(points)
-        (gradients,) = torch.autograd.grad(values.sum(), points)
+    values, gradients = values_and_gradients(field, rays.at(distance))
     slopes = (gradients * rays.directions).sum(-1)
     steep = slopes < -LEAST_COSINE * gradients.norm(dim=-1)
-    steps = (-values.detach() / torch.where(steep, slopes, -1.0)).nan_to_num(0.0).clamp(-longest, longest)
+    steps = (-values / torch.where(steep, slopes, -1.0)).nan_to_num(0.0).clamp(-longest, longest)
     return distance + torch.where(steep, steps, 0.0), gradients.nan_to_num(0.0)
 
 
