@@ -90,6 +90,9 @@ class PriorSettings:
         code_penalty: weight of the mean squared length of the codes.
         surface_width: errors are weighted by w / (w + |distance|), which is largest at the surface; w in scene units.
         seed: of samples, codes, weights and batches.
+        truncation: magnitude, in scene units, to which the field and the true distance are clamped before they are
+            compared (delta of DeepSDF, Eq. 4, which takes 0.1); None compares them everywhere. Beyond it, the field is
+            not constrained: a march clamps its values too (`renderer.step_clamp`).
         colour: what is learnt of colours; None learns the distance alone.
     """
 
@@ -105,6 +108,7 @@ class PriorSettings:
     code_penalty: float
     surface_width: float
     seed: int
+    truncation: float | None = None
     colour: ColourSettings | None = None
 
     def __post_init__(self) -> None:
@@ -112,6 +116,8 @@ class PriorSettings:
             check_at_least(f"prior.{name}", getattr(self, name), 1, "conf/prior holds values that work")
         check_positive("prior.learning_rate", self.learning_rate, "5e-3 works")
         check_positive("prior.surface_width", self.surface_width, "0.05 works")
+        if self.truncation is not None:
+            check_positive("prior.truncation", self.truncation, "DeepSDF has 0.1; null compares distances everywhere")
 
     @property
     def of_one_shape(self) -> bool:
@@ -197,8 +203,13 @@ def near_surface_first(
     return error * width / (width + distance.abs())
 
 
+def truncated(distance: Float[Tensor, "*batch"], truncation: float | None) -> Float[Tensor, "*batch"]:
+    """Distances clamped to a magnitude, or as they are where it is None."""
+    return distance if truncation is None else distance.clamp(-truncation, truncation)
+
+
 def train(samples: DistanceSamples, settings: PriorSettings, device: torch.device, progress: Report) -> Prior:
-    """Fits the decoder and a code for each shape together (DeepSDF, Sec. 4.2, without its clamp)."""
+    """Fits the decoder and a code for each shape together (DeepSDF, Sec. 4.2)."""
     torch.manual_seed(settings.seed)
     decoder = settings.new_decoder()
     codes = settings.code_sigma * torch.randn(len(samples.points), settings.network.code_length)
@@ -218,7 +229,8 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
         picked = torch.randint(count, (rows, settings.points_per_step), device=device)
         points, distances = samples.points[chosen[:, None], picked], samples.distances[chosen[:, None], picked]
         shape = decoder.at(codes[chosen])
-        weighted = near_surface_first((shape(points) - distances).abs(), distances, settings.surface_width)
+        error = truncated(shape(points), settings.truncation) - truncated(distances, settings.truncation)
+        weighted = near_surface_first(error.abs(), distances, settings.surface_width)
         loss = weighted.mean() + settings.code_penalty * codes[chosen].square().sum(-1).mean()
         if (colour := settings.colour) is not None:
             loss = loss + colour.weight * _colour_error(shape, samples, chosen, colour.points_per_step)
@@ -238,12 +250,13 @@ def _colour_error(shape: TexturedShape, samples: DistanceSamples, chosen: Tensor
     return (found - samples.colours[chosen[:, None], places]).abs().mean()
 
 
-def fit_error(decoder: Trained, samples: DistanceSamples, *, steps: int = 200) -> float:
+def fit_error(decoder: Trained, samples: DistanceSamples, truncation: float | None, *, steps: int = 200) -> float:
     """As `surface_error`, with codes fitted to the samples from zero.
 
     Args:
         decoder: not changed.
         samples: of any shapes, in training or not.
+        truncation: see `PriorSettings`.
         steps: of Adam, whose rate falls to zero; 0 evaluates the mean shape.
     """
     shapes, count = samples.distances.shape
@@ -253,7 +266,8 @@ def fit_error(decoder: Trained, samples: DistanceSamples, *, steps: int = 200) -
     rows = torch.arange(shapes)[:, None]
     for _ in range(steps):
         picked = torch.randint(count, (shapes, min(count, 256)))
-        error = (decoder.at(codes)(samples.points[rows, picked]) - samples.distances[rows, picked]).abs()
+        field = truncated(decoder.at(codes)(samples.points[rows, picked]), truncation)
+        error = (field - truncated(samples.distances[rows, picked], truncation)).abs()
         optimiser.zero_grad()
         error.mean().backward()
         optimiser.step()
@@ -380,11 +394,12 @@ def _surface_errors(
     """
     if settings.of_one_shape:
         return {"training": surface_error(prior.decoder, prior.codes, samples)}
-    unseen = distance_samples(dataset, Split.VALIDATION, settings, HELD_OUT, progress)
+    unseen, delta = distance_samples(dataset, Split.VALIDATION, settings, HELD_OUT, progress), settings.truncation
+    seen = DistanceSamples(samples.points[:HELD_OUT], samples.distances[:HELD_OUT])
     return {
-        "training": fit_error(prior.decoder, DistanceSamples(samples.points[:HELD_OUT], samples.distances[:HELD_OUT])),
-        "validation": fit_error(prior.decoder, unseen),
-        "mean_shape": fit_error(prior.decoder, unseen, steps=0),
+        "training": fit_error(prior.decoder, seen, delta),
+        "validation": fit_error(prior.decoder, unseen, delta),
+        "mean_shape": fit_error(prior.decoder, unseen, delta, steps=0),
     }
 
 

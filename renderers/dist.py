@@ -13,7 +13,7 @@ from renderers.field import Field, steepest, values_to_march_on
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march, march_coarse_to_fine
 from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, check_kind
-from renderers.silhouette import Hinge
+from renderers.silhouette import AVERAGES, Hinge
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class DIST:
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
     Deviates from the paper: `extra_step_cap`, `careful_split`, `step_back`, `least_step`, `slope_samples` and `coarse`
         are ours.
-        `step_clamp`, `silhouette_signed` and the average over violating pixels are as in the official code; Eq. 11
-        states neither sign nor average. Each has a setting, which is off in the preset that follows the paper's text. A
-        ray that begins at negative values stops at once with STARTED_INSIDE. Coarse to fine applies to rays of an
-        image (`Rays.image`); others march at full resolution.
+        `silhouette_signed` is as in the official code, and so is `silhouette_average` as "missed_plus_spurious"; Eq. 11
+        states neither sign nor average. `step_clamp` is as in the official code: the paper's networks are truncated at
+        0.1. A ray that begins at negative values stops at once with STARTED_INSIDE. Coarse to fine applies to rays of
+        an image (`Rays.image`); others march at full resolution.
 
     Args:
         steps: most marching steps per ray.
@@ -73,7 +73,7 @@ class DIST:
         check_at_least("alpha", self.alpha, 1, "1 is plain sphere tracing, the paper uses 1.5")
         check_at_least("n_gradient_samples", self.n_gradient_samples, 1, "the paper uses 1 to 3")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
-        check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
+        check_choice("silhouette_average", self.silhouette_average, AVERAGES)
         if not 0 <= self.relaxation <= 1:
             raise ValueError(f"relaxation must lie between 0 (none) and 1, not {self.relaxation:g}: 0.3 works")
         if self.relaxation and not self.step_back:

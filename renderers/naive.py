@@ -13,7 +13,7 @@ from renderers.field import Field
 from renderers.gradients import approximate_front
 from renderers.march import Front, Stepping, march
 from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, Status, assemble, check_kind
-from renderers.silhouette import Hinge
+from renderers.silhouette import AVERAGES, Hinge
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Naive:
         if self.n_gradient_samples is not None:
             check_at_least("n_gradient_samples", self.n_gradient_samples, 1, "the paper uses 1 to 3")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
-        check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
+        check_choice("silhouette_average", self.silhouette_average, AVERAGES)
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches all rays through all steps."""

@@ -10,7 +10,7 @@ from renderers.camera import Rays
 from renderers.checks import check_choice, check_positive
 from renderers.field import Field
 from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, check_kind
-from renderers.silhouette import Hinge
+from renderers.silhouette import AVERAGES, Hinge
 from renderers.tracer import Tracer
 from renderers.warm import Memory, warm_trace
 
@@ -68,7 +68,7 @@ class Newton:
     def __post_init__(self) -> None:
         _ = self.tracer  # which checks its settings
         check_positive("silhouette_epsilon", self.silhouette_epsilon, "DIST uses 5e-5")
-        check_choice("silhouette_average", self.silhouette_average, ("all", "violating"))
+        check_choice("silhouette_average", self.silhouette_average, AVERAGES)
 
     @property
     def tracer(self) -> Tracer:

@@ -22,6 +22,7 @@ from renderers.rendering import OF_LENGTHS, Capabilities, Observed, Renderer, Re
 
 RANDOM, DEPTH = "random", "depth"  # where L_occupancy is; see `Occupancy`
 PLACES = (RANDOM, DEPTH)
+AVERAGES = ("all", "violating", "missed_plus_spurious")  # over which rays `Hinge` averages
 CLOSEST = "its closest field values carry"  # what a loss is made of, in the message where they carry no gradient
 
 
@@ -59,8 +60,9 @@ class Hinge:
         epsilon: the threshold between them, in scene units.
         signed: False takes the magnitude of `closest`, as the paper does. A background ray that stops just inside the
             shape is then pushed deeper. True keeps the sign, which avoids that.
-        average: over "all" rays, or over those that are "violating". With all, a missed pixel weighs next to nothing,
-            and an optimiser can lower the depth loss by losing hits.
+        average: the mean over "all" rays or over "violating" ones, or "missed_plus_spurious": the mean over violating
+            rays of the foreground plus that over violating rays of the background, as in the official code. With all, a
+            missed pixel weighs next to nothing, and an optimiser can lower the depth loss by losing hits.
         weight: of the loss.
     """
 
@@ -71,7 +73,7 @@ class Hinge:
 
     def __post_init__(self) -> None:
         check_positive("epsilon", self.epsilon, "the paper uses 5e-5")
-        check_choice("average", self.average, ("all", "violating"))
+        check_choice("average", self.average, AVERAGES)
         check_at_least("weight", self.weight, 0, "0 switches the loss off")
 
     def __call__(
@@ -94,11 +96,11 @@ class Hinge:
         wrong = silent | (violates & ~(rendering.hit & mask))
         excess = self._excess(closest_values(field, rays, rendering, wrong), mask)
         excess = torch.where(silent, excess - excess.detach() + self.epsilon, excess)
-        return self._mean(torch.where(wrong, excess, 0.0))
+        return self._mean(torch.where(wrong, excess, 0.0), mask)
 
     def of(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
         """The loss of the field's values of least magnitude on each ray, with their sign."""
-        return self._mean(self.violation(closest, mask))
+        return self._mean(self.violation(closest, mask), mask)
 
     def violation(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
         """By how much the soft silhouette is on the wrong side; 0 where it is on the right one."""
@@ -109,9 +111,15 @@ class Hinge:
         soft = (closest if self.signed else closest.abs()) - self.epsilon
         return torch.where(mask, soft, -soft)
 
-    def _mean(self, violation: Float[Tensor, "*rays"]) -> Float[Tensor, ""]:
-        count = torch.full_like(violation, True, dtype=torch.bool) if self.average == "all" else violation > 0
-        return self.weight * violation.sum() / count.sum().clamp_min(1)
+    def _mean(self, violation: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+        violating = violation > 0
+        over = {
+            "all": [torch.ones_like(mask)],
+            "violating": [violating],
+            "missed_plus_spurious": [violating & mask, violating & ~mask],
+        }[self.average]
+        means = [(violation * rays).sum() / rays.sum().clamp_min(1) for rays in over]
+        return self.weight * torch.stack(means).sum()
 
 
 @dataclass(frozen=True)

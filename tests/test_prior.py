@@ -11,6 +11,7 @@ from bench import shape_prior as prior_store
 from bench.shape_prior import (
     SHIPPED,
     ColourSettings,
+    DistanceSamples,
     NetworkSettings,
     PriorSettings,
     distance_samples,
@@ -71,7 +72,7 @@ def never(*_, **__):
 def test_a_prior_learns_its_shapes(kept):
     _, prior = kept
     samples = distance_samples(Boxes(), Split.TRAIN, replace(SETTINGS, seed=9), 3, silent)
-    fitted, mean_shape = fit_error(prior.decoder, samples), fit_error(prior.decoder, samples, steps=0)
+    fitted, mean_shape = fit_error(prior.decoder, samples, None), fit_error(prior.decoder, samples, None, steps=0)
     zero = torch.zeros(3, 4)
     assert mean_shape > 0.05
     assert fitted < 0.25 * mean_shape
@@ -99,6 +100,25 @@ def test_training_follows_its_seed():
     assert torch.equal(first.codes, again.codes)
     assert torch.equal(first.decoder.last.weight, again.decoder.last.weight)
     assert not torch.equal(first.codes, other.codes)
+
+
+def test_beyond_its_truncation_a_prior_is_not_constrained():
+    points = 2 * torch.nn.functional.normalize(torch.randn(3, 64, 3), dim=-1)
+
+    def trained(distance: float, truncation: float | None):
+        """A network that begins as a sphere of radius 0.5, after steps at points far outside of it."""
+        settings = replace(SETTINGS, steps=3, points_per_step=8, truncation=truncation, code_penalty=0.0)
+        samples = DistanceSamples(points, torch.full((3, 64), distance))
+        return train(samples, settings, CPU, silent).decoder.state_dict()
+
+    def equal(one: dict, other: dict) -> bool:
+        return all(torch.equal(one[name], other[name]) for name in one)
+
+    begun = trained(0.9, 0.1)
+    assert equal(begun, trained(0.2, 0.1))  # neither 0.9 nor 0.2 says more than "beyond 0.1"
+    assert not equal(begun, trained(0.9, None))
+    with pytest.raises(ValueError, match=r"prior\.truncation must be positive.*null compares distances everywhere"):
+        replace(SETTINGS, truncation=0.0)
 
 
 def test_a_prior_is_kept_with_its_record(kept):
@@ -182,12 +202,13 @@ def shipped_records() -> list[dict]:
     return [json.loads(path.read_text()) for path in sorted(SHIPPED.glob("*.json"))]
 
 
+@pytest.mark.parametrize("truncation", ["null", 0.1])
 @pytest.mark.parametrize("family", sorted(FAMILIES))
-def test_the_shipped_prior_is_that_of_the_default_configuration(family, compose_config, tmp_path, monkeypatch):
-    desk = cell_from(compose_config(f"dataset={family}", "scale=desk"))
+def test_the_shipped_priors_are_those_of_the_configuration(family, truncation, compose_config, tmp_path, monkeypatch):
+    desk = cell_from(compose_config(f"dataset={family}", "scale=desk", f"prior.truncation={truncation}"))
     dataset, settings = desk.inputs.dataset, desk.prior
-    (record,) = (record for record in shipped_records() if record["dataset"]["name"] == family)
-    assert record["key"] == prior_key(dataset, settings)
+    (record,) = (record for record in shipped_records() if record["key"] == prior_key(dataset, settings))
+    assert record["dataset"]["name"] == family
     assert record["settings"] == settings.identity
     assert probe(dataset) == pytest.approx(record["probe"], rel=1e-4)  # the family is as it was
     error = record["surface_error"]
@@ -208,4 +229,4 @@ def test_every_shipped_file_belongs_to_a_family_and_serves_both_scales(compose_c
     keys = {f"{record['dataset']['name']}-{record['key']}" for record in shipped_records()}
     names = {path.name for path in SHIPPED.iterdir()}
     assert names == {f"{key}.{suffix}" for key in keys for suffix in ("json", "safetensors")}
-    assert len(keys) == len(FAMILIES)
+    assert len(keys) == 2 * len(FAMILIES)  # with truncated distances, and without

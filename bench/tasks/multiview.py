@@ -37,7 +37,7 @@ FAR_APART = 60.0  # degrees between compared photographs, above which the record
 
 @dataclass(frozen=True)
 class Multiview(PhotographTask):
-    """Shape from photographs whose cameras are known; of those that are taken of a scene no mask is used.
+    """Shape from photographs whose cameras are known.
 
     Args:
         images, longest, held_out, masks: see `PhotographTask`; all but the first are of photographs of one's own.
@@ -53,7 +53,8 @@ class Multiview(PhotographTask):
         coarse_blur: standard deviation of the initial Gaussian blur of the images, as a share of their height; it falls
             to 0 over the first half of a start's iterations.
         rotations: their number, about the vertical axis, from which a similarity of one's own photographs begins.
-        silhouette, silhouette_weight: loss of the masks of one's own photographs, and its weight.
+        silhouette, silhouette_weight: loss of the masks, and its weight; 0 compares none. Eq. 6 is a mean over pixels
+            that the shape covers, and pixels of the object that it leaves free cost nothing.
         scale, degrees, shift: scale, rotation and shift of the initial shape against the true one; where one is not
             neutral, a similarity transform is optimised as well (DIST, Fig. 12). Ratio, degrees, scene units.
         similarity: whether one is optimised in any case.
@@ -250,7 +251,8 @@ class GivenPhotographs:
         self.rays = [camera.rays() for camera in self.cameras]
         self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
         self.per_step = min(settings.views_per_step, len(photographs))
-        count, masks = len(photographs), [one.mask for one in photographs if own and one.mask is not None]
+        count = len(photographs)
+        masks = [one.mask for one in photographs if settings.silhouette_weight and one.mask is not None]
         self.others = [(view + settings.neighbour) % count for view in range(count)]
         if own:
             places = torch.stack([camera.center for camera in self.cameras])

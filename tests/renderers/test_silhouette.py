@@ -12,7 +12,7 @@ from renderers.boundary import BrokenContract
 from renderers.camera import Rays
 from renderers.fields.analytic import sphere
 from renderers.rendering import Capabilities, Observed, Renderer, at_iteration
-from renderers.silhouette import Hinge, SilhouetteLoss
+from renderers.silhouette import AVERAGES, Hinge, SilhouetteLoss
 from tests.looped import each
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
@@ -41,6 +41,9 @@ def loss(mask, *, signed=False, average="all", closest=CLOSEST):
         (NONE, True, "violating", (0.07 + 0.4 + 0.14) / 3),
         (torch.tensor([False, True, True, True]), True, "violating", 0),  # nothing violates
         (torch.tensor([False, True, False, True]), False, "all", 0),
+        (torch.tensor([True, True, False, False]), False, "missed_plus_spurious", 0.4 + 0.06),
+        (torch.tensor([True, True, False, False]), True, "missed_plus_spurious", 0.4 + (0.4 + 0.14) / 2),
+        (ALL, False, "missed_plus_spurious", (0.4 + 0.2) / 2),
     ],
 )
 def test_values_worked_out_by_hand(mask, signed, average, expected):
@@ -57,7 +60,7 @@ def test_a_background_ray_just_inside_is_pushed_out_with_its_sign_and_deeper_wit
     assert slope(signed=False) == 1  # descent lowers it: deeper
 
 
-@each("average", ["all", "violating"])
+@each("average", AVERAGES)
 def test_no_rays_cost_nothing(average):
     assert loss(ALL[:0], average=average, closest=CLOSEST[:0]).item() == 0
 
@@ -105,7 +108,7 @@ def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
 @each(
     "loss, values, message",
     [
-        ("hinge", {"average": "some"}, "average must be one of all, violating, not 'some'"),
+        ("hinge", {"average": "some"}, "average must be one of all, violating, missed_plus_spurious, not 'some'"),
         ("cross_entropy", {"sharpness": -1.0}, "sharpness must be positive, not -1.0"),
         ("occupancy", {"weight": -1.0}, "weight must be at least 0, not -1.0"),
         ("occupancy", {"occupied_at": "hull"}, "occupied_at must be one of random, depth, not 'hull'"),

@@ -32,7 +32,7 @@ SETTINGS = Multiview(
     visible=1e-3, photometric_weight=5.0, code=CodePenalty(0.0, "sum"), start_scale=0.0,
     starts=1, trial=3, coarse_blur=0.0,
     scale=1.0, degrees=0.0, shift=0.0, similarity=False, rotations=2,
-    silhouette=load("silhouette", "cross_entropy_sharp"), silhouette_weight=10.0,
+    silhouette=load("silhouette", "cross_entropy_sharp"), silhouette_weight=0.0,
     optimiser=OptimiserSettings(30, 0.01, "constant"),
 )  # fmt: skip
 
@@ -57,6 +57,13 @@ def test_the_truth_costs_least(scene):
     losses = [photographs.compare(sphere(radius), 0)["photometric"].item() for radius in (0.35, 0.45, 0.5, 0.55, 0.65)]
     assert losses.index(min(losses)) == 2
     assert losses[2] < 0.5 * min(losses[0], losses[4])
+
+
+def test_masks_are_compared_where_their_loss_has_a_weight_and_hold_what_a_shape_leaves_free(scene):
+    smaller = sphere(0.4)
+    assert set(given(scene).compare(smaller, 0)) == {"photometric"}
+    masked = given(scene, silhouette_weight=10.0)
+    assert masked.compare(smaller, 0)["silhouette"] > 3 * masked.compare(sphere(0.5), 0)["silhouette"]
 
 
 def test_views_move_on_and_are_spread_evenly(scene):
