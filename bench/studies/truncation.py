@@ -1,0 +1,104 @@
+"""Aggressive marching on distances and on truncated distances: pixels that are lost, and field evaluations."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.report.study import Result, Runs, Selection, chart, compare, statistics, table
+
+PLACE = 24
+READS = (Selection("truncation", ("renderer.alpha", "renderer.step_clamp", "prior.truncation")),)
+SERIES = {  # by whether the prior is truncated, and steps clamped: the name, and a row that has the same look
+    (True, True): ("truncated field, clamped steps: DIST's own", "dist_aggressive"),
+    (True, False): ("truncated field", "dist_step_floor"),
+    (False, True): ("distances, clamped steps", "dist_dynamic"),
+    (False, False): ("distances", "dist_capped"),
+}
+DISTANCES = (False, False)
+WRONG, COST = "wrong pixels (share of hits)", "field evaluations (ratio)"
+COLUMNS = (
+    *(table.text("field", "Field and steps"), table.Column("alpha", "Alpha"), table.Column("shapes", "Shapes")),
+    *(
+        table.Column("wrong", "Wrong pixels", show=table.small_percent),
+        *table.ends("wrong", lambda line: line["share"]),
+    ),
+    *(table.Column("cost", "Field evaluations, ratio"), *table.ends("cost", lambda line: line["ratio"])),
+)
+NOTES = (
+    "Wrong pixels are missed, spurious, or off in depth by more than 0.02 scene units, over the float64 reference's "
+    "hits. The ratio is over plain sphere tracing of the distances: alpha = 1, no clamp.",
+    "A truncated field is a prior trained on distances clamped at 0.1 scene units, as DeepSDF's networks are: beyond, "
+    "its values are not constrained. Clamped steps clamp values at 0.1 before alpha, as DIST's official code does.",
+)
+Kind = tuple[bool, bool]  # whether the prior is truncated, and whether steps are clamped
+Line = dict[str, Any]
+
+
+def make(runs: Runs) -> Result:
+    """A line per kind of field and steps, and per alpha, over all shapes."""
+    frame = runs.frame[["family", "solid"]].assign(
+        alpha=runs.number("config.renderer.alpha"),
+        truncated=runs.number("config.prior.truncation").notna(),
+        clamped=runs.number("config.renderer.step_clamp").notna(),
+        wrong=sum(runs.number(name) for name in ("lost", "false", "wrong")) / runs.number("hits"),
+        queries=runs.number("queries"),
+    )
+    plain = _of(frame, DISTANCES)
+    once = plain[plain.alpha == 1].set_index(["family", "solid"]).queries
+    lines = [line for kind in SERIES for line in _lines(_of(frame, kind), kind, once)]
+    return Result(
+        runs,
+        "Aggressive marching on distances and on truncated distances.",
+        "Medians over shapes of the share of wrong pixels, and of the field evaluations of a rendering, over alpha.",
+        question="Which field does aggressive marching need?",
+        verdict=_verdict({(line["kind"], line["alpha"]): line for line in lines}),
+        interval=compare.INTERVAL,
+        remarks=NOTES,
+        columns=COLUMNS,
+        lines=lines,
+        figure=chart.draw(_panels(lines), 3.1, legend=2),
+    )
+
+
+def _of(frame: pd.DataFrame, kind: Kind) -> pd.DataFrame:
+    return frame.loc[(frame.truncated == kind[0]) & (frame.clamped == kind[1])]
+
+
+def _lines(frame: pd.DataFrame, kind: Kind, once: pd.Series) -> list[Line]:
+    lines = []
+    for alpha, own in frame.groupby("alpha"):
+        shapes = own.set_index(["family", "solid"])
+        share, ratio = (statistics.typical([np.array([x]) for x in of]) for of in (shapes.wrong, shapes.queries / once))
+        about = {"field": SERIES[kind][0], "preset": SERIES[kind][1], "kind": kind, "alpha": alpha, "shapes": len(own)}
+        lines.append({**about, "wrong": share.value, "share": share, "cost": ratio.value, "ratio": ratio})
+    return lines
+
+
+def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
+    """What alpha = 1.5 loses and costs on distances, and with clamped steps on a truncated field."""
+    wanted = [(DISTANCES, 1.0), (DISTANCES, 1.5), ((True, True), 1.0), ((True, True), 1.5)]
+    if not all(key in lines for key in wanted):
+        return ""
+    plain, far, slow, own = (lines[key] for key in wanted)
+    wrong = [table.small_percent(line["wrong"]) for line in (plain, far, own)]
+    return (
+        f"On distances, alpha = 1.5 has *{wrong[1]}* wrong pixels, and alpha = 1 has {wrong[0]}. On a truncated field "
+        f"with clamped steps, alpha = 1.5 has {wrong[2]} and {own['cost'] / slow['cost']:.2f} times the evaluations of "
+        f"alpha = 1, but {own['cost']:.2f} times those of alpha = 1 on distances; n = {plain['shapes']} shapes."
+    )
+
+
+def _panels(lines: list[Line]) -> list[chart.Panel]:
+    panels = []
+    for label, key in ((WRONG, "share"), (COST, "ratio")):
+        curves = [
+            chart.curve(name, preset, [line["alpha"] for line in of], [line[key] for line in of])
+            for kind, (name, preset) in SERIES.items()
+            if (of := [line for line in lines if line["kind"] == kind])
+        ]
+        panels.append(chart.panel_data("", "alpha", label, curves))
+    return panels
+
+
+PAGES = {"truncation": make}
