@@ -9,14 +9,17 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from bench.config import load
+from bench.shape_prior import initialise_to_sphere
 from renderers.camera import Rays
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
+from renderers.fields.mlp import Decoder
 from renderers.gradients import implicit
 from renderers.rendering import Observed, Rendering, Status, at_iteration
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, along_z, vector
+from tests.tiny import camera_of
 
 DVR = load("renderer", "dvr", mask_weight=1.0)
 IDR = load("renderer", "idr", epsilon=1e-11, steps=300)
@@ -48,6 +51,30 @@ def test_stopping_early_changes_nothing():
     assert set(plain.status.tolist()) == {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
     for part in ("distance", "status", "points", "residual", "closest"):
         assert torch.equal(getattr(plain, part), getattr(early, part)), part
+
+
+def test_what_a_step_keeps_does_not_grow_with_n():
+    """DVR, Sec. 3.3: the samples of the search need no memory. NeuS keeps all of its own, so that the test can fail."""
+
+    def kept(name: str, **settings) -> int:
+        """The bytes of all tensors that a rendering keeps for its backward pass."""
+        storages: dict[int, int] = {}
+
+        def keep(tensor: Tensor) -> Tensor:
+            storages[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        torch.manual_seed(0)
+        decoder = Decoder(layers=3, width=32, code_length=1, skip=1, narrow=False)
+        initialise_to_sphere(decoder, radius=0.5)
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            rendering = load("renderer", name, **settings).render(decoder.at(torch.zeros(1)), camera_of(32).rays())
+            rendering.distance[rendering.hit].sum()
+        return sum(storages.values())
+
+    few, many = (kept("dvr", n_ray_samples=n, doublings=[]) for n in (16, 128))
+    assert many == pytest.approx(few, rel=0.01)
+    assert kept("neus", samples=64) > 1.1 * kept("neus", samples=16)
 
 
 def test_samples_double_on_schedule_up_to_all():

@@ -1,0 +1,115 @@
+"""Claims of the papers, aggressive marching over alpha, and DIST one change at a time, from runs of known numbers."""
+
+from math import nan
+from pathlib import Path
+
+import pytest
+
+from bench.config import names
+from bench.report.data.statistics import Interval
+from bench.studies.claims import CLAIMS, EQUAL, SMALLER, Claim, verdict_of
+from tests.looped import each
+from tests.report.test_report_paper import page_of, told, write_run
+
+SHAPES = tuple(range(6))
+
+
+@each(
+    "expected, published, low, value, high, verdict",
+    [
+        (SMALLER, 0.5, 0.5, 0.6, 0.9, "holds"),  # more than half of the effect: 0.71
+        (SMALLER, 0.5, 0.5, 0.8, 0.9, "weaker"),
+        (SMALLER, None, 0.5, 0.8, 0.9, "holds"),
+        (SMALLER, 0.5, 0.5, 0.6, 1.1, "not decided"),
+        (SMALLER, 0.5, 1.1, 1.2, 1.3, "does not hold"),
+        (EQUAL, None, 0.9, 1.0, 1.2, "holds"),
+        (EQUAL, None, 0.7, 1.0, 1.2, "not decided"),
+        (EQUAL, None, 1.3, 1.5, 2.0, "does not hold"),
+        (EQUAL, None, 0.5, 0.6, 0.7, "does not hold"),
+        (SMALLER, 0.5, nan, 0.6, nan, "as claimed, 4 shapes"),
+        (SMALLER, 0.5, nan, 1.6, nan, "against the claim, 4 shapes"),
+        (EQUAL, None, nan, 1.3, nan, "against the claim, 4 shapes"),
+    ],
+)
+def test_a_verdict_follows_the_rule(expected, published, low, value, high, verdict):
+    claim = Claim("a paper", "a claim", published, expected=expected)
+    assert verdict_of(claim, Interval(value, low, high, (value,) * 4)) == verdict
+
+
+def test_every_claim_names_rows_and_tests_that_exist_or_says_what_it_needs():
+    rows = {*names("renderer"), *names("method")}
+    for claim in CLAIMS:
+        if claim.experiment:
+            assert {claim.top, claim.bottom} <= rows and (claim.command or claim.experiment) in names("experiment"), (
+                claim
+            )
+        elif not claim.test:
+            assert claim.why.startswith("needs"), claim
+    tests = "".join(path.read_text() for path in Path(__file__).parents[1].rglob("test_*.py"))
+    assert all(f"def {claim.test}(" in tests for claim in CLAIMS if claim.test)
+
+
+def dense(results, method, errors, **changed):
+    """Completions of sofas from dense depth."""
+    for index, error in zip(SHAPES, errors, strict=True):
+        known = {"task": "completion", "dataset": "sofa", "method": method, "index": index} | changed
+        settings = {"task": {"points": "dense"}, "split": "test"} | known.pop("settings", {})
+        write_run(
+            results,
+            known.pop("experiment", "table2"),
+            method,
+            settings=settings,
+            **known,
+            metrics={"chamfer_l2": error},
+        )
+
+
+def test_claims_are_measured_on_shapes_that_both_rows_have(tmp_path):
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 6)
+    dense(tmp_path, "dist_mask_official", [0.3, 0.4, 0.5, 0.6, 0.7, 9.0])
+    dense(tmp_path, "dist_mask_paper", [2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
+    dense(tmp_path, "dist_mask_paper", [0.1] * 6, dataset="car")  # the paper has no cars
+    page = page_of(tmp_path, "claims")
+    lines = {line["claim"]: line for line in page.lines if line["shapes"]}
+    assert {name: line["shapes"] for name, line in lines.items()} == dict.fromkeys(lines, 6) and len(lines) == 2
+    printed, official = lines.values()
+    assert printed["ratio"].value == pytest.approx(20**0.5) and printed["verdict"] == "does not hold"
+    assert printed["why"].startswith("Eq. 11 over all pixels")
+    assert official["ratio"].value == pytest.approx(0.3**0.5)
+    assert official["verdict"] == "not decided"  # one shape of six is against it
+    assert "does not hold *1*" in page.verdict and "not tested" in page.verdict
+
+
+def test_a_claim_is_not_tested_by_runs_that_are_only_planned(tmp_path):
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 6)
+    dense(tmp_path, "dist_mask_paper", [2.0] * 6, status="not_run")
+    assert not any(line["shapes"] for line in page_of(tmp_path, "claims").lines)
+
+
+def marched(results, alpha, *, truncation, clamp, wrong, queries):
+    for index in SHAPES:
+        settings = {"renderer": {"alpha": alpha, "step_clamp": clamp}, "prior": {"truncation": truncation}}
+        metrics = {"lost": wrong, "false": 0, "wrong": 0, "hits": 100, "queries": queries}
+        write_run(results, "truncation", f"{alpha}", index=index, dataset="sofa", settings=settings, metrics=metrics)
+
+
+def test_aggressive_marching_is_measured_over_plain_marching_of_distances(tmp_path):
+    marched(tmp_path, 1.0, truncation=None, clamp=None, wrong=1, queries=1000)
+    marched(tmp_path, 1.5, truncation=None, clamp=None, wrong=30, queries=700)
+    marched(tmp_path, 1.0, truncation=0.1, clamp=0.1, wrong=1, queries=3000)
+    marched(tmp_path, 1.5, truncation=0.1, clamp=0.1, wrong=2, queries=2100)
+    page = page_of(tmp_path, "truncation")
+    found = {(line["kind"], line["alpha"]): (line["wrong"], line["cost"]) for line in page.lines}
+    assert found[(False, False), 1.5] == (0.3, 0.7)
+    assert found[(True, True), 1.5] == (0.02, 2.1)
+    assert "*30.0 %* wrong pixels" in page.verdict and "0.70 times" in page.verdict and "2.10 times" in page.verdict
+    assert page.figure is not None
+
+
+def test_each_change_is_divided_by_deepsdf_on_the_same_prior(tmp_path):
+    for method, error in {"deepsdf": 1.0, "deepsdf_truncated": 2.0, "as_printed_clamp": 3.0, "as_printed": 4.0}.items():
+        dense(tmp_path, method, [error] * 6, experiment="as_printed")
+    page = page_of(tmp_path, "as_printed")
+    ratios = {line["preset"]: line["ratio"].ratio.value for line in page.lines if line["ratio"]}
+    assert ratios == pytest.approx({"as_printed_clamp": 3.0, "as_printed": 2.0})
+    assert "same prior" in told(page)
