@@ -37,6 +37,7 @@ Line = dict[str, Any]
 
 def make(runs: Runs) -> Result:
     """A line per kind of field and steps, and per alpha, over all shapes."""
+    runs = runs.made
     frame = runs.frame[["family", "solid"]].assign(
         alpha=runs.number("config.renderer.alpha"),
         truncated=runs.number("config.prior.truncation").notna(),
@@ -69,8 +70,15 @@ def _lines(frame: pd.DataFrame, kind: Kind, once: pd.Series) -> list[Line]:
     lines = []
     for alpha, own in frame.groupby("alpha"):
         shapes = own.set_index(["family", "solid"])
-        share, ratio = (statistics.typical([np.array([x]) for x in of]) for of in (shapes.wrong, shapes.queries / once))
-        about = {"field": SERIES[kind][0], "preset": SERIES[kind][1], "kind": kind, "alpha": alpha, "shapes": len(own)}
+        shapes = shapes.assign(ratio=shapes.queries / once).dropna()
+        share, ratio = (statistics.typical([np.array([x]) for x in of]) for of in (shapes.wrong, shapes.ratio))
+        about = {
+            "field": SERIES[kind][0],
+            "preset": SERIES[kind][1],
+            "kind": kind,
+            "alpha": alpha,
+            "shapes": len(shapes),
+        }
         lines.append({**about, "wrong": share.value, "share": share, "cost": ratio.value, "ratio": ratio})
     return lines
 
