@@ -183,7 +183,11 @@ def test_the_first_and_last_cell_of_an_experiment_compose_and_build(paths, name,
         elif key != "stress":
             found, asked = OmegaConf.select(config, key), yaml.safe_load(value.replace(":", ": "))
             # Of a node, the rest of it stays.
-            assert asked.items() <= dict(found).items() if isinstance(asked, dict) else found in (asked, value)
+            assert (
+                asked.items() <= dict(found).items()
+                if isinstance(asked, dict)
+                else found == (asked if found is None else type(found)(value))
+            )
 
 
 def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) -> None:
