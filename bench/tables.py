@@ -281,25 +281,20 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
 
 
 def _methods(kind: str, *without: str, _root_: DictConfig) -> str:
-    """The methods with a search space, to be swept over: of the kind `space` the spaces.
-
-    Of the kind `tuned`, the settings that have been written for them, each behind its method.
+    """The spaces of the methods with a search space, to be swept over.
 
     Args:
         without: names of methods that are left out.
 
     Raises:
-        ValueError: for such a name that has no search space, and for another kind.
+        ValueError: for such a name that has no search space, and for another kind than `space`.
     """
-    if kind not in ("space", "tuned"):
-        raise ValueError(f"${{methods:KIND}} has the kinds space and tuned, not {kind!r}")
-    spaces, tuned = (_choices(group, _root_.hydra.runtime) for group in (SPACE, TUNED))
+    if kind != "space":
+        raise ValueError(f"${{methods:KIND}} has the kind space, not {kind!r}")
+    spaces = _choices(SPACE, _root_.hydra.runtime)
     if unknown := {*without} - {*spaces}:
         raise ValueError(f"${{methods:{kind},...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
-    kept = [name for name in sorted(spaces) if name not in without]
-    if kind == "space":
-        return ",".join(f"space/{name}" for name in kept)
-    return ",".join(f"{name},tuned/{name}" for name in kept if name in tuned)
+    return ",".join(f"space/{name}" for name in sorted(spaces) if name not in without)
 
 
 def _prior_kind(of: str | None, own: str) -> str:

@@ -74,7 +74,7 @@ class Compared:
     """
 
     runs: Runs
-    reference: Callable[[str], str] | None = None
+    reference: Callable[[str], str]
     metric: str = METRIC
     label: str = LABEL
 
@@ -121,7 +121,7 @@ class Compared:
 
     def reference_of(self, row: Row) -> Row:
         """The row that a row is divided by; itself where there is no other."""
-        wanted = row.name if self.reference is None else self.reference(row.preset)
+        wanted = self.reference(row.preset)
         found = [r for r in self.rows if r.name == wanted] or [r for r in self.rows if r.preset == wanted]
         return min(found, key=self.planned.index) if len(found) > 1 else next(iter(found), row)
 
@@ -168,16 +168,11 @@ class Compared:
         groups = by_shape(self.means(family, row))
         return statistics.typical(groups) if groups else Interval(math.nan, math.nan, math.nan)
 
-    def gap(self, family: str, first: list[Row], second: list[Row]) -> Gap | None:
-        """The gap between two groups of rows, by the geometric means of their rows; None without a common shape."""
-        if not {*first, *second} <= {*self.rows}:
-            return None
-        tables = {row: self.means(family, row) for row in (*first, *second)}
-        common = [run for run in tables[first[0]] if all(run in table for table in tables.values())]
-        means = (
-            {run: float(geometric_mean([tables[row][run] for row in of])) for run in common} for of in (first, second)
-        )
-        ours, theirs = map(by_shape, means)
+    def gap(self, family: str, first: Row, second: Row) -> Gap | None:
+        """The gap between two rows; None without a common shape."""
+        means = [self.means(family, row) for row in (first, second)]
+        common = [run for run in means[0] if run in means[1]]
+        ours, theirs = (by_shape({run: each[run] for run in common}) for each in means)
         return Gap(statistics.ratio(ours, theirs), statistics.better(ours, theirs), len(ours)) if ours else None
 
     @cached_property
@@ -198,7 +193,7 @@ class Compared:
             **{"family": family, "row": row.name, "preset": row.preset},
             **{at: self.median(family, row, at) for at in self.conditions},
             "error": self.error(family, row),
-            "ratio": None if reference == row else self.gap(family, [row], [reference]),
+            "ratio": None if reference == row else self.gap(family, row, reference),
             **{cost: None if math.isnan(value) else float(value) for cost, value in costs.items()},
             "lacking": lacking,
             "failed": f"{(~mine.ok).sum()} of {len(mine)}" + (f", {lacking} missing" if lacking else ""),
@@ -239,8 +234,8 @@ class Compared:
             ]
         return found
 
-    def columns(self, ratio: str = "") -> list[Column]:
-        """The columns of the lines; the ratio has that heading, and without one the CSV alone has it."""
+    def columns(self, ratio: str) -> list[Column]:
+        """The columns of the lines; the ratio has that heading."""
         return [
             *(text("family", "Family"), text("row", "Method")),
             *(Column(at, heading(at)) for at in self.conditions),
@@ -256,11 +251,11 @@ class Compared:
         """The page of the comparison: a line per family and row, with the front of error over cost.
 
         Args:
-            changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; `ratio`, the
-                heading of the ratios; and `filled`, see `front`.
+            changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; and `ratio`, the
+                heading of the ratios.
         """
         ratio = changed.pop("ratio", "Ratio to the reference")
-        panels = self.front(changed.pop("filled", None))
+        panels = self.front()
         whole = [(line["row"], ratio_of(line["ratio"])) for line in self.comparable]
         sure = differing(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
@@ -306,11 +301,10 @@ class Compared:
         quickest = ", which is the quickest row too)" if best is quick else f"); the quickest row has {other})"
         return f"The least median of {least_of} is *{least}{quickest}; n = {format.plural(n, 'shape')}."
 
-    def front(self, filled: Callable[[str], bool] | None = None) -> list[chart.Panel]:
+    def front(self) -> list[chart.Panel]:
         """Panels of the mean error of each row over each cost, over all families.
 
-        Args:
-            filled: whether the points of a preset are filled; by default those are that no row beats at less cost.
+        Filled are the points of rows that no row beats at less cost.
         """
         panels = []
         for cost, label in COSTS.items():
@@ -319,7 +313,7 @@ class Compared:
             points = [
                 chart.series(
                     *(line["row"], line["preset"], [line[cost]], [line["error"]]),
-                    **{"size": 9, "hollow": not (filled(line["preset"]) if filled else line[f"front_{cost}"])},
+                    **{"size": 9, "hollow": not line[f"front_{cost}"]},
                 )
                 for line in self.pooled
                 if line[cost] is not None

@@ -13,6 +13,7 @@ from bench.report.write import chart
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, estimate, metrics, text
 
 BELOW = "median Chamfer distance from truth to prediction (squared scene units, times 1000)"
+LABEL = "truth to prediction × 1000\n(scene units²)"
 INTERVALS = "95 % bootstrap intervals over {shapes and seeds}"
 MEDIAN = estimate("error", "Median")
 NAMED = (text("family", "Family"), text("method", "Method"), text("condition", "Condition"))
@@ -43,12 +44,12 @@ def run_columns(conditions: Sequence[Condition], *others: str) -> tuple[Column, 
     return (FAMILY, *keys, *(configured(key, "task", key) for key in others), *metrics(ONE_WAY, "chamfer_l2"))
 
 
-def middle(records: Sequence[Record], metric: str = ONE_WAY) -> Interval:
-    """The median of a metric x 1000 over shapes and seeds, in which a run that failed is infinite."""
-    return bootstrap(by_shape({run_key(run): SCALE * error(run, metric) for run in records}), median)
+def middle(records: Sequence[Record]) -> Interval:
+    """The median error x 1000 over shapes and seeds, in which a run that failed is infinite."""
+    return bootstrap(by_shape({run_key(run): SCALE * error(run, ONE_WAY) for run in records}), median)
 
 
-def lines_of(records: Sequence[Record], conditions: Sequence[Condition], metric: str = ONE_WAY) -> list[dict[str, Any]]:
+def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
     """A line per family, row, condition and its value, with all other conditions at their neutral values.
 
     Each has family, method, preset, the condition as text, the place of the condition, its value `at`, its `runs` and
@@ -59,7 +60,7 @@ def lines_of(records: Sequence[Record], conditions: Sequence[Condition], metric:
         alone = [r for r in records if all(other.of(r) == other.neutral for other in conditions if other != one)]
         for (name, row, at), own in grouped(alone, lambda r, one=one: (family(r), row_of(r), one.of(r))).items():
             told = {"family": name, "method": row.name, "preset": row.preset, "condition": f"{one.label}: {at:g}"}
-            lines.append(told | {"key": one.key, "place": place, "at": at, "runs": own, "error": middle(own, metric)})
+            lines.append(told | {"key": one.key, "place": place, "at": at, "runs": own, "error": middle(own)})
     return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["at"]))
 
 
@@ -67,7 +68,6 @@ def draw(
     lines: Sequence[dict[str, Any]],
     conditions: Sequence[Condition],
     *,
-    label: str = "truth to prediction × 1000\n(scene units²)",
     success: float | None = None,
 ) -> Figure:
     """Draws a row of panels per family: the error over the value of each condition, a line per method.
@@ -80,5 +80,5 @@ def draw(
         drawn = [chart.curve(*row, [x["at"] for x in of], [x["error"] for x in of]) for row, of in of_row.items()]
         if success is not None and drawn:
             drawn.append(chart.level("success: below", [x["at"] for x in own if x["place"] == place], success))
-        panels.append(chart.panel_data(name, one.label, label, drawn))
+        panels.append(chart.panel_data(name, one.label, LABEL, drawn))
     return chart.draw(panels, 2.1 * len(of_family) + 0.5, len(of_family), legend=3, sharey="row")

@@ -1,9 +1,8 @@
-"""The runs of the tuning: errors of methods' drawn settings on validation and test shapes, and the best of them.
+"""The runs of the tuning: errors of methods' drawn settings on validation shapes, and the best of them.
 
 All methods are read on the same draws, shapes and seeds: those of which every method has a run that ended.
 """
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,12 +16,9 @@ from bench.report.data.records import (
     SCALE,
     Record,
     RunKey,
-    by_shape,
     error,
     grouped,
-    median_of_known,
     run_key,
-    value_evaluations,
 )
 from bench.report.data.runs import Runs, Selection
 
@@ -32,8 +28,7 @@ PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")
 CHAMFER = "chamfer_l2"
 ERRORS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # that draws are chosen by, where it is not the usual one
 SPACE, TUNED = "space/", "tuned/"  # before the names of methods whose settings are drawn; of those written for them
-VALIDATION, TEST = "validation", "test"
-BUDGETS = (1, 2, 4, 8, 16, 32, 64)  # numbers of draws
+VALIDATION = "validation"
 OTHER = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are no drawn settings
 
 
@@ -46,12 +41,9 @@ class Tuning:
         label: its name for readers.
         draws: the numbers of the draws.
         settings: the drawn settings of each draw, by dotted key.
-        validation, test: the logarithms [draws, runs] of errors. A run that failed has the largest finite error of any
-            draw of any method on its shape and seed.
+        validation: the logarithms [draws, runs] of errors. A run that failed has the largest finite error of any draw
+            of any method on its shape and seed.
         failures: the number of validation runs of each draw that failed.
-        failed, runs: how many runs failed, on both kinds of shapes, of how many.
-        test_runs: the shapes and seeds of the columns of `test`.
-        evaluations: the median number of field values of a run of each draw; None where none ended ok.
     """
 
     method: str
@@ -59,12 +51,7 @@ class Tuning:
     draws: list[int]
     settings: list[dict[str, Any]]
     validation: np.ndarray
-    test: np.ndarray
     failures: np.ndarray
-    failed: int
-    runs: int
-    test_runs: list[RunKey]
-    evaluations: list[float | None]
 
     @property
     def scores(self) -> np.ndarray:
@@ -80,22 +67,6 @@ class Tuning:
     def best(self) -> int:
         return int(self.order[0])
 
-    @property
-    def budgets(self) -> list[int]:
-        """The numbers of draws up to all of them."""
-        return [k for k in BUDGETS if k <= len(self.draws)]
-
-    def expected(self, k: int) -> list[np.ndarray]:
-        """The expected test error if the best of k draws is taken, an array per shape with an entry per seed.
-
-        The expectation is of the logarithm of the error, over all choices of k of the draws, each equally likely (Tang
-        et al. 2020, "Showing Your Work Doesn't Always Work", Eq. 3: without replacement).
-        """
-        n = len(self.draws)
-        weights = np.array([math.comb(n - place - 1, k - 1) for place in range(n)]) / math.comb(n, k)
-        errors = np.exp(weights @ self.test[self.order])
-        return by_shape(dict(zip(self.test_runs, errors.tolist(), strict=True)))
-
 
 def unfinished(runs: Runs) -> int:
     """The number of runs that were planned and have not ended."""
@@ -110,7 +81,7 @@ def metric_of(runs: Runs) -> str:
 def tunings(runs: Runs) -> list[Tuning]:
     """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none.
 
-    Validation shapes are enough: without test shapes `test` has no columns.
+    Test shapes are not needed; where there are some, a draw has all of them.
     """
     ended = [record for record in runs.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
@@ -125,7 +96,7 @@ def tunings(runs: Runs) -> list[Tuning]:
         return []
     worst = cells.error.where(np.isfinite(cells.error)).groupby([cells.split, cells.run]).transform("max").fillna(1.0)
     cells = cells.assign(error=np.log(np.minimum(cells.error, worst)))
-    return [_tuning(cells[cells.method == method], records, keys) for method, records in by_method.items()]
+    return [_tuning(cells[cells.method == method], records) for method, records in by_method.items()]
 
 
 def pooled(methods: list[Tuning]) -> Tuning:
@@ -144,12 +115,7 @@ def pooled(methods: list[Tuning]) -> Tuning:
         method=", ".join(method.method for method in methods),
         label=", ".join(method.label for method in methods),
         validation=np.concatenate([method.validation for method in methods], axis=1),
-        test=np.concatenate([method.test for method in methods], axis=1),
         failures=np.sum([method.failures for method in methods], axis=0),
-        failed=sum(method.failed for method in methods),
-        runs=sum(method.runs for method in methods),
-        test_runs=[run for method in methods for run in method.test_runs],
-        evaluations=[median_of_known(each) for each in zip(*(method.evaluations for method in methods), strict=True)],
     )
 
 
@@ -166,27 +132,21 @@ def _cell(record: Record, keys: list[RunKey], metric: str) -> dict[str, Any]:
     return {
         **{"method": record["method"], "split": config["split"], "draw": config["draw"]},
         **{"run": keys.index(run_key(record)), "failed": not ok, "record": record},
-        **{"error": SCALE * error(record, metric), "values": value_evaluations(record) if ok else None},
+        "error": SCALE * error(record, metric),
     }
 
 
-def _tuning(own: pd.DataFrame, records: list[Record], keys: list[RunKey]) -> Tuning:
-    first = own[own.split == VALIDATION].groupby("draw").record.first()
+def _tuning(own: pd.DataFrame, records: list[Record]) -> Tuning:
+    own = own[own.split == VALIDATION]
+    first = own.groupby("draw").record.first()
     method, config = own.method.iloc[0].removeprefix(SPACE), first.iloc[0]["config"]
-    logs = {split: part.pivot(index="draw", columns="run", values="error") for split, part in own.groupby("split")}
-    test = logs.get(TEST, pd.DataFrame(index=first.index))
     return Tuning(
         method=method,
         label=str(config.get("label") or method),
         draws=first.index.tolist(),
         settings=_settings(first.tolist(), records),
-        validation=logs[VALIDATION].to_numpy(),
-        test=test.to_numpy(float),
-        failures=own[own.split == VALIDATION].groupby("draw").failed.sum().to_numpy(),
-        failed=int(own.failed.sum()),
-        runs=len(own),
-        test_runs=[keys[place] for place in test],
-        evaluations=[median_of_known(part.dropna()) for _, part in own.groupby("draw")["values"]],
+        validation=own.pivot(index="draw", columns="run", values="error").to_numpy(),
+        failures=own.groupby("draw").failed.sum().to_numpy(),
     )
 
 

@@ -2,13 +2,15 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import COSTS, EVERY, HOLM, Compared, ordered
+from bench.report.compare import COSTS, EVERY, HOLM, Compared, differing, ordered
+from bench.report.data import statistics
 from bench.report.data.records import Row
 from bench.report.data.runs import choose
-from bench.studies import one_loss, tuned
+from bench.studies import one_loss
 from tests.report.test_report_paper import write_run
 
 # Error over DIST's, field values, seconds of the loop of a run.
@@ -44,6 +46,11 @@ def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
 def whole(tmp_path_factory):
     """The runs without a failure, written once."""
     return compared(tmp_path_factory.mktemp("whole"))
+
+
+def of_eight(ratios):
+    """Ratios of the errors of a row, in turn, on eight shapes."""
+    return statistics.ratio([np.array([ratio]) for ratio in ratios * 4], [np.ones(1)] * 8)
 
 
 def kept(runs, keep):
@@ -151,28 +158,14 @@ def test_rows_of_other_families_with_other_evaluations_are_told(tmp_path):
     assert choose(read_records(tmp_path)[0], one_loss.READS[0], tmp_path).mixed() == ["evaluation.points"]
 
 
-def test_a_tuned_row_is_compared_with_its_default():
-    presets = ("idr_mask", "tuned/idr_mask", "dist_mask_paper", "dist_mask_official")
-    assert [*map(tuned.default_of, presets)] == ["idr_mask", "idr_mask", "dist_mask", "dist_mask"]
+def test_a_verdict_counts_the_ratios_that_differ_from_1():
+    ratios = {name: of_eight([one, other]) for name, one, other in (("worse", 2.0, 2.0), ("mixed", 1.5, 0.7))}
+    said = differing([*ratios.items()], "to DIST")
+    assert said.startswith(f"{HOLM}, *1 of 2* ratios to DIST differ from 1: worse 2.00")
+    assert said.endswith("; 1 cannot be distinguished from 1.")
 
 
-def test_the_table_of_tuned_rows_has_their_ratio_to_the_default(tmp_path):
-    for preset, label, factor in (("dist_mask", "DIST", 2.0), ("tuned/dist_mask", "DIST, tuned", 1.0)):
-        for index in range(6):
-            for points in ("100", "20"):
-                write_run(
-                    tmp_path,
-                    "tuned",
-                    label,
-                    **{"task": "completion", "dataset": "sofa", "renderer": "dist", "method": preset},
-                    metrics={"chamfer_l2": factor * (1 + index) / 1000},
-                    index=index,
-                    settings={"task": {"points": points, "_target_": "completion"}},
-                )
-    result = tuned.make(choose(read_records(tmp_path)[0], tuned.READS[0], tmp_path))
-    table = result.table.set_index("Method")
-    said = f"{HOLM}, *1 of 1* ratios of tuned settings to the defaults differ from 1: DIST, tuned on sofa 0.500"
-    assert result.verdict.startswith(said)
-    assert table.loc["DIST, tuned", "Ratio to the default"] == "0.500 [0.500, 0.500]; 6 of 6"
-    assert table.loc["DIST", "Ratio to the default"] == ""
-    assert table.loc["DIST", "100 pts"] == "7.00"
+def test_a_verdict_that_no_data_could_give_is_none():
+    said = differing([(f"row {n}", of_eight([2.0, 2.0])) for n in range(7)], "to DIST")
+    assert "*cannot be decided with 8 shapes*" in said and "7 ratios need 9 shapes or more" in said
+    assert differing([("none", None)], "to DIST") == ""

@@ -5,7 +5,6 @@ from itertools import product
 import numpy as np
 import pytest
 
-from bench.report import compare
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import page_of, write_run
 from tests.report.test_report_shapes import images
@@ -120,51 +119,6 @@ def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
     assert found["car 1, best", "another image"] == (0.75,) * 3 and found["car 1, best", "RGB"] == (0.5, 0.5, 1.0)
     assert notes(result.figure) == ["no picture"] * 2
     assert "No pictures of 2 runs: no images.npz." in result.shown().notes
-
-
-def budget(results, shapes, views, chamfer, index):
-    return write_run(
-        results, "single_view_budget", "RGB and depth", task="single_view", method="single_view_rgb_depth",
-        metrics={"iou": 0.8, "chamfer_l1": chamfer}, index=index,
-        settings={"task": {"shapes": shapes, "views": views}},
-    )  # fmt: skip
-
-
-def test_the_budget_has_a_line_and_a_point_for_each_training(tmp_path):
-    errors = {(96, 1): 0.08, (96, 24): 0.02, (96, 4): 0.04, (12, 24): 0.06}
-    for (shapes, views), chamfer in errors.items():
-        for index in range(3):
-            budget(tmp_path, shapes, views, chamfer, index)
-    result = page_of(tmp_path, "single_view_budget")
-    table = result.table.set_index("Condition")
-    shapes, views = ("training shapes: {}".format, "images of each shape: {}".format)
-    assert list(table.index) == [shapes(12), shapes(96), views(1), views(4), views(24)]
-    assert table["Median"].str.split().str[0].tolist() == ["60.0", "20.0", "80.0", "40.0", "20.0"]
-    assert table["Over the largest"].tolist() == ["3.00 (n = 3)", "", "4.00 (n = 3)", "2.00 (n = 3)", ""]
-    left, right = result.figure.axes
-    drawn = [axis.lines[0].get_xydata().tolist() for axis in (left, right)]
-    assert drawn == [[[12, 60], [96, 20]], [[1, 80], [4, 40], [24, 20]]]
-    assert (left.get_xlabel(), right.get_xlabel()) == ("training shapes", "images of each shape")
-    assert result.verdict == ""  # of three shapes there are no intervals
-
-
-def test_the_verdict_on_budgets_counts_ratios_that_differ_from_the_largest_training(tmp_path):
-    for index in range(8):
-        for (shapes, views), factor in {(96, 24): 1.0, (96, 1): 2.0, (12, 24): 1.5 if index % 2 else 0.7}.items():
-            budget(tmp_path, shapes, views, (0.02 + 0.001 * index) * factor, index)
-    said = (
-        f"{compare.HOLM}, *1 of 2* ratios to the training on 96 shapes with 24 images each differ from 1: car, images"
-    )
-    verdict = page_of(tmp_path, "single_view_budget").verdict
-    assert verdict.startswith(said) and "; 1 cannot be distinguished from 1." in verdict
-
-
-def test_a_verdict_on_budgets_that_no_data_could_give_is_none(tmp_path):
-    for index in range(8):
-        for views, error in zip((24, 1, 2, 3, 4, 5, 6, 8), (0.02, *[0.04] * 7), strict=True):
-            budget(tmp_path, 96, views, error, index)
-    verdict = page_of(tmp_path, "single_view_budget").verdict
-    assert "*cannot be decided with 8 shapes*" in verdict and "7 ratios need 9 shapes or more" in verdict
 
 
 def test_its_figure_has_a_point_for_each_shape(tmp_path):

@@ -259,21 +259,3 @@ def test_shapes_of_one_family_are_scenes_of_their_own(tmp_path):
     experiment = chosen(tmp_path)
     assert [scene_of(record) for record in experiment.records] == ["sofa 0", "sofa 1"]
     assert line_of(dvr_table2.make(experiment), NEWTON)["Chamfer-L1, seen"] == "30.0"
-
-
-def test_the_side_that_no_photograph_shows_is_judged_and_drawn_from_behind(tmp_path):
-    rough = {"seen_roughness": 1.0, "unseen_roughness": 6.0}
-    for row, extra in ((NEWTON, {}), (NEUS, {"own_early_weight": 0.25})):
-        folder = made(tmp_path, row, scored(0.02) | rough | extra, experiment="unseen_back")
-        images(folder, (1.0, 0.0, 0.0))
-        with np.load(folder / "images.npz") as file:
-            arrays = dict(file)
-        behind = {f"back_{name}": array for name, array in arrays.items() if name != "photograph"}
-        behind["back_colours"] = np.full_like(arrays["colours"], 0.25)
-        np.savez(folder / "images.npz", **arrays, **behind, back_truth=np.full_like(arrays["colours"], 0.75))
-    result = page_of(tmp_path, "unseen_back")
-    assert line_of(result, NEUS)[["unseen", "Early weight"]].tolist() == ["6.00", "25 %"]
-    assert line_of(result, NEWTON)["Early weight"] == "–"
-    found = shown(result.figure)["sofa 0"]
-    assert [column for row, column in found if row == "normals"] == ["truth", NEWTON, NEUS]
-    assert found["normals", "truth"] == (0.75,) * 3 and found["colours", NEWTON] == (0.25,) * 3  # from behind

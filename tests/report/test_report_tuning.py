@@ -1,21 +1,17 @@
-"""The tuning, from run folders whose errors are known: what the best of some draws is worth, and its file."""
+"""The tuning, from run folders whose errors are known: the best of some draws, and its file."""
 
 import math
-from itertools import combinations
 
 import numpy as np
 import pytest
 import yaml
 
 from bench.records.read import read_records
-from bench.report.data import statistics
 from bench.report.data.runs import choose
-from bench.report.tuning import TUNING, tunings
-from bench.studies import tuning
+from bench.report.tuning import TUNING, left_out, tunings
 from bench.tables import CONF, read_rows, read_yaml
 from bench.tune import HEAD, WIDTH, main, write
-from tests.looped import each
-from tests.report.test_report_paper import told, write_run
+from tests.report.test_report_paper import write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
 OWN = (1.0, 2.0, 0.5, 4.0, 1.0, 0.25, 8.0)  # of shapes: their geometric mean over the first six is 1
@@ -79,44 +75,17 @@ def test_what_families_differ_in_is_no_setting(tmp_path):
     assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
 
 
-@each("k", [1, 2, 4])
-def test_the_expected_error_is_the_mean_over_all_choices_of_draws(whole, k):
-    (method,) = tunings(whole)
-    chosen = [min(some, key=lambda draw: VALIDATION[draw]) for some in combinations(range(4), k)]
-    expected = math.exp(np.mean([math.log(TEST[draw]) for draw in chosen]))
-    assert len(method.expected(k)) == 6
-    assert np.concatenate(method.expected(k)) == pytest.approx(np.multiply(expected, OWN[:6]))
-
-
-def test_the_page_has_a_column_per_budget(whole):
-    result = tuning.make(whole)
-    budgets = ["Best of 1", "Best of 2", "Best of 4"]
-    assert list(result.table.columns) == [
-        *("Method", *budgets, "Best over one draw", "Evaluations of the best", "Failed")
-    ]
-    assert result.table["Best of 4"].item().startswith("2.00 [")
-    assert result.table["Evaluations of the best"].item() == "200"
-    assert "n = 48 runs (12 shapes, 1 seed)" in result.caption  # six of each split
-    assert "have not ended" not in told(result)
-    assert "Validation runs: 6 per draw; test runs: 6 per draw" in told(result)
-    assert result.verdict.startswith("Error of the best of 4 draws over that of one draw: *0.649*")
-    assert result.verdict.endswith("n = 6 test shapes.")
-
-
 def test_a_failure_counts_as_the_worst_error_of_its_shape_and_its_draw_ranks_behind(tmp_path):
-    drawn(tmp_path, failed={("test", 1, 0), ("validation", 1, 2)})
+    drawn(tmp_path, failed={("validation", 1, 2)})
     (method,) = tunings(read(tmp_path))
-    assert method.test[1].tolist() == pytest.approx(np.log([9, *np.multiply(2, OWN[1:6])]))
     assert method.validation[1, 2] == pytest.approx(math.log(4 * 0.5))
     assert method.failures.tolist() == [0, 1, 0, 0] and method.order.tolist() == [3, 2, 0, 1]
-    assert tuning.make(read(tmp_path)).table["Failed"].item() == "2 of 48"
 
 
 def test_runs_that_have_not_ended_are_missing_and_not_failed(tmp_path, capsys):
     drawn(tmp_path, killed={("validation", 1, 5)})
     (method,) = tunings(read(tmp_path))
     assert method.draws == [0, 2, 3] and method.draws[method.best] == 3
-    assert "1 planned runs have not ended" in told(tuning.make(read(tmp_path)))
     assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned.yaml")]) == 1
     assert "1 runs of the tuning have not ended" in capsys.readouterr().err
     assert not (tmp_path / "tuned.yaml").exists()
@@ -127,13 +96,9 @@ def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path
     drawn(tmp_path, method="idr_mask", shapes=7, scale=10)
     first, second = tunings(read(tmp_path))
     assert first.draws == second.draws == [0, 1, 3]
-    assert "lacks them: draws 2." in told(tuning.make(read(tmp_path)))
-    assert first.test.shape == second.test.shape == (3, 6)
-    assert second.test == pytest.approx(first.test + math.log(10))
-    assert [(method.method, method.runs) for method in (first, second)] == [("dist_mask", 36), ("idr_mask", 36)]
-    two = statistics.ratio(first.expected(2), first.expected(1))
-    assert two.value < 0.9
-    assert list(tuning.make(read(tmp_path)).table["Best over one draw"]) == [str(two)] * 2
+    assert left_out(read(tmp_path), [first, second]) == ["Left out, since a method or a shape lacks them: draws 2."]
+    assert first.validation.shape == second.validation.shape == (3, 6)
+    assert second.validation == pytest.approx(first.validation + math.log(10))
 
 
 def test_the_best_is_written_as_a_row_over_its_default(tmp_path, capsys):
