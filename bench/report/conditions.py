@@ -64,12 +64,7 @@ def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list
     return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["at"]))
 
 
-def draw(
-    lines: Sequence[dict[str, Any]],
-    conditions: Sequence[Condition],
-    *,
-    success: float | None = None,
-) -> Figure:
+def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], *, success: float | None = None) -> Figure:
     """Draws a row of panels per family: the error over the value of each condition, a line per method.
 
     `success` is the largest error of a run that counts as one, drawn as a line. What is infinite is drawn at the edge.

@@ -130,18 +130,17 @@ def colours_above_normals(
     title: str,
     rows: Iterable[Row],
     records: Sequence[Record],
-    first: tuple[str, str, Paint],
-    prefix: str = "",
+    first: tuple[str, Paint],
 ) -> Block:
-    """A block with the colours of each row and its normals below, of arrays with that prefix.
+    """A block with the colours of each row and its normals below.
 
-    `first` is the heading of the column before them, its only line, "colours" or "normals", and its picture.
+    `first` is the heading of the column before them, and its picture, beside the colours.
     """
     at = {row_of(record): record for record in records}
-    heading, line, paint = first
+    heading, paint = first
     cells = {
-        name: [scene.shared(records, paint) if name == line else Cell(), *(scene.cell(at.get(row), of) for row in rows)]
-        for name, of in (("colours", colours(prefix)), ("normals", normals(prefix)))
+        "colours": [scene.shared(records, paint), *(scene.cell(at.get(row), colours()) for row in rows)],
+        "normals": [Cell(), *(scene.cell(at.get(row), normals()) for row in rows)],
     }
     return Block(title, [heading, *(row.name for row in rows)], cells)
 

@@ -12,14 +12,7 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import NEUTRAL_KEYS
 from bench.report.data.kept import UNFINISHED
-from bench.report.data.records import (
-    SCALE,
-    Record,
-    RunKey,
-    error,
-    grouped,
-    run_key,
-)
+from bench.report.data.records import SCALE, Record, RunKey, error, grouped, run_key
 from bench.report.data.runs import Runs, Selection
 
 TUNING = Selection("tuning", ("split",))

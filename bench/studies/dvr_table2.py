@@ -188,7 +188,7 @@ def figures(runs: Runs) -> Result:
     rows, every = list(_unlike(runs)), grouped(runs.records, medians.scene_of)
     shown = {name: [record for record in of if row_of(record) in rows] for name, of in list(every.items())[:SCENES]}
     scenes = {name: gallery.Scene(runs, of, ARRAYS) for name, of in shown.items()}
-    photograph = ("held out", "colours", lambda found: [found["photograph"]])
+    photograph = ("held out", lambda found: [found["photograph"]])
     blocks = [gallery.colours_above_normals(scenes[name], name, rows, of, photograph) for name, of in shown.items()]
     return Result(
         runs,
