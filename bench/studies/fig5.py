@@ -73,7 +73,7 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
     ranks = {" = ".join(line["row"] for line in of): of[0]["spearman"] for of in same}  # one computation counts once
     apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < HIGH]
     alike = f"{len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')} (ρ of {HIGH} or more)"
-    said = f"not in {', '.join(apart)}, against the paper" if apart else "as in the paper"
+    said = f"not in {', '.join(apart)}" if apart else "as in the paper"
     return f"Loss and error fall together in {alike}; {said}." if ranks else ""
 
 

@@ -289,7 +289,7 @@ def test_fig5_data_holds_runs_medians_and_correlation(completions):
     assert rho.loc[PARALLEL, "spearman"] == pytest.approx(0.5) and rho.loc[PARALLEL, "n"] == 1
     assert rho.loc[DYNAMIC, "spearman"] == pytest.approx(1) and rho.loc[DYNAMIC, "n"] == 2  # runs, each by itself
     said = page_of(completions, "fig5").verdict
-    assert "in 1 of 2 different rows (ρ of 0.7 or more); not in + parallel (*0.50*), against the paper." in said
+    assert "in 1 of 2 different rows (ρ of 0.7 or more); not in + parallel (*0.50*)." in said
     assert rho.loc["+ aggressive", "spearman"] is None and rho.loc["+ aggressive", "n"] == 0
 
 
@@ -349,7 +349,8 @@ def test_experiments_of_nothing_but_failures_are_still_made(tmp_path):
 
 def test_command_writes_all_files_and_the_page_shows_them(reported):
     drawn_too = {".csv", ".md", ".tex", ".json", ".png", ".pdf"}
-    suffixes = {"table1": {".csv", ".md", ".tex", ".json"}, "gradients": drawn_too, "gradients_visibility": drawn_too}
+    table_alone = {".csv", ".md", ".tex", ".json"}
+    suffixes = {"claims": table_alone, "table1": table_alone, "gradients": drawn_too, "gradients_visibility": drawn_too}
     written = {path.name for path in (reported / "paper").iterdir()}
     assert written == {name + suffix for name, them in suffixes.items() for suffix in them}
     page = Page(reported)
@@ -357,7 +358,7 @@ def test_command_writes_all_files_and_the_page_shows_them(reported):
     links = {link for whole in found for link in [*whole["files"].values(), whole["picture"]] if link}
     assert links == {f"paper/{name}" for name in written if not name.endswith(".json")}
     assert "1.99M" in page.paper("table1")["rows"][0]
-    assert [paper["name"] for paper in page.papers] == ["table1", "gradients", "gradients_visibility"]
+    assert [paper["name"] for paper in page.papers] == ["claims", "table1", "gradients", "gradients_visibility"]
     assert (reported / "paper" / "gradients.png").read_bytes()[:4] == b"\x89PNG"
 
 
