@@ -20,7 +20,15 @@ def make(runs: Runs) -> Result:
         "DIST's own setting on dense depth, one change at a time.",
         "To what is the error of DIST's own setting due?",
         ratio="Ratio to DeepSDF's samples",
-        remarks=(compare.ERROR, f"{compare.RATIO} {compare.FAILURE}", *NOTES),
+        verdict=found.best("errors × 1000"),
+        remarks=(
+            compare.differing(
+                [(line["row"], compare.ratio_of(line["ratio"])) for line in found.comparable], "to DeepSDF's samples"
+            ),
+            compare.ERROR,
+            f"{compare.RATIO} {compare.FAILURE}",
+            *NOTES,
+        ),
         columns=[column for column in found.columns("Ratio to DeepSDF's samples") if column.key != "dense"],
     )
 

@@ -107,7 +107,7 @@ def test_a_study_that_cannot_be_made_costs_no_other_table(tmp_path, monkeypatch,
     monkeypatch.setitem(broken.pages, "fig4", late if caption else lambda runs: {}["lost"])
     problems: list[str] = []
     written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path, problems=problems)]
-    assert written == ["table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]
+    assert written == ["claims.csv", "table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]
 
 
 def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path, monkeypatch):
