@@ -1,13 +1,13 @@
 """Claims of the papers, aggressive marching over alpha, and DIST one change at a time, from runs of known numbers."""
 
-from math import nan
+from math import inf, nan
 from pathlib import Path
 
 import pytest
 
 from bench.config import names
 from bench.report.data.statistics import Interval
-from bench.studies.claims import CLAIMS, EQUAL, NO_LARGER, SMALLER, Claim, verdict_of
+from bench.studies.claims import CLAIMS, EQUAL, NO_LARGER, SMALLER, UNREAD, Claim, verdict_of
 from tests.looped import each
 from tests.report.test_report_paper import page_of, told, write_run
 
@@ -81,6 +81,26 @@ def test_claims_are_measured_on_shapes_that_both_rows_have(tmp_path):
     assert official["ratio"].value == pytest.approx(0.3**0.5)
     assert official["verdict"] == "not decided"  # one shape of six is against it
     assert "does not hold *1*" in page.verdict and "not tested" in page.verdict
+
+
+def test_what_failed_in_both_rows_says_nothing_and_a_failure_in_one_counts(tmp_path):
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 5 + [2.0])
+    dense(tmp_path, "dist_mask_paper", [0.1] * 6, status="nan")
+    (line,) = [line for line in page_of(tmp_path, "claims").lines if line["shapes"]]
+    assert line["ratio"].value == inf and line["verdict"] == "does not hold"
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 6, status="nan", minute=30)
+    assert not [line for line in page_of(tmp_path, "claims").lines if line["shapes"]]
+
+
+def test_a_claim_is_not_tested_by_runs_of_other_settings_than_it_names(tmp_path):
+    for preset, queries in {"dist_dynamic": 100, "dist_aggressive": 70}.items():
+        for clamp in (None, 0.1) if preset == "dist_dynamic" else (None,):
+            settings = {"renderer": {"step_clamp": clamp}, "view": {"resolution": 64}}
+            write_run(tmp_path, "table1", preset, renderer=preset, metrics={"queries": queries}, settings=settings)
+    (line,) = [
+        line for line in page_of(tmp_path, "claims").lines if line["claim"].startswith("aggressive marching saves")
+    ]
+    assert (line["verdict"], line["why"]) == ("not tested", UNREAD)
 
 
 def test_a_claim_is_not_tested_by_runs_that_are_only_planned(tmp_path):
