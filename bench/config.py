@@ -37,13 +37,8 @@ SELF, HERE = "_self_", "@_here_"  # of a list of defaults: the file itself; wher
 OURS = ("renderers", "datasets", "bench")  # packages that a `_target_` may always name
 PACKAGE = "_package_"  # of the node `renderer`: one more, that of the class typed for renderer=custom
 OF = "of"  # of a prior: a dataset whose prior it is
-DEFAULTS = (
-    "_prior_",
-    "_field_",
-    "_similarity_",
-    "_iterations_",
-    "_silhouette_weight_",
-)  # of a dataset or a task: what other keys follow
+# Keys of a dataset or a task that other keys follow.
+DEFAULTS = ("_prior_", "_field_", "_similarity_", "_iterations_", "_silhouette_weight_")
 RESERVED = ("_target_", PACKAGE, *DEFAULTS, OF, LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
 ROLES = {  # what the class of a node of the top level must be
     "task": "bench.setup.inputs.Task",

@@ -60,9 +60,10 @@ class Hinge:
         epsilon: the threshold between them, in scene units.
         signed: False takes the magnitude of `closest`, as the paper does. A background ray that stops just inside the
             shape is then pushed deeper. True keeps the sign, which avoids that.
-        average: the mean over "all" rays or over "violating" ones, or "missed_plus_spurious": the mean over violating
-            rays of the foreground plus that over violating rays of the background, as in the official code. With all, a
-            missed pixel weighs next to nothing, and an optimiser can lower the depth loss by losing hits.
+        average: the mean over "all" rays, or over "violating" ones. With "missed_plus_spurious" it is the mean over
+            violating rays of the foreground plus that over violating rays of the background. The official code has this
+            sum, but counts missed pixels whose violation is 0 as well. With "all", a missed pixel weighs next to
+            nothing, and an optimiser can lower the depth loss by losing hits.
         weight: of the loss.
     """
 
@@ -112,14 +113,15 @@ class Hinge:
         return torch.where(mask, soft, -soft)
 
     def _mean(self, violation: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
-        violating = violation > 0
-        over = {
-            "all": [torch.ones_like(mask)],
-            "violating": [violating],
-            "missed_plus_spurious": [violating & mask, violating & ~mask],
-        }[self.average]
-        means = [(violation * rays).sum() / rays.sum().clamp_min(1) for rays in over]
-        return self.weight * torch.stack(means).sum()
+        if self.average == "missed_plus_spurious":
+            return self._mean_over(violation, mask) + self._mean_over(violation, ~mask)
+        if self.average == "violating":
+            return self._mean_over(violation, torch.ones_like(mask))
+        return self.weight * violation.sum() / max(violation.numel(), 1)
+
+    def _mean_over(self, violation: Float[Tensor, "*rays"], rays: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
+        """The weighted mean over those of the rays that violate the mask."""
+        return self.weight * (violation * rays).sum() / ((violation > 0) & rays).sum().clamp_min(1)
 
 
 @dataclass(frozen=True)
