@@ -16,6 +16,7 @@ SERIES = {  # by whether the prior is truncated, and steps clamped: the name, an
     (False, False): ("distances", "dist_capped"),
 }
 DISTANCES = (False, False)
+SHAPE = ["family", "solid"]
 WRONG, COST = "wrong pixels (share of hits)", "field evaluations (ratio)"
 COLUMNS = (
     *(table.text("field", "Field and steps"), table.Column("alpha", "Alpha"), table.Column("shapes", "Shapes")),
@@ -38,7 +39,7 @@ Line = dict[str, Any]
 def make(runs: Runs) -> Result:
     """A line per kind of field and steps, and per alpha, over all shapes."""
     runs = runs.made
-    frame = runs.frame[["family", "solid"]].assign(
+    frame = runs.frame[SHAPE].assign(
         alpha=runs.number("config.renderer.alpha"),
         truncated=runs.number("config.prior.truncation").notna(),
         clamped=runs.number("config.renderer.step_clamp").notna(),
@@ -46,7 +47,7 @@ def make(runs: Runs) -> Result:
         queries=runs.number("queries"),
     )
     plain = _of(frame, DISTANCES)
-    once = plain[plain.alpha == 1].set_index(["family", "solid"]).queries
+    once = plain[plain.alpha == 1].groupby(SHAPE).queries.mean()
     lines = [line for kind in SERIES for line in _lines(_of(frame, kind), kind, once)]
     return Result(
         runs,
@@ -69,7 +70,7 @@ def _of(frame: pd.DataFrame, kind: Kind) -> pd.DataFrame:
 def _lines(frame: pd.DataFrame, kind: Kind, once: pd.Series) -> list[Line]:
     lines = []
     for alpha, own in frame.groupby("alpha"):
-        shapes = own.set_index(["family", "solid"])
+        shapes = own.groupby(SHAPE)[["wrong", "queries"]].mean()
         shapes = shapes.assign(ratio=shapes.queries / once).dropna()
         share, ratio = (statistics.typical([np.array([x]) for x in of]) for of in (shapes.wrong, shapes.ratio))
         about = {
@@ -90,10 +91,17 @@ def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
         return ""
     plain, far, slow, own = (lines[key] for key in wanted)
     wrong = [table.small_percent(line["wrong"]) for line in (plain, far, own)]
+    clamped = lines.get(((False, True), 1.5))
+    alike = (
+        f" On distances, clamped steps have {table.small_percent(clamped['wrong'])} and {clamped['cost']:.2f}."
+        if clamped
+        else ""
+    )
     return (
         f"On distances, alpha = 1.5 has *{wrong[1]}* wrong pixels, and alpha = 1 has {wrong[0]}. On a truncated field "
         f"with clamped steps, alpha = 1.5 has {wrong[2]} and {own['cost'] / slow['cost']:.2f} times the evaluations of "
         f"alpha = 1, but {own['cost']:.2f} times those of alpha = 1 on distances; n = {plain['shapes']} shapes."
+        f"{alike}"
     )
 
 
