@@ -1,0 +1,86 @@
+"""The commands in conf/README.md plan the runs that the linked pages were drawn from: the same shapes, rows, settings."""
+
+import re
+import shlex
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+
+from bench.config import register
+from bench.records.names import flat
+from bench.records.record import row_name
+from bench.report.data.kept import read_rows
+from bench.report.write.paper import FOLDER, SHIPPED
+from bench.run.compose import Composer, swept_over
+from bench.tables import CONF
+from tests.documentation import text_of
+
+COMMAND = re.compile(r"`-m \+experiment=([^`]+)`")
+NAMED = re.compile(r"^\| \[?`(\w+)`")  # experiments whose command is their name alone
+# What changes no result, or names files of the machine; and sizes, whose values stand in other keys too.
+IGNORED = re.compile(r"(sizes|scale|results_dir|priors_dir|threads|device|time_limit|packages|verbose)\b|dataset\.path")
+Cells = dict[tuple[str, ...], dict[str, str]]  # the settings of runs, by row, shape and seed
+
+
+@cache
+def shipped() -> dict[str, list[dict[str, Any]]]:
+    """The rows of each experiment; without restored ones, which have lost most settings."""
+    found = defaultdict(list)
+    for record in read_rows(SHIPPED / FOLDER):
+        if "restored" not in record:
+            found[record["config"]["experiment"]].append(record)
+    return found
+
+
+def described(config: dict[str, Any], dataset: str, renderer: str) -> tuple[tuple[str, ...], dict[str, str]]:
+    path = config["dataset"].get("path")
+    settings = {key: str(value) for key, value in flat(config, "").items() if not IGNORED.match(key)}
+    return (row_name(config, renderer), Path(path).stem if path else dataset), settings
+
+
+def planned(experiment: str) -> list[tuple[tuple[str, ...], dict[str, str]]]:
+    """The cells of the commands in the tables that link to results, of those whose runs name the experiment."""
+    lines = [line for line in text_of("conf/README.md").splitlines() if line.startswith("|")]
+    commands = [COMMAND.findall(line) or NAMED.findall(line) for line in lines if "../results" in line or NAMED.match(line)]
+    found = []
+    register()
+    for command in dict.fromkeys(command for of in commands for command in of):
+        name, *words = shlex.split(command)
+        file = CONF / "experiment" / f"{name}.yaml"
+        if not file.exists() or OmegaConf.load(file).get("experiment") != experiment:
+            continue
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            loader = GlobalHydra.instance().config_loader()
+            config = loader.load_configuration("config", [f"+experiment={name}", *words], RunMode.MULTIRUN)
+            composer = Composer(config)
+            cells = [composer.identity(overrides) for overrides in swept_over(config)]
+        found += [described(cell.config, cell.choices["dataset"], cell.choices["renderer"]) for cell in cells]
+    return found
+
+
+@pytest.mark.parametrize("experiment", sorted(shipped()))
+def test_the_command_of_a_page_plans_the_runs_that_it_shows(experiment: str):
+    rows = [described(r["config"], r["dataset"], r["renderer"]) for r in shipped()[experiment]]
+    cells = planned(experiment)
+    assert cells, "conf/README.md has no command of this experiment"
+    common = set.intersection(*({*settings} for _, settings in [*rows, *cells]))
+
+    def kinds(runs: list[tuple[tuple[str, ...], dict[str, str]]]) -> set[tuple[Any, ...]]:
+        return {(*name, *sorted((key, settings[key]) for key in common)) for name, settings in runs}
+
+    plan, shown = kinds(cells), kinds(rows)
+    assert plan == shown, nearest(plan - shown, shown - plan)
+
+
+def nearest(plan: set[tuple[Any, ...]], shown: set[tuple[Any, ...]]) -> str:
+    """Counts, and in what a run of one side differs from the one of the other side that is most like it."""
+    one = min(plan or shown, key=str)
+    other = min(shown if plan else [], key=lambda run: len({*run} - {*one}), default=())
+    return f"{len(plan)} runs are planned alone, {len(shown)} shown alone: {({*one} - {*other})} for {({*other} - {*one})}"
