@@ -96,7 +96,8 @@ def test_a_claim_is_not_tested_by_runs_of_other_settings_than_it_names(tmp_path)
     for preset, queries in {"dist_dynamic": 100, "dist_aggressive": 70}.items():
         for clamp in (None, 0.1) if preset == "dist_dynamic" else (None,):
             settings = {"renderer": {"step_clamp": clamp}, "view": {"resolution": 64}}
-            write_run(tmp_path, "table1_large", preset, renderer=preset, metrics={"queries": queries}, settings=settings)
+            about = {"renderer": preset, "settings": settings, "metrics": {"queries": queries}}
+            write_run(tmp_path, "table1_large", preset, **about)
     (line,) = [
         line for line in page_of(tmp_path, "claims").lines if line["claim"].startswith("aggressive marching saves")
     ]

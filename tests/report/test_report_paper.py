@@ -160,7 +160,7 @@ def test_only_what_may_be_compared_is_merged(tmp_path_factory, changed, merged):
     write_run(results, "table1", PARALLEL, metrics=costs())
     made = chosen(results, "table1")
     assert (len(made.records), made.left_out) == ((2, 0) if merged else (1, 1))
-    assert ("Not shown: 1 run" in told(table1.make(made))) is not merged
+    assert ("Not shown: 1 run" in told(table1.make(made, None))) is not merged
 
 
 @each("other", [{"threads": 8}, {"cpu": "Other CPU"}, {"device": "Some GPU"}, {"kernels": "compiled"}])
@@ -172,7 +172,7 @@ def test_times_of_different_machines_are_not_compared_without_saying_so(tmp_path
     write_run(results, "table1", NAIVE, metrics=costs(), environment={**MACHINE, **other})
     made = chosen(results, "table1")
     assert made.names() == [DYNAMIC, PARALLEL, NAIVE]  # no planned row is lost for it
-    result = table1.make(made)
+    result = table1.make(made, None)
     (warning,) = [note for note in result.notes if note.startswith("Times of rows from different machines")]
     assert all(words in warning for words in (*map(str, other.values()), f"({NAIVE})", f"({DYNAMIC})"))
     assert "2 machines, see the notes" in result.caption
@@ -182,6 +182,18 @@ def test_a_run_with_other_settings_takes_no_row_from_one_that_has_its_label(tmp_
     write_run(tmp_path, "table1", DYNAMIC, metrics=costs(), settings={"renderer": {"steps": 50}})
     write_run(tmp_path, "table1", DYNAMIC, settings={"renderer": {"steps": 1}}, status="crashed", reason="no luck")
     assert chosen(tmp_path, "table1").names() == [f"{DYNAMIC} (steps 50)", f"{DYNAMIC} (steps 1)"]
+
+
+def test_table_1_says_what_a_strategy_saves_and_has_the_published_numbers_at_their_size(tmp_path):
+    for number, (size, experiment) in enumerate({64: "table1", 512: "table1_large"}.items()):
+        for label, seconds in ((PARALLEL, 3.0), (DYNAMIC, 1.5)):
+            settings = {"view": {"resolution": size}}
+            about = {"metrics": costs(size=size, step_seconds=seconds), "settings": settings, "minute": 10 * number}
+            write_run(tmp_path, experiment, label, **about)
+    page = page_of(tmp_path, "table1")
+    assert page.verdict.startswith("A step at 64 pixels") and f"{DYNAMIC} *2.0*" in page.verdict
+    published = [column for column in page.columns if column.heading == "Published queries"][0]
+    assert [published.words(line) for line in page.lines] == ["", "", "6.06M", "1.99M"]
 
 
 def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
@@ -350,15 +362,15 @@ def test_experiments_of_nothing_but_failures_are_still_made(tmp_path):
 def test_command_writes_all_files_and_the_page_shows_them(reported):
     drawn_too = {".csv", ".md", ".tex", ".json", ".png", ".pdf"}
     table_alone = {".csv", ".md", ".tex", ".json"}
-    suffixes = {"claims": table_alone, "table1": table_alone, "gradients": drawn_too, "gradients_visibility": drawn_too}
+    suffixes = {"table1": table_alone, "gradients": drawn_too, "gradients_visibility": drawn_too}
     written = {path.name for path in (reported / "paper").iterdir()}
     assert written == {name + suffix for name, them in suffixes.items() for suffix in them}
     page = Page(reported)
     found = [page.paper(paper["name"]) for paper in page.papers]
     links = {link for whole in found for link in [*whole["files"].values(), whole["picture"]] if link}
     assert links == {f"paper/{name}" for name in written if not name.endswith(".json")}
-    assert "1.99M" in page.paper("table1")["rows"][0]
-    assert [paper["name"] for paper in page.papers] == ["claims", "table1", "gradients", "gradients_visibility"]
+    assert "+ dynamic" in page.paper("table1")["rows"][0]
+    assert [paper["name"] for paper in page.papers] == ["table1", "gradients", "gradients_visibility"]
     assert (reported / "paper" / "gradients.png").read_bytes()[:4] == b"\x89PNG"
 
 
