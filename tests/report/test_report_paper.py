@@ -192,7 +192,7 @@ def test_table_1_says_what_a_strategy_saves_and_has_the_published_numbers_at_the
             write_run(tmp_path, experiment, label, **about)
     page = page_of(tmp_path, "table1")
     assert page.verdict.startswith("A step at 64 pixels") and f"{DYNAMIC} *2.0*" in page.verdict
-    published = [column for column in page.columns if column.heading == "Published queries"][0]
+    published = next(column for column in page.columns if column.heading == "Published queries")
     assert [published.words(line) for line in page.lines] == ["", "", "6.06M", "1.99M"]
 
 
