@@ -74,8 +74,10 @@ def _verdict(runs: Runs) -> str:
     }
     chain = [steps[preset] for preset in list(PUBLISHED)[:-1] if preset in steps]
     saved = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
+    if not saved:
+        return format.ends(f"A step at {least} pixels", dict(steps.values()), "one shape", show=format.seconds)
     said = f"A step at {least} pixels is faster than with the strategy before, by factors"
-    return f"{said}: {', '.join(saved)}; n = one shape." if saved else ""
+    return f"{said}: {', '.join(saved)}; n = one shape."
 
 
 def _requested(record: records.Record) -> int | None:
@@ -108,9 +110,12 @@ def _step(record: records.Record) -> str:
 
 
 def _published(record: records.Record, part: int) -> int | str | None:
-    """A published value, beside the row of its size."""
-    row = PUBLISHED.get(records.row_of(record).preset, (None,) * 4)
-    return row[part] if row[0] == _requested(record) else None
+    return PUBLISHED.get(records.row_of(record).preset, (None,) * 4)[part]
+
+
+def _shown(record: records.Record, part: int) -> str:
+    """A published value as text, where the row has the published size."""
+    return str(_published(record, part) or "") if _published(record, 0) == _requested(record) else ""
 
 
 RUNS = (
@@ -145,8 +150,8 @@ COLUMNS = (  # of a record, for readers; metrics are those of the largest size t
         table.together(records.measured, format.number, "depth_error_median", "depth_error_max"),
     ),
     table.metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
-    table.shown("Published queries", lambda record: str(_published(record, 2) or "")),
-    table.shown("Published time", lambda record: str(_published(record, 3) or "")),
+    table.shown("Published queries", lambda record: _shown(record, 2)),
+    table.shown("Published time", lambda record: _shown(record, 3)),
 )
 
 PAGES = {"table1": make}
