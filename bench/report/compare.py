@@ -1,4 +1,4 @@
-"""One comparison of rows on the same shapes: medians per condition, mean errors, ratios, costs, fronts, two figures."""
+"""One comparison of rows on the same shapes: medians per condition, mean errors, ratios, costs, fronts, a figure."""
 
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -20,7 +20,7 @@ from bench.report.write.result import Result
 from bench.report.write.table import Column, ends, estimate, text
 
 EVERY = "all families"
-COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
+COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "seconds of the loop"}  # and how axes name them
 FAILURE = (
     "In a shape's mean a run that did not end ok has the largest finite error of any row on the same shape, seed and "
     "condition; a shape on which every row failed is left out. A row that lacks a shape of another is on no front."
@@ -32,9 +32,8 @@ RATIO = (
     "A ratio is the median over shapes of that of their geometric means; after it stand the shapes on which the row is "
     "better, ties half."
 )
-LEGEND = 3  # its columns
 HOLM = "By the sign test over shapes with Holm's correction"
-METRIC, LABEL = "chamfer_l2", "Chamfer × 1000 (scene units²)"
+METRIC, LABEL = "chamfer_l2", "Chamfer × 1000\n(scene units²)"
 CONDITION = "task.points"  # over which tables have columns
 ORDER = ("dense", "50%", "10%", "100", "50", "20")  # of its values
 PRIORS = Selection("priors")
@@ -248,19 +247,18 @@ class Compared:
         ]
 
     def result(self, title: str, question: str, **changed: Any) -> Result:
-        """The page of the comparison: a line per family and row, with the front of error over cost.
+        """The page of the comparison: a line per family and row, and a figure with a line per row.
 
         Args:
             changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; and `ratio`, the
                 heading of the ratios.
         """
         ratio = changed.pop("ratio", "Ratio to the reference")
-        panels = self.front()
         whole = [(line["row"], ratio_of(line["ratio"])) for line in self.comparable]
         sure = differing(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
-            "plotted": "Median error under each condition, that over shapes of their geometric means, and the median "
-            "cost of runs that ended ok.",
+            "plotted": "Median error under each condition, that over shapes of their geometric means, its ratio, and "
+            "the median cost of runs that ended ok.",
             "verdict": f"{self.best('errors × 1000')} {sure}".strip(),
             "interval": INTERVAL,
             "estimates": [line["error"] for line in self.lines],
@@ -268,9 +266,9 @@ class Compared:
             "columns": self.columns(ratio),
             "lines": self.lines,
         } | changed
+        panels = self.panels(next(column.heading for column in parts["columns"] if column.key == "ratio"))
         if "figure" not in parts:
-            taller = 0.35 * max(-(-len(self.runs.rows()) // LEGEND) - 3, 0)  # inches, for a legend of over three lines
-            parts["figure"] = chart.draw(panels, 3.2 + taller, sharey=True, legend=LEGEND)
+            parts["figure"] = chart.draw(panels, 0.19 * len(self.rows) + 1.1, legend=0, sharey=True)
         return Result(self.runs, title, question=question, chart={"panels": panels}, **parts)
 
     @property
@@ -301,24 +299,25 @@ class Compared:
         quickest = ", which is the quickest row too)" if best is quick else f"); the quickest row has {other})"
         return f"The least median of {least_of} is *{least}{quickest}; n = {format.plural(n, 'shape')}."
 
-    def front(self) -> list[chart.Panel]:
-        """Panels of the mean error of each row over each cost, over all families.
-
-        Filled are the points of rows that no row beats at less cost.
-        """
+    def panels(self, ratio: str) -> list[chart.Panel]:
+        """Panels of errors, of ratios under that name, and of costs: a line per row, the least error first."""
+        lines = sorted(self.pooled, key=lambda line: (math.isnan(line["error"].value), line["error"].value))
+        costs = {label: cost for cost, label in COSTS.items() if cost != "seconds" or self.runs.timed}
+        measures = {
+            self.label: [line["error"] for line in lines],
+            ratio: [ratio_of(line["ratio"]) for line in lines],
+            **{label: [line[cost] for line in lines] for label, cost in costs.items()},
+        }
         panels = []
-        for cost, label in COSTS.items():
-            if cost == "seconds" and not self.runs.timed:
-                continue
+        for label, values in measures.items():
             points = [
-                chart.series(
-                    *(line["row"], line["preset"], [line[cost]], [line["error"]]),
-                    **{"size": 9, "hollow": not line[f"front_{cost}"]},
-                )
-                for line in self.pooled
-                if line[cost] is not None
+                chart.series(line["row"], line["preset"], [value], [place])
+                for place, (line, value) in enumerate(zip(lines, values, strict=True))
+                if value is not None
             ]
-            panels.append(chart.panel_data("", label, self.label, points))
+            panels.append(chart.panel_data("", label, "", points, rows=[line["row"] for line in lines]))
+        panels[1]["series"].insert(0, chart.level("equal", [1, 1], 0) | {"y": [-0.6, len(lines) - 0.4], "quiet": True})
+        panels[1]["x"]["log"] = True
         return panels
 
 

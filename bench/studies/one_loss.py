@@ -7,8 +7,7 @@ READS = (Selection("one_loss", ("task.points",)),)
 NOTES = (
     compare.ERROR,
     f"{compare.RATIO} {compare.FAILURE}",
-    "On a front, filled in the figure, no other row has less error for less cost; a bound of range analysis counts as "
-    "three field values.",
+    "On a front no other row has less error for less cost; a bound of range analysis counts as three field values.",
     "Under this loss a renderer is its hits, their distances and the least value along each ray: the relaxed boundary "
     "is IDR with more steps, and what these two differ by is close to the noise of the fits.",
     "Rates and weights are the best draw over some of the methods on validation shapes (`python -m bench.tune`).",

@@ -78,7 +78,7 @@ def draw(found: compare.Compared, oracle: dict[str, float]) -> Figure:
         if family in oracle:
             lines.append(chart.level(compare.ORACLE, places, oracle[family]))
             lines.append(chart.level("1.5 times that", places, 1.5 * oracle[family], dash=":"))
-        panels.append(chart.panel_data(family, "", compare.LABEL, lines, ticks=found.conditions))
+        panels.append(chart.panel_data(family, "given depth points", compare.LABEL, lines, ticks=found.conditions))
     height = -(-len(panels) // 4)
     return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
 

@@ -169,3 +169,14 @@ def test_a_verdict_that_no_data_could_give_is_none():
     said = differing([(f"row {n}", of_eight([2.0, 2.0])) for n in range(7)], "to DIST")
     assert "*cannot be decided with 8 shapes*" in said and "7 ratios need 9 shapes or more" in said
     assert differing([("none", None)], "to DIST") == ""
+
+
+def test_its_panels_have_a_line_per_row_the_least_error_first(whole):
+    errors, ratios, evaluations, seconds = Compared(whole, lambda _: "dist_mask").panels("Ratio to DIST")
+    names = [f"{name} with mask" for name in ("neus", "newton", "dist", "volsdf")]
+    assert [panel["rows"] for panel in (errors, ratios, evaluations, seconds)] == [names] * 4
+    assert [(each["name"], each["y"]) for each in errors["series"]] == [(name, [n]) for n, name in enumerate(names)]
+    equal, *points = ratios["series"]
+    assert equal["x"] == [1, 1] and ratios["x"] == {"title": "Ratio to DIST", "log": True}
+    assert [(each["x"], each["y"]) for each in points] == [([0.25], [0]), ([0.5], [1]), ([2.0], [3])]
+    assert [each["x"] for each in evaluations["series"]] == [[9000], [500], [1000], [9000]]
