@@ -21,6 +21,7 @@ NOTES = (
     "foreground, in front of black.",
     "Volumes have the cross entropy of their opacity for the masks and a budget of samples a ray.",
     "“Error over the iterations on photographs” shows whether a row is at its end.",
+    "A row without field evaluations has no point where the figure shows them.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
     "measured rows.",
 )
@@ -68,7 +69,7 @@ ARRAYS = ("photograph", "colours", "normals", "hit")
 
 def make(runs: Runs) -> Result:
     """A line per row, and the published ones."""
-    lines, scenes = medians.medians(runs, NAMES), _scenes(runs)
+    lines, scenes = sorted(medians.medians(runs, NAMES), key=_error), _scenes(runs)
     published = [
         {"method": f"published: {name}", **dict(zip(NAMES, (value / SCALE for value in values), strict=False))}
         for name, values in DVR_TABLE2.items()
@@ -94,8 +95,13 @@ def make(runs: Runs) -> Result:
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
-        figure=medians.draw_runs(runs, panels),
+        figure=medians.draw_runs(runs, panels, [Row(line["preset"], line["method"]) for line in lines]),
     )
+
+
+def _error(line: dict[str, Any]) -> float:
+    """The median error on what is seen, by which lines are in order; infinite where a run has none."""
+    return math.inf if line[SEEN] is None else line[SEEN]
 
 
 def _unlike(runs: Runs) -> dict[Row, list[Record]]:
