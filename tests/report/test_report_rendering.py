@@ -232,7 +232,7 @@ def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
     assert list(page.data["lost_share"]) == [0.01, None, 0.0, 0.1]
     assert list(page.data["false_share"]) == [0.25, None, 0.0025, 0.0]
     assert list(page.data["status"]) == ["ok", "killed", "ok", "ok"]
-    shown = page.table[["Epsilon", "Erosion", "Dilation"]].to_numpy().tolist()
+    shown = page.table[["Epsilon", "Missed", "Spurious"]].to_numpy().tolist()
     assert shown[0] == ["0.0500", "1.00 %", "25.0 %"] and shown[1][1:] == ["–", "–"]
     assert "killed (stopped)" in told(page)
     assert "fewest, *0.250 %* of the hits, at epsilon = 5e-05, and at 0.05 they are 26.0 %" in page.verdict
