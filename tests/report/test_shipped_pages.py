@@ -26,6 +26,15 @@ def test_a_ratio_with_seven_of_eight_shapes_is_no_difference():
     assert "0 of 2 ratios to Newton differ from 1; 2 cannot be distinguished" in PAGES["single_view_renderers"].answer
 
 
+def test_a_row_has_one_look_in_all_shipped_figures():
+    looks: dict[tuple[str, str], set[str]] = {}
+    for page in PAGES.values():
+        for series in (series for panel in (page.chart or {}).get("panels", ()) for series in panel["series"]):
+            for part in ("colour", "symbol", "dash"):  # lines may have no symbols, and points have no line
+                looks.setdefault((series["name"], part), set()).update(filter(None, [series.get(part)]))
+    assert {key: found for key, found in looks.items() if len(found) > 1} == {}
+
+
 def test_the_shipped_ranking_has_one_row_a_renderer():
     rows = [row for row in read_rows(SHIPPED / FOLDER) if row["config"]["experiment"] == "stability"]
     classes = {row["renderer"]: setting(row["config"], "renderer", "_target_") for row in rows}
