@@ -69,8 +69,9 @@ def recommendation() -> str:
     return (
         f"**Start with `{hard[0]}`.** With as many field evaluations as one whole DIST run (1 ×), `{hard[0]}` and "
         f"`{other}` make significantly more progress than all other renderers.\nThe difference between these two is "
-        f"not significant. `{hard[0]}` stays first with any problem set left out, and `{other}` is last on "
-        "[hard scenes](results/README.md#stability_cost).\nIn the time of one DIST run, in depth completion, "
+        f"not significant. `{hard[0]}` stays first with any problem set left out. On "
+        f"[hard scenes](results/README.md#stability_cost), `{other}` has the worst mean rank.\nIn the time of one DIST "
+        "run, in depth completion, "
         f"`{hard[0]}` is first, and {', '.join(near[:-1])} and {near[-1]} are not significantly behind. "
         "All others are. At the end of their runs, no two renderers can be distinguished. "
         f"Over all problems, a run costs {costs[least]:.2g} (`{least}`) to {costs[most]:.2g} (`{most}`) times the "

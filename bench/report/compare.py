@@ -275,10 +275,11 @@ class Compared:
     def comparable(self) -> list[Line]:
         """The pooled lines that a verdict is on: of rows that lack no shape and have the settings that most runs have.
 
-        The settings are those of `Runs.mixed`, of which a note says that rows with other values do not compare.
+        The settings are those of `Runs.mixed`, of which a note says that rows with other values do not compare, and the
+        number of views.
         """
         usual = np.ones(len(self.runs.records), dtype=bool)
-        for key in self.runs.mixed():
+        for key in (*self.runs.mixed(), "task.images.views"):
             values = self.runs.setting(key)
             usual &= (values == values.mode()[0]).to_numpy()
         same = self.runs.where(pd.Series(usual)).rows()

@@ -19,14 +19,15 @@ PUBLISHED = {
     "dist_coarse_to_fine_100": (512, 100, "898K", "1.24s"),
 }
 NOTES = (
-    "Forward is one rendering without gradient, backward the backward pass of a step, and a step both and the loss; in "
-    "brackets the least and the largest.",
+    "Forward is one rendering without gradient. A step renders with a graph, computes the loss and goes backward, so "
+    "it takes longer than forward and backward together. In brackets are the least and the largest of several repeats.",
+    "“+ dynamic” also clamps values to 0.1, as all rows after it but “no clamp” do: naive tracing has no clamp.",
     "Queries are points whose field value one rendering computes; coarse ones are computed in bfloat16, where they "
     "decide nothing.",
     "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
     "hit.",
     "Behind the surface is the share of field values, coarse ones too, that are negative (DIST, Fig. 14).",
-    "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: not to be compared with our rows.",
+    "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: compare ratios, not numbers.",
 )
 _TIMES = ("forward_seconds", "backward_seconds", "step_seconds")
 # Metrics of the CSV: at the requested size, and none where a smaller one alone was finished.
@@ -103,7 +104,7 @@ def _step(record: records.Record) -> str:
     """The median of the step's time and, in brackets, its minimum and maximum, without units where these are equal."""
     spread = [records.measured(record, f"step_seconds{end}") for end in ("", "_low", "_high")]
     texts = [format.seconds(x) for x in spread]
-    if None in spread:
+    if None in spread or len({*spread}) == 1:
         return texts[0]
     same = len({time.split()[-1] for time in texts}) == 1
     return f"{texts[0]} ({texts[1].split()[0]}–{texts[2].split()[0]})" if same else "{} ({}–{})".format(*texts)
@@ -134,14 +135,14 @@ RUNS = (
 COLUMNS = (  # of a record, for readers; metrics are those of the largest size that was finished
     table.text("name", "Strategy"),
     table.shown("Size", _size),
-    table.configured("", "renderer", "steps", heading="Steps"),
+    table.configured("", "renderer", "steps", heading="Marching steps"),
     table.shown(
         "Queries", lambda r: format.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries"))
     ),
     table.metric("forward_seconds", "Forward", format.seconds),
     table.metric("backward_seconds", "Backward", format.seconds),
-    table.shown("Step", _step),
-    table.metric("hits", "Hits", table.whole),
+    table.shown("Time of a step", _step),
+    table.metric("hits", "Hits of the reference", table.whole),
     table.shown(
         "Missed / spurious / wrong depth", table.together(records.measured, table.whole, "lost", "false", "wrong")
     ),
@@ -151,7 +152,7 @@ COLUMNS = (  # of a record, for readers; metrics are those of the largest size t
     ),
     table.metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
     table.shown("Published queries", lambda record: _shown(record, 2)),
-    table.shown("Published time", lambda record: _shown(record, 3)),
+    table.shown("Published time of a step", lambda record: _shown(record, 3)),
 )
 
 PAGES = {"table1": make}
