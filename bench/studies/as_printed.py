@@ -21,12 +21,9 @@ def make(runs: Runs) -> Result:
     return found.result(
         "DIST's own setting on dense depth, one change at a time.",
         "To what is the error of DIST's own setting due?",
-        ratio="Ratio to DeepSDF's samples",
         verdict=found.best("errors × 1000"),
         remarks=(
-            compare.differing(
-                [(line["row"], compare.ratio_of(line["ratio"])) for line in found.comparable], "to DeepSDF's samples"
-            ),
+            found.differing("to DeepSDF's samples"),
             compare.ERROR,
             f"{compare.RATIO} {compare.FAILURE}",
             *NOTES,
