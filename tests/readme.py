@@ -7,8 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bench.report.data.statistics import Interval, Verdict, differ
-
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAPER = README.parent / "results" / "paper"
 COLUMNS = (
@@ -97,16 +95,12 @@ def table() -> str:
     return HEAD + "\n".join(rows)
 
 
-def answers() -> str:
-    """README's table of questions: each answer is a test of committed numbers, by the statistics of this version."""
+def hard_scenes() -> str:
+    """README's line on hard scenes, from the verdict on the mean ranks of the atlas."""
     best, *tied = _hardest()
     axes = _lines("stability_cost")[0]["axes"]
     hard = f"{best} has the best mean rank over {axes} kinds of stress. Not distinguished from it: {'; '.join(tied)}"
-    return (
-        "| question | answer |\n|---|---|\n"
-        f"| Which error is lowest, under one loss and setting? | [{_lowest_error()}](results/README.md#one_loss). |\n"
-        f"| Which renderer is most robust in hard scenes? | [{hard}](results/README.md#stability_cost). |"
-    )
+    return f"- Hard scenes: [{hard}](results/README.md#stability_cost)."
 
 
 def _hardest() -> list[str]:
@@ -115,20 +109,6 @@ def _hardest() -> list[str]:
     tied = re.search(r"of the \d+ others \((.*)\) cannot be distinguished from (.*)\.$", verdict)
     _check(tied, "the words of stability_cost")
     return [tied[2], *tied[1].split("; ")] if tied else []
-
-
-def _lowest_error() -> str:
-    """Which ratios of errors to DIST's differ from 1: the sign test over shapes, with Holm's correction."""
-    lines = [line for line in _lines("one_loss") if line["family"] == "all families" and line["ratio"]]
-    counts = [re.search(r"; (\d+) of (\d+)$", line["ratio"]) for line in lines]
-    if None in counts:
-        raise ValueError("a ratio of one_loss.csv does not say on how many shapes it is below 1")
-    below = [(int(count[1]), int(count[2])) for count in counts if count]
-    ratios = [Interval(1.0, 0.5, 2.0, (0.5,) * k + (2.0,) * (n - k)) for k, n in below]
-    verdicts = {*differ(ratios)}
-    if verdicts != {Verdict.NOT_DISTINGUISHED}:
-        raise ValueError(f"the verdicts on one_loss are {verdicts}: write another answer")
-    return f"None of the {len(ratios)} others differs significantly from DIST (sign test over {below[0][1]} shapes)"
 
 
 def _lines(page: str) -> list[dict[str, str]]:

@@ -25,8 +25,10 @@ FAILURE = (
     "In a shape's mean a run that did not end ok has the largest finite error of any row on the same shape, seed and "
     "condition; a shape on which every row failed is left out. A row that lacks a shape of another is on no front."
 )
-CHAMFER = "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000."
-ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
+ERROR = (
+    "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000. A run that did "
+    "not end ok, or was planned and not run, counts as infinite."
+)
 INTERVAL = "95 % intervals over shapes (of the sign test)"
 RATIO = (
     "A ratio is the median over shapes of that of their geometric means; after it stand the shapes on which the row is "
@@ -66,8 +68,8 @@ class Compared:
 
     Args:
         runs: at least one.
-        reference: gives the name or the preset of the row that the row of a preset is divided by. Of several rows of
-            that preset it is the first one of the plan of the sweep.
+        reference: gives the preset of the row that the row of a preset is divided by. Of several rows of that preset
+            it is the first one of the plan of the sweep.
         metric: the error.
         label: its name on axes.
     """
@@ -121,7 +123,7 @@ class Compared:
     def reference_of(self, row: Row) -> Row:
         """The row that a row is divided by; itself where there is no other."""
         wanted = self.reference(row.preset)
-        found = [r for r in self.rows if r.name == wanted] or [r for r in self.rows if r.preset == wanted]
+        found = [other for other in self.rows if other.preset == wanted]
         return min(found, key=self.planned.index) if len(found) > 1 else next(iter(found), row)
 
     @cached_property
@@ -250,20 +252,14 @@ class Compared:
         """The page of the comparison: a line per family and row, and a figure with a line per row.
 
         Args:
-            changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; and `ratio`, the
-                heading of the ratios.
+            changed: further parts of the result: `verdict`, `remarks`, `columns`; and what replaces others: `lines`,
+                `figure`, ...
         """
-        ratio = changed.pop("ratio", "Ratio to the reference")
-        whole = [(line["row"], ratio_of(line["ratio"])) for line in self.comparable]
-        sure = differing(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
             "plotted": "Median error under each condition, that over shapes of their geometric means, its ratio, and "
             "the median cost of runs that ended ok.",
-            "verdict": f"{self.best('errors × 1000')} {sure}".strip(),
             "interval": INTERVAL,
             "estimates": [line["error"] for line in self.lines],
-            "remarks": (ERROR, f"{RATIO} {FAILURE}"),
-            "columns": self.columns(ratio),
             "lines": self.lines,
         } | changed
         panels = self.panels(next(column.heading for column in parts["columns"] if column.key == "ratio"))
@@ -284,6 +280,10 @@ class Compared:
             usual &= (values == values.mode()[0]).to_numpy()
         same = self.runs.where(pd.Series(usual)).rows()
         return [line for line in self.pooled if not line["lacking"] and Row(line["preset"], line["row"]) in same]
+
+    def differing(self, of: str) -> str:
+        """The verdict on the ratios of all rows to their references; see `differing`."""
+        return differing([(line["row"], ratio_of(line["ratio"])) for line in self.comparable], of)
 
     def best(self, least_of: str) -> str:
         """The row with the least mean error and the quickest one, as a verdict; empty where there is none."""

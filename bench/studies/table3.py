@@ -56,11 +56,11 @@ def make(runs: Runs) -> Result:
     return found.result(
         "Shape from many views, without a mask.",
         "Which method finds a shape by photographs from many views, without a mask?",
-        ratio="Ratio to DIST",
         plotted="Median error over {shapes and seeds}, over shapes alone, its ratio, and the median cost of runs that "
         "ended ok.",
         verdict=found.best("errors × 1000, from truth to prediction"),
         remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
+        columns=found.columns("Ratio to DIST"),
         lines=found.beside(above, published),
         run_columns=RUNS,
     )
