@@ -202,7 +202,7 @@ def _beside(found: Found, results_dir: Path) -> list[list[str]]:
 def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[Path]:
     """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
 
-    A page that cannot be drawn stays as it is, and its head says which version drew it.
+    A page that cannot be drawn keeps what it says, in this version's form, and its head says which version drew it.
 
     Raises:
         ValueError: where rows that are there cannot be read, and would be lost.
@@ -213,8 +213,9 @@ def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[P
     own_rows = {name for study in studies() if study.keeps is not None for name in study.pages}
     for page in _in(into):
         table = page.base.with_suffix(".csv")
-        if table not in drawn and page.name not in own_rows and not page.shown.drawn_by:
-            write_shown(replace(page.shown, drawn_by=age.drawn_by(table)), page.base)
+        if table not in drawn:
+            stamp = "" if page.name in own_rows else age.drawn_by(table)
+            write_shown(replace(page.shown, drawn_by=page.shown.drawn_by or stamp), page.base)
     return [*rows, *drawn]
 
 
