@@ -236,6 +236,23 @@ def test_latex_has_one_sentence_powers_of_ten_dashes_and_rules_between_groups():
     assert second.count(r"\midrule") == 2 and "\\midrule\n96$^3$ & car \\\\\nid3e5x & car" in second
 
 
+def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_path, capsys):
+    copy = shutil.copytree(reported, tmp_path / "results")
+    before = {path.name: path.read_bytes() for path in (copy / "paper").iterdir()}
+    assert main([f"results_dir={copy}", 'columns.table1="Queries", Strategy']) == 0
+    text = (copy / "paper" / "table1.tex").read_text()
+    assert "Queries & Strategy \\\\\n\\midrule\n1.00k & + dynamic \\\\\n\\bottomrule" in text
+    changed = {path.name for path in (copy / "paper").iterdir() if path.read_bytes() != before[path.name]}
+    assert changed == {"table1.tex"}
+    for argument, named in (
+        ("columns.table1=Step,Quers", "columns.table1: no column 'Quers'; choose from Strategy,"),
+        ("columns.tabel1=Step", "columns.tabel1: no table of that name; there are table1, gradients, "),
+    ):
+        capsys.readouterr()
+        assert main([f"results_dir={copy}", argument]) == 2
+        assert named in capsys.readouterr().err
+
+
 def bands(factor: float = 1.0, camera: bool = True) -> dict:
     """The metrics of a gradients run."""
     metrics = {"silhouette.pixels": 77, "silhouette.image_cosine": 0.75, "silhouette.image_scale": 0.5 * factor}
