@@ -14,7 +14,7 @@ from bench.report.data import curves
 from bench.report.data.runs import Runs, choose
 from bench.report.write.html import write_index
 from bench.report.write.paper import find_paper, studies
-from bench.report.write.result import Result
+from bench.report.write.result import Result, Shown, latex
 from bench.studies import fig4, fig5, fig7, gradients, table1
 from tests.looped import each
 from tests.report.page_data import Page
@@ -208,7 +208,7 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     write_run(tmp_path, "table1", hostile, metrics=odd, status="crashed", reason=hostile)
     main([f"results_dir={tmp_path}"])
     text = (tmp_path / "paper" / "table1.tex").read_text()
-    assert r"\begin{tabular}{lr" in text
+    assert r"\begin{tabular}{>{\raggedright\arraybackslash}p{0.4\textwidth}" in text
     row = text[text.index(r"\midrule") : text.index(r"\bottomrule")]
     assert (
         r"{[}50 \% of a\_b \& \#1 \{x\} \textbackslash{}input \textbar{} \textasciitilde{}\textasciicircum{} \$" in row
@@ -219,6 +219,38 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     shown = next(paper.shown for paper in find_paper(tmp_path) if paper.name == "table1")
     assert shown.rows[0][0] == hostile and len(shown.rows[0]) == len(shown.columns) == 13
     assert Page(tmp_path).paper("table1")["rows"][0][0] == hostile  # reading it checks that no script can come of it
+
+
+def test_latex_has_one_sentence_powers_of_ten_dashes_and_rules_between_groups():
+    rows = [["sofa", "a_b", "2.2e-5"], ["sofa", "50 %", "[-1e-7, 1e+6]"], ["car", "96³", ""], ["car", "id3e5x", "N/A"]]
+    page = Shown(title="Errors.", caption="Of 3e5 rays. n = 4 runs.", columns=["Family", "Row", "Error"], rows=rows)
+    head, text = latex(page, "mine").split(r"\begin{table*}")
+    assert all(line.startswith("% ") for line in head.splitlines()) and "n = 4 runs." in head
+    assert r"\caption{Errors.}" in text and text.isascii()
+    assert text[text.index(r"\midrule") : text.index(r"\bottomrule")].splitlines() == [
+        *(r"\midrule", r"sofa & a\_b & $2.2\times10^{-5}$ \\", r" & 50 \% & {[}$-1\times10^{-7}$, $1\times10^{6}$] \\"),
+        *(r"\midrule", r"car & 96$^3$ & -- \\", r" & id3e5x & -- \\"),
+    ]
+    apart, second = (latex(page.narrowed(names), "mine") for names in (["Error", "Row"], ["Row", "Family"]))
+    assert apart.count(r"\midrule") == 1 and r"$2.2\times10^{-5}$ & a\_b \\" in apart
+    assert second.count(r"\midrule") == 2 and "\\midrule\n96$^3$ & car \\\\\nid3e5x & car" in second
+
+
+def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_path, capsys):
+    copy = shutil.copytree(reported, tmp_path / "results")
+    before = {path.name: path.read_bytes() for path in (copy / "paper").iterdir()}
+    assert main([f"results_dir={copy}", 'columns.table1="Queries", Strategy']) == 0
+    text = (copy / "paper" / "table1.tex").read_text()
+    assert "Queries & Strategy \\\\\n\\midrule\n1.00k & + dynamic \\\\\n\\bottomrule" in text
+    changed = {path.name for path in (copy / "paper").iterdir() if path.read_bytes() != before[path.name]}
+    assert changed == {"table1.tex"}
+    for argument, named in (
+        ("columns.table1=Step,Quers", "columns.table1: no column 'Quers'; choose from Strategy,"),
+        ("columns.tabel1=Step", "columns.tabel1: no table of that name; there are table1, gradients, "),
+    ):
+        capsys.readouterr()
+        assert main([f"results_dir={copy}", argument]) == 2
+        assert named in capsys.readouterr().err
 
 
 def bands(factor: float = 1.0, camera: bool = True) -> dict:

@@ -1,5 +1,6 @@
 """Writes the tables and figures of all studies and their README; finds those of a results folder for index.html."""
 
+import csv
 import hashlib
 import os
 import re
@@ -18,7 +19,7 @@ from bench.report.data import age
 from bench.report.data.kept import KEPT, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
 from bench.report.write.caption import SMOKE
-from bench.report.write.result import Result, Shown, as_markdown, markdown, read_shown, write, write_shown
+from bench.report.write.result import Result, Shown, as_markdown, latex, markdown, read_shown, write, write_shown
 
 FOLDER = "paper"
 SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
@@ -202,7 +203,7 @@ def _beside(found: Found, results_dir: Path) -> list[list[str]]:
 def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[Path]:
     """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
 
-    A page that cannot be drawn stays as it is, and its head says which version drew it.
+    A page that cannot be drawn keeps what it says, in this version's form, and its head says which version drew it.
 
     Raises:
         ValueError: where rows that are there cannot be read, and would be lost.
@@ -213,9 +214,27 @@ def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[P
     own_rows = {name for study in studies() if study.keeps is not None for name in study.pages}
     for page in _in(into):
         table = page.base.with_suffix(".csv")
-        if table not in drawn and page.name not in own_rows and not page.shown.drawn_by:
-            write_shown(replace(page.shown, drawn_by=age.drawn_by(table)), page.base)
+        if table not in drawn:
+            stamp = "" if page.name in own_rows else age.drawn_by(table)
+            write_shown(replace(page.shown, drawn_by=page.shown.drawn_by or stamp), page.base)
     return [*rows, *drawn]
+
+
+def write_columns(results_dir: Path, given: dict[str, str]) -> None:
+    """Writes the LaTeX table of each page or sweep of a key `columns.NAME` again, with these headings alone.
+
+    Raises:
+        ValueError: where there is no such table, or it has no such column.
+    """
+    tables = {page.name: page for page in [*_in(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
+    for key in (key for key in given if key.startswith("columns.")):
+        if (page := tables.get(key.removeprefix("columns."))) is None:
+            raise ValueError(f"{key}: no table of that name; there are {', '.join(tables) or 'none'}")
+        headings = next(csv.reader([given[key]], skipinitialspace=True))
+        if unknown := [heading for heading in headings if heading not in page.shown.columns]:
+            known = ",".join(f'"{one}"' if "," in one else one for one in page.shown.columns)
+            raise ValueError(f"{key}: no column {unknown[0]!r}; choose from {known}")
+        write_text(page.base.with_suffix(".tex"), latex(page.shown.narrowed(headings), page.name))
 
 
 def write_readme(results_dir: Path) -> Path | None:
