@@ -22,6 +22,10 @@ def test_a_page_of_this_version_has_rows_and_the_intervals_of_its_verdict(name: 
         assert "(of the sign test)" in page.caption and "bootstrap" not in page.caption
 
 
+def test_no_rows_are_in_the_format_of_before():
+    assert [*(SHIPPED / FOLDER).glob("*.runs.csv")] == []
+
+
 def test_a_ratio_with_seven_of_eight_shapes_is_no_difference():
     assert "0 of 2 ratios to Newton differ from 1; 2 cannot be distinguished" in PAGES["single_view_renderers"].answer
 
