@@ -26,8 +26,8 @@ def wrongs(text: str) -> list[str]:
     """What is too long in a README, a line for each; code and addresses have no numbers and are a word."""
     prose = CODE.sub("code", ADDRESS.sub(r"\1", BLOCK.sub("", text)))
     lines, numbers = len(text.splitlines()), len(NUMBER.findall(prose))
-    found = [f"{lines} lines, at most {LINES}: move some to results/README.md"] if lines > LINES else []
-    found += [f"{numbers} numbers, at most {NUMBERS}: leave them to results/README.md"] if numbers > NUMBERS else []
+    found = [f"{lines} lines, at most {LINES}: move some to the README of a folder"] if lines > LINES else []
+    found += [f"{numbers} numbers, at most {NUMBERS}: leave them to results/paper"] if numbers > NUMBERS else []
     for sentence in (" ".join(part.split()) for part in ENDS.split(prose)):
         words = sum(any(map(str.isalnum, word)) for word in sentence.split(" "))
         found += [f"a sentence of {words} words, at most {WORDS}: {sentence}"] if words > WORDS else []
@@ -68,7 +68,7 @@ def recommendation() -> str:
         f"**Start with `{hard[0]}`.** With as many field evaluations as one whole DIST run (1 ×), `{hard[0]}` and "
         f"`{other}` make significantly more progress than all other renderers.\nThe difference between these two is "
         f"not significant. `{hard[0]}` stays first with any problem set left out. On "
-        f"[hard scenes](results/README.md#stability_cost), `{other}` has the worst mean rank.\nIn the time of one DIST "
+        f"[hard scenes](results/paper/stability_cost.md), `{other}` has the worst mean rank.\nIn the time of one DIST "
         "run, in depth completion, "
         f"`{hard[0]}` is first, and {', '.join(near[:-1])} and {near[-1]} are not significantly behind. "
         "All others are. At the end of their runs, no two renderers can be distinguished. "
@@ -100,7 +100,7 @@ def hard_scenes() -> str:
     best, *tied = _hardest()
     axes = _lines("stability_cost")[0]["axes"]
     hard = f"{best} has the best mean rank over {axes} kinds of stress. Not distinguished from it: {'; '.join(tied)}"
-    return f"- Hard scenes: [{hard}](results/README.md#stability_cost)."
+    return f"- Hard scenes: [{hard}](results/paper/stability_cost.md)."
 
 
 def _hardest() -> list[str]:

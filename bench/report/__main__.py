@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 from bench.records.read import RESULTS, check_results, read_records
-from bench.report.data.frame import write_csv
 from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
@@ -20,7 +19,7 @@ KEYS = {text.partition("=")[0]: text for text in TYPED}
 
 
 def main(arguments: list[str]) -> int:
-    """Writes `runs.csv`, all pages, the tables of sweeps and `index.html`; gives the exit status.
+    """Writes all pages, the tables of sweeps and `index.html`; gives the exit status.
 
     It is 2 where an argument is wrong, and 1 where a study could not be made.
     """
@@ -55,11 +54,9 @@ def _report(given: dict[str, str]) -> int:
 def _written(results_dir: Path, meshes: int | None) -> int:
     """Writes all that is written of a results folder; gives the exit status."""
     records, unread = read_records(results_dir)
-    table = results_dir / "runs.csv"
-    write_csv(records, table)
     broken: list[str] = []
     papers = write_paper(records, results_dir, problems=broken)
-    for path in (table, *papers, *write_sweeps(records, results_dir, broken)):
+    for path in (*papers, *write_sweeps(records, results_dir, broken)):
         print(path)
     for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
         print(problem, file=sys.stderr)

@@ -232,7 +232,7 @@ def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
     kinds = [
         "; ".join(
             f"{n:.0f} {name.removeprefix(FAILED).replace('_', ' ')}"
-            for name, n in record["metrics"].items()
+            for name, n in sorted(record["metrics"].items())
             if name.startswith(FAILED)
         )
         for record in runs.records

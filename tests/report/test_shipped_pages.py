@@ -35,6 +35,10 @@ def test_a_row_has_one_look_in_all_shipped_figures():
     assert {key: found for key, found in looks.items() if len(found) > 1} == {}
 
 
+def test_no_rows_are_in_the_format_of_before():
+    assert [*(SHIPPED / FOLDER).glob("*.runs.csv")] == []
+
+
 def test_the_shipped_ranking_has_one_row_a_renderer():
     rows = [row for row in read_rows(SHIPPED / FOLDER) if row["config"]["experiment"] == "stability"]
     classes = {row["renderer"]: setting(row["config"], "renderer", "_target_") for row in rows}
