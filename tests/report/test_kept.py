@@ -118,7 +118,10 @@ def test_of_the_records_of_a_run_the_newest_that_measured_counts(tmp_path):
 
 
 TEXTS = ["id,started\n1\n", 'id\n"""a"""\n', 'id,started\n"""a""","""today"""\n']
-DAMAGED = [gzip.compress(text.encode()) for text in TEXTS] + [b"id,started\n1\n", gzip.compress(bytes(99))[:-9]]
+DAMAGED = [gzip.compress(text.encode(), mtime=0) for text in TEXTS] + [
+    b"id,started\n1\n",
+    gzip.compress(bytes(99), mtime=0)[:-9],
+]
 
 
 @pytest.mark.parametrize("content", DAMAGED)
