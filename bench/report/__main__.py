@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from bench.records.read import RESULTS, check_results, read_records
-from bench.report.data.frame import write_csv
+from bench.report.data.frame import to_frame
 from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
@@ -51,7 +51,7 @@ def _written(results_dir: Path, meshes: int | None) -> int:
     """Writes all that is written of a results folder; gives the exit status."""
     records, unread = read_records(results_dir)
     table = results_dir / "runs.csv"
-    write_csv(records, table)
+    to_frame(records).to_csv(table, index=False, lineterminator="\n")
     broken: list[str] = []
     papers = write_paper(records, results_dir, problems=broken)
     for path in (table, *papers, *write_sweeps(records, results_dir, broken)):
