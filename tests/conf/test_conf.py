@@ -290,6 +290,22 @@ def test_rows_of_an_experiment_are_told_apart(name):
     assert len({(look(row).colour, look(row).marker) for row in alike}) == len(alike)
 
 
+def label_of(group: str, name: str) -> str:
+    """The name of a method or a renderer in tables, its own or that of what it builds on; empty without one."""
+    own = choice(group, name)
+    bases = [base for base in own.get("defaults", ()) if isinstance(base, str) and base != "_self_"]
+    inherited = [label_of(group, base.removeprefix(f"/{group}/")) for base in bases]
+    return own.get("label") or own.get("_label_") or next(filter(None, inherited), "")
+
+
+def test_rows_of_one_label_have_one_look():
+    looks: dict[str, set[style.Look]] = {}
+    for group in ("method", "renderer"):
+        for name in names(group):
+            looks.setdefault(label_of(group, name) or name, set()).add(look(name))
+    assert {label: found for label, found in looks.items() if len(found) > 1} == {}
+
+
 def test_a_row_that_conf_does_not_know_has_a_colour_of_no_renderer():
     classes = {name: type(load("renderer", name)) for name in visible("renderer") if name != "custom"}
     known = {(look(name).colour, cls) for name, cls in classes.items()}

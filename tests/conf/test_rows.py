@@ -133,9 +133,7 @@ def test_combinations_are_those_that_hydra_runs(swept):
     ]
 
 
-MINE = (
-    "# @package _global_\ndefaults: [tuning, _self_]\nhydra: {sweeper: {params: {+method: '${methods:space,neus}'}}}\n"
-)
+MINE = "# @package _global_\ndefaults: [tuning, _self_]\nhydra: {sweeper: {params: {+method: '${spaces:neus}'}}}\n"
 SLOW = {f"{name}_mask" for name in ("neus", "range_analysis", "unisurf", "volsdf")}
 
 
@@ -166,7 +164,7 @@ def test_methods_of_ones_own_join_the_tuning_which_slow_ones_do_not(swept, tmp_p
     ("variants.yaml", "- mine\n", "variants.yaml must hold keys and values"),
     ("variants.yaml", "mine: {a: 1\n", "variants.yaml cannot be read: while parsing"),
     ("renderer/list.yaml", "- 1\n", "renderer/list.yaml must hold keys and values"),
-    ("experiment/mine.yaml", MINE, "${methods:space,...} leaves out neus: not in method/space"),
+    ("experiment/mine.yaml", MINE, "${spaces:...} leaves out neus: not in method/space"),
 ])  # fmt: skip
 def test_a_broken_file_of_the_users_is_named(swept, tmp_path, capsys, file, text, message):
     (tmp_path / "own" / file).parent.mkdir(parents=True)

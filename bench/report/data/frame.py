@@ -1,4 +1,4 @@
-"""All runs of a results folder as one table with typed columns, for pandas or a spreadsheet."""
+"""All runs of a results folder as one table with typed columns, for pandas."""
 
 import os
 import warnings
