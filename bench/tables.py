@@ -16,7 +16,6 @@ spaces but those.
 import importlib.util
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from math import inf
@@ -76,16 +75,6 @@ def register_rows(folders: Sequence[Path] = ()) -> None:
 _REPLACED: list[tuple[str, str, Any]] = []  # rows of other folders: group, key, and what stood there before
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A row that Hydra keeps. Hydra copies what it loads, which makes it a node; all 200 rows as nodes take .15 s."""
-
-    content: Node
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> DictConfig:
-        return OmegaConf.create(self.content)
-
-
 def _stored(group: str) -> dict[str, Any]:
     """What Hydra keeps of a group."""
     from hydra.core.config_store import ConfigStore  # only here: runs do without Hydra
@@ -101,7 +90,7 @@ def _store(path: Path, group: str, text: str) -> None:
 
     for of, name, node in _rows_of(path, group, text):
         whole = of.startswith(METHOD) or node == {group: None}
-        kept: Any = _Row({key: value for key, value in node.items() if key != LOOK or not whole})
+        kept = OmegaConf.create({key: value for key, value in node.items() if key != LOOK or not whole})
         _stored(of)[f"{name}.yaml"] = ConfigNode(f"{name}.yaml", kept, of, "_global_" if whole else None, None)
 
 
