@@ -12,7 +12,7 @@ from bench.report.write.paper import ship, write_columns, write_paper, write_rea
 USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [columns.PAGE=HEADING,HEADING] [ship=PATH]
   results_dir   the folder with the runs; `{RESULTS}` unless given
   meshes        of how many runs, the newest first, the mesh turns on the page; {MOST_MESHES} unless given, or all
-  columns.PAGE  the columns of its LaTeX table, such as columns.table1=Strategy,Queries,Step; all unless given
+  columns.PAGE  the columns of its LaTeX table, such as columns.table1=Strategy,Queries,Forward; all unless given
   ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
 TYPED = ("results_dir=PATH", "meshes=all", "columns.PAGE=HEADING,HEADING", "ship=PATH")
 KEYS = {text.partition("=")[0]: text for text in TYPED}

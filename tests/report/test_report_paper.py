@@ -245,7 +245,7 @@ def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_pat
     changed = {path.name for path in (copy / "paper").iterdir() if path.read_bytes() != before[path.name]}
     assert changed == {"table1.tex"}
     for argument, named in (
-        ("columns.table1=Step,Quers", "columns.table1: no column 'Quers'; choose from Strategy,"),
+        ("columns.table1=Strategy,Quers", "columns.table1: no column 'Quers'; choose from Strategy,"),
         ("columns.tabel1=Step", "columns.tabel1: no table of that name; there are table1, gradients, "),
     ):
         capsys.readouterr()

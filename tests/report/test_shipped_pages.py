@@ -7,8 +7,9 @@ import pytest
 
 from bench.report.data.kept import read_rows
 from bench.report.data.records import OURS, setting
-from bench.report.write.paper import FOLDER, SHIPPED, find_paper
+from bench.report.write.paper import FOLDER, SHIPPED, find_paper, write_columns
 from bench.report.write.result import latex
+from tests.documentation import commands
 
 PAGES = {page.name: page.shown for page in find_paper(SHIPPED)}
 EXPERIMENTS = {row["config"]["experiment"] for row in read_rows(SHIPPED / FOLDER)}
@@ -46,6 +47,12 @@ def test_the_shipped_ranking_has_one_row_a_renderer():
     ranked = [classes[names[line[0]]] for line in PAGES["stability_cost"].rows]
     assert all(target.startswith(OURS) for target in ranked)
     assert sorted(ranked) == sorted({*classes.values()})
+
+
+def test_documented_columns_are_those_of_shipped_pages(tmp_path):
+    given = dict(word.split("=", 1) for one in commands() for word in one.words if word.startswith("columns."))
+    write_columns(shutil.copytree(SHIPPED / FOLDER, tmp_path / FOLDER).parent, given)
+    assert len(given) == 2 and r"\begin{tabular}{lrr}" in (tmp_path / FOLDER / "table1.tex").read_text()
 
 
 def test_shipped_latex_is_of_todays_writer_and_compiles(tmp_path):
