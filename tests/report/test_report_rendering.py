@@ -52,7 +52,7 @@ def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
     write_run(tmp_path, "table1", PARALLEL, status="crashed", reason="no luck")
     page = page_of(tmp_path, "table1")
     assert list(page.table["Size"]) == ["32 (64: timeout)", "– (64: crashed)", "64"]
-    assert page.table["Step"].iloc[2] == "750 ms (625–875)"
+    assert page.table["Time of a step"].iloc[2] == "750 ms (625–875)"
     assert page.table["Missed / spurious / wrong depth"].iloc[2] == "12 / 8 / 3"
     said = (
         "car 0",
