@@ -42,7 +42,7 @@ def shipped() -> dict[str, list[dict[str, Any]]]:
 def described(config: dict[str, Any], dataset: str, renderer: str) -> tuple[tuple[str, ...], dict[str, str]]:
     path = config["dataset"].get("path")
     settings = {key: str(value) for key, value in flat(config, "").items() if not IGNORED.match(key)}
-    return (row_name(config, renderer), Path(path).stem if path else dataset), settings
+    return (row_name(config, renderer), Path(path).stem if path and dataset == "mesh" else dataset), settings
 
 
 def planned(experiment: str) -> list[tuple[tuple[str, ...], dict[str, str]]]:
