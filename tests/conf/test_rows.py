@@ -112,7 +112,7 @@ def test_the_command_line_narrows_and_replaces_the_rows(swept):
 def test_a_method_is_a_part_of_what_a_run_is_called(swept):
     plan, _ = swept("+experiment=table3", "index=0", "dataset=car")
     methods = [cell.method for cell in plan.cells]
-    names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "mesh_long", "encoder", "mesh_encoder")
+    names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "encoder", "mesh_encoder")
     assert methods == [f"multiview_{name}" for name in names]
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == [
         "multiview-dist_paper-car-multiview_paper",
