@@ -320,15 +320,16 @@ def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers
 
 
 def test_measuring_experiments_measure_the_shape_that_their_network_was_fitted_to(compose_config):
-    for name, scale, size in (
-        ("table1", "smoke", 64), ("table1_large", "desk", 512), ("fig4", "paper", 512), ("fig7", "desk", 256),
-        ("gradients", "desk", 256),
+    deepsdf, small = (8, 512, 256, 4), (4, 128, 64, 2)  # DIST, B.1; and of what takes central differences
+    for name, scale, size, layers in (
+        ("table1", "smoke", 64, deepsdf), ("table1_large", "desk", 512, deepsdf), ("fig4", "paper", 512, deepsdf),
+        ("fig7", "desk", 256, deepsdf), ("gradients", "desk", 256, small),
     ):  # fmt: skip
         config = compose_config(f"+experiment={name}", f"scale={scale}")
         prior = build_part(config, "prior")
         assert (prior.shapes, config.split, config.index, config.view.resolution) == (1, "train", 0, size)
         network = prior.network
-        assert (network.layers, network.width, network.code_length, network.skip) == (8, 512, 256, 4)  # DIST, B.1
+        assert (network.layers, network.width, network.code_length, network.skip) == layers
 
 
 def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
