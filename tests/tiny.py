@@ -23,9 +23,11 @@ from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
+from renderers.fields.network import Facts
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
+FACTS = Facts(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, near=(1.0, 1.0, 1.0), nearly_all=1.0)  # of a distance
 TRIANGLE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
 PEAK = 1e10  # operations a second that the machine of a run is said to do
 
@@ -144,7 +146,7 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
         device=CPU,
         cache=folder / "cache",
         field=FieldChoice("prior", None),
-        prior_choice=PriorChoice(Known(prior.decoder, prior.codes, facts=None, notes=()), scene_code=0),
+        prior_choice=PriorChoice(Known(prior.decoder, prior.codes, FACTS, ()), scene_code=0),
     )
     record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
     record.environment = {"gemm_peak_flops": PEAK}
