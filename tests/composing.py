@@ -8,11 +8,14 @@ from hydra import compose, initialize_config_dir
 from hydra._internal.config_repository import CachingConfigRepository
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import register
 from bench.records.folder import Identity, identify, resolved
+from bench.records.read import PlannedCell
 from bench.run.command import options_first
+from bench.run.compose import make_plan, swept_over
 from bench.tables import CONF
 
 _KEPT: dict[str, CachingConfigRepository] = {}
@@ -46,3 +49,11 @@ def identified(*arguments: str) -> Identity:
     OmegaConf.set_struct(config, False)
     del config["hydra"]
     return identify(resolved(config, runtime), runtime, overrides)
+
+
+def cells_of(*overrides: str) -> list[PlannedCell]:
+    """The cells of a sweep, as its plan lists them."""
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = GlobalHydra.instance().config_loader().load_configuration("config", [*overrides], RunMode.MULTIRUN)
+        return make_plan(config, swept_over(config)).cells
