@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import register, type_of, wrong_type
 from bench.records.folder import Identity, identify, resolved
 from bench.run.compose import parsed
+from bench.run.job import unwritten
 from bench.run.pack import register_slurm
 from bench.run.plan import Shown
 from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
@@ -198,14 +199,6 @@ def own_folders(arguments: list[str]) -> list[Path]:
     """The folder of configurations that a command adds, which may have tables."""
     folder = get_args_parser().parse_known_args(arguments)[0].config_dir
     return [Path(folder)] if folder else []
-
-
-def unwritten(error: OSError, results_dir: str | None = None) -> str:
-    """One line on what could not be written, and what to do; `results_dir` is named where the error names no file."""
-    path = Path(named) if (named := error.filename or results_dir) else None
-    file = next((above for above in path.parents if above.is_file()), path) if path else None
-    where = f" ({file})" if file else ""
-    return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
 
 
 def _identified(config: DictConfig) -> Identity:

@@ -24,6 +24,7 @@ from bench.records.format import plural
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import BESIDE, RunStatus
 from bench.run.compose import identity_of
+from bench.run.job import unwritten
 from bench.run.plan import kind, times
 from bench.run.process import catch_signals, stopped_by
 
@@ -145,7 +146,7 @@ class Pack:
 
 def made(cell: PlannedCell) -> list[str]:
     """Makes the run of a cell, or reuses it; says why it has no record, where that is so."""
-    from bench.run.run import run, unwritten  # of the command line, which imports this module
+    from bench.run.run import run  # of the command line, which imports this module
 
     try:
         run(identity_of(cell))

@@ -15,7 +15,8 @@ from bench.config import Isolation
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import row_name
-from bench.run.process import in_child, reason_of
+from bench.run.job import reason_of
+from bench.run.process import in_child
 
 # Statuses of runs that did not take their whole time.
 UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")

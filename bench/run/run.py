@@ -16,21 +16,10 @@ from bench.progress import Report, notice, run_progress
 from bench.records.folder import Identity, claimed, release, reusable
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.run.command import unwritten
 from bench.run.compose import planned
+from bench.run.job import Job, Message, Notice, Started, Step, reason_of, unwritten
 from bench.run.plan import refusals, show_plan
-from bench.run.process import (
-    Job,
-    Message,
-    Notice,
-    RunLimits,
-    Started,
-    Step,
-    reason_of,
-    run_isolated,
-    signals_delayed,
-    stopped_by,
-)
+from bench.run.process import RunLimits, run_isolated, signals_delayed, stopped_by
 from bench.run.summary import show, write_log
 from bench.trackers import Nothing, Tracker
 
