@@ -281,8 +281,8 @@ def own_row(renderer: dict[str, Any], choice: str) -> dict[str, Any]:
     Args:
         choice: the name of its file or row.
     """
-    own = listed("renderer")[choice].content if choice in listed("renderer") else {}
-    dropped = {ROWS, LOOK, LABEL} if "defaults" in own and LABEL not in own else {ROWS, LOOK}
+    content = listed("renderer")[choice].content if choice in listed("renderer") else {}
+    dropped = {ROWS, LOOK, LABEL} if "defaults" in content and LABEL not in content else {ROWS, LOOK}
     return {key: value for key, value in renderer.items() if key not in dropped}
 
 
@@ -290,9 +290,8 @@ def renderers_of(experiment: str) -> list[str]:
     """The renderers that have a row in an experiment, in the order of their places, then by name."""
     ranks = {}
     for name, choice in listed("renderer").items():
-        own = choice.content
-        rank = own.get(ROWS, {experiment: inf}).get(experiment)
-        if rank is not None and own.get("_target_") != MISSING:  # custom: its class is on the command line
+        rank = choice.content.get(ROWS, {experiment: inf}).get(experiment)
+        if rank is not None and choice.content.get("_target_") != MISSING:  # custom: its class is on the command line
             ranks[name] = rank
     return sorted(ranks, key=lambda name: (ranks[name], name))
 
