@@ -9,16 +9,12 @@ import sys
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 # Threads of OpenMP that wait must sleep: where they spin, a second process on the same cores makes both 4 to 20 times
 # slower. Read by the runtime once, when torch is first imported, hence here.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
-
-# Open3D imports dash and plotly for drawings in a browser, which nothing here makes: a quarter of a second a process.
-DRAWINGS = "open3d.visualization.draw_plotly"
 
 __all__ = ["load", "load_field", "run"]
 
@@ -61,21 +57,6 @@ def _foreign() -> str:
             )
     return ""
 
-
-def _left_out(name: str) -> Any:
-    """Stands in for a function of Open3D's drawings in a browser."""
-    if name.startswith("__"):  # such as `__path__`, which a module may lack
-        raise AttributeError(name)
-
-    def function(*_: Any, **__: Any) -> None:
-        raise RuntimeError(f"{DRAWINGS}.{name} is left out by {OURS}: import open3d before bench")
-
-    return function
-
-
-stand_in = ModuleType(DRAWINGS)
-vars(stand_in)["__getattr__"] = _left_out
-sys.modules.setdefault(DRAWINGS, stand_in)  # unless Open3D is there already
 
 if foreign := _foreign():
     if sys.argv[:1] == ["-m"]:  # of `python -m bench`, while the command is looked for

@@ -16,15 +16,14 @@ def train(run: Identity) -> None:
     from bench.progress import run_progress
     from bench.setup.inputs import cell_of
     from bench.shape_prior import PriorSettings, prior_file
-    from datasets.network_files import Networked
 
-    cell = cell_of(run.config)
-    inputs, settings = cell.inputs, cell.prior
-    if isinstance(inputs.dataset, Networked) or not isinstance(settings, PriorSettings):
+    inputs = cell_of(run.config).inputs
+    choice = inputs.prior_choice
+    if not isinstance(choice.source, PriorSettings):
         raise ValueError("the codes of a network are the prior already: there is nothing to train")
     inputs.check_prior()
     with flushing_denormals(), run_progress("prior") as progress:
-        path = prior_file(cell.learnt, settings, inputs.cache, inputs.device, progress)
+        path = prior_file(choice.dataset, choice.source, inputs.cache, inputs.device, progress)
     print(path)
 
 

@@ -7,35 +7,27 @@
     python -m bench.suite set=pose,complete                     some sets of problems
     python -m bench.suite setting=tuned renderer=newton         at its own setting of conf/tuned.yaml, as a second row
     python -m bench.suite plan=true                             what would run, and for how long
-    python -m bench.suite verify=3                              runs three of the results again: do they agree?
 
 Any other KEY=VALUE is that of `python -m bench`.
 """
 
-import random
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
-from math import isclose
 from pathlib import Path
 from typing import Any
 
 from bench.records.format import MISSING, number, plural
 from bench.records.read import RESULTS, read_records
-from bench.records.record import read_record
 from bench.report.suite.attempts import (
     BY_ITSELF,
     EXPERIMENT,
     GIVEN,
     STATED,
     TUNED,
-    Attempt,
     attempts_of,
     gather,
-    place,
-    portable,
     read_attempts,
     suite,
     write_attempts,
@@ -44,7 +36,6 @@ from bench.report.suite.standing import BUDGETS, KEY, Standing
 from bench.report.write import paper
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
 from bench.report.write.table import percent
-from bench.run.library import AGREE, run_again
 from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 
 PAGE = "suite"  # its name in the folder `paper`
@@ -63,8 +54,6 @@ def main(arguments: Sequence[str]) -> int:
     try:
         own, passed = parsed(arguments)
         results_dir = Path(dict(text.split("=", 1) for text in passed).get("results_dir", RESULTS))
-        if "verify" in own:
-            return verify(results_dir, int(own["verify"]))
         for said, keys in _sweeps(own, passed):
             print(said, flush=True)
             if (code := _sweep(keys)) not in GOES_ON:
@@ -79,12 +68,12 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """The keys of this command, with their defaults, and what is passed on.
 
     Raises:
-        ValueError: for an unknown size, set or setting, or a number that is none.
+        ValueError: for an unknown size, set or setting, or a key that the suite states.
     """
     own, passed = {"suite": "quick", "set": ",".join(suite().errors), "setting": "stated"}, list[str]()
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key in ("suite", "set", "setting", "verify"):
+        if key in ("suite", "set", "setting"):
             own[key] = value
         elif re.match(FIXED, key) and key not in [given for given, _ in GIVEN.values()]:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
@@ -98,8 +87,6 @@ def parsed(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         for word in own[key].split(",") if key == "set" else [own[key]]:
             if word not in known:
                 raise ValueError(f"unknown {key} {word!r}{nearest(word, [*known])}")
-    if not own.get("verify", "1").isdecimal() or own.get("verify") == "0":
-        raise ValueError(f"verify must be a number of results, such as verify=3, not {own['verify']!r}")
     return own, passed
 
 
@@ -208,46 +195,6 @@ def _print_errors(standing: Standing, mine: set[str]) -> None:
         errors = f"initial error {number(run.initial)}, final error {number(run.final)}"
         least = f"best renderer {number(best.get((run.set, run.problem, run.seed)))}"
         print(f"{run.row}, {run.set}, {run.problem}: {errors}; {least}, best possible {number(run.reference)}")
-
-
-def verify(results_dir: Path, count: int) -> int:
-    """Runs some of the kept attempts again, drawn anew each time, and says which agree; 1 where one does not.
-
-    Raises:
-        ValueError: where there is none.
-    """
-    kept, problems = read_attempts(results_dir if place(results_dir).is_dir() else paper.SHIPPED)
-    found = [one for one in kept if one.ok]
-    if not found:
-        unread = f" ({'; '.join(problems)})" if problems else ""
-        raise ValueError(f"{place(results_dir)} has no results that ended ok{unread}: type python -m bench.suite")
-    agree = [_agrees(one) for one in random.sample(found, min(count, len(found)))]
-    for problem in problems:
-        print(f"not read: {problem}", file=sys.stderr)
-    return 0 if all(agree) and not problems else 1
-
-
-def _agrees(attempt: Attempt) -> bool:
-    """Whether an attempt gives the same errors and costs once more; prints a line about it."""
-    with tempfile.TemporaryDirectory() as folder:
-        folders, said = run_again(portable(attempt.overrides), Path(folder))
-        again = attempts_of(map(read_record, folders), Path(folder))
-    name = f"{attempt.set}: {attempt.problem}, seed {attempt.seed}, {attempt.row}"
-    if not again:
-        print(f"not run again: {name}: {said}")
-        return False
-    (found,) = again
-    first, second = ([number for cost, _, error in one.curve for number in (cost, error)] for one in (attempt, found))
-    same = (
-        found.ok
-        and len(first) == len(second)
-        and all(isclose(*pair, rel_tol=AGREE) for pair in zip(first, second, strict=True))
-    )
-    pairs = (attempt.final, found.final), (attempt.cost, found.cost)
-    told = ", ".join(f"{number(a)} and {number(b)}" for a, b in pairs)
-    ended = "" if found.ok else f"; {found.status}: {found.reason}"
-    print(f"{'agrees' if same else 'differs'}: {name}: error and field values {told}{ended}")
-    return same
 
 
 if __name__ == "__main__":

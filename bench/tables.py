@@ -9,7 +9,8 @@ renderer's row in its table, and `_label_` names the row. A renderer without `_r
 experiment, after the others. An experiment sweeps over `renderer: ${rows:EXPERIMENT}`.
 
 A choice of `method/space` declares what may be tuned of a method: `${drawn:DIMENSION,LEAST,MOST}` is the value, in
-that dimension, of the Sobol point whose number is `draw`. An experiment sweeps over `+method: ${methods:space}`.
+that dimension, of the Sobol point whose number is `draw`. An experiment sweeps over `+method: ${spaces:NAME,...}`, all
+spaces but those.
 """
 
 import re
@@ -267,7 +268,7 @@ def nearest(word: str, known: list[str]) -> str:
 def register_resolvers() -> None:
     """Makes known to OmegaConf what values of the configuration may ask for."""
     OmegaConf.register_new_resolver("rows", _rows, replace=True)
-    OmegaConf.register_new_resolver("methods", _methods, replace=True)
+    OmegaConf.register_new_resolver("spaces", _spaces, replace=True)
     OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
     OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
     OmegaConf.register_new_resolver("stem_of", _stem, replace=True)
@@ -303,20 +304,18 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
     return ",".join(renderers_of(experiment))
 
 
-def _methods(kind: str, *without: str) -> str:
+def _spaces(*without: str) -> str:
     """The spaces of the methods with a search space, to be swept over.
 
     Args:
         without: names of methods that are left out.
 
     Raises:
-        ValueError: for such a name that has no search space, and for another kind than `space`.
+        ValueError: for such a name that has no search space.
     """
-    if kind != "space":
-        raise ValueError(f"${{methods:KIND}} has the kind space, not {kind!r}")
     spaces = listed(SPACE)
     if unknown := {*without} - {*spaces}:
-        raise ValueError(f"${{methods:{kind},...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
+        raise ValueError(f"${{spaces:...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
     return ",".join(f"space/{name}" for name in sorted(spaces) if name not in without)
 
 

@@ -2,20 +2,19 @@
 
     python -m bench.verify results/local/runs/NAME              a run, or several
     python -m bench.verify results/local                        all runs of a results folder
-    python -m bench.verify results/local --rerun 3              three of them are run again, drawn anew each time, too
 
 The exit status is 0 where all that left a field agree. A configuration is trusted, as `python -m bench` trusts one.
 """
 
 import argparse
-import random
 import re
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import inf, isnan
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from bench.evaluate.evaluate import evaluate
 from bench.evaluate.state import State
@@ -24,8 +23,6 @@ from bench.records.folder import Identity
 from bench.records.format import number, plural
 from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, link_out, read_record
-from bench.report.suite.attempts import portable
-from bench.run.library import AGREE, run_again
 from bench.setup.inputs import Judges, RunContext, cell_of
 from datasets.field_files import FIELD, load_field
 from renderers.checks import BadInput
@@ -34,7 +31,6 @@ SAME = 1e-4  # relative difference of a metric that the same field may have else
 NEAR = 1e-9  # difference, in the metric's own unit, that is none
 MACHINE = ("cpu", "device", "torch", "numpy", "python", "threads", "kernels")  # of a record's environment
 TIMES = re.compile(r"\.|seconds|overhead|saved|gemm")  # metrics of several fits, and those that a clock decides
-Again = tuple[dict[str, Any], Callable[[], dict[str, Any]]]  # metrics; the environment, asked for where they differ
 
 
 class LeftOut(Exception):
@@ -45,14 +41,10 @@ def main(arguments: Sequence[str]) -> int:
     """Prints a line per run; gives the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.verify", description=__doc__.splitlines()[0].split(": ")[1])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run's folder, or a results folder")
-    parser.add_argument("--rerun", type=int, default=0, metavar="N", help="run so many of them again, drawn at random")
     given = parser.parse_args(arguments)
     try:
-        if given.rerun < 0:
-            raise ValueError(f"--rerun must be 0 or more, not {given.rerun}")
         folders = [folder for path in given.runs for folder in _folders(path)]
-        agree = [_told(folder) for folder in folders]
-        agree += [_told(folder, rerun=True) for folder in random.sample(folders, min(given.rerun, len(folders)))]
+        agree = [_agrees(folder) for folder in folders]
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -74,47 +66,39 @@ def _folders(path: Path) -> list[Path]:
     return found
 
 
-def _told(folder: Path, *, rerun: bool = False) -> bool | None:
+def _agrees(folder: Path) -> bool | None:
     """Whether the metrics of a run, computed once more, are those of its record; prints a line about it.
 
     None where there is nothing to compare.
     """
-    how, compute, most = ("run again", _from_rerun, AGREE) if rerun else ("from its field", _from_field, SAME)
     try:
         if link := link_out(folder, folder.parent):
             raise BadInput(f"{link} is a link out of the folder")
         record = Record.of(read_record(folder))
-        found, environment = compute(folder, record)
+        metrics, device = _from_field(folder, record)
     except LeftOut as reason:
-        print(f"left out: {folder.name}, {how}: {reason}")
+        print(f"left out: {folder.name}, from its field: {reason}")
         return None
     except (ValueError, OSError) as error:
-        print(f"not compared: {folder.name}, {how}: {error}")
+        print(f"not compared: {folder.name}, from its field: {error}")
         return False
-    numbers, again = _numbers(_whole(vars(record)) if rerun else record.metrics), _numbers(found)
+    numbers, again = _numbers(record.metrics), _numbers(metrics)
     if not again:
-        print(f"left out: {folder.name}, {how}: no metric of its record can be computed from its field alone")
+        print(f"left out: {folder.name}, from its field: no metric of its record can be computed from its field alone")
         return None
-    names = [*again, *(name for name in numbers if name not in again and rerun)]
-    apart = {name: _apart(numbers[name], again[name]) if name in numbers and name in again else inf for name in names}
-    wrong = [name for name, gap in apart.items() if not gap <= most]  # nor is one that is not a number
+    apart = {name: _apart(numbers[name], again[name]) if name in numbers else inf for name in again}
+    wrong = [name for name, gap in apart.items() if not gap <= SAME]  # nor is one that is not a number
     if not wrong:
         widest, others = max(apart.values()), len(numbers.keys() - again.keys())
         rest = f"; {others} others are not of the field" if others else ""
-        print(f"agrees: {folder.name}, {how}: {plural(len(again), 'metric')}, at most {widest:.1g} apart{rest}")
+        metrics = plural(len(again), "metric")
+        print(f"agrees: {folder.name}, from its field: {metrics}, at most {widest:.1g} apart{rest}")
         return True
     pairs = {name: [number(of[name]) if name in of else "not there" for of in (numbers, again)] for name in wrong}
     told = [f"{name} is {before} in the record, now {now}" for name, (before, now) in pairs.items()]
-    why = "; ".join(_reasons(record, environment())) or "code and machine are the same: was the record edited?"
-    print(f"differs: {folder.name}, {how}: {'; '.join(told)}. {why}")
+    why = "; ".join(_reasons(record, describe(device))) or "code and machine are the same: was the record edited?"
+    print(f"differs: {folder.name}, from its field: {'; '.join(told)}. {why}")
     return False
-
-
-def _whole(record: dict[str, Any]) -> dict[str, Any]:
-    """All numbers of a record that a run gives again: its metrics, those at the start, and its counts."""
-    counts = {f"{name} evaluations": count for name, count in record["evaluations"].items()}
-    starts = {f"{name} at the start": value for name, value in record["metrics_start"].items()}
-    return {**record["metrics"], **starts, **counts}
 
 
 def _numbers(metrics: dict[str, Any]) -> dict[str, float]:
@@ -123,8 +107,8 @@ def _numbers(metrics: dict[str, Any]) -> dict[str, float]:
 
 
 @flushing_denormals()
-def _from_field(folder: Path, record: Record) -> Again:
-    """The metrics of the field that a run left, and the environment here.
+def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.device]:
+    """The metrics of the field that a run left, and the device that computed them.
 
     Raises:
         LeftOut: where it left none.
@@ -139,26 +123,7 @@ def _from_field(folder: Path, record: Record) -> Again:
     field = load_field(folder, cell.inputs.device)
     run = RunContext(cell.inputs, folder, record, lambda *_: None)
     judged = cell.task.judged(field, run) if isinstance(cell.task, Judges) else None
-    found = evaluate(State(field, cell.inputs)).metrics if judged is None else judged
-    return found, lambda: describe(cell.inputs.device)
-
-
-def _from_rerun(folder: Path, record: Record) -> Again:
-    """The metrics of the same run once more, and the environment here.
-
-    Raises:
-        BadInput: where it could not be run.
-    """
-    with tempfile.TemporaryDirectory() as results_dir:
-        folders, said = run_again(portable(record.overrides), Path(results_dir))
-        if not folders:
-            raise BadInput(said)
-        again = read_record(folders[0])
-    if again["config_hash"] != record.config_hash:
-        raise BadInput("its overrides give another configuration today: a default or a file has changed")
-    if again["status"] != record.status:
-        raise BadInput(f"it ended {record.status}, and now {again['status']}: {again.get('reason', '')}")
-    return _whole(again), lambda: again["environment"]
+    return evaluate(State(field, cell.inputs)).metrics if judged is None else judged, cell.inputs.device
 
 
 def _apart(first: float, second: float) -> float:

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from datasets.captures.frames import opened
-from datasets.captures.take import opened_mask, stored_depths
+from datasets.captures.depth import stored_depths
+from datasets.captures.image import opened
+from datasets.captures.mask import opened_mask
 from datasets.mesh import Mesh
 from datasets.meshes import load_mesh
 from datasets.range_scans import joined

@@ -24,7 +24,6 @@ FEWEST = 3  # photographs
 GOOD, DOUBTFUL, WRONG = 0.9, 0.8, 0.5  # overlap of hull and masks: cameras are right; hardly; photographs are refused
 LOOK = "python -m bench.photos shows it"
 ONE_PLACE = 1e-9  # most by which places of cameras may differ to be one, as a share of their coordinates
-CLEARLY = 0.1  # by which a way of pairing must fit better than another
 
 
 @dataclass(frozen=True)
@@ -198,31 +197,10 @@ def read_capture(folder: Path, reading: Reading) -> Capture:
     layout = find_layout(folder, reading.images, masks=reading.masks)
     if len(layout.frames) < FEWEST:
         raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
-    read = _by_masks if layout.rival else _capture
-    capture, doubts = _checked(read(layout, reading), layout.frames)
+    capture, doubts = _checked(_capture(layout, reading), layout.frames)
     if doubts and not reading.unchecked:
         raise BadInput(f"{folder}: {'; '.join(doubts)}; or set dataset.unchecked=true")
     return replace(capture, notes=(*capture.notes, *doubts))
-
-
-def _by_masks(layout: Layout, reading: Reading) -> Capture:
-    """The pairs of images and cameras whose masks fit, of two that the names allow."""
-    captures, cause = [], ""
-    for frames in (layout.frames, layout.rival):
-        try:
-            captures.append(_capture(replace(layout, frames=frames), reading))
-        except BadInput as error:  # such as an empty hull
-            cause = f" ({error})"
-    fits = [0.0 if one.fit is None else float(np.median(one.fit.overlaps)) for one in captures]
-    best = int(np.argmax(fits)) if fits else 0
-    if not fits or fits[best] < DOUBTFUL or any(fits[best] - fit < CLEARLY for i, fit in enumerate(fits) if i != best):
-        first, last = layout.frames[0].image.name, layout.frames[-1].image.name
-        raise BadInput(
-            f"images are missing, and the names {first} to {last} do not tell which, nor do masks{cause}: add "
-            "the missing images, or remove their cameras"
-        )
-    told = f"which images are missing was found by the masks, which fit by {fits[best]:.0%}"
-    return replace(captures[best], notes=(*captures[best].notes, told))
 
 
 def _capture(layout: Layout, reading: Reading) -> Capture:

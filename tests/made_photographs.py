@@ -18,6 +18,7 @@ from datasets.views import look_at
 from renderers.camera import Camera
 
 CENTRE, RADIUS = np.array([0.4, -1.1, 2.0]), 0.35  # of the ball, in the world of the files
+NUMBERED = "{:03d}.png"
 SIZE = 40, 48  # height and width
 FOCAL, MIDDLE = 60.0, (25.0, 19.0)  # pixels; the principal point is not in the middle
 HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # between the two places where a first pixel's centre may be
@@ -55,15 +56,15 @@ def image(camera: Camera, *, alpha: bool = False) -> tuple[Image.Image, Image.Im
     return picture, Image.fromarray(mask)
 
 
-def write_images(folder: Path, images: str, *, masks: bool = True, alpha: bool = False, names: str = "{:03d}.png"):
-    """Writes the images, and the masks into a folder of their own."""
+def write_images(folder: Path, images: str, *, masks: str = NUMBERED, alpha: bool = False, names: str = NUMBERED):
+    """Writes the images, and the masks, where these have names, into a folder of their own."""
     (folder / images).mkdir(parents=True, exist_ok=True)
     for i, camera in enumerate(cameras()):
         picture, mask = image(camera, alpha=alpha)
         picture.save(folder / images / names.format(i))
         if masks:
             (folder / "mask").mkdir(exist_ok=True)
-            mask.save(folder / "mask" / f"{i:03d}.png")
+            mask.save(folder / "mask" / masks.format(i))
 
 
 def idr(folder: Path) -> None:
@@ -94,7 +95,7 @@ def dvr(folder: Path) -> None:
 
 
 def nerf(folder: Path) -> None:
-    write_images(folder, "train", masks=False, alpha=True, names="r_{}.png")
+    write_images(folder, "train", masks="", alpha=True, names="r_{}.png")
     places = [(np.linalg.inv(motion) @ OPENGL).tolist() for _, motion in matrices()]
     frames = [{"file_path": f"./train/r_{i}", "transform_matrix": place} for i, place in enumerate(places)]
     stored = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": MIDDLE[0], "cy": MIDDLE[1], "w": SIZE[1], "h": SIZE[0]}
@@ -102,7 +103,7 @@ def nerf(folder: Path) -> None:
 
 
 def middlebury(folder: Path) -> None:
-    write_images(folder, ".", names="ball{:04d}.png")
+    write_images(folder, ".", names="ball{:04d}.png", masks="ball{:04d}.png")
     lines = ["10"]
     for i, (intrinsics, motion) in enumerate(matrices()):
         numbers = [*(intrinsics - HALF).flatten(), *motion[:3, :3].flatten(), *motion[:3, 3]]

@@ -206,7 +206,7 @@ def shipped_records() -> list[dict]:
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_the_shipped_priors_are_those_of_the_configuration(family, truncation, compose_config, tmp_path, monkeypatch):
     desk = cell_from(compose_config(f"dataset={family}", "scale=desk", f"prior.truncation={truncation}"))
-    dataset, settings = desk.inputs.dataset, desk.prior
+    dataset, settings = desk.inputs.dataset, desk.inputs.prior_choice.source
     (record,) = (record for record in shipped_records() if record["key"] == prior_key(dataset, settings))
     assert record["dataset"]["name"] == family
     assert record["settings"] == settings.identity
@@ -225,7 +225,7 @@ def test_the_shipped_priors_are_those_of_the_configuration(family, truncation, c
 
 def test_every_shipped_file_belongs_to_a_family_and_serves_both_scales(compose_config):
     desk, smoke = (cell_from(compose_config("dataset=sofa", f"scale={scale}")) for scale in ("desk", "smoke"))
-    assert desk.prior == smoke.prior
+    assert desk.inputs.prior_choice == smoke.inputs.prior_choice
     keys = {f"{record['dataset']['name']}-{record['key']}" for record in shipped_records()}
     names = {path.name for path in SHIPPED.iterdir()}
     assert names == {f"{key}.{suffix}" for key in keys for suffix in ("json", "safetensors")}

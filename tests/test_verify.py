@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import bench
-from bench import verify
 from bench.records.folder import Identity
 from bench.verify import main
 from datasets.field_files import FIELD
@@ -88,28 +87,6 @@ def test_an_edited_metric_is_found_and_the_cause_told(copied, capsys, spoil, wor
     spoil(copied)
     code, out = main([str(copied)]), capsys.readouterr().out
     assert code == (not out.startswith("agrees")) and all(word in out for word in words), out
-
-
-@pytest.mark.parametrize("changed, code, words", [
-    ({}, 0, "agrees: copy, run again"),
-    ({"metrics": {"fscore": 0.5}}, 1, "fscore is 0.500 in the record, now"),
-    ({"metrics_start": {"fscore": 0.5}}, 1, "fscore at the start is 0.500 in the record, now"),
-    ({"evaluations": {"value": 1}}, 1, "value evaluations is 1 in the record, now"),
-    ({"metrics": {"invented": 0.5}}, 1, "invented is 0.500 in the record, now not there"),
-    ({"config_hash": "other"}, 1, "its overrides give another configuration today"),
-    ({"status": "nan"}, 1, "it ended nan, and now"),
-])  # fmt: skip
-def test_a_run_that_is_made_again_is_compared_also_without_its_field(
-    runs, copied, monkeypatch, capsys, changed, code, words
-):
-    asked = []
-    monkeypatch.setattr(verify, "run_again", lambda keys, _: asked.append(keys) or ([runs["a code of the prior"]], ""))
-    edit(copied, **changed)
-    (copied / FIELD).unlink()
-    assert main([str(copied), "--rerun", "1"]) == code
-    out = capsys.readouterr().out
-    assert words in out and "; 1 left out" in out
-    assert "task=completion" in asked[0] and not any(key.startswith("results_dir") for key in asked[0])
 
 
 def test_of_a_run_whose_field_is_read_the_field_alone_decides_what_is_run_again(copied):

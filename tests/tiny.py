@@ -14,16 +14,20 @@ from bench.config import EvaluationSettings
 from bench.records.record import Record
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import Cell, RunContext, RunInputs, cell_of
+from bench.setup.priors import PriorChoice
 from bench.shape_prior import Prior
 from datasets.mesh import Mesh
+from datasets.network_files import Known
 from datasets.scene import Scene, Truth, View, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
+from renderers.fields.network import Facts
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
+FACTS = Facts(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, near=(1.0, 1.0, 1.0), nearly_all=1.0)  # of a distance
 TRIANGLE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
 PEAK = 1e10  # operations a second that the machine of a run is said to do
 
@@ -142,7 +146,7 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
         device=CPU,
         cache=folder / "cache",
         field=FieldChoice("prior", None),
-        trained=0,
+        prior_choice=PriorChoice(Known(prior.decoder, prior.codes, FACTS, ()), scene_code=0),
     )
     record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
     record.environment = {"gemm_peak_flops": PEAK}

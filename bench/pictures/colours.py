@@ -48,8 +48,8 @@ def note_colours(run: RunContext, state: State) -> None:
     }
     run.record.definitions |= DEFINITIONS
     shown: dict[str, Seen] = {"": lambda camera: render_image(state.field, camera, inputs)}
-    if inputs.trained is not None:
-        known = prior.decoder.at(prior.codes[inputs.trained].to(inputs.device))
+    if inputs.prior_choice.scene_code is not None:
+        known = prior.decoder.at(prior.codes[inputs.prior_choice.scene_code].to(inputs.device))
         shown["trained_"] = lambda camera: render_image(known, camera, inputs)
     shown["true_"] = lambda camera: _of_mesh(scene, camera)
     camera, evaluation = scene.view.camera, inputs.evaluation

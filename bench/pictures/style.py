@@ -100,7 +100,7 @@ def log_axis(axes: Axes, letter: str, values: Any) -> None:
         return
     getattr(axes, f"set_{letter}scale")("log", nonpositive="mask")
     ratio = max(positive) / min(positive)  # where it is small, ticks at decades alone would be too few
-    digits = {2, 3, 4, 5, 6, 7, 8} if ratio < 4 else {2, 5} if ratio < 100 else set()
+    digits = {2, 3, 4, 5, 6, 7, 8} if ratio < 5 else {2, 5} if ratio < 100 else set()
     axis = getattr(axes, f"{letter}axis")
     axis.set_major_formatter(FuncFormatter(lambda x, _: short(x)))
     axis.set_minor_formatter(FuncFormatter(lambda x, _: short(x) if int(f"{x:.0e}"[0]) in digits else ""))

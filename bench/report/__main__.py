@@ -4,21 +4,22 @@ import sys
 from pathlib import Path
 
 from bench.records.read import RESULTS, check_results, read_records
-from bench.report.data.frame import write_csv
 from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MOST_MESHES, page_lock, write_page
-from bench.report.write.paper import ship, write_paper, write_readme
+from bench.report.write.paper import ship, write_columns, write_paper, write_readme
 
-USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [ship=PATH]
+USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [columns.PAGE=HEADING,HEADING] [ship=PATH]
   results_dir   the folder with the runs; `{RESULTS}` unless given
   meshes        of how many runs, the newest first, the mesh turns on the page; {MOST_MESHES} unless given, or all
+  columns.PAGE  the columns of its LaTeX table, such as columns.table1=Strategy,Queries,Forward; all unless given
   ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
-KEYS = {"results_dir": "results_dir=PATH", "meshes": "meshes=all", "ship": "ship=PATH"}  # and what to type
+TYPED = ("results_dir=PATH", "meshes=all", "columns.PAGE=HEADING,HEADING", "ship=PATH")
+KEYS = {text.partition("=")[0]: text for text in TYPED}
 
 
 def main(arguments: list[str]) -> int:
-    """Writes `runs.csv`, all pages, the tables of sweeps and `index.html`; gives the exit status.
+    """Writes all pages, the tables of sweeps and `index.html`; gives the exit status.
 
     It is 2 where an argument is wrong, and 1 where a study could not be made.
     """
@@ -26,7 +27,10 @@ def main(arguments: list[str]) -> int:
         print(USAGE)
         return 0
     try:
-        return _report(parsed(arguments))
+        given = parsed(arguments)
+        status = _report(given)
+        write_columns(Path(given.get("ship") or given.get("results_dir", RESULTS)), given)
+        return status
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -50,11 +54,9 @@ def _report(given: dict[str, str]) -> int:
 def _written(results_dir: Path, meshes: int | None) -> int:
     """Writes all that is written of a results folder; gives the exit status."""
     records, unread = read_records(results_dir)
-    table = results_dir / "runs.csv"
-    write_csv(records, table)
     broken: list[str] = []
     papers = write_paper(records, results_dir, problems=broken)
-    for path in (table, *papers, *write_sweeps(records, results_dir, broken)):
+    for path in (*papers, *write_sweeps(records, results_dir, broken)):
         print(path)
     for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
         print(problem, file=sys.stderr)
@@ -71,10 +73,11 @@ def parsed(arguments: list[str]) -> dict[str, str]:
     given = {}
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key not in KEYS:
+        kind = "columns.PAGE" if key.startswith("columns.") else key
+        if kind not in KEYS:
             raise ValueError(f"argument must be one of {', '.join(KEYS.values())}, found {argument!r}")
         if not value:
-            raise ValueError(f"{key} has no value: type {KEYS[key]}")
+            raise ValueError(f"{key} has no value: type {KEYS[kind]}")
         given[key] = value
     return given
 

@@ -1,4 +1,4 @@
-"""One comparison of rows on the same shapes: medians per condition, mean errors, ratios, costs, fronts, two figures."""
+"""One comparison of rows on the same shapes: medians per condition, mean errors, ratios, costs, fronts, a figure."""
 
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -20,21 +20,22 @@ from bench.report.write.result import Result
 from bench.report.write.table import Column, ends, estimate, text
 
 EVERY = "all families"
-COSTS = {"evaluations": "field values of a run", "seconds": "seconds of the loop"}  # and how axes name them
+COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "seconds of the loop"}  # and how axes name them
 FAILURE = (
     "In a shape's mean a run that did not end ok has the largest finite error of any row on the same shape, seed and "
     "condition; a shape on which every row failed is left out. A row that lacks a shape of another is on no front."
 )
-CHAMFER = "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000."
-ERROR = f"{CHAMFER} A run that did not end ok, or was planned and not run, counts as infinite."
+ERROR = (
+    "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000. A run that did "
+    "not end ok, or was planned and not run, counts as infinite."
+)
 INTERVAL = "95 % intervals over shapes (of the sign test)"
 RATIO = (
     "A ratio is the median over shapes of that of their geometric means; after it stand the shapes on which the row is "
     "better, ties half."
 )
-LEGEND = 3  # its columns
 HOLM = "By the sign test over shapes with Holm's correction"
-METRIC, LABEL = "chamfer_l2", "Chamfer × 1000 (scene units²)"
+METRIC, LABEL = "chamfer_l2", "Chamfer × 1000\n(scene units²)"
 CONDITION = "task.points"  # over which tables have columns
 ORDER = ("dense", "50%", "10%", "100", "50", "20")  # of its values
 PRIORS = Selection("priors")
@@ -67,8 +68,8 @@ class Compared:
 
     Args:
         runs: at least one.
-        reference: gives the name or the preset of the row that the row of a preset is divided by. Of several rows of
-            that preset it is the first one of the plan of the sweep.
+        reference: gives the preset of the row that the row of a preset is divided by. Of several rows of that preset
+            it is the first one of the plan of the sweep.
         metric: the error.
         label: its name on axes.
     """
@@ -122,7 +123,7 @@ class Compared:
     def reference_of(self, row: Row) -> Row:
         """The row that a row is divided by; itself where there is no other."""
         wanted = self.reference(row.preset)
-        found = [r for r in self.rows if r.name == wanted] or [r for r in self.rows if r.preset == wanted]
+        found = [other for other in self.rows if other.preset == wanted]
         return min(found, key=self.planned.index) if len(found) > 1 else next(iter(found), row)
 
     @cached_property
@@ -248,43 +249,41 @@ class Compared:
         ]
 
     def result(self, title: str, question: str, **changed: Any) -> Result:
-        """The page of the comparison: a line per family and row, with the front of error over cost.
+        """The page of the comparison: a line per family and row, and a figure with a line per row.
 
         Args:
-            changed: what replaces parts of the result: `verdict`, `remarks`, `lines`, `figure`, ...; and `ratio`, the
-                heading of the ratios.
+            changed: further parts of the result: `verdict`, `remarks`, `columns`; and what replaces others: `lines`,
+                `figure`, ...
         """
-        ratio = changed.pop("ratio", "Ratio to the reference")
-        panels = self.front()
-        whole = [(line["row"], ratio_of(line["ratio"])) for line in self.comparable]
-        sure = differing(whole, ratio.removeprefix("Ratio "))
         parts: dict[str, Any] = {
-            "plotted": "Median error under each condition, that over shapes of their geometric means, and the median "
-            "cost of runs that ended ok.",
-            "verdict": f"{self.best('errors × 1000')} {sure}".strip(),
+            "plotted": "Median error under each condition, that over shapes of their geometric means, its ratio, and "
+            "the median cost of runs that ended ok.",
             "interval": INTERVAL,
             "estimates": [line["error"] for line in self.lines],
-            "remarks": (ERROR, f"{RATIO} {FAILURE}"),
-            "columns": self.columns(ratio),
             "lines": self.lines,
         } | changed
+        panels = self.panels(next(column.heading for column in parts["columns"] if column.key == "ratio"))
         if "figure" not in parts:
-            taller = 0.35 * max(-(-len(self.runs.rows()) // LEGEND) - 3, 0)  # inches, for a legend of over three lines
-            parts["figure"] = chart.draw(panels, 3.2 + taller, sharey=True, legend=LEGEND)
+            parts["figure"] = chart.draw(panels, 0.19 * len(self.rows) + 1.1, legend=0, sharey=True)
         return Result(self.runs, title, question=question, chart={"panels": panels}, **parts)
 
     @property
     def comparable(self) -> list[Line]:
         """The pooled lines that a verdict is on: of rows that lack no shape and have the settings that most runs have.
 
-        The settings are those of `Runs.mixed`, of which a note says that rows with other values do not compare.
+        The settings are those of `Runs.mixed`, of which a note says that rows with other values do not compare, and the
+        number of views.
         """
         usual = np.ones(len(self.runs.records), dtype=bool)
-        for key in self.runs.mixed():
+        for key in (*self.runs.mixed(), "task.images.views"):
             values = self.runs.setting(key)
             usual &= (values == values.mode()[0]).to_numpy()
         same = self.runs.where(pd.Series(usual)).rows()
         return [line for line in self.pooled if not line["lacking"] and Row(line["preset"], line["row"]) in same]
+
+    def differing(self, of: str) -> str:
+        """The verdict on the ratios of all rows to their references; see `differing`."""
+        return differing([(line["row"], ratio_of(line["ratio"])) for line in self.comparable], of)
 
     def best(self, least_of: str) -> str:
         """The row with the least mean error and the quickest one, as a verdict; empty where there is none."""
@@ -301,24 +300,25 @@ class Compared:
         quickest = ", which is the quickest row too)" if best is quick else f"); the quickest row has {other})"
         return f"The least median of {least_of} is *{least}{quickest}; n = {format.plural(n, 'shape')}."
 
-    def front(self) -> list[chart.Panel]:
-        """Panels of the mean error of each row over each cost, over all families.
-
-        Filled are the points of rows that no row beats at less cost.
-        """
+    def panels(self, ratio: str) -> list[chart.Panel]:
+        """Panels of errors, of ratios under that name, and of costs: a line per row, the least error first."""
+        lines = sorted(self.pooled, key=lambda line: (math.isnan(line["error"].value), line["error"].value))
+        costs = {label: cost for cost, label in COSTS.items() if cost != "seconds" or self.runs.timed}
+        measures = {
+            self.label: [line["error"] for line in lines],
+            ratio: [ratio_of(line["ratio"]) for line in lines],
+            **{label: [line[cost] for line in lines] for label, cost in costs.items()},
+        }
         panels = []
-        for cost, label in COSTS.items():
-            if cost == "seconds" and not self.runs.timed:
-                continue
+        for label, values in measures.items():
             points = [
-                chart.series(
-                    *(line["row"], line["preset"], [line[cost]], [line["error"]]),
-                    **{"size": 9, "hollow": not line[f"front_{cost}"]},
-                )
-                for line in self.pooled
-                if line[cost] is not None
+                chart.series(line["row"], line["preset"], [value], [place])
+                for place, (line, value) in enumerate(zip(lines, values, strict=True))
+                if value is not None
             ]
-            panels.append(chart.panel_data("", label, self.label, points))
+            panels.append(chart.panel_data("", label, "", points, rows=[line["row"] for line in lines]))
+        panels[1]["series"].insert(0, chart.level("equal", [1, 1], 0) | {"y": [-0.6, len(lines) - 0.4], "quiet": True})
+        panels[1]["x"]["log"] = True
         return panels
 
 

@@ -13,7 +13,7 @@ from bench.report.write import chart
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, estimate, metrics, text
 
 BELOW = "median Chamfer distance from truth to prediction (squared scene units, times 1000)"
-LABEL = "truth to prediction × 1000\n(scene units²)"
+LABEL = "Chamfer × 1000, truth to\nprediction (scene units²)"
 INTERVALS = "95 % bootstrap intervals over {shapes and seeds}"
 MEDIAN = estimate("error", "Median")
 NAMED = (text("family", "Family"), text("method", "Method"), text("condition", "Condition"))
@@ -64,7 +64,7 @@ def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list
     return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["at"]))
 
 
-def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], *, success: float | None = None) -> Figure:
+def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], success: float) -> Figure:
     """Draws a row of panels per family: the error over the value of each condition, a line per method.
 
     `success` is the largest error of a run that counts as one, drawn as a line. What is infinite is drawn at the edge.
@@ -73,7 +73,7 @@ def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], *, su
     for (name, own), (place, one) in product(of_family.items(), enumerate(conditions)):
         of_row = grouped([x for x in own if x["place"] == place], lambda line: (line["method"], line["preset"]))
         drawn = [chart.curve(*row, [x["at"] for x in of], [x["error"] for x in of]) for row, of in of_row.items()]
-        if success is not None and drawn:
+        if drawn:
             drawn.append(chart.level("success: below", [x["at"] for x in own if x["place"] == place], success))
         panels.append(chart.panel_data(name, one.label, LABEL, drawn))
     return chart.draw(panels, 2.1 * len(of_family) + 0.5, len(of_family), legend=3, sharey="row")

@@ -23,7 +23,7 @@ from bench.report.data.records import Record, Row, family, grouped, index, row_o
 from bench.report.data.runs import Runs
 
 LARGEST, LARGEST_COMPARED = 0.9, 1.5  # inches of a picture's side at most, and of one beside a colour bar
-NAMES, BAR = 1.3, 0.7  # inches of the names of rows at most, and of a colour bar
+NAMES, BAR, MARGIN = 1.35, 0.7, 0.05  # inches of the names of rows at most, of a colour bar, and to the edges
 LETTERS = 18  # of a line of a row's name
 LETTERS_PER_INCH = 19  # of names of columns
 FRAME = "#d9d9d9"
@@ -259,7 +259,7 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
     height = sum(heads) + sum(lines) + (0.1 if largest is None else 0.4)
     figure = Figure(figsize=(names + columns * across * inches + bar, height), layout="constrained")
     axes = figure.subplots(max(len(blocks), 1), 1, squeeze=False, height_ratios=lines or [1])[:, 0].tolist()
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03, wspace=0.01, hspace=0.01)
+    figure.get_layout_engine().set(w_pad=MARGIN, h_pad=MARGIN, wspace=0.01, hspace=0.01)
     for axis, block in zip(axes, blocks, strict=False):
         fill(axis, block, inches, across)
     if largest is not None:
@@ -309,7 +309,7 @@ def _explain(figure: Figure, axes: Sequence[Axes], largest: float) -> None:
     label = "angle between\nnormals (degrees)"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.9 / len(axes), aspect=25, extend="max", pad=0.01)
     missed = Patch(color=style.MISSED, label="missed: only the reference hits")
-    spurious = Patch(color=style.SPURIOUS, label="spurious: only the row hits")
+    spurious = Patch(color=style.SPURIOUS, label="spurious: only the renderer hits")
     figure.legend(handles=[missed, spurious], loc="outside lower center", ncols=2)
 
 

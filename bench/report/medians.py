@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.records import format, metrics
-from bench.report.data.records import Record, family, index
+from bench.report.data.records import Record, Row, family, index
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import median
 from bench.report.write import chart
@@ -57,8 +57,9 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def cost(runs: Runs) -> dict[str, pd.Series]:
-    """The seconds of each run under the label of an axis; its field values where times are doubtful."""
-    return {"seconds in the loop": runs.frame.loop} if runs.timed else {"field values of the run": runs.frame["values"]}
+    """The seconds of each run under the label of an axis; its field evaluations, if any, where times are doubtful."""
+    evaluations = runs.frame["values"].where(runs.frame["values"] > 0)
+    return {"seconds in the loop": runs.frame.loop} if runs.timed else {"field evaluations of the run": evaluations}
 
 
 def whole(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
@@ -67,14 +68,17 @@ def whole(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | No
     return {line["method"]: line[name] for line in lines if line["runs"] == most}
 
 
-def draw_runs(runs: Runs, panels: Mapping[str, pd.Series], *, log: bool = True) -> Figure:
+def draw_runs(
+    runs: Runs, panels: Mapping[str, pd.Series], rows: Sequence[Row] | None = None, *, log: bool = True
+) -> Figure:
     """Draws a panel per measure, with a line per row: a point per run, and a bar at the median of several.
 
     Args:
         panels: of each measure its values by the label of its axis; nan is not drawn, infinite is at the edge.
+        rows: from above, all of them; by default in the order of the runs.
         log: whether an axis whose values differ by a factor is logarithmic.
     """
-    rows, made = list(runs.rows()), []
+    rows, made = list(rows or runs.rows()), []
     for label, values in panels.items():
         drawn = []
         for place, row in enumerate(rows):

@@ -7,7 +7,7 @@
 # ruff: noqa: F401 - what is imported here is passed on
 from bench.pictures import style
 from bench.records import format
-from bench.report import compare, conditions, gallery, medians, single_view
+from bench.report import compare, conditions, gallery, medians
 from bench.report.data import curves, records, statistics
 from bench.report.data.runs import Runs, Selection, together
 from bench.report.write import chart, table

@@ -203,11 +203,11 @@ def table_of(sweep: Sweep) -> Result:
 
 def _panel(found: list[dict[str, Any]], key: str, title: str, shown: Metric) -> Panel:
     """A row of the table per line of the panel, with its median and interval along x."""
-    drawn = []
-    for place, line in enumerate(found):
-        if line[key] is not None:
-            one = series(line["row"], line["preset"], [place], [line[key].times(shown.factor)])
-            drawn.append(one | {"x": one["y"], "y": one["x"]})
+    drawn = [
+        series(line["row"], line["preset"], [line[key].times(shown.factor)], [place])
+        for place, line in enumerate(found)
+        if line[key] is not None
+    ]
     return panel_data(title, shown.label, "", drawn, rows=[line["row"] for line in found])
 
 

@@ -16,8 +16,7 @@ from bench.report.data.records import SCALE, Record, RunKey, error, grouped, run
 from bench.report.data.runs import Runs, Selection
 
 TUNING = Selection("tuning", ("split",))
-ONE_LOSS = replace(TUNING, experiment="tuning_one_loss")  # validation shapes alone, as the next
-PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")
+PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")  # validation shapes alone
 CHAMFER = "chamfer_l2"
 ERRORS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # that draws are chosen by, where it is not the usual one
 SPACE, TUNED = "space/", "tuned/"  # before the names of methods whose settings are drawn; of those written for them
@@ -90,26 +89,6 @@ def tunings(runs: Runs) -> list[Tuning]:
     worst = cells.error.where(np.isfinite(cells.error)).groupby([cells.split, cells.run]).transform("max").fillna(1.0)
     cells = cells.assign(error=np.log(np.minimum(cells.error, worst)))
     return [_tuning(cells[cells.method == method], records) for method, records in by_method.items()]
-
-
-def pooled(methods: list[Tuning]) -> Tuning:
-    """The draws of methods that drew the same settings as those of one, with the runs of all of them.
-
-    Raises:
-        ValueError: where methods have drawn settings that the others do not share.
-    """
-    if any(method.settings != methods[0].settings for method in methods):
-        raise ValueError(
-            "the methods differ in their drawn settings, and one setting is asked for all of them: sweep over methods "
-            "without a search space of their own"
-        )
-    return replace(
-        methods[0],
-        method=", ".join(method.method for method in methods),
-        label=", ".join(method.label for method in methods),
-        validation=np.concatenate([method.validation for method in methods], axis=1),
-        failures=np.sum([method.failures for method in methods], axis=0),
-    )
 
 
 def left_out(runs: Runs, methods: list[Tuning]) -> list[str]:

@@ -14,26 +14,12 @@ GROUPS = ("method", "experiment")  # none is chosen by default, so that the comm
 PLAIN = re.compile(r"[\w./:@%+-]+")  # a text that Hydra takes as it is
 
 
-AGREE = 0.05  # relative difference of errors and costs of a run and its repetition: rounding on another processor
-
-
 class Outcome(NamedTuple):
     """What a command left: its exit status, standard output and standard error."""
 
     code: int
     out: str
     err: str
-
-
-def run_again(overrides: Sequence[str], results_dir: Path) -> tuple[list[Path], str]:
-    """Makes a run from the keys of another in a results folder; gives the folders in it, and why where there is none.
-
-    Args:
-        overrides: of the other run, without its place.
-    """
-    done = _command([*overrides, _override("results_dir", results_dir)])
-    folders = [path.parent for path in (results_dir / "runs").glob("*/record.json")]
-    return folders, "" if folders else " ".join(done.err.split())[-300:]
 
 
 def run_once(overrides: Sequence[str], choices: Mapping[str, Any]) -> Record:

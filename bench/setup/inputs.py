@@ -3,24 +3,24 @@
 `cell_of` is the one place where a configuration becomes objects: for the check of a sweep, and for each run.
 """
 
-import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from bench.config import OF, EvaluationSettings, build_once, load
-from bench.machine.environment import pick_device, using_threads
+from bench.config import OF, EvaluationSettings, build_once
+from bench.machine.environment import pick_device
 from bench.progress import Report
 from bench.records.record import Record
 from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
-from bench.shape_prior import Prior, PriorSettings, prior_for
+from bench.setup.priors import PriorChoice, learnt_dataset, naming_prior_keys
+from bench.shape_prior import Prior, PriorSettings
 from datasets.network_files import Networked
 from datasets.own_photographs import Photographed
 from datasets.scene import SPLIT_STRIDE, Dataset, OneView, Scene, Split, Surface, make_scene, sample_surface, scene_name
@@ -49,11 +49,9 @@ class RunInputs:
     device: torch.device
     cache: Path  # folder of priors and references
     field: FieldChoice  # what an unknown shape is made of
+    prior_choice: PriorChoice
     dataset: Dataset | None = None  # of the scene
-    coloured: bool = False  # whether the prior has colours
-    notes: tuple[str, ...] = ()  # on settings with the value `auto`
-    has_prior: bool = True
-    trained: int | None = None  # number of the scene's shape among the prior's codes; None where it is not of these
+    notes: tuple[str, ...] = ()  # on settings with the value `auto`, and on the network of a scene or prior
 
     @property
     def photographed(self) -> Photographed | None:
@@ -84,7 +82,7 @@ class RunInputs:
 
     def check_prior(self) -> None:
         """Raises BadInput for an object of one's own, which has no prior, where none is named."""
-        if not self.has_prior:
+        if not self.prior_choice.exists:
             without = "field=auto completes a depth image without one"
             if self.photographed is not None:
                 without = "photographs take one with task=multiview, and none with task=reconstruction"
@@ -94,17 +92,17 @@ class RunInputs:
             )
 
     def check_fitted(self) -> int:
-        """The place of the scene's shape among the codes of the prior.
+        """The number of the scene's shape among the codes of the prior.
 
         Raises:
             BadInput: where the prior was not trained on that shape.
         """
-        if self.trained is None:
+        if self.prior_choice.scene_code is None:
             raise BadInput(
                 "the task renders a network at the shape that it was fitted to: add +experiment=fitted, or set "
                 "dataset=network dataset.path=FILE for a network of yours"
             )
-        return self.trained
+        return self.prior_choice.scene_code
 
     def fitted(self) -> Prior:
         """The prior with the code of the scene's shape alone; raises as `check_fitted` does."""
@@ -177,17 +175,11 @@ class Cell:
     """A task and what it works with, built and checked; nothing slow was done.
 
     Args:
-        prior: how the prior is trained, where it has to be; or the network whose codes it is.
-        learnt: the dataset whose prior is trained.
-        width: of the prior's network, in neurons per layer.
         threads: of the CPU; None: see `start`.
     """
 
     task: Task
     inputs: RunInputs
-    prior: PriorSettings | Networked
-    learnt: Dataset
-    width: int
     threads: int | None
 
     def start(self) -> None:
@@ -197,16 +189,8 @@ class Cell:
         narrow network so briefly that threads mostly wait for each other: at 64 x 64 pixels and 4 layers of 128, the
         loop of a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
         """
-        torch.set_num_threads(self.threads or (1 if self.width < WIDE else ALL_THREADS))
+        torch.set_num_threads(self.threads or (1 if self.inputs.prior_choice.width < WIDE else ALL_THREADS))
         torch.manual_seed(self.inputs.seed)
-
-
-def _family(name: str) -> Dataset:
-    """The dataset that `prior.of` names."""
-    try:
-        return load("dataset", name)
-    except ValueError:
-        raise BadInput(f"prior.of={name} has no prior: name sofa, plane, table, car or a primitive") from None
 
 
 def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None) -> Cell:
@@ -220,81 +204,76 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
     Raises:
         ValueError, OSError: for anything invalid in it.
     """
-    packages, built = list(config["packages"]), {} if built is None else built
-
-    def parts(*names: str, **nodes: Any) -> list[Any]:
-        return build_once({name: config[name] for name in names} | nodes, packages, built)
-
-    def renderer(requested: Node) -> Noted:
-        """A renderer from its node, with a number for each `auto`, and notes on these."""
-        node, notes = resolved(requested, view, auto)
-        (made,) = parts(renderer=node)
-        if not isinstance(made, Renderer):
-            name = type(made).__name__
-            raise ValueError(
-                f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
-            )
-        return made, notes
-
-    view, auto = parts("view", "auto")
-    made, notes = renderer(config["renderer"])
-    task, dataset, evaluation, models = parts("task", "dataset", "evaluation", "models")
-    split, index, threads = *_place(config["split"], config["index"]), config["threads"]
-    device, cache = pick_device(config["device"]), Path(config["priors_dir"])
-
-    shown = dataset.network(index) if isinstance(dataset, Networked) else None
-    family = config["prior"].get(OF)
-    with _naming_prior(config["prior"]):
-        (prior,) = parts("prior")
-        learnt = dataset if family is None else _family(family)
-        known = shown if isinstance(prior, PriorSettings) else prior.network(0)
-
-    own = prior.shapes if isinstance(prior, PriorSettings) and family is None else 0
-    coloured = isinstance(prior, PriorSettings) and known is None and prior.colour is not None
-
-    def make_prior() -> Prior:
-        if known is not None:
-            return Prior(known.decoder, known.codes)
-        with using_threads(threads or ALL_THREADS):  # training pays with more of them
-            return prior_for(learnt, prior, cache, device, progress)
-
+    builder = _Builder(config, {} if built is None else built)
+    renderer, notes = builder.renderer(config["renderer"])
+    task, dataset, view, evaluation, models = builder.parts("task", "dataset", "view", "evaluation", "models")
+    split, index = _shape_number(config["split"], config["index"])
+    prior = builder.prior(dataset, split, index)
+    device, cache, threads = pick_device(config["device"]), Path(config["priors_dir"]), config["threads"]
     inputs = RunInputs(
-        renderer=made,
+        renderer=renderer,
         views=view,
         scene_name=dataset.name if isinstance(dataset, Photographed | OneView) else scene_name(dataset, split, index),
-        make_scene=lambda: replace(
-            make_scene(dataset, view, split=split, index=index),
-            texture=prior.texture(dataset, split, index) if coloured and not isinstance(dataset, OneView) else None,
-        ),
-        make_prior=make_prior,
-        make_pixel_precise=lambda: renderer(at_pixel_precision(config["renderer"])),
+        make_scene=partial(_scene, dataset, view, split, index, prior),
+        make_prior=partial(prior.load, cache, device, threads or ALL_THREADS, progress),  # training pays with more
+        make_pixel_precise=partial(builder.renderer, at_pixel_precision(config["renderer"])),
         evaluation=evaluation,
         seed=config["seed"],
         device=device,
         cache=cache,
         field=FieldChoice(config["field"], models),
+        prior_choice=prior,
         dataset=dataset,
-        notes=(*notes, *(known.notes if known else ())),
-        coloured=coloured,
-        has_prior=family is not None or known is not None or not isinstance(dataset, Photographed | OneView),
-        trained=index if known is shown and (shown or (split == Split.TRAIN and index < own)) else None,
+        notes=(*notes, *prior.notes),
     )
     _check(task, inputs, index)
-    return Cell(task, inputs, prior, learnt, known.decoder.width if known else prior.network.width, threads)
+    return Cell(task, inputs, threads)
 
 
-@contextmanager
-def _naming_prior(node: Node) -> Iterator[None]:
-    """Within it, an error of a dataset's class that has the place of a prior names the keys of that prior."""
-    try:
-        yield
-    except ValueError as error:
-        error.args = (re.sub(rf"(?<![\w/])dataset\.(?=(?:{'|'.join(node)})\b)", "prior.", str(error)),)
-        raise
+@dataclass(frozen=True)
+class _Builder:
+    """Builds the parts of a configuration; equal nodes are built once, see `bench.config.build_once`."""
+
+    config: Node
+    built: dict[str, Any]
+
+    def parts(self, *names: str, **nodes: Any) -> list[Any]:
+        """The objects of these nodes of the configuration, and of further nodes."""
+        nodes = {name: self.config[name] for name in names} | nodes
+        return build_once(nodes, list(self.config["packages"]), self.built)
+
+    def renderer(self, requested: Node) -> Noted:
+        """A renderer from its node, with a number for each `auto`, and notes on these."""
+        node, notes = resolved(requested, *self.parts("view", "auto"))
+        (renderer,) = self.parts(renderer=node)
+        if not isinstance(renderer, Renderer):
+            name = type(renderer).__name__
+            raise ValueError(
+                f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
+            )
+        return renderer, notes
+
+    def prior(self, dataset: Dataset, split: Split, index: int) -> PriorChoice:
+        """The prior for shape number `index` of a dataset."""
+        node, shown = self.config["prior"], dataset.network(index) if isinstance(dataset, Networked) else None
+        with naming_prior_keys(node):
+            (settings,) = self.parts("prior")
+            learnt = learnt_dataset(node.get(OF))
+            network = shown if isinstance(settings, PriorSettings) else settings.network(0)
+        if network is not None:
+            return PriorChoice(network, scene_code=index if network is shown else None)
+        fitted = learnt is None and split is Split.TRAIN and index < settings.shapes
+        exists = learnt is not None or not isinstance(dataset, Photographed | OneView)
+        return PriorChoice(settings, learnt or dataset, index if fitted else None, exists)
 
 
-def _place(split: str, index: int) -> tuple[Split, int]:
-    """The place of a shape in a dataset; raises ValueError where no dataset has it."""
+def _scene(dataset: Dataset, view: ViewSampler, split: Split, index: int, prior: PriorChoice) -> Scene:
+    """The scene of a run, in colours where its prior has some."""
+    return replace(make_scene(dataset, view, split=split, index=index), texture=prior.texture(dataset, split, index))
+
+
+def _shape_number(split: str, index: int) -> tuple[Split, int]:
+    """The split and number of a shape; raises ValueError where no dataset has it."""
     if split not in list(Split):
         raise ValueError(f"split must be one of {', '.join(Split)}, not {split!r}")
     if index >= SPLIT_STRIDE:

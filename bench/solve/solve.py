@@ -178,7 +178,7 @@ def solve_task(task: InverseTask, run: RunContext) -> State:
 
 def defined(inputs: RunInputs) -> dict[str, str]:
     """The definitions of what a solved code is judged by."""
-    return DEFINITIONS | COLOUR if inputs.coloured else DEFINITIONS
+    return DEFINITIONS | COLOUR if inputs.prior_choice.coloured else DEFINITIONS
 
 
 def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | None:

@@ -1,10 +1,30 @@
 """Table 1 and Figs. 4 and 5 of DVR: shape from one image, by what the training may know."""
 
-from bench.report.data.records import SHAPENET, Record, Row, error, grouped, row_of
-from bench.report.study import Result, Runs, Selection, format, gallery, medians, single_view, table
+from collections.abc import Iterable
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from bench.report.data.records import (
+    SHAPENET,
+    Record,
+    Row,
+    RunKey,
+    by_shape,
+    error,
+    grouped,
+    median_of_known,
+    row_of,
+    run_key,
+    setting,
+)
+from bench.report.data.statistics import Interval, ratio, typical
+from bench.report.study import Result, Runs, Selection, compare, format, gallery, medians, table
 
 PLACE = 41
 READS = (Selection("dvr_table1", setup=("machine",), conditions=("task.training.seed",)),)
+BASELINES = {"single_view_mean": "Over the mean shape", "single_view_nearest": "Over the nearest image"}  # presets
+MEDIANS = ("iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr")
 # DVR (Niemeyer et al. 2020), Table 1: Chamfer-L1, in tenths of the largest edge of a shape's bounding box.
 PUBLISHED = {
     "car": {"DVR, RGB": 0.196, "DVR, depth": 0.179, "ONet (3D)": 0.181},
@@ -20,26 +40,30 @@ NOTES = (
     "At desk a step has 4 images of 128 rays, at a rate of 1e-3; gradients are shortened to 1. A seed is a training.",
     "Without a training: the code of the prior that DIST finds by the mask, knowing the camera; the mean shape; the "
     "training shape with the nearest image; the one with the least Chamfer-L1, which no retrieval can beat.",
-    f"{single_view.OVER} “Trained in” is once for the family, “Inference” the network with its mesh, or the search "
-    "without one.",
+    "“Over ...”: the median over shapes of the ratio of Chamfer-L1 to that row's; below 1 is better. “Trained in” is "
+    "once for the family, “Inference” the network with its mesh, or the search without one.",
     "“Published” is DVR, Table 1: ShapeNet, in tenths of the largest edge of a shape's bounding box, which cannot be "
     "compared directly with the measured rows.",
 )
 COLUMNS = (
-    *single_view.columns("Training"),
+    *(table.text("family", "Family"), table.text("method", "Training"), table.Column("iou", "IoU")),
+    table.Column("chamfer_l1", "Chamfer-L1", show=table.thousandfold),
+    table.shown("95 % interval", lambda line: line["interval"].ends(1000) if "interval" in line else ""),
+    *(table.shown(heading, lambda line, name=name: str(line.get(name) or "")) for name, heading in BASELINES.items()),
     table.Column("normal_consistency", "Normals"),
     *(table.Column("mask_iou", "Mask IoU"), table.Column("psnr", "PSNR")),
     table.Column("training", "Trained in", show=format.seconds),
     table.Column("seconds", "Inference", show=format.seconds),
     *(table.text("failed", "Failed"), table.text("published", "Published")),
 )
+RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*MEDIANS, "chamfer_l2", "mask_iou_least"), *table.LOOP)
 IMAGES = {"given": "given", "photograph": "another\nimage"}  # arrays of images.npz
 PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics("chamfer_l1", "iou"))
 
 
 def make(runs: Runs) -> Result:
     """A line per family and row, and the published ones."""
-    of_family = {name: single_view.lines_of(runs, name, single_view.BASELINES) for name in runs.families()}
+    of_family = {name: _lines_of(runs, name) for name in runs.families()}
     lines = []
     for name, own in of_family.items():
         published = PUBLISHED.get(name.removeprefix(SHAPENET), {}).items()
@@ -52,14 +76,41 @@ def make(runs: Runs) -> Result:
         "Chamfer-L1 in scene units, times 1000.",
         question="How much must a training know, so that one image gives a shape?",
         verdict=" ".join(filter(None, (_verdict(name, own) for name, own in of_family.items()))),
-        interval=single_view.INTERVALS,
+        interval=compare.INTERVAL,
         estimates=[line["interval"] for line in lines if "interval" in line],
         remarks=NOTES,
         columns=COLUMNS,
         lines=lines,
-        run_columns=single_view.RUNS,
-        figure=single_view.draw(runs),
+        run_columns=RUNS,
+        figure=draw(runs),
     )
+
+
+def _lines_of(runs: Runs, family: str) -> list[dict[str, Any]]:
+    """A line per row of one family, with its ratio to the row of each of `BASELINES` under that preset."""
+    own = runs.where(runs.frame.family == family).made
+    errors = {row: _errors_of(records) for row, records in own.rows().items()}
+    others = {row: values for row, values in errors.items() if row.preset in BASELINES}
+    return [
+        line
+        | {"family": family, "interval": typical(by_shape(errors[row]))}
+        | {"training": median_of_known(setting(record, "seconds", "training") for record in records)}
+        | {other.preset: _over(errors[row], values) for other, values in others.items() if other != row}
+        for line, (row, records) in zip(medians.medians(own, MEDIANS), own.rows().items(), strict=True)
+    ]
+
+
+def _errors_of(records: Iterable[Record]) -> dict[RunKey, float]:
+    """The Chamfer-L1 of each run; infinite for a failed one."""
+    return {run_key(record): error(record, "chamfer_l1") for record in records}
+
+
+def _over(errors: dict[RunKey, float], others: dict[RunKey, float]) -> Interval | None:
+    """The ratio of the errors to others over the runs that both have; None without any."""
+    both = sorted(set(errors) & set(others), key=str)
+    if not both:
+        return None
+    return ratio(*(by_shape({key: values[key] for key in both}) for values in (errors, others)))
 
 
 def _verdict(family: str, lines: list[dict]) -> str:
@@ -69,6 +120,16 @@ def _verdict(family: str, lines: list[dict]) -> str:
     errors = {line["method"]: line["chamfer_l1"] for line in lines if shapes.get(line["method"]) == most}
     what = f"Median Chamfer-L1 × 1000 of {family}"
     return format.ends(what, errors, format.plural(most, "shape"), show=table.thousandfold)
+
+
+def draw(runs: Runs) -> Figure:
+    """A panel per family: the IoU of each shape, a line per row, and the median."""
+    iou = medians.scored(runs, "iou")
+    panels = {f"IoU, {name}": iou.where(runs.frame.family == name) for name in runs.families()}
+    figure = medians.draw_runs(runs, panels, log=False)
+    for axis in figure.axes:
+        axis.set_xlim(-0.02, 1.02)
+    return figure
 
 
 def figures(runs: Runs) -> Result:

@@ -1,6 +1,11 @@
 """Fig. 10 of DIST: shape from many views under other focal lengths and other noise in the initial code."""
 
-from bench.report.study import Result, Runs, Selection, conditions, format, records
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from bench.report.study import Result, Runs, Selection, chart, conditions, format, records, statistics
 
 PLACE = 50
 CONDITIONS = (
@@ -23,7 +28,8 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Shape from many views under other focal lengths and starts.",
-        f"{conditions.BELOW[0].upper()}{conditions.BELOW[1:]}.",
+        f"{conditions.BELOW[0].upper()}{conditions.BELOW[1:]}; in the figure, the median ratio to the error at 1 of "
+        "the same shape.",
         question="Does another focal length or start change the shape that is found?",
         verdict=_verdict(runs.made),
         interval=conditions.INTERVALS,
@@ -32,8 +38,34 @@ def make(runs: Runs) -> Result:
         columns=(*conditions.NAMED, *conditions.MEDIAN),
         lines=lines,
         run_columns=conditions.run_columns(CONDITIONS),
-        figure=conditions.draw(lines, CONDITIONS),
+        figure=draw(lines),
     )
+
+
+def draw(lines: Sequence[dict[str, Any]]) -> Figure:
+    """Draws a panel per condition: a line per method, with the ratio of its error to that at 1."""
+    panels = []
+    for one in CONDITIONS:
+        own = records.grouped([x for x in lines if x["key"] == one.key], lambda line: (line["method"], line["preset"]))
+        changes = {row: _changes(of_row) for row, of_row in own.items()}
+        drawn = [chart.curve(*row, change, change.values()) for row, change in changes.items() if change]
+        panels.append(chart.panel_data("", one.label, "error / error at 1", drawn))
+    return chart.draw(panels, 2.9, legend=3)
+
+
+def _changes(lines: Sequence[dict[str, Any]]) -> dict[float, statistics.Interval]:
+    """By the value of a condition, the ratio of a method's errors to those of the same runs where the value is 1."""
+    errors = {
+        at: {records.run_key(run): records.error(run, records.ONE_WAY) for line in own for run in line["runs"]}
+        for at, own in sorted(records.grouped(lines, lambda line: line["at"]).items())
+    }
+    usual = errors.get(1.0, {})
+    both = {at: [run for run in own if run in usual] for at, own in errors.items()}
+    return {
+        at: statistics.ratio(*(records.by_shape({run: of[run] for run in runs}) for of in (errors[at], usual)))
+        for at, runs in both.items()
+        if runs
+    }
 
 
 def _verdict(runs: Runs) -> str:

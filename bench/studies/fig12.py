@@ -54,7 +54,7 @@ def make(runs: Runs) -> Result:
         columns=(*conditions.NAMED, table.shown("Success", lambda line: _successes(line["runs"])), *conditions.MEDIAN),
         lines=lines + others,
         run_columns=RUNS,
-        figure=conditions.draw(lines, CONDITIONS, success=SUCCESS) if lines else None,
+        figure=conditions.draw(lines, CONDITIONS, SUCCESS) if lines else None,
     )
 
 

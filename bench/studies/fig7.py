@@ -1,4 +1,4 @@
-"""Fig. 7 of DIST: erosion and dilation of the rendered shape by the convergence threshold epsilon."""
+"""Fig. 7 of DIST: missed and spurious pixels by the convergence threshold epsilon."""
 
 import math
 from dataclasses import replace
@@ -9,8 +9,7 @@ from bench.report.study import Result, Runs, Selection, gallery, records, table
 PLACE = 230
 READS = (Selection("fig7", alike=("dataset", "view", "prior", "task")),)
 NOTES = (
-    "Erosion is the number of missed pixels over that of the reference's hits; dilation is the number of spurious "
-    "pixels over the same.",
+    "Missed and spurious pixels, the paper's erosion and dilation, are shares of the number of the reference's hits.",
     "The depth error is over pixels that both hit; epsilon is in scene units.",
 )
 MOST_COLUMNS = 7
@@ -25,7 +24,7 @@ def make(runs: Runs) -> Result:
     lines = [(record, _counts(record, drawn)) for record, drawn in zip(chosen.records, found.counts, strict=True)]
     return Result(
         chosen,
-        "Erosion and dilation of the image by the convergence threshold.",
+        "Missed and spurious pixels by the convergence threshold.",
         "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
         "blue) above the angle to the reference's.",
         question="Which threshold of convergence shows the true outline?",
@@ -72,8 +71,8 @@ COLUMNS = (  # of a record and its counts
     *table.through(lambda line: line[1], *map(table.Column, gallery.COUNTED)),
     *table.through(
         lambda line: line[1],
-        table.Column("lost_share", "Erosion", show=table.small_percent),
-        table.Column("false_share", "Dilation", show=table.small_percent),
+        table.Column("lost_share", "Missed", show=table.small_percent),
+        table.Column("false_share", "Spurious", show=table.small_percent),
     ),
     *table.through(lambda line: line[0], table.metric("depth_error_median", "Median depth error")),
 )

@@ -142,7 +142,7 @@ def make_curves(runs: Runs) -> Result:
             told = [
                 f"{s.successes:.0f} of {s.trials:.0f} succeed at {format.number(s.severity)}" for s in own.itertuples()
             ]
-            lines.append(chart.series(row, preset, own["severity"], 100 * own["share"], dash="-", size=5, text=told))
+            lines.append(chart.curve(row, preset, own["severity"], 100 * own["share"], size=5, text=told))
         panels.append(chart.panel_data(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))
     return Result(
         runs,
@@ -232,7 +232,7 @@ def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
     kinds = [
         "; ".join(
             f"{n:.0f} {name.removeprefix(FAILED).replace('_', ' ')}"
-            for name, n in record["metrics"].items()
+            for name, n in sorted(record["metrics"].items())
             if name.startswith(FAILED)
         )
         for record in runs.records

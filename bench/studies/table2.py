@@ -28,8 +28,9 @@ PUBLISHED = {
 }
 NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
-    "Dense depth implies the mask; “paper's as printed” is the setting of DIST, B.4, with the mean of the squared code "
-    "of the official code. The figure leaves out rows with the settings of papers.",
+    "Dense depth implies the mask; “paper's setting” is that of DIST, B.4; the mean of the squared code is the "
+    "official code's, the mean of the mask loss over all pixels is ours. The figure leaves out rows with "
+    "the settings of papers.",
     f"{compare.FITTED} “Published” is DIST, Table 2: 200 shapes of ShapeNet with another prior and camera, and another "
     "number of points per share, so these numbers do not compare with the measured ones.",
 )
@@ -78,7 +79,7 @@ def draw(found: compare.Compared, oracle: dict[str, float]) -> Figure:
         if family in oracle:
             lines.append(chart.level(compare.ORACLE, places, oracle[family]))
             lines.append(chart.level("1.5 times that", places, 1.5 * oracle[family], dash=":"))
-        panels.append(chart.panel_data(family, "", compare.LABEL, lines, ticks=found.conditions))
+        panels.append(chart.panel_data(family, "given depth points", compare.LABEL, lines, ticks=found.conditions))
     height = -(-len(panels) // 4)
     return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
 

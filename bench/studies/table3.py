@@ -1,6 +1,6 @@
 """Table 3 and Figs. 11 and 23 of DIST: shape from many views, from random initial codes."""
 
-from bench.report.study import Result, Runs, Selection, compare, gallery, medians, records, table
+from bench.report.study import Result, Runs, Selection, compare, conditions, gallery, medians, records, table
 
 PLACE = 40
 READS = (Selection("table3"),)
@@ -40,8 +40,7 @@ MOST_SHAPES = 4  # of each family, in pictures
 
 def make(runs: Runs) -> Result:
     """A line per family and method, with the start, the oracle and published numbers beside each family."""
-    label = "Chamfer to prediction × 1000 (scene units²)"
-    found = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, label)
+    found = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, conditions.LABEL)
     starts = records.SCALE * runs.number(f"start_{records.ONE_WAY}")
     encoded = runs.setting(ENCODED) != ""
     of_kind = {"start: random codes": starts[~encoded], "start: encoder's codes": starts[encoded]}
@@ -57,10 +56,11 @@ def make(runs: Runs) -> Result:
     return found.result(
         "Shape from many views, without a mask.",
         "Which method finds a shape by photographs from many views, without a mask?",
-        ratio="Ratio to DIST",
-        plotted="Median error over {shapes and seeds}, over shapes alone, and the median cost of runs that ended ok.",
+        plotted="Median error over {shapes and seeds}, over shapes alone, its ratio, and the median cost of runs that "
+        "ended ok.",
         verdict=found.best("errors × 1000, from truth to prediction"),
         remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
+        columns=found.columns("Ratio to DIST"),
         lines=found.beside(above, published),
         run_columns=RUNS,
     )

@@ -53,7 +53,7 @@ def make(runs: Runs) -> Result:
         runs,
         "Aggressive marching on distances and on truncated distances.",
         "Medians over shapes of the share of wrong pixels, and of the field evaluations of a rendering, over alpha.",
-        question="Which field does aggressive marching need?",
+        question="Does aggressive marching need a truncated field, or clamped steps?",
         verdict=_verdict({(line["kind"], line["alpha"]): line for line in lines}),
         interval=compare.INTERVAL,
         remarks=NOTES,
@@ -85,23 +85,17 @@ def _lines(frame: pd.DataFrame, kind: Kind, once: pd.Series) -> list[Line]:
 
 
 def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
-    """What alpha = 1.5 loses and costs on distances, and with clamped steps on a truncated field."""
-    wanted = [(DISTANCES, 1.0), (DISTANCES, 1.5), ((True, True), 1.0), ((True, True), 1.5)]
-    if not all(key in lines for key in wanted):
+    """What alpha = 1.5 loses on distances without the clamp and with it, and on a truncated field with it."""
+    kinds = {"plain": DISTANCES, "clamped": (False, True), "both": (True, True)}
+    if not all((kind, alpha) in lines for kind in kinds.values() for alpha in (1.0, 1.5)):
         return ""
-    plain, far, slow, own = (lines[key] for key in wanted)
-    wrong = [table.small_percent(line["wrong"]) for line in (plain, far, own)]
-    clamped = lines.get(((False, True), 1.5))
-    alike = (
-        f" On distances, clamped steps have {table.small_percent(clamped['wrong'])} and {clamped['cost']:.2f}."
-        if clamped
-        else ""
-    )
+    wrong = {name: table.small_percent(lines[kind, 1.5]["wrong"]) for name, kind in kinds.items()}
+    plain, clamped, both = (lines[kind, 1.5] for kind in kinds.values())
     return (
-        f"On distances, alpha = 1.5 has *{wrong[1]}* wrong pixels, and alpha = 1 has {wrong[0]}. On a truncated field "
-        f"with clamped steps, alpha = 1.5 has {wrong[2]} and {own['cost'] / slow['cost']:.2f} times the evaluations of "
-        f"alpha = 1, but {own['cost']:.2f} times those of alpha = 1 on distances; n = {plain['shapes']} shapes."
-        f"{alike}"
+        f"At alpha = 1.5, *{wrong['plain']}* of the pixels are wrong on distances without clamped steps. With them, "
+        f"{wrong['clamped']} are wrong on distances and {wrong['both']} on a truncated field. Clamped steps cost "
+        f"{clamped['cost']:.2f} and {both['cost']:.2f} times the evaluations of alpha = 1 without them; "
+        f"n = {plain['shapes']} shapes."
     )
 
 

@@ -87,7 +87,7 @@ class Completion:
         """Raises BadInput where a prior is asked for, and there is none, or none of colours."""
         if inputs.field.of_prior:
             inputs.check_prior()
-        if self.colour_weight and not (inputs.coloured and inputs.field.of_prior):
+        if self.colour_weight and not (inputs.prior_choice.coloured and inputs.field.of_prior):
             raise BadInput("task.colour_weight needs codes of shape and colour: set prior=textured field=prior")
         if self.colour_weight and (self.similarity or isinstance(inputs.dataset, OneView)):
             raise BadInput("colours are compared of shapes that stand as the prior's do: set task.colour_weight=0")

@@ -3,24 +3,20 @@
 Axes and pixels are those of `renderers.camera`: x right, y down, z forward, the first pixel's centre at (0.5, 0.5).
 """
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 from scipy.linalg import rq
 
 from datasets.captures.lenses import Lens
-from datasets.readers.text import mistaken
 from renderers.checks import BadInput
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
 HALF = 0.5  # pixels: where the first pixel's centre is at whole numbers, the principal point moves by this
-UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)  # what Pillow says of a broken image
 LAST = (0.0, 0.0, 0.0, 1.0)  # row of a matrix
 RIGID = 5e-3  # most by which a rotation's axes may differ from unit and orthogonal ones
 ROUNDED = 1e-5  # those that differ more are replaced by the nearest rotation: the file has few digits
@@ -84,7 +80,6 @@ class Layout:
         notes: how images, cameras and masks were paired, where that is not plain, and what was left out.
         points: a sphere about most of the reconstructed points, where the format has them.
         world: from the cameras' world into that of the file.
-        rival: other pairs of images and cameras that the names allow; masks decide.
         missing: the first image that it names, for what is said where none is there.
     """
 
@@ -94,7 +89,6 @@ class Layout:
     notes: tuple[str, ...] = ()
     points: tuple[Float[np.ndarray, "3"], float] | None = None
     world: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    rival: tuple[Frame, ...] = ()
     missing: str = ""
 
 
@@ -103,25 +97,6 @@ def need(known: Mapping[str, Any], key: str, where: str) -> Any:
     if key not in known:
         raise BadInput(f"{where} has no {key}: export it again, with {key}")
     return known[key]
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[Image.Image]:
-    """An image whose pixels are not yet read; raises BadInput where it, or what is asked of it, cannot be read."""
-    try:
-        with Image.open(path) as image:
-            yield image
-    except UNREADABLE as error:
-        pointer = path.is_file() and mistaken(path)
-        raise BadInput(
-            f"{path} {pointer or f'cannot be read as an image ({error}): copy or export it again'}"
-        ) from None
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as it is stored; raises BadInput where it cannot be read."""
-    with opened(path) as image:
-        return image.size
 
 
 def decomposed(projection: Float[np.ndarray, "3 4"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "4 4"]]:

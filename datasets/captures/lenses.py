@@ -1,12 +1,13 @@
 """Lenses: how the models of OpenCV, COLMAP and NeRF's files bend rays, and which of them are understood."""
 
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import map_coordinates
 
 from renderers.checks import BadInput
 
@@ -29,14 +30,8 @@ FISHEYE = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 UNDERSTOOD = ", ".join([*PLAIN, *FISHEYE])
-READ = {*RADIAL, *TANGENTIAL, "camera_model", "is_fisheye", "distortion_params"}
+READ = {*RADIAL, *TANGENTIAL, "camera_model", "is_fisheye", "distortion_params"}  # keys of transforms.json
 PINHOLE = {"", "NONE", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE"}
-SPEAKS = re.compile(  # of a lens, or of a shutter
-    r"(.*\.)?([kpsb]\d+|tau_?[xy]|dist(_?(\d+|coeff\w*|params))?|lens(_?(model|type|params))?|(camera|model)_?(model|type|params)"
-    r"|projection(_?(model|type))?|(ftheta|radial|tangential|transform_matrix_).*"
-    r"|(is_)?(equirect|latlong|ortho(graphic|photo)|panoram|spherical|omni).*|.*(distort|fish_?eye|shutter).*)",
-    re.IGNORECASE,
-)
 
 
 @dataclass(frozen=True)
@@ -82,6 +77,19 @@ class Lens:
             y * factor + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
         )
 
+    def undistorted(
+        self, image: Float[np.ndarray, "height width channels"], intrinsics: Float[np.ndarray, "3 3"]
+    ) -> Float[np.ndarray, "height width channels"]:
+        """The image that a pinhole camera of these intrinsics takes."""
+        rows, columns = np.meshgrid(np.arange(image.shape[0]) + 0.5, np.arange(image.shape[1]) + 0.5, indexing="ij")
+        y = (rows - intrinsics[1, 2]) / intrinsics[1, 1]
+        x = (columns - intrinsics[0, 2] - intrinsics[0, 1] * y) / intrinsics[0, 0]
+        bent_x, bent_y = self.bend(x, y)
+        across = bent_x * intrinsics[0, 0] + bent_y * intrinsics[0, 1] + intrinsics[0, 2]
+        sources = np.stack([bent_y * intrinsics[1, 1] + intrinsics[1, 2] - 0.5, across - 0.5])
+        channels = [map_coordinates(image[..., i], sources, order=1, mode="nearest") for i in range(image.shape[2])]
+        return np.stack(channels, axis=-1)
+
 
 def _polynomial(numbers: tuple[float, ...], square: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """1 + k1 s + k2 s^2 + ..."""
@@ -112,7 +120,6 @@ def nerf_lens(known: dict[str, Any], where: str) -> Lens:
     Raises:
         BadInput: for models that are not understood, by name.
     """
-    refuse_other_lenses(known, where)
     model = str(known.get("camera_model") or "").upper()
     if model not in {*PLAIN, *FISHEYE, *PINHOLE}:
         raise BadInput(
@@ -142,25 +149,10 @@ def nerf_lens(known: dict[str, Any], where: str) -> Lens:
     return _lens(bent, fisheye=fisheye)
 
 
-def refuse_other_lenses(known: dict[str, Any], where: str) -> None:
-    """Raises BadInput for keys that speak of a lens, that are not read, and whose values are not those of a pinhole."""
-    tables = {key: value for key, value in known.items() if isinstance(value, Mapping)}
-    inner = {f"{key}.{name}": value for key, table in tables.items() for name, value in table.items()}
-    unread = {name: value for name, value in (known | inner).items() if name not in READ and SPEAKS.fullmatch(name)}
-    if others := [name for name, value in unread.items() if _bends(value)]:
-        raise BadInput(
-            f"{where}: the lens has {', '.join(others)}, which is not understood ({', '.join(sorted(READ))} are, so "
-            "written): undistort the images, and export again, or remove what says nothing of distortion"
-        )
-
-
-def _bends(value: Any) -> bool:
-    """Whether a value says more than that there is no distortion."""
-    if isinstance(value, str):
-        return value.upper() not in PINHOLE
-    if isinstance(value, Mapping | list):
-        return any(map(_bends, value.values() if isinstance(value, Mapping) else value))
-    return bool(np.any(value))
+def unread_note(keys: Sequence[str], file: Path) -> tuple[str, ...]:
+    """A note on keys of a file of cameras that are not read; they may be of a lens."""
+    remedy = "if they describe a lens, undistort the images, and export again"
+    return (f"{file.name} has keys that are not read, {', '.join(keys)}: {remedy}",) if keys else ()
 
 
 def _lens(bent: Mapping[str, float], *, fisheye: bool) -> Lens:

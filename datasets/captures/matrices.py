@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from datasets.captures.frames import Frame, Layout, decomposed, image_size, need, whole
-from datasets.captures.lenses import refuse_other_lenses
-from datasets.captures.pairing import by_order, first_images, made, masks_of, paired
+from datasets.captures.frames import Frame, Layout, decomposed, need, whole
+from datasets.captures.image import image_size
+from datasets.captures.lenses import unread_note
+from datasets.captures.pairing import by_name, by_order, first_images, masks_of
 from renderers.checks import BadInput
 
 Matrices = dict[str, Float[np.ndarray, "4 4"]]
@@ -25,7 +26,7 @@ def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     file = files[0]
     with np.load(file) as stored:
         every = {key: stored[key] for key in stored}
-    refuse_other_lenses(every, str(file))
+    unread = unread_note([key for key in every if not re.fullmatch(r"(world|scale|camera)_mat(_inv)?_\d+", key)], file)
     wanted = [key for key in every if re.fullmatch(r"(world|scale|camera)_mat_\d+", key)]
     known = {key: whole(np.asarray(every[key], dtype=np.float64), f"{file}, {key}") for key in wanted}
     count = sum(key.startswith("world_mat_") for key in known)
@@ -34,7 +35,7 @@ def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     for i in range(count):
         need(known, f"world_mat_{i}", str(file))
     images = first_images(folder, "image", "images")
-    answers = by_order([*images], count, file.name)
+    names, order = by_order(images, count, file.name)
     scale, notes = _scale(known, count, str(file))
     masks, how = masks_of(folder, images if masked else {}, sorted_too=True)
     apart = _is_dvr(known)
@@ -47,10 +48,10 @@ def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
         seen = need(known, f"camera_mat_{i}", str(file)) @ world @ scale
         return _dvr_frame(seen, images[name], masks.get(name), depths.get(name))
 
-    frames, rival, found = made(answers, count, frame)
+    frames = tuple(frame(i, name) for i, name in enumerate(names))
     sphere = (np.zeros(3), CUBE if apart else 1.0) if any(key.startswith("scale_mat_") for key in known) else None
-    name, notes = "DVR" if apart else "IDR/NeuS", (*notes, *found, *how)
-    return Layout(name, frames, sphere, notes, world=scale, rival=rival, missing="image/*")
+    name, notes = "DVR" if apart else "IDR/NeuS", (*unread, *notes, *order, *how)
+    return Layout(name, frames, sphere, notes, world=scale, missing="image/*")
 
 
 def _is_dvr(known: Matrices) -> bool:
@@ -64,7 +65,7 @@ def _is_dvr(known: Matrices) -> bool:
 def _depths(folder: Path, images: dict[str, Path]) -> dict[str, Path]:
     """The files of depths, by the names of their images."""
     stored = {one.name: one for one in sorted(folder.glob("depth/*.exr")) if not one.name.startswith(".")}
-    return {name: stored[depth] for name, depth in paired([*images], [*stored])[0].items()}
+    return {name: stored[depth] for name, depth in by_name(images, stored).items()}
 
 
 def _dvr_frame(seen: Float[np.ndarray, "4 4"], image: Path, mask: Path | None, depth: Path | None) -> Frame:

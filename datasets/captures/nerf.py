@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datasets.captures.frames import OPENGL, Frame, Layout, image_size, need, whole
-from datasets.captures.lenses import nerf_lens
+from datasets.captures.frames import OPENGL, Frame, Layout, need, whole
+from datasets.captures.image import image_size
+from datasets.captures.lenses import READ, nerf_lens, unread_note
 from datasets.captures.pairing import located, masks_of, natural, without
 from renderers.checks import BadInput
 
 AXES = {"from_na": np.eye(4), "from_mitsuba": np.diag([-1.0, -1.0, 1.0, 1.0])}  # flags of NeuS2 and instant-ngp
+NAMED = {"frames", "file_path", "mask_path", "transform_matrix", "intrinsic_matrix", "w", "h", "cx", "cy", *AXES, *READ}
+OTHER = {  # of training, poses and files, none of which changes a camera
+    *("rotation", "aabb_scale", "aabb", "scale", "offset", "sharpness", "applied_transform", "applied_scale"),
+    *("ply_file_path", "depth_file_path", "colmap_im_id", "orientation_override", "auto_scale_poses_override"),
+    *("train_filenames", "val_filenames", "test_filenames", "time"),
+}
 SAME = 0.02  # most by which two of them may differ, as a share
 
 
@@ -35,7 +42,9 @@ def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     found, how = located([*known], folder)
     masks, told = _masks(folder, known, found) if masked else ({}, ())
     frames = [_frame(known[path], image, masks.get(path), f"{files[0]}, {path}") for path, image in found.items()]
-    notes = (*how, *told, *without("image", [path for path in known if path not in found]))
+    expected = {*NAMED, *OTHER, *_focal_keys("x"), *_focal_keys("y")}
+    unread = unread_note(sorted({key for frame in known.values() for key in frame} - expected), files[0])
+    notes = (*unread, *how, *told, *without("image", [path for path in known if path not in found]))
     of_size = {"w", "h", *_focal_keys("x")[1:], *_focal_keys("y")[1:]}
     if any(not of_size & {*known[path]} for path in found):
         notes += (f"{files[0].name} states no w and h: focal lengths are taken for the size of the images",)

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from datasets.captures.frames import OPENGL, Frame, Layout, centred, image_size, motion, whole
-from datasets.captures.pairing import by_order, first_images, images_in, located, made, masks_of, paired, without
+from datasets.captures.frames import OPENGL, Frame, Layout, centred, motion, whole
+from datasets.captures.image import image_size
+from datasets.captures.pairing import by_name, by_order, first_images, images_in, located, masks_of, without
 from renderers.checks import BadInput
 
 
@@ -41,7 +42,7 @@ def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     rows, images = np.load(file), first_images(folder, "images", "images_2", "images_4", "images_8")
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInput(f"{file} must have a row of 17 numbers for each image, found shape {list(rows.shape)}")
-    answers = by_order([*images], len(rows), file.name)
+    names, notes = by_order(images, len(rows), file.name)
     masks, how = masks_of(folder, images if masked else {})
 
     def frame(i: int, name: str) -> Frame:
@@ -52,8 +53,8 @@ def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
         near, far = map(float, rows[i, 15:])
         return Frame(images[name], intrinsics, moved, masks.get(name), (int(height), int(width)), span=(near, far))
 
-    frames, rival, notes = made(answers, len(rows), frame)
-    return Layout("LLFF", frames, None, (*notes, *how), rival=rival, missing="images/*")
+    frames = tuple(frame(i, name) for i, name in enumerate(names))
+    return Layout("LLFF", frames, None, (*notes, *how), missing="images/*")
 
 
 def blended_mvs(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
@@ -61,7 +62,7 @@ def blended_mvs(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     cameras = {file.name[: -len("_cam.txt")]: file for file in files}
     images = first_images(folder, "blended_images", "images")
     images = {name: file for name, file in images.items() if not file.stem.endswith("_masked")}
-    pairs, _ = paired([*cameras], [*images])
+    pairs = by_name(cameras, images)
     if lost := [name for name in images if name not in pairs.values()]:
         raise BadInput(f"{images[lost[0]]} has no camera: there is no cams/{Path(lost[0]).stem}_cam.txt")
     masks, how = masks_of(folder, images if masked else {})
@@ -97,8 +98,8 @@ def choy(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
         intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
         return Frame(images[name], intrinsics, _from_angles(rows[i, 0], rows[i, 1], rows[i, 3] * FARTHEST), None)
 
-    frames, rival, notes = made(by_order([*images], len(rows), files[0].name), len(rows), frame)
-    return Layout("Choy", frames, None, notes, rival=rival, missing="*.png")
+    names, notes = by_order(images, len(rows), files[0].name)
+    return Layout("Choy", tuple(frame(i, name) for i, name in enumerate(names)), None, notes, missing="*.png")
 
 
 def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.ndarray, "4 4"]:

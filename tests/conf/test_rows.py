@@ -87,7 +87,7 @@ def test_the_command_line_narrows_and_replaces_the_rows():
 def test_a_method_is_a_part_of_what_a_run_is_called():
     plan = swept("+experiment=table3", "index=0", "dataset=car")
     methods = [cell.method for cell in plan.cells]
-    names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "mesh_long", "encoder", "mesh_encoder")
+    names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "encoder", "mesh_encoder")
     assert methods == [f"multiview_{name}" for name in names]
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == [
         "multiview-dist_paper-car-multiview_paper",
@@ -106,9 +106,7 @@ def test_of_two_values_of_one_key_the_later_counts_at_the_place_of_the_first():
     ]
 
 
-MINE = (
-    "# @package _global_\ndefaults: [tuning, _self_]\nhydra: {sweeper: {params: {+method: '${methods:space,neus}'}}}\n"
-)
+MINE = "# @package _global_\ndefaults: [tuning, _self_]\nhydra: {sweeper: {params: {+method: '${spaces:neus}'}}}\n"
 SLOW = {f"{name}_mask" for name in ("neus", "range_analysis", "unisurf", "volsdf")}
 
 
@@ -139,7 +137,7 @@ def test_methods_of_ones_own_join_the_tuning_which_slow_ones_do_not(tmp_path):
     ("variants.yaml", "- mine\n", "variants.yaml must hold keys and values"),
     ("variants.yaml", "mine: {a: 1\n", "variants.yaml cannot be read: while parsing"),
     ("renderer/list.yaml", "- 1\n", "renderer/list.yaml must hold keys and values"),
-    ("experiment/mine.yaml", MINE, "${methods:space,...} leaves out neus: not in method/space"),
+    ("experiment/mine.yaml", MINE, "${spaces:...} leaves out neus: not in method/space"),
 ])  # fmt: skip
 def test_a_broken_file_of_the_users_is_named(tmp_path, file, text, message):
     (tmp_path / "own" / file).parent.mkdir(parents=True)

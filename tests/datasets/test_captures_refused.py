@@ -23,6 +23,7 @@ from tests.made_photographs import (
     middlebury,
     moved,
     nerf,
+    renamed,
     repainted,
     rewritten,
 )
@@ -94,6 +95,9 @@ REFUSED = {
         (lambda f: truncate(f / "image/000003.png", 100), "000003.png cannot be read as an image"),
         (written("image/000003.png", POINTER), FETCH),
         (written(MATRICES, POINTER), FETCH),
+        (removed("image/000004.png"), r"10 cameras, number 0 to 9, and there are 9 images \(000000.png, .*missing"),
+        (masks(lambda mask: mask > 0, ONE), "mask/004.png has values up to 1, as labels do: write 255"),
+        (masks(lambda mask: mask // 2), "mask/000.png has values up to 127, as labels do"),
         (removed("mask/004.png"), r"000004.png has no mask in.*9 masks \(000.png.*add it"),
         (lambda f: Image.new("L", (10, 10)).save(f / "mask/004.png"), "004.png has 10 x 10 pixels, its image 48 x 40"),
         (turned, r"a mask has the size of its image; the image's tag of orientation \(EXIF\)"),
@@ -131,7 +135,11 @@ REFUSED = {
         (every(intrinsic_matrix=TRANSPOSED), "transposed"),
         (every(intrinsic_matrix=np.ravel(TRANSPOSED).tolist()), "must be 3 x 3"),
     ],
-    middlebury: [(text(LINES, r"(?s)(ball0002.*?\n)(.*)", r"\1\2\1"), "ball_par.txt has ball0002.png twice")],
+    middlebury: [
+        (lambda folder: renamed(folder / "mask", "mask{}.png".format),
+         r"ball0000.png has no mask in .* 10 images \(ball0000.*, ball0004.png, \.\.\.\) and 10 masks \(mask0.png"),
+        (text(LINES, r"(?s)(ball0002.*?\n)(.*)", r"\1\2\1"), "ball_par.txt has ball0002.png twice"),
+    ],
     colmap: [
         (text(IMAGES, "\n\n", "\n"), "images.txt: after 000.png there must be a line of its points"),
         (text(IMAGES, r"(?m)^4 \S+ \S+ \S+ \S+", "4 0 0 0 0"), "the quaternion of 003.png is 0 0 0 0"),

@@ -298,7 +298,7 @@ def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
 def test_its_codes_are_the_prior_of_another_dataset(tmp_path):
     file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
     inputs = composed_inputs("dataset=sphere", "prior=deepsdf", f"prior.path={file.path}", "split=train")
-    assert inputs.prior.codes.tolist() == file.network(0).codes.tolist() and inputs.trained is None
+    assert inputs.prior.codes.tolist() == file.network(0).codes.tolist() and inputs.prior_choice.scene_code is None
     near(inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS), octahedron(POINTS) + 0.3)
 
 

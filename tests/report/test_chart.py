@@ -56,6 +56,21 @@ def test_without_an_interval_the_points_of_the_shapes_are_drawn():
     assert "low" not in made and made["shapes"] == [[7, 1], [7, 3]]
     _, shapes = axis_of(made).lines
     assert shapes.get_markersize() == 2 and np.transpose(shapes.get_data()).tolist() == made["shapes"]
+    far = series("a", "dist", [7], [Interval(2.0, math.nan, math.nan, (1.0, 30.0))])  # above twice the median
+    assert axis_of(far).lines[1].get_ydata().tolist() == [1, 30]
+
+
+def test_in_a_panel_with_names_of_rows_intervals_and_shapes_are_along_x():
+    drawn = axis_of(series("a", "dist", KNOWN, [0, 1]), series("b", "idr", FEW, [2]), rows=["p", "q", "r"])
+    (bars,) = drawn.collections
+    assert [segment.tolist() for segment in bars.get_segments()] == [[[1, 0], [4, 0]], [[10, 1], [40, 1]]]
+    assert np.transpose(drawn.lines[-1].get_data()).tolist() == [[1, 2], [3, 2]]
+
+
+def test_the_ticks_of_x_do_not_depend_on_the_intervals_of_y():
+    errors = [Interval(0.1, 0.01, 0.2)] * 2
+    ticks = axis_of(series("a", "dist", [1e7, 9e7], errors)).get_xticklabels(minor=True)
+    assert {"2e7", "5e7"} <= {tick.get_text() for tick in ticks}
 
 
 def test_looks_of_the_page_are_those_of_the_figure():

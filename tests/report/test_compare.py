@@ -8,13 +8,20 @@ import pytest
 from bench.records.read import read_records
 from bench.report.compare import COSTS, EVERY, HOLM, Compared, differing, ordered
 from bench.report.data import statistics
-from bench.report.data.records import Row
-from bench.report.data.runs import choose
-from bench.studies import one_loss
+from bench.report.data.runs import Runs, Selection, choose
+from bench.report.write.result import Result
 from tests.report.test_report_paper import write_run
 
+SELECTION = Selection("mine", ("task.points",))
 # Error over DIST's, field values, seconds of the loop of a run.
 METHODS = {"dist": (1.0, 1000, 4.0), "newton": (0.5, 500, 8.0), "neus": (0.25, 9000, 30.0), "volsdf": (2.0, 9000, 40.0)}
+
+
+def page(runs: Runs) -> Result:
+    """A page of the ratios to DIST."""
+    found = Compared(runs, lambda _: "dist_mask")
+    verdict = f"{found.best('errors')} {found.differing('to DIST')}".strip()
+    return found.result("Rows.", "Which?", verdict=verdict, columns=found.columns("Ratio to DIST"))
 
 
 def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
@@ -26,7 +33,7 @@ def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
                 error = factor * (1 + index) * (4 if points == "20" else 1) * (9 if name == "plane" else 1) / 1000
                 write_run(
                     results,
-                    "one_loss",
+                    "mine",
                     f"{renderer} with mask",
                     **{"task": "completion", "dataset": name, "renderer": renderer},
                     **{"method": f"{renderer}_mask", "status": "ok" if ok else "empty"},
@@ -39,7 +46,7 @@ def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
                         "silhouette": {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"},
                     },
                 )
-    return choose(read_records(results)[0], one_loss.READS[0], results)
+    return choose(read_records(results)[0], SELECTION, results)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +62,7 @@ def of_eight(ratios):
 
 def kept(runs, keep):
     """The page of those runs alone that are to be kept."""
-    return one_loss.make(type(runs)(runs.selection, runs.results_dir, [*filter(keep, runs.records)]))
+    return page(type(runs)(runs.selection, runs.results_dir, [*filter(keep, runs.records)]))
 
 
 def line(result, row, family=EVERY):
@@ -66,7 +73,7 @@ def line(result, row, family=EVERY):
 
 
 def test_a_line_has_errors_ratio_cost_and_both_fronts(whole):
-    result = one_loss.make(whole)
+    result = page(whole)
     newton = line(result, "newton with mask")
     assert newton["ratio"] == "0.500 [0.500, 0.500]; 12 of 12"
     assert (newton["evaluations"], newton["seconds"], newton["failed"]) == (500, 8.0, "0 of 24")
@@ -81,7 +88,7 @@ def test_a_line_has_errors_ratio_cost_and_both_fronts(whole):
 
 
 def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
-    result = one_loss.make(compared(tmp_path, families=("sofa",), failed={("newton", "sofa", 0)}))
+    result = page(compared(tmp_path, families=("sofa",), failed={("newton", "sofa", 0)}))
     newton = line(result, "newton with mask", "sofa")
     assert newton["failed"] == "2 of 12"
     assert newton["error"] == pytest.approx(4)  # of 2 to 6, and of VolSDF's 4 on the first shape
@@ -99,12 +106,12 @@ def test_without_the_reference_there_is_no_ratio_and_no_verdict(whole):
 
 def test_where_nothing_ended_well_there_is_no_verdict(tmp_path):
     every = {(renderer, "sofa", 0) for renderer in METHODS}
-    result = one_loss.make(compared(tmp_path, families=("sofa",), shapes=1, failed=every))
+    result = page(compared(tmp_path, families=("sofa",), shapes=1, failed=every))
     assert result.verdict == ""
 
 
 def test_the_verdict_names_the_best_and_the_quickest(whole):
-    verdict = one_loss.make(whole).verdict
+    verdict = page(whole).verdict
     assert "(neus with mask, 30.0 s)" in verdict and "(dist with mask, 4.00 s); n = 12 shapes." in verdict
 
 
@@ -130,7 +137,7 @@ def test_the_reference_is_the_first_row_of_the_plan_not_the_oldest_of_its_preset
     for label, factor in (("tried before", 3), ("DIST", 2), ("Newton", 1)):
         folder = write_run(
             tmp_path,
-            "one_loss",
+            "mine",
             label,
             **{"task": "completion", "renderer": "dist", "method": "newton_mask" if factor == 1 else "dist_mask"},
             metrics={"chamfer_l2": factor / 1000},
@@ -140,22 +147,21 @@ def test_the_reference_is_the_first_row_of_the_plan_not_the_oldest_of_its_preset
             {"id": folder.name, "overrides": [], "seed": 0, "config": {}}
             | dict.fromkeys(("task", "renderer", "dataset", "method"), "")
         )
-    runs = choose(read_records(tmp_path)[0], one_loss.READS[0], tmp_path)
-    assert line(one_loss.make(runs), "Newton", "car")["ratio"].startswith("0.333 ")  # without a plan
+    runs = choose(read_records(tmp_path)[0], SELECTION, tmp_path)
+    assert line(page(runs), "Newton", "car")["ratio"].startswith("0.333 ")  # without a plan
     (tmp_path / "sweeps" / "one").mkdir(parents=True)
     plan = {"schema": 1, "name": "one", "asked": "2025-03-01T12:00:00+00:00", "cells": cells[1:]}
     (tmp_path / "sweeps" / "one" / "plan.json").write_text(json.dumps(plan))
-    found = one_loss.make(runs)
+    found = page(runs)
     assert line(found, "Newton", "car")["ratio"].startswith("0.500 ")
     assert line(found, "DIST", "car")["ratio"] == ""
-    assert Compared(runs, lambda _: "tried before").reference_of(Row("newton_mask", "Newton")).name == "tried before"
 
 
 def test_rows_of_other_families_with_other_evaluations_are_told(tmp_path):
     for name, points in (("sofa", 1000), ("plane", 5000)):
         evaluation = {"evaluation": {"points": points}, "prior": {"name": name}}
-        write_run(tmp_path, "one_loss", "DIST", dataset=name, settings=evaluation)
-    assert choose(read_records(tmp_path)[0], one_loss.READS[0], tmp_path).mixed() == ["evaluation.points"]
+        write_run(tmp_path, "mine", "DIST", dataset=name, settings=evaluation)
+    assert choose(read_records(tmp_path)[0], SELECTION, tmp_path).mixed() == ["evaluation.points"]
 
 
 def test_a_verdict_counts_the_ratios_that_differ_from_1():
@@ -165,7 +171,24 @@ def test_a_verdict_counts_the_ratios_that_differ_from_1():
     assert said.endswith("; 1 cannot be distinguished from 1.")
 
 
+def test_a_ratio_with_seven_of_eight_shapes_is_no_difference():
+    seven = statistics.ratio([np.array([0.5])] * 7 + [np.array([2.0])], [np.ones(1)] * 8)
+    said = differing([("one", seven), ("other", seven)], "to DIST")
+    assert said.startswith(f"{HOLM}, *0 of 2* ratios to DIST differ from 1; 2 cannot be distinguished from 1.")
+
+
 def test_a_verdict_that_no_data_could_give_is_none():
     said = differing([(f"row {n}", of_eight([2.0, 2.0])) for n in range(7)], "to DIST")
     assert "*cannot be decided with 8 shapes*" in said and "7 ratios need 9 shapes or more" in said
     assert differing([("none", None)], "to DIST") == ""
+
+
+def test_its_panels_have_a_line_per_row_the_least_error_first(whole):
+    errors, ratios, evaluations, seconds = Compared(whole, lambda _: "dist_mask").panels("Ratio to DIST")
+    names = [f"{name} with mask" for name in ("neus", "newton", "dist", "volsdf")]
+    assert [panel["rows"] for panel in (errors, ratios, evaluations, seconds)] == [names] * 4
+    assert [(each["name"], each["y"]) for each in errors["series"]] == [(name, [n]) for n, name in enumerate(names)]
+    equal, *points = ratios["series"]
+    assert equal["x"] == [1, 1] and ratios["x"] == {"title": "Ratio to DIST", "log": True}
+    assert [(each["x"], each["y"]) for each in points] == [([0.25], [0]), ([0.5], [1]), ([2.0], [3])]
+    assert [each["x"] for each in evaluations["series"]] == [[9000], [500], [1000], [9000]]

@@ -1,8 +1,10 @@
 """Shipped tables are drawn anew from their rows, without run folders, and grow by later runs."""
 
+import gzip
 import shutil
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from bench.records.read import read_record, read_records
@@ -17,7 +19,13 @@ def ship(results: Path, into: Path) -> dict[str, str]:
     results.mkdir(exist_ok=True)
     assert main([f"results_dir={results}", f"ship={into}"]) == 0
     shutil.rmtree(results)
-    return {path.name: path.read_text() for path in sorted((into / "paper").glob("*.[cjm]*"))}
+    paths = sorted((into / "paper").glob("*.[cjm]*"))
+    return {path.name: text_of(path) for path in paths}
+
+
+def text_of(path: Path) -> str:
+    content = path.read_bytes()
+    return (gzip.decompress(content) if path.suffix == ".gz" else content).decode()
 
 
 def test_a_table_is_drawn_anew_without_its_runs_and_grows_by_later_ones(tmp_path):
@@ -27,19 +35,21 @@ def test_a_table_is_drawn_anew_without_its_runs_and_grows_by_later_ones(tmp_path
     failed = {"status": "oom", "reason": 'said "no", twice', "minute": 5}
     write_run(own, "table1", "DIST with mask", id="a", **failed)
     first = ship(own, into)
-    assert first["table1.runs.csv"].count("\n") == 5 and str(tmp_path) not in "".join(first.values())
+    assert first["table1.runs.csv.gz"].count("\n") == 5 and str(tmp_path) not in "".join(first.values())
     assert {name for name in first if name.startswith("table1")} == {
-        f"table1.{kind}" for kind in ("csv", "json", "md", "runs.csv")
+        f"table1.{kind}" for kind in ("csv", "json", "md", "runs.csv.gz")
     }
     (into / "paper" / "table1.csv").unlink()
+    rows = (into / "paper" / "table1.runs.csv.gz").read_bytes()
     assert ship(own, into) == first  # nothing but the rows
+    assert (into / "paper" / "table1.runs.csv.gz").read_bytes() == rows  # without a date
 
     write_run(own, "table1", "DIST with mask", id="a", metrics=costs(), minute=6)  # that failed at first
     for number in range(2):
         write_run(own, "table1", f"Mine {number}", id=f"mine{number}", metrics=costs(), minute=10 + number)
-    grown = ship(own, into)["table1.csv"]
-    assert grown.count("\n") == first["table1.csv"].count("\n") + 2 and "oom" not in grown
-    assert "n = 6 runs" in (into / "README.md").read_text()
+    grown = ship(own, into)
+    assert grown["table1.csv"].count("\n") == first["table1.csv"].count("\n") + 2 and "oom" not in grown["table1.csv"]
+    assert "n = 6 runs" in grown["table1.md"]
 
 
 def test_a_page_that_needs_run_folders_stays_until_there_are_some(tmp_path):
@@ -54,32 +64,45 @@ def test_a_page_that_needs_run_folders_stays_until_there_are_some(tmp_path):
     for run, minute in (("b", 5), ("c", 6), ("d", 7)):
         write_curve(write_run(own, "fig5", DYNAMIC, id=run, minute=minute), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
     later = ship(own, into)
-    assert PARALLEL in later["fig5.runs.csv"] and PARALLEL not in later["fig5.csv"] and DYNAMIC in later["fig5.csv"]
+    assert PARALLEL in later["fig5.runs.csv.gz"] and PARALLEL not in later["fig5.csv"] and DYNAMIC in later["fig5.csv"]
     assert "Drawn by version" not in later["fig5.md"]
     write_curve(write_run(own, "fig5", NAIVE, id="e", minute=9), [8, 6, 4, 2], {0: 0.4, 2: 0.2})
     last = ship(own, into)  # one run says less than those that the page shows
-    assert NAIVE in last["fig5.runs.csv"] and last["fig5.csv"] == later["fig5.csv"]
+    assert NAIVE in last["fig5.runs.csv.gz"] and last["fig5.csv"] == later["fig5.csv"]
 
 
 def test_rows_are_the_records_but_for_what_is_of_the_machine(tmp_path):
     settings = {"dataset": {"path": "/home/me/chair.obj"}, "stress": None, "ranges": {"a": [1, 2.5]}, "empty": {}}
-    settings |= {"label": "-", "name": "", "points": "20", "of": 'a "b", c', "field": "NaN"}
+    settings |= {"label": "-", "name": "", "points": "20", "of": 'a "b", c', "field": "NaN", "far": "inf"}
     write_run(tmp_path, "gradients", None, id="a", metrics=bands() | {"error": "inf"}, settings=settings)
     write_run(tmp_path, "gradients", None, id="b", settings={"stress": {"name": "dent"}}, notes=["a", "b"])
     write_run(tmp_path, "gradients", None, id="c", status="killed")
     before = read_records(tmp_path)[0]
     write_rows(before, ["gradients", "table1"], tmp_path / "paper")
     after = read_rows(tmp_path / "paper")
-    assert [path.name for path in (tmp_path / "paper").iterdir()] == ["gradients.runs.csv"]
+    assert [path.name for path in (tmp_path / "paper").iterdir()] == ["gradients.runs.csv.gz"]
     assert [one["id"] for one in after] == ["a", "b"] and family(after[0]) == family(before[-1]) == "me/chair.obj"
-    assert str(tmp_path) not in (tmp_path / "paper" / "gradients.runs.csv").read_text()
+    assert str(tmp_path) not in text_of(tmp_path / "paper" / "gradients.runs.csv.gz")
     for record in after:
         (other,) = (one for one in before if one["id"] == record["id"])
         assert record.keys() - {KEPT} == other.keys() | {"log"}
         for part in record.keys() - {*HERE, "config"}:
             assert record[part] == other[part], part
+        assert list(record["metrics"]) == list(other["metrics"])
         own = {key: value for key, value in other["config"].items() if key not in ("results_dir", "dataset")}
         assert {key: record["config"][key] for key in own} == own
+
+
+def test_pandas_reads_the_rows_cell_by_cell(tmp_path):
+    settings = {"label": "Mine, with a comma", "stress": None, "points": 20}
+    write_run(tmp_path, "gradients", None, id="a", metrics=bands() | {"error": "inf"}, settings=settings)
+    write_run(tmp_path, "gradients", None, id="b", minute=1, status="oom", settings={"stress": {"name": "dent"}})
+    write_rows(read_records(tmp_path)[0], ["gradients"], tmp_path / "paper")
+    table = pd.read_csv(tmp_path / "paper" / "gradients.runs.csv.gz")
+    assert list(table.id) == ["a", "b"] and list(table.status) == ["ok", "oom"] and table.reused.dtype == bool
+    assert table["metrics.error"].tolist()[0] == float("inf")
+    assert table["config.points"].tolist()[0] == 20 and pd.isna(table["config.points"][1])
+    assert table["config.label"][0] == settings["label"] and table["config.stress.name"][1] == "dent"
 
 
 def test_of_the_records_of_a_run_the_newest_that_measured_counts(tmp_path):
@@ -94,12 +117,19 @@ def test_of_the_records_of_a_run_the_newest_that_measured_counts(tmp_path):
     assert join([planned], []) == [planned]
 
 
-@pytest.mark.parametrize("text", ["id,started\n1\n", 'id\n"""a"""\n', 'id,started\n"""a""","""today"""\n'])
-def test_rows_that_cannot_be_read_are_told_and_not_lost(tmp_path, capsys, text):
-    path = tmp_path / "paper" / "table1.runs.csv"
+TEXTS = ["id,started\n1\n", 'id\n"""a"""\n', 'id,started\n"""a""","""today"""\n']
+DAMAGED = [gzip.compress(text.encode(), mtime=0) for text in TEXTS] + [
+    b"id,started\n1\n",
+    gzip.compress(bytes(99), mtime=0)[:-9],
+]
+
+
+@pytest.mark.parametrize("content", DAMAGED)
+def test_rows_that_cannot_be_read_are_told_and_not_lost(tmp_path, capsys, content):
+    path = tmp_path / "paper" / "table1.runs.csv.gz"
     path.parent.mkdir()
-    path.write_text(text)
+    path.write_bytes(content)
     write_run(tmp_path / "own", "table1", NAIVE, metrics=costs())
     assert main([f"results_dir={tmp_path / 'own'}", f"ship={tmp_path}"]) == 2
-    assert "table1.runs.csv cannot be read, mend it or move it away" in capsys.readouterr().err
-    assert path.read_text() == text and not (tmp_path / "paper" / "table1.csv").exists()
+    assert "table1.runs.csv.gz cannot be read, mend it or move it away" in capsys.readouterr().err
+    assert path.read_bytes() == content and not (tmp_path / "paper" / "table1.csv").exists()

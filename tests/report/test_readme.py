@@ -1,14 +1,14 @@
 """README files show the numbers of `results/paper`, and no others."""
 
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 from bench.report.data.kept import read_rows
 from bench.report.write.paper import write_paper, write_readme
-from bench.report.write.result import Shown, read_shown
+from bench.report.write.result import Shown, read_shown, write_shown
 from tests import readme
+from tests.documentation import LINK
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = ROOT / "results" / "paper"
@@ -22,7 +22,13 @@ def rows(text: str) -> list[list[str]]:
 
 def test_the_results_page_is_that_of_the_committed_tables(tmp_path):
     shutil.copytree(PAPER, tmp_path / "paper")
-    assert write_readme(tmp_path).read_text() == (ROOT / "results" / "README.md").read_text()
+    text = write_readme(tmp_path).read_text()
+    assert text == (ROOT / "results" / "README.md").read_text()
+    links = [path for path, _ in LINK.findall(text)]
+    assert sorted(path for path in links if path.endswith(".md") and path.startswith("paper/")) == sorted(
+        f"paper/{page.name}" for page in PAPER.glob("*.md")
+    )
+    assert all((ROOT / "results" / path).exists() for path in links)
 
 
 def test_the_results_page_follows_its_tables(tmp_path):
@@ -30,20 +36,18 @@ def test_the_results_page_follows_its_tables(tmp_path):
     folder.mkdir()
     assert write_readme(tmp_path) is None
     mine = Shown(title="Mine.", question="Whose?", verdict="Of *1* run.", caption="Of one run.", columns=["a", "b"])
-    (folder / "mine.json").write_text(replace(mine, rows=[["x", "1.5"]], notes=["A note"]).to_json())
+    mine = replace(mine, rows=[["x", "1.5"]], notes=["A note"], experiments=["mine_1", "mine_2"])
+    write_shown(mine, folder / "mine")
     text = write_readme(tmp_path).read_text()
-    assert (
-        "| [Whose?](#mine) | Of 1 run. |" in text
-        and "Whose? **Of 1 run.**" in text
-        and "Of one run." in text
-        and ["x", "1.5"] in rows(text)
-    )
-    assert re.search(r"<details><summary>Notes</summary>\n\n- A note\n\n</details>", text)
+    assert ["[Whose?](paper/mine.md)", "Of 1 run.", "`mine_1`, `mine_2`"] in rows(text)
+    page = (folder / "mine.md").read_text()
+    assert "Whose? **Of 1 run.**" in page and "Of one run." in page and ["x", "1.5"] in rows(page)
+    assert page.endswith("\n\n- A note\n")
 
 
 def test_the_answers_of_the_readme_are_those_of_the_committed_results():
     text = (ROOT / "README.md").read_text()
-    assert all(part in text for part in (readme.recommendation(), readme.table(), readme.answers()))
+    assert all(part in text for part in (readme.recommendation(), readme.table(), readme.hard_scenes()))
 
 
 def test_the_ranks_that_the_readme_names_are_those_of_the_kept_rows(tmp_path):

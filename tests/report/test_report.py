@@ -191,6 +191,8 @@ def test_command_prints_the_page_last(results, capsys):
         ("result_dir=x", "argument must be one of results_dir=PATH"),
         ("results_dir=", "results_dir has no value: type results_dir=PATH"),
         ("meshes=many", "a number of runs or all"),
+        ("columns=Step", "columns.PAGE=HEADING,HEADING, ship=PATH, found 'columns=Step'"),
+        ("columns.table1=", "columns.table1 has no value: type columns.PAGE=HEADING,HEADING"),
     ],
 )
 def test_command_refuses_what_it_does_not_know(argument, named, tmp_path, monkeypatch, capsys):

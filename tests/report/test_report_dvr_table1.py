@@ -13,15 +13,15 @@ ROWS = {
     "RGB": "single_view",
     "Mean shape": "single_view_mean",
     "Nearest image": "single_view_nearest",
-    "Newton": "single_view_by_newton",
-    "IDR": "single_view_by_idr",
+    "Depth": "single_view_depth",
+    "Occupancy": "single_view_occupancy",
 }
 
 
-def made(results, row, chamfer, *, status="ok", experiment="dvr_table1", **more):
+def made(results, row, chamfer, *, status="ok", **more):
     metrics = {"iou": 1 - chamfer, "chamfer_l1": chamfer / 10, "normal_consistency": 0.9, "mask_iou": 0.8, "psnr": 20.0}
     return write_run(
-        results, experiment, row, task="single_view", method=ROWS[row], status=status,
+        results, "dvr_table1", row, task="single_view", method=ROWS[row], status=status,
         metrics=metrics if status == "ok" else {}, **{"renderer": "newton"} | more,
     )  # fmt: skip
 
@@ -58,51 +58,30 @@ def test_several_trainings_of_a_row_are_one_row(tmp_path):
     assert (rgb["Chamfer-L1"], rgb["Failed"], rgb["Over the mean shape"]) == ("20.0", "0 of 6", "0.250 (n = 1)")
 
 
-def test_renderers_that_teach_are_compared_with_newton_and_with_retrieval(tmp_path):
-    teaches = {"experiment": "single_view_renderers"}
-    for index in range(3):
-        cost = {"evaluations": {"training": 2e6}, "seconds": {"forward": 1.0, "backward": 0.0, "training": 90.0}}
-        made(tmp_path, "Newton", 0.2, index=index, **teaches, **cost)
-        made(tmp_path, "IDR", 0.3, index=index, **teaches, status="ok" if index else "empty")
-        made(tmp_path, "Nearest image", 0.1, index=index, **teaches)
-    table = page_of(tmp_path, "single_view_renderers").table.set_index("Renderer")
-    assert table.loc["Newton", ["Trained in", "Field values"]].tolist() == ["90.0 s", "2.00M"]
-    assert table.loc["Newton", "Over the nearest image"] == "2.00 (n = 3)"
-    assert table["Over Newton"].tolist() == ["", "1.50 (n = 3)", "0.500 (n = 3)"]
-    assert table.loc["IDR", "Failed"] == "1 of 3"
-
-
-def test_the_verdict_on_renderers_that_teach_is_per_family(tmp_path):
-    for index in range(3):
-        for family, factor in (("car", 1.5), ("sofa", 0.5)):
-            more = {"index": index, "dataset": family, "experiment": "single_view_renderers"}
-            made(tmp_path, "Mean shape", 0.01, **more, renderer="dist")
-            made(tmp_path, "IDR", 0.2 * factor, **more, renderer="idr")
-            if index == 0 and family == "car":
-                assert page_of(tmp_path, "single_view_renderers").verdict == ""  # without a row of Newton
-            made(tmp_path, "Newton", 0.2, **more)
-    verdict = page_of(tmp_path, "single_view_renderers").verdict
-    assert "car: *1.50* (IDR); n = 3 unseen shapes. " in verdict and "sofa: *0.500* (IDR); n = 3" in verdict
-
-
-@pytest.mark.parametrize("study", ["dvr_table1", "single_view_renderers"])
-def test_a_verdict_counts_the_shapes_that_it_is_of(tmp_path, study):
+def test_a_verdict_counts_the_shapes_that_it_is_of(tmp_path):
     for index in range(5):
-        made(tmp_path, "Mean shape", 0.3, index=index, experiment=study)
-    for index, row in product(range(3), ("RGB", "Newton", "IDR")):
-        seconds = {"forward": 1.0, "backward": 0.0, "training": 90.0}
-        made(tmp_path, row, 0.2, index=index, experiment=study, seconds=seconds)
-    assert "n = 3 " in page_of(tmp_path, study).verdict
+        made(tmp_path, "Mean shape", 0.3, index=index)
+    for index, row in product(range(3), ("RGB", "Depth", "Occupancy")):
+        made(tmp_path, row, 0.2, index=index, seconds={"forward": 1.0, "backward": 0.0, "training": 90.0})
+    assert "n = 3 " in page_of(tmp_path, "dvr_table1").verdict
+
+
+def test_a_failed_run_is_infinite_in_the_ratio(tmp_path):
+    for index in range(3):
+        made(tmp_path, "RGB", 0.3, index=index, status="ok" if index else "empty")
+        made(tmp_path, "Mean shape", 0.2, index=index)
+    rgb = lines(tmp_path)["car", "RGB"]
+    assert (rgb["Over the mean shape"], rgb["Failed"]) == ("1.50 (n = 3)", "1 of 3")
 
 
 def test_a_ratio_to_a_row_that_failed_alone_says_nothing(tmp_path):
     for index in range(2):
-        more = {"index": index, "experiment": "single_view_renderers"}
-        made(tmp_path, "Newton", 0.2, **more, status="ok" if index else "empty")
-        made(tmp_path, "IDR", 0.3, **more, status="empty" if index == 1 else "ok")
-        made(tmp_path, "Nearest image", 0.1, **more)
-    result = page_of(tmp_path, "single_view_renderers")
-    assert result.verdict == "" and result.table["Over Newton"].tolist() == ["", "– (n = 2)", "0 (n = 2)"]
+        made(tmp_path, "Mean shape", 0.2, index=index, status="ok" if index else "empty")
+        made(tmp_path, "RGB", 0.3, index=index, status="empty" if index == 1 else "ok")
+        made(tmp_path, "Nearest image", 0.1, index=index)
+    found = lines(tmp_path)
+    ratios = [found["car", row]["Over the mean shape"] for row in ("RGB", "Mean shape", "Nearest image")]
+    assert ratios == ["– (n = 2)", "", "0 (n = 2)"]
 
 
 def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):

@@ -70,7 +70,7 @@ def test_the_base_of_a_preset_is_its_class_or_a_users_preset(renderer, target, b
 def test_two_presets_under_one_label_are_two_rows(tmp_path):
     for preset, queries in (("dist", 5), ("mine", 7)):
         write_run(tmp_path, "table1", "same", metrics=costs(queries), renderer=preset)
-    made = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path))
+    made = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path), None)
     assert list(made.data["queries"]) == [5, 7] and list(made.data["row"]) == ["same, dist", "same, mine"]
 
 
@@ -107,7 +107,7 @@ def test_a_study_that_cannot_be_made_costs_no_other_table(tmp_path, monkeypatch,
     monkeypatch.setitem(broken.pages, "fig4", late if caption else lambda runs: {}["lost"])
     problems: list[str] = []
     written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path, problems=problems)]
-    assert written == ["claims.csv", "table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]
+    assert written == ["table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]
 
 
 def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path, monkeypatch):
@@ -164,7 +164,7 @@ def test_a_verdict_of_scale_smoke_is_that_nothing_follows(tmp_path):
         write_run(tmp_path, "table1", label, metrics=costs(), settings={"scale": {"name": "smoke"}})
     write_paper(read_records(tmp_path)[0], tmp_path)
     shown = read_shown(tmp_path / "paper" / "table1.json")
-    assert shown.verdict == SMOKE and shown.question.endswith("?") and shown.experiments == ["table1"]
+    assert shown.verdict == SMOKE and shown.question.endswith("?") and shown.experiments == ["table1", "table1_large"]
 
 
 @each("text", ["", "[1]", '{"verdict": 1, "chart": []}', "[" * 100_000])

@@ -14,7 +14,7 @@ from bench.report.data import curves
 from bench.report.data.runs import Runs, choose
 from bench.report.write.html import write_index
 from bench.report.write.paper import find_paper, studies
-from bench.report.write.result import Result
+from bench.report.write.result import Result, Shown, latex
 from bench.studies import fig4, fig5, fig7, gradients, table1
 from tests.looped import each
 from tests.report.page_data import Page
@@ -160,7 +160,7 @@ def test_only_what_may_be_compared_is_merged(tmp_path_factory, changed, merged):
     write_run(results, "table1", PARALLEL, metrics=costs())
     made = chosen(results, "table1")
     assert (len(made.records), made.left_out) == ((2, 0) if merged else (1, 1))
-    assert ("Not shown: 1 run" in told(table1.make(made))) is not merged
+    assert ("Not shown: 1 run" in told(table1.make(made, None))) is not merged
 
 
 @each("other", [{"threads": 8}, {"cpu": "Other CPU"}, {"device": "Some GPU"}, {"kernels": "compiled"}])
@@ -172,7 +172,7 @@ def test_times_of_different_machines_are_not_compared_without_saying_so(tmp_path
     write_run(results, "table1", NAIVE, metrics=costs(), environment={**MACHINE, **other})
     made = chosen(results, "table1")
     assert made.names() == [DYNAMIC, PARALLEL, NAIVE]  # no planned row is lost for it
-    result = table1.make(made)
+    result = table1.make(made, None)
     (warning,) = [note for note in result.notes if note.startswith("Times of rows from different machines")]
     assert all(words in warning for words in (*map(str, other.values()), f"({NAIVE})", f"({DYNAMIC})"))
     assert "2 machines, see the notes" in result.caption
@@ -182,6 +182,18 @@ def test_a_run_with_other_settings_takes_no_row_from_one_that_has_its_label(tmp_
     write_run(tmp_path, "table1", DYNAMIC, metrics=costs(), settings={"renderer": {"steps": 50}})
     write_run(tmp_path, "table1", DYNAMIC, settings={"renderer": {"steps": 1}}, status="crashed", reason="no luck")
     assert chosen(tmp_path, "table1").names() == [f"{DYNAMIC} (steps 50)", f"{DYNAMIC} (steps 1)"]
+
+
+def test_table_1_says_what_a_strategy_saves_and_has_the_published_numbers_at_their_size(tmp_path):
+    for number, (size, experiment) in enumerate({64: "table1", 512: "table1_large"}.items()):
+        for label, seconds in ((PARALLEL, 3.0), (DYNAMIC, 1.5)):
+            settings = {"view": {"resolution": size}}
+            about = {"metrics": costs(size=size, step_seconds=seconds), "settings": settings, "minute": 10 * number}
+            write_run(tmp_path, experiment, label, **about)
+    page = page_of(tmp_path, "table1")
+    assert page.verdict.startswith("A step at 64 pixels") and f"{DYNAMIC} *2.0*" in page.verdict
+    published = next(column for column in page.columns if column.heading == "Published queries")
+    assert [published.words(line) for line in page.lines] == ["", "", "6.06M", "1.99M"]
 
 
 def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
@@ -196,7 +208,7 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     write_run(tmp_path, "table1", hostile, metrics=odd, status="crashed", reason=hostile)
     main([f"results_dir={tmp_path}"])
     text = (tmp_path / "paper" / "table1.tex").read_text()
-    assert r"\begin{tabular}{lr" in text
+    assert r"\begin{tabular}{>{\raggedright\arraybackslash}p{0.4\textwidth}" in text
     row = text[text.index(r"\midrule") : text.index(r"\bottomrule")]
     assert (
         r"{[}50 \% of a\_b \& \#1 \{x\} \textbackslash{}input \textbar{} \textasciitilde{}\textasciicircum{} \$" in row
@@ -207,6 +219,38 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     shown = next(paper.shown for paper in find_paper(tmp_path) if paper.name == "table1")
     assert shown.rows[0][0] == hostile and len(shown.rows[0]) == len(shown.columns) == 13
     assert Page(tmp_path).paper("table1")["rows"][0][0] == hostile  # reading it checks that no script can come of it
+
+
+def test_latex_has_one_sentence_powers_of_ten_dashes_and_rules_between_groups():
+    rows = [["sofa", "a_b", "2.2e-5"], ["sofa", "50 %", "[-1e-7, 1e+6]"], ["car", "96³", ""], ["car", "id3e5x", "N/A"]]
+    page = Shown(title="Errors.", caption="Of 3e5 rays. n = 4 runs.", columns=["Family", "Row", "Error"], rows=rows)
+    head, text = latex(page, "mine").split(r"\begin{table*}")
+    assert all(line.startswith("% ") for line in head.splitlines()) and "n = 4 runs." in head
+    assert r"\caption{Errors.}" in text and text.isascii()
+    assert text[text.index(r"\midrule") : text.index(r"\bottomrule")].splitlines() == [
+        *(r"\midrule", r"sofa & a\_b & $2.2\times10^{-5}$ \\", r" & 50 \% & {[}$-1\times10^{-7}$, $1\times10^{6}$] \\"),
+        *(r"\midrule", r"car & 96$^3$ & -- \\", r" & id3e5x & -- \\"),
+    ]
+    apart, second = (latex(page.narrowed(names), "mine") for names in (["Error", "Row"], ["Row", "Family"]))
+    assert apart.count(r"\midrule") == 1 and r"$2.2\times10^{-5}$ & a\_b \\" in apart
+    assert second.count(r"\midrule") == 2 and "\\midrule\n96$^3$ & car \\\\\nid3e5x & car" in second
+
+
+def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_path, capsys):
+    copy = shutil.copytree(reported, tmp_path / "results")
+    before = {path.name: path.read_bytes() for path in (copy / "paper").iterdir()}
+    assert main([f"results_dir={copy}", 'columns.table1="Queries", Strategy']) == 0
+    text = (copy / "paper" / "table1.tex").read_text()
+    assert "Queries & Strategy \\\\\n\\midrule\n1.00k & + dynamic \\\\\n\\bottomrule" in text
+    changed = {path.name for path in (copy / "paper").iterdir() if path.read_bytes() != before[path.name]}
+    assert changed == {"table1.tex"}
+    for argument, named in (
+        ("columns.table1=Strategy,Quers", "columns.table1: no column 'Quers'; choose from Strategy,"),
+        ("columns.tabel1=Step", "columns.tabel1: no table of that name; there are table1, gradients, "),
+    ):
+        capsys.readouterr()
+        assert main([f"results_dir={copy}", argument]) == 2
+        assert named in capsys.readouterr().err
 
 
 def bands(factor: float = 1.0, camera: bool = True) -> dict:
@@ -350,15 +394,15 @@ def test_experiments_of_nothing_but_failures_are_still_made(tmp_path):
 def test_command_writes_all_files_and_the_page_shows_them(reported):
     drawn_too = {".csv", ".md", ".tex", ".json", ".png", ".pdf"}
     table_alone = {".csv", ".md", ".tex", ".json"}
-    suffixes = {"claims": table_alone, "table1": table_alone, "gradients": drawn_too, "gradients_visibility": drawn_too}
+    suffixes = {"table1": table_alone, "gradients": drawn_too, "gradients_visibility": drawn_too}
     written = {path.name for path in (reported / "paper").iterdir()}
     assert written == {name + suffix for name, them in suffixes.items() for suffix in them}
     page = Page(reported)
     found = [page.paper(paper["name"]) for paper in page.papers]
     links = {link for whole in found for link in [*whole["files"].values(), whole["picture"]] if link}
     assert links == {f"paper/{name}" for name in written if not name.endswith(".json")}
-    assert "1.99M" in page.paper("table1")["rows"][0]
-    assert [paper["name"] for paper in page.papers] == ["claims", "table1", "gradients", "gradients_visibility"]
+    assert "+ dynamic" in page.paper("table1")["rows"][0]
+    assert [paper["name"] for paper in page.papers] == ["table1", "gradients", "gradients_visibility"]
     assert (reported / "paper" / "gradients.png").read_bytes()[:4] == b"\x89PNG"
 
 

@@ -43,9 +43,7 @@ def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
     assert list(rows["reason"]) == ["64 pixels took over 60 s", "no luck", "", ""]
     names = ("forward_s", "backward_s", "step_s", "step_s_low", "step_s_high", "lost", "false", "wrong")
     assert list(rows.loc[DYNAMIC, [*names, "depth_error_max"]]) == [0.5, 0.25, 0.75, 0.625, 0.875, 12, 8, 3, 0.25]
-    assert page.verdict.startswith(
-        "A step, where it finishes (1 of 4 rows reach a limit at this size): *500 ms* (of ours)"
-    )
+    assert page.verdict.startswith("A step at 64 pixels: *500 ms* (of ours)")
 
 
 def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
@@ -54,7 +52,7 @@ def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
     write_run(tmp_path, "table1", PARALLEL, status="crashed", reason="no luck")
     page = page_of(tmp_path, "table1")
     assert list(page.table["Size"]) == ["32 (64: timeout)", "– (64: crashed)", "64"]
-    assert page.table["Step"].iloc[2] == "750 ms (625–875)"
+    assert page.table["Time of a step"].iloc[2] == "750 ms (625–875)"
     assert page.table["Missed / spurious / wrong depth"].iloc[2] == "12 / 8 / 3"
     said = (
         "car 0",
@@ -234,7 +232,7 @@ def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
     assert list(page.data["lost_share"]) == [0.01, None, 0.0, 0.1]
     assert list(page.data["false_share"]) == [0.25, None, 0.0025, 0.0]
     assert list(page.data["status"]) == ["ok", "killed", "ok", "ok"]
-    shown = page.table[["Epsilon", "Erosion", "Dilation"]].to_numpy().tolist()
+    shown = page.table[["Epsilon", "Missed", "Spurious"]].to_numpy().tolist()
     assert shown[0] == ["0.0500", "1.00 %", "25.0 %"] and shown[1][1:] == ["–", "–"]
     assert "killed (stopped)" in told(page)
     assert "fewest, *0.250 %* of the hits, at epsilon = 5e-05, and at 0.05 they are 26.0 %" in page.verdict

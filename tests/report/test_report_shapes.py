@@ -170,6 +170,16 @@ def test_the_figure_has_a_line_per_row_with_a_point_per_scene_and_their_median(t
     assert seconds.get_lines()[0].get_xdata().tolist() == [3.0] * len(scenes)
 
 
+def test_the_figure_is_in_the_order_of_the_error_and_shows_the_field_evaluations_of_rows_that_have_any(tmp_path):
+    for row, error in ((HULL, 0.03), (IDR, 0.04), (NEWTON, 0.02)):
+        made(tmp_path, row, scored(error), notes=["loaded machine: it waited"])
+    errors, evaluations = page_of(tmp_path, "dvr_table2").figure.axes
+    assert [label.get_text() for label in errors.get_yticklabels()] == [NEWTON, HULL, IDR]
+    assert "evaluations" in evaluations.get_xlabel()
+    points = [line.get_xydata().tolist() for line in evaluations.get_lines()]
+    assert points == [[[1000, 0]], [], [[1000, 2]]]
+
+
 def photographed(results, row, metrics, **changed):
     return made(results, row, metrics, experiment="photos", dataset=changed.pop("dataset", FOLDER), **changed)
 

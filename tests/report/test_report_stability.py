@@ -48,7 +48,7 @@ def test_a_breakdown_stands_with_its_interval(tmp_path):
     page = page_of(tmp_path, "stability")
     assert page.table.iloc[0].tolist()[:3] == ["wires", "scene units", "0.100 (0.126 to 0.0794)"]
     assert page.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"
-    assert page.data["failures"].tolist() == ["3 lost; 1 false"] * 2
+    assert page.data["failures"].tolist() == ["1 false; 3 lost"] * 2
     assert page.verdict.endswith("does not break: *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes.")
     assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of a full grid's" in told(page)
     dist, dvr = page.atlas["cells"][0]

@@ -86,7 +86,7 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     assert [panel["title"] for panel in panels] == ["sofa", "plane"] and panels[0]["rows"] == ["DIST", "DVR"]
     assert [(one["x"], one["y"]) for one in panels[1]["series"]] == [([4.0], [0.0]), ([2.0], [1.0])]
     text, tex = ((found.base.with_suffix(suffix)).read_text() for suffix in (".md", ".tex"))
-    assert "| DIST | **1.00** | 4.00 |" in text and r"DIST & \textbf{1.00} & 4.00 &" in tex and "(n = " not in text
+    assert "| DIST | **1.00** | 4.00 |" in text and r"& \textbf{\boldmath 1.00} & 4.00 &" in tex and "(n = " not in text
 
 
 def test_a_data_set_on_which_a_row_only_failed_has_a_column_all_the_same(tmp_path):

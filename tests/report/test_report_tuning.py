@@ -119,14 +119,20 @@ def test_the_best_is_written_as_a_row_over_its_default(tmp_path, capsys):
     assert node["renderer"]["steps"] == 11 and set(node) == {"label", "task", "renderer"}
 
 
-def test_renderers_of_photographs_are_chosen_by_what_is_seen(tmp_path):
-    drawn(tmp_path, experiment="tuning_photographs", method="rgb_dist", errors={"validation": VALIDATION})
+def test_renderers_of_photographs_are_chosen_by_what_is_seen(tmp_path, capsys):
+    hinge = {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"}
+    under = {"experiment": "tuning_photographs", "silhouette": hinge}
+    drawn(tmp_path, method="rgb_dist", errors={"validation": VALIDATION}, **under)
+    assert main(["--results", str(tmp_path)]) == 1
+    assert "has no runs of the tuning" in capsys.readouterr().err
     for path in tmp_path.glob("runs/*/record.json"):  # the experiment draws, and not the method's space
         text = path.read_text().replace("space/rgb_dist", "rgb_dist").replace("chamfer_l2", "seen_chamfer_l1")
         path.write_text(text)
-    write(tmp_path, tmp_path / "tuned.yaml", name="tuning_photographs")
-    row = read_yaml(tmp_path / "tuned.yaml")["rgb_dist"]
+    assert main(["--experiment", "tuning_photographs", "--results", str(tmp_path)]) == 0
+    ((name, row),) = read_yaml(tmp_path / "tuned.yaml").items()
+    assert name == "rgb_dist"
     assert row["chosen"].startswith("draw 1 of 4 of tuning_photographs: geometric mean of seen_chamfer_l1 x 1000 on 6")
+    assert "of sofa, all under DIST's mask loss: 1.00, of the median draw 2.45" in row["chosen"]
     assert (row["base"], row["task.optimiser.learning_rate"]) == ("/method/rgb_dist", 0.01)
 
 
@@ -140,40 +146,6 @@ def test_a_folder_is_no_table(tmp_path, capsys, place):
     drawn(tmp_path)
     assert main(["--results", str(tmp_path), "--into", str(tmp_path / place)]) == 1
     assert f"{place} is no table of settings: type --into conf/tuned.yaml" in capsys.readouterr().err
-
-
-def test_under_one_loss_the_draw_that_is_best_over_all_methods_is_written_as_one_row(tmp_path, capsys):
-    hinge = {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"}
-    under = {"experiment": "tuning_one_loss", "silhouette": hinge}
-    drawn(tmp_path, errors={"validation": VALIDATION}, **under)
-    drawn(tmp_path, method="idr_mask", errors={"validation": (4.0, 9.0, 3.0, 1.5)}, **under)  # best is 1 or 3 alone
-    assert main(["--results", str(tmp_path)]) == 1
-    capsys.readouterr()
-    assert main(["--experiment", "tuning_one_loss", "--results", str(tmp_path)]) == 0
-    ((name, row),) = read_yaml(tmp_path / "tuned.yaml").items()
-    said = row.pop("chosen")
-    assert said.startswith("draw 3 of 4 of _drawn") and "on 6 validation runs of each of dist_mask, idr_mask," in said
-    assert "of sofa, all under DIST's mask loss: 1.73, of the median draw 3.00" in said
-    assert (name, row) == ("_one_loss", {"task.optimiser.learning_rate": 0.02, "renderer.steps": 13})
-
-
-def test_under_one_loss_a_failed_run_counts_before_errors(tmp_path):
-    errors = {"experiment": "tuning_one_loss", "errors": {"validation": VALIDATION}}
-    drawn(tmp_path, **errors)
-    drawn(tmp_path, method="idr_mask", failed={("validation", 1, 2)}, **errors)
-    write(tmp_path, tmp_path / "tuned.yaml", name="tuning_one_loss")
-    assert read_yaml(tmp_path / "tuned.yaml")["_one_loss"]["task.optimiser.learning_rate"] == 0.02
-
-
-def test_one_setting_is_refused_where_methods_drew_settings_of_their_own(tmp_path):
-    errors = {"experiment": "tuning_one_loss", "errors": {"validation": VALIDATION}, "shapes": 1}
-    drawn(tmp_path, **errors)
-    drawn(tmp_path, method="idr_mask", **errors)
-    for path in tmp_path.glob("runs/*/record.json"):
-        if "space/idr_mask" in (text := path.read_text()):
-            path.write_text(text.replace('"steps"', '"samples"'))
-    with pytest.raises(ValueError, match="sweep over methods without a search space"):
-        write(tmp_path, tmp_path / "tuned.yaml", name="tuning_one_loss")
 
 
 def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_named(tmp_path, capsys):

@@ -119,6 +119,18 @@ def test_figure_10_varies_one_condition_at_a_time(tmp_path):
     assert len(result.data) == 4
 
 
+def test_figure_10_shows_what_a_condition_changes_on_the_same_shapes(tmp_path):
+    for index, (usual, changed) in enumerate(((1.0, 2.0), (10.0, 40.0), (3.0, 30.0))):
+        found(tmp_path, "fig10", "DIST", usual, index=index)
+        found(tmp_path, "fig10", "DIST", changed, index=index, focal=0.5)
+    found(tmp_path, "fig10", "DIST", 9.0, index=7, focal=0.5)  # without a run at 1
+    focal, noise = page_of(tmp_path, "fig10").figure.axes
+    median, shapes = focal.lines
+    assert list(zip(*median.get_data(), strict=True)) == [(0.5, 4.0), (1.0, 1.0)]
+    assert sorted(zip(*shapes.get_data(), strict=True))[:3] == [(0.5, 2.0), (0.5, 4.0), (0.5, 10.0)]
+    assert list(zip(*noise.lines[0].get_data(), strict=True)) == [(1.0, 1.0)]
+
+
 def test_figure_12_counts_successes_over_how_far_the_shape_was_misplaced(tmp_path):
     placed = {"shift": 0.0, "degrees": 0.0, "scale": 1.0}
     for index, chamfer in enumerate((0.5, 0.99, 1.01, None)):

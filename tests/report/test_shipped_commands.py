@@ -1,4 +1,4 @@
-"""The commands in conf/README.md plan the runs that the linked pages were drawn from: the same shapes, rows, settings."""
+"""The commands in conf/README.md plan the runs that shipped pages show: the same shapes, rows and settings."""
 
 import re
 import shlex
@@ -38,13 +38,14 @@ def shipped() -> dict[str, list[dict[str, Any]]]:
 def described(config: dict[str, Any], dataset: str, renderer: str) -> tuple[tuple[str, ...], dict[str, str]]:
     path = config["dataset"].get("path")
     settings = {key: str(value) for key, value in flat(config, "").items() if not IGNORED.match(key)}
-    return (row_name(config, renderer), Path(path).stem if path else dataset), settings
+    return (row_name(config, renderer), Path(path).stem if path and dataset == "mesh" else dataset), settings
 
 
 def planned(experiment: str) -> list[tuple[tuple[str, ...], dict[str, str]]]:
     """The cells of the commands in the tables that link to results, of those whose runs name the experiment."""
     lines = [line for line in text_of("conf/README.md").splitlines() if line.startswith("|")]
-    commands = [COMMAND.findall(line) or NAMED.findall(line) for line in lines if "../results" in line or NAMED.match(line)]
+    linked = [line for line in lines if "../results" in line or NAMED.match(line)]
+    commands = [COMMAND.findall(line) or NAMED.findall(line) for line in linked]
     found = []
     for command in dict.fromkeys(command for of in commands for command in of):
         name, *words = shlex.split(command)
@@ -72,6 +73,7 @@ def test_the_command_of_a_page_plans_the_runs_that_it_shows(experiment: str):
 
 def nearest(plan: set[tuple[Any, ...]], shown: set[tuple[Any, ...]]) -> str:
     """Counts, and in what a run of one side differs from the one of the other side that is most like it."""
-    one = min(plan or shown, key=str)
-    other = min(shown if plan else [], key=lambda run: len({*run} - {*one}), default=())
-    return f"{len(plan)} runs are planned alone, {len(shown)} shown alone: {({*one} - {*other})} for {({*other} - {*one})}"
+    first = min(plan or shown, key=str)
+    other = min(shown if plan else [], key=lambda run: len({*run} - {*first}), default=())
+    counts = f"{len(plan)} runs are planned alone, {len(shown)} shown alone"
+    return f"{counts}, such as {sorted({*first} - {*other}, key=str)} for {sorted({*other} - {*first}, key=str)}"

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.records import folder as run_folder
 from bench.run.command import message_of, options_of, text_as_typed
 from bench.run.plan import refusal
-from bench.setup import inputs
+from bench.setup import priors
 from tests.composing import identified
 from tests.looped import each
 from tests.run.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, record_of, wait_for
@@ -36,7 +36,7 @@ def no_prior(monkeypatch):
     def slow(*_):
         raise AssertionError("the slow steps began")
 
-    monkeypatch.setattr(inputs, "prior_for", slow)
+    monkeypatch.setattr(priors, "prior_for", slow)
 
 
 def assert_one_line(err: str, *words: str) -> None:

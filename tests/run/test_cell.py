@@ -1,7 +1,6 @@
 """A configuration becomes objects in one place: each node once, whatever asks for it; and a run takes its threads."""
 
 from collections import Counter
-from dataclasses import replace
 
 import pytest
 import torch
@@ -54,17 +53,16 @@ def test_a_part_that_cells_share_is_built_once_also_one_that_cannot_be(compose_c
 
 def test_a_shape_has_a_code_of_the_prior_where_its_training_had_the_shape(compose_config):
     cells = [cell_from(compose_config("split=train", "prior.shapes=2", f"index={index}")) for index in range(3)]
-    assert [cell.inputs.trained for cell in cells] == [0, 1, None]
+    assert [cell.inputs.prior_choice.scene_code for cell in cells] == [0, 1, None]
     with pytest.raises(BadInput, match="at the shape that it was fitted to"):
         cells[2].inputs.check_fitted()
-    assert cell_from(compose_config("split=test", "prior.shapes=2", "index=0")).inputs.trained is None
+    assert cell_from(compose_config("split=test", "prior.shapes=2", "index=0")).inputs.prior_choice.scene_code is None
 
 
 def test_a_narrow_network_takes_one_thread_and_a_wide_one_all(compose_config, monkeypatch):
     monkeypatch.setattr("bench.setup.inputs.ALL_THREADS", 3)
-    cell = cell_from(compose_config("scale=smoke"))
     for width, threads in ((128, 1), (512, 3)):
-        replace(cell, width=width).start()
+        cell_from(compose_config("scale=smoke", f"scale.network.width={width}")).start()
         assert torch.get_num_threads() == threads
 
 

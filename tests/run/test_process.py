@@ -99,7 +99,7 @@ def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is
 
 def test_the_server_has_what_runs_need_and_no_more():
     found = process.in_child(eval, "{name.partition('.')[0] for name in __import__('sys').modules}")
-    assert found >= {"torch", "open3d", "matplotlib"} and not found & {"dash", "plotly", "hydra", "pandas"}
+    assert found >= {"torch", "open3d", "matplotlib"} and not found & {"hydra", "pandas"}
 
 
 @each("arguments, early", [

@@ -23,6 +23,7 @@ from bench.records.record import Record, RunStatus, curve_file
 from bench.report.write.html import write_index
 from bench.run import execute
 from bench.setup import inputs as inputs_module
+from bench.setup import priors as priors_module
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve import solve
 from bench.solve.optimise import History, OptimiserSettings
@@ -305,7 +306,7 @@ def test_what_is_drawn_in_a_run_does_not_depend_on_whether_its_prior_was_there(c
     prior, drawn = ball_prior(), []
     monkeypatch.setattr(inputs_module, "make_scene", lambda *_, **__: Mock(spec=Scene))
     for used in (0, 1000):
-        monkeypatch.setattr(inputs_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
+        monkeypatch.setattr(priors_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
         cell = cell_from(compose_config("threads=1", "seed=3"))
         cell.start()
         stage = cell.inputs

@@ -37,9 +37,11 @@ def gone_settings(record: Record) -> list[str]:
 
 @cache
 def _arguments() -> dict[str, set[str]]:
-    """The settings of each class of conf/renderer."""
+    """The settings of each class of conf/renderer, with those that variants of any class set."""
     files = [read_yaml(path) for path in sorted((CONF / "renderer").glob("*.yaml"))]
-    return {str(of[0]["_target_"]): {LABEL}.union(*of) for of in grouped(files, lambda file: file["_target_"]).values()}
+    classes = grouped(files, lambda file: str(file["_target_"]))
+    variants = read_yaml(CONF / "variants.yaml").values()
+    return {target: {LABEL}.union(*settings, *variants) for target, settings in classes.items()}
 
 
 def _old_rows(records: list[Record]) -> str:

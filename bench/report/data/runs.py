@@ -17,6 +17,9 @@ from bench.report.data.kept import KEPT, NO_ATTEMPTS
 from bench.report.data.records import SCALE, Record, Row, doubtful, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
+ROW_SETTINGS = (
+    "prior.truncation",
+)  # in which rows of one table may differ, as an error against the truth compares them
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,8 @@ class Runs:
         found: dict[str, None] = {}
         for records, parts in together:
             known = [flat({part: record["config"].get(part) for part in parts}, "") for record in records]
-            keys = dict.fromkeys(key for one in known for key in one if key not in self.selection.conditions)
+            ignored = {*self.selection.conditions, *ROW_SETTINGS}
+            keys = dict.fromkeys(key for one in known for key in one if key not in ignored)
             found |= {key: None for key in keys if len({str(one[key]) for one in known if key in one}) > 1}
         return list(found)
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,22 +17,29 @@ Series = dict[str, Any]
 Panel = dict[str, Any]
 
 
-def series(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
+def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[float | Interval], **more: Any) -> Series:
     """Points with the colour and marker that their preset has in every figure; of estimates with their intervals.
 
     Args:
-        y: the values, or estimates: where one has no interval, the points of its shapes are drawn, small.
+        x, y: the values. Those of y, or in a panel with names of rows those of x, may be estimates: where one has no
+            interval, the points of its shapes are drawn, small.
         more: what the page reads as well, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
     """
-    look, places, found = style.look(preset), list(x), list(y)
-    values = [one.value if isinstance(one, Interval) else one for one in found]
-    made = {"name": name, "x": _rounded(places), "y": _rounded(values), "colour": look.colour, "symbol": look.marker}
-    estimates = [one for one in found if isinstance(one, Interval)]
+    look, x, y = style.look(preset), list(x), list(y)
+    made = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
+    estimates = [one for one in (*x, *y) if isinstance(one, Interval)]
     if any(one.known for one in estimates):
         ends = [(one.low, one.high) if one.known else (one.value, one.value) for one in estimates]
-        made |= dict(zip(("low", "high"), map(_rounded, zip(*ends, strict=True)), strict=True))
-    alone = [(at, p) for at, one in zip(places, estimates, strict=False) if not one.known for p in one.points]
-    return made | ({"shapes": [_rounded(pair) for pair in alone]} if alone else {}) | more
+        made |= dict(zip(("low", "high"), map(_values, zip(*ends, strict=True)), strict=True))
+    shapes = [_values(pair) for point in zip(x, y, strict=True) for pair in _of_shapes(*point)]
+    return made | ({"shapes": shapes} if shapes else {}) | more
+
+
+def _of_shapes(x: float | Interval, y: float | Interval) -> Iterable[tuple[float, float]]:
+    """The points of the single shapes of an estimate without an interval; none of another point."""
+    if not any(isinstance(one, Interval) and not one.known for one in (x, y)):
+        return ()
+    return product(*(one.points if isinstance(one, Interval) else (one,) for one in (x, y)))
 
 
 def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
@@ -82,7 +90,7 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     figure, axes = sheet(height, lines, columns, **how)
     size = {True: len(panels), "row": columns}.get(how.get("sharey"), 1)  # panels with one axis have one edge
     for place, (axis, panel) in enumerate(zip(axes.flat, panels, strict=False)):
-        _panel(axis, panel, _edge(panels[place // size * size :][:size], "y", "high"))
+        _panel(axis, panel, _edge(panels[place // size * size :][:size], "y"))
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")
     for axis in axes[:, 1:].flat if "sharey" in how else ():
@@ -164,19 +172,24 @@ def _shown(panel: Panel) -> list[Series]:
     return [each for each in panel["series"] if not each.get("off")]
 
 
-def _edge(panels: Sequence[Panel], *of: str) -> float:
-    """Where what is infinite is drawn: beyond all else of panels that share an axis, in these parts of their series."""
-    values = [v for panel in panels for each in _shown(panel) for key in of for v in each.get(key, ())]
-    return 2 * max(filter(math.isfinite, values), default=1.0)
+def _drawn(panel: Panel, letter: str) -> list[float]:
+    """All values along an axis, with those of single shapes and the ends of intervals: with names of rows, of x."""
+    ends = ("low", "high") if letter == ("x" if "rows" in panel else "y") else ()
+    values = [v for each in _shown(panel) for key in (letter, *ends) for v in each.get(key, ())]
+    return values + [pair["xy".index(letter)] for each in _shown(panel) for pair in each.get("shapes", ())]
+
+
+def _edge(panels: Sequence[Panel], letter: str) -> float:
+    """Where what is infinite is drawn: beyond all else of panels that share an axis."""
+    return 2 * max((v for panel in panels for v in _drawn(panel, letter) if math.isfinite(v)), default=1.0)
 
 
 def _panel(axis: Axes, panel: Panel, edge: float) -> None:
-    shown = _shown(panel)
-    for each in shown:
-        _series(axis, each, [_edge([panel], "x"), edge])
+    for each in _shown(panel):
+        _series(axis, each, [_edge([panel], "x"), edge], across="rows" in panel)
     for letter in "xy":
         if panel[letter]["log"]:
-            style.log_axis(axis, letter, [v for each in shown for v in (*each[letter], *each.get("low", ()))])
+            style.log_axis(axis, letter, _drawn(panel, letter))
     if "ticks" in panel:
         axis.set_xticks(range(len(panel["ticks"])), panel["ticks"])
     if "rows" in panel:
@@ -187,8 +200,11 @@ def _panel(axis: Axes, panel: Panel, edge: float) -> None:
     axis.set(title=panel["title"], xlabel=panel["x"]["title"], ylabel=panel["y"]["title"])
 
 
-def _series(axis: Axes, each: Series, edges: list[float]) -> None:
-    """Draws a series; what is infinite at the edge, points as crosses there; intervals as a band or as bars."""
+def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> None:
+    """Draws a series; what is infinite at the edge, points as crosses there; intervals as a band or as bars.
+
+    Intervals are along x where they are `across`.
+    """
     x, y, line = np.minimum(each["x"], edges[0]), np.minimum(each["y"], edges[1]), "dash" in each
     how: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
     how |= {"markevery": max(len(x) // 6, 1)} if line else {}
@@ -200,9 +216,11 @@ def _series(axis: Axes, each: Series, edges: list[float]) -> None:
     if lost.any():
         axis.plot(x[lost], y[lost], "x", color=each["colour"])
     if "low" in each:
-        ends = [np.minimum(each[end], edges[1]) for end in ("low", "high")]
+        ends = [np.minimum(each[end], edges[not across]) for end in ("low", "high")]
         if line:
             axis.fill_between(x, *ends, color=each["colour"], alpha=0.15, lw=0)
+        elif across:
+            axis.hlines(y, *ends, color=each["colour"], lw=1)
         else:
             axis.vlines(x, *ends, color=each["colour"], lw=0.7)
     if "shapes" in each:
@@ -210,5 +228,6 @@ def _series(axis: Axes, each: Series, edges: list[float]) -> None:
         axis.plot(at, found, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
 
 
-def _rounded(values: Iterable[float]) -> list[float]:
-    return [float(f"{value:.5g}") for value in values]
+def _values(found: Iterable[float | Interval]) -> list[float]:
+    """The values, of estimates without their intervals, with five digits."""
+    return [float(f"{one.value if isinstance(one, Interval) else one:.5g}") for one in found]

@@ -1,8 +1,8 @@
-"""Writes the tables and figures of all studies and their README; finds those of a results folder for index.html."""
+"""Writes the tables and figures of all studies and their index; finds those of a results folder for index.html."""
 
+import csv
 import hashlib
 import os
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,7 +18,7 @@ from bench.report.data import age
 from bench.report.data.kept import KEPT, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
 from bench.report.write.caption import SMOKE
-from bench.report.write.result import Result, Shown, as_markdown, markdown, read_shown, write, write_shown
+from bench.report.write.result import Result, Shown, as_markdown, latex, read_shown, write, write_shown
 
 FOLDER = "paper"
 SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
@@ -31,12 +31,16 @@ BESIDE = "shipped: "  # in front of the name of a row that is shipped, beside ro
 
 HEAD = """# Results
 
-Written by `make results` from [{folder}]({folder}): do not edit. Each table is there as CSV (raw numbers, in scene
-units), JSON, Markdown and LaTeX, each figure as PNG and PDF. `EXPERIMENT.runs.csv` has the runs of an experiment as
-rows: later runs are added, and tables drawn from them. A page that cannot be drawn from rows names the version that
-drew it. `python -m bench -m +experiment=NAME` makes the runs of the experiment that a page names; the README of `conf`
-lists the experiments and how long they take.
+`make results` writes this page and [paper]({folder}): do not edit. Each question links to its page with the table, the
+figure and the notes. Beside the page are its table as CSV (raw numbers, in scene units), JSON and LaTeX, and its figure
+as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs of an experiment again. [conf](../conf/README.md)
+lists the experiments and how long they take. A page that cannot be drawn from rows names the version that drew it.
 
+`paper/NAME.runs.csv.gz` has the runs of the experiment NAME: one line per run, one column per field, and an empty cell
+where a run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.gz")` reads it, in the checkout's folder.
+
+| question | answer | experiment |
+|---|---|---|
 """
 
 
@@ -202,7 +206,7 @@ def _beside(found: Found, results_dir: Path) -> list[list[str]]:
 def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[Path]:
     """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
 
-    A page that cannot be drawn stays as it is, and its head says which version drew it.
+    A page that cannot be drawn keeps what it says, in this version's form, and its head says which version drew it.
 
     Raises:
         ValueError: where rows that are there cannot be read, and would be lost.
@@ -213,23 +217,35 @@ def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[P
     own_rows = {name for study in studies() if study.keeps is not None for name in study.pages}
     for page in _in(into):
         table = page.base.with_suffix(".csv")
-        if table not in drawn and page.name not in own_rows and not page.shown.drawn_by:
-            write_shown(replace(page.shown, drawn_by=age.drawn_by(table)), page.base)
+        if table not in drawn:
+            stamp = "" if page.name in own_rows else age.drawn_by(table)
+            write_shown(replace(page.shown, drawn_by=page.shown.drawn_by or stamp), page.base)
     return [*rows, *drawn]
 
 
-def write_readme(results_dir: Path) -> Path | None:
-    """Writes `results_dir/README.md` with all tables and figures, so that no number is copied by hand.
+def write_columns(results_dir: Path, given: dict[str, str]) -> None:
+    """Writes the LaTeX table of each page or sweep of a key `columns.NAME` again, with these headings alone.
 
-    Gives its path; None where `results_dir/paper` has no table or figure.
+    Raises:
+        ValueError: where there is no such table, or it has no such column.
     """
-    pages = _in(results_dir)
-    if not pages:
+    tables = {page.name: page for page in [*_in(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
+    for key in (key for key in given if key.startswith("columns.")):
+        if (page := tables.get(key.removeprefix("columns."))) is None:
+            raise ValueError(f"{key}: no table of that name; there are {', '.join(tables) or 'none'}")
+        headings = next(csv.reader([given[key]], skipinitialspace=True))
+        if unknown := [heading for heading in headings if heading not in page.shown.columns]:
+            known = ",".join(f'"{one}"' if "," in one else one for one in page.shown.columns)
+            raise ValueError(f"{key}: no column {unknown[0]!r}; choose from {known}")
+        write_text(page.base.with_suffix(".tex"), latex(page.shown.narrowed(headings), page.name))
+
+
+def write_readme(results_dir: Path) -> Path | None:
+    """Writes `results_dir/README.md`, the index of all pages; gives its path, or None where there is no page."""
+    if not (pages := _in(results_dir)):
         return None
-    contents = ["| question | answer |", "|---|---|", *map(_answer, pages)]
     path = results_dir / "README.md"
-    parts = [_section(page) for page in pages]
-    write_text(path, HEAD.format(folder=FOLDER) + "\n".join(contents) + "\n\n" + "\n".join(parts))
+    write_text(path, HEAD.format(folder=FOLDER) + "".join(map(_line, pages)))
     return path
 
 
@@ -259,17 +275,9 @@ def key_of(name: str) -> str:
     return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
-def _answer(page: Found) -> str:
-    """A page's line in the table of all answers."""
-    asked = page.shown.question or page.shown.title.rstrip(".")
-    drawn = f" (drawn by {page.shown.drawn_by})" if page.shown.drawn_by else ""
-    return f"| [{as_markdown(asked)}](#{page.name}) | {as_markdown(page.shown.answer + drawn)} |"
-
-
-def _section(page: Found) -> str:
-    """A page's Markdown under a heading, with its experiment, folded notes and links relative to the folder above."""
-    text = markdown(page.shown, page.name).replace(f"]({page.name}.png)", f"]({FOLDER}/{page.name}.png)")
-    text = re.sub(r"((?:^- .*\n)+)", r"<details><summary>Notes</summary>\n\n\1\n</details>\n", text, flags=re.MULTILINE)
-    read = ", ".join(f"`{one}`" for one in page.shown.experiments)
-    heading = f'## <a id="{page.name}"></a>{page.shown.title.rstrip(".")}\n\n'
-    return heading + (f"Experiment: {read}.\n\n" if read else "") + text
+def _line(page: Found) -> str:
+    """A page's line of the index: its question with a link, its answer and its experiments."""
+    question = as_markdown(page.shown.question or page.shown.title.rstrip("."))
+    answer = page.shown.answer + (f" (drawn by {page.shown.drawn_by})" if page.shown.drawn_by else "")
+    experiments = ", ".join(f"`{name}`" for name in page.shown.experiments)
+    return f"| [{question}]({FOLDER}/{page.name}.md) | {as_markdown(answer)} | {experiments} |\n"

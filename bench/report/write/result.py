@@ -2,8 +2,10 @@
 
 import html
 import json
+import re
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -40,16 +42,19 @@ _LATEX = {
     "∞": r"$\infty$",
     "×": r"$\times$",
     "±": r"$\pm$",
-    "²": "$^2$",
+    **{raised: f"$^{sign}$" for raised, sign in zip("²³⁻", "23-", strict=True)},
+    "`": "'",
     "→": r"$\rightarrow$",
     "↓": r"$\downarrow$",
     "↑": r"$\uparrow$",
     "°": r"$^\circ$",
     "ρ": r"$\rho$",
+    "σ": r"$\sigma$",
     "≥": r"$\geq$",
     "≤": r"$\leq$",
     "µ": r"$\mu$",
 }
+_POWER = re.compile(r"(?<![\w.-])(-?\d+(?:\.\d+)?)e\+?(-?\d+)(?!\w)")  # such as 2.2e-5
 _MARKDOWN = str.maketrans({character: f"&#{ord(character)};" for character in "|*`[]\\"})
 
 
@@ -163,6 +168,13 @@ class Shown:
         """The verdict without stars about its numbers."""
         return self.verdict.replace("*", "")
 
+    def narrowed(self, headings: Sequence[str]) -> "Shown":
+        """The page with these columns alone, in this order."""
+        places = [self.columns.index(heading) for heading in headings]
+        rows = [[row[place] for place in places] for row in self.rows]
+        best = [[line, places.index(place)] for line, place in self.best if place in places]
+        return replace(self, columns=[*headings], rows=rows, best=best)
+
     def to_json(self) -> str:
         """Its content, a line per part; infinite numbers of a chart become null."""
         parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
@@ -240,22 +252,41 @@ def markdown(shown: Shown, name: str) -> str:
 
 
 def latex(shown: Shown, name: str) -> str:
-    """A LaTeX table environment, without the notes, no wider than the text; it needs booktabs and graphicx."""
-    aligned = "".join("l" if of_words else "r" for of_words in _of_words(shown))
-    cells = [map(_tex, shown.columns), *_emphasised(shown, _tex, r"\textbf{{{}}}")]
-    head, *rows = (rf"{' & '.join(row)} \\" for row in cells)
+    """A LaTeX table environment under the title, no larger than the page, with rules between groups of its lines.
+
+    A group has the same text in the first column, where it is written once, or the second. The caption is a comment.
+    """
+    cells = _emphasised(shown, _tex, r"\textbf{{\boldmath {}}}")
+    columns = [[row[place] for row in shown.rows] for place in range(len(shown.columns))]
+    for place, texts in enumerate(columns[:2]):
+        begins = [line for line, text in enumerate(texts) if line == 0 or text != texts[line - 1]]
+        if 1 < len(begins) <= len(texts) / 2 and (place == 0 or len(begins) == len({*texts})):
+            for line, row in enumerate(cells):
+                row[0] = ("\\midrule\n" if line in begins[1:] else "") + (row[0] if place or line in begins else "")
+            break
+    head, *rows = (rf"{' & '.join(row)} \\" for row in (map(_tex_heading, shown.columns, columns), *cells))
     lines = [
+        rf"% Page {name} of bench.report; the .md has its notes. Needs the packages array, booktabs and graphicx.",
+        rf"% {_tex(f'{shown.head} {shown.caption}')}",
         r"\begin{table*}",
         r"\centering",
-        rf"\caption{{{_tex(shown.title)} {_tex(f'{shown.head} {shown.caption}')}}}",
-        rf"\label{{tab:{name}}}",
+        rf"\caption{{{_tex(shown.title)}}}",
+        rf"\label{{tab:{name}}}\smallskip",
+        r"\resizebox*{!}{\ifdim\totalheight>0.9\textheight0.9\textheight\else\totalheight\fi}{%",
         r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
-        rf"\begin{{tabular}}{{{aligned}}}",
+        rf"\begin{{tabular}}{{{''.join(map(_aligned, columns))}}}",
         *(r"\toprule", head, r"\midrule", *rows, r"\bottomrule"),
-        r"\end{tabular}}",
+        r"\end{tabular}}}",
         r"\end{table*}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _aligned(cells: list[str]) -> str:
+    """The LaTeX alignment of a column: left where most cells begin with a letter, in lines where they are long."""
+    if any(len(cell) > 60 for cell in cells):
+        return r">{\raggedright\arraybackslash}p{0.4\textwidth}"
+    return "l" if 2 * sum(bool(re.match(r"\W*[^\W\d]", cell)) for cell in cells) > len(cells) else "r"
 
 
 def _emphasised(shown: Shown, escaped: Callable[[str], str], bold: str) -> list[list[str]]:
@@ -276,7 +307,16 @@ def _of_words(shown: Shown) -> list[bool]:
 
 
 def _tex(text: str) -> str:
-    return _flat(text).translate(str.maketrans(_LATEX))
+    """A text as LaTeX, a dash where there is none."""
+    escaped = _flat(text).translate(str.maketrans(_LATEX))
+    return "--" if text in ("", "N/A") else _POWER.sub(r"$\1\\times10^{\2}$", escaped)
+
+
+def _tex_heading(heading: str, cells: list[str]) -> str:
+    """A heading as LaTeX, in lines where it is longer than the cells below."""
+    lines = textwrap.wrap(_flat(heading), max([12, *map(len, cells)]), break_long_words=False)
+    text, side = r" \\ ".join(map(_tex, lines)), "lr"[_aligned(cells) == "r"]
+    return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}" if lines[1:] else text
 
 
 def as_markdown(text: str) -> str:
