@@ -1,6 +1,6 @@
 """A line per row with medians, failures and costs, and a figure with a point per run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,9 +8,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.records import format, metrics
-from bench.report.data.records import Record, Row, family, index
+from bench.report.data.records import Record, Row, RunKey, by_shape, error, family, index, run_key
 from bench.report.data.runs import Runs
-from bench.report.data.statistics import median
+from bench.report.data.statistics import Interval, median, ratio
 from bench.report.write import chart
 from bench.report.write.table import Column, text
 
@@ -54,6 +54,19 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
         failed = f"{(~own.ok).sum()} of {len(own)}"
         lines.append({"method": row, "preset": preset, "runs": len(own), **found, "failed": failed, **costs})
     return lines
+
+
+def errors_of(runs: Iterable[Record], metric: str) -> dict[RunKey, float]:
+    """The error of each run; infinite for a failed one."""
+    return {run_key(record): error(record, metric) for record in runs}
+
+
+def paired_ratio(errors: Mapping[RunKey, float], others: Mapping[RunKey, float]) -> Interval | None:
+    """The ratio of the errors to others over the runs that both have; None without any."""
+    both = sorted(set(errors) & set(others), key=str)
+    if not both:
+        return None
+    return ratio(*(by_shape({key: values[key] for key in both}) for values in (errors, others)))
 
 
 def cost(runs: Runs) -> dict[str, pd.Series]:

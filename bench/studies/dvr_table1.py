@@ -1,6 +1,5 @@
 """Table 1 and Figs. 4 and 5 of DVR: shape from one image, by what the training may know."""
 
-from collections.abc import Iterable
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -9,16 +8,14 @@ from bench.report.data.records import (
     SHAPENET,
     Record,
     Row,
-    RunKey,
     by_shape,
     error,
     grouped,
     median_of_known,
     row_of,
-    run_key,
     setting,
 )
-from bench.report.data.statistics import Interval, ratio, typical
+from bench.report.data.statistics import typical
 from bench.report.study import Result, Runs, Selection, compare, format, gallery, medians, table
 
 PLACE = 41
@@ -89,28 +86,15 @@ def make(runs: Runs) -> Result:
 def _lines_of(runs: Runs, family: str) -> list[dict[str, Any]]:
     """A line per row of one family, with its ratio to the row of each of `BASELINES` under that preset."""
     own = runs.where(runs.frame.family == family).made
-    errors = {row: _errors_of(records) for row, records in own.rows().items()}
+    errors = {row: medians.errors_of(records, "chamfer_l1") for row, records in own.rows().items()}
     others = {row: values for row, values in errors.items() if row.preset in BASELINES}
     return [
         line
         | {"family": family, "interval": typical(by_shape(errors[row]))}
         | {"training": median_of_known(setting(record, "seconds", "training") for record in records)}
-        | {other.preset: _over(errors[row], values) for other, values in others.items() if other != row}
+        | {other.preset: medians.paired_ratio(errors[row], values) for other, values in others.items() if other != row}
         for line, (row, records) in zip(medians.medians(own, MEDIANS), own.rows().items(), strict=True)
     ]
-
-
-def _errors_of(records: Iterable[Record]) -> dict[RunKey, float]:
-    """The Chamfer-L1 of each run; infinite for a failed one."""
-    return {run_key(record): error(record, "chamfer_l1") for record in records}
-
-
-def _over(errors: dict[RunKey, float], others: dict[RunKey, float]) -> Interval | None:
-    """The ratio of the errors to others over the runs that both have; None without any."""
-    both = sorted(set(errors) & set(others), key=str)
-    if not both:
-        return None
-    return ratio(*(by_shape({key: values[key] for key in both}) for values in (errors, others)))
 
 
 def _verdict(family: str, lines: list[dict]) -> str:

@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, conditions, format, records, statistics
+from bench.report.study import Result, Runs, Selection, chart, conditions, format, medians, records, statistics
 
 PLACE = 50
 CONDITIONS = (
@@ -56,16 +56,11 @@ def draw(lines: Sequence[dict[str, Any]]) -> Figure:
 def _changes(lines: Sequence[dict[str, Any]]) -> dict[float, statistics.Interval]:
     """By the value of a condition, the ratio of a method's errors to those of the same runs where the value is 1."""
     errors = {
-        at: {records.run_key(run): records.error(run, records.ONE_WAY) for line in own for run in line["runs"]}
-        for at, own in sorted(records.grouped(lines, lambda line: line["at"]).items())
+        value: medians.errors_of((run for line in own for run in line["runs"]), records.ONE_WAY)
+        for value, own in sorted(records.grouped(lines, lambda line: line["at"]).items())
     }
-    usual = errors.get(1.0, {})
-    both = {at: [run for run in own if run in usual] for at, own in errors.items()}
-    return {
-        at: statistics.ratio(*(records.by_shape({run: of[run] for run in runs}) for of in (errors[at], usual)))
-        for at, runs in both.items()
-        if runs
-    }
+    ratios = {value: medians.paired_ratio(own, errors.get(1.0, {})) for value, own in errors.items()}
+    return {value: ratio for value, ratio in ratios.items() if ratio}
 
 
 def _verdict(runs: Runs) -> str:

@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.data.runs import together
-from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table
+from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table, together
 from bench.report.write.caption import undefined
 
 PLACE = 80

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.report.data.runs import together
-from bench.report.study import Result, Runs, Selection, chart, format, table
+from bench.report.study import Result, Runs, Selection, chart, format, table, together
 from bench.report.suite import standing
 from bench.report.suite.attempts import EXPERIMENT, GIVEN, gather, place, suite
 from bench.report.suite.standing import ALPHA, AREA, AT_1, AT_10, AT_SECONDS, BUDGETS, END, OUTCOMES, Ranking, Standing

@@ -73,7 +73,7 @@ def _verdict(runs: Runs) -> str:
         for record in runs.records
         if _requested(record) == least and record["status"] == "ok"
     }
-    chain = [steps[preset] for preset in list(PUBLISHED)[:-1] if preset in steps]
+    chain = [steps.get(preset, ("", None)) for preset in list(PUBLISHED)[:-1]]
     saved = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
     if not saved:
         return format.ends(f"A step at {least} pixels", dict(steps.values()), "one shape", show=format.seconds)

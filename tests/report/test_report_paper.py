@@ -196,6 +196,12 @@ def test_table_1_says_what_a_strategy_saves_and_has_the_published_numbers_at_the
     assert [published.words(line) for line in page.lines] == ["", "", "6.06M", "1.99M"]
 
 
+def test_a_strategy_whose_forerunner_is_missing_is_not_credited_with_what_both_save(tmp_path):
+    for label, seconds in ((NAIVE, 9.0), (DYNAMIC, 1.5)):
+        write_run(tmp_path, "table1", label, metrics=costs(step_seconds=seconds))
+    assert "factors" not in page_of(tmp_path, "table1").verdict
+
+
 def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
     write_run(tmp_path, "table1", NAIVE, metrics=costs(), notes=["loaded machine: threads waited 31% of their time"])
     write_run(tmp_path, "table1", DYNAMIC, metrics=costs())

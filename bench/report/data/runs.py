@@ -17,9 +17,8 @@ from bench.report.data.kept import KEPT, NO_ATTEMPTS
 from bench.report.data.records import SCALE, Record, Row, doubtful, family, grouped, index, row_of, setting, solid, view
 
 MACHINE = ("cpu", "device", "threads")
-ROW_SETTINGS = (
-    "prior.truncation",
-)  # in which rows of one table may differ, as an error against the truth compares them
+# Rows of one table may differ in these: an error against the truth compares them.
+ROW_SETTINGS = ("prior.truncation",)
 
 
 @dataclass(frozen=True)
