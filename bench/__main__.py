@@ -9,31 +9,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from bench.records.folder import Identity
+    from bench.records.read import Plan
 
 
 def main() -> int:
     """Runs the command line; 0 if every run ended ok."""
-    from bench.run.command import FAILED, command_line
-    from bench.run.sweep import Sweep
+    from bench.run.command import command_line
+    from bench.run.run import run_one
+    from bench.run.sweep import run_sweep
 
-    statuses: list[str] = []
+    return command_line(run_one, lambda composer, config: run_sweep(composer, config, _summarise))
 
-    def one(run: Identity) -> None:  # in a sweep with a launcher this runs in other processes, on a copy
-        from bench.run.run import run_cell
 
-        statuses.append(run_cell(run))
+def _summarise(plan: Plan) -> list[str]:
+    """Writes and prints what a sweep came to; gives the status of each of its cells."""
+    from bench.report.sweeps import write_sweep
+    from bench.report.write.html import write_index
+    from bench.run.summary import show_sweep
 
-    code = command_line(one)
-    if (plan := Sweep.plan) is not None:  # also after Ctrl-C: what was run stands there
-        Sweep.end()
-        from bench.report.sweeps import write_sweep
-        from bench.report.write.html import write_index
-        from bench.run.summary import show_sweep
-
-        table = write_sweep(plan)
-        statuses = show_sweep(plan, write_index(plan.results_dir), table)
-    return code or (FAILED if any(status != "ok" for status in statuses) else 0)
+    table = write_sweep(plan)
+    return show_sweep(plan, write_index(plan.results_dir), table)
 
 
 def console() -> int:

@@ -8,14 +8,13 @@ from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from enum import StrEnum
 from importlib import import_module
 from inspect import Parameter, getdoc, signature
-from pathlib import Path
 from types import UnionType
 from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hints
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.tables import LABEL, LOOK, ROWS, choice, names, nearest, register_resolvers, register_rows
+from bench.tables import LABEL, LOOK, ROWS, choice, names, nearest, register_resolvers
 
 LEAST = {
     "seed": 0,
@@ -131,24 +130,6 @@ class Config:
     rerun: Rerun = MISSING
     plan: bool = MISSING
     verbose: bool = MISSING
-
-
-def register(*folders: Path) -> None:
-    """Makes known to Hydra the schema that conf/config.yaml uses, the rows of tables, and what values may ask for.
-
-    Args:
-        folders: of the user's, whose tables have more rows.
-
-    Raises:
-        ValueError: for a table that cannot be read.
-    """
-    from hydra.core.config_store import ConfigStore  # only here: runs do without Hydra
-
-    store = ConfigStore.instance()
-    store.store(name="schema", node=Config)
-    vars(store)["__deepcopy__"] = lambda _: store  # Hydra copies it, with all rows, for each composition
-    register_rows(folders)
-    register_resolvers()
 
 
 def check(config: Mapping[str, Any], overrides: Sequence[str]) -> None:

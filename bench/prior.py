@@ -6,25 +6,30 @@ from bench.records.folder import Identity
 from bench.run.command import command_line
 
 
+def train(run: Identity) -> None:
+    """Finds or trains the prior; prints its path.
+
+    Raises:
+        ValueError: for what cannot be trained.
+    """
+    from bench.machine.environment import flushing_denormals
+    from bench.progress import run_progress
+    from bench.setup.inputs import cell_of
+    from bench.shape_prior import PriorSettings, prior_file
+
+    inputs = cell_of(run.config).inputs
+    choice = inputs.prior_choice
+    if not isinstance(choice.source, PriorSettings):
+        raise ValueError("the codes of a network are the prior already: there is nothing to train")
+    inputs.check_prior()
+    with flushing_denormals(), run_progress("prior") as progress:
+        path = prior_file(choice.dataset, choice.source, inputs.cache, inputs.device, progress)
+    print(path)
+
+
 def main() -> int:
-    """Finds or trains the prior; prints its path."""
-
-    def train(run: Identity) -> None:
-        from bench.machine.environment import flushing_denormals
-        from bench.progress import run_progress
-        from bench.setup.inputs import cell_of
-        from bench.shape_prior import PriorSettings, prior_file
-
-        inputs = cell_of(run.config).inputs
-        choice = inputs.prior_choice
-        if not isinstance(choice.source, PriorSettings):
-            raise ValueError("the codes of a network are the prior already: there is nothing to train")
-        inputs.check_prior()
-        with flushing_denormals(), run_progress("prior") as progress:
-            path = prior_file(choice.dataset, choice.source, inputs.cache, inputs.device, progress)
-        print(path)
-
-    return command_line(train, runs=False)
+    """Trains what the command line describes; gives the exit status."""
+    return command_line(train)
 
 
 if __name__ == "__main__":

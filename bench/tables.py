@@ -13,9 +13,10 @@ that dimension, of the Sobol point whose number is `draw`. An experiment sweeps 
 spaces but those.
 """
 
-import importlib.util
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from math import inf
@@ -37,83 +38,118 @@ DROPPED = ("base", "space", "chosen")  # keys of a row that are no part of what 
 LABEL, ROWS = "_label_", "_rows_"  # of a renderer: its name in tables; the place of its row by experiment
 DRAWS, DIMENSIONS = 64, 8  # of the Sobol points that search spaces are drawn from
 SCRAMBLE = 1610  # seed with which no two of the first five dimensions correlate by 0.1 over the first 16 points
+HEADER = re.compile(r"\s*#\s*@package\s+(\S+)")  # the first line of a file whose keys stand elsewhere
 MANY = 20  # names, beyond which a message leaves variants out
 ALL = 100  # and beyond which it names none
 Node = dict[str, Any]
 
 
-def register_rows(folders: Sequence[Path] = ()) -> None:
-    """Makes the rows of our tables choices of their groups, and those of the same tables in other folders.
+@dataclass(frozen=True)
+class Choice:
+    """A file or a row of a group: where it stands, what a row holds, and the package in which Hydra sets its keys."""
 
-    Rows of folders of an earlier call are choices no more.
+    path: Path
+    row: Node | None = None
+    package: str | None = None
+
+    @property
+    def content(self) -> Node:
+        """What it holds by itself; read-only."""
+        return read_yaml(self.path) if self.row is None else self.row
+
+    def load(self) -> tuple[DictConfig, str | None]:
+        """Its content as Hydra merges it, and the package of its keys.
+
+        Raises:
+            ValueError: for a file that cannot be read, or of an experiment or a method without its first line.
+        """
+        if self.row is not None:
+            look = (LOOK,) if self.package else ()  # which would be a key of the top level
+            return OmegaConf.create({key: self.row[key] for key in self.row if key not in look}), self.package
+        node, package = _loaded(self.path, _text(self.path))
+        if self.package is not None and package != self.package:
+            raise ValueError(
+                f"{self.path} must begin with the line # @package {self.package}: its keys are those of the top level"
+            )
+        return deepcopy(node), package
+
+
+@cache
+def _loaded(path: Path, text: str) -> tuple[DictConfig, str | None]:
+    """The content of a file, and the package that its first lines name."""
+    header = HEADER.match(text)
+    try:
+        node = OmegaConf.create(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    if not isinstance(node, DictConfig):
+        raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
+    return node, header and header[1]
+
+
+_LISTED: dict[str, dict[str, Choice]] = {}  # by group and name: of conf, and of the folders of this command
+_FOLDERS: list[Path] = []  # of the user's, in this command
+
+
+def register_rows(folders: Sequence[Path] = ()) -> None:
+    """Lists the files and rows of conf, and of the user's folders; what an earlier call listed is listed no more.
 
     Raises:
         ValueError: for a table that cannot be read, and for a row or file of another folder with the name of ours.
     """
-    while _REPLACED:
-        group, key, before = _REPLACED.pop()
-        _stored(group).pop(key)
-        _stored(group).update({} if before is None else {key: before})
-    for folder in (CONF, *folders):
-        for table, group in GROUPS.items():
-            if not (path := folder / f"{table}.yaml").is_file():
-                continue
-            if folder == CONF:
-                _store_ours(path, group, _text(path))
-                continue
-            for of, name, _ in _rows_of(path, group, _text(path)):
-                if of != TUNED and name in names(of):  # settings that were tuned again are meant to take the place
-                    raise ValueError(f"{path}: {name} is a {group} of {CONF} already: give the row another name")
-                _REPLACED.append((of, f"{name}.yaml", _stored(of).get(f"{name}.yaml")))
-            _store(path, group, _text(path))
-        for group in GROUPS.values() if folder != CONF else ():
-            for file in sorted((folder / group).glob("*.yaml")):
-                if group != TUNED and file.stem in read_rows(CONF)[group]:
-                    raise ValueError(f"{file}: {file.stem} is a row of {CONF} already: give the file another name")
+    _FOLDERS[:] = folders
+    _LISTED.clear()
+    _LISTED.update({group: {**choices} for group, choices in _ours().items()})
+    for group, name, choice in (
+        (group, name, choice)
+        for folder in folders
+        for group, choices in choices_of(folder).items()
+        for name, choice in choices.items()
+    ):
+        ours = _LISTED.setdefault(group, {}).get(name)
+        if ours is None or group == TUNED:  # settings that were tuned again are meant to take the place of ours
+            _LISTED[group][name] = choice
+        elif ours.row is not None or choice.row is not None:
+            what = "file" if choice.row is None else "row"
+            raise ValueError(f"{choice.path}: {name} is a {group} of {CONF} already: give the {what} another name")
 
 
-_REPLACED: list[tuple[str, str, Any]] = []  # rows of other folders: group, key, and what stood there before
+def listed(group: str) -> dict[str, Choice]:
+    """The choices of a group by name, those of the user's folders among them; empty where it is no group."""
+    return _LISTED.get(group, {})
 
 
-def _stored(group: str) -> dict[str, Any]:
-    """What Hydra keeps of a group."""
-    from hydra.core.config_store import ConfigStore  # only here: runs do without Hydra
-
-    place = ConfigStore.instance().repo
-    for part in group.split("/"):
-        place = place.setdefault(part, {})
-    return place
+def folders() -> list[Path]:
+    """The user's folders of configurations."""
+    return [*_FOLDERS]
 
 
-def _store(path: Path, group: str, text: str) -> None:
-    from hydra.core.config_store import ConfigNode
-
-    for of, name, node in _rows_of(path, group, text):
-        whole = of.startswith(METHOD) or node == {group: None}
-        kept = OmegaConf.create({key: value for key, value in node.items() if key != LOOK or not whole})
-        _stored(of)[f"{name}.yaml"] = ConfigNode(f"{name}.yaml", kept, of, "_global_" if whole else None, None)
-
-
-_store_ours = cache(_store)
-
-
-def read_rows(folder: Path) -> dict[str, dict[str, Node]]:
-    """The rows of a folder's tables by group and name, each as a file of its group would hold it; read-only.
+def choices_of(folder: Path) -> dict[str, dict[str, Choice]]:
+    """The files and rows of a folder, by group and name.
 
     Raises:
         ValueError: for a table that cannot be read.
     """
-    found: dict[str, dict[str, Node]] = {group: {} for group in (*GROUPS.values(), SPACE)}
-    for table, group in GROUPS.items():
+    groups: dict[str, dict[str, Choice]] = {group: {} for group in (*GROUPS.values(), SPACE)}
+    files = [*folder.glob("*/*.yaml"), *folder.glob("hydra/*/*.yaml"), *folder.glob(f"{METHOD}/*/*.yaml")]
+    for path in sorted([*files, *(folder.glob("config.yaml") if folder == CONF else ())]):
+        group = path.parent.relative_to(folder).as_posix().removeprefix(".")
+        package = "_global_" if group.startswith((METHOD, "experiment")) else None
+        groups.setdefault(group, {})[path.stem] = Choice(path, package=package)
+    for table, table_group in GROUPS.items():
         path = folder / f"{table}.yaml"
-        for of, name, node in _rows_of(path, group, _text(path)) if path.is_file() else ():
-            found[of][name] = node
-    return found
+        for group, name, node in _rows_of(path, table_group, _text(path)) if path.is_file() else ():
+            whole = group.startswith(METHOD) or node == {group: None}
+            groups[group][name] = Choice(path, node, "_global_" if whole else None)
+    return groups
+
+
+_ours = cache(lambda: choices_of(CONF))
 
 
 def names(group: str) -> list[str]:
     """The names of all choices of a group in conf, files and rows."""
-    return sorted({path.stem for path in (CONF / group).glob("*.yaml")} | set(read_rows(CONF).get(group, ())))
+    return sorted(_ours().get(group, ()))
 
 
 def choice(group: str, name: str) -> Node:
@@ -123,8 +159,7 @@ def choice(group: str, name: str) -> Node:
         KeyError: where there is no such choice.
     """
     group, _, name = f"{group}/{name}".rpartition("/")
-    path = CONF / group / f"{name}.yaml"
-    return read_yaml(path) if path.is_file() else read_rows(CONF).get(group, {})[name]
+    return _ours()[group][name].content
 
 
 def read_yaml(path: Path) -> Node:
@@ -241,36 +276,35 @@ def register_resolvers() -> None:
     OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
 
 
-def own_row(renderer: dict[str, Any], choice: str, runtime: DictConfig) -> dict[str, Any]:
+def own_row(renderer: dict[str, Any], choice: str) -> dict[str, Any]:
     """A resolved `renderer` node without `_rows_`, its look, and a `_label_` inherited from what it builds on.
 
     Args:
         choice: the name of its file or row.
-        runtime: `hydra.runtime`, which has the folders of configurations.
     """
-    own = _choices("renderer", runtime).get(choice, {})
-    dropped = {ROWS, LOOK, LABEL} if "defaults" in own and LABEL not in own else {ROWS, LOOK}
+    content = listed("renderer")[choice].content if choice in listed("renderer") else {}
+    dropped = {ROWS, LOOK, LABEL} if "defaults" in content and LABEL not in content else {ROWS, LOOK}
     return {key: value for key, value in renderer.items() if key not in dropped}
 
 
-def renderers_of(experiment: str, runtime: DictConfig) -> list[str]:
+def renderers_of(experiment: str) -> list[str]:
     """The renderers that have a row in an experiment, in the order of their places, then by name."""
-    places = {}
-    for name, own in _choices("renderer", runtime).items():
-        place = own.get(ROWS, {experiment: inf}).get(experiment)
-        if place is not None and own.get("_target_") != MISSING:  # custom: its class is on the command line
-            places[name] = place
-    return sorted(places, key=lambda name: (places[name], name))
+    ranks = {}
+    for name, choice in listed("renderer").items():
+        rank = choice.content.get(ROWS, {experiment: inf}).get(experiment)
+        if rank is not None and choice.content.get("_target_") != MISSING:  # custom: its class is on the command line
+            ranks[name] = rank
+    return sorted(ranks, key=lambda name: (ranks[name], name))
 
 
 def _rows(experiment: str, *, _root_: DictConfig) -> str:
-    runtime = _root_.hydra.runtime
-    if runtime.choices.get("method") is not None:  # a method sets its renderer
-        return runtime.choices["renderer"]
-    return ",".join(renderers_of(experiment, runtime))
+    choices = _root_.hydra.runtime.choices
+    if choices.get("method") is not None:  # a method sets its renderer
+        return choices["renderer"]
+    return ",".join(renderers_of(experiment))
 
 
-def _spaces(*without: str, _root_: DictConfig) -> str:
+def _spaces(*without: str) -> str:
     """The spaces of the methods with a search space, to be swept over.
 
     Args:
@@ -279,7 +313,7 @@ def _spaces(*without: str, _root_: DictConfig) -> str:
     Raises:
         ValueError: for such a name that has no search space.
     """
-    spaces = _choices(SPACE, _root_.hydra.runtime)
+    spaces = listed(SPACE)
     if unknown := {*without} - {*spaces}:
         raise ValueError(f"${{spaces:...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
     return ",".join(f"space/{name}" for name in sorted(spaces) if name not in without)
@@ -287,7 +321,7 @@ def _spaces(*without: str, _root_: DictConfig) -> str:
 
 def _prior_kind(of: str | None, own: str) -> str:
     """A key of `scale.priors`: the kind of prior of the run's dataset, or of the one that `prior.of` names."""
-    return own if of is None else str(read_rows(CONF)["dataset"].get(of, {}).get("_prior_", "own"))
+    return own if of is None else str(choice("dataset", of).get("_prior_", "own") if of in names("dataset") else "own")
 
 
 def _stem(path: str | None) -> str:
@@ -320,23 +354,3 @@ def sobol_points() -> list[list[float]]:
     from scipy.stats import qmc  # only here: it takes a second
 
     return qmc.Sobol(DIMENSIONS, scramble=True, rng=SCRAMBLE).random(DRAWS).tolist()
-
-
-def _choices(group: str, runtime: DictConfig) -> dict[str, Node]:
-    """What each file or row of a group holds by itself; of two with the same name, the one that Hydra takes."""
-    folders, found = [*_folders(runtime)], dict[str, Node]()
-    for folder in folders:
-        for path in sorted((folder / group).glob("*.yaml")):
-            found.setdefault(path.stem, read_yaml(path))
-    for folder in reversed(folders):
-        found = read_rows(folder)[group] | found
-    return found
-
-
-def _folders(runtime: DictConfig) -> Iterator[Path]:
-    """The folders of configurations, in the order in which Hydra searches them."""
-    for source in runtime.config_sources:
-        if source.schema == "file":
-            yield Path(source.path)
-        elif source.schema == "pkg" and (found := importlib.util.find_spec(source.path.replace("/", "."))):
-            yield from map(Path, found.submodule_search_locations or [])

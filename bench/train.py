@@ -6,30 +6,35 @@ from bench.records.folder import Identity
 from bench.run.command import command_line
 
 
+def train(run: Identity) -> None:
+    """Finds or trains the network; prints its path. A training that was stopped goes on where it was.
+
+    Raises:
+        ValueError: for what cannot be trained.
+    """
+    from bench.machine.environment import flushing_denormals
+    from bench.progress import run_progress
+    from bench.setup.inputs import cell_of
+    from bench.tasks.single_view import OneImage, told
+
+    cell = cell_of(run.config)
+    if not isinstance(cell.task, OneImage):
+        raise ValueError(
+            "bench.train trains the network of task=single_view: python -m bench.train +method=single_view "
+            "dataset=car; python -m bench.prior trains a prior"
+        )
+    with flushing_denormals(), run_progress("single_view") as progress:
+        cell.start()
+        inputs = cell.inputs
+        recipe = cell.task.recipe(inputs, run.config)
+        path = recipe.make(inputs.cache, inputs.device, progress)
+    print(told(recipe.load(path)[1]), file=sys.stderr)
+    print(path)
+
+
 def main() -> int:
-    """Finds or trains the network; prints its path. A training that was stopped goes on where it was."""
-
-    def train(run: Identity) -> None:
-        from bench.machine.environment import flushing_denormals
-        from bench.progress import run_progress
-        from bench.setup.inputs import cell_of
-        from bench.tasks.single_view import OneImage, told
-
-        cell = cell_of(run.config)
-        if not isinstance(cell.task, OneImage):
-            raise ValueError(
-                "bench.train trains the network of task=single_view: python -m bench.train +method=single_view "
-                "dataset=car; python -m bench.prior trains a prior"
-            )
-        with flushing_denormals(), run_progress("single_view") as progress:
-            cell.start()
-            inputs = cell.inputs
-            recipe = cell.task.recipe(inputs, run.config)
-            path = recipe.make(inputs.cache, inputs.device, progress)
-        print(told(recipe.load(path)[1]), file=sys.stderr)
-        print(path)
-
-    return command_line(train, runs=False)
+    """Trains what the command line describes; gives the exit status."""
+    return command_line(train)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ from beartype import BeartypeConf, beartype
 from beartype.roar import BeartypeDecorHintPep585DeprecationWarning
 from hypothesis import settings
 from jaxtyping import install_import_hook
-from omegaconf import OmegaConf
 
 CHECKED = beartype(conf=BeartypeConf(is_pep484_tower=True))  # PEP 484 takes an int where a float is asked for
 
@@ -43,28 +42,6 @@ if os.environ.get("CHECK_TYPES"):  # set by `make test-types`; the hook must sta
 
 settings.register_profile("implicit-bench", deadline=None, derandomize=True)
 settings.load_profile("implicit-bench")
-
-
-def loads_each_text_once(load: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """`OmegaConf.load`, which parses a text once and gives a copy from then on: Hydra loads 20 files for each command.
-
-    What is kept is kept by the text, not by the name of its file, so that a file that changes is read anew.
-    """
-    loaded = {}
-
-    def once(file: Any) -> Any:
-        stream = hasattr(file, "read")
-        text = file.read() if stream else Path(file).read_text(encoding="utf-8")
-        if text not in loaded:
-            if stream:
-                file.seek(0)
-            loaded[text] = load(file)  # the file itself, since an error names it
-        return deepcopy(loaded[text])
-
-    return once
-
-
-OmegaConf.load = loads_each_text_once(OmegaConf.load)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -9,25 +9,20 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from copy import deepcopy
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
 
 import bench
 import bench.studies
 from bench import tables
-from bench.config import build, check_names, register
+from bench.config import build, check_names
+from bench.records.folder import Identity
 from bench.report.__main__ import main as report
 from bench.report.write import paper
-from bench.run import library
-from bench.run.command import with_network
-from bench.run.pack import register_slurm
-from bench.tables import CONF
-from tests import composing, documentation
+from bench.run.command import config_dirs, options_of, with_network
+from bench.run.compose import Composer, composing
+from tests import documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
 from tests.run.driving import SMALLEST
 from tests.run.driving import command as typed
@@ -63,35 +58,14 @@ def made(tmp_path_factory) -> Iterator[dict[str, str]]:
         yield named
 
 
-def first_cell(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Folders of configurations that a command adds, and the overrides of its first cell."""
-    texts = [argument for argument in arguments if not argument.startswith("-")]
-    folders = []
-    if "--config-dir" in arguments:
-        folders = [arguments[arguments.index("--config-dir") + 1]]
-        texts.remove(folders[0])
-    parsed = OverridesParser.create().parse_overrides(texts)
-    cells = [
-        f"{one.get_key_element()}={next(iter(one.sweep_string_iterator()))}" if one.is_sweep_override() else text
-        for one, text in zip(parsed, texts, strict=True)
-    ]
-    return folders, cells
-
-
-def composed(arguments: list[str]) -> DictConfig:
-    """The configuration of a command's first cell."""
-    register()
-    register_slurm()
-    folders, overrides = first_cell(arguments)
-    extra = [f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in folders)}]"] if folders else []
-    spaces = any("method=space/" in override for override in overrides)
-    draw = (
-        ["draw=0"] if spaces and not any("draw=" in override for override in overrides) else []
-    )  # tuning sweeps over it
-    if not extra:
-        return deepcopy(composing.composed(*overrides, *draw))
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=[*overrides, *draw, *extra])
+def first_cell(arguments: list[str]) -> Identity:
+    """The first cell of a command."""
+    options = options_of(arguments)
+    with composing(*config_dirs(options)):
+        composer = Composer(with_network(options.overrides))
+        cell = composer.swept(composer.whole())[0]
+        spaces, drawn = (any(word in text for text in cell) for word in ("method=space/", "draw="))
+        return composer.cells([[*cell, "draw=0"] if spaces and not drawn else cell])[0]
 
 
 def test_every_command_is_there():
@@ -109,11 +83,10 @@ def test_every_command_composes(made):
         arguments = filled(command, made)
         if "+experiment=sofa" in arguments:  # stands for any, which the tests of conf compose
             continue
-        config = composed(with_network(list(arguments)))
+        config = first_cell(arguments).config
         check_names(config)
-        OmegaConf.resolve(config)
         for part in ("renderer", "task"):  # of others, the tests of conf build every choice
-            build(config[part], part, list(config.packages))
+            build(config[part], part, config["packages"])
 
 
 def test_every_link_leads_to_a_file_and_a_heading():
@@ -137,15 +110,12 @@ def test_every_target_of_make_is_there():
     assert len(paths) > 5 and [path for path in paths if not (ROOT / path).exists()] == []
 
 
-@pytest.mark.parametrize("place", range(2))
-def test_the_code_of_the_readme_runs(tmp_path, monkeypatch, capsys, place):
+def test_the_code_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(library, "_command", lambda arguments: typed(*arguments, *SMALL))
-    code = code_of("README.md", "python")
-    assert len(code) == 2
-    exec(compile(code[place], "README.md", "exec"), {})
-    said = capsys.readouterr().out
-    assert ("hits" in said and "gradient" in said) if place == 0 else ("Newton" in said and "chamfer_l2" in said)
+    (code,) = code_of("README.md", "python")
+    exec(compile(code, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "hits" in printed and "gradient" in printed
 
 
 @pytest.fixture(scope="module")
@@ -194,20 +164,17 @@ def test_the_study_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
 
 def cell_of(command: Command, made: dict[str, str]) -> list[str]:
     """The first cell of a command, on this machine."""
-    arguments = filled(command, made)
-    folders, asked = first_cell([a for a in arguments if not a.startswith("hydra")])
-    method = any(a.startswith("+method=") for a in asked)
-    if "-m" in arguments and (name := next((a for a in asked if a.startswith("+experiment=")), "")):
-        register()
-        paths = [f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in folders)}]"] if folders else []
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            params = compose("config", [name, "scale=smoke", *paths], return_hydra_config=True).hydra.sweeper.params
-        _, swept = first_cell([f"{key}={value}" for key, value in params.items()])
-        given = [text.partition("=")[0] for text in asked]
-        swept = ["renderer=dist" if text.startswith("renderer=") else text for text in swept]  # the first is slow
-        swept = [text for text in swept if not (method and text.startswith("renderer="))]
-        asked += [text for text in swept if text.partition("=")[0] not in given]
-    return [*(word for folder in folders for word in ("--config-dir", folder)), *asked]
+    options = options_of([text for text in filled(command, made) if not text.startswith("hydra")])
+    typed = [text.partition("=")[0] for text in options.overrides]
+    with composing(*config_dirs(options)):
+        composer = Composer([*options.overrides, "scale=smoke"] if options.multirun else options.overrides)
+        swept = composer.swept(composer.whole())[0] if options.multirun else options.overrides
+    quick = [
+        "renderer=dist" if text.startswith("renderer=") and "renderer" not in typed else text  # the first is slow
+        for text in swept
+        if not (text.startswith("renderer=") and "renderer" not in typed and "+method" in typed)
+    ]
+    return [*(word for folder in config_dirs(options) for word in ("--config-dir", str(folder))), *quick]
 
 
 @pytest.mark.slow

@@ -34,7 +34,8 @@ COMMANDS = (
     "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune",
     "bench.turntable", "bench.verify",
 )  # fmt: skip
-DRIVING = ("__main__", "records/folder", "run/command", "run/run")  # no run imports these, which decide what is run
+# No run imports these, which decide what is run.
+DRIVING = ("__main__", "records/folder", "run/command", "run/process", "run/run")
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}

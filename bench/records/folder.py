@@ -5,7 +5,7 @@ import importlib.util
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -24,7 +24,7 @@ PASSIVE = (
     *("bench/report", "bench/studies"),
     *(f"bench/{name}.py" for name in ("judge", "merge", "photos", "prior", "progress", "suite", "trackers", "train")),
     *(f"bench/{name}.py" for name in ("tune", "turntable", "verify")),
-    *(f"bench/run/{name}.py" for name in ("compose", "library", "pack", "plan", "summary", "sweep")),
+    *(f"bench/run/{name}.py" for name in ("compose", "executors", "jobs", "library", "plan", "summary", "sweep")),
     *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )
@@ -88,33 +88,32 @@ class Identity:
         return digest([_our_code(), *(_package(name) for name in users), *files])
 
 
-def resolved(config: DictConfig, runtime: DictConfig) -> dict[str, Any]:
+def resolved(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, Any]:
     """A composed configuration as plain data; missing values are kept, as an error of the run that its record reports.
 
     Args:
         config: without Hydra's own node.
-        runtime: `hydra.runtime`, which has the names of the chosen YAMLs.
+        choices: the names of the chosen files and rows, by group.
 
     Raises:
         ValueError: where the command line removes a part that every run has, or sets a draw that nothing asks for.
     """
     check_draw(config)
     for part in ("task", "renderer", "dataset"):
-        if part not in runtime.choices:
+        if part not in choices:
             raise ValueError(f"every run needs one {part}: remove ~{part} or a list; several are -m {part}=A,B")
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     if isinstance(values.get("renderer"), dict):
-        values["renderer"] = own_row(values["renderer"], str(runtime.choices["renderer"]), runtime)
+        values["renderer"] = own_row(values["renderer"], str(choices["renderer"]))
     return values
 
 
-def identify(values: dict[str, Any], runtime: DictConfig, overrides: Sequence[str]) -> Identity:
+def identify(values: dict[str, Any], choices: Mapping[str, Any], overrides: Sequence[str]) -> Identity:
     """The run that a configuration describes, as `resolved` gives it, after all checks of it that need no torch.
 
     Raises:
         ValueError: for an invalid value.
     """
-    choices = runtime.choices
     seen = choices["dataset"] if choices.get("stress", NO_STRESS) == NO_STRESS else choices["stress"]
     named = {"task": choices["task"], "renderer": choices["renderer"], "dataset": seen}
     named["method"] = choices.get("method") or ""

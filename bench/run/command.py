@@ -1,36 +1,30 @@
-"""The command line: Hydra underneath, with one clear line for every mistake."""
+"""The command line: what is typed becomes a run or a sweep, and every mistake one clear line."""
 
 import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from argparse import ArgumentError, ArgumentParser, Namespace
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import hydra
-from hydra import compose, initialize_config_dir
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import get_args_parser
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.config import register, type_of, wrong_type
-from bench.records.folder import Identity, identify, resolved
-from bench.run.compose import parsed
-from bench.run.pack import register_slurm
-from bench.run.plan import Shown
+from bench.config import type_of
+from bench.progress import notice
+from bench.records.folder import Identity
+from bench.run.compose import NOT_BY_DEFAULT, Composer, composing, parsed, without_hydra
+from bench.run.job import Interrupted, unwritten
 from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
-from bench.run.sweep import Refused, Sweep
-from bench.tables import CONF, names, nearest, register_resolvers
-from datasets.extras import install
+from bench.run.sweep import LauncherStopped, do_each
+from bench.tables import names, nearest
 
 COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
 SETTING = re.compile(r"(\+*(\w+))=(.+)", re.DOTALL)  # of the top level: before its value, its key, its value
-CHOICE = re.compile(r"(\w+)=(\w+)")  # of one YAML of a group
 GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale")  # that `list` shows
 HELP = """
     python -m bench task=completion renderer=dist                          one run
@@ -43,77 +37,100 @@ HELP = """
     python -m bench.report                                                 tables, figures and results/local/index.html
 
 Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.
---cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML; --hydra-help is Hydra's own."""
+--cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML."""
 USAGE = 2  # exit status of a wrong command line
 FAILED = 1
 AS_TYPED = {"dataset.path: ": "field_path: ", "dataset.module.": "field."}  # with field=file; see `with_network`
-EXTRAS = {"joblib": "joblib", "submitit": "submitit", "ray": "ray"}  # by the beginning of a launcher's name
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 KERNELS = "IMPLICIT_BENCH_KERNELS"  # see renderers/kernels/library.py, whose import takes that of torch
+SWEEP = ("--multirun", "-m")
+OPTIONS = (*SWEEP, "--config-dir", "-cd", "--cfg", "-c", "--resolve", "--help", "-h")
+Job = Callable[[Identity], object]  # does what a configuration describes, and gives the status where that is a run
+Sweep = Callable[[Composer, DictConfig], list[str]]  # makes the runs of a sweep, and gives their statuses
 
 
-def command_line(job: Callable[[Identity], None], *, runs: bool = True) -> int:
-    """Composes the configuration of the command line and gives what it describes to `job`, in a sweep once a cell.
+def command_line(job: Job, sweep: Sweep | None = None) -> int:
+    """Does what the command line describes.
 
     Args:
-        runs: whether the cells of a sweep are runs, so that they have a plan.
+        job: what a single configuration asks for.
+        sweep: what a sweep asks for; None does the job of each cell, which is no run.
 
     Returns:
-        the exit status: 0, or the status of a mistake that was printed on standard error.
+        the exit status: 0, 1 where a run did not end ok, or the status of a mistake that was printed on standard error.
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, to be printed in one line
-    begun: list[DictConfig] = []
-    raised: list[OSError | ValueError] = []
-
-    def guarded(config: DictConfig) -> None:
-        begun.append(config)
-        try:
-            identity = _identified(config)
-            if config.plan and not runs:
-                raise ValueError("plan=true lists runs, and this command starts none: remove it")
-            job(identity)
-            raise_if_stopped()
-        except (OSError, ValueError) as error:  # Hydra would print a line of its own about it
-            raised.append(error)
-
     if (text := _answer(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
         return _print(text)
     catch_signals()
-    Sweep.runs, typed = runs, AS_TYPED if "field=file" in sys.argv else {}
-    program = hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(guarded)
+    typed = AS_TYPED if "field=file" in sys.argv else {}
     try:
-        sys.argv[1:] = [text_as_typed(argument) for argument in with_network(options_first(sys.argv[1:]))]
-        register(*own_folders(sys.argv[1:]))
-        register_slurm()
-        with mode_of_options(sys.argv[1:]):
-            _call(program)
-        if raised:
-            raise raised[0]
+        done = _carry_out(sys.argv[1:], job, sweep)
+        raise_if_stopped()  # also where a library swallowed it
+        return 0 if done else FAILED
     except KeyboardInterrupt as error:
-        text = stopped_by(error)
-        none = Sweep.plan is None and not text.startswith("killed")  # as a run says that has left a record
-        return _tell(f"{text}; nothing was run" if none else text, INTERRUPTED)
+        return _stopped(error)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
         leave_server()
-        text = _with_file(_explain(error))
+        text = message_of(error)
         for key, short in typed.items():
             text = text.replace(key, short)
-        return _tell(text, USAGE)
+        return _tell(_with_file(text), USAGE)
     except BrokenPipeError:  # `| head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return FAILED
     except OSError as error:
-        return _tell(unwritten(error))
+        return _stopped(error) if stopped_by(error) else _tell(unwritten(error))
+    except LauncherStopped as error:
+        return _tell(str(error))
     except Exception as error:
-        what = " ".join(str(error).split())
-        if Sweep.plan is not None:  # a cluster that is not there, a worker that is lost
-            return _tell(f"the launcher stopped: {what}; the same command goes on")
-        if begun:
-            raise
-        return _tell(f"cannot compose {' '.join(sys.argv[1:])!r}: {what}", USAGE)  # Hydra, at a value of an odd type
+        if stopped_by(error):  # a library made another error of it
+            return _stopped(error)
+        raise
     finally:
         forget_signals()
-    return 0
+
+
+def _carry_out(arguments: list[str], job: Job, sweep: Sweep | None) -> bool:
+    """Composes what is typed and does it; gives whether all runs ended ok.
+
+    Raises:
+        ValueError: for what cannot be.
+    """
+    options = options_of(arguments)
+    if (kernels := os.environ.get(KERNELS)) not in (None, "", "torch", "compiled"):
+        raise ValueError(f"{KERNELS} must be torch or compiled, not {kernels!r}: unset it for compiled")
+    with composing(*config_dirs(options)):
+        composer = Composer([text_as_typed(text) for text in with_network(options.overrides)])
+        config = composer.whole()
+        if options.cfg:
+            composer.check_keys()
+            print(OmegaConf.to_yaml(without_hydra(config), resolve=options.resolve), end="")
+            return True
+        if options.multirun or config.hydra.mode == RunMode.MULTIRUN:
+            if sweep is not None:
+                return all(status == "ok" for status in sweep(composer, config))
+            _refuse_plan(config)
+            return do_each(composer, config, job)
+        params = OmegaConf.select(config, "hydra.sweeper.params")
+        os.environ |= {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
+        identity = composer.single(config)
+    if sweep is None:
+        _refuse_plan(identity.config)
+    elif params:
+        notice("note: this is one run; with -m in the command it is all runs of the table")
+    return job(identity) in (None, "ok")
+
+
+def _refuse_plan(config: Any) -> None:
+    """Raises ValueError for plan=true in a command that makes no runs."""
+    if config["plan"]:
+        raise ValueError("plan=true lists runs, and this command starts none: remove it")
+
+
+def _stopped(error: BaseException) -> int:
+    """Says by which signal a command was stopped."""
+    text = stopped_by(error)
+    return _tell(text if isinstance(error, Interrupted) else f"{text}; nothing was run", INTERRUPTED)
 
 
 def _answer(arguments: list[str], about: str) -> str | None:
@@ -135,24 +152,33 @@ def _print(text: str) -> int:
     return 0
 
 
-def options_first(arguments: list[str]) -> list[str]:
-    """The arguments with options, such as -m, before all `key=value`, as Hydra wants them.
+def options_of(arguments: list[str]) -> Namespace:
+    """The options of a command line, which may stand anywhere, and its overrides.
 
     Raises:
-        ValueError: for an unknown option.
+        ValueError: for an unknown option, and one without its value.
     """
-    parser = get_args_parser()
-    given, unknown = parser.parse_known_intermixed_args(arguments)
-    if unknown:
-        known = sorted(name for action in parser._actions for name in action.option_strings)
-        key = unknown[0].lstrip("-").partition("=")[0]
+    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument(*SWEEP, action="store_true")
+    parser.add_argument("--config-dir", "-cd")
+    parser.add_argument("--cfg", "-c", choices=("job",))
+    parser.add_argument("--resolve", action="store_true")
+    try:
+        options, unknown = parser.parse_known_intermixed_args(arguments)
+    except ArgumentError as error:
+        raise ValueError(f"{error.argument_name}: {error.message}") from error
+    for option in unknown:
+        key = option.lstrip("-").partition("=")[0]
         if key and (names(key) or type_of(key) is not None):
-            raise ValueError(f"unknown option {unknown[0]!r}: settings have no dashes, write {key}=VALUE")
-        raise ValueError(f"unknown option {unknown[0]!r}{nearest(unknown[0], known)}")
-    options = list(arguments)
-    for override in given.overrides:
-        options.remove(override)
-    return [*options, *given.overrides]
+            raise ValueError(f"unknown option {option!r}: settings have no dashes, write {key}=VALUE")
+        raise ValueError(f"unknown option {option!r}{nearest(option, sorted(OPTIONS))}")
+    return options
+
+
+def config_dirs(options: Namespace) -> list[Path]:
+    """The folder of configurations that a command adds, which may have tables."""
+    return [Path(options.config_dir)] if options.config_dir else []
 
 
 def with_network(arguments: list[str]) -> list[str]:
@@ -194,61 +220,6 @@ def text_as_typed(argument: str) -> str:
     return f"{setting[1]}={','.join(typed)}"
 
 
-def own_folders(arguments: list[str]) -> list[Path]:
-    """The folder of configurations that a command adds, which may have tables."""
-    folder = get_args_parser().parse_known_args(arguments)[0].config_dir
-    return [Path(folder)] if folder else []
-
-
-def unwritten(error: OSError, results_dir: str | None = None) -> str:
-    """One line on what could not be written, and what to do; `results_dir` is named where the error names no file."""
-    path = Path(named) if (named := error.filename or results_dir) else None
-    file = next((above for above in path.parents if above.is_file()), path) if path else None
-    where = f" ({file})" if file else ""
-    return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
-
-
-def _identified(config: DictConfig) -> Identity:
-    """The run that a configuration describes; raises ValueError for what needs no torch to be found invalid."""
-    register_resolvers()  # again, since a launcher's worker has not read the command line
-    hydra = HydraConfig.get()
-    if (asked := os.environ.get(KERNELS)) not in (None, "", "torch", "compiled"):
-        raise ValueError(f"{KERNELS} must be torch or compiled, not {asked!r}: unset it for compiled")
-    if Path(hydra.runtime.cwd) != Path.cwd():  # of such a worker
-        config.results_dir = str(Path(hydra.runtime.cwd) / config.results_dir)
-    return identify(resolved(config, hydra.runtime), hydra.runtime, hydra.overrides.task)
-
-
-def _call(program: Callable[[], None]) -> None:
-    """Calls it; where a sweep was refused, raises why, and KeyboardInterrupt also where that became another error."""
-    try:
-        program()
-        raise_if_stopped()  # also where a library swallowed it
-    except Shown:
-        return
-    except (Refused, Exception) as error:
-        if stopped := stopped_by(error):
-            raise KeyboardInterrupt(stopped) from error
-        if isinstance(error, Refused):
-            raise error.why from error.why.__cause__
-        raise
-
-
-@contextmanager
-def mode_of_options(arguments: list[str]) -> Iterator[None]:
-    """Within it, -m alone decides whether a command is a sweep, unless the command or a folder of it may set that.
-
-    Else Hydra composes the configuration once more to read `hydra.mode`, which none of ours sets.
-    """
-    asked = Hydra.get_mode
-    if not own_folders(arguments) and not any("hydra.mode" in argument for argument in arguments):
-        Hydra.get_mode = lambda *_, **__: None
-    try:
-        yield
-    finally:
-        Hydra.get_mode = asked
-
-
 def _tell(message: str, code: int = FAILED) -> int:
     if any(argument.replace(" ", "").lower() == "verbose=true" for argument in sys.argv[1:]):
         traceback.print_exc()
@@ -256,58 +227,17 @@ def _tell(message: str, code: int = FAILED) -> int:
     return code
 
 
-def _explain(error: Exception) -> str:
-    """One line that names what is wrong and, for an unknown name, the nearest known one."""
-    if isinstance(error, OverrideParseException):
-        return _unreadable(error.override)
-    chain = [error, error.__cause__, error.__context__]
-    for cause in chain:
-        if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
-            missing = str(cause.missing_cfg_file)
-            nested = missing.startswith("hydra/") or "/" not in missing
-            group, _, name = missing.rpartition("/") if nested else missing.partition("/")
-            if group == "hydra/launcher" and (extra := EXTRAS.get(name.split("_")[0])):
-                return f"this launcher needs a plugin: {install(extra)}"
-            what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
-            options = cause.options or names(group)  # Hydra has none for what a row builds on
-            known = [option for option in options if not option.startswith("_")]  # others build on these
-            own = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
-            return what + nearest(name, known) + (own if "/" in name or "." in name else "")
-    message = " ".join(str(error).split())
-    if found := re.search(r"In '(experiment|method)/([^']+)'.* full_key: \1\b|@(experiment|method)\.", message):
-        file = f"{found[1]}/{found[2]}.yaml" if found[1] else f"a YAML of {found[3]}"
-        return f"{file} must begin with the line # @package _global_: its keys are those of the top level"
-    if found := re.search(r"Key '([^']+)' not in", message):  # of a row or a file
-        return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
-    if found := re.match(r"Ambiguous value for argument '(.*?)=(.*)' 1\.", message):
-        key, values = found.groups()
-        if names(key):
-            return f"{key} has several values: add -m for a run of each"
-        quoted = f"or quote it where it is one value: '{key}=\"{values}\"'"
-        return f"{key} has several values: add -m for a run of each, write {key}=[{values}] for a list, {quoted}"
-    if isinstance(error, ConfigCompositionException):
-        if found := re.search(r"Could not override '([^']+)'", message):
-            if names(found[1]):
-                return f"{found[1]} is not chosen by default: write +{found[1]}=NAME, with a plus"
-            if found[1].startswith("renderer.") and "renderer=custom" in sys.argv:
-                return f"unknown key {found[1]!r}: an argument of your class is set by +{found[1]}=VALUE, with a plus"
-            return f"unknown key {found[1]!r}" + nearest(found[1], _known_keys())
-        if found := re.search(r"Could not find '([^']+)/([^'/]+)'", message):
-            return f"unknown {found[1]} {found[2]!r}" + nearest(found[2], _choices(found[1]))
-        if found := re.match(r"Error merging override \+*([\w.]+)=(.*)$", message):
-            return wrong_type(found[1], found[2], type_of(found[1]))
-        if error.__cause__ is not None:
-            detail = " ".join(str(error.__cause__).split(" full_key")[0].split())
-            return f"{message}: {detail}" if detail not in message else message
-    return message
+def message_of(error: Exception) -> str:
+    """One line on what is wrong with what was typed."""
+    return _unreadable(error.override) if isinstance(error, OverrideParseException) else " ".join(str(error).split())
 
 
 def _with_file(message: str) -> str:
     """A message on a mistyped key, with the file of the user's folder that has it; other messages as they are."""
-    if (found := re.search(r"(?:has no|unknown) key '([^']+)'", message)) is None:
+    if (match := re.search(r"(?:has no|unknown) key '([^']+)'", message)) is None:
         return message
-    key = re.compile(rf"\b{re.escape(found[1])}\b[\w.]*\s*:")
-    files = [path for folder in own_folders(sys.argv[1:]) for path in sorted(folder.rglob("*.yaml"))]
+    key = re.compile(rf"\b{re.escape(match[1])}\b[\w.]*\s*:")
+    files = [path for folder in config_dirs(options_of(sys.argv[1:])) for path in sorted(folder.rglob("*.yaml"))]
     return message + next((f" It is in {path}" for path in files if key.search(path.read_text("utf-8", "replace"))), "")
 
 
@@ -315,7 +245,7 @@ def _unreadable(override: str) -> str:
     """One line on an override that Hydra cannot read."""
     for group in GROUPS:
         if override in _choices(group):
-            plus = "+" if group in ("method", "experiment") else ""
+            plus = "+" if group in NOT_BY_DEFAULT else ""
             return f"{override!r} is no setting: write {plus}{group}={override}"
     if COMMA.search(override):
         return f"{override!r} has a comma without a value beside it: write key=a,b"
@@ -324,22 +254,3 @@ def _unreadable(override: str) -> str:
 
 def _choices(group: str) -> list[str]:
     return [name for name in names(group) if not name.startswith("_")]
-
-
-def _known_keys() -> list[str]:
-    """Every dotted key of the configuration with the choices of the command line, as far as these are known."""
-    chosen = [a for a in sys.argv[1:] if (found := CHOICE.fullmatch(a)) and found[2] in _choices(found[1])]
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return list(_dotted(compose("config", chosen)))
-
-
-def _dotted(node: DictConfig, prefix: str = "") -> list[str]:
-    keys = []
-    for key in node:
-        name = f"{prefix}{key}"
-        keys.append(name)
-        child = node._get_node(key)
-        if OmegaConf.is_dict(child) and not child._is_missing() and not child._is_none():
-            keys += _dotted(child, f"{name}.")
-    return keys

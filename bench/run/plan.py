@@ -11,20 +11,43 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from bench.config import Isolation
+from bench.config import Isolation, Rerun
+from bench.records.folder import Identity, reusable
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_run, run_folders
-from bench.records.record import row_name
-from bench.run.process import in_child, reason_of
+from bench.records.record import digest, row_name
+from bench.run.job import reason_of
+from bench.run.process import in_child
 
 # Statuses of runs that did not take their whole time.
 UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 LIKE, MOST = 100, 300  # runs of one kind whose times are taken, and whose records are read
-HERE = ("basic", "joblib", "workers")  # launchers whose runs are on this machine
+HERE = ("basic", "workers")  # executors whose runs are on this machine
 
 
-class Shown(BaseException):
-    """A plan was shown in place of a sweep. Not an Exception, which Hydra would turn into a warning."""
+def plan_of(cells: Sequence[Identity]) -> Plan:
+    """The plan of a sweep with these runs."""
+    first = cells[0]
+    name = f"{first.config['experiment'] or first.choices['task']}-{digest([cell.name for cell in cells])}"
+    return Plan(name, Path(first.config["results_dir"]), [*map(planned, cells)])
+
+
+def planned(identity: Identity) -> PlannedCell:
+    """The cell of a sweep that is a run."""
+    config = identity.config
+    return PlannedCell(identity.name, identity.overrides, **identity.choices, seed=config["seed"], config=config)
+
+
+def identity_of(cell: PlannedCell) -> Identity:
+    """The identity of a planned cell's run."""
+    choices = {name: getattr(cell, name) for name in ("task", "renderer", "dataset", "method")}
+    return Identity(choices, cell.config, cell.overrides)
+
+
+def is_reused(plan: Plan, cell: PlannedCell) -> bool:
+    """Whether a cell's finished run is there already, and will be reused."""
+    folder = plan.results_dir / "runs" / cell.id
+    return reusable(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
 
 
 def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
@@ -56,17 +79,17 @@ def _refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     return [refusal(config, built) for config in configs]
 
 
-def check_plan(plan: Plan, launcher: str, reused: set[str]) -> None:
+def check_plan(plan: Plan, executor: str, reused: set[str]) -> None:
     """Checks all cells of a sweep, before it is written down.
 
     Args:
-        launcher: the choice of `hydra/launcher`; another machine may have a GPU where this one has none.
+        executor: what makes the runs; another machine may have a GPU where this one has none.
         reused: ids of the cells whose finished run is there already, so that they need not be checked.
 
     Raises:
         ValueError: for an invalid cell, with the cell and what is wrong with it.
     """
-    away = {} if launcher in HERE else {"device": "cpu"}
+    away = {} if executor in HERE else {"device": "cpu"}
     cells = [cell for cell in plan.cells if cell.id not in reused]
     found = refusals([cell.config | away for cell in cells])
     bad = [(cell, reason) for cell, reason in zip(cells, found, strict=True) if reason]

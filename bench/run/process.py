@@ -1,6 +1,5 @@
-"""The process of a run, seen from its parent: what it gets and sends back, its limits, how it ends, and signals."""
+"""The process of a run, seen from its parent: its limits, how it ends, and signals."""
 
-import errno
 import multiprocessing
 import os
 import signal
@@ -21,7 +20,8 @@ import psutil
 
 import bench.tasks
 import datasets
-from bench.records.record import Record, RunStatus
+from bench.records.record import RunStatus
+from bench.run.job import Ended, Job, Message, Started, Step
 
 INTERVAL = 0.05  # seconds between two checks of clock and memory
 GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
@@ -33,49 +33,6 @@ EXTERNAL = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal
 _stopped = ""  # by which signal, in words
 _delayed = False  # within `signals_delayed`
 _early = False  # whether this command has started the server before it knew that it would need it
-
-
-@dataclass(frozen=True)
-class Job:
-    """A run for a child process: the folder for its files, and the record that it fills, with its configuration."""
-
-    folder: Path
-    record: Record
-
-
-@dataclass(frozen=True)
-class Step:
-    """Progress within a phase; see `bench.progress.Report`."""
-
-    phase: str
-    done: int
-    total: int
-    loss: float | None
-
-    @property
-    def when(self) -> str:
-        """The phase and the step for the reason of a failure: `while optimising (3 of 20)`."""
-        return f"{'while' if self.done < self.total else 'after'} {self.phase} ({self.done} of {self.total})"
-
-
-@dataclass(frozen=True)
-class Notice:
-    """A message for the user."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Started:
-    """The child is ready: the time limit counts from now on."""
-
-
-@dataclass(frozen=True)
-class Ended:
-    """The child has sent its final record."""
-
-
-Message = Started | Step | Notice | Record | Ended
 
 
 @dataclass(frozen=True)
@@ -93,14 +50,6 @@ class RunLimits:
     @property
     def bytes(self) -> float:
         return 0.9 * machine_memory() if self.memory is None else self.memory * GIB
-
-
-def reason_of(error: BaseException, folder: Path | None = None) -> str:
-    """An error as the reason of a failure: in one line, with the remedy where the disk of the run's folder is full."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    where = f" ({folder})" if folder else ""
-    return f"{text}{where}: free space, or set results_dir to a folder on another disk" if full else text
 
 
 @dataclass(frozen=True)

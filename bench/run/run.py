@@ -8,7 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from bench.config import Isolation, build
@@ -16,29 +15,16 @@ from bench.progress import Report, notice, run_progress
 from bench.records.folder import Identity, claimed, release, reusable
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.run.command import unwritten
-from bench.run.compose import planned
-from bench.run.plan import refusals, show_plan
-from bench.run.process import (
-    Job,
-    Message,
-    Notice,
-    RunLimits,
-    Started,
-    Step,
-    reason_of,
-    run_isolated,
-    signals_delayed,
-    stopped_by,
-)
+from bench.run.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, unwritten
+from bench.run.plan import planned, refusals, show_plan
+from bench.run.process import RunLimits, run_isolated, signals_delayed, stopped_by
 from bench.run.summary import show, write_log
 from bench.trackers import Nothing, Tracker
 
-LOST = "lost"  # the status that the driver gets of a run whose record could not be written
 LAST_LINES, LAST_BYTES = 80, 16_384  # most of the log that the record of a failed run keeps
 
 
-class Interrupted(KeyboardInterrupt):
+class RunInterrupted(Interrupted):
     """Ctrl-C or SIGTERM ended a run, and its record has been written."""
 
     def __init__(self, folder: Path, record: Record) -> None:
@@ -46,40 +32,53 @@ class Interrupted(KeyboardInterrupt):
         self.folder, self.record = folder, record
 
 
-def run_cell(identity: Identity) -> str:
-    """Runs what a configuration describes and gives its status.
-
-    The summary of a single run is printed here; a sweep's driver prints a line per run.
+def run_one(identity: Identity) -> str:
+    """Makes the run that a command describes, prints its summary and gives its status; with plan=true lists it alone.
 
     Raises:
-        Interrupted: after Ctrl-C or SIGTERM.
-        ValueError: where a single run's configuration cannot be run; its folder is removed.
+        RunInterrupted: after Ctrl-C or SIGTERM.
+        ValueError: where the configuration cannot be run; its folder is removed.
+        OSError: where the results folder cannot be written.
     """
-    config, hydra = identity.config, HydraConfig.get()
-    single = OmegaConf.is_missing(hydra.job, "num")
-    if single and (config["plan"] or config["isolation"] == Isolation.process):  # a sweep's cells were checked before
+    config = identity.config
+    if config["plan"] or config["isolation"] == Isolation.process:
         _check(identity)
-    if single and hydra.sweeper.get("params"):
-        notice("note: this is one run; with -m in the command it is all runs of the table")
     if config["plan"]:
         return RunStatus.OK
     try:
         folder, record = run(identity)
-    except Interrupted as error:
-        if single:
-            show(error.folder, error.record)
+    except RunInterrupted as error:
+        show(error.folder, error.record)
         raise
     except OSError as error:
-        print(f"error: {unwritten(error, config['results_dir'])}", file=sys.stderr, flush=True)
-        return LOST
-    if config["verbose"]:
-        print("\n".join(record.log), file=sys.stderr, flush=True)
-    if single and record.status == RunStatus.REFUSED:
+        raise OSError(error.errno, error.strerror or str(error), error.filename or config["results_dir"]) from error
+    _print_log(record)
+    if record.status == RunStatus.REFUSED:
         shutil.rmtree(folder)
         raise ValueError(record.reason)
-    if single:
-        show(folder, record)
+    show(folder, record)
     return record.status
+
+
+def run_cell(identity: Identity) -> list[str]:
+    """Makes the run of a sweep's cell, or reuses it; gives a message where it has no record.
+
+    Raises:
+        RunInterrupted: after Ctrl-C or SIGTERM.
+    """
+    try:
+        _print_log(run(identity)[1])
+    except OSError as error:
+        return [unwritten(error, identity.config["results_dir"])]
+    except ValueError as error:
+        return [str(error)]
+    return []
+
+
+def _print_log(record: Record) -> None:
+    """Prints the last lines of a failed run's log, with verbose=true."""
+    if record.config["verbose"] and record.log:
+        print("\n".join(record.log), file=sys.stderr, flush=True)
 
 
 def _check(identity: Identity) -> None:
@@ -103,7 +102,7 @@ def run(identity: Identity) -> tuple[Path, Record]:
 
     Raises:
         OSError: where the results folder cannot be written.
-        Interrupted: after Ctrl-C or SIGTERM, with the record that was written.
+        RunInterrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
     config = identity.config
     with claimed(Path(config["results_dir"]), identity, config["rerun"]) as (folder, finished):
@@ -157,7 +156,7 @@ def _run_anew(job: Job) -> Record:
     if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:
         _export(tracker, folder, record)
     if stopped:
-        raise Interrupted(folder, record)
+        raise RunInterrupted(folder, record)
     return record
 
 

@@ -1,28 +1,30 @@
-"""Plans a sweep before its first cell starts, and prints a line as each cell ends."""
+"""A sweep: its cells are composed, checked, planned, made by an executor, and followed by a line as each ends."""
 
-import os
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hydra.experimental.callback import Callback
-from hydra.plugins.sweeper import Sweeper
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from bench.config import Isolation, Rerun
+from bench.config import Isolation
 from bench.progress import display, notice
-from bench.records.folder import reusable
+from bench.records.folder import Identity
 from bench.records.format import number, plural, seconds
 from bench.records.metrics import SHOWN, Metric
-from bench.records.read import Plan, PlannedCell
-from bench.records.record import row_name
-from bench.run.compose import identity_of, make_plan, swept_over
-from bench.run.pack import check_jobs, in_words, packed, packs
-from bench.run.plan import Shown, check_plan, show_plan
-from bench.run.process import warm_up
+from bench.records.read import Plan
+from bench.records.record import RunStatus, row_name
+from bench.run.compose import Composer
+from bench.run.executors import Launcher, execute
+from bench.run.job import Interrupted, reason_of
+from bench.run.jobs import check_jobs, in_words, packed
+from bench.run.plan import check_plan, identity_of, is_reused, plan_of, planned, show_plan
+from bench.run.process import stopped_by, warm_up
+from bench.run.run import run_cell
 
 IN_LINE = {  # metrics in the line of a cell
     "recommended_field": Metric("recommended"),
@@ -31,88 +33,112 @@ IN_LINE = {  # metrics in the line of a cell
 INTERVAL = 0.5  # seconds between two checks of which cells have ended
 
 
-class Refused(BaseException):
-    """A sweep cannot be planned. Not an Exception, since Hydra turns those that callbacks raise into warnings."""
-
-    def __init__(self, why: Exception) -> None:
-        super().__init__(str(why))
-        self.why = why
+class LauncherStopped(RuntimeError):
+    """An executor cannot go on: a cluster that is not there, a process that is lost."""
 
 
-class Sweep:
-    """The sweep that this process drives; `plan` is None where it drives none, or one whose cells are no runs."""
+@dataclass(frozen=True)
+class Once:
+    """Makes the run of a cell that has not ended since its sweep was planned: a job that is requeued goes on so."""
 
-    plan: Plan | None = None
-    reused = frozenset[str]()  # ids of its cells whose finished run was there already
-    runs = True  # whether its cells are runs: those of `bench.train` and `bench.prior` are not
-    shown = ExitStack()
+    plan: Plan
 
-    @classmethod
-    def start(cls, plan: Plan, reused: set[str]) -> None:
-        """Writes and keeps the plan, and shows the sweep's progress from now on."""
-        plan.write()
-        cls.plan, cls.reused = plan, frozenset(reused)
-        cls.shown.enter_context(followed(plan, reused))
-
-    @classmethod
-    def end(cls) -> None:
-        """Shows no more of the sweep, which has ended."""
-        cls.shown.close()
-        cls.plan = None
+    def __call__(self, identity: Identity) -> list[str]:
+        """Gives a message where it leaves no record."""
+        record = self.plan.record(planned(identity))
+        return run_cell(identity) if record is None or record["status"] == RunStatus.KILLED else []
 
 
-class Planner(Callback):
-    """Hydra's callback that writes the plan before a sweep's first cell; see conf/config.yaml.
+def run_sweep(composer: Composer, config: DictConfig, summarise: Callable[[Plan], list[str]]) -> list[str]:
+    """Makes the runs of a sweep, and gives their statuses; with plan=true lists them.
 
-    The plan composes every cell; Hydra's own check, which would do so once more, is left out.
+    Args:
+        config: what all cells share; see `Composer.whole`.
+        summarise: writes and prints what a plan came to, also after a signal; gives the statuses.
+
+    Raises:
+        Interrupted, KeyboardInterrupt: after Ctrl-C or SIGTERM, the first where runs had begun.
+        ValueError: for a sweep that cannot be.
+        OSError: where the results folder cannot be written.
+        LauncherStopped: where the executor cannot go on.
     """
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Plans the sweep and starts to follow it."""
-        if not Sweep.runs:
-            return
-        try:
-            swept, workers = swept_over(config), workers_of(config)
-            launcher, settings = config.hydra.runtime.choices["hydra/launcher"], config.hydra.launcher
-            if not config.plan:
-                how = "many to a job" if packs(settings) else f"{workers} at a time"
-                runs = f"{plural(len(swept), 'run')}, {how} (hydra/launcher={launcher})"
-                notice(f"sweep: {runs}; a line follows as each ends")
-            if config.isolation == Isolation.process:
-                warm_up()
-            plan = make_plan(config, swept)
-            reused = {cell.id for cell in plan.cells if is_reused(plan, cell)}
-            check_jobs([cell for cell in plan.cells if cell.id not in reused], settings)
-            check_plan(plan, launcher, reused)
-            if config.plan:
-                jobs = packed(plan, settings, reused) if packs(settings) else []
-                show_plan(plan, reused, min(workers, len(jobs) * settings.tasks_per_node) if jobs else workers)
-                if jobs:
-                    print(in_words(jobs, settings))
-                raise Shown
-            Sweep.start(plan, reused)
-        except Exception as error:
-            raise Refused(error) from error
-        self.check, Sweeper.validate_batch_is_legal = Sweeper.validate_batch_is_legal, lambda self, batch: None
-
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Gives Hydra its own check back."""
-        if Sweep.runs:
-            Sweeper.validate_batch_is_legal = self.check
+    swept, launcher = composer.swept(config), Launcher.of(config)
+    if not config.plan:
+        how = "many to a job" if launcher.packs else f"{launcher.at_once} at a time"
+        runs = f"{plural(len(swept), 'run')}, {how} (hydra/launcher={launcher.name})"
+        notice(f"sweep: {runs}; a line follows as each ends")
+    if config.isolation == Isolation.process:
+        warm_up()
+    plan = plan_of(composer.cells(swept))
+    _say_where(swept[0], plan)
+    reused = {cell.id for cell in plan.cells if is_reused(plan, cell)}
+    check_jobs([cell for cell in plan.cells if cell.id not in reused], launcher.settings)
+    check_plan(plan, launcher.executor, reused)
+    if config.plan:
+        _list(plan, reused, launcher)
+        return []
+    plan.write()
+    try:
+        with followed(plan, reused):
+            _make(plan, reused, launcher)
+    finally:
+        statuses = summarise(plan)
+    return statuses
 
 
-def is_reused(plan: Plan, cell: PlannedCell) -> bool:
-    """Whether a cell's finished run is there already, and will be reused."""
-    folder = plan.results_dir / "runs" / cell.id
-    return reusable(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
+def _say_where(overrides: list[str], plan: Plan) -> None:
+    """Says of overrides that not all cells have, how many do."""
+    for key in (text.partition("=")[0] for text in overrides):
+        having = sum(any(text.startswith(f"{key}=") for text in cell.overrides) for cell in plan.cells)
+        if having < len(plan.cells):
+            notice(f"sweep: {key} goes to {having} of {plural(len(plan.cells), 'run')}, which have this key")
 
 
-def workers_of(config: DictConfig) -> int:
-    """How many cells the launcher runs at a time, as far as its settings say so."""
-    for key in ("n_jobs", "array_parallelism"):  # of joblib, and of submitit
-        if (count := OmegaConf.select(config, f"hydra.launcher.{key}")) is not None:
-            return max(int(count), 1) if count > 0 else os.cpu_count() or 1
-    return 1
+def _list(plan: Plan, reused: set[str], launcher: Launcher) -> None:
+    """Prints the cells, and the jobs where a launcher makes some."""
+    if not launcher.packs or not (jobs := packed(plan, launcher.settings, reused)):
+        return show_plan(plan, reused, launcher.at_once)
+    show_plan(plan, reused, min(launcher.at_once, len(jobs) * launcher.settings["tasks_per_node"]))
+    print(in_words(jobs, launcher.settings))
+
+
+def _make(plan: Plan, reused: set[str], launcher: Launcher) -> None:
+    """Has an executor make all runs of a plan; reused ones are marked as asked for by this process."""
+    make, jobs = Once(replace(plan, cells=[])), [[cell] for cell in plan.cells]
+    try:
+        if launcher.executor != "basic":
+            execute(
+                make, [[identity_of(cell) for cell in plan.cells if cell.id in reused]], replace(launcher, settings={})
+            )
+            jobs = [[cell] for cell in plan.cells if cell.id not in reused]
+        if launcher.packs and (jobs := packed(plan, launcher.settings, reused)):
+            notice(in_words(jobs, launcher.settings))
+        execute(make, [[*map(identity_of, job)] for job in jobs], launcher)
+    except (ValueError, OSError):
+        raise
+    except (KeyboardInterrupt, Exception) as error:
+        if stopped := stopped_by(error):
+            raise Interrupted(stopped) from error
+        raise LauncherStopped(f"the launcher stopped: {reason_of(error)}; the same command goes on") from error
+
+
+def do_each(composer: Composer, config: DictConfig, job: Callable[[Identity], object]) -> bool:
+    """Does a job, which is no run, for each cell of a sweep; gives whether all were done.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C or SIGTERM.
+        ValueError: for a sweep that cannot be.
+    """
+    cells = composer.cells(composer.swept(config))
+    return execute(partial(_attempted, job), [[cell] for cell in cells], Launcher.of(config))
+
+
+def _attempted(job: Callable[[Identity], object], identity: Identity) -> list[str]:
+    try:
+        job(identity)
+    except (OSError, ValueError) as error:
+        return [reason_of(error)]
+    return []
 
 
 @contextmanager

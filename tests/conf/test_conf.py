@@ -6,13 +6,12 @@ from functools import cache
 import pytest
 import trimesh
 import yaml
-from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import TARGETS, build, check_draw, check_names, load
 from bench.pictures import style
 from bench.pictures.style import look
-from bench.run.compose import combinations
+from bench.run.compose import Composer, composing
 from bench.setup.inputs import Task
 from bench.tables import CONF, GROUPS, choice, names, read_yaml
 from datasets.scene import Dataset
@@ -91,10 +90,10 @@ def paths(tmp_path_factory) -> dict[str, str]:
 @cache
 def cells(name: str) -> list[list[str]]:
     """The first and the last cell of an experiment at desk scale, as overrides."""
-    params = composed(f"+experiment={name}", hydra=True).hydra.sweeper.get("params") or {}
-    with initialize_config_dir(str(CONF), version_base="1.3"):  # a glob asks for the choices of its group
-        swept = combinations([f"{key}={values}" for key, values in params.items()])
-    return [swept[0], swept[-1]]
+    with composing():
+        composer = Composer([f"+experiment={name}"])
+        swept = composer.swept(composer.whole())
+    return [[text for text in cell if not text.startswith("+experiment=")] for cell in (swept[0], swept[-1])]
 
 
 def build_part(config: DictConfig, part: str):
@@ -109,7 +108,7 @@ def test_no_yaml_lies_where_it_is_not_looked_for():
 
 
 def test_no_yaml_sets_the_mode_of_hydra():
-    assert composed(hydra=True).hydra.mode is None  # `bench.run.command.mode_of_options` says so to Hydra
+    assert composed(hydra=True).hydra.mode is None
     for path in CONF.rglob("*.yaml"):
         assert "mode" not in (read_yaml(path).get("hydra") or {}), path
 
@@ -284,7 +283,7 @@ def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_pl
 
 @each("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour per class
 def test_rows_of_an_experiment_are_told_apart(name):
-    params = composed(f"+experiment={name}", hydra=True).hydra.sweeper.get("params") or {}
+    params = composed(f"+experiment={name}", hydra=True).hydra.get("sweeper", {}).get("params") or {}
     rows = str(params.get("+method") or params.get("renderer") or "dist").split(",")
     alike = [row for row in rows if not row.startswith("tuned/")]  # drawn as their methods, hollow
     assert len({(look(row).colour, look(row).marker) for row in alike}) == len(alike)

@@ -1,20 +1,19 @@
 """A renderer is one file and one YAML: every experiment that compares renderers then has a row for it."""
 
-import sys
+import re
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import build
+from bench.records.read import Plan
 from bench.records.record import row_name
-from bench.run import sweep
-from bench.run.command import command_line
-from bench.tables import names, register_rows
+from bench.run import compose
+from bench.run.plan import plan_of
+from bench.tables import listed, names, register_rows
+from tests.composing import cells_of
 
 CLASS = (
     "class Mine:\n    def __init__(self, size):\n        self.size = size\n    def render(self, field, rays): ...\n"
@@ -42,42 +41,18 @@ def package(tmp_path, monkeypatch) -> str:
     return name
 
 
-class Planned(ValueError):
-    """Ends a command line behind its plan, before Hydra runs the cells."""
+def swept(*arguments: str, folder: Path | None = None) -> Plan:
+    """The plan of a sweep, with a folder of a user's YAMLs."""
+    return plan_of(cells_of(*arguments, "scale=smoke", folder=folder))
 
 
-@pytest.fixture
-def swept(monkeypatch, tmp_path):
-    """Plans a sweep with a folder of a user's YAMLs, or runs it with a job that does nothing: plan, configurations."""
-
-    def run(*arguments: str, folder: Path | None = None, launch: bool = False) -> tuple[sweep.Plan, list[dict]]:
-        plans, ran = [], []
-
-        def start(plan: sweep.Plan, left: object) -> None:
-            plans.append(plan)
-            if not launch:
-                raise Planned("planned")
-
-        monkeypatch.setattr(sweep.Sweep, "start", start)
-        monkeypatch.setattr(sweep, "check_plan", lambda *_: None)  # the plan is what is looked at
-        monkeypatch.setattr(sweep, "warm_up", lambda: None)
-        GlobalHydra.instance().clear()
-        options = [] if folder is None else ["--config-dir", str(folder)]
-        overrides = [*arguments, "hydra/launcher=basic", "scale=smoke", f"results_dir={tmp_path}/r"]
-        monkeypatch.setattr(sys, "argv", ["bench", "-m", *options, *overrides])
-        assert command_line(lambda run: ran.append(run.config)) == (0 if launch else 2)
-        return plans[0], ran
-
-    return run
-
-
-def rows(plan: sweep.Plan) -> list[str]:
+def rows(plan: Plan) -> list[str]:
     """The renderers of a plan, each once, in order."""
     return list(dict.fromkeys(cell.renderer for cell in plan.cells))
 
 
-def test_renderers_of_ones_own_have_rows_in_an_experiment_that_compares_renderers(swept, tmp_path, package):
-    plan, _ = swept("+experiment=stability", "stress=thin_plate", f"packages=[{package}]", folder=tmp_path / "conf")
+def test_renderers_of_ones_own_have_rows_in_an_experiment_that_compares_renderers(tmp_path, package):
+    plan = swept("+experiment=stability", "stress=thin_plate", f"packages=[{package}]", folder=tmp_path / "conf")
     first, found, one_loss = ["mine_first"], rows(plan), ", DIST's mask loss"
     assert found[: len(first)] == first
     assert found[-2:] == ["mine", "mine_on_dist"]  # they say nothing of rows
@@ -98,19 +73,19 @@ def test_renderers_of_ones_own_have_rows_in_an_experiment_that_compares_renderer
     assert row_name(cells["mine_on_keinert"].config, "mine_on_keinert") == "Keinert, 1.1" + one_loss
     assert not any({"_rows_", "_look_"} & {*cell.config["renderer"]} for cell in plan.cells)
     register_rows()
-    assert "mine_on_keinert.yaml" not in ConfigStore.instance().repo["renderer"]  # of another command alone
+    assert "mine_on_keinert" not in listed("renderer")  # of another command alone
 
 
-def test_the_command_line_narrows_and_replaces_the_rows(swept):
-    plan, _ = swept("+experiment=table1", "renderer=dvr,dist")
+def test_the_command_line_narrows_and_replaces_the_rows():
+    plan = swept("+experiment=table1", "renderer=dvr,dist")
     assert rows(plan) == ["dvr", "dist"]
     own = ("renderer=custom", "renderer._target_=renderers.IDR")
-    plan, _ = swept("+experiment=table1", *own)
+    plan = swept("+experiment=table1", *own)
     assert [(cell.renderer, row_name(cell.config, cell.renderer)) for cell in plan.cells] == [("custom", "IDR")]
 
 
-def test_a_method_is_a_part_of_what_a_run_is_called(swept):
-    plan, _ = swept("+experiment=table3", "index=0", "dataset=car")
+def test_a_method_is_a_part_of_what_a_run_is_called():
+    plan = swept("+experiment=table3", "index=0", "dataset=car")
     methods = [cell.method for cell in plan.cells]
     names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "encoder", "mesh_encoder")
     assert methods == [f"multiview_{name}" for name in names]
@@ -118,17 +93,15 @@ def test_a_method_is_a_part_of_what_a_run_is_called(swept):
         "multiview-dist_paper-car-multiview_paper",
         "multiview-dist-car-multiview_dist",
     ]
-    plan, _ = swept("seed=0,1")
+    plan = swept("seed=0,1")
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells] == ["completion-dist-sofa"] * 2
     assert [cell.method for cell in plan.cells] == ["", ""]
 
 
-def test_combinations_are_those_that_hydra_runs(swept):
-    # Of two values of one key the later counts, at the place of the first.
-    plan, ran = swept("seed=0,1", "dataset=glob(c*,exclude=car)", "index=3", "seed=range(5,7)", launch=True)
-    planned = [cell.config for cell in plan.cells]
-    assert planned == ran
-    assert [(one["dataset"]["name"], one["index"], one["seed"]) for one in planned] == [
+def test_of_two_values_of_one_key_the_later_counts_at_the_place_of_the_first():
+    plan = swept("seed=0,1", "dataset=glob(c*,exclude=car)", "index=3", "seed=range(5,7)")
+    cells = [cell.config for cell in plan.cells]
+    assert [(config["dataset"]["name"], config["index"], config["seed"]) for config in cells] == [
         (name, 3, seed) for seed in (5, 6) for name in ("capsule", "cylinder")
     ]
 
@@ -144,17 +117,17 @@ OWN_ROWS = {
 }
 
 
-def test_methods_of_ones_own_join_the_tuning_which_slow_ones_do_not(swept, tmp_path):
+def test_methods_of_ones_own_join_the_tuning_which_slow_ones_do_not(tmp_path):
     (tmp_path / "own").mkdir()
     for table, text in OWN_ROWS.items():
         (tmp_path / f"own/{table}.yaml").write_text(text)
     spaces, own = {*names("method/space")}, {"mine_row", "mine_untuned"}
-    plan, _ = swept("+experiment=tuning", "draw=3", "split=test", folder=tmp_path / "own")
+    plan = swept("+experiment=tuning", "draw=3", "split=test", folder=tmp_path / "own")
     cells = {cell.method.removeprefix("space/"): cell for cell in plan.cells}
     assert {*cells} == (spaces - SLOW) | own
     mine = cells["mine_row"].config
     assert mine["label"] == "Mine" and 1 < mine["renderer"]["alpha"] < 2
-    plan, _ = swept("+method=mine_row,tuned/mine_row", folder=tmp_path / "own")
+    plan = swept("+method=mine_row,tuned/mine_row", folder=tmp_path / "own")
     tuned = {cell.method: cell.config["renderer"]["alpha"] for cell in plan.cells}
     assert tuned == {"mine_row": 1.5, "tuned/mine_row": 1.25}
 
@@ -166,25 +139,21 @@ def test_methods_of_ones_own_join_the_tuning_which_slow_ones_do_not(swept, tmp_p
     ("renderer/list.yaml", "- 1\n", "renderer/list.yaml must hold keys and values"),
     ("experiment/mine.yaml", MINE, "${spaces:...} leaves out neus: not in method/space"),
 ])  # fmt: skip
-def test_a_broken_file_of_the_users_is_named(swept, tmp_path, capsys, file, text, message):
+def test_a_broken_file_of_the_users_is_named(tmp_path, file, text, message):
     (tmp_path / "own" / file).parent.mkdir(parents=True)
     (tmp_path / "own" / file).write_text(text)
-    with pytest.raises(IndexError):  # there is no plan
-        swept("+experiment=mine" if "experiment" in file else "+experiment=table1", folder=tmp_path / "own")
-    assert message in capsys.readouterr().err
+    experiment = "+experiment=mine" if "experiment" in file else "+experiment=table1"
+    with pytest.raises((ValueError, OmegaConfBaseException), match=re.escape(message)):
+        swept(experiment, folder=tmp_path / "own")
 
 
-def test_a_sweep_composes_its_choices_once_for_the_plan_and_each_cell_once_to_run_it(swept, monkeypatch):
-    composed, compose = [], ConfigLoaderImpl.load_sweep_config
-
-    def counting(*arguments: Any, **named: Any) -> DictConfig:
-        composed.append(arguments)
-        return compose(*arguments, **named)
-
-    monkeypatch.setattr(ConfigLoaderImpl, "load_sweep_config", counting)
-    _, ran = swept("seed=0,1,2", launch=True)
-    assert [config["seed"] for config in ran] == [0, 1, 2]
-    assert len(composed) == 1 + 3
+def test_a_sweep_composes_each_combination_of_choices_once(monkeypatch):
+    composed = []
+    monkeypatch.setattr(
+        compose, "composed", lambda choices, do=compose.composed: (composed.append(choices), do(choices))[1]
+    )
+    plan = swept("seed=0,1,2", "renderer=dist,dvr", "task.points=20,30")
+    assert len(plan.cells) == 12 and len(composed) == 1 + 2  # the first says what is swept over
 
 
 def test_a_choice_of_a_user_takes_no_name_of_ours(tmp_path):

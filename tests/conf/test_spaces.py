@@ -8,7 +8,8 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
-from bench.config import build, register
+from bench.config import build
+from bench.run.compose import register
 from bench.tables import DIMENSIONS, DRAWS, choice, names, sobol_points
 from tests.composing import composed
 from tests.looped import each

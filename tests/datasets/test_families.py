@@ -9,13 +9,14 @@ import torch
 
 from bench.config import load
 from bench.records.record import digest
-from bench.tables import CONF, read_rows
+from bench.tables import CONF, choices_of
 from datasets.families import BUILDERS, HALF_GRID, Family
 from datasets.scene import SPLIT_STRIDE, Split, seed_of
 from renderers.field import Kind, autograd_gradients
 from tests.looped import each
 
-NAMES = sorted(name for name in read_rows(CONF)["dataset"] if not name.startswith("_"))
+ROWS = {name for name, choice in choices_of(CONF)["dataset"].items() if choice.row is not None}
+NAMES = sorted(name for name in ROWS if not name.startswith("_"))
 
 
 FAMILY = [replace(load("dataset", name), resolution=32) for name in NAMES]

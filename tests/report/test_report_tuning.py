@@ -9,7 +9,7 @@ import yaml
 from bench.records.read import read_records
 from bench.report.data.runs import choose
 from bench.report.tuning import TUNING, left_out, tunings
-from bench.tables import CONF, read_rows, read_yaml
+from bench.tables import CONF, choices_of, read_yaml
 from bench.tune import HEAD, WIDTH, main, write
 from tests.report.test_report_paper import write_run
 
@@ -113,7 +113,7 @@ def test_the_best_is_written_as_a_row_over_its_default(tmp_path, capsys):
     row = rows["dist_mask"]
     assert "draw 1 of 4 of space/dist_mask: geometric mean" in row["chosen"]
     assert "6 validation runs at scale=desk of sofa: 1.00, of the median draw 2.45" in row["chosen"]
-    node = read_rows(path.parent)["method/tuned"]["dist_mask"]
+    node = choices_of(path.parent)["method/tuned"]["dist_mask"].content
     assert node.pop("defaults") == ["/method/dist_mask", "_self_"]
     assert (node["label"], node["task"]["optimiser"]["learning_rate"]) == ("DIST with mask, tuned", 0.01)
     assert node["renderer"]["steps"] == 11 and set(node) == {"label", "task", "renderer"}

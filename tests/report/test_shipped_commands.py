@@ -8,18 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from bench.config import register
 from bench.records.names import flat
 from bench.records.record import row_name
 from bench.report.data.kept import read_rows
 from bench.report.write.paper import FOLDER, SHIPPED
-from bench.run.compose import Composer, swept_over
 from bench.tables import CONF
+from tests.composing import cells_of
 from tests.documentation import text_of
 
 COMMAND = re.compile(r"`-m \+experiment=([^`]+)`")
@@ -51,17 +47,12 @@ def planned(experiment: str) -> list[tuple[tuple[str, ...], dict[str, str]]]:
     linked = [line for line in lines if "../results" in line or NAMED.match(line)]
     commands = [COMMAND.findall(line) or NAMED.findall(line) for line in linked]
     found = []
-    register()
     for command in dict.fromkeys(command for of in commands for command in of):
         name, *words = shlex.split(command)
         file = CONF / "experiment" / f"{name}.yaml"
         if not file.exists() or OmegaConf.load(file).get("experiment") != experiment:
             continue
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            loader = GlobalHydra.instance().config_loader()
-            config = loader.load_configuration("config", [f"+experiment={name}", *words], RunMode.MULTIRUN)
-            composer = Composer(config)
-            cells = [composer.identity(overrides) for overrides in swept_over(config)]
+        cells = cells_of(f"+experiment={name}", *words)
         found += [described(cell.config, cell.choices["dataset"], cell.choices["renderer"]) for cell in cells]
     return found
 

@@ -14,7 +14,6 @@ from typing import Any
 from unittest import mock
 
 import torch
-from hydra.core.global_hydra import GlobalHydra
 
 from bench.__main__ import main
 from bench.machine.environment import using_threads
@@ -61,7 +60,6 @@ def planned(*names: str) -> list[PlannedCell]:
 
 def command(*arguments: str, main: Callable[[], int] = main) -> Outcome:
     """A command line in this process; its runs have processes of their own, unless it says isolation=off."""
-    GlobalHydra.instance().clear()
     out, err = io.StringIO(), io.StringIO()
     with (
         using_threads(torch.get_num_threads()),

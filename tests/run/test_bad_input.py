@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.records import folder as run_folder
-from bench.run.command import _explain, options_first, text_as_typed
+from bench.run.command import message_of, options_of, text_as_typed
 from bench.run.plan import refusal
 from bench.setup import priors
 from tests.composing import identified
@@ -78,7 +78,7 @@ def explained(monkeypatch, *arguments: str) -> str:
     try:
         return refusal(identified(*arguments).config)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
-        return _explain(error)
+        return message_of(error)
 
 
 @pytest.mark.parametrize(
@@ -140,20 +140,14 @@ def test_a_word_lists_what_there_is(bench, word):
         assert name in out
 
 
-@each(
-    "given, arranged",
-    [
-        (["seed=0,1", "-m"], ["-m", "seed=0,1"]),
-        (
-            ["a=1", "--config-dir", "my conf", "b=2", "--multirun"],
-            ["--config-dir", "my conf", "--multirun", "a=1", "b=2"],
-        ),
-        (["a=1", "--config-dir=x", "--cfg", "job"], ["--config-dir=x", "--cfg", "job", "a=1"]),
-        (["a=-1", "--help"], ["--help", "a=-1"]),
-    ],
-)
-def test_options_may_stand_anywhere(given, arranged):
-    assert options_first(given) == arranged
+@each("typed, options, overrides", [
+    ("seed=0,1 -m", {"multirun": True}, ["seed=0,1"]),
+    ("a=1 --config-dir mine b=-2 --multirun", {"config_dir": "mine", "multirun": True}, ["a=1", "b=-2"]),
+    ("a=1 --config-dir=x --cfg job", {"config_dir": "x", "cfg": "job"}, ["a=1"]),
+])  # fmt: skip
+def test_options_may_stand_anywhere(typed, options, overrides):
+    found = vars(options_of(typed.split()))
+    assert found["overrides"] == overrides and options.items() <= found.items()
 
 
 @each("text, label", [

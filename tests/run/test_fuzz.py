@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from bench.run.command import USAGE, _dotted
+from bench.run.command import USAGE
+from bench.run.compose import dotted
 from tests.composing import composed
 from tests.run.driving import FAILING, command, record_of
 
@@ -18,7 +19,7 @@ FIXED = {"results_dir", "priors_dir", "isolation", "time_limit", "memory_limit",
 GROUPS = ("task", "renderer", "dataset", "prior", "scale")
 
 
-KEYS = [key for key in _dotted(composed()) if key.split(".")[0] not in FIXED and "_target_" not in key]
+KEYS = [key for key in dotted(composed()) if key.split(".")[0] not in FIXED and "_target_" not in key]
 NUMBERS = st.integers(-3, 40) | st.sampled_from([0.0, 0.5, -1.5, 1e-9, 1e9, 10**30, math.inf, -math.inf, math.nan])
 WORDS = st.sampled_from(
     ["true", "false", "null", "abc", "dist", "sofa", "''", "[]", "[1,2]", "{a:1}", "[0,360]", "10%"]

@@ -15,20 +15,18 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.write.html import write_index
-from bench.run.pack import grouped
+from bench.run.jobs import grouped
 from tests.composing import identified
 from tests.looped import each
 from tests.report.page_data import Page
 from tests.run.driving import FAILING, PATIENCE, ROOT, Outcome, command, driver, errors, wait_for
 from tests.run.test_process import CASES
 
-LAUNCHERS = {
+LAUNCHERS = {  # with the package that each needs, and its settings
     "basic": ("", ()),
-    "joblib": ("hydra_plugins.hydra_joblib_launcher", ("hydra.launcher.n_jobs=2",)),
-    "workers": ("hydra_plugins.hydra_joblib_launcher", ()),
-    "submitit_local": ("hydra_plugins.hydra_submitit_launcher", ("hydra.launcher.timeout_min=5",)),
-    "slurm": ("hydra_plugins.hydra_submitit_launcher", ("hydra.launcher.cluster=local",)),
-    "ray_cluster": ("hydra_plugins.hydra_ray_launcher", ()),
+    "workers": ("", ("hydra.launcher.n_jobs=3",)),
+    "slurm": ("submitit", ("hydra.launcher.cluster=local",)),
+    "ray_cluster": ("ray", ()),
 }
 # The cells of a sweep; `terminate` stands for a cell whose run folder cannot be made.
 NO_FOLDER = "terminate"
@@ -55,8 +53,8 @@ class Swept:
 
 def need(launcher: str) -> None:
     package = LAUNCHERS[launcher][0]
-    if package and (find_spec("hydra_plugins") is None or find_spec(package) is None):
-        pytest.skip(f"the plugin of {launcher} is not installed: pip install -e '.[joblib,submitit,ray]'")
+    if package and find_spec(package) is None:
+        pytest.skip(f"the package of {launcher} is not installed: pip install -e '.[submitit,ray]'")
 
 
 def by_program(*arguments: str) -> Outcome:
@@ -162,6 +160,19 @@ def test_a_sweep_that_is_stopped_says_what_it_came_to(tmp_path):
     assert (tmp_path / "index.html").is_file()
 
 
+def test_workers_that_are_stopped_write_the_records_of_their_runs(tmp_path):
+    cells = ("-m", *FAILING, "+renderer.how=not", "+renderer.pause=900", "seed=0,1,2", f"results_dir={tmp_path}")
+    program = [sys.executable, "-m", "bench", *cells, "hydra/launcher=workers"]
+    with subprocess.Popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        wait_for(lambda: len(list(tmp_path.glob("runs/*/record.json"))) == 2)
+        running.terminate()
+        out, err = running.communicate(timeout=PATIENCE)
+    assert running.returncode == 130 and errors(err) == ["error: stopped by SIGTERM"]
+    assert "3 planned: 2 killed, 1 not_run" in out
+    killed = [record["reason"] for record in read_records(tmp_path)[0] if record["status"] == "killed"]
+    assert killed == ["stopped by SIGTERM; the same command starts it anew"] * 2
+
+
 @pytest.fixture
 def interruptible() -> Iterator[None]:
     """Ctrl-C takes effect also where these tests are a shell's background job, which ignores it."""
@@ -230,7 +241,7 @@ def test_what_a_job_cannot_do_is_refused_before_anything_is_written(tmp_path, wr
 
 def test_where_no_slurm_is_nothing_runs_and_the_plan_stays(tmp_path, monkeypatch):
     need("slurm")
-    monkeypatch.setattr("bench.run.pack.which", lambda _: None)
+    monkeypatch.setattr("bench.run.executors.which", lambda _: None)
     code, out, err = command("-m", *FAILING, "+renderer.how=not", "hydra/launcher=slurm", f"results_dir={tmp_path}")
     assert code == 2 and "error: no Slurm is here: type this on a machine of the cluster, or hydra.launcher.c" in err
     assert "1 planned: 1 not_run" in out and len(plan_of(tmp_path)["cells"]) == 1

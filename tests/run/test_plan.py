@@ -1,20 +1,23 @@
 """What is planned is checked before anything runs; plan=true lists it, and leaves nothing behind."""
 
-import re
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from hydra import compose
 
 from bench.prior import main as prior_main
+from bench.records.folder import identify, resolved
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus
-from bench.run import compose, sweep
 from bench.run import plan as plan_module
 from bench.run import run as run_module
-from bench.run.plan import check_plan, kind, refusal, refusals, times
+from bench.run import sweep
+from bench.run.compose import Composer, composing, without_hydra
+from bench.run.plan import check_plan, identity_of, kind, refusal, refusals, times
 from bench.train import main as train_main
 from tests import tiny
+from tests.composing import cells_of
 from tests.run.driving import command
 
 SWEEP = ("-m", "scale=smoke", "isolation=off", "threads=1", "renderer=dist,dvr", "seed=0,1")
@@ -48,7 +51,7 @@ def write(results: Path, cell: PlannedCell, seconds: float) -> None:
     names = ("id", "task", "renderer", "dataset", "seed", "config")
     record = Record(**{name: value for name, value in asdict(cell).items() if name in names}, status=RunStatus.OK)
     record.ended, record.seconds = record.started, {"total": seconds}
-    identity = compose.identity_of(cell)
+    identity = identity_of(cell)
     record.config_hash, record.code = identity.config_hash, identity.code
     (results / "runs" / cell.id).mkdir(parents=True)
     record.write(results / "runs" / cell.id)
@@ -85,7 +88,7 @@ def test_what_is_there_is_reused_and_tells_of_like_runs(results):
 
 
 def test_a_plan_says_in_how_many_jobs_the_runs_are(results):
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    pytest.importorskip("submitit")
     cells, jobs = planned(results), ("hydra/launcher=slurm", "plan=true", f"results_dir={results}")
     for cell in cells[:2]:
         write(results, cell, 1000.0)  # so much do others of that renderer take, but for the limit
@@ -102,13 +105,35 @@ def test_a_plan_says_in_how_many_jobs_the_runs_are(results):
     ("-m", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
     ("-m", "seed=1,2", "index=0,3", "label='${index}',b"),
 ])  # fmt: skip
-def test_a_cell_is_what_hydra_makes_of_it(results, monkeypatch, arguments):
-    quick = planned(results, *arguments)
-    monkeypatch.setattr(compose.Composer, "_sets_a_value", lambda *_: False)
-    monkeypatch.setattr(compose, "LONE", re.compile("(?!)"))
-    monkeypatch.setattr(compose, "ReadOnce", lambda repository: repository)
-    assert planned(results, *arguments) == quick
-    assert len({cell.id for cell in quick}) == len(quick)
+def test_a_cell_is_what_hydra_makes_of_it(arguments):
+    with composing():
+        composer = Composer(arguments[1:])
+        swept = composer.swept(composer.whole())
+        cells = composer.cells(swept)
+        for cell, overrides in zip(cells, swept, strict=True):
+            whole = compose("config", overrides, return_hydra_config=True)
+            choices = dict(whole.hydra.runtime.choices)
+            assert cell == identify(resolved(without_hydra(whole), choices), choices, overrides)
+    assert len({cell.name for cell in cells}) == len(cells)
+
+
+def test_a_value_goes_to_the_cells_that_have_its_key():
+    mine = ("renderer._target_=tests.user_renderer.Mine", "+renderer.size=3", "label=Mine")
+    dist, custom = cells_of("renderer=dist,custom", *mine)
+    assert dist.overrides == ["renderer=dist"] and custom.overrides == ["renderer=custom", *mine]
+    assert (dist.config["label"], custom.config["label"]) == (None, "Mine")
+    cells = cells_of("renderer=dist,dvr", "renderer.alpha=1.2,2", "seed=0,1")
+    assert [cell.overrides for cell in cells] == [
+        *(["renderer=dist", f"renderer.alpha={alpha}", f"seed={seed}"] for alpha in ("1.2", "2") for seed in (0, 1)),
+        *(["renderer=dvr", f"seed={seed}"] for seed in (0, 1)),
+    ]
+    with pytest.raises(ValueError, match=r"unknown key 'renderer\.alpha'"):
+        cells_of("renderer=idr,dvr", "renderer.alpha=1.2,2")
+
+
+def test_a_sweep_says_which_keys_go_to_some_cells(results):
+    done = command("-m", "renderer=dist,dvr", "renderer.alpha=2", "plan=true", f"results_dir={results}")
+    assert done.err == "sweep: renderer.alpha goes to 1 of 2 runs, which have this key\n"
 
 
 def test_a_value_may_refer_to_the_seed_of_its_cell(results):
@@ -285,5 +310,5 @@ def test_a_gpu_is_looked_for_where_the_runs_are(plan_of, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     plan = plan_of(("device=cuda",))
     with pytest.raises(ValueError, match="PyTorch sees no GPU"):
-        check_plan(plan, "joblib", set())
+        check_plan(plan, "workers", set())
     check_plan(plan, "slurm", set())

@@ -5,11 +5,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from omegaconf import OmegaConf
 
 from bench.records.read import RESULTS, Plan
 from bench.records.record import Record, RunStatus
 from bench.run import sweep
+from bench.run.executors import Launcher
 from bench.run.summary import show, show_sweep
 from tests.looped import each
 from tests.run.driving import ROOT, planned
@@ -131,4 +131,4 @@ def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_are_run_not_reuse
 def test_a_sweep_says_how_many_runs_a_launcher_makes_at_a_time(launcher, workers, monkeypatch):
     """Joblib takes all processors for -1; submitit has a limit of its own."""
     monkeypatch.setattr("os.cpu_count", lambda: 7)
-    assert sweep.workers_of(OmegaConf.create({"hydra": {"launcher": launcher}})) == workers
+    assert Launcher("workers", launcher, {}).at_once == workers
