@@ -43,7 +43,7 @@ class FileColours:
 
     def __init__(self, path: Path, rest: Mesh, shape: Mesh) -> None:
         self._rest, self._shape = rest.vertices, Truth(shape, closed=False)
-        self._paint = _paint(path, path.stat().st_mtime_ns)
+        self._paint = _read_paint(path, path.stat().st_mtime_ns)
         self._file = Truth(self._paint.mesh, closed=False)
 
     @property
@@ -67,7 +67,7 @@ class FileColours:
 
 
 @lru_cache(maxsize=64)
-def _paint(path: Path, changed: int) -> Paint:
+def _read_paint(path: Path, changed: int) -> Paint:
     """The surface of a file and its colours; `changed`, the time of the last change, is only a key of the cache."""
     mesh, polygons = read_surface(path)
     if missing := [file for file in named_files(path) if not file.is_file()]:

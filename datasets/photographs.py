@@ -79,7 +79,7 @@ class Photography:
         for shot in taken:
             if shot.mask is None or not bool(shot.mask.any()):
                 raise BadInput(f"camera {shot.name} sees nothing of the shape: widen view.field_of_view or distance")
-        if max(_spread(shot) for shot in taken) < MIN_COLOUR_SPREAD:
+        if max(_colour_spread(shot) for shot in taken) < MIN_COLOUR_SPREAD:
             raise BadInput("the surface has one colour in all images: choose another texture or shading")
         return taken
 
@@ -108,7 +108,7 @@ class Photography:
         return Shot(name, camera, colours, view.mask, view.depth, view.normals)
 
 
-def _spread(shot: Shot) -> float:
+def _colour_spread(shot: Shot) -> float:
     """The interquartile range of the colours on the shape, to ignore outline pixels mixed with the background."""
     quartiles = shot.colours[shot.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
     return float((quartiles[1] - quartiles[0]).max())

@@ -18,7 +18,7 @@ IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "image",
 SPHERE_POINTS_FRACTION = 0.9  # the other points may be far from the object
 
 
-def colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None = None) -> Layout:
+def read_colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None = None) -> Layout:
     """The model with the most images, read by pycolmap; its points lie about the object or about the whole view.
 
     Args:

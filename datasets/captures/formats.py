@@ -6,12 +6,12 @@ from functools import partial
 from pathlib import Path
 from zipfile import BadZipFile
 
-from datasets.captures.colmap import colmap
+from datasets.captures.colmap import read_colmap
 from datasets.captures.frames import Layout
-from datasets.captures.matrices import matrices
-from datasets.captures.nerf import transforms
+from datasets.captures.matrices import read_matrices
+from datasets.captures.nerf import read_transforms
 from datasets.captures.pairing import natural_key
-from datasets.captures.rows import blended_mvs, choy, llff, middlebury
+from datasets.captures.rows import read_blended_mvs, read_choy, read_llff, read_middlebury
 from datasets.readers.text import wrong_kind_message
 from renderers.checks import BadInput
 
@@ -20,16 +20,16 @@ SUPPORTED_FORMATS = (
     "*_par.txt (Middlebury), poses_bounds.npy with images/ (LLFF), sparse/0 with images/ (COLMAP), cams/*_cam.txt "
     "(BlendedMVS), rendering_metadata.txt (Choy)"
 )
-
-COLMAP_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse", ".")
+COLMAP_ROOTS = ("sparse", "colmap/sparse", "distorted/sparse", ".")
+COLMAP_FOLDERS = [f"{root}/{inner}" for root in COLMAP_ROOTS for inner in ("[0-9]*/", "")]
 FORMATS = {  # the readers, and their files of cameras
-    "IDR, NeuS or DVR": (matrices, ("cameras_sphere.npz", "cameras.npz")),
-    "NeRF": (transforms, ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")),
-    "Middlebury": (middlebury, ("*_par.txt",)),
-    "LLFF": (llff, ("poses_bounds.npy",)),
-    "COLMAP": (colmap, [f"{root}/{inner}images.[bt][ix][nt]" for root in COLMAP_FOLDERS for inner in ("[0-9]*/", "")]),
-    "BlendedMVS": (blended_mvs, ("cams/*_cam.txt",)),
-    "Choy": (choy, ("rendering_metadata.txt", "rendering/rendering_metadata.txt")),
+    "IDR, NeuS or DVR": (read_matrices, ("cameras_sphere.npz", "cameras.npz")),
+    "NeRF": (read_transforms, ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")),
+    "Middlebury": (read_middlebury, ("*_par.txt",)),
+    "LLFF": (read_llff, ("poses_bounds.npy",)),
+    "COLMAP": (read_colmap, [f"{folder}images.[bt][ix][nt]" for folder in COLMAP_FOLDERS]),
+    "BlendedMVS": (read_blended_mvs, ("cams/*_cam.txt",)),
+    "Choy": (read_choy, ("rendering_metadata.txt", "rendering/rendering_metadata.txt")),
 }
 READ_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, MemoryError, BadZipFile)
 READ_ERRORS += (RuntimeError,)

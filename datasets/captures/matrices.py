@@ -18,7 +18,7 @@ SIMILARITY_TOLERANCE = 1e-4  # largest relative difference of scale_mat from a s
 DVR_CUBE_RADIUS = 0.75**0.5  # the cube reaches from -1/2 to 1/2
 
 
-def matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """IDR and NeuS: projections world_mat_i of image i in string order, and scale_mat_i from the unit sphere.
 
     DVR: camera_mat_i onto an image from -1 to 1, world_mat_i, scale_mat_i from a cube of side 1; and depths.

@@ -27,7 +27,7 @@ IGNORED_KEYS = {  # they do not change a camera
 FOCAL_LENGTH_TOLERANCE = 0.02  # largest relative difference between two statements of a focal length
 
 
-def transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """Reads camera_to_world, in OpenGL's axes or in the axes of a flag, focal lengths or fields of view, and lenses."""
     shared = json.loads(files[0].read_text(encoding="utf-8-sig"))
     entries = require_key(shared, "frames", str(files[0]))

@@ -21,7 +21,7 @@ from datasets.captures.pairing import (
 from renderers.checks import BadInput
 
 
-def middlebury(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_middlebury(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """Middlebury: one line per image: its name, K, R and t, row by row."""
     cameras = {}
     for line in filter(str.strip, files[0].read_text().splitlines()):
@@ -44,7 +44,7 @@ def middlebury(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     return Layout("Middlebury", frames, None, notes, example_image=next(iter(cameras), ""))
 
 
-def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """LLFF: one row per image, in string order: camera_to_world (axes down, right, back), size, focal, depth range."""
     file = files[0]
     rows, images = np.load(file), first_images(folder, "images", "images_2", "images_4", "images_8")
@@ -66,7 +66,7 @@ def llff(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     return Layout("LLFF", frames, None, (*notes, *mask_notes), example_image="images/*")
 
 
-def blended_mvs(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_blended_mvs(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """BlendedMVS and MVSNet: one file per image: world_to_camera, K, and the depth range."""
     cameras = {file.name[: -len("_cam.txt")]: file for file in files}
     images = first_images(folder, "blended_images", "images")
@@ -94,7 +94,7 @@ def _mvs_frame(file: Path, image: Path, mask: Path | None) -> Frame:
 FOCAL_MILLIMETRES, SENSOR_MILLIMETRES, DISTANCE_UNIT = 35.0, 32.0, 1.75  # Choy's camera in Blender
 
 
-def choy(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_choy(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """Choy's renderings: one line per image: azimuth, elevation, roll, distance, field of view."""
     rows = np.loadtxt(files[0], ndmin=2)
     if rows.shape[1] < 4 or rows[:, 2].any():

@@ -112,7 +112,7 @@ class Scene:
                 if triangles is None:
                     continue
                 attributes = primitive["attributes"]
-                vertices = self._shape(primitive, node.get("weights") or mesh.get("weights") or ())
+                vertices = self._vertices(primitive, node.get("weights") or mesh.get("weights") or ())
                 count, material = len(vertices), primitive.get("material", -1)
                 paint = self._colours(primitive, count), self._coordinates(primitive, count), material
                 skin = [self._skin_matrices(node["skin"], attributes, world)] if "skin" in node else None
@@ -136,7 +136,7 @@ class Scene:
             return np.stack([np.full(max(len(corners) - 2, 0), corners[:1]), corners[1:-1], corners[2:]], axis=1)
         return corners.reshape(-1, 3)
 
-    def _shape(self, primitive: dict[str, Any], weights: Sequence[float]) -> Float[np.ndarray, "v 3"]:
+    def _vertices(self, primitive: dict[str, Any], weights: Sequence[float]) -> Float[np.ndarray, "v 3"]:
         """The vertices of a primitive, moved by its weighted morph targets."""
         vertices = self._numbers(primitive["attributes"]["POSITION"]).astype(np.float64)
         for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
