@@ -31,7 +31,7 @@ NAMES = {number: name for name, number in SYNSETS.items()}
 MESH_PATHS = ("models/model_normalized.obj", "model.obj")  # ShapeNetCore v2 and v1
 SPLIT_WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"}  # parts of the names of lists
 DEEPSDF_BUFFER = 1.03  # radius of the unit sphere divided by the shape's radius
-WRAP_NOTE = (
+UNKNOWN_INSIDE_WARNING = (
     "warning: the file does not say what is inside: here it is what the wrap encloses; DeepSDF drops such shapes"
 )
 
@@ -159,7 +159,7 @@ def _shapes(folder: Path) -> dict[str, Path]:
 
 
 def _lists(file: Path) -> dict[Split, Path]:
-    """The file and its neighbours with another of `SPLIT_WORDS` in their names; without such a word, the test list."""
+    """The list of each split: `file` and files of its folder with other `SPLIT_WORDS`; without any word, only test."""
     if not file.is_file():
         raise ValueError(f"dataset.split: there is no file '{file}': give a split of DeepSDF (.json) or a list (.lst)")
     match = re.search(rf"(?<![a-z])({'|'.join(SPLIT_WORDS.values())})(?![a-z])", file.name)
@@ -201,5 +201,5 @@ def _load(path: Path, normalised: str) -> Mesh:
     if normalised == "onet":
         factor = 1 / float((points.max(axis=0) - points.min(axis=0)).max())
     mesh = repaired(path)
-    sign = (WRAP_NOTE,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
+    sign = (UNKNOWN_INSIDE_WARNING,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
     return replace(mesh, vertices=(mesh.vertices - centre) * factor, repairs=(*sign, *mesh.repairs))

@@ -16,7 +16,7 @@ SEARCH_SAMPLES_PER_AXIS = 48
 SHRINK_ROUNDS = 4  # the sampled cube shrinks to the hull in each round
 HULL_RADIUS_FRACTION = 0.9  # the hull's radius in the unit sphere
 PARALLEL_SPREAD, NARROW_SPREAD = 1e-4, 3e-3  # squared radians between optical axes that do not, or hardly, converge
-MIN_SIZE_RATIO, ASPECT_TOLERANCE = 1.3, 0.15  # from which on image sizes count as different, if both sides differ alike
+MIN_SIZE_RATIO, ASPECT_TOLERANCE = 1.3, 0.15  # smaller or unequal ratios of width and height do not matter
 GENERIC_HINT = (
     "Try flipped axes (stated ones, where they are flipped), check the order of the images and that masks are white on "
     "the object"
