@@ -265,8 +265,8 @@ SCENES |= {name: _cube_view_scene(view) for name, view in CUBE_VIEWS.items()}
 
 
 def _cube_case(draw: np.random.Generator, resolution: int, **view: float) -> StressCase:
-    view = {**CORNER_VIEW, "field_of_view": CUBE_FIELD_OF_VIEW_DEGREES, **view}
-    return _solid_case(box((CUBE_HALF_SIDE,) * 3), draw, resolution, **view)
+    settings = {**CORNER_VIEW, "field_of_view": CUBE_FIELD_OF_VIEW_DEGREES, **view}
+    return _solid_case(box((CUBE_HALF_SIDE,) * 3), draw, resolution, **settings)
 
 
 def _union_of_seven(make_solid: Callable[[int], Solid]) -> Solid:
