@@ -26,7 +26,7 @@ from bench.report.write.html import write_index
 from bench.tables import choice
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.meshes import find_meshes, read_mesh, read_points
-from datasets.own_photographs import Capture, Reading, read_capture, scan_number
+from datasets.own_photographs import Capture, ReadSettings, read_capture, scan_number
 from datasets.scene import sample_surface
 from renderers.checks import BadInput
 
@@ -152,7 +152,7 @@ class Judge:
 
 @cache
 def _photographs(folder: Path) -> Capture:
-    return read_capture(folder, Reading(LONGEST, unchecked=True))
+    return read_capture(folder, ReadSettings(LONGEST, unchecked=True))
 
 
 def _unlike(mesh: Mesh, places: Float[np.ndarray, "n 3"], most: float, least: float) -> list[str]:

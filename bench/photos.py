@@ -9,9 +9,9 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import SCREEN, bare, silhouette_image
-from datasets.captures.hull import Fit
-from datasets.captures.sphere import doubt_of
-from datasets.own_photographs import AXES, DOUBTFUL, GOOD, LOOK, Capture, Reading, read_capture
+from datasets.captures.hull import MaskFit
+from datasets.captures.sphere import likely_cause
+from datasets.own_photographs import AXES, GOOD_OVERLAP, PHOTOS_HINT, WARN_BELOW, Capture, ReadSettings, read_capture
 from renderers.camera import sphere_span
 
 MOST = 8  # photographs in the picture
@@ -19,16 +19,16 @@ OUTLINE = "#e5007d"
 NAMED = 5  # photographs that fit worst
 
 
-def told(fit: Fit, capture: Capture) -> list[str]:
+def told(fit: MaskFit, capture: Capture) -> list[str]:
     """The fit of the visual hull in words."""
     overlaps = fit.overlaps
     middle, order = float(np.median(overlaps)), np.argsort(overlaps)
-    found = [f"the visual hull and the masks overlap by {middle:.0%} (median; {GOOD:.0%} and more is good)"]
-    worst = [place for place in order[:NAMED] if overlaps[place] < DOUBTFUL]
+    found = [f"the visual hull and the masks overlap by {middle:.0%} (median; {GOOD_OVERLAP:.0%} and more is good)"]
+    worst = [place for place in order[:NAMED] if overlaps[place] < WARN_BELOW]
     if worst:
         named = ", ".join(f"{capture.shots[place].name} {overlaps[place]:.0%}" for place in worst)
         found.append(f"note: least in {named}: look at their masks and cameras")
-    if middle < DOUBTFUL and not doubt_of(capture.shots):
+    if middle < WARN_BELOW and not likely_cause(capture.shots):
         found.append("note: cameras and masks hardly fit: one wrong one is enough; or try --axes flipped")
     return found
 
@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
     into = given.into / "photos.png" if given.into.is_dir() else given.into.with_suffix(".png")
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
-        reading = Reading(given.longest, not given.without_masks, given.axes, images=given.images, unchecked=True)
+        reading = ReadSettings(given.longest, not given.without_masks, given.axes, images=given.images, unchecked=True)
         capture = read_capture(given.folder, reading)
         draw(capture).savefig(into, dpi=110)
     except (OSError, ValueError) as error:
@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     print(capture.summary)
     for note in capture.notes:
-        if LOOK not in note:  # which is told below
+        if PHOTOS_HINT not in note:  # which is told below
             print(f"note: {note}")
     if capture.fit:
         print("\n".join(told(capture.fit, capture)))

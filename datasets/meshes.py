@@ -13,7 +13,7 @@ from datasets.mesh import Mesh, joined
 from datasets.readers.glb import read_glb
 from datasets.readers.ply import read_ply
 from datasets.readers.polygons import Polygons
-from datasets.readers.text import mistaken, read_obj, read_off, read_stl
+from datasets.readers.text import read_obj, read_off, read_stl, wrong_kind_message
 from datasets.repair import repair
 from renderers.checks import BadInput
 
@@ -133,7 +133,7 @@ def _polygons(path: Path) -> Polygons:
     content = path.read_bytes()
     if not content:
         raise ValueError("must hold a mesh, found 0 bytes; export or copy it again")
-    if what := mistaken(path):
+    if what := wrong_kind_message(path):
         raise ValueError(what)
     with np.errstate(all="ignore"):  # of numbers that are refused later
         return READERS[path.suffix.lower()](content)

@@ -1,4 +1,4 @@
-"""One's own photographs as a dataset: one object, moved into the unit sphere, whose true shape is not known."""
+"""The user's photographs as a dataset: one object, moved into the unit sphere, of unknown true shape."""
 
 import re
 from collections.abc import Sequence
@@ -10,20 +10,20 @@ import numpy as np
 from jaxtyping import Float
 
 from datasets.captures.formats import find_layout
-from datasets.captures.frames import OPENGL, Frame, Layout, motion, nearest_motion
-from datasets.captures.hull import Fit, fit_of
-from datasets.captures.sphere import Sphere, doubt_of, hull_sphere, looked_at
-from datasets.captures.take import take, turning_notes
+from datasets.captures.frames import OPENGL, Frame, Layout, nearest_rigid_matrix, rigid_matrix
+from datasets.captures.hull import MaskFit, measure_mask_fit
+from datasets.captures.sphere import Sphere, hull_sphere, likely_cause, viewed_sphere
+from datasets.captures.take import exif_notes, read_shot
 from datasets.mesh import Mesh
 from datasets.scene import Split
 from datasets.shot import Shot
 from renderers.checks import BadInput, check_at_least, check_choice
 
 AXES = {"stated": np.eye(4), "flipped": OPENGL}
-FEWEST = 3  # photographs
-GOOD, DOUBTFUL, WRONG = 0.9, 0.8, 0.5  # overlap of hull and masks: cameras are right; hardly; photographs are refused
-LOOK = "python -m bench.photos shows it"
-ONE_PLACE = 1e-9  # most by which places of cameras may differ to be one, as a share of their coordinates
+MIN_PHOTOS = 3
+GOOD_OVERLAP, WARN_BELOW, REFUSE_BELOW = 0.9, 0.8, 0.5  # overlap of hull and masks, or visible fraction of the hull
+PHOTOS_HINT = "python -m bench.photos shows it"
+SAME_POSITION_TOLERANCE = 1e-9  # relative to the coordinates of the cameras
 
 
 @dataclass(frozen=True)
@@ -33,59 +33,52 @@ class Capture:
     Args:
         format: of the folder.
         shots: the photographs, by name.
-        masks: where the masks come from, in words; empty without masks.
-        found: how the unit sphere was found, in words.
-        to_world: the similarity from the world of the unit sphere into that of the file.
-        notes: how files were paired, where that is not plain; what was left out, changed, or is doubtful.
+        masks: the source of the masks, in words; empty without masks.
+        sphere_source: how the unit sphere was found, in words.
+        to_world: the similarity from the world of the unit sphere to the file's world.
+        notes: how files were paired, if not by equal names; what was left out, changed, or is doubtful.
         fit: of cameras and masks; None without masks.
     """
 
     format: str
     shots: tuple[Shot, ...]
     masks: str
-    found: str
+    sphere_source: str
     to_world: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...]
-    fit: Fit | None
+    fit: MaskFit | None
 
     @property
     def sphere(self) -> Sphere:
         """The unit sphere in the file's world."""
-        return Sphere(self.to_world[:3, 3], float(np.linalg.norm(self.to_world[:3, 0])), self.found)
+        return Sphere(self.to_world[:3, 3], float(np.linalg.norm(self.to_world[:3, 0])), self.sphere_source)
 
     @property
     def summary(self) -> str:
-        """What was found, in one sentence."""
+        """The photographs, masks and unit sphere in one sentence."""
         sizes = sorted({(shot.camera.width, shot.camera.height) for shot in self.shots})
         pixels = " and ".join(f"{width} x {height}" for width, height in sizes)
         masks = f"masks from {self.masks}" if self.masks else "no masks"
-        place = ", ".join(str(float(value)) for value in self.sphere.centre)  # all digits: a world may be far away
+        centre = ", ".join(str(float(value)) for value in self.sphere.centre)  # all digits, since it may be far away
         return (
             f"{self.format}: {len(self.shots)} photographs of {pixels} pixels, {masks}; the unit sphere has its centre "
-            f"at ({place}) and radius {self.sphere.radius}, {self.found}"
+            f"at ({centre}) and radius {self.sphere.radius}, {self.sphere_source}"
         )
 
 
 @runtime_checkable
 class Photographed(Protocol):
-    """A dataset of one object that is known from photographs, and perhaps from a file of its surface.
-
-    Args:
-        truth: see `OwnPhotographs`, as `dtu_scan`.
-    """
+    """A dataset of one object with photographs, and perhaps a file of its surface, `truth`; see `OwnPhotographs`."""
 
     truth: str | None
 
     @property
     def dtu_scan(self) -> int | None:
-        """The number of DTU's scan."""
+        """The number of DTU's scan; see `OwnPhotographs`."""
         ...
 
     def capture(self, longest: int, held_out: int) -> Capture:
-        """The photographs, with at most `longest` pixels along their longer sides.
-
-        Of so many as `held_out`, one has no part in finding the unit sphere.
-        """
+        """Reads the photographs, at most `longest` pixels a side; every `held_out`-th is not used for the sphere."""
         ...
 
 
@@ -94,12 +87,12 @@ class OwnPhotographs:
     """Photographs of one object with their cameras, in a folder; see `datasets/README.md` for the formats.
 
     Args:
-        path: the folder that has the photographs and their cameras.
-        masks: False reads none, as if there were none.
-        axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
-        images: the folder of COLMAP's images; None for the usual ones in `path`.
-        unchecked: whether photographs are used although cameras hardly fit masks or sizes.
-        truth: a mesh or a cloud of points in the cameras' world, or DTU's folder; None where nothing is known.
+        path: the folder with the photographs and their cameras.
+        masks: False ignores masks.
+        axes: "stated", as in the format, or "flipped": y and z of each camera are reversed.
+        images: the folder of COLMAP's images; None for the usual folders in `path`.
+        unchecked: use photographs although cameras hardly fit masks or sizes.
+        truth: a mesh or a cloud of points in the cameras' world, or DTU's folder; None without ground truth.
         scan: number of the scan of DTU's folder; None takes the number at the end of the photographs' folder.
     """
 
@@ -123,10 +116,10 @@ class OwnPhotographs:
 
     @property
     def dtu_scan(self) -> int | None:
-        """The number of the scan of DTU whose folder is the truth; None where the truth is none of DTU's.
+        """The number of the scan of DTU whose folder is the truth; None for another truth.
 
         Raises:
-            BadInput: where neither `scan` nor the folder's name says it.
+            BadInput: neither `scan` nor the folder's name states the number.
         """
         if self.truth is None or not Path(self.truth, "Points").is_dir():
             return None
@@ -139,42 +132,40 @@ class OwnPhotographs:
 
     def capture(self, longest: int, held_out: int) -> Capture:
         """See `Photographed`."""
-        reading = Reading(longest, self.masks, self.axes, held_out, self.images, self.unchecked)
-        return read_capture(Path(self.path), reading)
+        settings = ReadSettings(longest, self.masks, self.axes, held_out, self.images, self.unchecked)
+        return read_capture(Path(self.path), settings)
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """Raises BadInput: photographs have no true shape."""
         raise BadInput("photographs have no true shape: set task=reconstruction, task=multiview or another dataset")
 
     def identity(self) -> dict[str, Any]:
-        """The folder; runs are told apart by the contents of its files."""
+        """The folder; runs are distinguished by the contents of its files."""
         more = {} if self.images is None else {"images": self.images}
         return {"name": "photos", "path": self.path, "masks": self.masks, "axes": self.axes} | more
 
 
 def scan_number(name: str) -> int:
-    """The number of a scan of DTU that ends a name, as in `dtu_scan65`.
+    """The number of a scan of DTU at the end of a name, as in `dtu_scan65`.
 
     Raises:
-        BadInput: where there is none.
+        BadInput: the name has no number.
     """
-    found = re.search(r"(\d+)\D*$", name)
-    if found is None:
+    match = re.search(r"(\d+)\D*$", name)
+    if match is None:
         raise BadInput(f"'{name}' does not end in the number of a scan of DTU: set dataset.scan=65, or --scan 65")
-    return int(found[1])
+    return int(match[1])
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How photographs are read.
+class ReadSettings:
+    """Settings of reading photographs; see `OwnPhotographs` for `axes` and `images`.
 
     Args:
-        longest: most pixels of a photograph's longer side; larger ones are made smaller.
-        masks: whether masks are used where there are any.
-        axes: "stated", as the format has them, or "flipped": y and z of each camera point the other way.
-        held_out: of so many photographs one, from the first on, has no part in finding the sphere; None: all have.
-        images: the folder of COLMAP's images; None for the usual ones.
-        unchecked: whether what hardly fits is used, with a note.
+        longest: maximum number of pixels of a photograph's longer side; larger photographs are downscaled.
+        masks: whether masks are used if there are any.
+        held_out: every `held_out`-th photograph, from the first on, is not used to find the sphere; None: all are used.
+        unchecked: use photographs that hardly fit, with a note.
     """
 
     longest: int
@@ -188,75 +179,74 @@ class Reading:
         check_at_least("longest", self.longest, 8, "128 shows what there is")
 
 
-def read_capture(folder: Path, reading: Reading) -> Capture:
+def read_capture(folder: Path, settings: ReadSettings) -> Capture:
     """Reads the photographs of a folder, in one of the formats of `formats`.
 
     Raises:
-        BadInput: where something is missing, or cameras and masks do not fit.
+        BadInput: something is missing, or cameras and masks do not fit.
     """
-    layout = find_layout(folder, reading.images, masks=reading.masks)
-    if len(layout.frames) < FEWEST:
-        raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {FEWEST} or more are needed")
-    capture, doubts = _checked(_capture(layout, reading), layout.frames)
-    if doubts and not reading.unchecked:
+    layout = find_layout(folder, settings.images, masks=settings.masks)
+    if len(layout.frames) < MIN_PHOTOS:
+        raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {MIN_PHOTOS} or more are needed")
+    capture, doubts = _check_fit(_capture(layout, settings), layout.frames)
+    if doubts and not settings.unchecked:
         raise BadInput(f"{folder}: {'; '.join(doubts)}; or set dataset.unchecked=true")
     return replace(capture, notes=(*capture.notes, *doubts))
 
 
-def _capture(layout: Layout, reading: Reading) -> Capture:
+def _capture(layout: Layout, settings: ReadSettings) -> Capture:
     """The photographs of a layout, with their fit."""
-    frames, middle = _centred(layout.frames, AXES[reading.axes])
-    shots = [take(frame, reading.longest) for frame in frames]
-    masked = reading.masks and _all_masked(shots)
+    frames, origin = _centre(layout.frames, AXES[settings.axes])
+    shots = [read_shot(frame, settings.longest) for frame in frames]
+    masked = settings.masks and _all_masked(shots)
     shots = shots if masked else [replace(shot, mask=None) for shot in shots]
-    every = reading.held_out
-    given = [place for place in range(len(shots)) if every is None or place % every]
-    turns = turning_notes(frames)
+    used = [i for i in range(len(shots)) if settings.held_out is None or i % settings.held_out]
+    exif = exif_notes(frames)
     try:
-        sphere = _sphere(layout, middle, [shots[place] for place in given], [frames[place].span for place in given])
+        sphere = _sphere(layout, origin, [shots[i] for i in used], [frames[i].depth_range for i in used])
     except BadInput as error:
-        raise BadInput("; ".join([str(error), *turns])) from None
+        raise BadInput("; ".join([str(error), *exif])) from None
     largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
-    longest = reading.longest
-    whole = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
+    longest = settings.longest
+    size_note = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
     source = "files" if frames[0].mask is not None else "the alpha channel"
     to_world = np.diag([*[sphere.radius] * 3, 1.0])
     to_world[:3, 3] = sphere.centre
-    within = tuple(shot.within(to_world) for shot in shots)
-    to_world[:3, 3] += middle
+    unit_shots = tuple(shot.in_world(to_world) for shot in shots)
+    to_world[:3, 3] += origin
     return Capture(
         layout.format,
-        within,
+        unit_shots,
         source if masked else "",
-        sphere.found,
+        sphere.source,
         layout.world @ to_world,
-        (*layout.notes, *turns, *whole),
-        fit_of(within) if masked else None,
+        (*layout.notes, *exif, *size_note),
+        measure_mask_fit(unit_shots) if masked else None,
     )
 
 
-def _centred(frames: Sequence[Frame], axes: Float[np.ndarray, "4 4"]) -> tuple[list[Frame], Float[np.ndarray, "3"]]:
-    """Frames with the origin among the cameras, since digits would be lost in a far world; and where that was.
+def _centre(frames: Sequence[Frame], axes: Float[np.ndarray, "4 4"]) -> tuple[list[Frame], Float[np.ndarray, "3"]]:
+    """Frames with the origin moved to the mean camera position, and that position; far coordinates would lose digits.
 
     Raises:
-        BadInput: where all cameras are at one place.
+        BadInput: all cameras are at one position.
     """
-    motions = [axes @ nearest_motion(frame.world_to_camera) for frame in frames]
-    places = -np.stack([np.linalg.solve(one[:3, :3], one[:3, 3]) for one in motions])
-    middle = places.mean(axis=0)
-    if np.abs(places - middle).max() <= ONE_PLACE * np.abs(middle).max():
+    poses = [axes @ nearest_rigid_matrix(frame.world_to_camera) for frame in frames]
+    positions = -np.stack([np.linalg.solve(pose[:3, :3], pose[:3, 3]) for pose in poses])
+    origin = positions.mean(axis=0)
+    if np.abs(positions - origin).max() <= SAME_POSITION_TOLERANCE * np.abs(origin).max():
         raise BadInput(
             f"all {len(frames)} cameras, of {frames[0].image.name} to {frames[-1].image.name}, are at one place, "
-            f"({', '.join(f'{value:.6g}' for value in middle)}): photographs from several places are needed; check the "
+            f"({', '.join(f'{value:.6g}' for value in origin)}): photographs from several places are needed; check the "
             "translations in the file of cameras"
         )
-    shift = motion(np.eye(3), middle)
-    moved = [replace(frame, world_to_camera=one @ shift) for frame, one in zip(frames, motions, strict=True)]
-    return moved, middle
+    shift = rigid_matrix(np.eye(3), origin)
+    shifted = [replace(frame, world_to_camera=pose @ shift) for frame, pose in zip(frames, poses, strict=True)]
+    return shifted, origin
 
 
 def _all_masked(shots: Sequence[Shot]) -> bool:
-    """Whether photographs have masks; raises BadInput where only some have, or one is empty."""
+    """Whether photographs have masks; raises BadInput if only some have masks, or a mask is empty."""
     lacking = [shot.name for shot in shots if shot.mask is None]
     if 0 < len(lacking) < len(shots):
         raise BadInput(f"{lacking[0]} has no mask, and others have one: add it, or use no masks")
@@ -268,32 +258,33 @@ def _all_masked(shots: Sequence[Shot]) -> bool:
 
 
 def _sphere(
-    layout: Layout, middle: Float[np.ndarray, "3"], shots: Sequence[Shot], spans: Sequence[tuple[float, float] | None]
+    layout: Layout, origin: Float[np.ndarray, "3"], shots: Sequence[Shot], ranges: Sequence[tuple[float, float] | None]
 ) -> Sphere:
-    """The sphere that the format states; else about the masks' hull, the reconstructed points, or what is looked at."""
+    """The sphere that the format states, else about the masks' hull, the reconstructed points, or the viewed point."""
     if layout.sphere:
         centre, radius = layout.sphere
-        return Sphere(centre - middle, radius, "as the format states")
+        return Sphere(centre - origin, radius, "as the format states")
     if all(shot.mask is not None for shot in shots):
-        return hull_sphere(shots, looked_at(shots, spans))
-    if layout.points:
-        centre, radius = layout.points
-        return Sphere(centre - middle, radius, "about most of the reconstructed points")
-    return looked_at(shots, spans)
+        return hull_sphere(shots, viewed_sphere(shots, ranges))
+    if layout.points_sphere:
+        centre, radius = layout.points_sphere
+        return Sphere(centre - origin, radius, "about most of the reconstructed points")
+    return viewed_sphere(shots, ranges)
 
 
-def _checked(capture: Capture, frames: Sequence[Frame]) -> tuple[Capture, list[str]]:
-    """A capture with notes on what is doubtful, and what is so doubtful that it is refused."""
+def _check_fit(capture: Capture, frames: Sequence[Frame]) -> tuple[Capture, list[str]]:
+    """A capture with notes on doubtful fits, and the messages on fits that are refused."""
     fit = capture.fit
-    overlap, shown = (float(np.median(one)) for one in ((fit.overlaps, fit.shown) if fit else ([1.0], [1.0])))
-    open_to_doubt = overlap < DOUBTFUL if fit else None in [frame.size for frame in frames]
-    if open_to_doubt and (doubt := doubt_of(capture.shots)):
-        return capture, [doubt]
-    told = {
+    overlap, shown = map(float, (np.median(fit.overlaps), np.median(fit.shown)) if fit else (1, 1))
+    is_doubtful = overlap < WARN_BELOW if fit else None in [frame.size for frame in frames]
+    if is_doubtful and (cause := likely_cause(capture.shots)):
+        return capture, [cause]
+    fractions_by_text = {
         f"the visual hull of the masks overlaps with them by {overlap:.0%} (median): cameras may be those of other "
-        f"images; {LOOK}": overlap,
+        f"images; {PHOTOS_HINT}": overlap,
         f"the photographs show {shown:.0%} of the object (median): cameras may look elsewhere, or the focal length "
         "is another": shown,
     }
-    notes = [text for text, share in told.items() if WRONG <= share < DOUBTFUL]
-    return replace(capture, notes=(*capture.notes, *notes)), [text for text, share in told.items() if share < WRONG]
+    notes = [text for text, fraction in fractions_by_text.items() if REFUSE_BELOW <= fraction < WARN_BELOW]
+    refused = [text for text, fraction in fractions_by_text.items() if fraction < REFUSE_BELOW]
+    return replace(capture, notes=(*capture.notes, *notes)), refused

@@ -1,4 +1,4 @@
-"""Colour images of a textured mesh from cameras all around it, with noise, blur and exposure of a real camera."""
+"""Colour images of a textured mesh from several cameras, with noise, blur and exposure of a real camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from datasets.views import look_at
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 
-SUPERSAMPLING = 2  # a pixel's colour is the mean over 2 x 2 rays
-LIGHT = (0.4, 0.8, 0.45)  # towards the light, in world axes
-AMBIENT = 0.4  # of the light; the rest comes from one side
-GREY = 0.5
-HIGHEST = 60.0  # degrees
-ARC = 45.0  # degrees
-UNIFORM = 1e-3  # least difference between the quartiles of a surface's colours: below it nothing can be matched
+SUPERSAMPLING = 2  # rays per pixel and axis
+LIGHT_DIRECTION = (0.4, 0.8, 0.45)  # towards the light, in world axes
+AMBIENT_FRACTION = 0.4  # the rest of the light comes from LIGHT_DIRECTION
+BACKGROUND_GREY = 0.5
+MAX_ELEVATION_DEGREES = 60.0
+ARC_HALF_ANGLE_DEGREES = 45.0
+MIN_COLOUR_SPREAD = 1e-3  # interquartile range of a surface's colours; images of fewer colours cannot be matched
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Photography:
 
     Args:
         views: number of cameras.
-        places: "circle": evenly spaced about the vertical axis, the first is the scene's camera. "arc": the same
-            within `ARC` degrees to its left and right, from one side of the shape. "sphere": all around at its
-            distance, evenly spaced between `HIGHEST` degrees below and above.
+        places: "circle": evenly spaced about the vertical axis, starting at the scene's camera. "arc": on this circle,
+            at most `ARC_HALF_ANGLE_DEGREES` from the scene's camera. "sphere": on all sides, at the same distance,
+            at elevations of at most `MAX_ELEVATION_DEGREES` up and down.
         texture: one of `datasets.textures.TEXTURES`.
-        texture_size: of its largest parts, in scene units; see `datasets.textures.make_texture`.
+        texture_size: of the texture's largest parts, in scene units; see `datasets.textures.make_texture`.
         shading: "unlit": the texture's colours; "lambertian": under a fixed light.
-        background: "grey", or "noise" that differs between views, as a distant background does.
+        background: "grey", or "noise" that differs between views, like a distant background.
         noise: standard deviation of each colour's noise.
         blur: standard deviation of a Gaussian, in pixels.
         exposure: standard deviation of the logarithm of each view's exposure.
@@ -53,7 +53,7 @@ class Photography:
 
     def __post_init__(self) -> None:
         check_at_least("views", self.views, 2, "views are compared with their neighbours: 24 work")
-        check_choice("places", self.places, tuple(PLACES))
+        check_choice("places", self.places, tuple(CAMERA_LAYOUTS))
         check_choice("texture", self.texture, TEXTURES)
         check_positive("texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
         check_choice("shading", self.shading, ("unlit", "lambertian"))
@@ -64,22 +64,22 @@ class Photography:
             check_at_least(name, getattr(self, name), 0, f"{name}=0 switches it off")
 
     def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Shot]:
-        """The photographs of a mesh.
+        """Takes the photographs of a mesh.
 
         Raises:
-            ValueError: where a camera sees nothing of it, or all colours of its surface are alike.
+            ValueError: a camera does not see the mesh, or its surface has one colour.
         """
-        return self.take_from(truth, PLACES[self.places](first, self.views), seed=seed)
+        return self.take_from(truth, CAMERA_LAYOUTS[self.places](first, self.views), seed=seed)
 
     def take_from(self, truth: Truth, cameras: Sequence[Camera], *, seed: int) -> list[Shot]:
-        """The photographs of a mesh from given cameras; see `take`."""
+        """Takes the photographs of a mesh with `cameras`; see `take`."""
         generator = np.random.default_rng([seed, 2])
         texture = make_texture(self.texture, self.texture_size, seed)
         taken = [self._take_one(str(index), truth, texture, camera, generator) for index, camera in enumerate(cameras)]
         for shot in taken:
             if shot.mask is None or not bool(shot.mask.any()):
                 raise BadInput(f"camera {shot.name} sees nothing of the shape: widen view.field_of_view or distance")
-        if max(_spread(shot) for shot in taken) < UNIFORM:
+        if max(_colour_spread(shot) for shot in taken) < MIN_COLOUR_SPREAD:
             raise BadInput("the surface has one colour in all images: choose another texture or shading")
         return taken
 
@@ -90,13 +90,14 @@ class Photography:
         rays = fine.rays().flat()
         origins, directions = rays.origins.numpy().astype(float), rays.directions.numpy().astype(float)
         hits = truth.cast(origins, directions)
-        colours = np.full((len(origins), 3), GREY)
+        colours = np.full((len(origins), 3), BACKGROUND_GREY)
         if self.background == "noise":
             colours = generator.random((len(origins), 3))
         points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
         normals = hits.normals[hits.hit].astype(float)
-        light = np.array(LIGHT) / np.linalg.norm(LIGHT)
-        shade = 1.0 if self.shading == "unlit" else AMBIENT + (1 - AMBIENT) * (normals @ light).clip(0)[:, None]
+        light = np.array(LIGHT_DIRECTION) / np.linalg.norm(LIGHT_DIRECTION)
+        diffuse = (1 - AMBIENT_FRACTION) * (normals @ light).clip(0)[:, None]
+        shade = 1.0 if self.shading == "unlit" else AMBIENT_FRACTION + diffuse
         colours[hits.hit] = shade * texture(points, normals)
         image = colours.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING, 3).mean(axis=(1, 3))
         image = image * np.exp(self.exposure * generator.standard_normal())
@@ -107,8 +108,8 @@ class Photography:
         return Shot(name, camera, colours, view.mask, view.depth, view.normals)
 
 
-def _spread(shot: Shot) -> float:
-    """The interquartile range of the colours on the shape; it ignores outline pixels, which mix with the background."""
+def _colour_spread(shot: Shot) -> float:
+    """The interquartile range of the colours on the shape, to ignore outline pixels mixed with the background."""
     quartiles = shot.colours[shot.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
     return float((quartiles[1] - quartiles[0]).max())
 
@@ -119,19 +120,19 @@ def circle(first: Camera, count: int) -> list[Camera]:
 
 
 def arc(first: Camera, count: int) -> list[Camera]:
-    """Cameras evenly spaced on a part of that circle, the first camera in the middle."""
-    angles = np.radians(np.linspace(-ARC, ARC, count))
+    """Cameras evenly spaced on an arc of that circle, with `first` in the middle."""
+    angles = np.radians(np.linspace(-ARC_HALF_ANGLE_DEGREES, ARC_HALF_ANGLE_DEGREES, count))
     return [turned(first, float(angle)) for angle in angles]
 
 
 def around(first: Camera, count: int) -> list[Camera]:
-    """Cameras that look at the origin from evenly spaced places (a spiral of the golden angle)."""
-    heights = np.sin(np.radians(HIGHEST)) * (1 - (2 * np.arange(count) + 1) / count)
+    """Cameras that look at the origin from evenly spaced positions (a spiral of the golden angle)."""
+    heights = np.sin(np.radians(MAX_ELEVATION_DEGREES)) * (1 - (2 * np.arange(count) + 1) / count)
     turns = np.pi * (3 - 5**0.5) * np.arange(count)
-    flat = np.sqrt(1 - heights**2)
-    places = np.stack([flat * np.sin(turns), heights, flat * np.cos(turns)], axis=1) * float(first.center.norm())
-    motions = [look_at(torch.from_numpy(place).float(), torch.zeros(3)) for place in places]
-    return [Camera(first.intrinsics, motion, first.height, first.width) for motion in motions]
+    radii = np.sqrt(1 - heights**2)
+    positions = np.stack([radii * np.sin(turns), heights, radii * np.cos(turns)], axis=1) * float(first.center.norm())
+    poses = [look_at(torch.from_numpy(position).float(), torch.zeros(3)) for position in positions]
+    return [Camera(first.intrinsics, motion, first.height, first.width) for motion in poses]
 
 
 def turned(camera: Camera, angle: float) -> Camera:
@@ -142,4 +143,4 @@ def turned(camera: Camera, angle: float) -> Camera:
     return Camera(camera.intrinsics, camera.world_to_camera @ turn, camera.height, camera.width)
 
 
-PLACES = {"circle": circle, "arc": arc, "sphere": around}  # of cameras
+CAMERA_LAYOUTS = {"circle": circle, "arc": arc, "sphere": around}

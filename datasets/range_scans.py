@@ -1,4 +1,4 @@
-"""Range scans of one object as a dataset: depths that a scanner measured, beside the surface made from all of them."""
+"""Range scans of one object as a dataset: depths that a scanner measured, and the surface made from all of them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,15 +15,15 @@ from torch import Tensor
 from datasets.mesh import Mesh, fit_in_sphere, normalise
 from datasets.meshes import load_mesh
 from datasets.readers.ply import read_ply
-from datasets.readers.text import mistaken
+from datasets.readers.text import wrong_kind_message
 from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, meshlab, with_note
 from datasets.scene import Split, Truth, sample_surface
 from renderers.checks import BadInput, check_share
 
-LONGEST = 4.0  # median edges: points farther apart are not joined, as across a gap or behind an outline
-SCANNER = np.array([0.0, 0.0, 1.0])  # from the object to the scanner, in a scan's own axes (Stanford's repository)
-LINE = "bmesh FILE tx ty tz qx qy qz qw"
-OCTREE = 9  # depth of the octree of a Poisson reconstruction: cells of a 512th of its box
+MAX_EDGE_RATIO = 4.0  # to the median edge; a longer edge crosses a gap or an outline
+SCANNER_DIRECTION = np.array([0.0, 0.0, 1.0])  # from the object, in the scan's axes (Stanford's repository)
+CONF_LINE = "bmesh FILE tx ty tz qx qy qz qw"
+POISSON_DEPTH = 9  # octree cells are 1/512 of its box
 
 
 @dataclass(frozen=True)
@@ -40,33 +40,32 @@ class Scan:
         return Rotation.from_quat(self.quaternion).inv()
 
     def surface(self) -> Mesh:
-        """The scan as an open surface in world coordinates: neighbours in the scanner's view are joined.
+        """The scan as an open surface in world coordinates; neighbours in the scanner's view are joined.
 
         Raises:
-            BadInput: where the file is cut short, or has no points.
+            BadInput: the file is truncated, or has no points.
         """
         try:
-            if what := mistaken(self.file):
-                raise ValueError(what)
+            if wrong_kind := wrong_kind_message(self.file):
+                raise ValueError(wrong_kind)
             points = read_ply(self.file.read_bytes()).vertices
         except ValueError as error:
             raise BadInput(f"scan '{self.file}' {error}") from None
         if len(points) < 3 or not np.isfinite(points).all():
             raise BadInput(f"scan '{self.file}' has no points, or some that are not finite: copy the file again")
-        return replace(joined(points[:, :2], points), vertices=self.rotation.apply(points) + self.translation)
+        return replace(join_neighbours(points[:, :2], points), vertices=self.rotation.apply(points) + self.translation)
 
 
 @dataclass(frozen=True)
 class RangeScans:
-    """Range scans with their poses in a `.conf` file, and the mesh that was made from them, as Stanford keeps them.
+    """Range scans with poses in a `.conf` file, and the mesh that was made from them, as in Stanford's repository.
 
-    Every index is the same object, seen from the scanner of that scan.
+    Every index is the same object, seen from the scanner of the scan with this index.
 
     Args:
-        path: the folder: one `.conf` file whose lines `bmesh FILE tx ty tz qx qy qz qw` name the scans, these, and the
-            mesh.
-        truth: the mesh's file in it; None takes the largest `.ply` file that is no scan.
-        radius: of the sphere about the origin that holds the mesh.
+        path: a folder with the scans, the mesh, and one `.conf` file with lines `bmesh FILE tx ty tz qx qy qz qw`.
+        truth: the mesh's file in the folder; None takes the largest `.ply` file that is no scan.
+        radius: of the sphere about the origin that contains the mesh.
     """
 
     path: str
@@ -87,19 +86,19 @@ class RangeScans:
     @cached_property
     def scans(self) -> list[Scan]:
         """The scans that the `.conf` file names, in its order."""
-        found = sorted(Path(self.path).glob("*.conf"))
-        if len(found) != 1:
-            raise ValueError(f"dataset.path={self.path} must have one .conf file, the poses of scans, not {len(found)}")
-        text = found[0].read_text(encoding="utf-8-sig", errors="replace")
+        confs = sorted(Path(self.path).glob("*.conf"))
+        if len(confs) != 1:
+            raise ValueError(f"dataset.path={self.path} must have one .conf file, the poses of scans, not {len(confs)}")
+        text = confs[0].read_text(encoding="utf-8-sig", errors="replace")
         lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1)]
-        scans = [_scan(found[0], number, words) for number, words in lines if words and words[0] == "bmesh"]
+        scans = [_scan(confs[0], number, words) for number, words in lines if words and words[0] == "bmesh"]
         if not scans:
-            raise ValueError(f"'{found[0]}' names no scan: it needs lines '{LINE}'")
+            raise ValueError(f"'{confs[0]}' names no scan: it needs lines '{CONF_LINE}'")
         return scans
 
     @cached_property
     def reference(self) -> Path:
-        """The file of the mesh that stands for the true shape."""
+        """The file of the mesh that is the ground truth."""
         if self.truth is not None:
             file = Path(self.path) / self.truth
             if not file.is_file():
@@ -113,14 +112,14 @@ class RangeScans:
 
     @cached_property
     def _read(self) -> Mesh:
-        mesh = load_mesh(self.reference, close=smoothed)
+        mesh = load_mesh(self.reference, close=smooth)
         return replace(mesh, repairs=(f"the true shape is '{self.reference.name}'", *mesh.repairs))
 
     def mesh(self, split: Split, index: int) -> Mesh:
-        """The object, whatever the index; its `repairs` say what was repaired in the file.
+        """The object, the same for each index; its `repairs` state what was repaired in the file.
 
         Raises:
-            BadInput: where there is no scan of that number, or a prior should be trained.
+            BadInput: no scan has this index, or `split` is the training split.
         """
         if split is Split.TRAIN:
             raise BadInput(
@@ -131,7 +130,7 @@ class RangeScans:
 
     def towards_scanner(self, index: int) -> Float[Tensor, "3"]:
         """See `Scanned`."""
-        return torch.from_numpy(self._scan(index).rotation.apply(SCANNER)).float()
+        return torch.from_numpy(self._scan(index).rotation.apply(SCANNER_DIRECTION)).float()
 
     def seen(self, index: int) -> Mesh:
         """See `Scanned`."""
@@ -140,7 +139,7 @@ class RangeScans:
         return replace(surface, vertices=(surface.vertices - centre) * factor)
 
     def identity(self) -> dict[str, Any]:
-        """The folder; runs are told apart by the contents of its files."""
+        """The folder; runs are distinguished by the contents of its files."""
         return {"name": "scans", "path": self.path, "truth": self.truth, "radius": self.radius}
 
     def _scan(self, index: int) -> Scan:
@@ -149,48 +148,48 @@ class RangeScans:
         return self.scans[index]
 
 
-def joined(places: Real[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]) -> Mesh:
-    """The open surface of points that are neighbours at their places in a view, but for those that are far apart."""
-    faces = Delaunay(places).simplices
+def join_neighbours(image_positions: Real[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]) -> Mesh:
+    """The open surface that joins points which are neighbours in the image, except over long distances."""
+    faces = Delaunay(image_positions).simplices
     corners = points[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    return Mesh(points, faces[edges.max(axis=1) <= LONGEST * np.median(edges)])
+    return Mesh(points, faces[edges.max(axis=1) <= MAX_EDGE_RATIO * np.median(edges)])
 
 
 def _scan(conf: Path, number: int, words: list[str]) -> Scan:
-    """The scan of a line's words.
+    """The scan of a line of the `.conf` file.
 
     Raises:
-        ValueError: where they are no scan, or its file is not there.
+        ValueError: the line does not describe a scan, or its file is missing.
     """
     try:
         name, numbers = words[1], np.array(words[2:], dtype=np.float64)
     except (ValueError, IndexError):
         name, numbers = "", np.empty(0)
     if len(numbers) != 7 or not np.isfinite(numbers).all() or not numbers[3:].any():
-        raise ValueError(f"'{conf}', line {number}, must be '{LINE}', not '{' '.join(words)}'")
+        raise ValueError(f"'{conf}', line {number}, must be '{CONF_LINE}', not '{' '.join(words)}'")
     file = conf.parent / name
     if not file.is_file():
         raise ValueError(f"'{conf}' names '{name}', which is not beside it: copy it there, or take line {number} out")
     return Scan(file, numbers[:3], numbers[3:])
 
 
-def smoothed(mesh: Mesh) -> Mesh | None:
+def smooth(mesh: Mesh) -> Mesh | None:
     """The screened Poisson reconstruction of a mesh (Kazhdan and Hoppe 2013), for scans with holes and tangled faces.
 
-    None without PyMeshLab, and where either surface has more than `OUTSIDE_SHARE` farther than `OUTSIDE_BY` from the
-    other, as where faces are not wound consistently or a hole is wide.
+    None without PyMeshLab, or if more than `OUTSIDE_SHARE` of one surface is farther than `OUTSIDE_BY` from the other.
+    This happens if faces are oriented inconsistently or a hole is wide.
     """
     if meshlab() is None:
         return None
-    wound = apply(mesh, ("meshing_re_orient_faces_coherently", {}))
-    meshes = mesh_set(wound if wound.volume > 0 else replace(wound, faces=wound.faces[:, ::-1]))
-    meshes.generate_surface_reconstruction_screened_poisson(depth=OCTREE, preclean=True, threads=1)
-    found = current(meshes, mesh)
-    if not (found.watertight and found.volume > 0):
+    oriented = apply(mesh, ("meshing_re_orient_faces_coherently", {}))
+    meshes = mesh_set(oriented if oriented.volume > 0 else replace(oriented, faces=oriented.faces[:, ::-1]))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=POISSON_DEPTH, preclean=True, threads=1)
+    smooth_mesh = current(meshes, mesh)
+    if not (smooth_mesh.watertight and smooth_mesh.volume > 0):
         return None
-    for near, far in ((mesh, found), (found, mesh)):
+    for near, far in ((mesh, smooth_mesh), (smooth_mesh, mesh)):
         points = sample_surface(near, 5000, seed=0).points
         if (Truth(far, closed=False).distance(points) > OUTSIDE_BY * mesh.diagonal).mean() > OUTSIDE_SHARE:
             return None
-    return with_note(found, "replaced by its Poisson reconstruction, since its parts do not close into a solid")
+    return with_note(smooth_mesh, "replaced by its Poisson reconstruction, since its parts do not close into a solid")

@@ -1,4 +1,4 @@
-"""ShapeNetCore as a dataset: the files of a class and of a split, and where their shapes are placed."""
+"""ShapeNetCore as a dataset: the files of a class and of a split, and the placement of their shapes."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from datasets.captures.formats import find_layout
-from datasets.captures.take import take
+from datasets.captures.take import read_shot
 from datasets.colours import FileColours
 from datasets.local import VERSION, deal, repaired
 from datasets.mesh import Mesh, fit_in_sphere
@@ -28,25 +28,27 @@ SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
     **{"table": "04379243", "phone": "04401088", "vessel": "04530566"},
 }
 NAMES = {number: name for name, number in SYNSETS.items()}
-MESHES = ("models/model_normalized.obj", "model.obj")  # of v2 and of v1, in the folder of a shape
-WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"}  # in the names of lists
-BUFFER = 1.03  # of DeepSDF: the unit sphere is so many times as large as the shape
-UNKNOWN = "warning: the file does not say what is inside: here it is what the wrap encloses; DeepSDF drops such shapes"
+MESH_PATHS = ("models/model_normalized.obj", "model.obj")  # ShapeNetCore v2 and v1
+SPLIT_WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"}  # parts of the names of lists
+DEEPSDF_BUFFER = 1.03  # radius of the unit sphere divided by the shape's radius
+UNKNOWN_INSIDE_WARNING = (
+    "warning: the file does not say what is inside: here it is what the wrap encloses; DeepSDF drops such shapes"
+)
 
 
 @dataclass(frozen=True)
 class ShapeNet:
     """The shapes of a class of ShapeNetCore, each repaired to be a closed solid.
 
-    A split without a list has a fifth of the training list; where there is none, of the shapes that no list names.
-    Shapes of training and validation come again where a prior takes more than there are; those of the test do not.
+    A split without a list has a fifth of the training list; without that list, of the shapes that no list names.
+    Training and validation repeat shapes if a prior takes more than exist. The test split does not.
 
     Args:
-        path: the folder that has the synsets' folders, with `ID/models/model_normalized.obj` (v2) or `ID/model.obj`.
+        path: the folder with the synsets' folders, with `ID/models/model_normalized.obj` (v2) or `ID/model.obj`.
         synset: a name of `SYNSETS`, or a number.
-        split: a list of ids; see `_lists`. None: all shapes are dealt out.
+        split: a list of ids; see `_lists`. None: all shapes are divided among the splits.
         normalised: "deepsdf", into the unit sphere, or "onet", into a cube of side 1.
-        renders: a folder with `SYNSET/ID` of DVR's data or of NMR's as DVR has it, for `task=single_view`.
+        renders: a folder with `SYNSET/ID`, of DVR's data or of NMR's in DVR's form, for `task=single_view`.
     """
 
     path: str
@@ -59,30 +61,31 @@ class ShapeNet:
         check_choice("dataset.normalised", self.normalised, ("deepsdf", "onet"))
         if not self.synset.isdigit():
             check_choice("dataset.synset", self.synset, tuple(SYNSETS))
-        _ = self.files  # raises where something is missing
-        if self.renders is not None and not (pictured := Path(self.renders) / self.folder.name).is_dir():
-            raise ValueError(f"dataset.renders: there is no folder '{pictured}': give the one that has SYNSET/ID")
+        _ = self.files  # raises if something is missing
+        if self.renders is not None and not (class_folder := Path(self.renders) / self.folder.name).is_dir():
+            raise ValueError(f"dataset.renders: there is no folder '{class_folder}': give the one that has SYNSET/ID")
 
     @property
     def name(self) -> str:
-        """The class, by its name where it has one."""
+        """The class, by its name if `SYNSETS` has one."""
         return f"shapenet_{NAMES.get(self.synset, self.synset)}"
 
     @property
     def folder(self) -> Path:
-        """That of the class."""
+        """The folder of the class."""
         return Path(self.path) / SYNSETS.get(self.synset, self.synset)
 
     def mesh(self, split: Split, index: int) -> Mesh:
-        """A shape as a closed mesh; its `repairs` say which one it is, what its list lacks, and what was repaired."""
+        """A shape as a closed mesh; its `repairs` state its id, shapes that are missing on disk, and its repairs."""
         file = self._file(split, index)
-        mesh, told = _load(file, self.normalised), [f"the shape is {_id(file)}"]
-        if lost := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
-            told.append(f"warning: {len(lost)} shapes of the list are not on disk, and left out, such as {min(lost)}")
-        return replace(mesh, repairs=(*told, *mesh.repairs))
+        mesh, notes = _load(file, self.normalised), [f"the shape is {_id(file)}"]
+        if missing := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
+            text = f"{len(missing)} shapes of the list are not on disk, and left out, such as {min(missing)}"
+            notes.append(f"warning: {text}")
+        return replace(mesh, repairs=(*notes, *mesh.repairs))
 
     def texture(self, split: Split, index: int) -> Texture:
-        """The colours of a shape, as its file has them; see `Textured`."""
+        """The colours of a shape from its file; see `Textured`."""
         file = self._file(split, index)
         return FileColours(file, repaired(file), self.mesh(split, index))
 
@@ -91,7 +94,7 @@ class ShapeNet:
         if self.renders is None:
             return None
         folder = Path(self.renders) / self.folder.name / _id(self._file(split, index))
-        return tuple(take(frame, longest).within(np.eye(4)) for frame in find_layout(folder).frames)
+        return tuple(read_shot(frame, longest).in_world(np.eye(4)) for frame in find_layout(folder).frames)
 
     def _file(self, split: Split, index: int) -> Path:
         files = self.files[split]
@@ -105,24 +108,24 @@ class ShapeNet:
 
     @cached_property
     def files(self) -> dict[Split, list[Path]]:
-        """The files of each split, in the order of its list; those that are not on disk are left out.
+        """The files of each split that are on disk, in the order of its list.
 
         Raises:
-            ValueError: where the class or a list has no shapes.
+            ValueError: the class or a list has no shapes.
         """
-        here = _shapes(self.folder)
-        listed = {split: [here[name] for name in names if name in here] for split, names in self.lists.items()}
+        by_id = _shapes(self.folder)
+        listed = {split: [by_id[name] for name in names if name in by_id] for split, names in self.lists.items()}
         if listed and not any(listed.values()):
             names = [name for names in self.lists.values() for name in names]
             raise ValueError(
                 f"dataset.split: none of its {len(names)} shapes is in '{self.folder}', such as {names[0]}: unpack "
                 "them there, or give the split of the shapes that are"
             )
-        rest = {*here.values()}.difference(*listed.values())
+        rest = {*by_id.values()}.difference(*listed.values())
         files = deal(listed.get(Split.TRAIN, sorted(rest))) | listed
         if Split.TRAIN in listed:
-            held = {*files[Split.VALIDATION], *files[Split.TEST]}
-            files[Split.TRAIN] = [file for file in files[Split.TRAIN] if file not in held]
+            held_out = {*files[Split.VALIDATION], *files[Split.TEST]}
+            files[Split.TRAIN] = [file for file in files[Split.TRAIN] if file not in held_out]
         return files
 
     @cached_property
@@ -132,11 +135,11 @@ class ShapeNet:
         return {split: _read_ids(file, self.folder.name) for split, file in files.items()}
 
     def identity(self) -> dict[str, Any]:
-        """Plain data that determines the shapes: which these are, as a release of ShapeNet does not change."""
+        """Plain data that determines the shapes: their paths, since the files of a ShapeNet release do not change."""
         names = {split: [str(file.relative_to(self.folder)) for file in files] for split, files in self.files.items()}
         shapes = hashlib.sha256(json.dumps(names).encode()).hexdigest()
-        more = {} if self.renders is None else {"renders": self.renders}
-        return {"name": self.name, "version": VERSION, "shapes": shapes, "normalised": self.normalised} | more
+        renders = {} if self.renders is None else {"renders": self.renders}
+        return {"name": self.name, "version": VERSION, "shapes": shapes, "normalised": self.normalised} | renders
 
 
 def _id(file: Path) -> str:
@@ -146,31 +149,31 @@ def _id(file: Path) -> str:
 
 def _shapes(folder: Path) -> dict[str, Path]:
     """The file of each shape in a class's folder, by its id."""
-    for inner in MESHES:
-        if found := sorted(folder.glob(f"*/{inner}")):
-            return {_id(file): file for file in found}
-    what = f"'{folder}' has no ID/{MESHES[0]} (v2) and no ID/{MESHES[1]} (v1)"
-    for place in (folder, folder.parent):
-        what = what if place.is_dir() else f"there is no folder '{place}'"
+    for inner in MESH_PATHS:
+        if files := sorted(folder.glob(f"*/{inner}")):
+            return {_id(file): file for file in files}
+    what = f"'{folder}' has no ID/{MESH_PATHS[0]} (v2) and no ID/{MESH_PATHS[1]} (v1)"
+    for parent in (folder, folder.parent):
+        what = what if parent.is_dir() else f"there is no folder '{parent}'"
     raise ValueError(f"dataset.path: {what}: give the folder of ShapeNetCore in which that of the synset is unpacked")
 
 
 def _lists(file: Path) -> dict[Split, Path]:
-    """The lists of a split: the file, and those beside it with another of `WORDS` in their names; without one, test."""
+    """The list of each split: `file` and files of its folder with other `SPLIT_WORDS`; without any word, only test."""
     if not file.is_file():
         raise ValueError(f"dataset.split: there is no file '{file}': give a split of DeepSDF (.json) or a list (.lst)")
-    found = re.search(rf"(?<![a-z])({'|'.join(WORDS.values())})(?![a-z])", file.name)
-    if found is None:
+    match = re.search(rf"(?<![a-z])({'|'.join(SPLIT_WORDS.values())})(?![a-z])", file.name)
+    if match is None:
         return {Split.TEST: file}
-    others = {split: file.name[: found.start()] + word + file.name[found.end() :] for split, word in WORDS.items()}
-    return {split: file.with_name(name) for split, name in others.items() if file.with_name(name).is_file()}
+    names = {split: file.name[: match.start()] + word + file.name[match.end() :] for split, word in SPLIT_WORDS.items()}
+    return {split: file.with_name(name) for split, name in names.items() if file.with_name(name).is_file()}
 
 
 def _read_ids(file: Path, synset: str) -> list[str]:
-    """The ids that a list has of a synset: DeepSDF's JSON, or lines with an id, alone or after its synset.
+    """The ids of a synset in a list: DeepSDF's JSON, or lines with an id, alone or after its synset.
 
     Raises:
-        ValueError: where it cannot be read, or has none.
+        ValueError: the list cannot be read, or has no ids of the synset.
     """
     ids = dict[str, list[str]]()
     try:
@@ -178,8 +181,9 @@ def _read_ids(file: Path, synset: str) -> list[str]:
             for dataset in json.loads(file.read_text()).values():
                 ids |= dataset
         else:
-            for *of, name in (line.replace("/", " ").split() for line in file.read_text().splitlines() if line.strip()):
-                ids.setdefault(of[-1] if of else synset, []).append(name)
+            rows = (line.replace("/", " ").split() for line in file.read_text().splitlines() if line.strip())
+            for *parents, name in rows:
+                ids.setdefault(parents[-1] if parents else synset, []).append(name)
     except (ValueError, AttributeError) as error:
         raise ValueError(f"dataset.split: '{file}' cannot be read as a split of DeepSDF or a list: {error}") from None
     if not ids.get(synset):
@@ -191,11 +195,11 @@ def _read_ids(file: Path, synset: str) -> list[str]:
 
 @lru_cache(maxsize=64)
 def _load(path: Path, normalised: str) -> Mesh:
-    """The repaired mesh of a file, placed by the vertices of the file."""
+    """The repaired mesh of a file, normalised by the vertices of the unrepaired mesh."""
     points = read_mesh(path).used
-    centre, factor = fit_in_sphere(points, 1 / BUFFER)
+    centre, factor = fit_in_sphere(points, 1 / DEEPSDF_BUFFER)
     if normalised == "onet":
         factor = 1 / float((points.max(axis=0) - points.min(axis=0)).max())
     mesh = repaired(path)
-    sign = (UNKNOWN,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
+    sign = (UNKNOWN_INSIDE_WARNING,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
     return replace(mesh, vertices=(mesh.vertices - centre) * factor, repairs=(*sign, *mesh.repairs))

@@ -13,9 +13,9 @@ from datasets.scene import Split
 from renderers.camera import Camera
 
 
-def mask_iou(found: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
-    common, either = found & true, found | true
+def mask_iou(predicted: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> float:
+    """Intersection over union of two masks; 1 if both are empty."""
+    common, either = predicted & true, predicted | true
     return float(common.sum() / either.sum()) if either.any() else 1.0
 
 
@@ -27,9 +27,9 @@ class Shot:
         name: of its file, or its number.
         camera: its resolution is the photograph's.
         colours: RGB from 0 to 1.
-        mask: true on the object; None where it is not known.
-        depth: camera z in scene units, 0 where it is not known; None where it is known nowhere.
-        normals: unit, in world coordinates, 0 where they are not known; None where they are known nowhere.
+        mask: true on the object; None if it is unknown.
+        depth: camera z in scene units, 0 at pixels of unknown depth; None without any depth.
+        normals: unit, in world coordinates, 0 at pixels of unknown normal; None without any normal.
     """
 
     name: str
@@ -42,12 +42,12 @@ class Shot:
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
         for name in ("colours", "mask", "depth", "normals"):
-            part = getattr(self, name)
-            if part is not None and tuple(part.shape[:2]) != size:
-                raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(part.shape[:2])}")
+            image = getattr(self, name)
+            if image is not None and tuple(image.shape[:2]) != size:
+                raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(image.shape[:2])}")
 
-    def allows(self, points: Float[Tensor, "n 3"], margin: float = 0.0) -> Bool[Tensor, " n"]:
-        """Which points of the world its mask allows: those that are not shown, or at most `margin` pixels outside."""
+    def allowed_by_mask(self, points: Float[Tensor, "n 3"], margin: float = 0.0) -> Bool[Tensor, " n"]:
+        """True for points in world coordinates that are out of view, or at most `margin` pixels outside of the mask."""
         allowed = torch.ones(len(points), dtype=torch.bool)
         if self.mask is not None:
             points = points.to(self.camera.intrinsics.dtype)
@@ -57,14 +57,14 @@ class Shot:
             allowed[shown] = torch.from_numpy(mask)[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
         return allowed
 
-    def within(self, to_world: Float[np.ndarray, "4 4"]) -> "Shot":
-        """The same photograph, in single precision, in a world from which this similarity leads to its own."""
+    def in_world(self, to_world: Float[np.ndarray, "4 4"]) -> "Shot":
+        """The photograph in another world, in single precision; `to_world` maps from there to the present world."""
         depth = None if self.depth is None else self.depth / float(np.linalg.norm(to_world[:3, 0]))
-        return replace(self, camera=camera_within(self.camera, to_world), depth=depth)
+        return replace(self, camera=camera_in_world(self.camera, to_world), depth=depth)
 
 
-def camera_within(camera: Camera, to_world: Float[np.ndarray, "4 4"]) -> Camera:
-    """A camera, in single precision, in a world from which a similarity leads to its own."""
+def camera_in_world(camera: Camera, to_world: Float[np.ndarray, "4 4"]) -> Camera:
+    """The camera in another world, in single precision; the similarity `to_world` maps from there to its world."""
     motion = camera.world_to_camera.double() @ torch.from_numpy(to_world)
     motion[:3] /= float(np.linalg.norm(to_world[:3, 0]))
     return replace(camera, intrinsics=camera.intrinsics.float(), world_to_camera=motion.float())
@@ -72,8 +72,8 @@ def camera_within(camera: Camera, to_world: Float[np.ndarray, "4 4"]) -> Camera:
 
 @runtime_checkable
 class Pictured(Protocol):
-    """A dataset with images of its shapes that others rendered."""
+    """A dataset that includes rendered images of its shapes."""
 
     def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
-        """The images of a shape, with cameras in the world of its mesh and at most so many pixels; None without any."""
+        """The images of a shape with cameras in its mesh's world, at most `longest` pixels a side; None without any."""
         ...

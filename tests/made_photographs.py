@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from datasets.captures.frames import OPENGL
-from datasets.own_photographs import Capture, Reading
+from datasets.own_photographs import Capture, ReadSettings
 from datasets.views import look_at
 from renderers.camera import Camera
 
@@ -22,7 +22,7 @@ NUMBERED = "{:03d}.png"
 SIZE = 40, 48  # height and width
 FOCAL, MIDDLE = 60.0, (25.0, 19.0)  # pixels; the principal point is not in the middle
 HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # between the two places where a first pixel's centre may be
-READ, PLAIN = Reading(48), Reading(48, masks=False)
+READ, PLAIN = ReadSettings(48), ReadSettings(48, masks=False)
 POINTS = CENTRE + 0.5 * RADIUS * (np.random.default_rng(0).random((50, 3)) - 0.5)
 
 

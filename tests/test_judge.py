@@ -15,7 +15,7 @@ from bench.merge import merge
 from bench.records.record import Record, read_record
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
-from datasets.own_photographs import Reading, read_capture
+from datasets.own_photographs import ReadSettings, read_capture
 from datasets.scene import sample_surface
 from tests.made_dtu import CENTRE, ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE as PHOTOGRAPHED
@@ -185,7 +185,7 @@ def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path,
     write_dtu(tmp_path / "dtu", on_ball(4000, RADIUS) - CENTRE + PHOTOGRAPHED, plane=(0, 0, 1, 0), centre=PHOTOGRAPHED)
     there = ball(1.03 * RADIUS, PHOTOGRAPHED)
     there.save(tmp_path / "there65.ply")
-    capture = read_capture(tmp_path / "photos", Reading(800))
+    capture = read_capture(tmp_path / "photos", ReadSettings(800))
     there.moved(np.linalg.inv(capture.to_world)).save(tmp_path / "scan65.ply")
     away = ball(0.1 * RADIUS, PHOTOGRAPHED + np.array([0, 0, 1.6 * RADIUS]))
     faces = np.concatenate([there.faces, away.faces + len(there.vertices)])

@@ -151,7 +151,7 @@ def culled(mesh: Mesh, shots: Sequence[Shot]) -> Mesh | None:
     for shot in shots:
         if shot.mask is None:
             raise BadInput(f"culling needs a mask of each photograph, and {shot.name} has none")
-        kept &= shot.allows(points, DILATION * max(shot.mask.shape)).numpy()
+        kept &= shot.allowed_by_mask(points, DILATION * max(shot.mask.shape)).numpy()
     faces = mesh.faces[kept[mesh.faces].all(axis=1)]
     return replace(mesh, faces=faces).compact() if len(faces) else None
 

@@ -139,5 +139,5 @@ def _within(shots: Sequence[Shot], points: Float[np.ndarray, "n 3"]) -> Bool[np.
     """Points in the unit sphere that no mask excludes."""
     places, inside = torch.from_numpy(points).float(), torch.from_numpy(np.linalg.norm(points, axis=1) < 1)
     for shot in shots:
-        inside &= shot.allows(places)
+        inside &= shot.allowed_by_mask(places)
     return inside.numpy()

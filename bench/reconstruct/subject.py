@@ -134,8 +134,8 @@ def upright(subject: Subject) -> Subject:
     to_old[:3, :3] = radius * Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()
     return replace(
         subject,
-        given=tuple(shot.within(to_old) for shot in subject.given),
-        held_out=tuple(shot.within(to_old) for shot in subject.held_out),
+        given=tuple(shot.in_world(to_old) for shot in subject.given),
+        held_out=tuple(shot.in_world(to_old) for shot in subject.held_out),
         truth=None if subject.truth is None else subject.truth.moved(np.linalg.inv(to_old)).cut_off(),
         found=f"{subject.found}; set upright for the prior, its unit sphere {radius:.3g} times as large",
         to_world=None if subject.to_world is None else subject.to_world @ to_old,

@@ -53,7 +53,7 @@ def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
         )
     if all(shot.mask is not None for shot in subject.given):
         where = torch.from_numpy(points).float()
-        points = points[torch.stack([shot.allows(where, margin=1.0) for shot in subject.given]).all(0).numpy()]
+        points = points[torch.stack([shot.allowed_by_mask(where, margin=1.0) for shot in subject.given]).all(0).numpy()]
     cameras = [shot.camera for shot in subject.given]
     seeing = _seeing(torch.from_numpy(points).float(), cameras).numpy()
     return [Cloud(points[seeing == place], camera) for place, camera in enumerate(cameras)]

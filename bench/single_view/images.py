@@ -17,7 +17,7 @@ from bench.records.record import digest
 from bench.shape_prior import kept
 from datasets.captures.hull import carve
 from datasets.mesh import Mesh
-from datasets.photographs import GREY, Photography
+from datasets.photographs import BACKGROUND_GREY, Photography
 from datasets.scene import Dataset, Split, Truth, sample_surface, scene_name, see, seed_of
 from datasets.shot import Pictured, Shot, mask_iou
 from datasets.views import ViewSampler
@@ -127,7 +127,7 @@ def as_input(
     colours: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"]
 ) -> Float[Tensor, "4 height width"]:
     """An image as encoders take it: colours from 0 to 1, grey outside of the mask, and the mask."""
-    channels = torch.where(mask[..., None], colours, GREY).permute(2, 0, 1)
+    channels = torch.where(mask[..., None], colours, BACKGROUND_GREY).permute(2, 0, 1)
     return torch.cat([channels, mask[None].float()])
 
 

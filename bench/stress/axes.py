@@ -13,8 +13,8 @@ from bench.records.record import RunStatus
 from bench.stress.fit import FITS, judge_fit
 from bench.stress.judge import judge_gradient, judge_rendering
 from bench.stress.trial import Conditions, Failure, Outcome
-from datasets.stress.distortions import OF_NETWORKS
-from datasets.stress.scenes import SCENES, Scene, of_network
+from datasets.stress.distortions import NETWORK_DISTORTIONS
+from datasets.stress.scenes import SCENES, Scene, network_scene
 from renderers.checks import check_choice
 from renderers.rendering import Renderer, Unsupported
 
@@ -56,7 +56,7 @@ class Stress:
     """One axis of the stress atlas.
 
     Args:
-        scene: a name of `datasets.stress.scenes.SCENES`, or of `OF_NETWORKS` in `datasets.stress.distortions`; for
+        scene: a name of `datasets.stress.scenes.SCENES`, or of `datasets.stress.distortions.NETWORK_DISTORTIONS`; for
             measure=fit, one of `bench.stress.fit.FITS`.
         measure: what is tested: "rendering", its "gradient", or the result of a "fit".
         group: of axes in the atlas.
@@ -75,7 +75,9 @@ class Stress:
     def __post_init__(self) -> None:
         check_choice("task.stress.group", self.group, GROUPS)
         check_choice("task.stress.measure", self.measure, MEASURES)
-        check_choice("task.stress.scene", self.scene, FITS if self.measure == "fit" else (*SCENES, *OF_NETWORKS))
+        check_choice(
+            "task.stress.scene", self.scene, FITS if self.measure == "fit" else (*SCENES, *NETWORK_DISTORTIONS)
+        )
         if self.repeats not in (None, 1):
             raise ValueError(f"task.stress.repeats must be 1 or null, not {self.repeats}: set task.search.repeats")
 
@@ -98,9 +100,9 @@ class Stress:
 
     def made(self, conditions: Conditions) -> Scene:
         """What makes the exams of a rendering or its gradient."""
-        if (prior := conditions.prior) is None or self.scene not in OF_NETWORKS:
+        if (prior := conditions.prior) is None or self.scene not in NETWORK_DISTORTIONS:
             return SCENES[self.scene]
-        return of_network(self.scene, prior.decoder.to(conditions.device), prior.codes.to(conditions.device))
+        return network_scene(self.scene, prior.decoder.to(conditions.device), prior.codes.to(conditions.device))
 
     def trial(self, renderer: Renderer, level: float, repeat: int, conditions: Conditions) -> Outcome:
         """Trial number `repeat` at a level, the same one for every renderer. An exception is recorded as a failure.

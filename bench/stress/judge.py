@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Criteria, Failure, Outcome
-from datasets.stress.scenes import Exam
+from datasets.stress.scenes import StressCase
 from datasets.stress.solids import FirstHit, incidence_cosines
 from renderers.boundary import rendered
 from renderers.camera import Rays
@@ -32,7 +32,7 @@ OF_GRADIENTS = {
 
 
 @torch.no_grad()
-def judge_rendering(exam: Exam, renderer: Renderer, conditions: Conditions) -> Outcome:
+def judge_rendering(exam: StressCase, renderer: Renderer, conditions: Conditions) -> Outcome:
     """Renders an exam, and compares each ray with the truth in float64.
 
     Raises:
@@ -65,7 +65,7 @@ def judge_rendering(exam: Exam, renderer: Renderer, conditions: Conditions) -> O
     return Outcome(_failure_of_pixels(numbers, hit.numel(), conditions.criteria), numbers, images)
 
 
-def truth(exam: Exam) -> tuple[FirstHit, Float[Tensor, " n"]]:
+def truth(exam: StressCase) -> tuple[FirstHit, Float[Tensor, " n"]]:
     """The first hits of an exam's rays in float64, and the footprint of each pixel along its ray, in scene units."""
     camera = exam.camera.double()
     rays: Rays = camera.rays().flat()
@@ -85,7 +85,7 @@ def _failure_of_pixels(numbers: dict[str, float], rays: int, criteria: Criteria)
     return max(kinds, key=lambda kind: kinds[kind]) if kinds else Failure.NONE
 
 
-def judge_gradient(exam: Exam, renderer: Renderer, conditions: Conditions) -> Outcome:
+def judge_gradient(exam: StressCase, renderer: Renderer, conditions: Conditions) -> Outcome:
     """Renders an exam with gradient, and compares the gradient with the true one.
 
     Raises:

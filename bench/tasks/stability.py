@@ -15,7 +15,7 @@ from bench.stress.axes import Stress
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from datasets.network_files import Networked
-from datasets.stress.distortions import OF_NETWORKS
+from datasets.stress.distortions import NETWORK_DISTORTIONS
 from renderers.checks import BadInput, check_at_least
 from renderers.rendering import Renderer, Unsupported
 
@@ -66,8 +66,8 @@ class Stability:
         """Raises BadInput for a network of the user's under a stress that it has no part in."""
         if not isinstance(inputs.dataset, Networked):
             return
-        own, some = self.stress.scene, ", ".join(OF_NETWORKS)
-        if own not in OF_NETWORKS:
+        own, some = self.stress.scene, ", ".join(NETWORK_DISTORTIONS)
+        if own not in NETWORK_DISTORTIONS:
             raise BadInput(f"the stress {own} renders no network: remove field=file, or set stress={some}")
         if own == "far_code" and inputs.prior.decoder.placed:
             raise BadInput("the network has no code that the stress far_code could change: set stress=noisy_weights")
@@ -75,7 +75,7 @@ class Stability:
     def execute(self, run: RunContext) -> None:
         """Searches; fills the record, writes a line per trial to curve.jsonl, and draws the mildest failure."""
         record, renderer = run.record, run.inputs.renderer
-        prior = run.inputs.prior if self.stress.scene in OF_NETWORKS else None
+        prior = run.inputs.prior if self.stress.scene in NETWORK_DISTORTIONS else None
         conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device, prior)
         record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")

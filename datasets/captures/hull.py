@@ -1,4 +1,4 @@
-"""The visual hull of masks: where the object is, whether cameras and masks fit, and a first shape (a baseline)."""
+"""The visual hull of masks: it locates the object, checks cameras against masks, and is a baseline shape."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,59 +14,59 @@ from datasets.shot import Shot, mask_iou
 from renderers.field import Kind
 from renderers.fields.analytic import Shape
 
-SEEN = 0.5  # share of the photographs that a point of the hull must lie in, since objects may leave some of them
-FAR = 0.01  # of a mask: what is that far outside of one is outside of the hull, whatever the others show
-CHUNK = 65_536  # points projected at once
-SAMPLES = 64  # per axis, of the hull that is compared with masks
+MIN_VIEW_FRACTION = 0.5  # a point of the hull must lie in this fraction of the images; objects may leave some of them
+MIN_MASK_VALUE = 0.01  # a point with a smaller value in one mask is outside of the hull
+POINTS_PER_BATCH = 65_536
+FIT_SAMPLES_PER_AXIS = 64
 
 
 @torch.no_grad()
 def carve(shots: Sequence[Shot], points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """How far points are outside of the visual hull: negative inside of all masks that they are seen against.
+    """A level set of the visual hull: negative at points inside of all masks whose photographs show them.
 
-    A value is 1/2 less the least mask, from 0 to 1, that is interpolated between pixels; 1/2 for a point that lies in
-    less than `SEEN` of the photographs.
+    A value is 1/2 minus the smallest mask value, from 0 to 1, interpolated between pixels. It is 1/2 for a point in
+    less than `MIN_VIEW_FRACTION` of the photographs.
     """
     flat = points.reshape(-1, 3)
-    values = torch.cat([_carved(shots, some) for some in flat.split(CHUNK)]) if len(flat) else flat[:, 0]
+    values = torch.cat([_carve(shots, batch) for batch in flat.split(POINTS_PER_BATCH)]) if len(flat) else flat[:, 0]
     return values.view(points.shape[:-1])
 
 
-def _carved(shots: Sequence[Shot], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    least, seen = torch.ones_like(points[:, 0]), torch.zeros_like(points[:, 0])
-    left = torch.arange(len(points), device=points.device)  # not yet far outside of a mask
+def _carve(shots: Sequence[Shot], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    smallest, views = torch.ones_like(points[:, 0]), torch.zeros_like(points[:, 0])
+    remaining = torch.arange(len(points), device=points.device)  # points inside of all masks so far
     for shot in shots:
         assert shot.mask is not None
-        pixels, depth = shot.camera.project(points[left])
+        pixels, depth = shot.camera.project(points[remaining])
         size = points.new_tensor([shot.camera.width, shot.camera.height])
         inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
-        places = (2 * pixels / size - 1)[None, :, None]
+        grid = (2 * pixels / size - 1)[None, :, None]
         mask = shot.mask.to(points.dtype)[None, None]
-        found = torch.nn.functional.grid_sample(mask, places, padding_mode="border", align_corners=False).flatten()
-        least[left] = torch.where(inside, torch.minimum(least[left], found), least[left])
-        seen[left] += inside
-        left = left[least[left] > FAR]
-    return torch.where((seen >= SEEN * len(shots)) | (least <= FAR), 0.5 - least, 0.5)
+        mask_values = torch.nn.functional.grid_sample(mask, grid, padding_mode="border", align_corners=False).flatten()
+        smallest[remaining] = torch.where(inside, torch.minimum(smallest[remaining], mask_values), smallest[remaining])
+        views[remaining] += inside
+        remaining = remaining[smallest[remaining] > MIN_MASK_VALUE]
+    return torch.where((views >= MIN_VIEW_FRACTION * len(shots)) | (smallest <= MIN_MASK_VALUE), 0.5 - smallest, 0.5)
 
 
 def hull_mesh(shots: Sequence[Shot], samples: int) -> Mesh | None:
-    """The hull in the cube [-1, 1]^3, `samples` per axis, closed where it leaves the cube; None where it is empty."""
-    within = 1 - 1 / (samples - 1)  # all samples but the outermost
+    """The hull in the cube [-1, 1]^3, `samples` per axis, closed where it leaves the cube; None if it is empty."""
+    inner_limit = 1 - 1 / (samples - 1)  # excludes only the outermost samples
 
     def hull(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        return torch.where(points.abs().amax(-1) < within, carve(shots, points), 0.5)
+        return torch.where(points.abs().amax(-1) < inner_limit, carve(shots, points), 0.5)
 
     return extract(Shape(hull, Kind.LEVEL, None), grid=samples, reach=1.0)
 
 
 @dataclass(frozen=True)
-class Fit:
+class MaskFit:
     """How well cameras and masks fit.
 
     Args:
-        silhouettes: of the visual hull, in each photograph: where cameras are right, they cover nearly all of the mask.
-        overlaps: their intersection over union with the masks.
-        shown: the share of the hull's vertices that each photograph shows.
+        silhouettes: of the visual hull, in each photograph; with correct cameras they cover nearly all of the mask.
+        overlaps: intersection over union of each silhouette with its mask.
+        shown: the fraction of the hull's vertices that each photograph shows.
     """
 
     silhouettes: tuple[Bool[np.ndarray, "_ _"], ...]
@@ -74,12 +74,12 @@ class Fit:
     shown: tuple[float, ...]
 
 
-def fit_of(shots: Sequence[Shot]) -> Fit:
-    """How well photographs with masks fit, by their visual hull in the unit sphere."""
-    hull, masks = hull_mesh(shots, SAMPLES), [np.asarray(shot.mask) for shot in shots]
+def measure_mask_fit(shots: Sequence[Shot]) -> MaskFit:
+    """Measures how well photographs and masks fit, by their visual hull in the unit sphere."""
+    hull, masks = hull_mesh(shots, FIT_SAMPLES_PER_AXIS), [np.asarray(shot.mask) for shot in shots]
     if hull is None:
-        return Fit(tuple(map(np.zeros_like, masks)), (0.0,) * len(shots), (0.0,) * len(shots))
+        return MaskFit(tuple(map(np.zeros_like, masks)), (0.0,) * len(shots), (0.0,) * len(shots))
     truth, points = Truth(hull, closed=False), torch.from_numpy(hull.vertices).float()
     silhouettes = tuple(see(truth, shot.camera).mask.numpy() for shot in shots)
     shown = tuple(float(shot.camera.shows(points).float().mean()) for shot in shots)
-    return Fit(silhouettes, tuple(map(mask_iou, silhouettes, masks)), shown)
+    return MaskFit(silhouettes, tuple(map(mask_iou, silhouettes, masks)), shown)

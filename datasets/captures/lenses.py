@@ -1,4 +1,4 @@
-"""Lenses: how the models of OpenCV, COLMAP and NeRF's files bend rays, and which of them are understood."""
+"""Lens distortion in the models of OpenCV, COLMAP and NeRF's files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from renderers.checks import BadInput
 
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4", "k5", "k6"), ("p1", "p2")
 BROWN = ("k1", "k2", "p1", "p2")
-NERFSTUDIO = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of its distortion_params
-PLAIN = {  # COLMAP's models, and the numbers behind focal lengths and principal point
+NERFSTUDIO_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
+PERSPECTIVE_MODELS = {  # COLMAP's models, and their parameters after focal lengths and principal point
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
     "SIMPLE_RADIAL": ("k1",),
@@ -22,26 +22,26 @@ PLAIN = {  # COLMAP's models, and the numbers behind focal lengths and principal
     "OPENCV": BROWN,
     "FULL_OPENCV": (*BROWN, "k3", "k4", "k5", "k6"),
 }
-FISHEYE = {
+FISHEYE_MODELS = {
     "SIMPLE_RADIAL_FISHEYE": ("k1",),
     "RADIAL_FISHEYE": ("k1", "k2"),
     "SIMPLE_FISHEYE": (),
     "FISHEYE": (),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
-UNDERSTOOD = ", ".join([*PLAIN, *FISHEYE])
-READ = {*RADIAL, *TANGENTIAL, "camera_model", "is_fisheye", "distortion_params"}  # keys of transforms.json
-PINHOLE = {"", "NONE", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE"}
+SUPPORTED = ", ".join([*PERSPECTIVE_MODELS, *FISHEYE_MODELS])
+LENS_KEYS = {*RADIAL, *TANGENTIAL, "camera_model", "is_fisheye", "distortion_params"}  # transforms.json
+PINHOLE_MODELS = {"", "NONE", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE"}
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How a lens bends the rays of a pinhole camera.
+    """The distortion of a lens, in addition to a pinhole camera.
 
     Args:
-        fisheye: whether `radial` is OpenCV's equidistant fisheye; else it is its rational model (Brown's, where k4 to
-            k6 are 0).
-        radial: k1 and further ones, up to k6; of a fisheye up to k4.
+        fisheye: whether `radial` is for OpenCV's equidistant fisheye model, or for its rational model, which is Brown's
+            model if k4 to k6 are 0.
+        radial: k1, k2 and so on, up to k6, or up to k4 for a fisheye.
         tangential: p1, p2.
     """
 
@@ -50,25 +50,25 @@ class Lens:
     tangential: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def numbers(self) -> tuple[float, ...]:
-        """All of them."""
+    def coefficients(self) -> tuple[float, ...]:
+        """The radial and the tangential coefficients."""
         return (*self.radial, *self.tangential)
 
     @property
-    def bends(self) -> bool:
+    def has_distortion(self) -> bool:
         """Whether it differs from a pinhole camera."""
-        return self.fisheye or any(self.numbers)
+        return self.fisheye or any(self.coefficients)
 
-    def bend(
+    def distort(
         self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
     ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-        """Where a ray through (x, y, 1) meets the plane at depth 1 after the lens."""
+        """Maps the point (x, y, 1) of an undistorted ray to its distorted point in the plane at depth 1."""
         square = x**2 + y**2
         if self.fisheye:
             radius = np.sqrt(square)
             angle = np.arctan(radius)
-            bent = angle * _polynomial(self.radial, angle**2)
-            factor = np.divide(bent, radius, out=np.ones_like(radius), where=radius > 0)
+            bent_angle = angle * _polynomial(self.radial, angle**2)
+            factor = np.divide(bent_angle, radius, out=np.ones_like(radius), where=radius > 0)
             return x * factor, y * factor
         factor = _polynomial(self.radial[:3], square) / _polynomial(self.radial[3:], square)
         p1, p2 = self.tangential
@@ -77,84 +77,82 @@ class Lens:
             y * factor + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
         )
 
-    def undistorted(
+    def undistort(
         self, image: Float[np.ndarray, "height width channels"], intrinsics: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "height width channels"]:
-        """The image that a pinhole camera of these intrinsics takes."""
+        """The image without distortion, as a pinhole camera with these intrinsics takes it."""
         rows, columns = np.meshgrid(np.arange(image.shape[0]) + 0.5, np.arange(image.shape[1]) + 0.5, indexing="ij")
         y = (rows - intrinsics[1, 2]) / intrinsics[1, 1]
         x = (columns - intrinsics[0, 2] - intrinsics[0, 1] * y) / intrinsics[0, 0]
-        bent_x, bent_y = self.bend(x, y)
+        bent_x, bent_y = self.distort(x, y)
         across = bent_x * intrinsics[0, 0] + bent_y * intrinsics[0, 1] + intrinsics[0, 2]
         sources = np.stack([bent_y * intrinsics[1, 1] + intrinsics[1, 2] - 0.5, across - 0.5])
         channels = [map_coordinates(image[..., i], sources, order=1, mode="nearest") for i in range(image.shape[2])]
         return np.stack(channels, axis=-1)
 
 
-def _polynomial(numbers: tuple[float, ...], square: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def _polynomial(coefficients: tuple[float, ...], square: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """1 + k1 s + k2 s^2 + ..."""
-    return np.polynomial.polynomial.polyval(square, (1.0, *numbers))
+    return np.polynomial.polynomial.polyval(square, (1.0, *coefficients))
 
 
-def colmap_lens(model: str, numbers: list[float], where: str) -> Lens:
-    """The lens of a COLMAP camera.
-
-    Args:
-        numbers: all of the camera, focal lengths and principal point first.
+def colmap_lens(model: str, parameters: list[float], where: str) -> Lens:
+    """The lens of a COLMAP camera, whose `parameters` begin with focal lengths and principal point.
 
     Raises:
-        BadInput: for models that are not understood.
+        BadInput: the model is not supported.
     """
-    names = (PLAIN | FISHEYE).get(model)
+    names = (PERSPECTIVE_MODELS | FISHEYE_MODELS).get(model)
     if names is None:
         raise BadInput(
-            f"{where} has cameras of the model {model}, which is not understood ({UNDERSTOOD} are): use colmap "
+            f"{where} has cameras of the model {model}, which is not understood ({SUPPORTED} are): use colmap "
             "image_undistorter first"
         )
-    return _lens(dict(zip(names, numbers[len(numbers) - len(names) :], strict=True)), fisheye=model in FISHEYE)
+    distortion = parameters[len(parameters) - len(names) :]
+    return _lens(dict(zip(names, distortion, strict=True)), fisheye=model in FISHEYE_MODELS)
 
 
-def nerf_lens(known: dict[str, Any], where: str) -> Lens:
+def nerf_lens(settings: dict[str, Any], where: str) -> Lens:
     """The lens of a frame of transforms.json.
 
     Raises:
-        BadInput: for models that are not understood, by name.
+        BadInput: the model is not supported, or the settings contradict each other.
     """
-    model = str(known.get("camera_model") or "").upper()
-    if model not in {*PLAIN, *FISHEYE, *PINHOLE}:
+    model = str(settings.get("camera_model") or "").upper()
+    if model not in {*PERSPECTIVE_MODELS, *FISHEYE_MODELS, *PINHOLE_MODELS}:
         raise BadInput(
-            f"{where}: camera_model {model} is not understood ({UNDERSTOOD} are): undistort the images, export again"
+            f"{where}: camera_model {model} is not understood ({SUPPORTED} are): undistort the images, export again"
         )
-    fisheye = model in FISHEYE or bool(known.get("is_fisheye"))
-    if fisheye and model in {*PLAIN, "PERSPECTIVE"}:
+    fisheye = model in FISHEYE_MODELS or bool(settings.get("is_fisheye"))
+    if fisheye and model in {*PERSPECTIVE_MODELS, "PERSPECTIVE"}:
         raise BadInput(f"{where}: is_fisheye does not fit camera_model {model}: leave one of them out")
-    listed = known.get("distortion_params") or ()
-    if len(listed) not in (0, len(NERFSTUDIO)) and not (fisheye and len(listed) == 4):
+    listed = settings.get("distortion_params") or ()
+    if len(listed) not in (0, len(NERFSTUDIO_ORDER)) and not (fisheye and len(listed) == 4):
         raise BadInput(
-            f"{where}: distortion_params must be {', '.join(NERFSTUDIO)}, or k1 to k4 of a fisheye, not "
+            f"{where}: distortion_params must be {', '.join(NERFSTUDIO_ORDER)}, or k1 to k4 of a fisheye, not "
             f"{len(listed)} numbers: give them by name"
         )
-    named = {name: float(known.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
-    stated = {name: float(value) for name, value in zip(NERFSTUDIO, listed, strict=False)}
-    if any(named.values()) and any(named[name] != value for name, value in stated.items()):
+    by_name = {name: float(settings.get(name) or 0.0) for name in (*RADIAL, *TANGENTIAL)}
+    by_list = {name: float(value) for name, value in zip(NERFSTUDIO_ORDER, listed, strict=False)}
+    if any(by_name.values()) and any(by_name[name] != value for name, value in by_list.items()):
         raise BadInput(f"{where}: distortion_params and the numbers by name differ: leave one of them out")
-    bent = named | stated
-    if fisheye and any(bent[name] for name in ("k5", "k6", "p1", "p2")):
+    coefficients = by_name | by_list
+    if fisheye and any(coefficients[name] for name in ("k5", "k6", "p1", "p2")):
         raise BadInput(f"{where}: a fisheye has k1 to k4, and this one k5, k6, p1 or p2 too: export it again")
-    if not fisheye and bent["k4"] and model != "FULL_OPENCV" and not {"k5", "k6"} & set(known):
+    if not fisheye and coefficients["k4"] and model != "FULL_OPENCV" and not {"k5", "k6"} & set(settings):
         raise BadInput(
             f"{where}: k4 means one thing in a fisheye, another in OpenCV's rational model: set is_fisheye to true, or "
             "camera_model to FULL_OPENCV"
         )
-    return _lens(bent, fisheye=fisheye)
+    return _lens(coefficients, fisheye=fisheye)
 
 
-def unread_note(keys: Sequence[str], file: Path) -> tuple[str, ...]:
-    """A note on keys of a file of cameras that are not read; they may be of a lens."""
+def unread_keys_note(keys: Sequence[str], file: Path) -> tuple[str, ...]:
+    """A note on keys of a file of cameras that are not read, since they may describe a lens."""
     remedy = "if they describe a lens, undistort the images, and export again"
     return (f"{file.name} has keys that are not read, {', '.join(keys)}: {remedy}",) if keys else ()
 
 
-def _lens(bent: Mapping[str, float], *, fisheye: bool) -> Lens:
-    radial = tuple(bent.get(name, 0.0) for name in RADIAL[: 4 if fisheye else 6])
-    return Lens(fisheye, radial, (bent.get("p1", 0.0), bent.get("p2", 0.0)))
+def _lens(coefficients: Mapping[str, float], *, fisheye: bool) -> Lens:
+    radial = tuple(coefficients.get(name, 0.0) for name in RADIAL[: 4 if fisheye else 6])
+    return Lens(fisheye, radial, (coefficients.get("p1", 0.0), coefficients.get("p2", 0.0)))

@@ -1,4 +1,4 @@
-"""Masks: the object's pixels in an image that shows it white, in colours or opaque."""
+"""Masks: the object's pixels in an image that shows the object in white, in colours or opaque."""
 
 from pathlib import Path
 
@@ -6,46 +6,42 @@ import numpy as np
 from jaxtyping import Bool, Int
 from PIL import Image
 
-from datasets.captures.image import has_alpha, loaded
+from datasets.captures.image import has_alpha, load_image
 from renderers.checks import BadInput
 
-HALF = 127  # of 255: brighter pixels of a grey mask are the object
-COLOURED = 40  # of 255: channels of a mask that differ more are a colour, as colours that differ more are two
-AT_BORDER = 0.1  # share of the border from which on a coloured mask has a black background, whatever touches the rest
+MASK_THRESHOLD, COLOUR_DIFFERENCE = 127, 40  # out of 255; a pixel is coloured if its channels differ by more
+MIN_BLACK_BORDER_FRACTION = 0.1  # the object or other colours may cover the rest of the border
 
 
 def foreground(image: Image.Image, path: Path) -> Image.Image:
-    """The object in a mask, white: by an alpha that varies, grey values, or colours unlike the border's.
-
-    Args:
-        path: of the mask, for messages.
+    """The object in a mask, in white: by a varying alpha channel, by grey values, or by colours unlike the border's.
 
     Raises:
-        BadInput: where no pixel is bright, as in a mask of labels.
+        BadInput: no pixel is bright, as in a mask of labels; the message names `path`.
     """
     if has_alpha(image):
         alpha = image.convert("RGBA").getchannel("A")
-        least, most = alpha.getextrema()
-        if least < most:
+        smallest, peak = alpha.getextrema()
+        if smallest < peak:
             return alpha
     colours = np.asarray(image.convert("RGB")).astype(np.int16)
-    if (np.ptp(colours, axis=-1) > COLOURED).any():
+    if (np.ptp(colours, axis=-1) > COLOUR_DIFFERENCE).any():
         return Image.fromarray((255 * _unlike_border(colours)).astype(np.uint8))
     grey = image.convert("L")
-    if 0 < (most := grey.getextrema()[1]) <= HALF:
-        raise BadInput(f"the mask {path} has values up to {most}, as labels do: write 255 on the object, 0 elsewhere")
+    if 0 < (peak := grey.getextrema()[1]) <= MASK_THRESHOLD:
+        raise BadInput(f"the mask {path} has values up to {peak}, as labels do: write 255 on the object, 0 elsewhere")
     return grey
 
 
 def _unlike_border(colours: Int[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
-    """The pixels of other colours than the background: black where the border has it, else the border's commonest."""
+    """The pixels unlike the background, which is black if the border is partly black, else its commonest colour."""
     border = np.concatenate([colours[0], colours[-1], colours[:, 0], colours[:, -1]])
     values, counts = np.unique(border, axis=0, return_counts=True)
-    dark = (border.max(axis=-1) <= COLOURED).mean() > AT_BORDER
+    dark = (border.max(axis=-1) <= COLOUR_DIFFERENCE).mean() > MIN_BLACK_BORDER_FRACTION
     background = np.zeros(3) if dark else values[counts.argmax()]
-    return np.abs(colours - background).max(axis=-1) > COLOURED
+    return np.abs(colours - background).max(axis=-1) > COLOUR_DIFFERENCE
 
 
-def opened_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """The object's pixels in an image that shows it white; raises BadInput where it cannot be read."""
-    return np.asarray(foreground(loaded(path), path)) > HALF
+def load_mask(path: Path) -> Bool[np.ndarray, "height width"]:
+    """Reads a mask, true on the object; raises BadInput if the file cannot be read."""
+    return np.asarray(foreground(load_image(path), path)) > MASK_THRESHOLD

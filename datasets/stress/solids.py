@@ -1,6 +1,6 @@
 """Solids with a field and closed-form ray intersections: the truth that renderings are compared with.
 
-A solid gives the spans of a ray that lie within it; union and difference are those of the spans.
+A solid returns the spans of a ray inside it. Union and difference of solids are computed on the spans.
 """
 
 from collections.abc import Callable
@@ -17,12 +17,12 @@ from renderers.fields import analytic
 from renderers.fields.analytic import Shape
 from renderers.rendering import Status
 
-Spans = Float[Tensor, "n _ 2"]  # entry and exit along each ray; of a missing span the exit comes first
+Spans = Float[Tensor, "n _ 2"]  # entry and exit along each ray; for a missing span the exit comes first
 
 
 @dataclass(frozen=True)
 class FirstHit:
-    """The true first hits of n rays within the unit sphere; distances only where `hit`."""
+    """The true first hits of n rays within the unit sphere; distances are valid only where `hit`."""
 
     distance: Float[Tensor, " n"]
     hit: Bool[Tensor, " n"]
@@ -31,7 +31,7 @@ class FirstHit:
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape, and the spans of each line [n] that lie within it. `|` and `-` as for shapes."""
+    """A shape, and the spans of each ray [n] inside it. `|` is the union, `-` the difference, as for shapes."""
 
     field: Shape
     spans: Callable[[Rays], Spans]
@@ -40,7 +40,7 @@ class Solid:
         return Solid(self.field | other.field, lambda rays: torch.cat([self.spans(rays), other.spans(rays)], dim=1))
 
     def __sub__(self, other: "Solid") -> "Solid":
-        return Solid(self.field - other.field, lambda rays: _without(self.spans(rays), other.spans(rays)))
+        return Solid(self.field - other.field, lambda rays: _subtract_spans(self.spans(rays), other.spans(rays)))
 
     def turned(self, rotation: Float[Tensor, "3 3"]) -> "Solid":
         """The solid turned about the origin: a point x goes to `rotation @ x`."""
@@ -64,17 +64,17 @@ class Solid:
         entry, leave, meets = sphere_span(rays)
         spans = self.spans(rays)
         near, far = spans.unbind(-1)
-        there = far > near
+        exists = far > near
         start = entry[:, None]
-        inside = (there & (near <= start) & (far > start)).any(dim=1) & meets
-        ahead = there & (near > start) & (near <= leave[:, None])
-        distance = torch.where(ahead, near, torch.inf).amin(dim=1)
+        inside = (exists & (near <= start) & (far > start)).any(dim=1) & meets
+        in_front = exists & (near > start) & (near <= leave[:, None])
+        distance = torch.where(in_front, near, torch.inf).amin(dim=1)
         hit = meets & ~inside & distance.isfinite()
         return FirstHit(torch.where(hit, distance, leave), hit, inside)
 
 
 def incidence_cosines(field: Field, rays: Rays, first: FirstHit) -> Float[Tensor, " n"]:
-    """The cosine of each hit's angle of incidence, 0 for grazing; 1 where nothing is hit."""
+    """The cosine of each hit's angle of incidence, 0 for grazing rays; 1 for misses."""
     normals = autograd_normals(field, rays.at(first.distance.detach()))
     return torch.where(first.hit, (normals * rays.directions).sum(-1).abs(), 1.0)
 
@@ -84,11 +84,11 @@ def sphere_solid(radius: analytic.Numbers) -> Solid:
 
     def spans(rays: Rays) -> Spans:
         approach = -(rays.origins * rays.directions).sum(-1)
-        beyond = rays.origins + approach[:, None] * rays.directions
-        half_squared = torch.as_tensor(radius).to(beyond) ** 2 - beyond.square().sum(-1)
-        crosses = half_squared > 0
-        half = torch.where(crosses, half_squared, 1.0).sqrt()
-        return _span(approach - half, approach + half, crosses)
+        closest = rays.origins + approach[:, None] * rays.directions
+        half_squared = torch.as_tensor(radius).to(closest) ** 2 - closest.square().sum(-1)
+        meets = half_squared > 0
+        half_chord = torch.where(meets, half_squared, 1.0).sqrt()
+        return _span(approach - half_chord, approach + half_chord, meets)
 
     return Solid(analytic.sphere(radius), spans)
 
@@ -108,7 +108,7 @@ def box(half_sizes: analytic.Numbers) -> Solid:
 
 
 def half_space(normal: analytic.Numbers, offset: analytic.Numbers) -> Solid:
-    """All points x with normal . x below `offset`; the normal [3], of any length, points out of it."""
+    """All points x with normal . x below `offset`; the normal [3], of any length, points outward."""
 
     def spans(rays: Rays) -> Spans:
         n = torch.as_tensor(normal).to(rays.origins)
@@ -144,30 +144,30 @@ def rod(radius: analytic.Numbers, half_height: analytic.Numbers) -> Solid:
     return Solid(analytic.cylinder(radius, half_height), spans)
 
 
-def _span(near: Tensor, far: Tensor, there: Tensor) -> Spans:
-    """One span per ray; where it is missing its exit comes first, and no gradient flows."""
+def _span(near: Tensor, far: Tensor, exists: Tensor) -> Spans:
+    """One span per ray; a missing span has its exit first and no gradient."""
     nowhere = torch.full_like(near, torch.inf)
-    return torch.stack([torch.where(there, near, nowhere), torch.where(there, far, -nowhere)], dim=-1)[:, None]
+    return torch.stack([torch.where(exists, near, nowhere), torch.where(exists, far, -nowhere)], dim=-1)[:, None]
 
 
-def _without(first: Spans, second: Spans) -> Spans:
-    """The parts of the first spans that lie in none of the second."""
-    left = first
+def _subtract_spans(first: Spans, second: Spans) -> Spans:
+    """The first spans without the second spans."""
+    rest = first
     for near, far in (span.unbind(-1) for span in second.unbind(1)):
-        there = (far > near)[:, None]
-        before = torch.where(there, torch.minimum(left[..., 1], near[:, None]), left[..., 1])
-        after = torch.where(there, torch.maximum(left[..., 0], far[:, None]), torch.inf)
-        left = torch.cat([torch.stack([left[..., 0], before], -1), torch.stack([after, left[..., 1]], -1)], dim=1)
-    return left
+        exists = (far > near)[:, None]
+        before = torch.where(exists, torch.minimum(rest[..., 1], near[:, None]), rest[..., 1])
+        after = torch.where(exists, torch.maximum(rest[..., 0], far[:, None]), torch.inf)
+        rest = torch.cat([torch.stack([rest[..., 0], before], -1), torch.stack([after, rest[..., 1]], -1)], dim=1)
+    return rest
 
 
 @dataclass(frozen=True)
 class ReferenceTruth:
-    """A field whose first hits are found by the reference tracer.
+    """A field whose first hits are computed by the reference tracer.
 
     Args:
         field: evaluated in float64.
-        lipschitz: a bound on the length of its gradient.
+        lipschitz: an upper bound of the norm of its gradient.
         thinnest: parts thinner than this along a ray may be missed, in scene units.
     """
 
@@ -177,8 +177,8 @@ class ReferenceTruth:
 
     def trace(self, rays: Rays) -> FirstHit:
         """The first hits of flat rays [n]; without gradient."""
-        found = reference.trace(self.field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
-        return FirstHit(found.distance, found.hit, found.status == Status.STARTED_INSIDE)
+        rendering = reference.trace(self.field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
+        return FirstHit(rendering.distance, rendering.hit, rendering.status == Status.STARTED_INSIDE)
 
 
 Truth = Solid | ReferenceTruth  # a field whose first hits are known

@@ -16,10 +16,10 @@ from bench.photos import main
 from datasets import own_photographs
 from datasets.captures.formats import find_layout
 from datasets.captures.frames import OPENGL
-from datasets.captures.hull import carve, fit_of, hull_mesh
+from datasets.captures.hull import carve, hull_mesh, measure_mask_fit
 from datasets.captures.rows import _from_angles
-from datasets.captures.take import _alike, read_image, take
-from datasets.own_photographs import Reading, read_capture
+from datasets.captures.take import _same_aspect, read_image, read_shot
+from datasets.own_photographs import ReadSettings, read_capture
 from datasets.shot import Shot
 from renderers.checks import BadInput
 from tests.looped import each
@@ -134,7 +134,7 @@ def test_a_far_world_is_read_as_exactly_and_led_back_to(tmp_path, away):
 
 def test_a_photograph_is_made_smaller_with_its_camera_and_never_larger(tmp_path):
     nerf(tmp_path)
-    small, large = (read_capture(tmp_path, Reading(longest)) for longest in (24, 4096))
+    small, large = (read_capture(tmp_path, ReadSettings(longest)) for longest in (24, 4096))
     assert large.notes == ("the photographs have at most 48 pixels, not 4096",) and small.notes == ()
     assert small.shots[0].colours.shape == (20, 24, 3) and large.shots[0].colours.shape == (*SIZE, 3)
     torch.testing.assert_close(small.shots[0].camera.intrinsics[:2], large.shots[0].camera.intrinsics[:2] / 2)
@@ -159,8 +159,8 @@ def test_distortion_is_taken_out(tmp_path, bent):
     frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({**stored, "frames": [frame]}))
     read = find_layout(tmp_path).frames[0]
-    found = take(read, side).colours.numpy()[..., :2] * 255 / 4
-    places = np.dstack(read.lens.bend((columns - 31) / 50, (rows - 28) / 48)) * [50, 48] + [31, 28]
+    found = read_shot(read, side).colours.numpy()[..., :2] * 255 / 4
+    places = np.dstack(read.lens.distort((columns - 31) / 50, (rows - 28) / 48)) * [50, 48] + [31, 28]
     inside = ((places > 1) & (places < side - 1)).all(axis=-1)
     assert inside.mean() > 0.7 and np.abs(places - np.dstack([columns, rows]))[inside].max() > 1
     np.testing.assert_allclose(found[inside], places[inside], atol=0.01)
@@ -214,7 +214,7 @@ def test_images_of_two_sizes_each_have_their_camera(tmp_path):
     [((400, 300), True), ((401, 300), True), ((133, 100), True), ((400, 297), False), ((4000, 2975), False)],
 )
 def test_a_cropped_image_is_no_smaller_one(size, same):
-    assert _alike(size, (3000, 4000)) == same
+    assert _same_aspect(size, (3000, 4000)) == same
 
 
 @each("tag, turn", [*((tag, None) for tag in range(2, 9)), (6, Image.Transpose.ROTATE_90)])
@@ -257,7 +257,9 @@ def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
 
 def test_photographs_that_show_a_part_of_the_hull_are_told(tmp_path, capsys, monkeypatch):
     nerf(tmp_path)
-    monkeypatch.setattr(own_photographs, "fit_of", lambda *given: replace(fit_of(*given), shown=(0.7,)))
+    monkeypatch.setattr(
+        own_photographs, "measure_mask_fit", lambda *given: replace(measure_mask_fit(*given), shown=(0.7,))
+    )
     assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
     assert "note: the photographs show 70% of the object (median): cameras" in capsys.readouterr().out
 
@@ -268,7 +270,7 @@ def test_cameras_of_other_images_are_refused_unless_that_is_asked_for(tmp_path):
         repainted([file], lambda mask, i=i: np.roll(mask, 11 * (-1) ** i, axis=1))
     with pytest.raises(BadInput, match=r"the visual hull of the masks overlaps .* or set dataset.unchecked=true"):
         read_capture(tmp_path, READ)
-    capture = read_capture(tmp_path, Reading(48, unchecked=True))
+    capture = read_capture(tmp_path, ReadSettings(48, unchecked=True))
     assert "cameras may be those of other images" in capture.notes[-1]
 
 

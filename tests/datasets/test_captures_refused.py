@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from datasets.own_photographs import Reading, read_capture
+from datasets.own_photographs import ReadSettings, read_capture
 from renderers.checks import BadInput
 from tests.made_photographs import (
     PLAIN,
@@ -161,7 +161,7 @@ def test_without_masks_nothing_is_said_of_them_and_less_can_be_known(tmp_path):
     (tmp_path / "mask" / "004.png").unlink()
     assert read_capture(tmp_path, PLAIN).masks == ""
     with pytest.raises(BadInput, match=r"dataset\.images=image is for COLMAP, and .* has IDR/NeuS: leave it out"):
-        read_capture(tmp_path, Reading(SIZE[1], masks=False, images="image"))
+        read_capture(tmp_path, ReadSettings(SIZE[1], masks=False, images="image"))
     (tmp_path / MATRICES).unlink()
     nerf(tmp_path)
     moved(tmp_path, lambda matrix: np.hstack([np.eye(4)[:, :3], matrix[:, 3:]]))

@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bench.config import load
-from datasets.depth_image import PLACED, _cut_out
+from datasets.depth_image import OBJECT_RADIUS, _crop_and_subsample
 from datasets.meshes import read_mesh
 from datasets.scene import Split, Truth, see
 from datasets.views import look_at
@@ -63,7 +63,7 @@ def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, suffix, pi
     scene = depth_image(made, path=str(folder / f"depth{suffix}"), **changed).placed(pixels)
     view, known = scene.given()
     points = view.camera.rays().at(view.camera.distance(view.depth))[known].double().numpy()
-    assert PLACED < np.linalg.norm(points, axis=1).max() < 1 and known.sum() > pixels
+    assert OBJECT_RADIUS < np.linalg.norm(points, axis=1).max() < 1 and known.sum() > pixels
     assert scene.part and max(known.shape) <= pixels and torch.equal(known, view.mask)
     world = points @ scene.to_world[:3, :3].T + scene.to_world[:3, 3]
     if unknown:
@@ -80,7 +80,7 @@ def test_an_object_of_an_odd_extent_is_cut_out_as_a_square_whose_pixels_see_the_
     depth = np.zeros((20, 30))
     depth[5:12, 8:12] = 2 + 0.01 * np.arange(28).reshape(7, 4)
     pinhole = np.array([[40.0, 0, 14.3], [0, 35.0, 10.6], [0, 0, 1]])
-    cut, mask, moved = _cut_out(depth, depth > 0, pinhole, most)
+    cut, mask, moved = _crop_and_subsample(depth, depth > 0, pinhole, most)
     assert cut.shape == mask.shape and len(set(cut.shape)) == 1 and max(cut.shape) <= most
     assert np.array_equal(mask, cut > 0) and mask.sum() >= 4
     for row, column in np.argwhere(mask):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from datasets.colours import FileColours
 from datasets.meshes import read_mesh
-from datasets.readers.glb import GREY, read_glb
+from datasets.readers.glb import UNCOLOURED_GREY, read_glb
 from tests.looped import each
 
 VERTICES = np.array([(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)], np.float32)
@@ -251,7 +251,7 @@ def test_colours_are_shares_of_1_and_parts_without_are_grey_beside_others():
     painted = {"attributes": {"POSITION": 0, "COLOR_0": 2}}
     for keys in ({}, SHARE):
         read = read_glb(glb(VERTICES, CORNERS, (bytes_of, keys), parts=(painted, {})))
-        expected = np.repeat([(1, 0.2, 0), (GREY, GREY, GREY)], 4, axis=0)
+        expected = np.repeat([(1, 0.2, 0), (UNCOLOURED_GREY, UNCOLOURED_GREY, UNCOLOURED_GREY)], 4, axis=0)
         assert read.vertex_colours == pytest.approx(expected)
     assert read_glb(glb()).vertex_colours is None
 

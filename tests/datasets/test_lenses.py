@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datasets.captures.lenses import FISHEYE, PLAIN, colmap_lens, nerf_lens
+from datasets.captures.lenses import FISHEYE_MODELS, PERSPECTIVE_MODELS, colmap_lens, nerf_lens
 from renderers.checks import BadInput
 from tests.looped import each
 
@@ -17,7 +17,7 @@ FEW = settings(max_examples=20)
 
 
 def bent(lens) -> np.ndarray:
-    return np.stack(lens.bend(*PLACES.T), axis=-1)
+    return np.stack(lens.distort(*PLACES.T), axis=-1)
 
 
 @FEW
@@ -46,11 +46,11 @@ def test_each_model_of_colmap_is_read_as_colmap_has_it_or_refused(data):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra: pip install -e '.[colmap]'")
     name = data.draw(st.sampled_from([one for one in pycolmap.CameraModelId.__members__ if one != "INVALID"]))
     camera = pycolmap.Camera.create_from_model_id(1, getattr(pycolmap.CameraModelId, name), 50.0, 40, 30)
-    if name not in PLAIN | FISHEYE:
+    if name not in PERSPECTIVE_MODELS | FISHEYE_MODELS:
         with pytest.raises(BadInput, match=f"of the model {name}, which is not understood"):
             colmap_lens(name, list(camera.params), "sparse/0")
         return
-    extra = len((PLAIN | FISHEYE)[name])
+    extra = len((PERSPECTIVE_MODELS | FISHEYE_MODELS)[name])
     plain = list(camera.params[: len(camera.params) - extra])
     camera.params = plain + data.draw(st.lists(SMALL, min_size=extra, max_size=extra))
     focal, middle = camera.calibration_matrix()[[0, 1], [0, 1]], camera.calibration_matrix()[:2, 2]
@@ -97,4 +97,4 @@ def test_a_list_of_another_length_is_refused(known):
     ],
 )
 def test_what_says_nothing_of_a_lens_is_none(known):
-    assert not nerf_lens(known, "file").bends
+    assert not nerf_lens(known, "file").has_distortion

@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from datasets import own_photographs
-from datasets.captures.hull import fit_of
-from datasets.captures.pairing import by_name, by_order, located, masks_of
-from datasets.own_photographs import Reading, read_capture
+from datasets.captures.hull import measure_mask_fit
+from datasets.captures.pairing import find_images, find_masks, pair_by_name, pair_by_order
+from datasets.own_photographs import ReadSettings, read_capture
 from renderers.checks import BadInput
 from tests.looped import each
 from tests.made_photographs import PLAIN, READ, colmap, idr, llff, off, renamed
@@ -30,8 +30,8 @@ def write(folder: Path, *names: str) -> None:
 @given(PREFIXES, WIDTHS, st.integers(0, 5), st.integers(3, 30), st.randoms())
 def test_cameras_are_those_of_the_names_in_string_order(prefix, width, start, count, random):
     names = sorted(f"{prefix}{str(start + i).zfill(width)}.png" for i in range(count))
-    assert by_order(random.sample(names, count), count, "file")[0] == names
-    assert by_order([], count, "file") == ([], ())
+    assert pair_by_order(random.sample(names, count), count, "file")[0] == names
+    assert pair_by_order([], count, "file") == ([], ())
 
 
 @given(PREFIXES, WIDTHS, st.integers(3, 30), st.integers(1, 40))
@@ -42,7 +42,7 @@ def test_images_and_cameras_of_other_numbers_are_refused_with_five_names(prefix,
     some = ", ".join(names[:5]) + (", ..." if images > 5 else "")
     words = f"file has {count} cameras, number 0 to {count - 1}, and there are {images} images ({some})"
     with pytest.raises(BadInput) as caught:
-        by_order(names, count, "file")
+        pair_by_order(names, count, "file")
     assert str(caught.value).startswith(f"{names[count]} has no camera: {words}" if images > count else words)
 
 
@@ -64,28 +64,28 @@ def test_masks_are_those_of_their_images(stems, suffix, rule, random):
     """Even where last numbers are the same."""
     pairs = {stem + suffix: MASKS[rule](stem, suffix) for stem in stems}
     masks = random.sample([*pairs.values()], len(pairs))
-    assert by_name([*pairs], masks) == ({} if rule == "another name" else pairs)
+    assert pair_by_name([*pairs], masks) == ({} if rule == "another name" else pairs)
 
 
 def test_numbers_are_the_same_with_other_zeros_and_another_camera_is_not():
-    assert by_name(["0.png", "9.png", "10.png"], ["010.png", "009.png", "000.png"])["9.png"] == "009.png"
-    assert by_name(["cam1_0.png", "cam1_1.png"], ["cam2_0.png", "cam2_1.png"]) == {}
+    assert pair_by_name(["0.png", "9.png", "10.png"], ["010.png", "009.png", "000.png"])["9.png"] == "009.png"
+    assert pair_by_name(["cam1_0.png", "cam1_1.png"], ["cam2_0.png", "cam2_1.png"]) == {}
 
 
 @each("images, masks", [(["a.png", "a.jpg"], ["a.tif"]), (["1.png", "2.png"], ["01.png", "001.png", "2.png"])])
 def test_several_of_one_name_are_no_pairs(images, masks):
-    assert by_name(images, masks) == {}
+    assert pair_by_name(images, masks) == {}
 
 
 def test_masks_that_are_not_one_to_one_are_refused_with_both_lists(tmp_path):
     images = {name: tmp_path / name for name in ("a_0.png", "a_1.png", "a_2.png", "b_0.png")}
     write(tmp_path / "mask", "m_0.png", "m_1.png", "m_2.png", "._m_0.png")
     with pytest.raises(BadInput, match=re.escape("(a_0.png, a_1.png, a_2.png, b_0.png) and 3 masks (m_0.png, ")):
-        masks_of(tmp_path, images)
+        find_masks(tmp_path, images)
     write(tmp_path / "mask", "n_0.png")
     with pytest.raises(BadInput, match="has no mask"):
-        masks_of(tmp_path, images)
-    masks, notes = masks_of(tmp_path, images, sorted_too=True)
+        find_masks(tmp_path, images)
+    masks, notes = find_masks(tmp_path, images, sorted_too=True)
     assert masks["b_0.png"].name == "n_0.png" and notes == ("4 images; 4 masks by the order of their names",)
 
 
@@ -104,7 +104,7 @@ def test_images_are_found_by_paths_of_other_machines(tmp_path, before, windows, 
     write(tmp_path, *(f"images/{name}.png" for name in names), "images/._1.png")
     asked = {before + name + suffix: name for name in names}
     asked = {path.replace("/", "\\") if windows else path: name for path, name in asked.items()}
-    found, note = located([*asked], base)
+    found, note = find_images([*asked], base)
     assert {path: file.relative_to(tmp_path / "images").as_posix() for path, file in found.items()} == {
         path: f"{name}.png" for path, name in asked.items()
     } or (suffix == "" and len(found) < 3)
@@ -115,13 +115,13 @@ def test_images_are_found_by_paths_of_other_machines(tmp_path, before, windows, 
 def test_accents_of_a_mac_are_those_of_others(tmp_path, forms):
     there, asked = (normalize(form, "\u00e9 1.png") for form in forms)
     write(tmp_path, there, "e 1.png")
-    assert located([asked], tmp_path)[0] == {asked: tmp_path / there}
+    assert find_images([asked], tmp_path)[0] == {asked: tmp_path / there}
 
 
 def test_two_paths_to_one_file_are_refused(tmp_path):
     write(tmp_path, "0.png")
     with pytest.raises(BadInput, match=r"a/0.png and b/0.png have cameras, and are one file"):
-        located(["a/0.png", "b/0.png"], tmp_path)
+        find_images(["a/0.png", "b/0.png"], tmp_path)
 
 
 # Whole folders
@@ -146,7 +146,9 @@ def test_names_without_zeros_are_paired_in_string_order(tmp_path, format, folder
 
 def test_photographs_that_show_less_than_half_of_the_hull_are_refused(tmp_path, monkeypatch):
     idr(tmp_path)
-    monkeypatch.setattr(own_photographs, "fit_of", lambda *given: replace(fit_of(*given), shown=(0.4,)))
+    monkeypatch.setattr(
+        own_photographs, "measure_mask_fit", lambda *given: replace(measure_mask_fit(*given), shown=(0.4,))
+    )
     with pytest.raises(BadInput, match=r"the photographs show 40% of the object"):
         read_capture(tmp_path, READ)
 
@@ -173,4 +175,4 @@ def test_names_with_folders_blanks_and_paths_of_elsewhere(tmp_path, named):
     (tmp_path / "images").rename(tmp_path / "elsewhere")
     with pytest.raises(BadInput, match=r"none of their images, such as .*000.png; its files end with .png, .txt"):
         read_capture(tmp_path, READ)
-    assert off(read_capture(tmp_path, Reading(48, masks=False, images="elsewhere"))) < 0.01
+    assert off(read_capture(tmp_path, ReadSettings(48, masks=False, images="elsewhere"))) < 0.01

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.tasks.multiview import sample
-from datasets.photographs import HIGHEST, Photography, around, turned
+from datasets.photographs import MAX_ELEVATION_DEGREES, Photography, around, turned
 from datasets.scene import Truth
 from datasets.textures import ONE_COLOUR, PHOTOGRAPHS, TEXTURES, make_texture
 from tests.looped import each
@@ -81,7 +81,7 @@ def test_cameras_all_around_look_at_the_origin_from_above_and_below(count):
         assert camera.project(torch.tensor([[0.0, 0.1, 0.0]]))[0][0, 1] < 16  # y is up
         assert torch.equal(camera.intrinsics, CAMERA.intrinsics) and (camera.height, camera.width) == (32, 32)
     heights = centres[:, 1] / 2.5
-    highest = np.sin(np.radians(HIGHEST))
+    highest = np.sin(np.radians(MAX_ELEVATION_DEGREES))
     assert heights.abs().max() <= highest and heights.sum().item() == pytest.approx(0.0, abs=1e-4)
     assert heights.max().item() == pytest.approx(highest * (1 - 1 / count), abs=1e-4)
     apart = torch.cdist(centres, centres) + 9 * torch.eye(count)

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from datasets.mesh import Mesh
-from datasets.range_scans import RangeScans, smoothed
+from datasets.range_scans import RangeScans, smooth
 from datasets.repair import repair
 from datasets.scene import Split, make_scene, sample_surface
 from datasets.views import ViewSampler
@@ -149,7 +149,7 @@ def test_a_scan_with_a_tangle_keeps_its_surface():
     ball = trimesh.creation.icosphere(5)
     near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]
     tangled = handled(ball, 0, near)
-    mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]), smoothed)
+    mesh = repair(Mesh(tangled.vertices, tangled.faces[:, ::-1]), smooth)
     assert mesh.watertight
     assert mesh.repairs[-1].startswith("replaced by its Poisson reconstruction, since its parts do not close")
     points = sample_surface(mesh, 2000, seed=0).points

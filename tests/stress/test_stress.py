@@ -18,7 +18,7 @@ from bench.stress.judge import judge_gradient, judge_rendering, truth
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings
 from bench.tables import choice, names
-from datasets.stress.scenes import DISTANCE, SCENES
+from datasets.stress.scenes import CAMERA_DISTANCE, SCENES
 from datasets.stress.solids import box, half_space, rod, sphere_solid
 from renderers import reference
 from renderers.camera import Rays
@@ -103,7 +103,7 @@ def test_a_floater_is_seen_by_samples_and_not_by_a_march():
     """A ball of radius .9 x .03 in front of a cube, of .09 of the picture: 1.8 of 5.4 widths across."""
     exam = SCENES["floaters"](0.03, drawn(), 48)
     found = truth(exam)[0]
-    in_front = found.distance < DISTANCE - 0.81 + 0.03
+    in_front = found.distance < CAMERA_DISTANCE - 0.81 + 0.03
     assert in_front.double().mean() == pytest.approx(np.pi / 4 / 9, rel=0.3)
     rays = exam.camera.rays().flat()
     share = {}
