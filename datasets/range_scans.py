@@ -18,7 +18,7 @@ from datasets.readers.ply import read_ply
 from datasets.readers.text import mistaken
 from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, meshlab, with_note
 from datasets.scene import Split, Truth, sample_surface
-from renderers.checks import BadInput, check_share
+from renderers.checks import BadInput, check_fraction
 
 LONGEST = 4.0  # median edges: points farther apart are not joined, as across a gap or behind an outline
 SCANNER = np.array([0.0, 0.0, 1.0])  # from the object to the scanner, in a scan's own axes (Stanford's repository)
@@ -74,7 +74,7 @@ class RangeScans:
     radius: float
 
     def __post_init__(self) -> None:
-        check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
+        check_fraction("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
         if not self.path or not Path(self.path).is_dir():
             raise ValueError(f"dataset.path={self.path} is no folder: give the folder that has the .conf file")
         _ = self.scans, self.reference

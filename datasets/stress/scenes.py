@@ -21,7 +21,7 @@ from datasets.stress.distortions import CUBE, THINNEST
 from datasets.stress.solids import ReferenceTruth, Solid, Truth, box, half_space, rod, sphere_solid
 from datasets.views import ViewSampler
 from renderers.camera import Camera
-from renderers.field import Field, Kind, points_in_sphere, steepest
+from renderers.field import Field, Kind, estimate_lipschitz, points_in_sphere
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder
 from renderers.fields.network import Published
@@ -208,7 +208,7 @@ def of_network(name: str, network: Decoder | Published, codes: Float[Tensor, "sh
             exact = deepcopy(changed).cpu().double().at(code.cpu().double())
             if (exact(points_in_sphere(SEEN)) < 0).double().mean() > LEAST:
                 break
-        truth = ReferenceTruth(exact, steepest(exact, radius=1.0), THINNEST)
+        truth = ReferenceTruth(exact, estimate_lipschitz(exact, radius=1.0), THINNEST)
         return Exam(changed.at(code), _camera(draw, resolution, elevation=ABOVE), truth)
 
     return scene
