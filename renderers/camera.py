@@ -144,8 +144,7 @@ class Camera:
     def with_object_moved(self, twist: Float[Tensor, "6"]) -> "Camera":
         """The camera whose view of the object equals this camera's view of the moved object.
 
-        Gradients flow to the twist. The motion is about the object's origin, so that a rotation keeps the object in the
-        image.
+        Gradients flow to the twist. The motion is about the object's origin, so that a rotation keeps it in the image.
 
         Args:
             twist: see `rigid`.

@@ -10,7 +10,7 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, estimate_lipschitz, marching_values
-from renderers.gradients import render_with_approximate_gradient
+from renderers.gradients import approximate_rendering
 from renderers.march import RayFront, Stepping, march_coarse_to_fine, march_front
 from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, check_kind
 from renderers.silhouette import AVERAGES, Hinge
@@ -88,14 +88,13 @@ class DIST:
         check_kind(self, field)
         with torch.no_grad():
             front = self._trace(field, rays)
-        return render_with_approximate_gradient(field, rays, front, alpha=self.alpha, radius=self.sphere_radius)
+        return approximate_rendering(field, rays, front, alpha=self.alpha, radius=self.sphere_radius)
 
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """DIST, Eq. 11."""
-        hinge = Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average)
-        return hinge.of(rendering.closest, mask)
+        return Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average).of(rendering.closest, mask)
 
     def _trace(self, field: Field, rays: Rays) -> RayFront:
         settings = {key.name: getattr(self, key.name) for key in fields(Stepping) if key.name != "slope"}

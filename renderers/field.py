@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import log
 from typing import Protocol, cast, runtime_checkable
 
@@ -179,8 +179,7 @@ class Counts:
         return work / minimum_work if minimum_work else None
 
     def __sub__(self, other: "Counts") -> "Counts":
-        names = [count.name for count in fields(self)]
-        return Counts(**{name: getattr(self, name) - getattr(other, name) for name in names})
+        return Counts(**{each.name: getattr(self, each.name) - getattr(other, each.name) for each in fields(self)})
 
 
 class Wrapper(ABC):
@@ -217,7 +216,7 @@ class Meter(Wrapper):
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         values = self.inner(points)
-        self._count_value(values.numel())
+        self.counts.add("value", values.numel())
         if values.requires_grad:
             values.register_hook(self._count_backward)
         return values
@@ -226,18 +225,12 @@ class Meter(Wrapper):
     def coarse(self) -> Coarse | None:
         """The coarse values of the field, counted separately."""
         uncounted = coarse_version(self.inner)
-        return uncounted and uncounted.with_counter(self._count_coarse)
+        return uncounted and uncounted.with_counter(partial(self.counts.add, "coarse"))
 
     @property
     def bounds(self) -> Bounds | None:
         """The field's bounds; each counts as `EVALUATIONS_PER_BOUND` field evaluations."""
-        return counted_bounds(self.inner, self._count_value)
-
-    def _count_value(self, points: int) -> None:
-        self.counts.add("value", points)
-
-    def _count_coarse(self, points: int) -> None:
-        self.counts.add("coarse", points)
+        return counted_bounds(self.inner, partial(self.counts.add, "value"))
 
     def _count_backward(self, gradient: Tensor) -> None:
         LazyCount.add(self.counts, "gradient", gradient.count_nonzero())

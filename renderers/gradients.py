@@ -50,9 +50,7 @@ def attach_approximate_gradient(
     return distance + alpha * (total - total.detach()), table[:, 0]
 
 
-def render_with_approximate_gradient(
-    field: Field, rays: Rays, front: RayFront, *, alpha: float, radius: float
-) -> Rendering:
+def approximate_rendering(field: Field, rays: Rays, front: RayFront, *, alpha: float, radius: float) -> Rendering:
     """The rendering of a marched front, whose hits have the approximate gradient.
 
     Args:
@@ -118,7 +116,7 @@ def evaluate_crossing(field: Field, rays: Rays, distance: Float[Tensor, " n"], *
         leaf = points.detach().requires_grad_(True)
         value = field(leaf)
         (gradient,) = torch.autograd.grad(value.sum(), leaf, retain_graph=towards_field)
-    gradient = gradient.nan_to_num(0.0, 0.0, 0.0)  # one point without a gradient must not spoil that of all others
+    gradient = gradient.nan_to_num(0.0, 0.0, 0.0)  # one point without a gradient must not spoil all others
     slope = (gradient * rays.directions.detach()).sum(-1)
     change = torch.zeros_like(slope)
     if points.requires_grad:
@@ -160,13 +158,11 @@ def attach_implicit_gradient(
     return distance.detach() - crossing.change / slope
 
 
-def render_with_implicit_gradient(
-    field: Field, rays: Rays, front: RayFront, *, least_slope: float, radius: float
-) -> Rendering:
+def implicit_rendering(field: Field, rays: Rays, front: RayFront, *, least_slope: float, radius: float) -> Rendering:
     """The rendering of a marched front with one sample per ray, whose hits have the implicit gradient.
 
     Args:
-        rays, front, radius: see `render_with_approximate_gradient`.
+        rays, front, radius: see `approximate_rendering`.
         least_slope: see `attach_implicit_gradient`.
     """
     flat = rays.flat()

@@ -7,7 +7,7 @@ import torch
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, marching_values
-from renderers.gradients import render_with_implicit_gradient
+from renderers.gradients import implicit_rendering
 from renderers.march import RayFront, Stepping, march_front
 from renderers.rendering import Rendering, check_kind
 from renderers.silhouette import SurfaceRenderer
@@ -48,6 +48,4 @@ class IDR(SurfaceRenderer):
             front = RayFront.on_sphere(flat, radius=self.sphere_radius, samples=1)
             values, steps = marching_values(field, self.steps, epsilon=self.epsilon, coarse=self.coarse)
             march_front(values, flat, front, Stepping(self.epsilon), steps)
-        return render_with_implicit_gradient(
-            field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius
-        )
+        return implicit_rendering(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)

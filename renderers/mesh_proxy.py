@@ -30,8 +30,7 @@ class MeshProxy(SurfaceRenderer):
     Differentiable in: field parameters, through the vertices of the triangles that are hit; rays, on these triangles'
         planes. The gradient of `distance` lacks the visibility gradient; the mask loss (IDR's) has it.
     Needs: any level set. Parts thinner than the grid's spacing may be missed, and edges are cut off by as much.
-    Deviates from the paper: each rendering makes a new grid, without refinement; triangles are ray cast, not
-        rasterised.
+    Deviates from the paper: each rendering has a new grid, not refined; triangles are ray cast, not rasterised.
 
     Args:
         grid: samples on each side of the cube about the sphere.
@@ -150,9 +149,8 @@ class _Mesh:
 
     def cast(self, rays: Rays, start: Float[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
         """The distance of each ray's first crossing after `start`, or infinity, and its triangle, or -1."""
-        misses = torch.full_like(start, torch.inf), torch.full_like(start, -1, dtype=torch.int64)
         if not len(self.triangles) or not len(start):
-            return misses
+            return torch.full_like(start, torch.inf), torch.full_like(start, -1, dtype=torch.int64)
         scene = open3d.t.geometry.RaycastingScene()
         scene.add_triangles(
             open3d.core.Tensor.from_numpy(self.vertices.cpu().float().numpy()),
@@ -162,5 +160,4 @@ class _Mesh:
         hits = scene.cast_rays(open3d.core.Tensor.from_numpy(np.ascontiguousarray(table)))
         distance = start + torch.from_numpy(hits["t_hit"].numpy()).to(start)
         triangle = torch.from_numpy(hits["primitive_ids"].numpy().astype(np.int64)).to(start.device)
-        hit = distance.isfinite()
-        return torch.where(hit, distance, misses[0]), torch.where(hit, triangle, misses[1])
+        return distance, torch.where(distance.isfinite(), triangle, -1)

@@ -10,7 +10,7 @@ from torch import Tensor
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field
-from renderers.gradients import render_with_approximate_gradient
+from renderers.gradients import approximate_rendering
 from renderers.march import RayFront, Stepping, march_front
 from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, Status, assemble, check_kind
 from renderers.silhouette import AVERAGES, Hinge
@@ -82,15 +82,14 @@ class Naive:
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """DIST, Eq. 11."""
-        hinge = Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average)
-        return hinge.of(rendering.closest, mask)
+        return Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average).of(rendering.closest, mask)
 
     def _approximate(self, field: Field, rays: Rays) -> Rendering:
         with torch.no_grad():
             assert self.n_gradient_samples is not None  # checked above
             front = RayFront.on_sphere(rays, radius=self.sphere_radius, samples=self.n_gradient_samples)
             march_front(field, rays, front, Stepping(self.epsilon, active_only=False), self.steps)
-        return render_with_approximate_gradient(field, rays, front, alpha=1.0, radius=self.sphere_radius)
+        return approximate_rendering(field, rays, front, alpha=1.0, radius=self.sphere_radius)
 
     def _unrolled(self, field: Field, rays: Rays) -> Rendering:
         entry, leave, intersects = sphere_span(rays, self.sphere_radius)

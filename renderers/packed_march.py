@@ -187,8 +187,8 @@ class RayTable:
         child.value = torch.where(keeps_sample, coarse.value, child.value)
         child.least_distance = torch.where(keeps_sample, coarse.least_distance, child.least_distance)
         child.least = torch.where(keeps_sample, coarse.least, child.least)
-        clearance = torch.minimum(coarse.path_clearance, coarse.least)
-        clearance = torch.where(at_surface, coarse.path_clearance, clearance)
+        clearance = coarse.path_clearance
+        clearance = torch.where(at_surface, clearance, torch.minimum(clearance, coarse.least))
         child.path_clearance = torch.where(inherits, clearance - parent_distance, child.path_clearance)
         clear = ~at_surface & (child.path_clearance > CLEARANCE_THRESHOLD)
         child.restart_distance = torch.where(clear, resume_distance, child.entry)
@@ -196,7 +196,7 @@ class RayTable:
         return child
 
 
-def march_to_surface(
+def march_rays(
     values: PointFunction, rays: Rays, stride: Stride, *, steps: int, radius: float, error: float
 ) -> RayTable:
     """Marches all rays; those of an image coarse to fine (DIST, Sec. 3.2).
@@ -213,9 +213,9 @@ def march_to_surface(
     levels = ray_pyramid(rays) if rays.image else []
     table, *finer = (RayTable.on_sphere(each, radius) for each in [*(level.coarse for level in levels), rays.flat()])
     distances = [_parent_distance(level, start) for level, start in zip(levels, [table, *finer], strict=False)]
-    widest = [torch.nn.functional.pad(distance, (0, 1)).amax() for distance in distances]
-    widest = torch.stack(widest).tolist() if levels else []
-    for level, child, distance, max_distance in zip(levels, finer, distances, widest, strict=True):
+    maxima = [torch.nn.functional.pad(distance, (0, 1)).amax() for distance in distances]
+    maxima = torch.stack(maxima).tolist() if levels else []
+    for level, child, distance, max_distance in zip(levels, finer, distances, maxima, strict=True):
         coarse_epsilon = max(PARENT_SPHERE_FACTOR * max_distance + error, stride.epsilon)
         march_table(values, level.coarse, table, replace(stride, epsilon=coarse_epsilon), MAX_STEPS_PER_LEVEL)
         table = table.split(level.parent, distance, child, error=error)
@@ -281,9 +281,9 @@ class StepColumns(NamedTuple):
         at most to its start. A ray that stops stays at the sample; if it has left the sphere, it ends beyond `leave`.
         """
         distance, safe, magnitude, negative = self.distance, self.free_value, value.abs(), value < 0
-        went, finite = distance - self.free, magnitude < torch.inf
+        travelled, finite = distance - self.free, magnitude < torch.inf
         above, behind = (value > stride.epsilon) & finite, (value < -stride.epsilon) & finite
-        too_far = finite & (went - safe - magnitude > GAP_TOLERANCE_FACTOR * stride.unseen)
+        too_far = finite & (travelled - safe - magnitude > GAP_TOLERANCE_FACTOR * stride.unseen)
         from_behind = too_far & negative
         closer = finite & ~from_behind & (magnitude < self.least.abs())
         limit = torch.where(from_behind, distance, self.step_back_limit)
@@ -291,7 +291,7 @@ class StepColumns(NamedTuple):
         left = positive & (end > self.leave) & self.step_back_limit.isinf()
         first = safe.isinf() & (distance > self.entry)
         goes_on = too_far | (behind & first) | (above & ~left)
-        slope = ((safe - value) / went).nan_to_num(1.0)  # a step too short for the dtype has no slope
+        slope = ((safe - value) / travelled).nan_to_num(1.0)  # a step too short for the dtype has no slope
         moved = torch.where(too_far, self.free + safe, distance + stride.length(value, slope))
         moved = torch.minimum(torch.maximum(moved, self.entry), torch.minimum(self.leave, limit))
         rises = value > safe

@@ -1,4 +1,4 @@
-"""Ray casting by range analysis: what is not certified to be empty is cut in half (Sharp and Jacobson, 2022)."""
+"""Ray casting by range analysis: segments that are not certified to be empty are halved (Sharp and Jacobson, 2022)."""
 
 from dataclasses import dataclass
 
@@ -55,7 +55,8 @@ class RangeAnalysis(SurfaceRenderer):
         with torch.no_grad():
             cast = self._cast(field, flat)
             hit = (cast.status == Status.HIT).nonzero().squeeze(-1)
-            root, _ = refine(field, flat[hit], cast.bracket(hit), method="secant", steps=SECANT_STEPS)
+            bracket = Bracket(cast.distance[hit], cast.far[hit], cast.value[hit], cast.far_value[hit])
+            root, _ = refine(field, flat[hit], bracket, method="secant", steps=SECANT_STEPS)
             remaining = field(flat[hit].at(root))
         distance = attach_implicit_gradient(field, flat[hit], root, least_slope=self.least_slope)
         least, least_distance = cast.least.index_put((hit,), remaining), cast.least_distance.index_put((hit,), root)
@@ -132,10 +133,6 @@ class _CastState:
         closer = value.abs() < self.least[index].abs()
         self.least[index] = torch.where(closer, value, self.least[index])
         self.least_distance[index] = torch.where(closer, distance, self.least_distance[index])
-
-    def bracket(self, index: Tensor) -> Bracket:
-        """The last segments of the rays in `index`."""
-        return Bracket(self.distance[index], self.far[index], self.value[index], self.far_value[index])
 
 
 def _lipschitz_bounds(field: Field) -> Bounds:

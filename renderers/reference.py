@@ -28,7 +28,7 @@ def trace(field: Field, rays: Rays, *, lipschitz: float, least_step: float, radi
     Raises:
         ValueError: if a number is not positive, or the rays are not in float64.
     """
-    check_positive("lipschitz", lipschitz, "steepest() measures one")
+    check_positive("lipschitz", lipschitz, "estimate_lipschitz() measures one")
     check_positive("least_step", least_step, "2e-4 finds all that a pixel shows")
     if rays.origins.dtype is not torch.float64:
         raise ValueError(f"rays must be in float64, not {rays.origins.dtype}: convert the camera by .double()")

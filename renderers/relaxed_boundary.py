@@ -9,13 +9,12 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
-from renderers.gradients import reevaluate_with_graph, render_with_implicit_gradient
+from renderers.gradients import implicit_rendering, reevaluate_with_graph
 from renderers.march import RayFront, Stepping, march_front
 from renderers.rendering import Rendering, Status, Volume, check_kind
 from renderers.silhouette import SurfaceRenderer
 
-# Times the band: a local minimum among the samples below it is evaluated at the vertex of its parabola. If the field is
-# a distance, such a sample is at most 1.16 times the minimum.
+# Times the band: samples above it are no candidates. A sample of a distance is at most 1.16 times the ray's minimum.
 CANDIDATE_FACTOR = 1.5
 MAX_VALUE = 1e3  # larger and infinite values are clamped
 STEPS_PER_BATCH = 8  # steps between two searches for near misses
@@ -25,10 +24,9 @@ STEPS_PER_BATCH = 8  # steps between two searches for near misses
 class RelaxedBoundary(SurfaceRenderer):
     """Sphere tracing with a visibility gradient on rays that pass close by a surface.
 
-    A near miss is a ray's local minimum of the field within the band above `epsilon`. Its surface gets the weight 0,
-    with the derivative of minus the value over the band's width. The hit behind it gets the rest of the weight. The
-    mean over a pixel's rays then has the derivative of the pixel's content: the integral over the outline, spread over
-    the band.
+    A near miss is a ray's local minimum of the field within the band above `epsilon`. It has the weight 0, with the
+    derivative of minus the value over the band's width. The hit behind it has the rest of the weight. The mean over a
+    pixel's rays then has the derivative of the pixel's content: the integral over the outline, spread over the band.
 
     Source: "A Simple Approach to Differentiable Rendering of SDFs" (Wang et al. 2024, arXiv 2405.08733), Secs. 4, 5.
     Differentiable in: field parameters and rays. Hits by the implicit rule, exactly, up to `epsilon`. The visibility
@@ -69,8 +67,7 @@ class RelaxedBoundary(SurfaceRenderer):
         flat = rays.flat()
         with torch.no_grad():
             front, near_distance, near_value = self._march(field, flat)
-        radius = self.sphere_radius
-        rendering = render_with_implicit_gradient(field, rays, front, least_slope=self.least_slope, radius=radius)
+        rendering = implicit_rendering(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
         distance, hit = rendering.distance.view(-1), (front.status == Status.HIT).nonzero().squeeze(-1)
         near = near_value.isfinite().nonzero().squeeze(-1)
         value = reevaluate_with_graph(field, flat[near], near_distance[near], near_value[near])
@@ -120,11 +117,9 @@ class NearMissTracker:
             order = torch.where((value > epsilon) & (value < band + epsilon), step, STEPS_PER_BATCH)
             first = torch.full_like(self.value, STEPS_PER_BATCH, dtype=step.dtype).scatter_reduce(0, ray, order, "amin")
             chosen = (order == first[ray]) & (order < STEPS_PER_BATCH)  # at most one per ray
-            infinite = torch.full_like(self.value, torch.inf)
-            distance, value = (
-                infinite.scatter_reduce(0, ray, torch.where(chosen, candidates, torch.inf), "amin")
-                for candidates in (distance, value)
-            )
+            infinite, candidates = torch.full_like(self.value, torch.inf), (distance, value)
+            columns = [torch.where(chosen, column, torch.inf) for column in candidates]
+            distance, value = (infinite.scatter_reduce(0, ray, column, "amin") for column in columns)
             self.distance = torch.where(value < torch.inf, distance, self.distance)
             self.value = torch.minimum(self.value, value)
         self.samples[:2] = self.samples[-2:]

@@ -50,12 +50,10 @@ class Volume:
     distance: Float[Tensor, " samples"]
     weight: Float[Tensor, " samples"]
 
-    def weighted_sum(
-        self, values: Float[Tensor, " samples *channels"], count: int
-    ) -> Float[Tensor, " count *channels"]:
-        """The weighted sums of the samples' values for each of `count` rays."""
+    def weighted_sum(self, values: Float[Tensor, " samples *channels"], n: int) -> Float[Tensor, " n *channels"]:
+        """The weighted sum of the samples' values for each of n rays."""
         weight = self.weight.view(-1, *[1] * (values.dim() - 1))
-        return values.new_zeros(count, *values.shape[1:]).index_add(0, self.ray, weight * values)
+        return values.new_zeros(n, *values.shape[1:]).index_add(0, self.ray, weight * values)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from renderers.field import (
     points_in_sphere,
 )
 from renderers.gradients import evaluate_crossing
-from renderers.packed_march import RayTable, Stop, Stride, march_table, march_to_surface
+from renderers.packed_march import RayTable, Stop, Stride, march_rays, march_table
 from renderers.rendering import Deferred, Rendering, Status, assemble
 
 # Scene units, times the slope along the ray: after a longer Newton step the field is evaluated again, since a step is
@@ -84,7 +84,7 @@ class Tracer:
             marching = self._marching_field(field)
             steps = self._max_steps(field) * (1 if marching.values is field else COARSE_STEP_FACTOR)
             stride, error = self.stride(marching.error), marching.error
-            table = march_to_surface(marching.values, rays, stride, steps=steps, radius=self.sphere_radius, error=error)
+            table = march_rays(marching.values, rays, stride, steps=steps, radius=self.sphere_radius, error=error)
         return table, self._crossings_after(field, rays.flat(), table, marching)
 
     def resume(self, field: Field, rays: Rays, table: RayTable) -> "Crossings":
@@ -131,8 +131,8 @@ class Tracer:
         """
         first = self._solve_near_hits(field, rays, table)
         with torch.no_grad():
-            certain = table.stopped(Stop.LEFT).index_put((first.index,), first.converged)
-            certain &= table.ray_clearance > error
+            left, clear = table.stopped(Stop.LEFT), table.ray_clearance > error
+            certain = left.index_put((first.index,), first.converged) & clear
             index = (~certain).nonzero().squeeze(-1)
             doubtful, resumes = rays[index], torch.ones_like(index, dtype=torch.bool)
             again = table.select(index).restarted(doubtful, resumes, radius=self.sphere_radius)
@@ -202,7 +202,8 @@ class Tracer:
             distance = start + step - crossing.change / slope
             first_value = solved.first_value[pending] if steps_before else value
             columns = distance, value, crossing.slope, first_value, crossing.change, short | small
-            solved = solved.replace_at(pending, *columns)
+            pairs = zip(solved.columns[1:], columns, strict=True)
+            solved = Crossings(index, *(old.index_put((pending,), new) for old, new in pairs))
             if steps_before + 1 == self.newton_steps or (pending := pending[enters & ~short]).numel() == 0:
                 break
         return solved
@@ -307,11 +308,6 @@ class Crossings:
     def concatenate(self, other: "Crossings") -> "Crossings":
         """These crossings, followed by the others."""
         return Crossings(*(torch.cat(pair) for pair in zip(self.columns, other.columns, strict=True)))
-
-    def replace_at(self, selected: Int[Tensor, " k"], *columns: Tensor) -> "Crossings":
-        """The crossings with new columns, all except `index`, for the `selected` ones."""
-        pairs = zip(self.columns[1:], columns, strict=True)
-        return Crossings(self.index, *(old.index_put((selected,), new) for old, new in pairs))
 
 
 @dataclass(frozen=True)

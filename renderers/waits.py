@@ -52,8 +52,7 @@ class LazyCount:
         return number
 
     def __set__(self, counts: Any, number: "int | LazyCount") -> None:
-        # The default, within `dataclasses.field`, is a LazyCount.
-        vars(counts)[self.attribute] = 0 if isinstance(number, LazyCount) else number
+        vars(counts)[self.attribute] = 0 if isinstance(number, LazyCount) else number  # a LazyCount is the default
 
     @staticmethod
     def add(counts: Any, name: str, number: int | Tensor) -> None:

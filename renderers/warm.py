@@ -3,7 +3,7 @@
 The movement of the field's values is measured at the last hits, where a rendering evaluates them anyway, and at one
 point on each of some rays. If the field was larger than twice that movement along a ray's whole path, the ray is still
 free. A hit is solved again from its last distance, by the Newton step that its gradient needs. All other rays are
-marched again: if the path is still free up to where it came close to a surface, from there, else from its start.
+marched again, from where their path came close to a surface if it is free up to there, else from their start.
 
 This is no proof, since the movement is measured at samples: a surface that appears between them is found when the ray
 is marched again. An audit marches one ray in a hundred from its start, other rays in each rendering. If too many
