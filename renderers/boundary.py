@@ -65,14 +65,14 @@ def silhouette_loss(
     return loss
 
 
-def check_loss_gradient(renderer: Renderer, field: Field, rays: Rays, loss: Float[Tensor, ""], what: str) -> None:
+def check_loss_gradient(renderer: Renderer, field: Field, rays: Rays, loss: Float[Tensor, ""], subject: str) -> None:
     """Raises BrokenContract if a loss that is not 0 lacks a gradient, gradients are on and the renderer claims it.
 
     Args:
-        what: the input of the loss, for the message: "its closest values carry".
+        subject: of the message, with its verb: "its closest values carry".
     """
     if (capability := _missing_gradient(renderer, field, rays, loss)) and bool(loss != 0):
-        raise _missing_gradient_error(renderer, capability, what)
+        raise _missing_gradient_error(renderer, capability, subject)
 
 
 def check_gradients(renderer: Renderer, towards_field: Tensor | None, towards_rays: Tensor | None) -> None:
@@ -89,8 +89,8 @@ def _check_tensor(name: str, tensor_name: str, value: object, rays: Rays) -> Non
         raise BrokenContract(f"{name} must be a tensor, not a {type(value).__name__}")
     shape = (*rays.shape, 3) if tensor_name == "points" else tuple(rays.shape)
     if tuple(value.shape) != shape:
-        what = "points of shape [*rays, 3]" if tensor_name == "points" else "one answer per ray"
-        raise BrokenContract(f"{name} must have the shape {list(shape)}, not {list(value.shape)}: return {what}")
+        remedy = "points of shape [*rays, 3]" if tensor_name == "points" else "one answer per ray"
+        raise BrokenContract(f"{name} must have the shape {list(shape)}, not {list(value.shape)}: return {remedy}")
     dtype = torch.int8 if tensor_name == "status" else rays.origins.dtype
     if value.dtype != dtype:
         expected = f"{_dtype_name(dtype)}, {'a Status per ray' if tensor_name == 'status' else 'as the rays are'}"
@@ -127,9 +127,9 @@ def _missing_gradient(renderer: Renderer, field: Field, rays: Rays, output: Tens
     return "field_gradient" if can.field_gradient and carries_gradient(field, rays.origins) else ""
 
 
-def _missing_gradient_error(renderer: Renderer, capability: str, what: str) -> BrokenContract:
+def _missing_gradient_error(renderer: Renderer, capability: str, subject: str) -> BrokenContract:
     return BrokenContract(
-        f"{type(renderer).__name__}.capabilities.{capability} is True, but {what} no gradient towards "
+        f"{type(renderer).__name__}.capabilities.{capability} is True, but {subject} no gradient towards "
         f"{GRADIENT_TARGETS[capability]}: attach one (see renderers/gradients.py), or set {capability}=False"
     )
 

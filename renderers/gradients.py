@@ -159,10 +159,9 @@ def attach_implicit_gradient(
 
 
 def implicit_rendering(field: Field, rays: Rays, front: RayFront, *, least_slope: float, radius: float) -> Rendering:
-    """The rendering of a marched front with one sample per ray, whose hits have the implicit gradient.
+    """The rendering of a front with one sample per ray and the implicit gradient; see `approximate_rendering`.
 
     Args:
-        rays, front, radius: see `approximate_rendering`.
         least_slope: see `attach_implicit_gradient`.
     """
     flat = rays.flat()

@@ -109,12 +109,12 @@ class Naive:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         status = torch.full_like(distance, Status.OUT_OF_STEPS, dtype=torch.int8)
         active = torch.ones_like(distance, dtype=torch.bool)
-        last, closest = torch.zeros_like(distance), torch.full_like(distance, torch.inf)
+        last_value, closest = torch.zeros_like(distance), torch.full_like(distance, torch.inf)
         for step in range(self.steps):
             value = field(rays.at(distance))
             finite = value.isfinite()
             converged = active & (value.abs() < self.epsilon)
-            last = torch.where(active & finite, value, last)
+            last_value = torch.where(active & finite, value, last_value)
             closest = torch.where(active & finite & (value.abs() < closest.abs()), value, closest)
             if step == 0:
                 started_inside = finite & (value < 0) & ~converged
@@ -127,4 +127,4 @@ class Naive:
             distance = torch.where(left, leave, moved)
             active = active & ~left & ~converged
         closest = torch.where(closest.isfinite(), closest, 1.0)
-        return distance, status, last, closest
+        return distance, status, last_value, closest

@@ -128,14 +128,14 @@ class RayTable:
         Resuming rays keep their clearance up to there. Those that had LEFT end at `clear_from`, since they are free
         from there on.
         """
-        again = RayTable.on_sphere(rays, radius)
-        again.distance = torch.where(resumes, self.restart_distance, again.distance)
-        again.restart_distance = torch.where(resumes, self.restart_distance, again.restart_distance)
-        again.clear_from = torch.where(resumes, self.clear_from, again.clear_from)
+        restarted = RayTable.on_sphere(rays, radius)
+        restarted.distance = torch.where(resumes, self.restart_distance, restarted.distance)
+        restarted.restart_distance = torch.where(resumes, self.restart_distance, restarted.restart_distance)
+        restarted.clear_from = torch.where(resumes, self.clear_from, restarted.clear_from)
         clearance = self.path_clearance.clamp_min(CLEARANCE_THRESHOLD)
-        again.path_clearance = torch.where(resumes, clearance, again.path_clearance)
-        again.leave = torch.where(resumes & self.stopped(Stop.LEFT), self.clear_from, again.leave)
-        return again
+        restarted.path_clearance = torch.where(resumes, clearance, restarted.path_clearance)
+        restarted.leave = torch.where(resumes & self.stopped(Stop.LEFT), self.clear_from, restarted.leave)
+        return restarted
 
     def scatter(self, index: Int[Tensor, " m"], others: "RayTable") -> None:
         """Replaces the rays in `index` by `others`; both keep the `leave` of these rays."""

@@ -14,7 +14,7 @@ from renderers.gradients import attach_implicit_gradient, reevaluate_with_graph
 from renderers.rendering import Rendering, Status, assemble, check_kind
 from renderers.silhouette import SurfaceRenderer
 
-SEGMENT_GROWTH_FACTOR = 2.0  # after an empty segment
+SEGMENT_GROWTH = 2.0  # factor after an empty segment
 SECANT_STEPS = 6  # to the root, within the last segment
 
 
@@ -96,8 +96,7 @@ class RangeAnalysis(SurfaceRenderer):
             cast.status[active] = status.to(torch.int8)
             cast.distance[active] = torch.where(onward, far, near)
             cast.value[active] = torch.where(onward, value, cast.value[active])
-            length = torch.where(empty, SEGMENT_GROWTH_FACTOR * length, length / 2)
-            cast.length[active] = length.clamp_min(self.least_segment)
+            cast.length[active] = torch.where(empty, SEGMENT_GROWTH * length, length / 2).clamp_min(self.least_segment)
         return cast
 
 

@@ -135,10 +135,10 @@ class Tracer:
             certain = left.index_put((first.index,), first.converged) & clear
             index = (~certain).nonzero().squeeze(-1)
             doubtful, resumes = rays[index], torch.ones_like(index, dtype=torch.bool)
-            again = table.select(index).restarted(doubtful, resumes, radius=self.sphere_radius)
-            march_table(field, doubtful, again, self.stride(), COARSE_STEP_FACTOR * self._max_steps(field))
-        second = self._crossings(field, doubtful, again).reindexed(index)
-        table.scatter(index, again)
+            restarted = table.select(index).restarted(doubtful, resumes, radius=self.sphere_radius)
+            march_table(field, doubtful, restarted, self.stride(), COARSE_STEP_FACTOR * self._max_steps(field))
+        second = self._crossings(field, doubtful, restarted).reindexed(index)
+        table.scatter(index, restarted)
         table.path_clearance -= error
         return first.select(certain[first.index]).concatenate(second)
 
@@ -159,10 +159,10 @@ class Tracer:
             bracketed = (unsolved & crossed).nonzero().squeeze(-1)
             searched = ((unsolved & ~crossed) | table.stopped(Stop.MARCHING)).nonzero().squeeze(-1)
             hits, bracket = self._search(field, rays, table, searched)
-            again = torch.cat([bracketed, searched[hits]])
+            retried = torch.cat([bracketed, searched[hits]])
             bracket = table.select(bracketed).bracket().concatenate(bracket)
-            guess, _ = refine(field, rays[again], bracket, method="secant", steps=self.search_steps)
-        second = self.solve(field, rays, table, again, guess)
+            guess, _ = refine(field, rays[retried], bracket, method="secant", steps=self.search_steps)
+        second = self.solve(field, rays, table, retried, guess)
         return first.select(first.converged).concatenate(second)
 
     def solve(
@@ -228,12 +228,12 @@ class Tracer:
         searched.stop = torch.where(inside, Stop.INSIDE, searched.stop)
         table.table[index] = searched.table
         spacing = (searched.leave - start) / (self.search_samples - 1)
-        again = ((smallest < spacing / 2) & ~inside).nonzero().squeeze(-1)
+        resampled = ((smallest < spacing / 2) & ~inside).nonzero().squeeze(-1)
         low, high = torch.maximum(nearest - spacing, start), torch.minimum(nearest + spacing, searched.leave)
-        distance, value = self._samples(field, rays[index[again]], low[again], high[again])
-        crosses_again, closer = first_crossing(distance, value)
-        bracket = bracket.replace_where(again, crosses_again, closer)
-        hits = (crosses.index_put((again,), crosses[again] | crosses_again) & ~inside).nonzero().squeeze(-1)
+        distance, value = self._samples(field, rays[index[resampled]], low[resampled], high[resampled])
+        crosses_resampled, closer = first_crossing(distance, value)
+        bracket = bracket.replace_where(resampled, crosses_resampled, closer)
+        hits = (crosses.index_put((resampled,), crosses[resampled] | crosses_resampled) & ~inside).nonzero().squeeze(-1)
         return hits, bracket.select(hits)
 
     def _samples(
