@@ -13,7 +13,7 @@ import torch
 
 from datasets.mesh import Mesh, extract, normalise
 from datasets.scene import Split, seed_of
-from renderers.checks import BadInput, check_at_least, check_choice, check_share
+from renderers.checks import BadInput, check_at_least, check_choice, check_fraction
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union, sphere, torus
 
@@ -45,7 +45,7 @@ class Family:
             if not numbers or not -inf < bounds[0] <= bounds[1] < inf:
                 raise ValueError(f"dataset.ranges.{name} must be two rising numbers, not {bounds}: write [0.1, 0.2]")
         check_at_least("resolution", self.resolution, 16, "128 keeps legs and wings")
-        check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
+        check_fraction("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
 
     def draw(self, split: Split, index: int) -> dict[str, float]:
         """The parameters of a shape."""

@@ -20,7 +20,7 @@ from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
 from datasets.scene import Split, seed_of
 from datasets.textures import Texture
-from renderers.checks import check_at_least, check_share
+from renderers.checks import check_at_least, check_fraction
 
 VERSION = 4  # raise it when reading, repair or deformation changes the shapes
 SLOW = 2.0  # seconds from which on a repaired mesh is kept
@@ -46,7 +46,7 @@ class LocalMeshes:
     strength: float
 
     def __post_init__(self) -> None:
-        check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
+        check_fraction("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
         check_at_least("dataset.strength", self.strength, 0, "0 switches deformations off")
         try:
             find_meshes(self.path)

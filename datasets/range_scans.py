@@ -18,7 +18,7 @@ from datasets.readers.ply import read_ply
 from datasets.readers.text import wrong_kind_message
 from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, meshlab, with_note
 from datasets.scene import Split, Truth, sample_surface
-from renderers.checks import BadInput, check_share
+from renderers.checks import BadInput, check_fraction
 
 MAX_EDGE_RATIO = 4.0  # to the median edge; a longer edge crosses a gap or an outline
 SCANNER_DIRECTION = np.array([0.0, 0.0, 1.0])  # from the object, in the scan's axes (Stanford's repository)
@@ -73,7 +73,7 @@ class RangeScans:
     radius: float
 
     def __post_init__(self) -> None:
-        check_share("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
+        check_fraction("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
         if not self.path or not Path(self.path).is_dir():
             raise ValueError(f"dataset.path={self.path} is no folder: give the folder that has the .conf file")
         _ = self.scans, self.reference

@@ -1,7 +1,7 @@
 """Checks what a renderer returns, so that a broken contract gives one clear message.
 
-The values are data, NaN among them, and are not checked here; those of hits are in `hits`. The check of a valid
-rendering costs a few comparisons of shapes and types, and no evaluation of the field.
+Values, which may be NaN, are not checked here; `hits` checks the values of hits. The check of a valid rendering costs a
+few comparisons of shapes and types, and no field evaluation.
 """
 
 import torch
@@ -11,116 +11,114 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.checks import BrokenContract
 from renderers.field import Field, Meter, carries_gradient
-from renderers.hits import keep
-from renderers.rendering import Guided, Observed, Renderer, Rendering
-from renderers.waits import Late
+from renderers.hits import record_hits
+from renderers.rendering import RayObservation, Renderer, Rendering, UsesDistances
+from renderers.waits import LazyCount
 
-PARTS = ("distance", "status", "points", "residual", "closest")
-TOWARDS = {"field_gradient": "the field's parameters", "ray_gradient": "the rays"}
+RENDERING_TENSORS = ("distance", "status", "points", "residual", "closest")
+GRADIENT_TARGETS = {"field_gradient": "the field's parameters", "ray_gradient": "the rays"}
 
 
-def rendered(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
-    """The renderer's rendering of the field along the rays; a Meter's counts note its hits.
+def render_checked(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
+    """Renders the field along the rays and checks the rendering; the counts of a Meter include its hits.
 
     Raises:
-        BrokenContract: where it is no Rendering, a part has a wrong shape, type or device for the rays, or hits carry
-            no gradient although the renderer claims one and it is wanted.
+        BrokenContract: if it is no Rendering, if a tensor has a wrong shape, type or device for the rays, or if hits
+            have no gradient although gradients are on and the renderer claims one.
     """
     rendering = renderer.render(field, rays)
     name = f"{type(renderer).__name__}.render"
     if not isinstance(rendering, Rendering):
-        found = "None" if rendering is None else f"a {type(rendering).__name__}"
-        raise BrokenContract(f"{name} must return a Rendering, not {found}: see renderers/rendering.py")
-    for part in PARTS:
-        _check_part(name, part, getattr(rendering, part), rays)
+        raise BrokenContract(f"{name} must return a Rendering, not {_type_of(rendering)}: see renderers/rendering.py")
+    for tensor_name in RENDERING_TENSORS:
+        _check_tensor(name, tensor_name, getattr(rendering, tensor_name), rays)
     _check_deferred(name, rendering)
-    if (lacked := _lacked(renderer, field, rays, rendering.distance)) and bool(rendering.hit.any()):
-        raise _no_gradient(renderer, lacked, "the distances of its hits carry")
+    if (capability := _missing_gradient(renderer, field, rays, rendering.distance)) and bool(rendering.hit.any()):
+        raise _missing_gradient_error(renderer, capability, "the distances of its hits carry")
     if isinstance(field, Meter):
-        Late.add(field.counts, "hits", rendering.hit.sum())
-    keep(renderer, field, rays, rendering)
+        LazyCount.add(field.counts, "hits", rendering.hit.sum())
+    record_hits(renderer, field, rays, rendering)
     return rendering
 
 
 def silhouette_loss(
-    renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
+    renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
 ) -> Float[Tensor, ""]:
-    """The renderer's own loss between its rendering and what is observed: of a Guided one all, of others the mask.
+    """The renderer's loss between its rendering and the mask, with the observed distances if it `UsesDistances`.
 
     Raises:
-        BrokenContract: where it is no scalar of floating point, or carries no gradient although it is not 0, the
-            renderer claims one, and it is wanted.
+        BrokenContract: if it is no floating-point scalar, or if it is not 0 and has no gradient although gradients are
+            on and the renderer claims one.
     """
-    if isinstance(renderer, Guided):
+    if isinstance(renderer, UsesDistances):
         loss, method = renderer.observed_loss(field, rays, rendering, observed), "observed_loss"
     else:
         loss, method = renderer.silhouette_loss(field, rays, rendering, observed.mask), "silhouette_loss"
     name = f"{type(renderer).__name__}.{method}"
     if not isinstance(loss, Tensor):
-        found = "None" if loss is None else f"a {type(loss).__name__}"
-        raise BrokenContract(f"{name} must return a tensor with one number, not {found}: return the mean over the rays")
+        remedy = "return the mean over the rays"
+        raise BrokenContract(f"{name} must return a tensor with one number, not {_type_of(loss)}: {remedy}")
     if loss.shape != () or not loss.is_floating_point():
-        found = f"{_short(loss.dtype)} of shape {list(loss.shape)}"
-        raise BrokenContract(f"{name} must return one floating-point number of shape [], not {found}: take its mean")
+        returned = f"{_dtype_name(loss.dtype)} of shape {list(loss.shape)}"
+        raise BrokenContract(f"{name} must return one floating-point number of shape [], not {returned}: take its mean")
     check_loss_gradient(renderer, field, rays, loss, "its silhouette loss carries")
     return loss
 
 
-def check_loss_gradient(renderer: Renderer, field: Field, rays: Rays, loss: Float[Tensor, ""], what: str) -> None:
-    """Raises BrokenContract where a loss that is not 0 lacks a gradient that the renderer claims and that is wanted.
+def check_loss_gradient(renderer: Renderer, field: Field, rays: Rays, loss: Float[Tensor, ""], subject: str) -> None:
+    """Raises BrokenContract if a loss that is not 0 lacks a gradient, gradients are on and the renderer claims it.
 
     Args:
-        what: the output that the loss is made of, for the message: "its closest values carry".
+        subject: of the message, with its verb: "its closest values carry".
     """
-    if (lacked := _lacked(renderer, field, rays, loss)) and bool(loss != 0):
-        raise _no_gradient(renderer, lacked, what)
+    if (capability := _missing_gradient(renderer, field, rays, loss)) and bool(loss != 0):
+        raise _missing_gradient_error(renderer, capability, subject)
 
 
 def check_gradients(renderer: Renderer, towards_field: Tensor | None, towards_rays: Tensor | None) -> None:
-    """Raises BrokenContract where a gradient of a hit's distance is missing (None) that the renderer claims."""
-    for lacked, gradient in zip(TOWARDS, (towards_field, towards_rays), strict=True):
-        if gradient is None and getattr(renderer.capabilities, lacked):
-            raise _no_gradient(renderer, lacked, "the distances of its hits carry")
+    """Raises BrokenContract if a gradient of a hit's distance is missing (None) that the renderer claims."""
+    for capability, gradient in zip(GRADIENT_TARGETS, (towards_field, towards_rays), strict=True):
+        if gradient is None and getattr(renderer.capabilities, capability):
+            raise _missing_gradient_error(renderer, capability, "the distances of its hits carry")
 
 
-def _check_part(name: str, part: str, value: object, rays: Rays) -> None:
-    """Raises BrokenContract unless a part of a rendering has the shape, type and device of one answer per ray."""
+def _check_tensor(name: str, tensor_name: str, value: object, rays: Rays) -> None:
+    """Raises BrokenContract unless a tensor of a rendering has one entry per ray, and the rays' type and device."""
+    name = f"{name}: {tensor_name}"
     if not isinstance(value, Tensor):
-        raise BrokenContract(f"{name}: {part} must be a tensor, not a {type(value).__name__}")
-    shape = (*rays.shape, 3) if part == "points" else tuple(rays.shape)
+        raise BrokenContract(f"{name} must be a tensor, not a {type(value).__name__}")
+    shape = (*rays.shape, 3) if tensor_name == "points" else tuple(rays.shape)
     if tuple(value.shape) != shape:
-        what = "points of shape [*rays, 3]" if part == "points" else "one answer per ray"
-        raise BrokenContract(
-            f"{name}: {part} must have the shape {list(shape)}, not {list(value.shape)}: return {what}"
-        )
-    dtype = torch.int8 if part == "status" else rays.origins.dtype
+        remedy = "points of shape [*rays, 3]" if tensor_name == "points" else "one answer per ray"
+        raise BrokenContract(f"{name} must have the shape {list(shape)}, not {list(value.shape)}: return {remedy}")
+    dtype = torch.int8 if tensor_name == "status" else rays.origins.dtype
     if value.dtype != dtype:
-        whose = "a Status per ray" if part == "status" else "as the rays are"
-        remedy = f"convert it with .to(torch.{_short(dtype)})"
-        raise BrokenContract(f"{name}: {part} must be {_short(dtype)}, {whose}, not {_short(value.dtype)}: {remedy}")
+        expected = f"{_dtype_name(dtype)}, {'a Status per ray' if tensor_name == 'status' else 'as the rays are'}"
+        remedy = f"convert it with .to(torch.{_dtype_name(dtype)})"
+        raise BrokenContract(f"{name} must be {expected}, not {_dtype_name(value.dtype)}: {remedy}")
     if value.requires_grad and not torch.is_grad_enabled():
         raise BrokenContract(
-            f"{name}: {part} has a graph although gradients are off: do without torch.enable_grad, or detach it"
+            f"{name} has a graph although gradients are off: do without torch.enable_grad, or detach it"
         )
     if value.device != rays.origins.device:
         remedy = "create tensors with device=rays.origins.device"
-        raise BrokenContract(f"{name}: {part} must be on {rays.origins.device}, not on {value.device}: {remedy}")
+        raise BrokenContract(f"{name} must be on {rays.origins.device}, not on {value.device}: {remedy}")
 
 
 def _check_deferred(name: str, rendering: Rendering) -> None:
-    """Raises BrokenContract unless what is deferred has one answer per ray, and leaves out no hit."""
+    """Raises BrokenContract unless `deferred` has one entry per ray and defers the gradient of no hit."""
     deferred = rendering.deferred
     if deferred is None:
         return
-    shape, found = tuple(rendering.status.shape), (tuple(deferred.distance.shape), tuple(deferred.left_out.shape))
-    if found != (shape, shape):
-        raise BrokenContract(f"{name}: the parts of deferred must have the shape {list(shape)}, not {found}")
+    shape, shapes = tuple(rendering.status.shape), (tuple(deferred.distance.shape), tuple(deferred.left_out.shape))
+    if shapes != (shape, shape):
+        raise BrokenContract(f"{name}: the parts of deferred must have the shape {list(shape)}, not {shapes}")
     if bool((deferred.left_out & rendering.hit).any()):
         raise BrokenContract(f"{name}: deferred must leave out no hit: give `closest` its gradient there")
 
 
-def _lacked(renderer: Renderer, field: Field, rays: Rays, output: Tensor) -> str:
-    """The claimed capability whose gradient is wanted here but missing from an output; empty where none is missing."""
+def _missing_gradient(renderer: Renderer, field: Field, rays: Rays, output: Tensor) -> str:
+    """The claimed capability whose gradient is possible here but missing from an output; empty if none is missing."""
     if output.requires_grad or not torch.is_grad_enabled():
         return ""
     can = renderer.capabilities
@@ -129,13 +127,16 @@ def _lacked(renderer: Renderer, field: Field, rays: Rays, output: Tensor) -> str
     return "field_gradient" if can.field_gradient and carries_gradient(field, rays.origins) else ""
 
 
-def _no_gradient(renderer: Renderer, lacked: str, what: str) -> BrokenContract:
-    name = type(renderer).__name__
+def _missing_gradient_error(renderer: Renderer, capability: str, subject: str) -> BrokenContract:
     return BrokenContract(
-        f"{name}.capabilities.{lacked} is True, but {what} no gradient towards {TOWARDS[lacked]}: attach one "
-        f"(see renderers/gradients.py), or set {lacked}=False"
+        f"{type(renderer).__name__}.capabilities.{capability} is True, but {subject} no gradient towards "
+        f"{GRADIENT_TARGETS[capability]}: attach one (see renderers/gradients.py), or set {capability}=False"
     )
 
 
-def _short(dtype: torch.dtype) -> str:
+def _type_of(value: object) -> str:
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
+def _dtype_name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")

@@ -11,8 +11,8 @@ from torch import Tensor
 class Rays:
     """Half lines from `origins` [*rays, 3] along unit `directions` [*rays, 3].
 
-    `image` says that the last two leading dimensions are the rows and columns of an image, so that neighbours in the
-    tensor are neighbours in view.
+    With `image`, the last two leading dimensions are the rows and columns of an image, so that neighbours in the tensor
+    are neighbours in the view.
     """
 
     origins: Float[Tensor, "*rays 3"]
@@ -37,40 +37,40 @@ class Rays:
         return self.origins.shape[:-1]
 
     def flat(self) -> "Rays":
-        """The same rays in one row [n, 3]."""
-        return _checked(self.origins.reshape(-1, 3), self.directions.reshape(-1, 3))
+        """The same rays with one leading dimension, [n, 3]."""
+        return _rays_unchecked(self.origins.reshape(-1, 3), self.directions.reshape(-1, 3))
 
     def at(self, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays 3"]:
         """The points at `distance` along the rays."""
         return self.origins + distance[..., None] * self.directions
 
     def at_each(self, distances: Float[Tensor, "... samples"]) -> Float[Tensor, "*rays samples 3"]:
-        """The points at several distances along each ray; distances [samples] are the same for all."""
+        """The points at several distances along each ray; distances [samples] apply to all rays."""
         return self.origins[..., None, :] + distances[..., None] * self.directions[..., None, :]
 
     def __getitem__(self, index: Bool[Tensor, "*rays"] | Int[Tensor, " n"]) -> "Rays":
         if index.dtype == torch.bool:
-            return _checked(self.origins[index], self.directions[index])
-        return _checked(self.origins.index_select(0, index), self.directions.index_select(0, index))
+            return _rays_unchecked(self.origins[index], self.directions[index])
+        return _rays_unchecked(self.origins.index_select(0, index), self.directions.index_select(0, index))
 
     def to(self, device: torch.device) -> "Rays":
         """The same rays on a device."""
-        return _checked(self.origins.to(device), self.directions.to(device), self.image)
+        return _rays_unchecked(self.origins.to(device), self.directions.to(device), self.image)
 
     def coarser(self, factor: int) -> "Rays":
-        """One ray for each block of factor x factor pixels, through its middle; image rays only.
+        """One ray for each block of factor x factor pixels, through the middle of the block; image rays only.
 
         The last row and column of blocks are padded by repeating the image's edge.
         """
-        return _checked(
+        return _rays_unchecked(
             _block_mean(self.origins, factor),
             torch.nn.functional.normalize(_block_mean(self.directions, factor), dim=-1),
             image=True,
         )
 
 
-def _checked(origins: Tensor, directions: Tensor, image: bool = False) -> Rays:
-    """Rays made of some that were checked: without a look at every number."""
+def _rays_unchecked(origins: Tensor, directions: Tensor, image: bool = False) -> Rays:
+    """Builds Rays without validation, only from parts of Rays that were already validated."""
     rays = object.__new__(Rays)
     for name, value in (("origins", origins), ("directions", directions), ("image", image)):
         object.__setattr__(rays, name, value)
@@ -126,26 +126,25 @@ class Camera:
         return Camera(intrinsics, self.world_to_camera, height, width)
 
     def zoomed(self, factor: float) -> "Camera":
-        """The same place and pixels with focal lengths that are `factor` times as long."""
+        """The camera with the same position and pixels, and focal lengths multiplied by `factor`."""
         intrinsics = self.intrinsics.clone()
         intrinsics[0, 0] *= factor
         intrinsics[1, 1] *= factor
         return Camera(intrinsics, self.world_to_camera, self.height, self.width)
 
     def moved(self, twist: Float[Tensor, "6"]) -> "Camera":
-        """The camera after a rigid motion in its own axes; gradients flow to the twist.
+        """The camera after a rigid motion in camera axes; gradients flow to the twist.
 
         Args:
             twist: element of se(3): translation in scene units, then rotation vector in radians. World points in the
                 camera's coordinates go through its matrix exponential.
         """
-        motion = rigid(twist)
-        return Camera(self.intrinsics, motion @ self.world_to_camera, self.height, self.width)
+        return Camera(self.intrinsics, rigid(twist) @ self.world_to_camera, self.height, self.width)
 
     def with_object_moved(self, twist: Float[Tensor, "6"]) -> "Camera":
-        """The camera that sees an unmoved object as this one sees it after a rigid motion; gradients flow to the twist.
+        """The camera whose view of the object equals this camera's view of the moved object.
 
-        The motion is about the object's origin, so that a turn does not carry the object out of the image.
+        Gradients flow to the twist. The motion is about the object's origin, so that a rotation keeps it in the image.
 
         Args:
             twist: see `rigid`.
@@ -162,38 +161,37 @@ class Camera:
 
     def rays(self) -> Rays:
         """The rays [height, width] through the pixel centres; gradients flow to both matrices."""
-        bearings = self._bearings()
-        directions = torch.nn.functional.normalize(bearings @ self.camera_to_world[:3, :3].T, dim=-1)
+        directions = torch.nn.functional.normalize(self._pixel_directions() @ self.camera_to_world[:3, :3].T, dim=-1)
         return Rays(self.center.expand_as(directions), directions, image=True)
 
     def depth(self, distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
         """Camera z of the points at `distance` along each pixel's ray (DIST, Eq. 2)."""
-        return distance / torch.linalg.vector_norm(self._bearings(), dim=-1)
+        return distance / torch.linalg.vector_norm(self._pixel_directions(), dim=-1)
 
     def distance(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
         """The distance along each pixel's ray of the points at camera z `depth`."""
-        return depth * torch.linalg.vector_norm(self._bearings(), dim=-1)
+        return depth * torch.linalg.vector_norm(self._pixel_directions(), dim=-1)
 
     def project(self, points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
-        """Where the camera sees points of the world.
+        """Projects points in world coordinates to the image.
 
         Returns:
-            pixels: column and row; the first pixel's centre is (0.5, 0.5). Without meaning behind the camera.
+            pixels: column and row; the first pixel's centre is (0.5, 0.5). Meaningless behind the camera.
             depth: camera z, in scene units; 0 or less behind the camera.
         """
         motion = self.world_to_camera
-        seen = points @ motion[:3, :3].T + motion[:3, 3]
-        depth = seen[..., 2]
-        plane = seen / torch.where(depth > 0, depth, 1.0)[..., None]
+        in_camera = points @ motion[:3, :3].T + motion[:3, 3]
+        depth = in_camera[..., 2]
+        plane = in_camera / torch.where(depth > 0, depth, 1.0)[..., None]
         return (plane @ self.intrinsics.T)[..., :2], depth
 
     def shows(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Which points of the world lie in front of the camera and within its image, whatever hides them."""
+        """Which points in world coordinates lie in front of the camera and within its image, occluded or not."""
         pixels, depth = self.project(points)
         size = torch.tensor([self.width, self.height], device=points.device)
         return (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
 
-    def _bearings(self) -> Float[Tensor, "height width 3"]:
+    def _pixel_directions(self) -> Float[Tensor, "height width 3"]:
         """Camera coordinates of the pixel centres on the plane z = 1."""
         like = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
         rows, columns = torch.meshgrid(
@@ -218,13 +216,13 @@ def sphere_span(
     """Where rays enter and leave the sphere of `radius` about the origin.
 
     Returns:
-        entry, exit: distances along the ray, entry 0 where the ray starts inside; both are the distance of the closest
-            approach where it misses. Gradients flow to the rays.
-        meets: false where the ray misses the sphere, or the sphere lies behind its origin.
+        entry, leave: distances along the ray. Entry is 0 if the ray starts inside. If it misses, both are the distance
+            of the closest approach. Gradients flow to the rays.
+        intersects: false if the ray misses the sphere, or the sphere lies behind the ray's origin.
     """
     approach = -(rays.origins * rays.directions).sum(-1)
-    beyond = rays.origins + approach[..., None] * rays.directions
-    half_chord_squared = radius**2 - beyond.square().sum(-1)
+    closest_point = rays.origins + approach[..., None] * rays.directions
+    half_chord_squared = radius**2 - closest_point.square().sum(-1)
     crosses = half_chord_squared > 0
     half_chord = torch.where(crosses, half_chord_squared, 1.0).sqrt() * crosses
     entry, leave = (approach - half_chord).clamp_min(0), approach + half_chord
@@ -232,7 +230,7 @@ def sphere_span(
 
 
 def distance_to_origin(rays: Rays) -> Float[Tensor, "*rays"]:
-    """Least distance from the origin to each half line."""
+    """The smallest distance from the origin to each ray."""
     approach = -(rays.origins * rays.directions).sum(-1).clamp_max(0)
     return torch.linalg.vector_norm(rays.at(approach), dim=-1)
 

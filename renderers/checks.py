@@ -1,14 +1,14 @@
-"""Checks of arguments; each message names the argument, the rule, the value found and the remedy."""
+"""Checks of arguments; each message names the argument, the rule, the wrong value and the remedy."""
 
 from math import isfinite
 
 
 class BadInput(ValueError):
-    """What a user gave cannot be used, as is found only while it is used; the message names the remedy."""
+    """A user's input cannot be used, which is known only while it is read; the message names the remedy."""
 
 
 class BrokenContract(ValueError):
-    """A renderer returned what it must not; the message says what, and what to return instead."""
+    """A renderer returned something invalid; the message names it, and what to return instead."""
 
 
 def check_positive(name: str, value: float, remedy: str) -> None:
@@ -17,13 +17,13 @@ def check_positive(name: str, value: float, remedy: str) -> None:
         raise ValueError(f"{name} must be positive, not {value}: {remedy}")
 
 
-def check_at_least(name: str, value: float, least: float, remedy: str) -> None:
-    """Raises ValueError unless `value` is finite and at least `least`."""
-    if not isfinite(value) or value < least:
-        raise ValueError(f"{name} must be at least {least}, not {value}: {remedy}")
+def check_at_least(name: str, value: float, minimum: float, remedy: str) -> None:
+    """Raises ValueError unless `value` is finite and at least `minimum`."""
+    if not isfinite(value) or value < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, not {value}: {remedy}")
 
 
-def check_share(name: str, value: float, remedy: str) -> None:
+def check_fraction(name: str, value: float, remedy: str) -> None:
     """Raises ValueError unless `value` is above 0 and at most 1."""
     if not 0 < value <= 1:
         raise ValueError(f"{name} must be above 0 and at most 1, not {value}: {remedy}")

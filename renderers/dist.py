@@ -9,10 +9,10 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.field import Field, steepest, values_to_march_on
-from renderers.gradients import approximate_front
-from renderers.march import Front, Stepping, march, march_coarse_to_fine
-from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, check_kind
+from renderers.field import Field, estimate_lipschitz, marching_values
+from renderers.gradients import approximate_rendering
+from renderers.march import RayFront, Stepping, march_coarse_to_fine, march_front
+from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, check_kind
 from renderers.silhouette import AVERAGES, Hinge
 
 
@@ -23,28 +23,27 @@ class DIST:
     Source: DIST, Secs. 3.1 to 3.4, A.1 to A.3, B.2.
     Differentiable in: field parameters and rays, by the approximate rule of Eq. 4. The gradient of `distance` has the
         right direction at each pixel and a wrong scale, alpha * K * cos(angle of incidence); see
-        `gradients.approximate`. That of `closest` is exact at a fixed sample.
+        `gradients.attach_approximate_gradient`. The gradient of `closest` is exact at a fixed sample.
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
     Deviates from the paper: `extra_step_cap`, `careful_split`, `step_back`, `least_step`, `slope_samples` and `coarse`
-        are ours.
-        `silhouette_signed` is as in the official code, and so is `silhouette_average` as "missed_plus_spurious"; Eq. 11
-        states neither sign nor average. `step_clamp` is as in the official code: the paper's networks are truncated at
-        0.1. A ray that begins at negative values stops at once with STARTED_INSIDE. Coarse to fine applies to rays of
-        an image (`Rays.image`); others march at full resolution.
+        are ours. `silhouette_signed` and the `silhouette_average` "missed_plus_spurious" are as in the official code;
+        Eq. 11 states neither sign nor average. `step_clamp` is as in the official code: the paper's networks are
+        truncated at 0.1. A ray that starts at negative values stops at once with STARTED_INSIDE. Coarse to fine applies
+        to rays of an image (`Rays.image`); others march at full resolution.
 
     Args:
-        steps: most marching steps per ray.
+        steps: maximum marching steps per ray.
         epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split, step_back, least_step, relaxation: see
             `march.Stepping`.
-        slope_samples: points at which the steepest gradient is estimated before the march (`field.steepest`); values
-            are then divided by it; 0 trusts the field.
-        coarse_to_fine: begin with one ray per 4 x 4 pixels.
-        n_gradient_samples: K, how many samples of least magnitude carry the gradient of a hit.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        slope_samples: points at which the Lipschitz constant is estimated before the march
+            (`field.estimate_lipschitz`); values are divided by it. 0 trusts the field.
+        coarse_to_fine: start with one ray per 4 x 4 pixels.
+        n_gradient_samples: K, the number of samples of smallest magnitude that carry the gradient of a hit.
+        sphere_radius: of the sphere about the origin that contains the shape.
         silhouette_signed, silhouette_average: see `silhouette.Hinge`.
-        coarse: march on the field's coarse values away from the surface, where it offers any; see
-            `field.values_to_march_on`. What is lost or found is what would be on values nearer to 0 by twice their
-            error; without a gradient a miss's `closest` is such a value.
+        coarse: march on the field's coarse values away from the surface, if it has any; see `field.marching_values`.
+            The result is the same as if all values were closer to 0 by at most twice their error. Without a gradient,
+            `closest` of a missed ray is such an approximate value.
     """
 
     steps: int
@@ -65,7 +64,7 @@ class DIST:
     silhouette_average: str
     coarse: bool = False
 
-    capabilities: ClassVar[Capabilities] = OF_LENGTHS
+    capabilities: ClassVar[Capabilities] = DISTANCE_CAPABILITIES
 
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")
@@ -89,29 +88,26 @@ class DIST:
         check_kind(self, field)
         with torch.no_grad():
             front = self._trace(field, rays)
-        return approximate_front(field, rays, front, alpha=self.alpha, radius=self.sphere_radius)
+        return approximate_rendering(field, rays, front, alpha=self.alpha, radius=self.sphere_radius)
 
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """DIST, Eq. 11."""
-        hinge = Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average)
-        return hinge.of(rendering.closest, mask)
+        return Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average).of(rendering.closest, mask)
 
-    def _slope(self, field: Field, rays: Rays) -> float:
-        if not self.slope_samples:
-            return 1.0
-        return steepest(field, like=rays.origins, radius=self.sphere_radius, samples=self.slope_samples)
-
-    def _trace(self, field: Field, rays: Rays) -> Front:
-        given = {setting.name: getattr(self, setting.name) for setting in fields(Stepping) if setting.name != "slope"}
-        stepping = Stepping(**given, slope=self._slope(field, rays))
-        values, steps = values_to_march_on(field, self.steps, epsilon=self.epsilon, coarse=self.coarse)
+    def _trace(self, field: Field, rays: Rays) -> RayFront:
+        settings = {key.name: getattr(self, key.name) for key in fields(Stepping) if key.name != "slope"}
+        slope, samples = 1.0, self.slope_samples
+        if samples:
+            slope = estimate_lipschitz(field, like=rays.origins, radius=self.sphere_radius, samples=samples)
+        stepping = Stepping(**settings, slope=slope)
+        values, steps = marching_values(field, self.steps, epsilon=self.epsilon, coarse=self.coarse)
         if self.coarse_to_fine and rays.image:
             return march_coarse_to_fine(
                 values, rays, stepping, steps=steps, radius=self.sphere_radius, samples=self.n_gradient_samples
             )
         flat = rays.flat()
-        front = Front.on_sphere(flat, radius=self.sphere_radius, samples=self.n_gradient_samples)
-        march(values, flat, front, stepping, steps)
+        front = RayFront.on_sphere(flat, radius=self.sphere_radius, samples=self.n_gradient_samples)
+        march_front(values, flat, front, stepping, steps)
         return front

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import log
 from typing import Protocol, cast, runtime_checkable
 
@@ -13,19 +13,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import rigid
-from renderers.waits import Late, active_among
+from renderers.waits import LazyCount, active_mask
 
-PRODUCTS = 3  # of a network's weights for bounds on a segment, where a value takes one; see `fields.affine`
-GRADIENT, COARSE = 2.0, 0.125  # what a gradient and a coarse value count in `Counts.cost`
-PATIENT = 2  # times as many steps are made on coarse values, since these are shorter near the surface
-STEEPEST_MARGIN = 1.2  # over the steepest gradient found: the field may be steeper between the points
+EVALUATIONS_PER_BOUND = 3  # bounds on a segment multiply by a network's weights three times; see `fields.affine`
+GRADIENT_COST, COARSE_COST = 2.0, 0.125  # as multiples of a field evaluation; see `Counts.cost`
+COARSE_STEP_FACTOR = 2  # marches on coarse values may take more steps, since these are shorter near the surface
+LIPSCHITZ_SAFETY_FACTOR = 1.2  # the field may be steeper between the sampled points
 
 
 class Kind(Enum):
     """What the values of a field mean, the strongest meaning first.
 
-    DISTANCE: the signed distance to the surface. BOUND: its magnitude never exceeds the distance, so that a step of
-    that length passes no surface. LEVEL: only the sign and the zero set mean anything.
+    DISTANCE: the signed distance to the surface. BOUND: the magnitude never exceeds the distance, so that a step of
+    that length passes no surface. LEVEL: only the sign and the zero set have a meaning.
     """
 
     DISTANCE = "distance"
@@ -35,7 +35,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Flops:
-    """Floating-point operations per point: of its value, and of its backward pass."""
+    """Floating-point operations per point: of a field evaluation, and of its backward pass."""
 
     value: int
     gradient: int
@@ -43,9 +43,9 @@ class Flops:
 
 @runtime_checkable
 class Field(Protocol):
-    """Points [*batch, 3] to values [*batch], negative inside.
+    """A function from points [*batch, 3] to values [*batch], negative inside.
 
-    `lipschitz` bounds the length of the gradient, and `flops` gives the operations per point, where that is known.
+    `lipschitz` bounds the length of the gradient, and `flops` gives the operations per point; None if unknown.
     """
 
     kind: Kind
@@ -55,77 +55,77 @@ class Field(Protocol):
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]: ...
 
 
-Values = Callable[[Tensor], Tensor]  # points [*batch, 3] to values [*batch]: a field, or its coarse values
+PointFunction = Callable[[Tensor], Tensor]  # points [*batch, 3] to values [*batch]: a field, or its coarse values
 
 
 @dataclass(frozen=True)
 class Coarse:
-    """Cheaper values of a field, to march on; what they leave in doubt is decided by the field itself.
+    """Cheaper values of a field, to march on; the field itself decides about doubtful rays.
 
     Args:
         values: without a gradient.
-        error: most that one of them is off, in field units, stated or measured; near the surface, where it matters.
+        error: maximum error of a value near the surface, in field units, stated or measured.
     """
 
-    values: Values
+    values: PointFunction
     error: float
 
-    def noted(self, note: Callable[[int], None]) -> "Coarse":
-        """The same; `note` is told of how many points values are asked for, before they are evaluated."""
+    def with_counter(self, on_evaluate: Callable[[int], None]) -> "Coarse":
+        """The same values; before each evaluation, `on_evaluate` is called with the number of points."""
 
         def values(points: Tensor) -> Tensor:
-            note(points.numel() // 3)
+            on_evaluate(points.numel() // 3)
             return self.values(points)
 
         return replace(self, values=values)
 
 
-def coarse_of(field: Field) -> Coarse | None:
-    """The cheaper values that a field offers as `coarse`; None where it offers none."""
+def coarse_version(field: Field) -> Coarse | None:
+    """The cheaper values that a field has as `coarse`; None if it has none."""
     return getattr(field, "coarse", None)
 
 
-def values_to_march_on(field: Field, steps: int, *, epsilon: float, coarse: bool) -> tuple[Values, int]:
-    """The values that a march of at most `steps` steps asks for, and how many steps it makes on them.
+def marching_values(field: Field, steps: int, *, epsilon: float, coarse: bool) -> tuple[PointFunction, int]:
+    """The function to march on, and the maximum number of steps.
 
-    With `coarse` these are what is certain of the coarse values that the field offers, and `PATIENT` times the steps.
-    They are nearer to 0 by their error, so that no step is longer than the field's own value would have it. Where no
-    more than that error or `epsilon`, below which a ray hits, is left, or the coarse value is not finite, the field
-    itself is asked: a hit is one of its own.
+    With `coarse`, the function returns the coarse value with its magnitude reduced by its error, so that no step is
+    longer than the exact value allows. Where the reduced magnitude is at most the error or `epsilon`, the threshold of
+    a hit, or not finite, the exact field is evaluated. A hit is therefore always a hit of the exact field. Coarse
+    marching may take `COARSE_STEP_FACTOR` times as many steps.
     """
-    offered = coarse_of(field) if coarse else None
-    if offered is None:
+    cheaper = coarse_version(field) if coarse else None
+    if cheaper is None:
         return field, steps
 
     def values(points: Tensor) -> Tensor:
-        found = offered.values(points).to(points.dtype)
-        certain = found.abs() - offered.error
-        near = ~((certain > max(offered.error, epsilon)) & certain.isfinite())
-        active = active_among(len(near))
+        coarse_value = cheaper.values(points).to(points.dtype)
+        safe_magnitude = coarse_value.abs() - cheaper.error
+        near = ~((safe_magnitude > max(cheaper.error, epsilon)) & safe_magnitude.isfinite())
+        active = active_mask(len(near))
         near = (near if active is None else near & active).nonzero().squeeze(-1)
-        return found.sign().mul_(certain).index_copy_(0, near, field(points.index_select(0, near)))
+        return coarse_value.sign().mul_(safe_magnitude).index_copy_(0, near, field(points.index_select(0, near)))
 
-    return values, PATIENT * steps
+    return values, COARSE_STEP_FACTOR * steps
 
 
 # From the middles of segments and the vectors to their ends, both [n, 3], to bounds of the values there: low and high.
 Bounds = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
-def bounds_of(field: Field) -> Bounds | None:
-    """The bounds of its values on segments that a field offers as `bounds`, without a graph; None where it does not."""
+def field_bounds(field: Field) -> Bounds | None:
+    """The bounds of the values on segments that a field has as `bounds`, without a graph; None if it has none."""
     return getattr(field, "bounds", None)
 
 
-def noted_bounds(field: Field, note: Callable[[int], None]) -> Bounds | None:
-    """The same; `note` is told of as many values as cost as much, before they are evaluated."""
-    offered = bounds_of(field)
-    if offered is None:
+def counted_bounds(field: Field, on_evaluate: Callable[[int], None]) -> Bounds | None:
+    """The field's bounds; `on_evaluate` is called before with the number of field evaluations that cost as much."""
+    uncounted = field_bounds(field)
+    if uncounted is None:
         return None
 
     def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        note(PRODUCTS * len(middle))
-        return offered(middle, half)
+        on_evaluate(EVALUATIONS_PER_BOUND * len(middle))
+        return uncounted(middle, half)
 
     return bounds
 
@@ -134,57 +134,56 @@ def noted_bounds(field: Field, note: Callable[[int], None]) -> Bounds | None:
 class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
 
-    `coarse` are points whose value was computed by `Coarse`; they are not in `value`. `masked` are in none of these:
-    points of rays that had ended, whose values, coarse or not, were thrown away; see `waits.values_where`. `hits` are
-    those of the renderings of the metered field that `boundary.rendered` has checked.
+    `coarse` are points whose value was computed by `Coarse`; `value` does not include them. `masked` are points of
+    finished rays, whose values, coarse or not, were thrown away (`waits.evaluate_masked`); no other count includes
+    them. `hits` are the hits of all renderings of the metered field by `boundary.render_checked`.
     """
 
-    value: int = cast(int, Late())
-    gradient: int = cast(int, Late())
-    hits: int = field(default=cast(int, Late()), repr=False, compare=False)
-    coarse: int = cast(int, Late())
-    masked: int = field(default=cast(int, Late()), repr=False, compare=False)
+    value: int = cast(int, LazyCount())
+    gradient: int = cast(int, LazyCount())
+    hits: int = field(default=cast(int, LazyCount()), repr=False, compare=False)
+    coarse: int = cast(int, LazyCount())
+    masked: int = field(default=cast(int, LazyCount()), repr=False, compare=False)
 
     def add(self, name: str, points: int) -> None:
-        """Adds to `value` or `coarse` those of so many points that are asked for, and the others to `masked`."""
-        active = active_among(points)
-        asked = points if active is None else active.count_nonzero()
-        Late.add(self, name, asked)
-        Late.add(self, "masked", points - asked)
+        """Adds the active points to the counter `name`, and the points of finished rays to `masked`."""
+        active = active_mask(points)
+        active_points = points if active is None else active.count_nonzero()
+        LazyCount.add(self, name, active_points)
+        LazyCount.add(self, "masked", points - active_points)
 
     @property
     def cost(self) -> float:
-        """These evaluations as so many values: a gradient counts as two of them, a coarse value as an eighth."""
-        return self.value + GRADIENT * self.gradient + COARSE * self.coarse
+        """The cost in field evaluations: a gradient counts as two, a coarse evaluation as an eighth."""
+        return self.value + GRADIENT_COST * self.gradient + COARSE_COST * self.coarse
 
     def flops(self, field: Field) -> int | None:
-        """The floating-point operations of these evaluations, without coarse ones; None where the field has none."""
+        """The floating-point operations, without coarse evaluations; None if the field does not state them."""
         if field.flops is None:
             return None
         return field.flops.value * self.value + field.flops.gradient * self.gradient
 
     def coarse_flops(self, field: Field) -> int:
-        """The operations of coarse evaluations, each of which has as many as one that is not; 0 if none are stated."""
+        """The operations of coarse evaluations, each with as many as an exact one; 0 if the field states none."""
         return field.flops.value * self.coarse if field.flops else 0
 
     def over_bound(self, field: Field) -> float | None:
-        """The work of these evaluations, divided by that of one value and one gradient per hit; None without hits.
+        """The work of these evaluations, divided by one value and one gradient per hit; None without hits.
 
-        No renderer can do with less, if every hit has a gradient. Of a field that does not state its operations, a
-        gradient counts as much as a value. A coarse value counts as much as any.
+        No renderer can do less work, if every hit has a gradient. If the field does not state its operations, a
+        gradient counts as much as a value. A coarse value always does.
         """
         cost = field.flops or Flops(1, 1)
-        least = (cost.value + cost.gradient) * self.hits
+        minimum_work = (cost.value + cost.gradient) * self.hits
         work = cost.value * (self.value + self.coarse) + cost.gradient * self.gradient
-        return work / least if least else None
+        return work / minimum_work if minimum_work else None
 
     def __sub__(self, other: "Counts") -> "Counts":
-        names = [one.name for one in fields(self)]
-        return Counts(**{name: getattr(self, name) - getattr(other, name) for name in names})
+        return Counts(**{each.name: getattr(self, each.name) - getattr(other, each.name) for each in fields(self)})
 
 
 class Wrapper(ABC):
-    """A Field that does something beside evaluating the field that it wraps, whose properties it has."""
+    """A Field that evaluates the field `inner`, has its properties, and does something more."""
 
     inner: Field
 
@@ -206,10 +205,10 @@ class Wrapper(ABC):
 
 @dataclass(frozen=True)
 class Meter(Wrapper):
-    """A Field that counts the evaluations of the field that it wraps, so that no renderer can under-report.
+    """A Field that counts the evaluations of the field `inner`, so that no renderer can under-report.
 
     A value evaluation is one point passed to the field. A gradient evaluation is one point through whose value a
-    gradient other than zero was propagated back, counted when the backward pass arrives there.
+    non-zero gradient was propagated back; it is counted during the backward pass.
     """
 
     inner: Field
@@ -217,38 +216,32 @@ class Meter(Wrapper):
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         values = self.inner(points)
-        self._count_value(values.numel())
+        self.counts.add("value", values.numel())
         if values.requires_grad:
             values.register_hook(self._count_backward)
         return values
 
     @property
     def coarse(self) -> Coarse | None:
-        """The coarse values of the field, counted apart."""
-        offered = coarse_of(self.inner)
-        return offered and offered.noted(self._count_coarse)
+        """The coarse values of the field, counted separately."""
+        uncounted = coarse_version(self.inner)
+        return uncounted and uncounted.with_counter(partial(self.counts.add, "coarse"))
 
     @property
     def bounds(self) -> Bounds | None:
-        """The bounds that the field offers; each counts as the products of weights that it takes."""
-        return noted_bounds(self.inner, self._count_value)
-
-    def _count_value(self, points: int) -> None:
-        self.counts.add("value", points)
-
-    def _count_coarse(self, points: int) -> None:
-        self.counts.add("coarse", points)
+        """The field's bounds; each counts as `EVALUATIONS_PER_BOUND` field evaluations."""
+        return counted_bounds(self.inner, partial(self.counts.add, "value"))
 
     def _count_backward(self, gradient: Tensor) -> None:
-        Late.add(self.counts, "gradient", gradient.count_nonzero())
+        LazyCount.add(self.counts, "gradient", gradient.count_nonzero())
 
 
 @dataclass(frozen=True)
 class Moved(Wrapper):
-    """A shape that was scaled, then moved: world = M (scale * local); values stay distances.
+    """A field that was scaled, then moved: world = M (scale * local); values stay distances.
 
     Args:
-        inner: the shape in its own axes.
+        inner: the field in local coordinates.
         similarity: the six numbers of the rigid motion M, see `renderers.camera.rigid`, and the natural logarithm of
             the scale.
     """
@@ -257,34 +250,33 @@ class Moved(Wrapper):
     similarity: Float[Tensor, "7"]
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        scale, motion = self._parts
+        scale, motion = self._scale_and_motion
         return scale * self.inner((points - motion[:3, 3]) @ motion[:3, :3] / scale)
 
     @property
     def bounds(self) -> Bounds | None:
-        """The bounds that the field offers, moved as it is."""
-        offered = bounds_of(self.inner)
-        if offered is None:
+        """The bounds of the inner field, scaled and moved."""
+        local_bounds = field_bounds(self.inner)
+        if local_bounds is None:
             return None
-        scale, motion = (part.detach() for part in self._parts)
+        scale, motion = (tensor.detach() for tensor in self._scale_and_motion)
 
         def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-            turned = motion[:3, :3] / scale
-            low, high = offered((middle - motion[:3, 3]) @ turned, half @ turned)
+            to_local = motion[:3, :3] / scale
+            low, high = local_bounds((middle - motion[:3, 3]) @ to_local, half @ to_local)
             return scale * low, scale * high
 
         return bounds
 
     @property
-    def _parts(self) -> tuple[Tensor, Tensor]:
+    def _scale_and_motion(self) -> tuple[Tensor, Tensor]:
         return self.similarity[6].exp(), rigid(self.similarity[:6])
 
 
 def carries_gradient(field: Field, like: Float[Tensor, "*batch 3"]) -> bool:
-    """Whether the field's values have a gradient towards its parameters; asked at no points, so that it costs nothing.
+    """Whether the field's values have a gradient towards its parameters. Evaluates no points, so it costs nothing.
 
     Args:
-        field: asked where gradients are enabled.
         like: points of the dtype and device at which the field is evaluated.
     """
     return field(like.detach().reshape(-1, 3)[:0]).requires_grad
@@ -295,15 +287,15 @@ def autograd_normals(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[T
     return torch.nn.functional.normalize(autograd_gradients(field, points), dim=-1)
 
 
-def autograd_gradients(field: Values, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Gradients of the field by automatic differentiation, of any length; without a graph."""
+def autograd_gradients(field: PointFunction, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Gradients of the field by automatic differentiation, not normalised; without a graph."""
     return values_and_gradients(field, points)[1]
 
 
 def values_and_gradients(
-    field: Values, points: Float[Tensor, "*batch 3"]
+    field: PointFunction, points: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-    """Values of the field and its gradients by automatic differentiation, of one evaluation; without a graph."""
+    """Values of the field and its gradients by automatic differentiation, from one evaluation; without a graph."""
     with torch.enable_grad():
         leaf = points.detach().requires_grad_(True)
         value = field(leaf)
@@ -311,34 +303,34 @@ def values_and_gradients(
     return value.detach(), gradient
 
 
-def steepest(field: Field, *, radius: float, samples: int = 20_000, like: Tensor | None = None) -> float:
-    """An estimate of the field's Lipschitz bound: the longest gradient at points drawn in the sphere, with a margin.
+def estimate_lipschitz(field: Field, *, radius: float, samples: int = 20_000, like: Tensor | None = None) -> float:
+    """Estimates the field's Lipschitz constant: the longest gradient at points in the sphere, with a safety factor.
 
     Args:
         radius: of the sphere about the origin.
-        samples: how many points, the same ones each time.
+        samples: number of points, the same points in each call.
         like: a tensor of the dtype and device at which the field is evaluated; None for float64 on the CPU.
     """
     points = radius * points_in_sphere(samples, like)
     gradients = autograd_gradients(field, points)
-    return STEEPEST_MARGIN * float(torch.linalg.vector_norm(gradients, dim=-1).nan_to_num(0.0).max())
+    return LIPSCHITZ_SAFETY_FACTOR * float(torch.linalg.vector_norm(gradients, dim=-1).nan_to_num(0.0).max())
 
 
 def points_in_sphere(count: int, like: Tensor | None = None) -> Float[Tensor, "count 3"]:
-    """Points drawn evenly in the unit sphere about the origin, the same ones each time.
+    """Uniform random points in the unit sphere about the origin, the same points in each call.
 
     Args:
         like: a tensor of the dtype and device of the points; None for float64 on the CPU.
     """
-    where = (torch.float64, torch.device("cpu")) if like is None else (like.dtype, like.device)
-    return _drawn_in_sphere(count, *where).clone()
+    dtype, device = (torch.float64, torch.device("cpu")) if like is None else (like.dtype, like.device)
+    return _draw_in_sphere(count, dtype, device).clone()
 
 
-@lru_cache(maxsize=8)  # a renderer may ask at every rendering
-def _drawn_in_sphere(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "count 3"]:
-    draws = {"generator": torch.Generator("cpu").manual_seed(0), "dtype": torch.float64, "device": "cpu"}
-    direction = torch.nn.functional.normalize(torch.randn(count, 3, **draws), dim=-1)
-    return (torch.rand(count, 1, **draws) ** (1 / 3) * direction).to(device, dtype)
+@lru_cache(maxsize=8)  # a renderer may draw in every rendering
+def _draw_in_sphere(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "count 3"]:
+    options = {"generator": torch.Generator("cpu").manual_seed(0), "dtype": torch.float64, "device": "cpu"}
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, **options), dim=-1)
+    return (torch.rand(count, 1, **options) ** (1 / 3) * direction).to(device, dtype)
 
 
 @dataclass(frozen=True)
@@ -348,10 +340,10 @@ class OccupancyField:
     Args:
         logits: logit(p) at points.
         threshold: DVR's tau, between 0 and 1; 0.5 in the paper.
-        flops: operations per point, where that is known.
+        flops: operations per point; None if unknown.
     """
 
-    logits: Values
+    logits: PointFunction
     threshold: float
     flops: Flops | None = None
     kind: Kind = Kind.LEVEL
@@ -366,12 +358,12 @@ class OccupancyField:
 
 
 def occupancy_logits(field: Field, values: Float[Tensor, "*batch"], *, width: float) -> Float[Tensor, "*batch"]:
-    """Logits of occupancy from a field's values; 0 on the surface, also where the threshold is not 0.5.
+    """Logits of occupancy from a field's values; 0 on the surface, also if the threshold is not 0.5.
 
     Args:
         values: of the field.
-        width: length over which a distance or a bound changes the logit by 1, in scene units, positive. A level set
-            has no length: its values are negated only.
+        width: distance over which the logit of a distance or a bound changes by 1, in scene units, positive. Values of
+            a level set have no unit: they are only negated.
     """
     if not 0 < width < float("inf"):
         raise ValueError(f"width must be positive, not {width}: 0.02 suits distances in the unit sphere")

@@ -1,6 +1,6 @@
-"""What the hits of a rendering must be: at a finite distance, in front of the camera, on the surface.
+"""Checks of hits: they must have a finite distance, and lie in front of the camera and on the surface.
 
-Within `kept_hits`, `boundary.rendered` keeps the hits of each rendering. Keeping them costs nothing.
+Within `collect_hits`, `boundary.render_checked` records the hits of each rendering, at no cost.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,19 +12,19 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from renderers.bracket import evenly
+from renderers.bracket import equally_spaced
 from renderers.camera import Rays, sphere_span
 from renderers.checks import BrokenContract
 from renderers.field import Field, Meter, values_and_gradients
 from renderers.rendering import Renderer, Rendering, Status
 
-# Scene units by which a hit may lie further off the surface than its residual says. Distances that are 5 % too short
-# from 2.5 away are 0.05 to 0.1 off; hits of shipped renderers are at most 0.01 off.
-NEAR = 0.02
-STATED = 0.05  # scene units that a residual may account for, unless there is a volume: the largest shipped epsilon
-MANY = 0.1  # share of the hits that may lie further off, as at thin parts and sharp edges
-MOST = 1024  # hits at which the field is evaluated, evenly spaced among all
-ALONG = 16  # places on a ray at which the field is evaluated where a hit has no distance
+# Scene units by which a hit may lie further off the surface than its residual. Distances that are 5 % too short from
+# 2.5 away are 0.05 to 0.1 off; hits of shipped renderers are at most 0.01 off.
+SURFACE_TOLERANCE = 0.02
+MAX_RESIDUAL_DISTANCE = 0.05  # scene units that a residual of a single surface may explain: the largest shipped epsilon
+MAX_OFF_SURFACE_FRACTION = 0.1  # more than at thin parts and sharp edges
+MAX_CHECKED_HITS = 1024  # hits at which the field is evaluated, equally spaced among all
+SAMPLES_PER_RAY = 16  # evaluated if a hit has no distance
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Hits:
     """The hits of one rendering, without a graph.
 
     Args:
-        name: of the method that gave them.
-        field: that was rendered, without a Meter, so that a check is not counted.
-        rays: that were rendered.
+        name: of the method that returned them.
+        field: the rendered field, without a Meter, so that a check is not counted.
+        rays: the rendered rays.
         status, distance, residual: of each ray; see `rendering.Rendering`.
-        volume: whether the rendering has one. Then `distance` is a mean over samples, and `residual` says how far off.
+        volume: whether the rendering has one. Then `distance` is a mean over samples, and `residual` is its error.
     """
 
     name: str
@@ -53,16 +53,15 @@ class Hits:
         return self.status == Status.HIT
 
     @property
-    def endless(self) -> Bool[Tensor, "*rays"]:
+    def lacks_distance(self) -> Bool[Tensor, "*rays"]:
         """True where a ray has a hit without a finite distance."""
         return self.hit & ~self.distance.isfinite()
 
     def check(self) -> None:
-        """Raises BrokenContract where the distance of a hit is not finite, or negative."""
-        if bool(self.endless.any()):
-            raise BrokenContract(
-                f"{self.name}: {without_distance([self])}: return a finite distance for each hit, or another Status"
-            )
+        """Raises BrokenContract if the distance of a hit is not finite, or negative."""
+        if bool(self.lacks_distance.any()):
+            remedy = "return a finite distance for each hit, or another Status"
+            raise BrokenContract(f"{self.name}: {missing_distance_message([self])}: {remedy}")
         behind = self.distance[self.hit & (self.distance < 0)]
         if len(behind):
             raise BrokenContract(
@@ -72,67 +71,67 @@ class Hits:
             )
 
     def off_surface(self) -> str:
-        """A note where more than `MANY` of the hits lie off the surface; empty where they do not.
+        """A note if more than `MAX_OFF_SURFACE_FRACTION` of the hits lie off the surface; else empty.
 
-        How far a hit lies off is the field's value over the length of its gradient there, in scene units for every
-        kind of field. `NEAR` beyond the residual is allowed. A residual accounts for any error of a volume's mean
-        distance, and for no more than `STATED` of a single surface.
+        A hit's distance from the surface is the field's value over the length of its gradient, in scene units for every
+        kind of field. It may exceed the residual by `SURFACE_TOLERANCE`. The residual explains any error of a volume's
+        mean distance, but at most `MAX_RESIDUAL_DISTANCE` for a single surface.
         """
         index = self.hit.flatten().nonzero().squeeze(-1)
-        index = index[:: max(-(-len(index) // MOST), 1)]
+        index = index[:: max(-(-len(index) // MAX_CHECKED_HITS), 1)]
         value, gradient = values_and_gradients(self.field, self.rays.flat()[index].at(self.distance.flatten()[index]))
         value, slope = value.abs(), torch.linalg.vector_norm(gradient, dim=-1)
         residual = self.residual.flatten()[index].abs().nan_to_num(0.0)
-        stated = residual if self.volume else torch.minimum(residual, STATED * slope)
-        off = ~(value <= NEAR * slope + stated)  # as is a value that is not a number
+        explained = residual if self.volume else torch.minimum(residual, MAX_RESIDUAL_DISTANCE * slope)
+        off = ~(value <= SURFACE_TOLERANCE * slope + explained)  # NaN is off the surface too
         count = int(off.sum())
-        if count <= MANY * len(index):
+        if count <= MAX_OFF_SURFACE_FRACTION * len(index):
             return ""
-        middle = float((value / slope)[off].nanmedian())
+        median = float((value / slope)[off].nanmedian())
         return (
             f"{self.name}: {count:,} of {len(index):,} hits are not on the surface at origin + distance * direction. "
-            f"Their median distance from it is {middle:.2g} scene units, and {NEAR:g} beyond the residual is allowed. "
-            "Return the distance along the unit direction, in scene units"
+            f"Their median distance from it is {median:.2g} scene units, and {SURFACE_TOLERANCE:g} beyond the residual "
+            "is allowed. Return the distance along the unit direction, in scene units"
         )
 
 
-_kept: ContextVar[list[Hits] | None] = ContextVar("kept", default=None)
+_collected: ContextVar[list[Hits] | None] = ContextVar("collected", default=None)
 
 
 @contextmanager
-def kept_hits() -> Iterator[list[Hits]]:
-    """Within it, the hits of all renderings are kept, in the list that it gives."""
-    kept: list[Hits] = []
-    token = _kept.set(kept)
+def collect_hits() -> Iterator[list[Hits]]:
+    """Collects the hits of all renderings within the context, in the list that it yields."""
+    collected: list[Hits] = []
+    token = _collected.set(collected)
     try:
-        yield kept
+        yield collected
     finally:
-        _kept.reset(token)
+        _collected.reset(token)
 
 
-def keep(renderer: Renderer, field: Field, rays: Rays, rendering: Rendering) -> None:
-    """Keeps the hits of a rendering, where they are wanted."""
-    if (kept := _kept.get()) is not None:
+def record_hits(renderer: Renderer, field: Field, rays: Rays, rendering: Rendering) -> None:
+    """Records the hits of a rendering, within `collect_hits`."""
+    if (collected := _collected.get()) is not None:
         name = f"{type(renderer).__name__}.render"
-        shape = field.inner if isinstance(field, Meter) else field
-        parts = (rendering.status, rendering.distance.detach(), rendering.residual.detach())
-        kept.append(Hits(name, shape, rays, *parts, rendering.volume is not None))
+        field = field.inner if isinstance(field, Meter) else field
+        tensors = (rendering.status, rendering.distance.detach(), rendering.residual.detach())
+        collected.append(Hits(name, field, rays, *tensors, rendering.volume is not None))
 
 
 @torch.no_grad()
-def without_distance(kept: Sequence[Hits]) -> str:
+def missing_distance_message(renderings: Sequence[Hits]) -> str:
     """How many rays have a hit without a finite distance, and whether renderer or field is at fault; empty for none."""
-    endless = sum(int(hits.endless.sum()) for hits in kept)
-    if not endless:
+    lacking = sum(int(hits.lacks_distance.sum()) for hits in renderings)
+    if not lacking:
         return ""
-    rays = sum(hits.status.numel() for hits in kept)
-    blind = sum(int(_not_finite_along(hits.field, hits.rays[hits.endless]).sum()) for hits in kept)
+    rays = sum(hits.status.numel() for hits in renderings)
+    blind = sum(int(_not_finite_along(hits.field, hits.rays[hits.lacks_distance]).sum()) for hits in renderings)
     fault = f"the field has values that are not finite on {blind:,} of them" if blind else "the field is finite on them"
     fault += "" if blind else ", so the renderer is at fault"
-    return f"{endless:,} of {rays:,} rays have a hit without a finite distance ({fault})"
+    return f"{lacking:,} of {rays:,} rays have a hit without a finite distance ({fault})"
 
 
 def _not_finite_along(field: Field, rays: Rays) -> Bool[Tensor, " n"]:
-    """The rays along which some value of the field in the unit sphere is not finite."""
+    """The rays along which a value of the field in the unit sphere is not finite."""
     entry, leave, _ = sphere_span(rays)
-    return ~field(rays.at_each(evenly(entry, leave, ALONG))).isfinite().all(dim=-1)
+    return ~field(rays.at_each(equally_spaced(entry, leave, SAMPLES_PER_RAY))).isfinite().all(dim=-1)

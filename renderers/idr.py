@@ -6,9 +6,9 @@ import torch
 
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Field, values_to_march_on
-from renderers.gradients import implicit_front
-from renderers.march import Front, Stepping, march
+from renderers.field import Field, marching_values
+from renderers.gradients import implicit_rendering
+from renderers.march import RayFront, Stepping, march_front
 from renderers.rendering import Rendering, check_kind
 from renderers.silhouette import SurfaceRenderer
 
@@ -18,15 +18,15 @@ class IDR(SurfaceRenderer):
     """Sphere tracing whose hits have the exact gradient.
 
     Source: IDR (Yariv et al. 2020, arXiv 2003.09852), Sec. 3.1 (intersection) and 3.3 (masked rendering).
-    Differentiable in: field parameters and rays, by the implicit rule of DVR, Eq. 8, and exactly, up to `epsilon`.
-        What comes into view or leaves it has no part in the gradient of `distance`, only in that of the mask loss.
+    Differentiable in: field parameters and rays, by the implicit rule of DVR, Eq. 8, exactly, up to `epsilon`. The
+        gradient of `distance` lacks the visibility gradient; the mask loss has it.
     Needs: a distance or a bound inside the sphere.
-    Deviates from the paper: marches from the camera's side only, and does not sample rays that have not converged; the
-        least field value on a ray is that of the marched samples. A ray that begins at negative values stops at once.
+    Deviates from the paper: marches from the camera only, and does not search rays that have not converged. The
+        smallest field value on a ray is one of the marched samples. A ray that starts at negative values stops at once.
 
     Args:
-        steps: most marching steps per ray.
-        epsilon: a ray has converged where the field's magnitude is below this, in scene units.
+        steps: maximum marching steps per ray.
+        epsilon: a ray has converged if the field's magnitude is below this, in scene units.
         least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
         coarse: see `dist.DIST`; ours.
     """
@@ -45,7 +45,7 @@ class IDR(SurfaceRenderer):
         check_kind(self, field)
         flat = rays.flat()
         with torch.no_grad():
-            front = Front.on_sphere(flat, radius=self.sphere_radius, samples=1)
-            values, steps = values_to_march_on(field, self.steps, epsilon=self.epsilon, coarse=self.coarse)
-            march(values, flat, front, Stepping(self.epsilon), steps)
-        return implicit_front(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
+            front = RayFront.on_sphere(flat, radius=self.sphere_radius, samples=1)
+            values, steps = marching_values(field, self.steps, epsilon=self.epsilon, coarse=self.coarse)
+            march_front(values, flat, front, Stepping(self.epsilon), steps)
+        return implicit_rendering(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)

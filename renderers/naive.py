@@ -10,9 +10,9 @@ from torch import Tensor
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field
-from renderers.gradients import approximate_front
-from renderers.march import Front, Stepping, march
-from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, Status, assemble, check_kind
+from renderers.gradients import approximate_rendering
+from renderers.march import RayFront, Stepping, march_front
+from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, Status, assemble, check_kind
 from renderers.silhouette import AVERAGES, Hinge
 
 
@@ -20,23 +20,23 @@ from renderers.silhouette import AVERAGES, Hinge
 class Naive:
     """Sphere tracing that evaluates every ray that meets the sphere at every step. A slow baseline, not for real use.
 
-    With the unrolled gradient all steps stay in the graph, so that time and memory grow with rays times steps. Its
-    other settings are the first rows of DIST's Table 1: rays one by one or all at once, and the approximate gradient.
+    With the unrolled gradient all steps stay in the graph, so that runtime and memory grow with rays times steps. Other
+    settings give the first rows of DIST's Table 1: rays one by one or all at once, and the approximate gradient.
 
-    Source: DIST, Algorithm 1, begun on the bounding sphere (Sec. 3.2), since a network is undefined outside it.
-    Differentiable in: field parameters and rays. Unrolled, exact in the limit of many steps; too short by
-        a factor 1 - (1 - cos(angle of incidence))^steps, which matters near grazing. Its `closest` has next to no
-        gradient at a hit, since the sample follows the surface. Approximate ("practical"): as DIST at alpha = 1.
+    Source: DIST, Algorithm 1, started on the bounding sphere (Sec. 3.2), since a network is undefined outside it.
+    Differentiable in: field parameters and rays. Unrolled: exact in the limit of many steps; too short by
+        a factor 1 - (1 - cos(angle of incidence))^steps, which matters near grazing. Its `closest` has almost no
+        gradient at a hit, since the sample follows the surface. Approximate ("practical"): as DIST with alpha = 1.
     Needs: a distance or a bound inside the sphere.
-    Deviates from the paper: a ray that begins at negative values stops at once with STARTED_INSIDE.
+    Deviates from the paper: a ray that starts at negative values stops at once with STARTED_INSIDE.
 
     Args:
-        steps: marching steps, all of them taken.
-        epsilon: a ray has converged where the field's magnitude is below this, in scene units.
+        steps: exact number of marching steps.
+        epsilon: a ray has converged if the field's magnitude is below this, in scene units.
         gradient: "unrolled" through all steps, or "practical", DIST's approximate rule (Eq. 4) at the closest samples.
-        n_gradient_samples: K of the approximate gradient; None with the unrolled one, which has no such number.
+        n_gradient_samples: K of the approximate gradient; None for the unrolled gradient.
         serial: march the rays one after the other.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        sphere_radius: of the sphere about the origin that contains the shape.
         silhouette_signed, silhouette_average: see `silhouette.Hinge`.
     """
 
@@ -49,7 +49,7 @@ class Naive:
     silhouette_signed: bool
     silhouette_average: str
 
-    capabilities: ClassVar[Capabilities] = OF_LENGTHS
+    capabilities: ClassVar[Capabilities] = DISTANCE_CAPABILITIES
 
     def __post_init__(self) -> None:
         check_at_least("steps", self.steps, 1, "the paper uses 50 to 100")
@@ -68,12 +68,12 @@ class Naive:
         flat = rays.flat()
         render = self._unrolled if self.gradient == "unrolled" else self._approximate
         if not self.serial or flat.shape.numel() == 0:
-            parts = [render(field, flat)]
+            renderings = [render(field, flat)]
         else:
-            each = torch.arange(len(flat.origins), device=flat.origins.device).split(1)
-            parts = [render(field, flat[index]) for index in each]
+            indices = torch.arange(len(flat.origins), device=flat.origins.device).split(1)
+            renderings = [render(field, flat[index]) for index in indices]
         distance, status, residual, closest = (
-            torch.cat([getattr(part, name) for part in parts]).view(rays.shape)
+            torch.cat([getattr(rendering, name) for rendering in renderings]).view(rays.shape)
             for name in ("distance", "status", "residual", "closest")
         )
         return Rendering(distance, status, rays.at(distance), residual, closest)
@@ -82,28 +82,26 @@ class Naive:
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
         """DIST, Eq. 11."""
-        hinge = Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average)
-        return hinge.of(rendering.closest, mask)
+        return Hinge(self.epsilon, self.silhouette_signed, self.silhouette_average).of(rendering.closest, mask)
 
     def _approximate(self, field: Field, rays: Rays) -> Rendering:
         with torch.no_grad():
             assert self.n_gradient_samples is not None  # checked above
-            front = Front.on_sphere(rays, radius=self.sphere_radius, samples=self.n_gradient_samples)
-            stepping = Stepping(self.epsilon, active_only=False)
-            march(field, rays, front, stepping, self.steps)
-        return approximate_front(field, rays, front, alpha=1.0, radius=self.sphere_radius)
+            front = RayFront.on_sphere(rays, radius=self.sphere_radius, samples=self.n_gradient_samples)
+            march_front(field, rays, front, Stepping(self.epsilon, active_only=False), self.steps)
+        return approximate_rendering(field, rays, front, alpha=1.0, radius=self.sphere_radius)
 
     def _unrolled(self, field: Field, rays: Rays) -> Rendering:
-        entry, leave, meets = sphere_span(rays, self.sphere_radius)
-        distance, status, value, closest = self._march(field, rays[meets], entry[meets], leave[meets])
-        missed = torch.full_like(meets, Status.MISS, dtype=torch.int8)
+        entry, leave, intersects = sphere_span(rays, self.sphere_radius)
+        distance, status, value, closest = self._march(field, rays[intersects], entry[intersects], leave[intersects])
+        missed = torch.full_like(intersects, Status.MISS, dtype=torch.int8)
         return assemble(
             rays,
             self.sphere_radius,
-            distance=entry.masked_scatter(meets, distance),
-            status=missed.masked_scatter(meets, status),
-            residual=torch.zeros_like(entry).masked_scatter(meets, value.detach()),
-            closest=(meets.nonzero().squeeze(-1), closest),
+            distance=entry.masked_scatter(intersects, distance),
+            status=missed.masked_scatter(intersects, status),
+            residual=torch.zeros_like(entry).masked_scatter(intersects, value.detach()),
+            closest=(intersects.nonzero().squeeze(-1), closest),
         )
 
     def _march(
@@ -111,17 +109,17 @@ class Naive:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         status = torch.full_like(distance, Status.OUT_OF_STEPS, dtype=torch.int8)
         active = torch.ones_like(distance, dtype=torch.bool)
-        last, closest = torch.zeros_like(distance), torch.full_like(distance, torch.inf)
+        last_value, closest = torch.zeros_like(distance), torch.full_like(distance, torch.inf)
         for step in range(self.steps):
             value = field(rays.at(distance))
             finite = value.isfinite()
             converged = active & (value.abs() < self.epsilon)
-            last = torch.where(active & finite, value, last)
+            last_value = torch.where(active & finite, value, last_value)
             closest = torch.where(active & finite & (value.abs() < closest.abs()), value, closest)
             if step == 0:
-                began_inside = finite & (value < 0) & ~converged
-                status[began_inside] = Status.STARTED_INSIDE
-                active = active & ~began_inside
+                started_inside = finite & (value < 0) & ~converged
+                status[started_inside] = Status.STARTED_INSIDE
+                active = active & ~started_inside
             active = active & finite
             moved = torch.where(active, distance + value, distance)
             left = active & ~converged & (moved > leave)
@@ -129,4 +127,4 @@ class Naive:
             distance = torch.where(left, leave, moved)
             active = active & ~left & ~converged
         closest = torch.where(closest.isfinite(), closest, 1.0)
-        return distance, status, last, closest
+        return distance, status, last_value, closest

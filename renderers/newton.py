@@ -9,42 +9,42 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.checks import check_choice, check_positive
 from renderers.field import Field
-from renderers.rendering import OF_LENGTHS, Capabilities, Rendering, check_kind
+from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, check_kind
 from renderers.silhouette import AVERAGES, Hinge
 from renderers.tracer import Tracer
-from renderers.warm import Memory, warm_trace
+from renderers.warm import Memory, render_warm
 
 
 @dataclass(frozen=True)
 class Newton:
-    """Coarse-to-fine marching until the sign changes, a dense search for the rays that are left, and a Newton step.
+    """Coarse-to-fine marching until the sign changes, a dense search for the unfinished rays, and a Newton step.
 
-    The implicit gradient asks for the value and the slope at every hit. They also give the distance to second order, so
-    that the march may step behind the surface.
+    The implicit gradient needs the value and the slope at every hit. A Newton step on them gives the distance to second
+    order, so that the march may step behind the surface.
 
     Source: ours. The march follows DIST, Sec. 3.2; the search DVR, Sec. 3.3; the gradient DVR, Eqs. 8 and 11.
-    Differentiable in: field parameters and rays, by the implicit rule at the point before the last Newton step: off by
-        that step times the surface's curvature; the step is at most `tracer.LONGEST` times the cosine of incidence, but
-        for hits on surfaces flatter than `least_slope` along the ray.
-        What comes into view or leaves it has no part in the gradient of `distance`. That of `closest` is exact at a
-        fixed sample, and left to the loss (`rendering.closest_values`); on a hit, `closest` is 0.
-    Needs: a distance or a bound inside the sphere; a trained network is close enough to one. Where a field is steeper,
-        its values are divided by how steep it is nearly everywhere, see `tracer.Evened`; those of a bound never are.
-        Its gradient towards points by automatic differentiation, also where no gradient is wanted.
-    Deviates from the paper: there is none. What may be missed: what is at most 1.5 `unseen` long on a ray, of a field
-        that is a distance; on the rays of the dense search, what is thinner than the spacing of its samples, unless it
-        is next to the least one; in an image, what rays meet at the rim of the sphere in front of where their coarse
-        ray enters it. A ray that passes an edge closer than `march_epsilon` may hit it. `residual` is the value before
-        the last step. Where the field offers coarse values, twice their error more of a ray may be unseen, and a miss's
-        `closest` is off by the error: rays that came within it of the surface are marched again, on the field itself.
+    Differentiable in: field parameters and rays, by the implicit rule at the point before the last Newton step. The
+        error is that step times the surface's curvature. The step is at most `tracer.MAX_NEWTON_STEP` times the cosine
+        of incidence, except on surfaces flatter than `least_slope` along the ray.
+        The gradient of `distance` lacks the visibility gradient. The gradient of `closest` is exact at a fixed sample;
+        the loss attaches it (`rendering.closest_values`). On a hit, `closest` is 0.
+    Needs: a distance or a bound inside the sphere; a trained network is close enough to one. If a distance is steeper,
+        its values are divided by its typical slope (`tracer.SlopeNormalised`); the values of a bound never are. The
+        field's gradient towards points by automatic differentiation, even if no gradient is needed.
+    Deviates from the paper: there is none. It may miss: parts at most 1.5 `unseen` long on a ray, if the field is a
+        distance; on rays of the dense search, parts thinner than the spacing of its samples, unless next to the
+        smallest one; in an image, parts at the edge of the sphere, in front of where the coarse ray enters it. A ray
+        that passes an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step. With
+        coarse values, missed parts may be longer by twice their error, and a miss's `closest` is off by the error. Rays
+        that came within the error of the surface are marched again, on the field itself.
 
     Args:
         steps, march_epsilon, unseen, newton_steps, search_samples, search_steps, least_slope, sphere_radius,
             coarse: see `tracer.Tracer`.
         silhouette_epsilon, silhouette_signed, silhouette_average: see `silhouette.Hinge`.
-        warm: whether a rendering in an optimisation begins where that of the same rays ended before; see `warm`.
+        warm: whether renderings in an optimisation start where the last one of the same rays ended; see `warm`.
         memory: of the optimisation.
-        remembers: whether renderings are remembered; set by `at_iteration`.
+        remembers: whether renderings are stored in the memory; set by `at_iteration`.
     """
 
     steps: int
@@ -63,20 +63,20 @@ class Newton:
     memory: Memory = field(default_factory=Memory, repr=False, compare=False)
     remembers: bool = False
 
-    capabilities: ClassVar[Capabilities] = OF_LENGTHS
+    capabilities: ClassVar[Capabilities] = DISTANCE_CAPABILITIES
 
     def __post_init__(self) -> None:
-        _ = self.tracer  # which checks its settings
+        _ = self.tracer  # its constructor checks the settings
         check_positive("silhouette_epsilon", self.silhouette_epsilon, "DIST uses 5e-5")
         check_choice("silhouette_average", self.silhouette_average, AVERAGES)
 
     @property
     def tracer(self) -> Tracer:
-        """What finds the surface."""
+        """Finds the surface, with these settings."""
         return Tracer(**{setting.name: getattr(self, setting.name) for setting in fields(Tracer)})
 
     def at_iteration(self, iteration: int) -> "Newton":
-        """With `warm`, a renderer that begins where the same rays ended before; iteration 0 forgets them."""
+        """With `warm`, a renderer that starts where the same rays ended before; iteration 0 clears the memory."""
         if iteration == 0:
             self.memory.forget()
         return replace(self, remembers=self.warm)
@@ -85,15 +85,15 @@ class Newton:
         """Marches and searches without a graph; the Newton steps carry the gradient."""
         check_kind(self, field)
         if self.remembers:
-            return warm_trace(self.tracer, self.memory, field, rays)
-        return self.tracer.render_anew(field, rays)
+            return render_warm(self.tracer, self.memory, field, rays)
+        return self.tracer.render_cold(field, rays)
 
-    def fresh(self) -> "Newton":
-        """The same renderer with an empty memory, for another optimisation."""
+    def with_empty_memory(self) -> "Newton":
+        """The same renderer, for another optimisation."""
         return replace(self, memory=Memory())
 
     def final_notes(self) -> list[str]:
-        """What the audit of the warm start found."""
+        """The result of the warm start's audit."""
         return self.memory.notes()
 
     def silhouette_loss(

@@ -11,7 +11,7 @@ from torch import Tensor
 from renderers.camera import Rays, distance_to_origin
 from renderers.field import Field, Kind
 
-OUTSIDE = 1.0  # stands for a value that is not finite: far from any surface
+NON_FINITE_VALUE = 1.0  # replaces a value that is not finite: far from any surface
 
 
 class Status(IntEnum):
@@ -25,7 +25,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Deferred:
-    """Where a rendering sampled its `closest` values, if it leaves their gradient to `closest_values`.
+    """Where a rendering sampled its `closest` values, if `closest_values` attaches their gradient.
 
     Args:
         distance: along each ray to the sample.
@@ -38,37 +38,37 @@ class Deferred:
 
 @dataclass(frozen=True)
 class Volume:
-    """What rays see where that is more than one hit: samples, and the weights with which their values are summed.
+    """What rays see if that is more than one hit: samples, and their weights in sums along the ray.
 
     Args:
-        ray: of each sample, the place of its ray in one row.
+        ray: of each sample, the index of its ray among all rays in one row.
         distance: along the ray to the sample, in scene units.
-        weight: of the sample; those of a ray add up to its opacity, from 0 to 1. Differentiable.
+        weight: of the sample; the weights of a ray sum to its opacity, from 0 to 1. Differentiable.
     """
 
     ray: Int[Tensor, " samples"]
     distance: Float[Tensor, " samples"]
     weight: Float[Tensor, " samples"]
 
-    def summed(self, values: Float[Tensor, " samples *channels"], count: int) -> Float[Tensor, " count *channels"]:
-        """The weighted sums of the samples' values for each of `count` rays."""
+    def weighted_sum(self, values: Float[Tensor, " samples *channels"], n: int) -> Float[Tensor, " n *channels"]:
+        """The weighted sum of the samples' values for each of n rays."""
         weight = self.weight.view(-1, *[1] * (values.dim() - 1))
-        return values.new_zeros(count, *values.shape[1:]).index_add(0, self.ray, weight * values)
+        return values.new_zeros(n, *values.shape[1:]).index_add(0, self.ray, weight * values)
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """One answer per ray, all of the rays' leading shape, all finite.
+    """Where each ray ended, in tensors of the rays' leading shape; all values are finite.
 
     Args:
-        distance: along the ray to where it ended; a surface only where `hit`. Differentiable as the renderer states.
+        distance: along the ray to its end; on a surface only if `hit`. Differentiable as the renderer states.
         status: of each ray, a Status as int8.
         points: the points at `distance`.
         residual: the last field value on the ray, a measure of the remaining error. Not differentiable.
-        closest: the field's value, with its sign, at the sample of least magnitude on the ray. Its magnitude less a
-            threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable, but for rays that are deferred.
-        deferred: where `closest` has no gradient yet, since most losses need it on few rays; None where it has.
-        volume: what the rays see, of a renderer for which that is more than their hits; else None.
+        closest: the field's value, with its sign, at the sample of smallest magnitude on the ray. Its magnitude minus a
+            threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable, except on deferred rays.
+        deferred: the rays whose `closest` has no gradient yet, since most losses need it on few rays; else None.
+        volume: what the rays see, for renderers that show more than hits; else None.
     """
 
     distance: Float[Tensor, "*rays"]
@@ -81,11 +81,11 @@ class Rendering:
 
     @property
     def opacity(self) -> Float[Tensor, "*rays"]:
-        """How much each ray sees of the shape, from 0 to 1: 1 on hits and 0 elsewhere, unless there is a volume."""
+        """The opacity of each ray, from 0 to 1: the sum of its weights; without a volume, 1 for a hit, else 0."""
         if self.volume is None:
             return self.hit.to(self.distance.dtype)
         ones = torch.ones_like(self.volume.weight)
-        return self.volume.summed(ones, self.status.numel()).view(self.status.shape)
+        return self.volume.weighted_sum(ones, self.status.numel()).view(self.status.shape)
 
     @property
     def hit(self) -> Bool[Tensor, "*rays"]:
@@ -98,7 +98,7 @@ class Capabilities:
     """A renderer's capabilities.
 
     Args:
-        needs: the kinds of field that it is meant for.
+        needs: the kinds of field that it can render.
         field_gradient, ray_gradient: whether `distance` and the silhouette loss have a gradient towards the field's
             parameters and the rays; checked in `boundary`.
     """
@@ -108,22 +108,21 @@ class Capabilities:
     ray_gradient: bool
 
 
-OF_LENGTHS = Capabilities(needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True)
-OF_LEVELS = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
+DISTANCE_CAPABILITIES = Capabilities(needs=(Kind.DISTANCE, Kind.BOUND), field_gradient=True, ray_gradient=True)
+LEVEL_SET_CAPABILITIES = Capabilities(needs=tuple(Kind), field_gradient=True, ray_gradient=True)
 
 
 class Unsupported(Exception):
-    """A renderer lacks what is asked of it; the message says what."""
+    """A renderer lacks a capability that this run needs; the message names it."""
 
 
 @dataclass(frozen=True)
-class Observed:
-    """What is observed of rays: a mask, and distances where they are given.
+class RayObservation:
+    """What is observed along rays: a mask, and distances on some or no rays.
 
     Args:
         mask: true on the foreground.
-        distance: along each ray to the observed surface, in scene units; NaN where it is not given. None where no ray
-            has one.
+        distance: along each ray to the observed surface, in scene units; NaN if unknown. None if unknown on all rays.
     """
 
     mask: Bool[Tensor, "*rays"]
@@ -150,12 +149,12 @@ class Renderer(Protocol):
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """The method's own loss between its rendering and a binary mask, true on the foreground."""
+        """The loss of the renderer's paper between its rendering and a binary mask, true on the foreground."""
         ...
 
 
 def check_kind(renderer: Renderer, field: Field) -> None:
-    """Raises Unsupported where a field is not of a kind that the renderer is meant for."""
+    """Raises Unsupported if the renderer cannot render this kind of field."""
     needs = renderer.capabilities.needs
     if field.kind not in needs:
         names = " or ".join(need.value for need in needs)
@@ -168,70 +167,72 @@ def check_kind(renderer: Renderer, field: Field) -> None:
 
 @runtime_checkable
 class Scheduled(Protocol):
-    """A renderer whose settings change as an optimisation goes on."""
+    """A renderer whose settings change during an optimisation."""
 
     def at_iteration(self, iteration: int) -> Renderer:
-        """The renderer as it is at an iteration, counted from 0."""
+        """The renderer with the settings of an iteration, counted from 0."""
         ...
 
 
 @runtime_checkable
-class Remembering(Protocol):
-    """A renderer that remembers something of the optimisation that it serves."""
+class Stateful(Protocol):
+    """A renderer with a memory of one optimisation."""
 
-    def fresh(self) -> Renderer:
-        """The renderer for another optimisation, with nothing remembered."""
+    def with_empty_memory(self) -> Renderer:
+        """The same renderer for another optimisation."""
         ...
 
     def final_notes(self) -> list[str]:
-        """What a reader of the record should know of what it remembers; none before it was used."""
+        """Notes on the memory for the record; none before it was used."""
         ...
 
 
 @runtime_checkable
-class Guided(Protocol):
-    """A renderer whose own silhouette loss takes given distances as well; the mask alone is `silhouette_loss`."""
+class UsesDistances(Protocol):
+    """A renderer whose silhouette loss can use observed distances; its `silhouette_loss` uses the mask alone."""
 
-    def observed_loss(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:
-        """The method's own loss between its rendering, and a mask and the distances that are given."""
+    def observed_loss(
+        self, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
+    ) -> Float[Tensor, ""]:
+        """The loss of the renderer's paper between its rendering, and a mask with the observed distances."""
         ...
 
 
 @runtime_checkable
 class Blurred(Renderer, Protocol):
-    """A renderer whose gradient of visibility is spread over a length."""
+    """A renderer whose visibility gradient is spread over a length."""
 
     @property
     def blur(self) -> float:
-        """That length, in scene units: of the fall of an opacity, or of a band about the outline."""
+        """The length, in scene units: over which an opacity falls, or of a band about the outline."""
         ...
 
     def with_blur(self, blur: float) -> "Blurred":
-        """The renderer with another one, all else left, at every iteration."""
+        """The same renderer with another length, at every iteration."""
         ...
 
 
 def at_iteration(renderer: Renderer, iteration: int) -> Renderer:
-    """The renderer as it is at an iteration of an optimisation: itself, unless it has a schedule."""
+    """The renderer with the settings of an iteration; the renderer itself, unless it is Scheduled."""
     return renderer.at_iteration(iteration) if isinstance(renderer, Scheduled) else renderer
 
 
-def fresh(renderer: Renderer) -> Renderer:
-    """The renderer for one of several optimisations: itself, unless it remembers something."""
-    return renderer.fresh() if isinstance(renderer, Remembering) else renderer
+def with_empty_memory(renderer: Renderer) -> Renderer:
+    """The renderer for another optimisation; the renderer itself, unless it is Stateful."""
+    return renderer.with_empty_memory() if isinstance(renderer, Stateful) else renderer
 
 
 def final_notes(renderer: Renderer) -> list[str]:
-    """What is to be noted of an optimisation that a renderer served; none unless it remembers something."""
-    return renderer.final_notes() if isinstance(renderer, Remembering) else []
+    """Notes on the renderer's memory for the record of an optimisation; none unless it is Stateful."""
+    return renderer.final_notes() if isinstance(renderer, Stateful) else []
 
 
 def closest_values(
     field: Field, rays: Rays, rendering: Rendering, wanted: Bool[Tensor, "*rays"]
 ) -> Float[Tensor, "*rays"]:
-    """`rendering.closest`, with its gradient on the `wanted` rays, for one value on each of them that was deferred.
+    """`rendering.closest`, with its gradient on the `wanted` rays, by one field evaluation on each deferred one.
 
-    The value there is that of the ray itself; coarse to fine may have sampled `rendering.closest` on its coarse ray.
+    These values are new samples of the ray; coarse to fine may have sampled `rendering.closest` on its coarse ray.
     """
     if rendering.deferred is None or not torch.is_grad_enabled():
         return rendering.closest
@@ -249,24 +250,25 @@ def assemble(
     residual: Float[Tensor, " n"],
     closest: tuple[Int[Tensor, " m"], Float[Tensor, " m"]],
 ) -> Rendering:
-    """The rendering of rays of any leading shape, from one answer per ray in one row.
+    """The rendering of rays of any leading shape, from tensors with one entry per ray in one row.
 
-    A field value that is not finite decides nothing: as a residual it is 0, and as `closest` it is `OUTSIDE`.
+    A field value that is not finite becomes 0 as a residual, and `NON_FINITE_VALUE` as `closest`.
 
     Args:
-        rays: all n of them.
-        radius: of the sphere about the origin that holds the shape.
+        rays: all n rays.
+        radius: of the sphere about the origin that contains the shape.
         distance, status, residual: as in Rendering.
-        closest: the rays on which the field was evaluated, and its value of least magnitude on these. For the others,
-            `closest` is their distance from the sphere (DIST, A.3).
+        closest: the rays on which the field was evaluated, and its value of smallest magnitude on each. For the other
+            rays, `closest` is their distance from the sphere (DIST, A.3).
     """
-    queried, least = closest
-    passing_by = distance_to_origin(rays.flat()) - radius
+    queried, smallest = closest
+    distance_to_sphere = distance_to_origin(rays.flat()) - radius
+    smallest = smallest.nan_to_num(NON_FINITE_VALUE, NON_FINITE_VALUE, NON_FINITE_VALUE)
     shaped = distance.view(rays.shape)
     return Rendering(
         distance=shaped,
         status=status.view(rays.shape),
         points=rays.at(shaped),
         residual=residual.detach().nan_to_num(0.0, 0.0, 0.0).view(rays.shape),
-        closest=passing_by.index_put((queried,), least.nan_to_num(OUTSIDE, OUTSIDE, OUTSIDE)).view(rays.shape),
+        closest=distance_to_sphere.index_put((queried,), smallest).view(rays.shape),
     )

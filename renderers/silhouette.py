@@ -1,8 +1,8 @@
-"""Silhouette losses: of each paper one, for the rendering of any renderer, so that renderers can be compared under one.
+"""Silhouette losses: one per paper, for the rendering of any renderer, so that all renderers can use the same loss.
 
-`Own` is the renderer's own. The other three are made of what every renderer gives: `hit`, `distance` and `closest`.
-Their gradient is that of the renderer's `closest`, which the hinge asks for only on rays that are wrong: on a hit, that
-of `naive` follows the surface, so that its spurious hits are hardly pushed away.
+`Own` is the renderer's own loss. The other three use what every renderer returns: `hit`, `distance` and `closest`.
+Their gradient is the gradient of the renderer's `closest`; the hinge uses it only on wrong rays. On a hit,
+the `closest` of `naive` follows the surface, so that its spurious hits are hardly pushed away.
 """
 
 from abc import ABC, abstractmethod
@@ -18,26 +18,26 @@ from renderers import boundary
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, occupancy_logits
-from renderers.rendering import OF_LENGTHS, Capabilities, Observed, Renderer, Rendering, closest_values
+from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, RayObservation, Renderer, Rendering, closest_values
 
-RANDOM, DEPTH = "random", "depth"  # where L_occupancy is; see `Occupancy`
-PLACES = (RANDOM, DEPTH)
-AVERAGES = ("all", "violating", "missed_plus_spurious")  # over which rays `Hinge` averages
-CLOSEST = "its closest field values carry"  # what a loss is made of, in the message where they carry no gradient
+RANDOM, DEPTH = "random", "depth"
+OCCUPANCY_POINTS = (RANDOM, DEPTH)  # choices of `occupied_at`; see `Occupancy`
+AVERAGES = ("all", "violating", "missed_plus_spurious")  # see `Hinge`
+CLOSEST_VALUES_CARRY = "its closest field values carry"  # begins a message: "... no gradient"
 
 
 @runtime_checkable
 class SilhouetteLoss(Protocol):
-    """A loss between a rendering and a binary mask, or what else is observed of its rays."""
+    """A loss between a rendering and an observation: a binary mask, perhaps with distances."""
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
     ) -> Float[Tensor, ""]:
         """The loss.
 
         Args:
-            renderer, field, rays: of which `rendering` is the outcome.
-            observed: the mask, and the distances that are given.
+            renderer, field, rays: `rendering` is the renderer's, of this field along these rays.
+            observed: the mask and the observed distances.
         """
         ...
 
@@ -47,7 +47,7 @@ class Own:
     """The renderer's own silhouette loss, checked by `boundary.silhouette_loss`."""
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
     ) -> Float[Tensor, ""]:
         return boundary.silhouette_loss(renderer, field, rays, rendering, observed)
 
@@ -60,10 +60,10 @@ class Hinge:
         epsilon: the threshold between them, in scene units.
         signed: False takes the magnitude of `closest`, as the paper does. A background ray that stops just inside the
             shape is then pushed deeper. True keeps the sign, which avoids that.
-        average: the mean over "all" rays, or over "violating" ones. With "missed_plus_spurious" it is the mean over
-            violating rays of the foreground plus that over violating rays of the background. The official code has this
-            sum, but counts missed pixels whose violation is 0 as well. With "all", a missed pixel weighs next to
-            nothing, and an optimiser can lower the depth loss by losing hits.
+        average: the mean over "all" rays, or over "violating" rays. "missed_plus_spurious" is the mean over violating
+            foreground rays plus the mean over violating background rays. The official code has this sum, but also
+            counts missed pixels with a violation of 0. With "all", a missed pixel has almost no weight, and an
+            optimiser can lower the depth loss by losing hits.
         weight: of the loss.
     """
 
@@ -78,37 +78,37 @@ class Hinge:
         check_at_least("weight", self.weight, 0, "0 switches the loss off")
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
     ) -> Float[Tensor, ""]:
         loss = self.of_rendering(field, rays, rendering, observed.mask)
-        boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
+        boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST_VALUES_CARRY)
         return loss
 
     def of_rendering(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """The loss of a rendering; a hit is right on the foreground and wrong on the background, whatever its value.
+        """The loss of a rendering. Foreground hits have no loss; background hits have one, whatever their value.
 
-        Volume renderers and meshes hit where the least value that they know is larger than `epsilon`. On the background
-        such a hit is off by `epsilon`, as one whose value is 0.
+        Hits of volume renderers and meshes may have a `closest` value above `epsilon`. On the background such a hit
+        counts as a value of 0: its violation is `epsilon`.
         """
         violates = self.violation(rendering.closest, mask) > 0
-        silent = rendering.hit & ~mask & ~violates
-        wrong = silent | (violates & ~(rendering.hit & mask))
+        zero_loss_hits = rendering.hit & ~mask & ~violates
+        wrong = zero_loss_hits | (violates & ~(rendering.hit & mask))
         excess = self._excess(closest_values(field, rays, rendering, wrong), mask)
-        excess = torch.where(silent, excess - excess.detach() + self.epsilon, excess)
+        excess = torch.where(zero_loss_hits, excess - excess.detach() + self.epsilon, excess)
         return self._mean(torch.where(wrong, excess, 0.0), mask)
 
     def of(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
-        """The loss of the field's values of least magnitude on each ray, with their sign."""
+        """The loss for the field's value of smallest magnitude on each ray, with its sign."""
         return self._mean(self.violation(closest, mask), mask)
 
     def violation(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
-        """By how much the soft silhouette is on the wrong side; 0 where it is on the right one."""
+        """By how much the soft silhouette is on the wrong side of 0; 0 on the right side."""
         return self._excess(closest, mask).clamp_min(0)
 
     def _excess(self, closest: Float[Tensor, "*rays"], mask: Bool[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
-        """The violation, which is negative on the right side."""
+        """The violation before clamping: negative on the right side."""
         soft = (closest if self.signed else closest.abs()) - self.epsilon
         return torch.where(mask, soft, -soft)
 
@@ -120,17 +120,17 @@ class Hinge:
         return self.weight * violation.sum() / max(violation.numel(), 1)
 
     def _mean_over(self, violation: Float[Tensor, "*rays"], rays: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
-        """The weighted mean over those of the rays that violate the mask."""
+        """The weighted mean over the violating ones of the rays."""
         return self.weight * (violation * rays).sum() / ((violation > 0) & rays).sum().clamp_min(1)
 
 
 @dataclass(frozen=True)
 class CrossEntropy:
-    """IDR, Sec. 3.3: cross entropy of a sigmoid of the least field value, over all rays but correct hits.
+    """IDR, Sec. 3.3: cross entropy of a sigmoid of the smallest field value, over all rays except correct hits.
 
     Args:
-        sharpness: of the sigmoid, for a length of one scene unit; the paper begins at 50 and doubles it.
-        weight: rho in the paper, which takes 100.
+        sharpness: of the sigmoid, per scene unit; the paper begins at 50 and doubles it.
+        weight: rho in the paper, which uses 100.
     """
 
     sharpness: float
@@ -141,11 +141,11 @@ class CrossEntropy:
         check_at_least("weight", self.weight, 0, "the paper uses 100")
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
     ) -> Float[Tensor, ""]:
         wanted = ~(observed.mask & rendering.hit)
         loss = self.of(replace(rendering, closest=closest_values(field, rays, rendering, wanted)), observed.mask)
-        boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST)
+        boundary.check_loss_gradient(renderer, field, rays, loss, CLOSEST_VALUES_CARRY)
         return loss
 
     def of(self, rendering: Rendering, mask: Bool[Tensor, "*rays"]) -> Float[Tensor, ""]:
@@ -158,12 +158,12 @@ class CrossEntropy:
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceRenderer(ABC):
-    """What renderers share whose hits have the exact gradient, and whose mask loss is IDR's.
+    """The base of renderers whose hits have the exact gradient, and whose mask loss is IDR's.
 
     Args:
-        least_slope: see `gradients.implicit`.
+        least_slope: see `gradients.attach_implicit_gradient`.
         mask_sharpness, mask_weight: of the mask loss; see `CrossEntropy`.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        sphere_radius: of the sphere about the origin that contains the shape.
     """
 
     least_slope: float
@@ -171,7 +171,7 @@ class SurfaceRenderer(ABC):
     mask_weight: float
     sphere_radius: float
 
-    capabilities: ClassVar[Capabilities] = OF_LENGTHS
+    capabilities: ClassVar[Capabilities] = DISTANCE_CAPABILITIES
 
     def __post_init__(self) -> None:
         check_positive("least_slope", self.least_slope, "1e-3 leaves all but the most grazing rays as they are")
@@ -186,7 +186,7 @@ class SurfaceRenderer(ABC):
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """Cross entropy of a sigmoid of the least field value (IDR, Sec. 3.3); see `CrossEntropy`."""
+        """IDR's cross entropy; see `CrossEntropy`."""
         return CrossEntropy(self.mask_sharpness, self.mask_weight).of(rendering, mask)
 
 
@@ -194,18 +194,18 @@ class SurfaceRenderer(ABC):
 class Occupancy:
     """DVR, Eqs. 14 and 15, summed and divided by the number of rays.
 
-    On the background, the hit or else a point drawn on the ray should be free (L_freespace); on the foreground without
-    a hit, a point of the ray should be occupied (L_occupancy). Points are drawn evenly, from PyTorch's own generator.
-    A point where the field is not finite has no part in the loss.
+    On a background ray, the hit, or a random point if there is no hit, should be free (L_freespace). On a foreground
+    ray without a hit, one point should be occupied (L_occupancy). Random points are uniform, from PyTorch's default
+    generator. Points where the field is not finite do not count.
 
     Args:
         width: length in scene units over which a distance turns from occupied to free; see `field.occupancy_logits`.
             Occupancy networks do not use it.
-        weight: of both terms; 1 leaves them as the paper's equations have them.
-        sphere_radius: of the sphere about the origin on whose chords points are drawn.
-        occupied_at: the point of L_occupancy. "random": drawn, as in Eq. 15. "depth": at the observed distance, where
-            the ray has one within the sphere, as the paper does with depth supervision; drawn on other rays. The
-            paper's third, the depth of the visual hull, is such a distance where a task gives it.
+        weight: of both terms; 1 as in the paper's equations.
+        sphere_radius: of the sphere about the origin on whose chords random points lie.
+        occupied_at: the point of L_occupancy. "random": a random point, as in Eq. 15. "depth": at the observed
+            distance, if the ray has one within the sphere, as in the paper's depth supervision; random on other rays.
+            For the paper's third choice, the depth of the visual hull, a task passes that as the observed distance.
     """
 
     width: float
@@ -217,25 +217,25 @@ class Occupancy:
         check_positive("width", self.width, "0.02 suits distances in the unit sphere")
         check_at_least("weight", self.weight, 0, "1 keeps the paper's equations")
         check_positive("sphere_radius", self.sphere_radius, "shapes lie in the unit sphere, radius 1")
-        check_choice("occupied_at", self.occupied_at, PLACES)
+        check_choice("occupied_at", self.occupied_at, OCCUPANCY_POINTS)
 
     def __call__(
-        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: Observed
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
     ) -> Float[Tensor, ""]:
         return self.of(field, rays, rendering, observed)
 
-    def of(self, field: Field, rays: Rays, rendering: Rendering, observed: Observed) -> Float[Tensor, ""]:
+    def of(self, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation) -> Float[Tensor, ""]:
         """The loss of a rendering of the field along the rays."""
-        flat, hit, wanted = rays.flat(), rendering.hit.flatten(), observed.mask.flatten()
-        entry, leave, meets = (part.detach() for part in sphere_span(flat, self.sphere_radius))
-        place = entry + torch.rand_like(entry) * (leave - entry)
+        flat, hit, foreground = rays.flat(), rendering.hit.flatten(), observed.mask.flatten()
+        entry, leave, intersects = (tensor.detach() for tensor in sphere_span(flat, self.sphere_radius))
+        distance = entry + torch.rand_like(entry) * (leave - entry)
         if self.occupied_at == DEPTH and observed.distance is not None:
-            given = observed.distance.detach().flatten()
-            place = torch.where(wanted & (given >= entry) & (given <= leave), given, place)
-        distance = torch.where(hit, rendering.distance.detach().flatten(), place)
-        judged = meets & ~(wanted & hit)
-        values = field(flat[judged].at(distance[judged]))
+            depth = observed.distance.detach().flatten()
+            distance = torch.where(foreground & (depth >= entry) & (depth <= leave), depth, distance)
+        distance = torch.where(hit, rendering.distance.detach().flatten(), distance)
+        compared = intersects & ~(foreground & hit)
+        values = field(flat[compared].at(distance[compared]))
         finite = values.isfinite()
         logits = occupancy_logits(field, values[finite], width=self.width)
-        total = softplus(torch.where(wanted[judged][finite], -logits, logits)).sum()
-        return self.weight * total / max(wanted.numel(), 1)
+        total = softplus(torch.where(foreground[compared][finite], -logits, logits)).sum()
+        return self.weight * total / max(foreground.numel(), 1)

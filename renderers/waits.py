@@ -1,4 +1,4 @@
-"""Fewer waits of the host for a device: marches keep rays that have ended, and counts are read late."""
+"""Fewer waits of the host for a device: marches keep finished rays for some steps, and counts are read late."""
 
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -8,23 +8,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-# After so many steps a march leaves out the rays that have ended, by type of device. It asks for values of fewer points
-# then, and must know how many rays are left: on a CPU that costs nothing, any other is waited for.
-STEPS = {"cpu": 1}
-SELDOM = 8  # of devices that are not named above
+# Steps between two removals of finished rays from a march, by type of device. A removal saves field evaluations, but
+# needs the number of rays that are left: on a CPU that costs nothing, for any other device the host waits.
+COMPACTION_INTERVALS = {"cpu": 1}
+DEFAULT_COMPACTION_INTERVAL = 8
 
 _active: ContextVar[Tensor | None] = ContextVar("active", default=None)
 
 
-def steps_between(device: torch.device) -> int:
-    """After how many steps a march leaves out the rays that have ended; what it finds does not depend on it."""
-    return STEPS.get(device.type, SELDOM)
+def compaction_interval(device: torch.device) -> int:
+    """The number of steps between two removals of finished rays. It affects speed only, not the rendering."""
+    return COMPACTION_INTERVALS.get(device.type, DEFAULT_COMPACTION_INTERVAL)
 
 
-def values_where(
+def evaluate_masked(
     active: Bool[Tensor, " n"], values: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"]
 ) -> Float[Tensor, " n"]:
-    """The values at n points, of which those that are not `active` are thrown away; a Meter counts these apart."""
+    """The values at n points. Those of inactive points are thrown away; a Meter counts them separately."""
     token = _active.set(active)
     try:
         return values(points)
@@ -32,27 +32,27 @@ def values_where(
         _active.reset(token)
 
 
-def active_among(points: int) -> Bool[Tensor, " n"] | None:
-    """Which of so many points are asked for within `values_where`; None where all are."""
+def active_mask(points: int) -> Bool[Tensor, " n"] | None:
+    """The mask of `evaluate_masked`, if it is running and has this number of points; None if all points are active."""
     active = _active.get()
     return active if active is not None and len(active) == points else None
 
 
-class Late:
-    """A number of a dataclass, 0 at first, that a device may still be counting: who reads it waits, `add` does not."""
+class LazyCount:
+    """A number of a dataclass that a device may still be counting: reading waits for the device, `add` does not."""
 
     def __set_name__(self, owner: type, name: str) -> None:
-        self.place = f"_{name}"
+        self.attribute = f"_{name}"
 
     def __get__(self, counts: Any, owner: type) -> int:
         if counts is None:
             return 0  # the default of the dataclass
-        number = int(vars(counts)[self.place])
-        vars(counts)[self.place] = number
+        number = int(vars(counts)[self.attribute])
+        vars(counts)[self.attribute] = number
         return number
 
-    def __set__(self, counts: Any, number: "int | Late") -> None:
-        vars(counts)[self.place] = 0 if isinstance(number, Late) else number  # the default, within `dataclasses.field`
+    def __set__(self, counts: Any, number: "int | LazyCount") -> None:
+        vars(counts)[self.attribute] = 0 if isinstance(number, LazyCount) else number  # a LazyCount is the default
 
     @staticmethod
     def add(counts: Any, name: str, number: int | Tensor) -> None:

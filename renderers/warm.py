@@ -1,14 +1,13 @@
-"""A rendering of the same rays as in the last iteration of an optimisation, begun where that one ended.
+"""Renders the same rays as in the last iteration of an optimisation, starting from where that rendering ended.
 
-How far the field's values have moved is measured at the last hits, where they are asked for anyway, and at one place on
-each of some rays. A ray on whose path the field was larger than twice that movement is as free as before. A hit is
-solved again from its last place, by the Newton step that its gradient needs. All other rays are marched, from where
-their path came close to a surface if it is free up to there.
+The movement of the field's values is measured at the last hits, where a rendering evaluates them anyway, and at one
+point on each of some rays. If the field was larger than twice that movement along a ray's whole path, the ray is still
+free. A hit is solved again from its last distance, by the Newton step that its gradient needs. All other rays are
+marched again, from where their path came close to a surface if it is free up to there, else from their start.
 
-None of this is a proof, since the movement is measured at samples: what appears between them is seen when the ray is
-marched again. An audit marches one ray in a hundred from its beginning, whatever is known of it, and another one the
-next time. Where the two answers differ too often, all rays are. A miss keeps its closest sample until it is marched
-again.
+This is no proof, since the movement is measured at samples: a surface that appears between them is found when the ray
+is marched again. An audit marches one ray in a hundred from its start, other rays in each rendering. If too many
+audited rays differ, all rays are marched again. A miss keeps its closest sample until it is marched again.
 """
 
 from dataclasses import dataclass, field
@@ -21,224 +20,218 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
-from renderers.packed_march import CLEAR, FURTHER, Reached
+from renderers.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable
 from renderers.rendering import Rendering
-from renderers.tracer import Solved, Tracer, evened
+from renderers.tracer import Crossings, Tracer, normalise_slope
 
-SAFETY = 2.0  # times the movement at the hits: elsewhere the field may have moved further
-STEEP = -0.1  # slope of the field along a ray: a hit on a flatter one is marched again, since it may leave at a touch
-USUAL = 0.9  # quantile of the movement of hits that were marched: it foretells how far values move the next time
-MARCHED = 0.5  # share of the rays that may be marched one by one: beyond it, coarse to fine is cheaper
-LOOKED = 29  # on one of so many rays the field's movement is measured; no part of a usual image's width
-GOLDEN = 0.618034  # of the way along a ray from one of these places to the next: they spread over all of it
-AUDITED, SHIFT = 100, 37  # of so many rays one is audited in a rendering; by how many it is another the next time
-SHARE = 0.025  # of the audited rays that may differ: a rendering in which more do, and more than one, is begun anew
-WRONG, ENOUGH = 0.02, 200  # the same of all renderings together, from so many audited rays on
-APART = 0.01  # scene units: crossings further apart differ
-MEASURED = 4  # of so many renderings one measures how steep the field is
-STEEPER = 0.05  # by what share that may have changed: where it has by more, all rays are begun anew; and slopes at hits
+MOVEMENT_SAFETY_FACTOR = 2.0  # elsewhere the field may have moved further than at the samples
+MAX_REUSABLE_SLOPE = -0.1  # hits with a flatter slope along the ray are marched again, since they may vanish suddenly
+MOVEMENT_QUANTILE = 0.9  # this quantile of the movements at hits predicts the movement in the next rendering
+MAX_REMARCHED_FRACTION = 0.5  # if more rays must be marched again, rendering everything coarse to fine is cheaper
+PROBE_STRIDE = 29  # every 29th ray measures the movement; a usual image's width is no multiple
+GOLDEN_RATIO_STEP = 0.618034  # fraction of the ray from one probed point to the next: they spread over the whole ray
+AUDIT_STRIDE, AUDIT_OFFSET = 100, 37  # every 100th ray is audited; the first one moves by 37 in each rendering
+MAX_MISMATCH_FRACTION = 0.025  # if more than one and more than this fraction of the audited rays differ, march all rays
+MAX_TOTAL_MISMATCH_FRACTION, MIN_AUDITED_RAYS = 0.02, 200  # if all renderings together exceed it, the cache is disabled
+MISMATCH_DISTANCE = 0.01  # scene units
+SLOPE_CHECK_INTERVAL = 4  # renderings
+MAX_SLOPE_CHANGE = 0.05  # relative change of the slope scale, or of the slopes at hits; beyond it all rays are marched
 
 
 @dataclass
-class Image:
-    """What is known of n rays in one row, all of it without a graph.
+class CachedRays:
+    """The last rendering of n rays in one row, without a graph.
 
     Args:
-        reached: where the march left them.
-        hit, distance, slope: whether they met a surface, where, and the slope of the field along the ray there.
-        moved: how far values have moved since the first rendering, in field units.
-        step: how far of that in the last rendering.
-        marched: what `moved` was when the ray was last marched from its beginning.
-        looked: the field's last values at the places of `_look`.
-        steepness: of the field; its values here are divided by it.
+        table: where the march left the rays.
+        hit, distance, slope: whether and where they hit, and the slope of the field along the ray there.
+        total_movement: how far values have moved since the first rendering, in field units.
+        last_movement: how far they moved in the last rendering.
+        movement_when_marched: `total_movement` when the ray was last marched from its start.
+        probe_values: the field's last values at the points of `_probe`.
+        slope_scale: the field's values here are divided by it.
         renderings: their number so far.
     """
 
-    reached: Reached
+    table: RayTable
     hit: Bool[Tensor, " n"]
     distance: Float[Tensor, " n"]
     slope: Float[Tensor, " n"]
-    moved: Float[Tensor, ""]
-    step: Float[Tensor, ""]
-    marched: Float[Tensor, " n"]
-    looked: Float[Tensor, " m"]
-    steepness: float
+    total_movement: Float[Tensor, ""]
+    last_movement: Float[Tensor, ""]
+    movement_when_marched: Float[Tensor, " n"]
+    probe_values: Float[Tensor, " m"]
+    slope_scale: float
     renderings: int = 0
 
-    @staticmethod
-    def of(reached: Reached, step: Float[Tensor, ""], looked: Float[Tensor, " m"], steepness: float) -> "Image":
-        """Rays that were just marched."""
-        zeros = torch.zeros_like(reached.distance)
-        return Image(reached, zeros.bool(), zeros, zeros, zeros.new_zeros(()), step, zeros.clone(), looked, steepness)
-
-    def note(self, solved: Solved) -> None:
-        """Notes where the rays meet a surface now."""
-        index, settled = solved.index, solved.settled
-        self.hit = torch.zeros_like(self.hit).index_put((index,), settled)
-        distance = torch.where(settled, solved.distance.detach(), self.distance[index])
+    def update_hits(self, solved: Crossings) -> None:
+        """Stores where the rays hit now."""
+        index, converged = solved.index, solved.converged
+        self.hit = torch.zeros_like(self.hit).index_put((index,), converged)
+        distance = torch.where(converged, solved.distance.detach(), self.distance[index])
         self.distance = self.distance.index_put((index,), distance)
-        self.slope = self.slope.index_put((index,), torch.where(settled, solved.slope, self.slope[index]))
+        self.slope = self.slope.index_put((index,), torch.where(converged, solved.slope, self.slope[index]))
         self.renderings += 1
 
-    def free(self, moved: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Which rays are as free as they were, after values have moved so far: as a whole, and up to their anchor.
+    def free(self, total_movement: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
+        """Which rays are still free after this movement: along the whole path, and up to their restart distance.
 
-        On a step that is at most `FURTHER` longer than the value, the field is at least half the smaller of the values
-        at its ends, less half of `FURTHER`. A hit is not compared with what it passed on its last descent, which its
-        Newton step sees.
+        On a step that is at most `MAX_OVERSTEP` longer than the value, the field is at least half the smaller of the
+        values at its ends, less half of `MAX_OVERSTEP`. A hit's final descent is not compared: its Newton step sees it.
         """
-        margin = 2 * (moved - self.marched) + FURTHER
-        passed, up_to_anchor = self.reached.passed, margin < CLEAR
-        passed = torch.where(self.hit, passed, torch.minimum(passed, self.reached.least))
-        return (margin < passed) & (up_to_anchor | ~self.hit), up_to_anchor
+        margin = 2 * (total_movement - self.movement_when_marched) + MAX_OVERSTEP
+        clearance, up_to_restart = self.table.path_clearance, margin < CLEARANCE_THRESHOLD
+        clearance = torch.where(self.hit, clearance, torch.minimum(clearance, self.table.least))
+        return (margin < clearance) & (up_to_restart | ~self.hit), up_to_restart
 
 
 @dataclass
 class Memory:
-    """What an optimisation remembers: its images of rays, as long as these exist, and what the audit found.
+    """The memory of an optimisation: the last rendering of each set of rays that still exists, and the audit's counts.
 
-    It serves one optimisation in one thread: in another thread nothing is remembered.
+    It serves one optimisation in one thread; in another thread nothing is cached.
     """
 
-    images: dict[int, tuple[ref[Tensor], ref[Tensor], Image]] = field(default_factory=dict)
+    cached: dict[int, tuple[ref[Tensor], ref[Tensor], CachedRays]] = field(default_factory=dict)
     audited: int = 0
     differed: int = 0
     thread: int = field(default_factory=get_ident)
 
     def forget(self) -> None:
-        """Begins another optimisation."""
-        self.images, self.audited, self.differed, self.thread = {}, 0, 0, get_ident()
+        """Prepares for another optimisation."""
+        self.cached, self.audited, self.differed, self.thread = {}, 0, 0, get_ident()
 
     @property
-    def unsound(self) -> bool:
-        """Whether the audit found so much that nothing is taken from memory any more."""
-        return self.audited >= ENOUGH and self.differed > WRONG * self.audited
+    def disabled(self) -> bool:
+        """Whether so many audited rays differed that the cache is not used any more."""
+        return self.audited >= MIN_AUDITED_RAYS and self.differed > MAX_TOTAL_MISMATCH_FRACTION * self.audited
 
-    def of(self, rays: Rays) -> Image | None:
-        """What is known of these very rays."""
-        kept = self.images.get(id(rays.origins))
-        same = kept and kept[0]() is rays.origins and kept[1]() is rays.directions
-        return kept[2] if kept and same else None
+    def lookup(self, rays: Rays) -> CachedRays | None:
+        """The last rendering of these very rays."""
+        entry = self.cached.get(id(rays.origins))
+        return entry[2] if entry and entry[0]() is rays.origins and entry[1]() is rays.directions else None
 
-    def keep(self, rays: Rays, image: Image) -> None:
-        """Remembers an image until its rays are gone."""
-        images, key = self.images, id(rays.origins)
-        images[key] = ref(rays.origins, lambda _: images.pop(key, None)), ref(rays.directions), image
+    def store(self, rays: Rays, cache: CachedRays) -> None:
+        """Caches a rendering until its rays are deleted."""
+        cached, key = self.cached, id(rays.origins)
+        cached[key] = ref(rays.origins, lambda _: cached.pop(key, None)), ref(rays.directions), cache
 
     def audit(self, rays: int, differing: int) -> bool:
-        """Notes how many audited rays have another answer; whether these are too many for one rendering."""
+        """Counts the audited rays and those that differ; returns whether too many differ in this rendering."""
         self.audited += rays
         self.differed += differing
-        return differing > max(1, SHARE * rays)
+        return differing > max(1, MAX_MISMATCH_FRACTION * rays)
 
     def notes(self) -> list[str]:
-        """What the audit found, for the record; nothing where there was none."""
+        """The result of the audit, for the record; empty without an audit."""
         if not self.audited:
             return []
-        found = f"renderer.warm: {self.differed} of {self.audited} audited rays had another answer when marched anew"
-        return [f"{found}: too many, so nothing was taken from memory any more" if self.unsound else found]
+        note = f"renderer.warm: {self.differed} of {self.audited} audited rays had another answer when marched anew"
+        return [f"{note}: too many, so nothing was taken from memory any more" if self.disabled else note]
 
 
-def warm_trace(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rendering:
-    """The rendering, from what the memory knows of the rays; and from now on it knows more.
+def render_warm(tracer: Tracer, memory: Memory, field: Field, rays: Rays) -> Rendering:
+    """The rendering, starting from the cached one of the same rays; stores the new one.
 
-    Rays with a gradient of their own move from one iteration to the next, and are not remembered. Others are known by
-    their tensors, which must not be changed in place.
+    Rays with a gradient move from one iteration to the next, and are not cached. Other rays are identified by their
+    tensors, which must not be changed in place.
     """
     if rays.origins.requires_grad or rays.directions.requires_grad or memory.thread != get_ident():
-        return tracer.render_anew(field, rays)
-    image, solved = memory.of(rays), None
-    if image is not None and not memory.unsound and _worthwhile(image):
-        solved = _continued(tracer, memory, field, rays.flat(), image)
-    if image is None or solved is None:
-        image, solved = _begun(tracer, field, rays, image)
-        memory.keep(rays, image)
+        return tracer.render_cold(field, rays)
+    cache, solved = memory.lookup(rays), None
+    if cache is not None and not memory.disabled and _is_worthwhile(cache):
+        solved = _solve_cached(tracer, memory, field, rays.flat(), cache)
+    if cache is None or solved is None:
+        cache, solved = _march_all(tracer, field, rays, cache)
+        memory.store(rays, cache)
     else:
-        image.note(solved)
-    return tracer.assembled(rays, image.reached, solved, steepness=image.steepness)
+        cache.update_hits(solved)
+    return tracer.to_rendering(rays, cache.table, solved, slope_scale=cache.slope_scale)
 
 
-def _as_steep(tracer: Tracer, field: Field, rays: Rays, image: Image) -> bool:
-    """Whether the field is as steep as where these rays were begun."""
-    return abs(tracer.steepness(field, rays) / image.steepness - 1) <= STEEPER
-
-
-def _begun(tracer: Tracer, field: Field, rays: Rays, before: Image | None) -> tuple[Image, Solved]:
-    """All rays marched coarse to fine; what was known of them tells how far values have moved."""
-    steepness = tracer.steepness(field, rays)
-    field = evened(field, steepness)
-    reached, solved = tracer.trace(field, rays)
-    step = reached.distance.new_zeros(())
-    if before is not None:
-        again = solved.some(solved.settled & before.hit[solved.index])
-        apart = ((again.distance.detach() - before.distance[again.index]) * again.slope).abs()
-        step = SAFETY * apart.quantile(USUAL) if len(apart) else step
+def _march_all(tracer: Tracer, field: Field, rays: Rays, previous: CachedRays | None) -> tuple[CachedRays, Crossings]:
+    """Marches all rays coarse to fine; hits of the previous rendering measure how far values have moved."""
+    slope_scale = tracer.slope_scale(field, rays)
+    field = normalise_slope(field, slope_scale)
+    table, solved = tracer.trace(field, rays)
+    movement = table.distance.new_zeros(())
+    if previous is not None:
+        again = solved.select(solved.converged & previous.hit[solved.index])
+        movements = ((again.distance.detach() - previous.distance[again.index]) * again.slope).abs()
+        movement = MOVEMENT_SAFETY_FACTOR * movements.quantile(MOVEMENT_QUANTILE) if len(movements) else movement
     with torch.no_grad():
-        image = Image.of(reached, step, _look(field, rays.flat(), reached), steepness)
-    image.note(solved)
-    return image, solved
+        zeros, probes = torch.zeros_like(table.distance), _probe(field, rays.flat(), table)
+    cache = CachedRays(
+        table, zeros.bool(), zeros, zeros, zeros.new_zeros(()), movement, zeros.clone(), probes, slope_scale
+    )
+    cache.update_hits(solved)
+    return cache, solved
 
 
-def _worthwhile(image: Image) -> bool:
-    """Whether enough rays will be free, if values move as far as the last time."""
-    free, _ = image.free(image.moved + image.step)
-    return bool((~free).sum() <= MARCHED * len(free))
+def _is_worthwhile(cache: CachedRays) -> bool:
+    """Whether enough rays will be free, if values move as far as in the last rendering."""
+    free, _ = cache.free(cache.total_movement + cache.last_movement)
+    return bool((~free).sum() <= MAX_REMARCHED_FRACTION * len(free))
 
 
-def _continued(tracer: Tracer, memory: Memory, field: Field, rays: Rays, image: Image) -> Solved | None:
-    """The crossings of flat rays; None where the field is steeper now, or so many must be marched that it does not pay.
+def _solve_cached(tracer: Tracer, memory: Memory, field: Field, rays: Rays, cache: CachedRays) -> Crossings | None:
+    """The crossings of flat rays; None if the field is steeper now, or too many rays differ or must be marched.
 
-    How steep the field is, is measured now and then, and where the slopes at hits have changed.
+    The slope scale is measured again at intervals, and if the slopes at hits have changed.
     """
-    reached, asked = image.reached, evened(field, image.steepness)
-    steady = (image.hit & (image.slope < STEEP)).nonzero().squeeze(-1)
-    solved = tracer.solve(asked, rays, reached, steady, image.distance[steady], furthest=CLEAR)
+    table, normalised = cache.table, normalise_slope(field, cache.slope_scale)
+    reusable = (cache.hit & (cache.slope < MAX_REUSABLE_SLOPE)).nonzero().squeeze(-1)
+    solved = tracer.solve(normalised, rays, table, reusable, cache.distance[reusable], max_step=CLEARANCE_THRESHOLD)
     with torch.no_grad():
-        change = torch.where(solved.settled, solved.slope / image.slope[steady], torch.nan).nanmedian()
-        changed = not bool((change - 1).abs() <= STEEPER)  # not a number where no root is settled
-        if (changed or image.renderings % MEASURED == 0) and not _as_steep(tracer, field, rays, image):
+        ratio = torch.where(solved.converged, solved.slope / cache.slope[reusable], torch.nan).nanmedian()
+        changed = not bool((ratio - 1).abs() <= MAX_SLOPE_CHANGE)  # the ratio is NaN if no root has converged
+        check = changed or cache.renderings % SLOPE_CHECK_INTERVAL == 0
+        if check and not abs(tracer.slope_scale(field, rays) / cache.slope_scale - 1) <= MAX_SLOPE_CHANGE:
             return None
-        looked = _look(asked, rays, reached)
-        image.step = SAFETY * torch.maximum(_largest(solved.begun), _largest(looked - image.looked))
-        image.moved, image.looked = image.moved + image.step, looked
-        free, up_to_anchor = image.free(image.moved)
-        certain = free & ~image.hit.index_put((steady,), ~solved.settled)
+        probe_values = _probe(normalised, rays, table)
+        movement = torch.maximum(_largest(solved.first_value), _largest(probe_values - cache.probe_values))
+        cache.last_movement, cache.probe_values = MOVEMENT_SAFETY_FACTOR * movement, probe_values
+        cache.total_movement = cache.total_movement + cache.last_movement
+        free, up_to_restart = cache.free(cache.total_movement)
+        certain = free & ~cache.hit.index_put((reusable,), ~solved.converged)
         audited = torch.zeros_like(free)
-        audited[SHIFT * image.renderings % AUDITED :: AUDITED] = True
+        audited[AUDIT_OFFSET * cache.renderings % AUDIT_STRIDE :: AUDIT_STRIDE] = True
         index = (~certain | audited).nonzero().squeeze(-1)
-        if len(index) > MARCHED * len(free):
+        if len(index) > MAX_REMARCHED_FRACTION * len(free):
             return None
-        anchored = up_to_anchor & ~audited
-        moving = reached.some(index).begun_again(rays[index], anchored[index], radius=tracer.sphere_radius)
-    found = tracer.resume(asked, rays[index], moving).among(index)
+        resumes = up_to_restart & ~audited
+        marching = table.select(index).restarted(rays[index], resumes[index], radius=tracer.sphere_radius)
+    marched = tracer.resume(normalised, rays[index], marching).reindexed(index)
     with torch.no_grad():
-        judged = certain & audited
-        if memory.audit(*torch.stack([judged.sum(), (judged & _differing(solved, found, judged)).sum()]).tolist()):
+        compared = certain & audited
+        differing = compared & _differing(solved, marched, compared)
+        if memory.audit(*torch.stack([compared.sum(), differing.sum()]).tolist()):
             return None
-        reached.put_back(index, moving)
-        image.marched[index] = torch.where(anchored[index], image.marched[index], image.moved)
-    return solved.some((certain & ~audited)[solved.index]).joined(found)
+        table.scatter(index, marching)
+        marched_at = cache.movement_when_marched
+        marched_at[index] = torch.where(resumes[index], marched_at[index], cache.total_movement)
+    return solved.select((certain & ~audited)[solved.index]).concatenate(marched)
 
 
-def _look(field: Field, rays: Rays, reached: Reached) -> Float[Tensor, " m"]:
-    """The field's values at one place on each of a share of the rays, the same places in each rendering; 0 for NaN."""
-    index = torch.arange(0, len(reached.entry), LOOKED, device=reached.entry.device)
-    entry, leave = reached.entry[index], reached.leave[index]
-    shares = torch.arange(1, len(index) + 1, dtype=entry.dtype, device=entry.device) * GOLDEN % 1
-    return field(rays[index].at(entry + shares * (leave - entry))).nan_to_num(0.0)
+def _probe(field: Field, rays: Rays, table: RayTable) -> Float[Tensor, " m"]:
+    """The field's values at one point on every `PROBE_STRIDE`th ray, the same points in each rendering; 0 for NaN."""
+    index = torch.arange(0, len(table.entry), PROBE_STRIDE, device=table.entry.device)
+    entry, leave = table.entry[index], table.leave[index]
+    fractions = torch.arange(1, len(index) + 1, dtype=entry.dtype, device=entry.device) * GOLDEN_RATIO_STEP % 1
+    return field(rays[index].at(entry + fractions * (leave - entry))).nan_to_num(0.0)
 
 
-def _differing(kept: Solved, found: Solved, like: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Which rays meet a surface elsewhere in one of the two."""
+def _differing(cached: Crossings, marched: Crossings, like: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Which rays hit in only one of the two renderings, or at another distance."""
 
-    def met(solved: Solved) -> Float[Tensor, " n"]:
-        nowhere = torch.full_like(like, torch.inf, dtype=solved.distance.dtype)
-        return nowhere.index_put((solved.index,), solved.distance.detach().where(solved.settled, torch.inf))
+    def distances(solved: Crossings) -> Float[Tensor, " n"]:
+        infinite = torch.full_like(like, torch.inf, dtype=solved.distance.dtype)
+        return infinite.index_put((solved.index,), solved.distance.detach().where(solved.converged, torch.inf))
 
-    said, seen = met(kept), met(found)
-    return ~((said == seen) | ((said - seen).abs() <= APART))
+    old, new = distances(cached), distances(marched)
+    return ~((old == new) | ((old - new).abs() <= MISMATCH_DISTANCE))
 
 
 def _largest(values: Float[Tensor, " n"]) -> Float[Tensor, ""]:
-    """The largest magnitude; 0 of nothing, infinite where one is not finite."""
+    """The largest magnitude; 0 without values, infinite if a value is not finite."""
     return values.abs().nan_to_num(torch.inf).amax() if values.numel() else values.new_zeros(())

@@ -9,7 +9,7 @@ import time
 import torch
 
 from renderers import IDR, Capabilities, Kind
-from renderers.boundary import PARTS
+from renderers.boundary import RENDERING_TENSORS
 from renderers.rendering import Rendering
 
 
@@ -52,7 +52,7 @@ def _not_a_number(rendering: Rendering) -> Rendering:
 
 
 def _short(rendering: Rendering) -> Rendering:
-    return Rendering(**{part: getattr(rendering, part)[:-1] for part in PARTS})
+    return Rendering(**{part: getattr(rendering, part)[:-1] for part in RENDERING_TENSORS})
 
 
 def _loop(rendering: Rendering) -> Rendering:

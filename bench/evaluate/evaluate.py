@@ -18,7 +18,7 @@ from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import Surface, View, sample_surface
 from datasets.shot import mask_iou
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals
 from renderers.fields.coloured import Coloured
@@ -225,7 +225,7 @@ def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
 def _rendered(field: Field, camera: Camera, inputs: RunInputs) -> tuple[Rendering, View]:
     """The run's rendering of a field, without gradients, and its hits as a View on the CPU."""
     with torch.no_grad():
-        rendering = rendered(inputs.renderer, field, camera.rays().to(inputs.device))
+        rendering = render_checked(inputs.renderer, field, camera.rays().to(inputs.device))
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()
@@ -241,7 +241,7 @@ def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[Vi
     rays = camera.rays().flat().to(inputs.device)
     some = rays[volume.ray]
     colours = colours_at(field, some.at(volume.distance), some.directions, inputs.device).to(inputs.device)
-    return view, volume.summed(colours, len(rays.origins)).view(*view.mask.shape, 3).cpu()
+    return view, volume.weighted_sum(colours, len(rays.origins)).view(*view.mask.shape, 3).cpu()
 
 
 def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:

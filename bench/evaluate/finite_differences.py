@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import evenly
+from renderers.bracket import equally_spaced
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Field, autograd_gradients
 from renderers.fields.mlp import Decoder
@@ -243,4 +243,4 @@ def _by_weight(
 def _clear(field: Field, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:
     """Whether the field stays above a margin along the ray up to the hit."""
     entry, _, _ = sphere_span(rays)
-    return (field(rays.at_each(evenly(entry, distance - CLEAR, BEFORE))) > margin).all(dim=1)
+    return (field(rays.at_each(equally_spaced(entry, distance - CLEAR, BEFORE))) > margin).all(dim=1)

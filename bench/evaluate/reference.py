@@ -13,7 +13,7 @@ from bench.progress import notice
 from bench.records.record import digest
 from bench.shape_prior import Prior, kept
 from renderers.camera import Camera
-from renderers.field import Field, autograd_normals, steepest
+from renderers.field import Field, autograd_normals, estimate_lipschitz
 from renderers.reference import trace
 
 VERSION = 1  # raise it when the reference changes
@@ -50,7 +50,7 @@ def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
 def make_reference(field: Field, camera: Camera) -> Reference:
     """Traces a float64 field through every pixel's centre."""
     rays = camera.double().rays()
-    lipschitz = steepest(field, radius=RADIUS)
+    lipschitz = estimate_lipschitz(field, radius=RADIUS)
     rendering = trace(field, rays, lipschitz=lipschitz, least_step=LEAST_STEP, radius=RADIUS)
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.machine.environment import MemoryPeak
 from bench.records.record import RunStatus
 from renderers.checks import check_positive
-from renderers.field import Bounds, Coarse, Field, Wrapper, coarse_of, noted_bounds
+from renderers.field import Bounds, Coarse, Field, Wrapper, coarse_version, counted_bounds
 
 MEMORY_INTERVAL = 0.05  # seconds between two checks of the memory
 LEAST = 32  # values that a call counts as at least: calls for fewer points take about as long
@@ -79,13 +79,13 @@ class Watched(Wrapper):
     @property
     def coarse(self) -> Coarse | None:
         """The coarse values of the field, until a limit is reached."""
-        offered = coarse_of(self.inner)
-        return offered and offered.noted(self._spend)
+        offered = coarse_version(self.inner)
+        return offered and offered.with_counter(self._spend)
 
     @property
     def bounds(self) -> Bounds | None:
         """The bounds that the field offers, until a limit is reached."""
-        return noted_bounds(self.inner, self._spend)
+        return counted_bounds(self.inner, self._spend)
 
     def _spend(self, values: int) -> None:
         """Counts values before they are evaluated.

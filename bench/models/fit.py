@@ -21,7 +21,7 @@ from bench.solve.latent_code import Terms
 from bench.solve.observed_view import slopes_at
 from bench.solve.optimise import FirstChecked, History, NotReached, OptimiserSettings, optimise
 from renderers.field import Counts, Field, Meter
-from renderers.rendering import Renderer, Unsupported, check_kind, fresh
+from renderers.rendering import Renderer, Unsupported, check_kind, with_empty_memory
 
 EIKONAL_POINTS = 512
 SPENT = ("seconds", "evaluations", "gradients", "flops")  # the costs in an Evidence
@@ -101,7 +101,7 @@ class Fitter:
     def _fitted(self, candidate: Candidate, model: Model, previous: Model | None) -> Fitted:
         """A candidate's model as a Fitted; it has failed where the renderer does not support its kind of field."""
         evidence = Evidence(candidate.name, model.size, candidate.flops)
-        fitted = Fitted(candidate, previous, model, fresh(self.observations.renderer), evidence)
+        fitted = Fitted(candidate, previous, model, with_empty_memory(self.observations.renderer), evidence)
         try:
             check_kind(self.observations.renderer, model.frozen())
         except Unsupported as error:

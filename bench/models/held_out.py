@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Field, autograd_normals
 from renderers.rendering import Renderer
@@ -82,7 +82,7 @@ class HeldOut:
     def error(self, field: Field, renderer: Renderer) -> HeldOutError:
         """The error of a field, rendered by a renderer."""
         missed = MISSED * self.footprint
-        rendering = rendered(renderer, field, self.rays)
+        rendering = render_checked(renderer, field, self.rays)
         compared = rendering.hit & self.observed
         apart = torch.zeros_like(self.distance)
         normals = autograd_normals(field, rendering.points[compared])

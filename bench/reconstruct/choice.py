@@ -24,7 +24,7 @@ from bench.setup.fields import PRIOR, parsed
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from datasets.shot import Shot
-from renderers.checks import BadInput, check_at_least, check_positive, check_share
+from renderers.checks import BadInput, check_at_least, check_fraction, check_positive
 from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
 
 FORMS = "task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
@@ -97,7 +97,7 @@ class AutoField:
         check_at_least("the length of task.auto.candidates", len(self.candidates), 1, "network_2x64, network_4x128")
         if len(set(self.candidates)) < len(self.candidates):
             raise ValueError(f"task.auto.candidates must name each once, not {', '.join(self.candidates)}")
-        check_share("task.auto.trial", self.trial, "0.1 shows which one follows the photographs better")
+        check_fraction("task.auto.trial", self.trial, "0.1 shows which one follows the photographs better")
         check_at_least("task.auto.patience", self.patience, 1, "2 looks past one that is no better")
 
     def choose(

@@ -9,12 +9,12 @@ from torch import Tensor
 from bench.reconstruct.pixels import Pixels
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error, slopes_at
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.field import Field, Kind, Meter
 from renderers.fields.coloured import Coloured
-from renderers.rendering import Observed, Renderer, Volume
+from renderers.rendering import RayObservation, Renderer, Volume
 from renderers.silhouette import SilhouetteLoss
 
 ANYWHERE = 512  # points of the cube at which a distance's gradient is measured
@@ -64,7 +64,7 @@ class Losses:
             metered: the same, counted.
             pixels: that are compared; for `colour_gradient` in groups of four, see `Stack.drawn`.
         """
-        rendering = rendered(renderer, metered, pixels.rays)
+        rendering = render_checked(renderer, metered, pixels.rays)
         inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
         points, rays = rendering.points[inside], len(inside)
         slopes = slopes_at(metered, points)
@@ -90,7 +90,7 @@ class Losses:
             error = depth_error(self.depth_loss, found, given, at_one)
             terms["depth"] = self.depth * error.sum() / rays
         if self.silhouette_weight and pixels.mask is not None:
-            observed = Observed(pixels.mask, pixels.guide)
+            observed = RayObservation(pixels.mask, pixels.guide)
             loss = self.silhouette(renderer, metered, pixels.rays, rendering, observed)
             terms["silhouette"] = self.silhouette_weight * loss
         if self.smoothness:
@@ -112,7 +112,7 @@ def _summed_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -
     """The colours that rays see in a volume in front of black: the weighted sums of its samples'."""
     some = rays[volume.ray]
     points = some.at(volume.distance)
-    return volume.summed(shape.colours(points, slopes_at(field, points), some.directions), len(rays.origins))
+    return volume.weighted_sum(shape.colours(points, slopes_at(field, points), some.directions), len(rays.origins))
 
 
 def _between_neighbours(difference: Float[Tensor, "n 3"], inside: Bool[Tensor, " n"]) -> Float[Tensor, ""]:

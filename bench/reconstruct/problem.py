@@ -19,7 +19,7 @@ from bench.reconstruct.pixels import Pixels, Stack
 from bench.reconstruct.subject import Subject
 from bench.solve.latent_code import Terms
 from datasets.scene import View
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Camera
 from renderers.field import Counts, Meter
 from renderers.fields.coloured import Coloured, ColouredDistance, ColouredGrid, ColouredOccupancy
@@ -110,7 +110,7 @@ class ReconstructionProblem:
         """The mean difference of the three colours of each pixel, black outside of the shape and of masks."""
         shape = self.field()
         with torch.no_grad():
-            rendering = rendered(at_iteration(self.renderer, self.iterations), shape, pixels.rays)
+            rendering = render_checked(at_iteration(self.renderer, self.iterations), shape, pixels.rays)
         true = pixels.colours if pixels.mask is None else pixels.colours * pixels.mask[:, None]
         found = torch.zeros_like(true)
         at, towards = rendering.points[rendering.hit], pixels.rays.directions[rendering.hit]

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from bench.evaluate.evaluate import OWN
 from bench.setup.inputs import RunInputs
 from datasets.scene import Surface, View
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.field import Field
 
 NEIGHBOURS = 0.05  # scene units: farthest apart that two points of the surface are compared
@@ -70,11 +70,11 @@ def early_weight(field: Field, views: Sequence[View], inputs: RunInputs) -> dict
             continue
         rays = view.camera.rays()[view.mask].to(inputs.device)
         surface = view.camera.distance(view.depth)[view.mask].to(inputs.device)
-        volume = rendered(inputs.renderer, field, rays).volume
+        volume = render_checked(inputs.renderer, field, rays).volume
         if volume is None:
             return {}
         early = (volume.distance < surface[volume.ray] - EARLY).to(surface)
-        both = volume.summed(torch.stack([early, torch.ones_like(early)], dim=-1), len(surface))
+        both = volume.weighted_sum(torch.stack([early, torch.ones_like(early)], dim=-1), len(surface))
         opaque = both[:, 1] > LEAST_WEIGHT
         shares.append((both[opaque, 0] / both[opaque, 1]).cpu())
     known = torch.cat(shares) if shares else torch.zeros(0)

@@ -9,7 +9,7 @@ from math import ceil, isnan, log, radians, sin
 from typing import Any
 
 from datasets.views import ViewSampler
-from renderers.checks import check_positive, check_share
+from renderers.checks import check_fraction, check_positive
 
 AUTO = "auto"
 Node = Mapping[str, Any]  # of the renderer
@@ -32,7 +32,7 @@ class AutoSettings:
 
     def __post_init__(self) -> None:
         check_positive("auto.grazing", self.grazing, "DIST, A.1, takes 10")
-        check_share("auto.spurious", self.spurious, "0.01 is one hit in a hundred")
+        check_fraction("auto.spurious", self.spurious, "0.01 is one hit in a hundred")
         check_positive(
             "auto.area_over_perimeter", self.area_over_perimeter, "a disc of radius 0.5 has 0.25, a plane 0.08"
         )

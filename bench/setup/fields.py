@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from bench.setup.auto import AUTO
 from bench.tables import nearest
-from renderers.checks import check_at_least, check_choice, check_share
+from renderers.checks import check_at_least, check_choice, check_fraction
 
 PRIOR = "prior"
 PARTS = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
@@ -67,7 +67,7 @@ class FitSettings:
     def __post_init__(self) -> None:
         for name in ("iterations", "warm_points"):
             check_at_least(f"models.fit.{name}", getattr(self, name), 1, "conf/scale has values that work")
-        check_share("models.fit.fewest_rays", self.fewest_rays, "1 always takes all rays")
+        check_fraction("models.fit.fewest_rays", self.fewest_rays, "1 always takes all rays")
         check_at_least("models.fit.warm_iterations", self.warm_iterations, 0, "0 switches the warm start off")
         check_at_least("models.fit.eikonal_weight", self.eikonal_weight, 0, "0 switches the term off")
 
@@ -88,7 +88,8 @@ class GrowthSettings:
     budget: float
 
     def __post_init__(self) -> None:
-        check_share("models.growth.trial", self.trial, "1/40 shows whether a candidate is better than the one before")
+        remedy = "1/40 shows whether a candidate is better than the one before"
+        check_fraction("models.growth.trial", self.trial, remedy)
         check_at_least("models.growth.patience", self.patience, 1, "5 finds a grid behind small networks")
         check_at_least("models.growth.budget", self.budget, 1, "2 is twice the fit of the final candidate")
 

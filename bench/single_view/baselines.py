@@ -23,7 +23,7 @@ from bench.solve.optimise import OptimiserSettings
 from datasets.mesh import Mesh, extract
 from datasets.scene import Dataset, Split, Truth, sample_surface
 from datasets.shot import Shot
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.checks import check_at_least
 from renderers.field import Field
 from renderers.fields.grid import Grid
@@ -101,6 +101,6 @@ class MaskSearch:
         )
 
         def wrong(field: Field) -> float:
-            return float((rendered(inputs.renderer, field, given.rays).hit != given.mask).float().mean())
+            return float((render_checked(inputs.renderer, field, given.rays).hit != given.mask).float().mean())
 
         return CodeProblem(inputs.prior, self.code, given.compare, none, none.numel(), inputs.device, judged=wrong)

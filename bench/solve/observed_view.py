@@ -10,11 +10,11 @@ from torch import Tensor
 
 from bench.solve.latent_code import Terms
 from datasets.scene import View
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Field, Meter
 from renderers.fields.coloured import TexturedShape
-from renderers.rendering import Observed, Renderer, Rendering, at_iteration
+from renderers.rendering import RayObservation, Renderer, Rendering, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 DEPTH, POINTS = "depth", "points"  # what a depth loss takes the mean of; see `bench.tasks.completion.Completion`
@@ -114,7 +114,7 @@ class GivenView:
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted terms of DIST, Eq. 5."""
         renderer = at_iteration(self.renderer, iteration)
-        rendering = rendered(renderer, field, self.rays)
+        rendering = render_checked(renderer, field, self.rays)
         compared = self.observed & rendering.hit
         found = rendering.distance * self.depth_of_distance
         error = depth_error(self.settings.depth_loss, found, self.depth, self.depth_of_distance)
@@ -127,7 +127,9 @@ class GivenView:
             terms["colour"] = self.colour_weight * self._colour_error(field, rendering)
         if self.mask is not None:
             given = torch.where(self.observed, self.depth / self.depth_of_distance, torch.nan)
-            silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, Observed(self.mask, given))
+            silhouette = self.settings.silhouette(
+                renderer, field, self.rays, rendering, RayObservation(self.mask, given)
+            )
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
 

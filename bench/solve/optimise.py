@@ -17,7 +17,7 @@ from bench.machine.environment import MemoryPeak, Stopwatch
 from bench.records.record import RunStatus
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
-from renderers.hits import Hits, kept_hits, without_distance
+from renderers.hits import Hits, collect_hits, missing_distance_message
 
 DIVERGED = 100.0  # a loss above this many times its first value, or `least_reference`, has diverged
 KEPT = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
@@ -111,7 +111,7 @@ class FirstChecked:
         if self.checked:
             return self.problem.loss(iteration)
         self.checked = True
-        with kept_hits() as kept:
+        with collect_hits() as kept:
             terms = self.problem.loss(iteration)
         if not bool(terms["total"].isnan()):  # else `optimise` ends before the step, and says why
             for hits in kept:
@@ -159,7 +159,7 @@ def optimise(
     for iteration in range(settings.iterations):
         optimiser.forget_gradients()
         rate, terms = settings.rate(iteration), dict[str, Tensor]()
-        with kept_hits() as kept:
+        with collect_hits() as kept:
             history.seconds["forward"] += _timed(device, lambda i=iteration, t=terms: t.update(problem.loss(i)))
         numbers = dict(zip(terms, _read([*terms.values()]), strict=True))
         if isnan(numbers["total"]):
@@ -223,7 +223,7 @@ def _not_a_number(numbers: dict[str, float], iteration: int, kept: Sequence[Hits
     """Why the loss of an iteration is not a number: its terms that are not, and the hits without a distance."""
     wrong = [name for name, number in numbers.items() if isnan(number) and name != "total"]
     what = f"the {' and the '.join(wrong)} term{'s are' if len(wrong) > 1 else ' is'}" if wrong else "the loss is"
-    endless = without_distance(kept)
+    endless = missing_distance_message(kept)
     return f"{what} not a number at iteration {iteration}{f': {endless}' if endless else ''}"
 
 

@@ -8,7 +8,7 @@ from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Criteria, Failure, Outcome
 from datasets.stress.scenes import StressCase
 from datasets.stress.solids import FirstHit, incidence_cosines
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.rendering import Renderer
@@ -41,7 +41,7 @@ def judge_rendering(exam: StressCase, renderer: Renderer, conditions: Conditions
     camera = exam.camera
     true, footprint = truth(exam)
     meter = Meter(conditions.limits.watch(exam.field, conditions.device))
-    rendering = rendered(renderer, meter, camera.rays().to(conditions.device))
+    rendering = render_checked(renderer, meter, camera.rays().to(conditions.device))
     hit = rendering.hit.flatten().cpu()
     distance = rendering.distance.flatten().cpu().double()
     finite = distance.isfinite()
@@ -98,7 +98,7 @@ def judge_gradient(exam: StressCase, renderer: Renderer, conditions: Conditions)
     device = conditions.device
     free = exam.parameters.float().to(device).requires_grad_()
     watched = conditions.limits.watch(exam.solid(free).field, device)
-    found = rendered(renderer, watched, exam.camera.rays().to(device))
+    found = render_checked(renderer, watched, exam.camera.rays().to(device))
     exact = exam.parameters.double().requires_grad_()
     first = exam.solid(exact).trace(exam.camera.double().rays().flat())
     compared = first.hit & found.hit.flatten().cpu()

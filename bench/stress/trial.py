@@ -10,7 +10,7 @@ from bench.machine.limits import Limits
 from bench.shape_prior import Prior
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.optimise import OptimiserSettings
-from renderers.checks import check_at_least, check_choice, check_positive, check_share
+from renderers.checks import check_at_least, check_choice, check_fraction, check_positive
 from renderers.silhouette import SilhouetteLoss
 
 
@@ -34,7 +34,7 @@ class Criteria:
 
     def __post_init__(self) -> None:
         for name in ("hits", "cosine"):
-            check_share(f"task.criteria.{name}", getattr(self, name), "0.99 is strict")
+            check_fraction(f"task.criteria.{name}", getattr(self, name), "0.99 is strict")
         for name in ("false_hits", "scale", "surface_error"):
             check_positive(f"task.criteria.{name}", getattr(self, name), "0.01 is strict")
 

@@ -26,12 +26,22 @@ from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import slopes_over
 from bench.solve.solve import check_field_gradient, counted
 from datasets.scene import View
-from renderers.boundary import rendered, silhouette_loss
+from renderers.boundary import render_checked, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Bounds, Coarse, Counts, Field, Meter, Wrapper, autograd_normals, bounds_of, coarse_of
-from renderers.rendering import Observed, Renderer, Rendering, check_kind
-from renderers.waits import active_among
+from renderers.field import (
+    Bounds,
+    Coarse,
+    Counts,
+    Field,
+    Meter,
+    Wrapper,
+    autograd_normals,
+    coarse_version,
+    field_bounds,
+)
+from renderers.rendering import RayObservation, Renderer, Rendering, check_kind
+from renderers.waits import active_mask
 
 BASE = "base"  # the run's renderer, where others are timed beside it
 SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
@@ -275,7 +285,7 @@ class Signs(Wrapper):
         return self._noted(self.inner(points))
 
     def _noted(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        flat, active = values.flatten(), active_among(values.numel())
+        flat, active = values.flatten(), active_mask(values.numel())
         asked = flat if active is None else flat[active]
         self.asked += asked.numel()
         self.negative += int((asked < 0).sum())
@@ -283,12 +293,12 @@ class Signs(Wrapper):
 
     @property
     def coarse(self) -> Coarse | None:
-        offered = coarse_of(self.inner)
+        offered = coarse_version(self.inner)
         return offered and replace(offered, values=lambda points: self._noted(offered.values(points)))
 
     @property
     def bounds(self) -> Bounds | None:
-        return bounds_of(self.inner)
+        return field_bounds(self.inner)
 
 
 class Workbench:
@@ -319,7 +329,7 @@ class Workbench:
 
         def work(field: Field) -> float:
             with torch.no_grad():
-                self.rendering = rendered(self.renderer, field, self.rays)
+                self.rendering = render_checked(self.renderer, field, self.rays)
             return 0.0
 
         self._clock(self.forward, f"a rendering{of}", work, repeats)
@@ -352,7 +362,7 @@ class Workbench:
         """The share of the values of a rendering that are negative."""
         signs = Signs(self.decoder.at(self.code.detach()))
         with torch.no_grad():
-            rendered(self.renderer, signs, self.rays)
+            render_checked(self.renderer, signs, self.rays)
         return signs.negative / max(signs.asked, 1)
 
     def views(self, normal_width: float | None = None) -> tuple[View, View]:
@@ -377,8 +387,8 @@ class Workbench:
 
     def _step(self, field: Field, rays: Rays, mask: Tensor) -> float:
         """Takes one step and gives the seconds of its backward pass."""
-        rendering = rendered(self.renderer, field, rays)
-        silhouette = silhouette_loss(self.renderer, field, rays, rendering, Observed(mask.to(self.device)))
+        rendering = render_checked(self.renderer, field, rays)
+        silhouette = silhouette_loss(self.renderer, field, rays, rendering, RayObservation(mask.to(self.device)))
         loss = rendering.distance[rendering.hit].sum() + silhouette
         stopwatch = Stopwatch(self.device)
         torch.autograd.grad(loss, self.code, allow_unused=True)

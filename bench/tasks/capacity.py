@@ -19,7 +19,7 @@ from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.solve import COSTS, check_field_gradient, note_result
-from renderers.checks import check_at_least, check_choice, check_positive, check_share
+from renderers.checks import check_at_least, check_choice, check_fraction, check_positive
 from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss
 
@@ -79,7 +79,7 @@ class Capacity:
 
     def __post_init__(self) -> None:
         check_at_least("task.rounds", self.rounds, 1, "1 fits once, 4 as long as the error falls")
-        check_share("task.frugal_rays", self.frugal_rays, "0.125 begins with an eighth of the rays")
+        check_fraction("task.frugal_rays", self.frugal_rays, "0.125 begins with an eighth of the rays")
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "silhouette_weight"):
             check_positive(f"task.{name}", getattr(self, name), "10 works for both")

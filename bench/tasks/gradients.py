@@ -14,10 +14,10 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import slopes_at
 from bench.solve.solve import check_field_gradient
-from renderers.boundary import check_gradients, rendered
+from renderers.boundary import check_gradients, render_checked
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Counts, Field, Meter, steepest
+from renderers.field import Counts, Field, Meter, estimate_lipschitz
 from renderers.fields.mlp import Decoder
 from renderers.rendering import Blurred, Renderer, Rendering, check_kind
 
@@ -157,7 +157,7 @@ class Gradients:
         """The metrics across the silhouette, at the renderer's own blur, and at those of `blurs` if it has one."""
         if not pixels.numel():
             return {"silhouette.pixels": 0}
-        lipschitz = steepest(subject.decoder.at(subject.code), radius=RADIUS)
+        lipschitz = estimate_lipschitz(subject.decoder.at(subject.code), radius=RADIUS)
 
         def field_at(shift: Tensor) -> Field:
             return subject.decoder.at(subject.code + shift)
@@ -210,7 +210,7 @@ class Subject:
         weights = [] if paint is None else [paint.weights.clone().requires_grad_(True)]
         rays = self.camera.moved(twist).rays().flat()
         field = Meter(self.decoder.at(code), self.counts)
-        rendering = rendered(self.renderer, field, rays[pixels])
+        rendering = render_checked(self.renderer, field, rays[pixels])
         rows = rendering.hit.nonzero().squeeze(-1)
         seen = rendering.distance[rows, None]
         if paint is not None:
@@ -237,7 +237,8 @@ class Subject:
         towards these are the derivatives of all rays at once.
         """
         shift = torch.zeros(directions.shape[1], dtype=torch.float64, requires_grad=True)
-        rendering = rendered(self.renderer, Meter(self.decoder.at(self.code + directions @ shift), self.counts), rays)
+        field = Meter(self.decoder.at(self.code + directions @ shift), self.counts)
+        rendering = render_checked(self.renderer, field, rays)
         weights = torch.ones(rays.shape, dtype=torch.float64, requires_grad=True)
         (gradient,) = torch.autograd.grad(_seen(rendering, rays), shift, weights, create_graph=True)
         columns = [torch.autograd.grad(part, weights, retain_graph=True)[0] for part in gradient]
@@ -270,7 +271,7 @@ def _seen(rendering: Rendering, rays: Rays) -> Float[Tensor, "*rays"]:
     if rendering.volume is None:
         return torch.where(rendering.hit, rendering.distance, leave)
     beside = rendering.volume.distance - leave.flatten()[rendering.volume.ray]
-    return leave + rendering.volume.summed(beside, leave.numel()).view(leave.shape)
+    return leave + rendering.volume.weighted_sum(beside, leave.numel()).view(leave.shape)
 
 
 def _compared(

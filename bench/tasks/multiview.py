@@ -23,11 +23,11 @@ from bench.solve.solve import COSTS, check_field_gradient, defined, descend, sol
 from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Field
-from renderers.rendering import Observed, Renderer, at_iteration, check_kind
+from renderers.rendering import RayObservation, Renderer, at_iteration, check_kind
 from renderers.silhouette import SilhouetteLoss
 
 MIN_SCALE, MAX_SHIFT = 0.8, 0.2
@@ -276,9 +276,9 @@ class GivenPhotographs:
         colours = self.blurred(iteration)
         views, neighbours = map(list, zip(*pairs, strict=True))
         rays = self._together(views)
-        mine = rendered(renderer, field, rays)
+        mine = render_checked(renderer, field, rays)
         with torch.no_grad():
-            others = rendered(renderer, field, self._together(neighbours))
+            others = render_checked(renderer, field, self._together(neighbours))
         differences = []
         for k, (view, other) in enumerate(pairs):
             pixels, depth = self.cameras[other].project(mine.points[k])
@@ -292,7 +292,7 @@ class GivenPhotographs:
             raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
         terms = {"photometric": self.settings.photometric_weight * together.mean()}
         if self.masks is not None:
-            given = Observed(self.masks[views], torch.full_like(mine.distance, torch.nan))
+            given = RayObservation(self.masks[views], torch.full_like(mine.distance, torch.nan))
             off = self.settings.silhouette(renderer, field, rays, mine, given)
             terms["silhouette"] = self.settings.silhouette_weight * off
         return terms

@@ -18,12 +18,12 @@ from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings
 from bench.solve.solve import solve
 from datasets.scene import Scene, View, see
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
-from renderers.rendering import Observed, Renderer, Unsupported, at_iteration
+from renderers.rendering import RayObservation, Renderer, Unsupported, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 DEFINITIONS = {
@@ -225,12 +225,12 @@ class PoseProblem:
         start, step = self.starts.turn(iteration)
         camera = self.cameras[start].with_object_moved(self.parameters[start])
         renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.known, self.counts)
-        rendering = rendered(renderer, metered, rays)
+        rendering = render_checked(renderer, metered, rays)
         compared = self.observed & rendering.hit
         count = compared.sum().clamp_min(1)
         found, at_one = camera.depth(rendering.distance), camera.depth(torch.ones_like(self.depth))
         error = depth_error(self.settings.depth_loss, found, self.depth, at_one)
-        given = Observed(self.observed, torch.where(self.observed, self.depth / at_one, torch.nan))
+        given = RayObservation(self.observed, torch.where(self.observed, self.depth / at_one, torch.nan))
         silhouette = self.settings.silhouette(renderer, metered, rays, rendering, given)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,

@@ -21,7 +21,7 @@ from datasets.stress.distortions import CUBE_HALF_SIDE, MIN_RESOLVED_THICKNESS
 from datasets.stress.solids import ReferenceTruth, Solid, Truth, box, half_space, rod, sphere_solid
 from datasets.views import ViewSampler
 from renderers.camera import Camera
-from renderers.field import Field, Kind, points_in_sphere, steepest
+from renderers.field import Field, Kind, estimate_lipschitz, points_in_sphere
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder
 from renderers.fields.network import Published
@@ -208,7 +208,7 @@ def network_scene(name: str, network: Decoder | Published, codes: Float[Tensor, 
             exact = deepcopy(changed).cpu().double().at(code.cpu().double())
             if (exact(points_in_sphere(INSIDE_TEST_POINTS)) < 0).double().mean() > MIN_INSIDE_FRACTION:
                 break
-        truth = ReferenceTruth(exact, steepest(exact, radius=1.0), MIN_RESOLVED_THICKNESS)
+        truth = ReferenceTruth(exact, estimate_lipschitz(exact, radius=1.0), MIN_RESOLVED_THICKNESS)
         return StressCase(changed.at(code), _draw_camera(draw, resolution, elevation=NETWORK_ELEVATION_DEGREES), truth)
 
     return scene

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Bounds, Field, Flops, Kind, OccupancyField, Wrapper, bounds_of
+from renderers.field import Bounds, Field, Flops, Kind, OccupancyField, Wrapper, field_bounds
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import BoundDecoder, Decoder, flops_of, passes
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
@@ -272,7 +272,7 @@ class TexturedShape(Wrapper):
     @property
     def bounds(self) -> Bounds | None:
         """See `BoundDecoder`."""
-        return bounds_of(self.inner)
+        return field_bounds(self.inner)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return self.inner(points)

@@ -18,7 +18,7 @@ from torch.nn.functional import linear
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from renderers.checks import check_at_least
-from renderers.field import Coarse, Flops, Kind, Values, points_in_sphere
+from renderers.field import Coarse, Flops, Kind, PointFunction, points_in_sphere
 from renderers.fields.affine import segment_bounds
 from renderers.kernels.decoder import CompiledDecoder, compiled
 
@@ -192,7 +192,7 @@ class BoundDecoder:
             self._copies[state] = compiled(self.hidden, self.last, self.skip)
         return self._copies[state]
 
-    def _quickest(self, points: Tensor) -> Values:
+    def _quickest(self, points: Tensor) -> PointFunction:
         """The values without a graph: by compiled code where there is some, which is that of one thread."""
         suits = points.dtype == torch.float32 and points.device.type == "cpu" and torch.get_num_threads() == 1
         network = self._compiled() if suits else None
@@ -290,7 +290,7 @@ def _affine(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return features @ weight.T + bias[..., None, :]
 
 
-def coarse_values(hidden: tuple[Layer, ...], last: Layer, skip: int, exact: Values) -> Coarse | None:
+def coarse_values(hidden: tuple[Layer, ...], last: Layer, skip: int, exact: PointFunction) -> Coarse | None:
     """The coarse values of a network at one code, whose hidden layers are `hidden`; None where they do not pay.
 
     Args:
@@ -395,7 +395,7 @@ def _product(weight: Tensor, bias: Tensor | None, activation: str) -> Callable[[
     return lambda features: linear(features, weight, bias).relu_()
 
 
-def _largest_error(network: _Network, exact: Values, like: Tensor) -> float:
+def _largest_error(network: _Network, exact: PointFunction, like: Tensor) -> float:
     """The largest error of the network's values near its surface, at points that are the same each time."""
     points = points_in_sphere(DRAWN, like)
     values = network(points)

@@ -10,16 +10,16 @@ from torch import Tensor, nn
 
 from renderers.checks import BadInput
 from renderers.field import (
-    STEEPEST_MARGIN,
+    LIPSCHITZ_SAFETY_FACTOR,
     Bounds,
     Coarse,
     Field,
     Flops,
     Kind,
-    Values,
+    PointFunction,
     autograd_gradients,
-    bounds_of,
-    coarse_of,
+    coarse_version,
+    field_bounds,
     points_in_sphere,
 )
 from renderers.fields.analytic import Shape
@@ -98,14 +98,14 @@ class Meaning:
 
 
 def measured(
-    field: Values,
+    field: PointFunction,
     like: Tensor,
     *,
     kind: Kind | None = None,
     sign: float | None = None,
     level: float = 0.0,
     scale: float = 1.0,
-    others: Sequence[Values] = (),
+    others: Sequence[PointFunction] = (),
 ) -> Meaning:
     """What the values of a field mean, by values and slopes in the unit sphere.
 
@@ -137,11 +137,11 @@ def measured(
     kind, divisor = kind or facts.kind, 1.0
     if kind is Kind.BOUND:
         steepest = max(others, key=lambda other: float(_slopes(other, points[:FEW]).max()), default=field)
-        divisor = STEEPEST_MARGIN * max(facts.steepest, scale * float(_slopes(steepest, points[:AROUND]).max()))
+        divisor = LIPSCHITZ_SAFETY_FACTOR * max(facts.steepest, scale * float(_slopes(steepest, points[:AROUND]).max()))
     return Meaning(facts, kind, divisor, sign * scale / divisor)
 
 
-def _slopes(field: Values, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def _slopes(field: PointFunction, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     return torch.linalg.vector_norm(autograd_gradients(field, points), dim=-1).double()
 
 
@@ -258,7 +258,7 @@ class Adjusted:
     @property
     def coarse(self) -> Coarse | None:
         """The inner field's coarse values; a tanh has no slope above 1."""
-        offered = coarse_of(self.inner)
+        offered = coarse_version(self.inner)
         if offered is None:
             return None
         return Coarse(lambda points: self._of(offered.values(points)), float(self.factor.abs()) * offered.error)
@@ -266,7 +266,7 @@ class Adjusted:
     @property
     def bounds(self) -> Bounds | None:
         """The inner field's bounds; the values rise or fall with its own."""
-        offered = bounds_of(self.inner)
+        offered = field_bounds(self.inner)
         if offered is None:
             return None
 

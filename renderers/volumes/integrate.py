@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import BLOCK
+from renderers.bracket import SAMPLES_PER_BATCH
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, carries_gradient
-from renderers.gradients import fixed_samples
-from renderers.rendering import OF_LENGTHS, Capabilities, Deferred, Rendering, Status, Volume, assemble
+from renderers.gradients import reevaluate_with_graph
+from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Deferred, Rendering, Status, Volume, assemble
 
 FAINT = 1e-5  # share of a ray's light below which a sample has no part: neither a weight nor a gradient
 SEEN = 0.5  # opacity above which a ray has hit
@@ -106,7 +106,7 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
     flat = rays.flat()
     entry, leave, meets = (part.detach() for part in sphere_span(flat, radius))
     queried = meets.nonzero().squeeze(-1)
-    blocks = queried.split(BLOCK // 256)  # bounds the memory of a search; one block, even of no rays
+    blocks = queried.split(SAMPLES_PER_BATCH // 256)  # bounds the memory of a search; one block, even of no rays
     parts = [_Part.of(field, flat, some, (entry, leave), search, passing) for some in blocks]
     whole = _Part(*(torch.cat(part) for part in zip(*(vars(part).values() for part in parts), strict=True)))
     inside = whole.begun_inside
@@ -116,7 +116,7 @@ def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *,
     status = status.masked_fill(inside, Status.STARTED_INSIDE).masked_fill(hit, Status.HIT)
     ended = torch.where(hit, whole.mean, torch.where(inside, entry[queried], leave[queried]))
     least = whole.least.index_put(
-        (seen,), fixed_samples(field, flat[queried[seen]], whole.least_distance[seen], whole.least[seen])
+        (seen,), reevaluate_with_graph(field, flat[queried[seen]], whole.least_distance[seen], whole.least[seen])
     )
     rendering = assemble(
         rays,
@@ -146,7 +146,7 @@ class VolumeRenderer(ABC):
     mask_weight: float
     sphere_radius: float
 
-    capabilities: ClassVar[Capabilities] = OF_LENGTHS
+    capabilities: ClassVar[Capabilities] = DISTANCE_CAPABILITIES
 
     def __post_init__(self) -> None:
         check_at_least("sharpening", self.sharpening, 0, "as many as the optimisation has, or 0 to be sharp at once")

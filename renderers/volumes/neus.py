@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from renderers.bracket import evenly
+from renderers.bracket import equally_spaced
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
@@ -72,7 +72,7 @@ class NeuS(VolumeRenderer):
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
         """Equally spaced samples, then rounds of more, where the last found most weight."""
-        found = Samples.of(field, rays, evenly(entry, leave, self.samples))
+        found = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
         for number in range(self.rounds):
             importance = weights(_falling(found.value, self.round_sharpness * 2**number))
             more = by_importance(found.distance, importance, self.round_samples)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from renderers.bracket import evenly, first_crossing, refine
+from renderers.bracket import equally_spaced, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, occupancy_logits
@@ -88,14 +88,17 @@ class UNISURF(VolumeRenderer):
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
         """Equally spaced samples in front of the surface and in the interval; on the whole ray where there is none."""
-        coarse = Samples.of(field, rays, evenly(entry, leave, self.search_samples))
+        coarse = Samples.of(field, rays, equally_spaced(entry, leave, self.search_samples))
         found, bracket = first_crossing(coarse.distance, coarse.value)
         hit = found.nonzero().squeeze(-1)
-        root, _ = refine(field, rays[hit], bracket.some(hit), method="secant", steps=self.search_steps)
+        root, _ = refine(field, rays[hit], bracket.select(hit), method="secant", steps=self.search_steps)
         near = torch.maximum(root - self.interval, entry[hit])
         far = torch.minimum(root + self.interval, leave[hit])
-        distance = evenly(entry, leave, self.free_samples + self.samples)
-        about = [evenly(entry[hit], near, self.free_samples + 1)[:, :-1], evenly(near, far, self.samples)]
+        distance = equally_spaced(entry, leave, self.free_samples + self.samples)
+        about = [
+            equally_spaced(entry[hit], near, self.free_samples + 1)[:, :-1],
+            equally_spaced(near, far, self.samples),
+        ]
         samples = Samples.of(field, rays, distance.index_put((hit,), torch.cat(about, dim=1)))
         crowded = torch.zeros_like(found).index_put((hit,), near <= entry[hit])  # all free samples are at one place
         samples.value[:, : self.free_samples].masked_fill_(crowded[:, None], self.sphere_radius)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import evenly
+from renderers.bracket import equally_spaced
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind
@@ -88,7 +88,7 @@ class VolSDF(VolumeRenderer):
         Gives the places of these rays, their samples, and the width of each ray for which they bound the error.
         """
         index = torch.arange(len(entry), device=entry.device)
-        found = Samples.of(field, rays, evenly(entry, leave, self.samples))
+        found = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
         square = _spacing(found.distance).square().sum(dim=1, keepdim=True)
         width = (square / (4 * log(1 + self.error))).sqrt().clamp_min(self.width)  # Lemma 2, of any spacing
         for number in range(self.rounds + 1):

@@ -18,7 +18,7 @@ from bench.setup.inputs import RunInputs
 from datasets.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
-from renderers.field import STEEPEST_MARGIN, Field, Kind, autograd_gradients, points_in_sphere
+from renderers.field import LIPSCHITZ_SAFETY_FACTOR, Field, Kind, autograd_gradients, points_in_sphere
 from renderers.fields.network import from_module, measured
 from tests.composing import composed
 from tests.documentation import code_of
@@ -147,7 +147,7 @@ def test_a_bound_that_is_scaled_has_no_slope_above_1_at_the_steepest_code():
     steep = lambda points: 3 * octahedron(points)  # noqa: E731
     bound = measured(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
     slopes = autograd_gradients(lambda points: bound.factor * steep(points), POINTS).norm(dim=-1)
-    assert bound.lipschitz == 1.0 and slopes.max() == pytest.approx(1 / STEEPEST_MARGIN, rel=1e-3)
+    assert bound.lipschitz == 1.0 and slopes.max() == pytest.approx(1 / LIPSCHITZ_SAFETY_FACTOR, rel=1e-3)
 
 
 def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):

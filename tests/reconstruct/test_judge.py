@@ -17,7 +17,7 @@ from bench.records.record import RunStatus
 from datasets.photographs import around
 from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import sphere_span
 from tests.reconstruct.test_losses import Ball, ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, icosphere, run_of
@@ -141,9 +141,9 @@ def test_a_volume_is_judged_by_the_weighted_sum_that_it_shows(inputs):
     volume = replace(inputs, renderer=load("renderer", "neus", sharpness=10.0))
     view, image = render_image(plain, camera_of(24), volume)
     with torch.no_grad():
-        rendering = rendered(volume.renderer, plain, camera_of(24).rays())
+        rendering = render_checked(volume.renderer, plain, camera_of(24).rays())
     assert rendering.volume is not None
-    opacity = rendering.volume.summed(torch.ones_like(rendering.volume.weight), 24 * 24).view(24, 24)
+    opacity = rendering.volume.weighted_sum(torch.ones_like(rendering.volume.weight), 24 * 24).view(24, 24)
     assert bool((view.mask & (opacity < 0.9)).any())
     torch.testing.assert_close(image, (opacity / 2)[..., None].expand(-1, -1, 3))
 

@@ -7,18 +7,18 @@ import pytest
 import torch
 
 from bench.config import load
-from renderers.boundary import BrokenContract, check_gradients, rendered, silhouette_loss
+from renderers.boundary import BrokenContract, check_gradients, render_checked, silhouette_loss
 from renderers.camera import Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, sphere
-from renderers.rendering import Capabilities, Observed, Rendering
+from renderers.rendering import Capabilities, RayObservation, Rendering
 from tests.looped import each
 from tests.tiny import camera_of
 
 IDR = load("renderer", "idr")
 RAYS = camera_of(8).rays()
 MASK = torch.ones(RAYS.shape, dtype=torch.bool)
-SEEN = Observed(MASK)
+SEEN = RayObservation(MASK)
 BOTH = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
 NEITHER = Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=False)
 
@@ -93,22 +93,22 @@ BROKEN = {
 def test_a_broken_rendering_is_an_error_that_names_renderer_and_part(name):
     change, message = BROKEN[name]
     with pytest.raises(BrokenContract, match=message):
-        rendered(Mine(change), ball(), RAYS)
+        render_checked(Mine(change), ball(), RAYS)
 
 
 def test_a_graph_where_none_is_wanted_is_an_error():
     bound = Mine(lambda r: changed(r, residual=r.residual.clone().requires_grad_()))
-    rendered(bound, ball(), RAYS)
+    render_checked(bound, ball(), RAYS)
     with torch.no_grad(), pytest.raises(BrokenContract, match="residual has a graph although gradients are off"):
-        rendered(bound, ball(), RAYS)
+        render_checked(bound, ball(), RAYS)
 
 
 def test_a_claimed_gradient_that_is_missing_is_an_error():
     towards_field = r"Mine\.capabilities\.field_gradient is True, but the distances of its hits carry no gradient "
     with pytest.raises(BrokenContract, match=towards_field + "towards the field's parameters: attach one .*=False"):
-        rendered(Mine(detached), ball(free=True), RAYS)
+        render_checked(Mine(detached), ball(free=True), RAYS)
     with pytest.raises(BrokenContract, match=r"ray_gradient is True, .* towards the rays"):
-        rendered(Mine(detached), ball(), free_rays())
+        render_checked(Mine(detached), ball(), free_rays())
 
 
 @each(
@@ -122,7 +122,7 @@ def test_a_claimed_gradient_that_is_missing_is_an_error():
     ],
 )
 def test_no_gradient_is_missed_where_there_need_be_none(renderer, field, rays):
-    rendered(renderer, field, rays)
+    render_checked(renderer, field, rays)
 
 
 LOSSES = {
@@ -151,7 +151,7 @@ class Told(Mine):
 
 
 def test_given_distances_reach_a_renderer_that_takes_them_and_no_other():
-    field, seen = ball(), Observed(MASK, torch.full(RAYS.shape, 1.25))
+    field, seen = ball(), RayObservation(MASK, torch.full(RAYS.shape, 1.25))
     rendering = IDR.render(field, RAYS)
     assert silhouette_loss(Told(), field, RAYS, rendering, seen) == 1.25
     assert silhouette_loss(Mine(), field, RAYS, rendering, seen) == IDR.silhouette_loss(field, RAYS, rendering, MASK)
@@ -185,7 +185,7 @@ def test_a_valid_rendering_passes_unchanged_without_evaluations(name, free):
     expected = renderer.render(plain, RAYS)
     expected_loss = renderer.silhouette_loss(plain, RAYS, expected, MASK)
     torch.manual_seed(0)
-    found = rendered(renderer, checked, RAYS)
+    found = render_checked(renderer, checked, RAYS)
     found_loss = silhouette_loss(renderer, checked, RAYS, found, SEEN)
     assert torch.equal(found.distance, expected.distance) and found_loss.item() == expected_loss.item()
     if free:

@@ -53,7 +53,7 @@ def test_rays_with_a_crossing_have_a_bracket():
     values = torch.stack([vector((1, -1)), vector((1, 1)), vector((2, -3))])
     found, ends = first_crossing(vector((0, 1)).expand(3, 2), values)
     assert found.tolist() == [True, False, True]
-    assert ends.some(found.nonzero().squeeze(-1)).far_value.tolist() == [-1, -3]
+    assert ends.select(found.nonzero().squeeze(-1)).far_value.tolist() == [-1, -3]
     none, empty = first_crossing(torch.zeros(0, 4), torch.zeros(0, 4))
     assert (none.shape, empty.near.shape) == ((0,), (0,))
 

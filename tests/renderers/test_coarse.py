@@ -9,14 +9,14 @@ from torch import Tensor
 
 from bench.config import load
 from bench.machine.limits import LimitReached, Limits
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Rays
-from renderers.field import Coarse, Counts, Field, Kind, Meter, Wrapper, coarse_of, points_in_sphere
+from renderers.field import Coarse, Counts, Field, Kind, Meter, Wrapper, coarse_version, points_in_sphere
 from renderers.fields import mlp
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
 from renderers.packed_march import Stop
-from renderers.rendering import Status, at_iteration, fresh
+from renderers.rendering import Status, at_iteration, with_empty_memory
 from tests.looped import each
 from tests.renderers.test_newton import camera, exact
 
@@ -89,8 +89,8 @@ def test_a_surface_is_found_where_it_is_whatever_coarse_values_say(shape, off, n
 def test_the_field_is_asked_near_the_surface_alone(shape, name, share, more, gradients):
     meter, plain = Meter(Offering(shape, ERRORS["rippled"])), Meter(shape)
     with torch.no_grad():
-        hits = int(rendered(MARCHES[name], meter, camera().rays()).hit.sum())
-        rendered(MARCHES[name], plain, camera().rays())
+        hits = int(render_checked(MARCHES[name], meter, camera().rays()).hit.sum())
+        render_checked(MARCHES[name], plain, camera().rays())
     assert meter.counts.value < share * plain.counts.value
     assert min(gradients, 1) * hits <= meter.counts.gradient <= gradients * hits
     assert meter.counts.coarse <= more * plain.counts.value
@@ -125,11 +125,11 @@ def test_whether_a_camera_is_inside_the_shape_is_told_by_the_field(x, status, na
 
 def test_an_optimisation_begins_warm_on_coarse_values_too():
     """A ball grows, and another one enters from the side."""
-    rays, warm = camera().rays(), fresh(NEWTON)
+    rays, warm = camera().rays(), with_empty_memory(NEWTON)
     for iteration in range(8):
         shape = sphere(0.4 + 0.004 * iteration) | sphere(0.2, (1.3 - 0.06 * iteration, 0.0, 0.0))
         meter = Meter(Offering(shape, ERRORS["rippled"]))
-        found = rendered(at_iteration(warm, iteration), meter, rays)
+        found = render_checked(at_iteration(warm, iteration), meter, rays)
         cold = load("renderer", "newton", warm=False).render(shape, rays)
         apart = (found.distance - cold.distance).abs() > 5e-4
         assert int(((found.hit != cold.hit) | (cold.hit & apart)).sum()) <= 2
@@ -149,11 +149,11 @@ def test_rays_in_doubt_go_on_along_a_bound_without_a_search():
 @each("shape", SHAPES.values())
 def test_what_rays_have_passed_is_no_more_than_the_field_is_there(shape):
     rays = camera().rays()
-    reached, _ = NEWTON.tracer.trace(Offering(shape, ERRORS["too large"]), rays)
-    left = reached.stopped(Stop.LEFT) & reached.least.isfinite()
-    there = shape(rays.flat().at(reached.least_distance))
+    table, _ = NEWTON.tracer.trace(Offering(shape, ERRORS["too large"]), rays)
+    left = table.stopped(Stop.LEFT) & table.least.isfinite()
+    there = shape(rays.flat().at(table.least_distance))
     assert left.sum() > 1000
-    assert (reached.passed <= there + 1e-5)[left].all()
+    assert (table.path_clearance <= there + 1e-5)[left].all()
 
 
 @each("behind", [2.0, 0.06])
@@ -175,7 +175,7 @@ def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind, name):
 def test_coarse_values_are_counted_apart_and_limited():
     offering = Offering(sphere(0.5), ERRORS["rippled"])
     meter = Meter(Limits(values=200, memory=4).watch(offering, torch.device("cpu")))
-    values = coarse_of(meter)
+    values = coarse_version(meter)
     assert values is not None and values.error == ERROR
     values.values(torch.zeros(5, 20, 3))
     assert meter.counts == Counts(coarse=100)
@@ -207,7 +207,7 @@ def points(count: int = 3000) -> Tensor:
 def test_the_coarse_values_of_a_network_are_off_by_no_more_than_they_say(wide):
     for code in (torch.zeros(8), torch.randn(8, generator=torch.Generator().manual_seed(2))):
         field = wide.at(code)
-        coarse = coarse_of(field)
+        coarse = coarse_version(field)
         assert coarse is not None
         off = (coarse.values(points()) - field(points())).abs()
         assert 0 < off.max() <= coarse.error

@@ -8,10 +8,10 @@ import torch
 from bench.config import load
 from bench.tables import choice, names
 from renderers.camera import Camera
-from renderers.field import Field, Moved, steepest
+from renderers.field import Field, Moved, estimate_lipschitz
 from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
-from renderers.rendering import Observed
+from renderers.rendering import RayObservation
 from renderers.silhouette import DEPTH, CrossEntropy, Hinge, Occupancy, Own
 
 CPU = torch.device("cpu")
@@ -62,7 +62,7 @@ def test_a_renderer_stays_on_the_device_of_its_rays(elsewhere, name):
         rays.origins.requires_grad_()
         rendering = renderer.render(field, rays)
         depth = torch.where(rendering.hit, rendering.distance.detach(), torch.nan)
-        observed = Observed(rendering.hit.logical_not(), depth)
+        observed = RayObservation(rendering.hit.logical_not(), depth)
         losses = [silhouette(renderer, field, rays, rendering, observed) for silhouette in SILHOUETTES]
         total = torch.stack([rendering.distance.sum(), *losses]).sum()
         assert total.device == CPU
@@ -72,5 +72,5 @@ def test_a_renderer_stays_on_the_device_of_its_rays(elsewhere, name):
 
 
 def test_the_steepest_gradient_is_measured_where_the_field_is(elsewhere):
-    found = steepest(fields()["grid"], radius=1.0, samples=64, like=torch.zeros(1, device=CPU))
+    found = estimate_lipschitz(fields()["grid"], radius=1.0, samples=64, like=torch.zeros(1, device=CPU))
     assert 0.9 < found < 1.5

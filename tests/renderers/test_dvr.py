@@ -14,8 +14,8 @@ from renderers.camera import Rays
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import Decoder
-from renderers.gradients import implicit
-from renderers.rendering import Observed, Rendering, Status, at_iteration
+from renderers.gradients import attach_implicit_gradient
+from renderers.rendering import RayObservation, Rendering, Status, at_iteration
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, along_z, vector
@@ -108,7 +108,7 @@ def test_the_implicit_gradient_is_exact(name, case: Case):
 def test_a_flat_slope_keeps_its_sign(slope, used):
     offset = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
     field = Shape(lambda p: slope * p[..., 2] + offset, Kind.LEVEL, None)
-    distance = implicit(field, along_z(0.0), vector((2.0,)), least_slope=1e-3)
+    distance = attach_implicit_gradient(field, along_z(0.0), vector((2.0,)), least_slope=1e-3)
     (found,) = torch.autograd.grad(distance.sum(), offset)
     assert found.item() == pytest.approx(-1 / used)  # Eq. 8
 
@@ -145,7 +145,7 @@ def test_a_shrunk_sphere_grows_where_depth_is_given(name):
     loss = Own() if name == "own" else load("silhouette", name, width=width, weight=1.0, occupied_at="depth")
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     rendering = dvr.render(sphere(radius), rays)
-    seen = Observed(torch.tensor([True]), torch.tensor([1.9], dtype=torch.float64))
+    seen = RayObservation(torch.tensor([True]), torch.tensor([1.9], dtype=torch.float64))
     found = loss(dvr, sphere(radius), rays, rendering, seen)
     value = ((0.6**2 + 0.1**2) ** 0.5 - 0.5) / width  # at z = -0.1
     assert found.item() == pytest.approx(log1p(exp(value)), rel=1e-9)
@@ -157,8 +157,8 @@ def observed_losses(renderer, mask: list[bool], given: list[float], *heights: fl
     """The loss of each ray with the distances that are given, and of the mask alone, from the same draws."""
     rays, found = along_z(*heights), []
     rendering = renderer.render(sphere(0.5), rays)
-    seen = Observed(torch.tensor(mask), torch.tensor(given, dtype=torch.float64))
-    for observed in (seen, Observed(seen.mask)):
+    seen = RayObservation(torch.tensor(mask), torch.tensor(given, dtype=torch.float64))
+    for observed in (seen, RayObservation(seen.mask)):
         torch.manual_seed(0)
         found.append(renderer.observed_loss(sphere(0.5), rays, rendering, observed).item())
     torch.manual_seed(0)

@@ -10,7 +10,7 @@ from bench.config import load
 from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.fields.analytic import Shape, sphere
-from renderers.gradients import approximate
+from renderers.gradients import attach_approximate_gradient
 from renderers.rendering import Status
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, Case, ground, vector
@@ -140,7 +140,7 @@ def test_the_approximate_rule_counts_the_samples_that_exist():
     rays = Rays(vector((0, 2, 0)).expand(3, 3), vector((0, -1, 0)).expand(3, 3))
     at = vector((1.5, 1.0, 1.75, 9, 9, 9)).view(3, 2)
     values = vector((0.5, 1.0, 0.25, torch.inf, torch.inf, torch.inf)).view(3, 2)
-    distance, first = approximate(
+    distance, first = attach_approximate_gradient(
         ground(offset), rays, vector((1.9, 1.8, 1.7)), alpha=1.5, sample_distance=at, sample_value=values
     )
     assert distance.tolist() == [1.9, 1.8, 1.7]

@@ -7,11 +7,11 @@ import torch
 
 from bench.config import load
 from bench.tables import names
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.checks import BrokenContract
 from renderers.field import Counts, Field, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
-from renderers.hits import MOST, Hits, kept_hits, without_distance
+from renderers.hits import MAX_CHECKED_HITS, Hits, collect_hits, missing_distance_message
 from renderers.rendering import Renderer, Rendering, at_iteration
 from tests.looped import each
 from tests.renderers.test_renderer_contract import stated
@@ -35,8 +35,8 @@ class Other(WrongHits):
 
 
 def hits_of(renderer: Renderer, field: Field, rays=RAYS) -> Hits:
-    with kept_hits() as kept, torch.no_grad():
-        rendered(renderer, field, rays)
+    with collect_hits() as kept, torch.no_grad():
+        render_checked(renderer, field, rays)
     (hits,) = kept
     return hits
 
@@ -137,9 +137,9 @@ def test_a_hit_without_a_finite_distance_breaks_the_contract(value):
 def test_a_field_without_finite_values_is_named():
     broken = Shape(lambda p: torch.where(p[..., 0] > 0, torch.nan, PLATE(p)))
     hits = replace(hits_of(WrongHits("endless"), PLATE), field=broken)
-    said = without_distance([hits])
+    said = missing_distance_message([hits])
     assert "the field has values that are not finite on" in said and "the renderer is at fault" not in said
-    assert without_distance([hits_of(load("renderer", "dist"), PLATE)]) == without_distance([]) == ""
+    assert missing_distance_message([hits_of(load("renderer", "dist"), PLATE)]) == missing_distance_message([]) == ""
 
 
 def test_a_miss_may_have_any_distance():
@@ -163,17 +163,17 @@ def test_a_check_evaluates_the_field_once_and_is_not_counted():
     asked.clear()
     hits.check()
     assert hits.off_surface() == ""
-    assert len(asked) == 1 and MOST / 2 < asked[0] <= MOST < hits.hit.sum()
+    assert len(asked) == 1 and MAX_CHECKED_HITS / 2 < asked[0] <= MAX_CHECKED_HITS < hits.hit.sum()
     assert counts.value == before
 
 
 def test_hits_are_kept_within_the_innermost_block_alone():
     renderer = load("renderer", "idr")
-    with kept_hits() as outer:
-        with kept_hits() as inner:
-            rendered(renderer, PLATE, RAYS)
-        rendered(renderer, PLATE, RAYS)
-        rendered(renderer, PLATE, RAYS)
-    rendered(renderer, PLATE, RAYS)
+    with collect_hits() as outer:
+        with collect_hits() as inner:
+            render_checked(renderer, PLATE, RAYS)
+        render_checked(renderer, PLATE, RAYS)
+        render_checked(renderer, PLATE, RAYS)
+    render_checked(renderer, PLATE, RAYS)
     assert (len(outer), len(inner)) == (2, 1)
     assert not any(part.requires_grad for part in (inner[0].distance, inner[0].residual))

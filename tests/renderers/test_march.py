@@ -10,7 +10,7 @@ from bench.config import load
 from renderers.camera import Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
-from renderers.march import Front, Stepping, march, march_coarse_to_fine, pyramid
+from renderers.march import RayFront, Stepping, march_coarse_to_fine, march_front, ray_pyramid
 from renderers.rendering import Status
 from tests.looped import each
 from tests.renderers.analytic_cases import beam, sphere_hits, vector
@@ -33,14 +33,14 @@ def sheet(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
     return Rays(origins, vector((0, 0, 1)).expand_as(origins), image=True)
 
 
-def trace(field: Shape, rays: Rays, stepping: Stepping, *, steps: int = 50, samples: int = 1) -> tuple[Front, int]:
+def trace(field: Shape, rays: Rays, stepping: Stepping, *, steps: int = 50, samples: int = 1) -> tuple[RayFront, int]:
     """The front, and how many values it cost; coarse to fine for an image."""
     meter = Meter(field)
     if rays.image:
         front = march_coarse_to_fine(meter, rays, stepping, steps=steps, radius=1.0, samples=samples)
     else:
-        front = Front.on_sphere(rays, radius=1.0, samples=samples)
-        march(meter, rays, front, stepping, steps)
+        front = RayFront.on_sphere(rays, radius=1.0, samples=samples)
+        march_front(meter, rays, front, stepping, steps)
     assert meter.counts.gradient == 0
     return front, meter.counts.value
 
@@ -126,7 +126,7 @@ def test_coarse_to_fine_fills_up_odd_sizes_and_takes_batches_of_images():
 
 
 def test_a_ray_continues_the_coarse_ray_that_covers_it():
-    for level, (columns, across) in zip(pyramid(sheet(7, 10, pitch=0.1)), [(5, 3), (10, 5)], strict=True):
+    for level, (columns, across) in zip(ray_pyramid(sheet(7, 10, pitch=0.1)), [(5, 3), (10, 5)], strict=True):
         for ray, parent in enumerate(level.parent.tolist()):
             assert parent == ray // columns // 2 * across + ray % columns // 2
 
@@ -157,14 +157,14 @@ def test_a_careful_split_keeps_the_outline_that_a_plain_one_loses():
 )
 def test_where_a_split_ray_goes_on(apart, careful, start):
     # The coarse ray stands at 2.0, and had its least value, 0.05, at 1.2. The unit sphere begins at 1.
-    front = Front.on_sphere(HEAD_ON, radius=1.0, samples=2)
-    front.distance, front.fresh = vector((2.0,)), torch.tensor([False])
+    front = RayFront.on_sphere(HEAD_ON, radius=1.0, samples=2)
+    front.distance, front.not_evaluated = vector((2.0,)), torch.tensor([False])
     front.sample_distance, front.sample_value = vector((1.2, 1.9))[None], vector((-0.05, 0.07))[None]
     rays = beam((apart, 0, -2), (0.8, 0, -2))
     child = front.split(torch.zeros(2, dtype=torch.long), HEAD_ON, rays, radius=1.0, careful=careful)
     assert child.distance[0].item() == start
     assert child.active.all()
-    assert not child.fresh.any()
+    assert not child.not_evaluated.any()
     # A ray far apart enters the sphere at 1.4 only.
     assert child.distance[1].item() == pytest.approx(1.4 if careful else 2.0)
 
@@ -268,9 +268,9 @@ def test_the_field_is_asked_for_the_kept_samples_again_and_no_more():
     assert meter.counts == Counts(value=5 + 1)
 
 
-def marched(field: Shape, rays: Rays, stepping: Stepping, steps: int = 50) -> Front:
-    front = Front.on_sphere(rays, radius=1.0, samples=1)
-    march(field, rays, front, stepping, steps)
+def marched(field: Shape, rays: Rays, stepping: Stepping, steps: int = 50) -> RayFront:
+    front = RayFront.on_sphere(rays, radius=1.0, samples=1)
+    march_front(field, rays, front, stepping, steps)
     return front
 
 
@@ -331,13 +331,13 @@ def test_relaxed_steps_are_fewer_and_find_the_same():
 def test_a_relaxed_step_towards_a_plane_touches_its_next_empty_sphere():
     """On a plane at 60 degrees the slope is -1/2: the steps become 4/3 of the value."""
     field, ray = plane((0.0, 1.0, 0.0), -0.5), Rays(vector((-1.4, 0.3, 0))[None], vector((3**0.5 / 2, -0.5, 0))[None])
-    front = Front.on_sphere(ray, radius=2.0, samples=1)
+    front = RayFront.on_sphere(ray, radius=2.0, samples=1)
     front.distance[:] = 0.0
     stepping = replace(PLAIN, step_back=True, relaxation=1.0)
     for steps in (1, 2):
         before = front.distance.clone()
         value = field(ray.at(before))
-        march(field, ray, front, stepping, 1)
+        march_front(field, ray, front, stepping, 1)
         assert (front.distance - before).item() == pytest.approx(value.item() * (1.0 if steps == 1 else 4 / 3))
 
 

@@ -11,9 +11,9 @@ from bench.config import load
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
-from renderers.packed_march import CLEAR, FURTHER, Reached, Stop, Stride, march
+from renderers.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable, Stop, Stride, march_table
 from renderers.rendering import Rendering, Status, closest_values
-from renderers.tracer import PAIRS
+from renderers.tracer import SLOPE_PAIR_COUNT
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, beam
 from tests.tiny import camera_of
@@ -97,7 +97,7 @@ def test_grazing_rays_are_found_by_the_dense_search():
     assert rendering.hit.all() and without.hit.all()
     assert rendering.distance.item() == pytest.approx(0.9, abs=1e-6)
     searched = 2 * NEWTON.search_samples + NEWTON.search_steps
-    assert meter.counts.value <= 2 * PAIRS + 6 + searched + NEWTON.newton_steps
+    assert meter.counts.value <= 2 * SLOPE_PAIR_COUNT + 6 + searched + NEWTON.newton_steps
 
 
 def test_what_hides_between_two_samples_is_found_beside_the_least():
@@ -117,7 +117,7 @@ def test_a_plate_between_two_samples_of_the_search_is_found_where_values_are_les
     spacing = 2 / (NEWTON.search_samples - 1)
     middle = -1 + 7.5 * spacing
     plate = Shape(lambda p: (p[..., 2] - middle).abs() - (0.5 - share) * spacing, Kind.DISTANCE, 1.0)
-    found, bracket = NEWTON.tracer._search(plate, rays, Reached.on_sphere(rays, 1.0), number)
+    found, bracket = NEWTON.tracer._search(plate, rays, RayTable.on_sphere(rays, 1.0), number)
     assert found.tolist() == [0]
     front = 2 + middle - (0.5 - share) * spacing
     assert bracket.near.item() < front < bracket.far.item() < front + spacing / 8
@@ -259,65 +259,65 @@ def test_images_of_rays_that_meet_in_a_point_lose_nothing_small():
 @by_shape
 def test_up_to_its_anchor_the_field_is_large(shape):
     rays = camera().rays()
-    reached, _ = NEWTON.tracer.trace(shape, rays)
-    assert ((reached.anchor >= reached.entry) & (reached.anchor <= reached.leave)).all()
-    assert (reached.anchor > reached.entry).sum() > 300
+    table, _ = NEWTON.tracer.trace(shape, rays)
+    assert ((table.restart_distance >= table.entry) & (table.restart_distance <= table.leave)).all()
+    assert (table.restart_distance > table.entry).sum() > 300
     shares = torch.linspace(0, 1, 100)
-    before = rays.flat().at_each(reached.entry[:, None] + shares * (reached.anchor - reached.entry)[:, None])
-    assert shape(before).min() > CLEAR - 0.01
+    before = rays.flat().at_each(table.entry[:, None] + shares * (table.restart_distance - table.entry)[:, None])
+    assert shape(before).min() > CLEARANCE_THRESHOLD - 0.01
 
 
 def test_a_root_lies_between_where_its_ray_begins_and_ends():
     rays = beam((0.0, 0.0, -2.0))
-    reached, guess = Reached.on_sphere(rays, 1.0), torch.tensor([2.0]).double()
-    for offset, place, settled in [(1.0005, 1.0, True), (-1.0005, None, False), (-0.9995, 2.9995, True)]:
+    table, guess = RayTable.on_sphere(rays, 1.0), torch.tensor([2.0]).double()
+    for offset, place, converged in [(1.0005, 1.0, True), (-1.0005, None, False), (-0.9995, 2.9995, True)]:
         wall = plane((0.0, 0.0, -1.0), offset)
         start = guess - (1.0 if offset > 0 else -0.9995)
-        solved = NEWTON.tracer.solve(wall, rays, reached, torch.tensor([0]), start)
-        assert solved.settled.item() == settled
+        solved = NEWTON.tracer.solve(wall, rays, table, torch.tensor([0]), start)
+        assert solved.converged.item() == converged
         assert place is None or solved.distance.item() == pytest.approx(place)
 
 
 def test_the_value_where_the_first_step_began_is_kept_where_all_roots_take_a_second():
     rays, guess = beam((0.0, 0.0, -2.0), (0.1, 0.0, -2.0)), torch.tensor([1.99, 1.992]).double()
-    reached = Reached.on_sphere(rays, 1.0)
-    solved = NEWTON.tracer.solve(plane((0.0, 0.0, -1.0), 0.0), rays, reached, torch.arange(2), guess)
-    assert solved.settled.all()
-    assert solved.begun.tolist() == pytest.approx([0.01, 0.008], abs=1e-6)
+    table = RayTable.on_sphere(rays, 1.0)
+    solved = NEWTON.tracer.solve(plane((0.0, 0.0, -1.0), 0.0), rays, table, torch.arange(2), guess)
+    assert solved.converged.all()
+    assert solved.first_value.tolist() == pytest.approx([0.01, 0.008], abs=1e-6)
 
 
-def marched(*values: float) -> Reached:
+def marched(*values: float) -> RayTable:
     """Where a ray is that begins in the sphere's centre and finds these values."""
     rays, left = beam((0.0, 0.0, 0.0)), iter(values)
-    reached, stride = Reached.on_sphere(rays, 1.0), NEWTON.tracer.stride()
-    march(lambda points: points.new_full(points.shape[:-1], next(left)), rays, reached, stride, len(values))
-    return reached
+    table, stride = RayTable.on_sphere(rays, 1.0), NEWTON.tracer.stride()
+    march_table(lambda points: points.new_full(points.shape[:-1], next(left)), rays, table, stride, len(values))
+    return table
 
 
-def advance(reached: Reached, value: float, stride: Stride) -> None:
+def advance(table: RayTable, value: float, stride: Stride) -> None:
     """Moves a ray that begins in the sphere's centre by one value."""
-    march(lambda points: points.new_full((1,), value), beam((0.0, 0.0, 0.0)), reached, stride, 1)
+    march_table(lambda points: points.new_full((1,), value), beam((0.0, 0.0, 0.0)), table, stride, 1)
 
 
 def test_a_ray_leaves_where_its_empty_sphere_reaches_the_end_and_nothing_is_unseen_before():
-    assert marched(0.4, 0.58).stopped(Stop.ON_THE_WAY).item()  # at 0.4025: its step would lead behind the end
+    assert marched(0.4, 0.58).stopped(Stop.MARCHING).item()  # at 0.4025: its step would lead behind the end
     assert marched(0.4, 0.6).stopped(Stop.LEFT).item()
     taken_back = marched(0.4, 0.58, 0.005)
-    assert taken_back.stopped(Stop.ON_THE_WAY).item()
+    assert taken_back.stopped(Stop.MARCHING).item()
     assert taken_back.distance.item() == pytest.approx(0.4025 + 0.58)
     assert marched(-NEWTON.march_epsilon / 2).stopped(Stop.INSIDE).item()  # however little
 
 
 def test_what_a_step_was_taken_back_from_is_no_closest_sample():
     taken_back = marched(0.4, 0.39, -0.005, 0.3)  # the third at 0.8225, a gap of 0.025 behind the second's sphere
-    assert taken_back.stopped(Stop.ON_THE_WAY).item()
+    assert taken_back.stopped(Stop.MARCHING).item()
     assert taken_back.least.item() == pytest.approx(0.3)
     assert taken_back.distance.item() == pytest.approx(0.8225)  # and no further
     assert marched(0.4, 0.39, -0.005, 0.3, -0.005).stopped(Stop.CROSSED).item()
 
 
 def test_a_step_of_no_length_has_no_slope():
-    at = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
+    at = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
     advance(at, 0.4, NEWTON.tracer.stride())
     first = at.distance.item()
     at.distance = at.free
@@ -328,38 +328,38 @@ def test_a_step_of_no_length_has_no_slope():
 def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
     parent, apart, fine = torch.tensor([0]), torch.tensor([0.03]).double(), beam((0.03, 0.0, 0.0))
     for values, end in [((0.4, -0.1), 0.4), ((0.4, 5e-5), 0.4025), ((0.4, 0.2), 0.6025)]:
-        reached = marched(*values)
-        finer = reached.split(parent, apart, Reached.on_sphere(fine, 1.0), error=0.002)
+        table = marched(*values)
+        finer = table.split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
         assert finer.distance.item() == pytest.approx(end - 0.03 - 0.002)
-    gone = marched(0.4, 0.62).split(parent, apart, Reached.on_sphere(fine, 1.0), error=0.002)
-    assert gone.distance.item() < 1.0 and gone.stopped(Stop.ON_THE_WAY).item()
-    gone = marched(0.4, 0.7).split(parent, apart, Reached.on_sphere(fine, 1.0), error=0.002)
+    gone = marched(0.4, 0.62).split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
+    assert gone.distance.item() < 1.0 and gone.stopped(Stop.MARCHING).item()
+    gone = marched(0.4, 0.7).split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
     assert gone.stopped(Stop.LEFT).item()
 
 
 def test_a_finer_ray_inherits_no_sample_from_behind_a_surface():
     """Its coarse ray, which continued one itself, began behind the surface and is on its way back."""
-    behind, parent, fine = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0), torch.tensor([0]), beam((0.03, 0.0, 0.0))
+    behind, parent, fine = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0), torch.tensor([0]), beam((0.03, 0.0, 0.0))
     behind.distance = behind.entry + 0.5
     advance(behind, -0.1, NEWTON.tracer.stride())
-    assert behind.stopped(Stop.ON_THE_WAY).item() and behind.least.item() < 0
-    finer = behind.split(parent, torch.tensor([0.03]).double(), Reached.on_sphere(fine, 1.0), error=0.0)
-    assert finer.least.isinf().item() and finer.stopped(Stop.ON_THE_WAY).item()
+    assert behind.stopped(Stop.MARCHING).item() and behind.least.item() < 0
+    finer = behind.split(parent, torch.tensor([0.03]).double(), RayTable.on_sphere(fine, 1.0), error=0.0)
+    assert finer.least.isinf().item() and finer.stopped(Stop.MARCHING).item()
 
 
 def test_a_step_whose_spheres_lie_apart_is_taken_back():
-    at = Reached.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
+    at = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
     advance(at, 0.4, Stride(1e-3, 0.005))
     assert at.distance.item() == pytest.approx(0.4025)  # (2 0.4 + 0.005) / (1 + 1)
     advance(at, 0.2, Stride(1e-3, 0.005))
-    assert at.distance.item() == pytest.approx(0.4025 + 0.2 + FURTHER)
+    assert at.distance.item() == pytest.approx(0.4025 + 0.2 + MAX_OVERSTEP)
     free, free_value = at.free.item(), at.free_value.item()
-    advance(at, 0.005, Stride(1e-3, 0.005))  # FURTHER - 0.005 is more than 1.5 0.005
+    advance(at, 0.005, Stride(1e-3, 0.005))  # MAX_OVERSTEP - 0.005 is more than 1.5 0.005
     assert at.distance.item() == pytest.approx(0.4025 + 0.2)
     assert (at.free.item(), at.free_value.item()) == (free, free_value)
     advance(at, 0.1, Stride(1e-3, 0.005))
     slope = 0.1 / 0.2
-    assert at.distance.item() == pytest.approx(0.6025 + min(0.205 / (1 + slope), 0.1 + FURTHER))
+    assert at.distance.item() == pytest.approx(0.6025 + min(0.205 / (1 + slope), 0.1 + MAX_OVERSTEP))
 
 
 @each("thickness", [0.008, 0.02])

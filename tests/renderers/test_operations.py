@@ -8,9 +8,9 @@ from torch import Tensor
 
 from bench.config import load
 from renderers import waits
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.fields.analytic import Shape, torus
-from renderers.rendering import at_iteration, fresh
+from renderers.rendering import at_iteration, with_empty_memory
 from tests.looped import each
 from tests.operations import Operations
 from tests.tiny import camera_of
@@ -35,11 +35,11 @@ def step(name: str, warm: int) -> Operations:
         with count.pause():
             return torus(0.5, radius)(points)
 
-    renderer, rays = fresh(load("renderer", name)), camera_of(64, angles=(30.0, 25.0)).rays()
+    renderer, rays = with_empty_memory(load("renderer", name)), camera_of(64, angles=(30.0, 25.0)).rays()
     for iteration in range(warm):
-        rendered(at_iteration(renderer, iteration), Shape(ring), rays)
+        render_checked(at_iteration(renderer, iteration), Shape(ring), rays)
     with count:
-        rendering = rendered(at_iteration(renderer, warm) if warm else renderer, Shape(ring), rays)
+        rendering = render_checked(at_iteration(renderer, warm) if warm else renderer, Shape(ring), rays)
         (torch.where(rendering.hit, rendering.distance, 0.0).sum() + rendering.closest.sum()).backward()
     return count
 
@@ -47,7 +47,7 @@ def step(name: str, warm: int) -> Operations:
 @each("name", [*MOST])
 @each("warm", [0, 3])
 def test_a_step_takes_no_more_operations_and_waits_than_it_did(name, warm, monkeypatch):
-    monkeypatch.setitem(waits.STEPS, "cpu", waits.SELDOM)
+    monkeypatch.setitem(waits.COMPACTION_INTERVALS, "cpu", waits.DEFAULT_COMPACTION_INTERVAL)
     operations, most = MOST[name]
     count = step(name, warm)
     assert count.launches <= operations

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import batch_norm, layer_norm, linear, softplus
 
 from renderers.checks import BadInput
-from renderers.field import Coarse, Kind, bounds_of, coarse_of, points_in_sphere
+from renderers.field import Coarse, Kind, coarse_version, field_bounds, points_in_sphere
 from renderers.fields import published
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import BoundDecoder
@@ -100,12 +100,12 @@ def test_a_tanh_keeps_what_a_decoder_offers():
     network.factor.fill_(-2.0)
     network.level.fill_(0.1)
     field, half = network.at(CODE), 0.1 * POINTS.flip(0)
-    low, high = bounds_of(field)(POINTS, half)
+    low, high = field_bounds(field)(POINTS, half)
     for t in (-1.0, 0.0, 0.3, 1.0):
         values = field(POINTS + t * half)
         assert ((low <= values) & (values <= high)).all()
     assert (high - low).max() < 4 and field.flops == network.inner.at(CODE).flops
-    assert coarse_of(field) is None  # a narrow one has none
+    assert coarse_version(field) is None  # a narrow one has none
 
 
 def test_an_adjusted_field_has_coarse_values_and_bounds_that_are_adjusted_as_its_values():
@@ -118,12 +118,12 @@ def test_an_adjusted_field_has_coarse_values_and_bounds_that_are_adjusted_as_its
     for factor in (3.0, -3.0):
         inner = Inner(lambda points: points[..., 0], Kind.LEVEL, None)
         field = Adjusted(inner, 0, torch.tensor(factor), torch.tensor(0.2), Kind.LEVEL, None)
-        coarse = coarse_of(field)
+        coarse = coarse_version(field)
         assert coarse is not None
         assert coarse.error == pytest.approx(0.03)
         torch.testing.assert_close(coarse.values(POINTS), factor * (POINTS[:, 0] + 0.01 - 0.2))
         assert ((coarse.values(POINTS) - field(POINTS)).abs() <= coarse.error + 1e-6).all()
-        low, high = bounds_of(field)(POINTS, 0.1 * POINTS.flip(0))
+        low, high = field_bounds(field)(POINTS, 0.1 * POINTS.flip(0))
         for t in (-1.0, 0.0, 0.5, 1.0):
             values = field(POINTS + t * 0.1 * POINTS.flip(0))
             assert ((low - 1e-6 <= values) & (values <= high + 1e-6)).all()

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from bench.config import load
 from bench.machine.limits import Limits
 from renderers.camera import Rays
-from renderers.field import Counts, Kind, Meter, Moved, bounds_of, steepest
+from renderers.field import Counts, Kind, Meter, Moved, estimate_lipschitz, field_bounds
 from renderers.fields.affine import segment_bounds
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
@@ -72,7 +72,7 @@ def around(count: int) -> Rays:
 def test_no_first_hit_of_a_network_is_missed(seed, lost):
     """Its values are no lengths, so that sphere tracing loses hits; the certificate loses none."""
     field, rays = network(seed), around(400)
-    truth = trace(field, rays, lipschitz=2.5 * steepest(field, radius=1.0), least_step=1e-4, radius=1.0)
+    truth = trace(field, rays, lipschitz=2.5 * estimate_lipschitz(field, radius=1.0), least_step=1e-4, radius=1.0)
     asked, marching = Counts(), Counts()
     found = RENDERER.render(Meter(field, asked), rays)
     hits = truth.status == Status.HIT
@@ -118,10 +118,10 @@ def test_values_that_are_coarser_than_the_bounds_give_a_hit_where_they_change_si
 def test_bounds_are_counted_by_their_products():
     field, counts = network(0), Counts()
     meter = Meter(field, counts)
-    assert bounds_of(meter) is not None
-    bounds_of(meter)(*segments(10, 0.1))
+    assert field_bounds(meter) is not None
+    field_bounds(meter)(*segments(10, 0.1))
     assert counts.value == 30
-    assert bounds_of(Meter(sphere(0.5))) is None
+    assert field_bounds(Meter(sphere(0.5))) is None
 
 
 def test_a_wrapped_network_is_cast_by_the_same_bounds():

@@ -3,7 +3,7 @@
 import pytest
 
 from renderers.camera import Rays
-from renderers.field import steepest
+from renderers.field import estimate_lipschitz
 from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.reference import trace
 from renderers.rendering import Status
@@ -59,7 +59,7 @@ def test_invalid_numbers_are_errors():
 
 
 def test_steepest_is_the_longest_gradient_and_a_margin():
-    assert steepest(sphere(0.5), radius=1.0) == pytest.approx(1.2)
-    assert steepest(plane((0, 1, 0), 0.0), radius=1.0) == pytest.approx(1.2)
+    assert estimate_lipschitz(sphere(0.5), radius=1.0) == pytest.approx(1.2)
+    assert estimate_lipschitz(plane((0, 1, 0), 0.0), radius=1.0) == pytest.approx(1.2)
     bent = Shape(lambda p: p[..., 0] ** 2)  # 2 |x|, at most 2 in the sphere
-    assert steepest(bent, radius=1.0) == pytest.approx(1.2 * 2, abs=0.06)
+    assert estimate_lipschitz(bent, radius=1.0) == pytest.approx(1.2 * 2, abs=0.06)

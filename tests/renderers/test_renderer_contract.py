@@ -16,7 +16,7 @@ from torch.nn.functional import max_pool2d, normalize
 
 from bench.config import build, load
 from bench.tables import choice, names
-from renderers.boundary import PARTS
+from renderers.boundary import RENDERING_TENSORS
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
@@ -68,14 +68,14 @@ def stated(shape: Shape, kind: Kind) -> Shape:
 
 
 def same(first: Rendering, second: Rendering, atol: float = 1e-12) -> None:
-    for part in PARTS:
+    for part in RENDERING_TENSORS:
         one, other = getattr(first, part), getattr(second, part)
         torch.testing.assert_close(one.reshape(other.shape), other, rtol=0, atol=atol)
 
 
 def check_rendering(rendering: Rendering, rays: Rays) -> None:
     """Shapes, dtypes, finite numbers, and that the parts agree with one another."""
-    for part in PARTS:
+    for part in RENDERING_TENSORS:
         wanted = (*rays.shape, 3) if part == "points" else rays.shape
         assert getattr(rendering, part).shape == wanted, part
         assert getattr(rendering, part).isfinite().all(), part
@@ -177,7 +177,7 @@ def test_images_may_have_any_size_and_come_in_batches(renderer, shapes=((1, 1), 
         rendering = renderer.render(sphere(0.5), rays)
         check_rendering(rendering, rays)
         alone = renderer.render(sphere(0.5), one)
-        for part in PARTS:
+        for part in RENDERING_TENSORS:
             expected = getattr(alone, part).expand_as(getattr(rendering, part))
             torch.testing.assert_close(expected, getattr(rendering, part))
 
@@ -217,7 +217,7 @@ def test_splitting_the_rays_changes_nothing(renderer):
             renderer.render(field, Rays(*some))
             for some in zip(rays.origins.split(size), rays.directions.split(size), strict=True)
         ]
-        same(whole, Rendering(*(torch.cat([getattr(part, name) for part in parts]) for name in PARTS)))
+        same(whole, Rendering(*(torch.cat([getattr(part, name) for part in parts]) for name in RENDERING_TENSORS)))
 
 
 def leaves() -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
@@ -288,7 +288,7 @@ def test_no_graph_is_built_where_none_is_wanted(renderer):
         rendering = renderer.render(sphere(radius), rays)
     plain = renderer.render(sphere(0.5), Rays(rays.origins.detach(), rays.directions.detach()))
     for quiet in (rendering, plain):
-        assert not any(getattr(quiet, part).requires_grad for part in PARTS)
+        assert not any(getattr(quiet, part).requires_grad for part in RENDERING_TENSORS)
     same(rendering, plain)
 
 

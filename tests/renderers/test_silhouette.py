@@ -11,7 +11,7 @@ from bench.tables import names
 from renderers.boundary import BrokenContract
 from renderers.camera import Rays
 from renderers.fields.analytic import sphere
-from renderers.rendering import Capabilities, Observed, Renderer, at_iteration
+from renderers.rendering import Capabilities, RayObservation, Renderer, at_iteration
 from renderers.silhouette import AVERAGES, Hinge, SilhouetteLoss
 from tests.looped import each
 
@@ -76,7 +76,9 @@ def of_sphere(renderer: Renderer, loss: SilhouetteLoss, mask: list[bool]) -> tup
     origins = torch.stack([HEIGHTS, torch.zeros_like(HEIGHTS), torch.full_like(HEIGHTS, -2.0)], dim=-1)
     rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(5, 3))
     torch.manual_seed(0)  # some losses draw points
-    value = loss(renderer, sphere(radius), rays, renderer.render(sphere(radius), rays), Observed(torch.tensor(mask)))
+    value = loss(
+        renderer, sphere(radius), rays, renderer.render(sphere(radius), rays), RayObservation(torch.tensor(mask))
+    )
     slope = torch.autograd.grad(value, radius, allow_unused=True)[0] if value.requires_grad else None
     return value.item(), 0.0 if slope is None else slope.item()
 

@@ -9,11 +9,11 @@ from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bench.config import load
-from renderers.bracket import evenly
+from renderers.bracket import equally_spaced
 from renderers.camera import Rays, sphere_span
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import Shape, box, plane, sphere
-from renderers.relaxed_boundary import _lowest
+from renderers.relaxed_boundary import _parabola_vertex
 from renderers.rendering import Blurred, Status, Volume, at_iteration
 from renderers.volumes.integrate import Samples, by_importance, weights
 from renderers.volumes.volsdf import Bound, _clearance, _passing
@@ -64,7 +64,7 @@ def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
         sharp, places = 0, []
         for index, found, reached in renderer.bounded(field, rays, entry, leave):
-            dense = Samples.of(field, rays[index], evenly(entry[index], leave[index], 20_000))
+            dense = Samples.of(field, rays[index], equally_spaced(entry[index], leave[index], 20_000))
             truth, opacity = (
                 1 - _passing(one.value, one.distance, reached)[:, :-1].cumsum(dim=1).exp() for one in (dense, found)
             )
@@ -222,8 +222,8 @@ def test_hits_lie_on_a_surface_where_a_ray_passes_another_one(renderer):
     rendering = renderer.render(both, rays)
     assert rendering.hit.all()
     assert (both(rendering.points).abs() < 0.03).all()
-    mixed = (rendering.opacity > 0.99) & (rendering.volume.summed(rendering.volume.distance, 41) < 2.5)
-    assert (mixed & (rendering.volume.summed(rendering.volume.distance, 41) > 2.1)).any()
+    mixed = (rendering.opacity > 0.99) & (rendering.volume.weighted_sum(rendering.volume.distance, 41) < 2.5)
+    assert (mixed & (rendering.volume.weighted_sum(rendering.volume.distance, 41) > 2.1)).any()
 
 
 @VOLUMES
@@ -314,13 +314,13 @@ def test_weights_importance_and_sums_worked_out_by_hand():
     torch.testing.assert_close(even, vector((0.5, 1.5, 2.5, 3.5))[None])
     volume = Volume(torch.tensor([2, 0, 2]), vector((1, 2, 3)), vector((0.5, 1, 0.25)))
     channels: Tensor = vector((1, 0, 0, 1, 1, 1)).view(3, 2)
-    torch.testing.assert_close(volume.summed(channels, 3), vector((0, 1, 0, 0, 0.75, 0.25)).view(3, 2))
+    torch.testing.assert_close(volume.weighted_sum(channels, 3), vector((0, 1, 0, 0, 0.75, 0.25)).view(3, 2))
 
 
 def test_the_band_looks_where_the_parabola_through_three_samples_is_lowest():
     places = vector((0.0, 0.3, 0.9, 0.1, 0.3, 0.35)).view(2, 3).T
     lowest = vector((0.37, 0.28))
-    torch.testing.assert_close(_lowest(places, 3 * (places - lowest) ** 2 + 0.1), lowest)
+    torch.testing.assert_close(_parabola_vertex(places, 3 * (places - lowest) ** 2 + 0.1), lowest)
 
 
 def test_settings_that_cannot_be_are_refused():

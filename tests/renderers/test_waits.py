@@ -5,10 +5,10 @@ from torch import Tensor
 
 from bench.config import load
 from renderers import waits
-from renderers.boundary import PARTS, rendered
+from renderers.boundary import RENDERING_TENSORS, render_checked
 from renderers.field import Coarse, Counts, Flops, Kind, Meter
 from renderers.fields.analytic import torus
-from renderers.rendering import Renderer, Rendering, fresh
+from renderers.rendering import Renderer, Rendering, with_empty_memory
 from tests.looped import each
 from tests.tiny import camera_of
 
@@ -49,7 +49,7 @@ class Coarsely(Ring):
 def found(renderer: Renderer, field: Ring) -> tuple[Rendering, Counts, Tensor]:
     """A rendering of 32 x 32 rays, what it counts, and a gradient."""
     meter = Meter(field)
-    rendering = rendered(fresh(renderer), meter, camera_of(32, angles=(30.0, 25.0)).rays())
+    rendering = render_checked(with_empty_memory(renderer), meter, camera_of(32, angles=(30.0, 25.0)).rays())
     loss = torch.where(rendering.hit, rendering.distance, 0.0).sum() + rendering.closest.sum()
     return rendering, meter.counts, torch.autograd.grad(loss, field.radius)[0]
 
@@ -61,9 +61,9 @@ def test_when_ended_rays_are_left_out_changes_no_number(name, monkeypatch):
     plain, shape = field(), field()
     one, counts, gradient = found(renderer, plain)
     with monkeypatch.context() as elsewhere:
-        elsewhere.setitem(waits.STEPS, "cpu", 8)
+        elsewhere.setitem(waits.COMPACTION_INTERVALS, "cpu", 8)
         other, seldom, same = found(renderer, shape)
-    for part in PARTS:
+    for part in RENDERING_TENSORS:
         assert torch.equal(getattr(one, part), getattr(other, part)), part
     assert torch.equal(gradient, same)
     assert counts == seldom and counts.hits == seldom.hits > 100

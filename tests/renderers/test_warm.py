@@ -8,13 +8,13 @@ import torch
 
 from bench.config import load
 from renderers import warm as warm_module
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Field, Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, sphere
-from renderers.rendering import Rendering, at_iteration, final_notes, fresh
+from renderers.rendering import Rendering, at_iteration, final_notes, with_empty_memory
 from renderers.silhouette import Hinge
-from renderers.warm import AUDITED, ENOUGH, LOOKED, Memory
+from renderers.warm import AUDIT_STRIDE, MIN_AUDITED_RAYS, PROBE_STRIDE, Memory
 from tests.tiny import camera_of
 
 SIZE = 48  # pixels per side
@@ -33,7 +33,7 @@ def in_turn(renderer, fields, rays: Rays = RAYS) -> list[tuple[Rendering, int]]:
     found = []
     for iteration, field in enumerate(fields):
         meter = Meter(field)
-        found.append((rendered(at_iteration(renderer, iteration), meter, rays), meter.counts.value))
+        found.append((render_checked(at_iteration(renderer, iteration), meter, rays), meter.counts.value))
     return found
 
 
@@ -52,7 +52,7 @@ def most_differing(renderer, fields) -> int:
 
 def begun() -> int:
     """The values that an optimisation's first rendering of the ball takes."""
-    return in_turn(fresh(load("renderer", "newton", warm=True)), [ball(0.5)])[0][1]
+    return in_turn(with_empty_memory(load("renderer", "newton", warm=True)), [ball(0.5)])[0][1]
 
 
 def ball(radius: float, x: float = 0.0) -> Shape:
@@ -86,7 +86,7 @@ def test_a_field_that_becomes_steep_loses_nothing(warm):
 def test_what_enters_where_nothing_was_hit_is_seen_and_hits_that_leave_become_misses(warm):
     entering = [ball(0.4, x=-0.4) | sphere(0.2, (0.3, 1.3 - 0.03 * i, 0.2)) for i in range(16)]
     assert most_differing(warm, entering) <= 1
-    assert most_differing(fresh(warm), [ball(0.4 - 0.04 * i) for i in range(10)]) <= 1
+    assert most_differing(with_empty_memory(warm), [ball(0.4 - 0.04 * i) for i in range(10)]) <= 1
 
 
 @pytest.mark.parametrize("second", [box((0.6, 0.3, 0.4)), NOTHING, ball(0.3) | ball(0.3, x=-0.6)])
@@ -99,11 +99,11 @@ def test_where_values_move_too_far_nothing_is_asked_of_the_last_hits(warm):
     fields = [ball(0.4, x=0.3 * i - 0.3) for i in range(3)]
     *_, (_, values) = in_turn(warm, fields)
     cold = in_turn(COLD, fields[-1:])[0][1]
-    assert cold <= values <= cold + SIZE * SIZE / LOOKED + 1
+    assert cold <= values <= cold + SIZE * SIZE / PROBE_STRIDE + 1
 
 
 def test_what_appears_where_no_value_moved_is_found_by_the_audit(warm, monkeypatch):
-    monkeypatch.setattr("renderers.warm.LOOKED", SIZE * SIZE)  # movement is measured on the first ray only
+    monkeypatch.setattr("renderers.warm.PROBE_STRIDE", SIZE * SIZE)  # movement is measured on the first ray only
     plate = ball(0.5) | box((0.9, 0.9, 0.01)).translate((0.0, 0.0, 0.7))
 
     def values(points):
@@ -121,8 +121,8 @@ def test_what_appears_where_no_value_moved_is_found_by_the_audit(warm, monkeypat
 
 def test_after_too_many_disagreements_nothing_is_taken_from_memory(warm):
     in_turn(warm, [ball(0.5)] * 2)
-    warm.memory.audited, warm.memory.differed = ENOUGH, ENOUGH
-    assert warm.memory.unsound
+    warm.memory.audited, warm.memory.differed = MIN_AUDITED_RAYS, MIN_AUDITED_RAYS
+    assert warm.memory.disabled
     assert "nothing was taken from memory" in final_notes(warm)[0]
     meter = Meter(ball(0.5))
     at_iteration(warm, 2).render(meter, RAYS)
@@ -139,7 +139,7 @@ def test_the_audit_takes_one_ray_in_a_hundred_and_another_one_each_time(warm, mo
     monkeypatch.setattr(warm_module, "_differing", recorded)
     in_turn(warm, [ball(0.5)] * 11)
     assert taken.max() == 1 and taken.sum() == warm.memory.audited
-    assert 9.5 < warm.memory.audited / (SIZE * SIZE / AUDITED) < 10.5
+    assert 9.5 < warm.memory.audited / (SIZE * SIZE / AUDIT_STRIDE) < 10.5
     assert final_notes(warm) == [
         f"renderer.warm: 0 of {warm.memory.audited} audited rays had another answer when marched anew"
     ]
@@ -149,18 +149,18 @@ def test_another_optimisation_remembers_nothing(warm):
     in_turn(warm, [ball(0.5)] * 3)
     assert in_turn(warm, [ball(0.5)])[0][1] == begun()
     in_turn(warm, [ball(0.5)] * 2)
-    assert fresh(warm).memory == Memory(thread=warm.memory.thread) != warm.memory
-    assert final_notes(fresh(warm)) == final_notes(COLD) == []
+    assert with_empty_memory(warm).memory == Memory(thread=warm.memory.thread) != warm.memory
+    assert final_notes(with_empty_memory(warm)) == final_notes(COLD) == []
 
 
 def test_renderings_outside_of_an_optimisation_neither_use_nor_change_what_is_remembered(warm):
     in_turn(warm, [ball(0.5)] * 2)
-    before = [image.renderings for *_, image in warm.memory.images.values()]
+    before = [cache.renderings for *_, cache in warm.memory.cached.values()]
     meter, cold = Meter(ball(0.5)), Meter(ball(0.5))
     warm.render(meter, RAYS)
     COLD.render(cold, RAYS)
     assert meter.counts.value == cold.counts.value
-    assert [image.renderings for *_, image in warm.memory.images.values()] == before == [2]
+    assert [cache.renderings for *_, cache in warm.memory.cached.values()] == before == [2]
 
 
 def test_a_camera_that_moves_is_another_image_and_rays_that_are_gone_are_forgotten(warm):
@@ -168,15 +168,15 @@ def test_a_camera_that_moves_is_another_image_and_rays_that_are_gone_are_forgott
     moved = camera_of(SIZE, angles=(40.0, 25.0)).rays()
     found = at_iteration(warm, 1).render(ball(0.5), moved)
     assert differing(found, ball(0.5), moved) == 0
-    assert len(warm.memory.images) == 2
+    assert len(warm.memory.cached) == 2
     del moved, found
-    assert len(warm.memory.images) == 1
+    assert len(warm.memory.cached) == 1
 
 
 def test_rays_with_a_gradient_are_not_remembered(warm):
     rays = replace(RAYS, origins=RAYS.origins.clone().requires_grad_(True))
     assert all(found.distance.requires_grad for found, _ in in_turn(warm, [ball(0.5)] * 2, rays))
-    assert not warm.memory.images
+    assert not warm.memory.cached
 
 
 def test_a_batch_of_views(warm):
@@ -197,7 +197,7 @@ def test_a_field_that_is_nan_somewhere(warm):
 
     broken = Shape(values, Kind.BOUND, None)
     for field in (broken, ball(0.5), broken, broken, ball(0.5)):
-        found = rendered(at_iteration(warm, 1), field, RAYS)
+        found = render_checked(at_iteration(warm, 1), field, RAYS)
         for part in (found.distance, found.closest, found.residual):
             assert part.isfinite().all()
     assert differing(found, ball(0.5)) == 0

@@ -11,7 +11,7 @@ from bench.config import load
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import RunStatus
 from bench.solve.optimise import DIVERGED, FirstChecked, History, OptimiserSettings, Starts, StartSettings, optimise
-from renderers.boundary import rendered
+from renderers.boundary import render_checked
 from renderers.checks import BrokenContract
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
@@ -204,7 +204,7 @@ class Seen(Toy):
 
     def loss(self, iteration):
         shape = sphere(self.radius / 2)
-        rendering = rendered(self.renderer, Meter(shape, self.counts), RAYS)
+        rendering = render_checked(self.renderer, Meter(shape, self.counts), RAYS)
         self.calls += 1
         depth = ((rendering.distance - 1.8).square() * rendering.hit).sum() / rendering.hit.sum().clamp_min(1)
         return {"total": depth, "depth": depth}

@@ -174,7 +174,8 @@ def test_longer_steps_ask_more_behind_the_surface(tmp_path, monkeypatch):
 
     regular, longer = behind("dist_dynamic"), behind("dist_aggressive")
     assert 0 <= regular < 0.02 and 0.05 < longer < 0.5  # DIST, Fig. 14
-    monkeypatch.setitem(waits.STEPS, "cpu", waits.SELDOM)  # rays that ended are asked with the others, as on a GPU
+    # Finished rays are evaluated with the others, as on a GPU.
+    monkeypatch.setitem(waits.COMPACTION_INTERVALS, "cpu", waits.DEFAULT_COMPACTION_INTERVAL)
     assert behind("dist_aggressive") == pytest.approx(longer)
 
 

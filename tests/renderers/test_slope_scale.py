@@ -6,32 +6,32 @@ from torch import Tensor
 
 from renderers.field import Coarse, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere, torus
-from renderers.tracer import PAIRS, STEEP, Evened, evened, measured_steepness
+from renderers.tracer import MAX_DISTANCE_SLOPE, SLOPE_PAIR_COUNT, SlopeNormalised, measure_slope_scale, normalise_slope
 from tests.looped import each
 
 LIKE = torch.zeros(0, 3)
 RING, BALL = torus(0.5, 0.2), sphere(0.5)
 
 
-def steepness(values, radius: float = 1.0) -> float:
-    return measured_steepness(values, LIKE, radius=radius)
+def slope_scale(values, radius: float = 1.0) -> float:
+    return measure_slope_scale(values, LIKE, radius=radius)
 
 
 @each("of", [lambda d: 1.1 * d, lambda d: d, lambda d: 0.1 * d, lambda d: 0.4 * torch.sin(d / 0.4)])
 def test_a_field_that_is_hardly_steeper_than_a_distance_is_taken_for_one(of):
-    assert steepness(lambda p: of(RING(p))) == 1.0
+    assert slope_scale(lambda p: of(RING(p))) == 1.0
 
 
 @each("times", [1.5, 100.0])
 @each("shape", [RING, box((0.4, 0.3, 0.2))])
 def test_distances_times_a_factor_are_steep_by_it(shape, times):
-    assert steepness(lambda p: times * shape(p)) == pytest.approx(times, rel=0.08)
+    assert slope_scale(lambda p: times * shape(p)) == pytest.approx(times, rel=0.08)
 
 
 @each("spoilt", [torch.nan, torch.inf])
 def test_it_is_measured_where_values_are_finite(spoilt):
-    assert steepness(lambda p: torch.where(p[..., 0] > 0.2, spoilt, 4 * BALL(p))) == pytest.approx(4.0, rel=0.1)
-    assert steepness(lambda p: torch.full_like(p[..., 0], spoilt)) == 1.0
+    assert slope_scale(lambda p: torch.where(p[..., 0] > 0.2, spoilt, 4 * BALL(p))) == pytest.approx(4.0, rel=0.1)
+    assert slope_scale(lambda p: torch.full_like(p[..., 0], spoilt)) == 1.0
 
 
 @each("radius", [0.05, 30.0])
@@ -42,12 +42,12 @@ def test_it_asks_points_in_the_sphere(radius):
         asked.append(points)
         return 4 * sphere(radius / 2)(points)
 
-    assert steepness(values, radius) == pytest.approx(4.0, rel=0.1)
+    assert slope_scale(values, radius) == pytest.approx(4.0, rel=0.1)
     (points,) = asked
-    assert len(points) == 2 * PAIRS and points.norm(dim=-1).max() <= radius
+    assert len(points) == 2 * SLOPE_PAIR_COUNT and points.norm(dim=-1).max() <= radius
 
 
-def test_an_evened_field_is_counted_and_divided_with_its_coarse_values():
+def test_a_normalised_field_is_counted_and_divided_with_its_coarse_values():
     class Offering:
         kind, lipschitz, flops = Kind.DISTANCE, None, None
         coarse = Coarse(lambda points: 4 * BALL(points) + 0.2, 0.2)
@@ -56,10 +56,13 @@ def test_an_evened_field_is_counted_and_divided_with_its_coarse_values():
             return 4 * BALL(points)
 
     meter, points = Meter(Offering()), torch.randn(7, 3)
-    field = evened(meter, 4.0)
-    assert isinstance(field, Evened) and field.kind is Kind.DISTANCE
+    field = normalise_slope(meter, 4.0)
+    assert isinstance(field, SlopeNormalised) and field.kind is Kind.DISTANCE
     torch.testing.assert_close(field(points), BALL(points))
     assert field.coarse is not None and field.coarse.error == pytest.approx(0.05)
     torch.testing.assert_close(field.coarse.values(points), BALL(points) + 0.05)
     assert (meter.counts.value, meter.counts.coarse) == (7, 7)
-    assert evened(meter, 1.0) is meter and evened(Shape(lambda p: p[..., 0]), STEEP) is not meter
+    assert (
+        normalise_slope(meter, 1.0) is meter
+        and normalise_slope(Shape(lambda p: p[..., 0]), MAX_DISTANCE_SLOPE) is not meter
+    )
