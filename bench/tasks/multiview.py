@@ -156,8 +156,8 @@ class Multiview(PhotographTask):
         check_field_gradient(inputs.renderer)
         record.definitions = COLOURED_DEFINITIONS | COSTS
         subject = self.subject(inputs)
-        record.notes = [*record.notes, subject.found]
-        given = GivenPhotographs(self, inputs.renderer, subject.given, inputs.device, own=True)
+        record.notes = [*record.notes, subject.summary]
+        given = GivenPhotographs(self, inputs.renderer, subject.input_shots, inputs.device, own=True)
         problem = self._problem(inputs.prior, given, torch.Generator().manual_seed(inputs.seed))
         check_kind(inputs.renderer, problem.field())
 
@@ -187,7 +187,7 @@ class Multiview(PhotographTask):
             return evaluate(State(field, run.inputs)).metrics
         subject = self.subject(run.inputs)
         found = judge_mesh(coloured(field, subject, run.inputs), subject, run.inputs)
-        return found.metrics | subject.judged(found.mesh, run.inputs)
+        return found.metrics | subject.point_metrics(found.mesh, run.inputs)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device

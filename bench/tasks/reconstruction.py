@@ -70,8 +70,8 @@ class Reconstruction(PhotographTask):
         definitions = COLOURED_DEFINITIONS | UNCOUNTED | (DEFINITIONS if name == AUTO else {})
         run.record.definitions = dict(definitions)
         subject = self.subject(inputs)
-        doubts = [UNMASKED] if subject.given[0].mask is None else []
-        run.record.notes = [*run.record.notes, subject.found, *doubts]
+        doubts = [UNMASKED] if subject.input_shots[0].mask is None else []
+        run.record.notes = [*run.record.notes, subject.summary, *doubts]
         if name != AUTO:
             solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
             subject.finish(run)
@@ -90,14 +90,14 @@ class Reconstruction(PhotographTask):
         """The metrics of a field that a run ended on; see `bench.setup.inputs.Judges`."""
         subject = self.subject(run.inputs)
         found = judge(State(field, run.inputs), subject)
-        return found.metrics | subject.judged(found.mesh, run.inputs)
+        return found.metrics | subject.point_metrics(found.mesh, run.inputs)
 
     def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
         """The problem of photographs with the field of a name."""
         inputs = run.inputs
         model = self.appearance.make(name).to(inputs.device)
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
-        stack = Stack.of(subject.given, guide and guide(subject.given), inputs.device)
+        stack = Stack.from_shots(subject.input_shots, guide and guide(subject.input_shots), inputs.device)
         iterations = self.optimiser.iterations
         return ReconstructionProblem(
             subject, stack, model, self.losses, inputs.renderer, self.rays, iterations, inputs.seed

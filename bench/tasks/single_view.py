@@ -247,7 +247,7 @@ class OneImage:
     def _search(self, run: RunContext, images: ImagesOf, subject: Subject) -> None:
         """The shape of the code that is found, with the colours of the given image."""
         inputs = run.inputs
-        problem = self.search.problem(subject.given[0], inputs)
+        problem = self.search.problem(subject.input_shots[0], inputs)
         check_kind(inputs.renderer, problem.field())
         settings, least = self.search.optimiser, self.search.least_reference
         history = descend(problem, settings, run, lambda iteration: {}, least_reference=least)
@@ -261,7 +261,7 @@ class OneImage:
         inputs, record, count = run.inputs, run.record, self.shapes
         record.notes = [*record.notes, "no network and no renderer took part"]
         if self.method == MEAN:
-            mesh, seen = mean_shape(recipe.dataset, count, inputs.cache, run.progress), subject.given
+            mesh, seen = mean_shape(recipe.dataset, count, inputs.cache, run.progress), subject.input_shots
         else:
             others = recipe.imaging.images(recipe.dataset, Split.TRAIN, count, inputs.cache, run.progress)
             with run.on_clock():

@@ -32,7 +32,7 @@ DEFINITIONS = {
     "failed_...": "trials that failed in this way; each counts once, as its most frequent kind of failure",
     "evaluations_per_ray": "field values per ray; median of the trials at the mild end",
 }
-MEASURED = {"rendering": judge.OF_RENDERINGS, "gradient": judge.OF_GRADIENTS, "fit": fit.DEFINITIONS}
+MEASURED = {"rendering": judge.RENDERING_NUMBERS, "gradient": judge.GRADIENT_NUMBERS, "fit": fit.DEFINITIONS}
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Stability:
                 search.note(index, outcome.success)
                 trials.note(Trial(level, self.stress.sweep.severity(level), outcome))
                 write_line(trials.line())
-                run.progress("searching", len(trials.all), search.most, None)
+                run.progress("searching", len(trials.all), search.max_trials, None)
         record.metrics = self._metrics(search, trials)
         record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
         record.status, record.reason = trials.verdict()
@@ -121,7 +121,7 @@ class Stability:
             **{f"level{end}": level for end, level in levels.items()},
             "width": found.width,
             "trials": len(trials.all),
-            "grid_trials": search.grid,
+            "grid_trials": search.grid_trials,
             "mild_successes": mild,
             "mild_trials": milds,
             "severe_successes": severe,

@@ -9,7 +9,7 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
-from bench.reconstruct.surfaces import fused, given_clouds, measured_clouds, poisson, with_colours
+from bench.reconstruct.surfaces import fuse_clouds, given_clouds, measured_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import COSTS
 from datasets.captures.hull import hull_mesh
@@ -30,11 +30,11 @@ class _Surface(PhotographTask):
         record = run.record
         record.definitions = COLOURED_DEFINITIONS | COSTS
         subject = self.subject(run.inputs)
-        record.notes = [*record.notes, subject.found, "no renderer took part"]
+        record.notes = [*record.notes, subject.summary, "no renderer took part"]
         with run.on_clock():
             surface = self.surface(subject)
             mesh = None if surface is None else surface.cut_off()
-            mesh = None if mesh is None else with_colours(mesh, subject.given)
+            mesh = None if mesh is None else with_colours(mesh, subject.input_shots)
         record.evaluations = {"value": 0, "gradient": 0}
         with run.off_clock():
             note_surface(run, mesh, subject, {})
@@ -54,7 +54,7 @@ class Fusing:
 
     def surface(self, clouds: Sequence[Cloud]) -> Mesh | None:
         """The surface of all points."""
-        return poisson(*fused(clouds), depth=self.octree, trim=self.trim)
+        return poisson(*fuse_clouds(clouds), depth=self.octree, trim=self.trim)
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ class Hull(_Surface):
 
     def surface(self, subject: Subject) -> Mesh | None:
         """The hull, carved."""
-        if any(shot.mask is None for shot in subject.given):
+        if any(shot.mask is None for shot in subject.input_shots):
             raise BadInput(f"{NO_HULL}, or set task=stereo")
-        return hull_mesh(subject.given, self.samples)
+        return hull_mesh(subject.input_shots, self.samples)
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,9 @@ class Poisson(_Surface):
         """The fused points."""
         if self.cloud is not None:
             return self.fusing.surface(measured_clouds(self.cloud, subject))
-        if all(shot.depth is None for shot in subject.given):
+        if all(shot.depth is None for shot in subject.input_shots):
             raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task.cloud=POINTS.ply")
-        return self.fusing.surface(given_clouds(subject.given))
+        return self.fusing.surface(given_clouds(subject.input_shots))
 
 
 @dataclass(frozen=True)
@@ -118,4 +118,4 @@ class Stereo(_Surface):
 
     def surface(self, subject: Subject) -> Mesh | None:
         """The fused points that the photographs agree on."""
-        return self.fusing.surface(stereo_clouds(subject.given, self.matching))
+        return self.fusing.surface(stereo_clouds(subject.input_shots, self.matching))
