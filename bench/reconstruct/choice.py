@@ -114,9 +114,8 @@ class AutoField:
             subject: all photographs; the held-out ones are not used.
             settings: the settings of the full run.
         """
-        shots, device = subject.input_shots, run.inputs.device
-        validation = shots[::VALIDATION_STEP]
-        fitted = tuple(shot for index, shot in enumerate(shots) if index % VALIDATION_STEP)
+        validation, device = subject.input_shots[::VALIDATION_STEP], run.inputs.device
+        fitted = tuple(shot for index, shot in enumerate(subject.input_shots) if index % VALIDATION_STEP)
         trial_subject = replace(subject, input_shots=fitted)
         trial_settings = replace(settings, iterations=max(round(self.trial * settings.iterations), 1))
 
@@ -132,9 +131,8 @@ class AutoField:
             evidence.seconds = history.seconds["forward"] + history.seconds["backward"]
             evidence.evaluations = history.counts.value
             if history.status is RunStatus.OK:
-                evidence.error = tiled(
-                    problem.colour_errors(Stack.from_shots(validation, None, device).pixels).cpu(), validation
-                )
+                pixels = Stack.build(validation, None, device).pixels
+                evidence.error = tiled(problem.colour_errors(pixels).cpu(), validation)
             return evidence
 
         ordered = sorted(self.candidates, key=lambda name: sizes[name])

@@ -33,7 +33,7 @@ from renderers.field import Field
 
 SEEN_PREFIX = "seen_"  # marks metrics over the points of both surfaces that are visible in an input photograph
 SURFACE_METRICS = tuple(WORST_SURFACE)
-IMAGE_METRICS = {
+IMAGE_SCORES = {
     "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph's mask, black where the shape is not"
     " seen, mean over photographs, in decibels, as IDR and NeuS define it. Without masks: over the pixels whose rays"
     " meet the unit sphere.",
@@ -48,16 +48,13 @@ MESH_IMAGE_NOTE = " The shape is seen by exact first hits of the mesh that evalu
 COLOURED_DEFINITIONS = {
     **{name: DEFINITIONS[name] for name in SURFACE_METRICS},
     **{
-        SEEN_PREFIX
-        + name: f"{DEFINITIONS[name]} Over the points of both surfaces that a given photograph sees: within it,"
-        " and not hidden by the surface itself."
+        f"{SEEN_PREFIX}{name}": f"{DEFINITIONS[name]} Over the points of both surfaces that a given photograph sees:"
+        " within it, and not hidden by the surface itself."
         for name in SURFACE_METRICS
     },
     **ROUGHNESS,
-    **{name: text + MESH_IMAGE_NOTE for name, text in IMAGE_METRICS.items()},
-    **{
-        OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE_METRICS.items()
-    },
+    **{name: text + MESH_IMAGE_NOTE for name, text in IMAGE_SCORES.items()},
+    **{OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE_SCORES.items()},
     **WEIGHT,
 }
 
@@ -113,7 +110,7 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
 
 
 def field_scores(state: State, shots: Sequence[Shot]) -> dict[str, float]:
-    """The metrics of `IMAGE_METRICS` of a field's colours on its mesh's visible surface."""
+    """The metrics of `IMAGE_SCORES` of a field's colours on its mesh's visible surface."""
     views = [state.seen(shot.camera) for shot in shots]
     return image_scores(views, [coloured_image(state.field, view, state.inputs.device) for view in views], shots)
 
@@ -121,7 +118,7 @@ def field_scores(state: State, shots: Sequence[Shot]) -> dict[str, float]:
 def image_scores(
     views: Sequence[View], images: Sequence[Float[Tensor, "_ _ 3"]], shots: Sequence[Shot]
 ) -> dict[str, float]:
-    """The metrics of `IMAGE_METRICS` of images, black outside of the shape; without masks, those that need none."""
+    """The metrics of `IMAGE_SCORES` of images, black outside of the shape; without masks, those that need none."""
     pairs = [_compare_image(view, image, shot) for view, image, shot in zip(views, images, shots, strict=True)]
     means = {
         name: float(np.mean([pair[name] for pair in pairs])) for name in ("psnr", "psnr_image", "ssim", "mask_iou")

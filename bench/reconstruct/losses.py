@@ -84,12 +84,10 @@ class Losses:
             if self.colour_gradient:
                 terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / rays
         if self.depth and pixels.distance is not None:
-            compared_depth = rendering.hit & pixels.distance.isfinite()
-            depth_per_distance = pixels.depth_per_distance[compared_depth]
-            depths, given_depths = (
-                distance[compared_depth] * depth_per_distance for distance in (rendering.distance, pixels.distance)
-            )
-            error = depth_error(self.depth_loss, depths, given_depths, depth_per_distance)
+            measured = rendering.hit & pixels.distance.isfinite()
+            scale = pixels.depth_per_distance[measured]
+            depths, given_depths = (distance[measured] * scale for distance in (rendering.distance, pixels.distance))
+            error = depth_error(self.depth_loss, depths, given_depths, scale)
             terms["depth"] = self.depth * error.sum() / rays
         if self.silhouette_weight and pixels.mask is not None:
             observed = Observed(pixels.mask, pixels.guide)
@@ -103,8 +101,7 @@ class Losses:
             terms["normals"] = self.normals * normal_error(normals, pixels.normals[inside])
         if self.eikonal and shape.kind is not Kind.LEVEL:
             random_points = 2 * torch.rand(EIKONAL_POINTS, 3, device=points.device) - 1
-            point_sets = gradients, slopes_at(metered, random_points)
-            slopes = [torch.linalg.vector_norm(vectors, dim=-1) for vectors in point_sets]
+            slopes = [torch.linalg.vector_norm(g, dim=-1) for g in (gradients, slopes_at(metered, random_points))]
             terms["eikonal"] = self.eikonal * sum((slope - 1).square().sum() / max(len(slope), 1) for slope in slopes)
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")

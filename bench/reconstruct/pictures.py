@@ -29,8 +29,8 @@ from renderers.camera import Camera
 from renderers.field import Field
 
 MAX_HELD_OUT_SHOWN, MAX_INPUTS_SHOWN = 3, 12
-ERROR_COLOURMAP = colormaps["magma_r"].with_extremes(bad="0.85")  # pixels that are not compared are grey
-MAX_SHOWN_ERROR = 0.3  # a larger mean difference of colours has the same, darkest colour
+ERROR_COLOURS = colormaps["magma_r"].with_extremes(bad="0.85")  # pixels that are not compared are grey
+MAX_ERROR = 0.3  # a larger mean difference of colours has the same, darkest colour
 
 
 def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: list[dict[str, Any]], title: str) -> None:
@@ -115,9 +115,7 @@ def _summary(render: Seen, inputs: RunInputs, subject: Subject, title: str) -> F
         view, image = render(at_size(shot.camera, inputs.evaluation.picture))
         row[0].imshow(shot.colours.numpy(), interpolation="nearest")
         row[1].imshow(np.where(view.mask[..., None], image.numpy(), 1.0).clip(0, 1))
-        error_image = row[2].imshow(
-            _error(render, shot), cmap=ERROR_COLOURMAP, vmin=0, vmax=MAX_SHOWN_ERROR, interpolation="nearest"
-        )
+        error = row[2].imshow(_error(render, shot), cmap=ERROR_COLOURS, vmin=0, vmax=MAX_ERROR, interpolation="nearest")
         row[3].imshow(normals_image(view))
         row[0].set_ylabel(Path(shot.name).stem if Path(shot.name).suffix else f"photograph {shot.name}")
         for axis in row:
@@ -125,14 +123,14 @@ def _summary(render: Seen, inputs: RunInputs, subject: Subject, title: str) -> F
     for axis, name in zip(axes[0], ("held-out photograph", "rendering", "difference", "normals"), strict=True):
         axis.set_title(name)
     scale_axis = axes[-1, 2].inset_axes((0.05, -0.1, 0.9, 0.05))
-    scale = figure.colorbar(error_image, cax=scale_axis, orientation="horizontal", extend="max")
+    scale = figure.colorbar(error, cax=scale_axis, orientation="horizontal", extend="max")
     scale.set_label("mean error of colours, 0 to 1")
     figure.suptitle(title)
     return figure
 
 
 def _error(render: Seen, shot: Shot) -> Float[np.ndarray, "height width"]:
-    """The mean difference of colours at the photograph's size, as in `judge.IMAGE_METRICS`; NaN at other pixels."""
+    """The mean difference of colours at the photograph's size, as in `judge.IMAGE_SCORES`; NaN at other pixels."""
     image = render(shot.camera)[1]
     judged, photographed = judged_pixels(shot)
     error = (image - shot.colours * photographed[..., None]).abs().mean(-1)

@@ -57,9 +57,7 @@ class Stack:
     width: Int[Tensor, " n"]
 
     @staticmethod
-    def from_shots(
-        shots: Sequence[Shot], guide: Sequence[Float[Tensor, "_ _"]] | None, device: torch.device
-    ) -> "Stack":
+    def build(shots: Sequence[Shot], guide: Sequence[Float[Tensor, "_ _"]] | None, device: torch.device) -> "Stack":
         """The pixels of photographs with the same kinds of observations; `guide` has the distances of each."""
         depths_at_one = [shot.camera.depth(torch.ones(shot.colours.shape[:2])) for shot in shots]
         rays = [shot.camera.rays().flat() for shot in shots]

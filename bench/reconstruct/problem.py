@@ -56,11 +56,8 @@ class ReconstructionProblem:
     @property
     def observed(self) -> Bool[Tensor, "1 n"]:
         """A mask of the pixels with a given depth, of all photographs in one row."""
-        distance = self.stack.pixels.distance
-        measured = (
-            torch.zeros_like(self.stack.pixels.depth_per_distance).bool() if distance is None else distance.isfinite()
-        )
-        return measured[None]
+        distance, colours = self.stack.pixels.distance, self.stack.pixels.colours
+        return (torch.zeros_like(colours[:, 0]).bool() if distance is None else distance.isfinite())[None]
 
     @property
     def shown(self) -> Shown:

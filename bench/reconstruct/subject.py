@@ -271,5 +271,4 @@ def hull_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:
     scene = Truth(hull, closed=False)
     views = [see(scene, shot.camera) for shot in shots]
     distances = [torch.where(view.mask, view.camera.distance(view.depth), torch.nan) for view in views]
-    pairs = zip(given_distances(shots), distances, strict=True)
-    return [torch.where(measured.isfinite(), measured, to_hull) for measured, to_hull in pairs]
+    return [torch.where(d.isfinite(), d, hull) for d, hull in zip(given_distances(shots), distances, strict=True)]

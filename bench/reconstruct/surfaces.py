@@ -53,9 +53,7 @@ def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
         )
     if all(shot.mask is not None for shot in subject.input_shots):
         positions = torch.from_numpy(points).float()
-        points = points[
-            torch.stack([shot.allows(positions, margin=1.0) for shot in subject.input_shots]).all(0).numpy()
-        ]
+        points = points[torch.stack([s.allows(positions, margin=1.0) for s in subject.input_shots]).all(0).numpy()]
     cameras = [shot.camera for shot in subject.input_shots]
     viewers = _nearest_viewers(torch.from_numpy(points).float(), cameras).numpy()
     return [Cloud(points[viewers == index], camera) for index, camera in enumerate(cameras)]
@@ -72,9 +70,7 @@ def _nearest_viewers(points: Float[torch.Tensor, "n 3"], cameras: Sequence[Camer
         front = torch.full(((camera.height + 1) * (camera.width + 1),), torch.inf)
         front.scatter_reduce_(0, pixel, torch.where(inside, depth, torch.inf), "amin")
         hidden = ~inside | (depth > front[pixel] + OCCLUSION_GAP)
-        distance = torch.linalg.vector_norm(points - camera.center, dim=-1) + torch.where(
-            hidden, BEYOND_ALL_CAMERAS, 0.0
-        )
+        distance = torch.linalg.vector_norm(points - camera.center, dim=-1) + hidden * BEYOND_ALL_CAMERAS
         viewers[distance < nearest] = index
         nearest = torch.minimum(nearest, distance)
     return viewers

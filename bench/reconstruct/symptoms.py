@@ -38,13 +38,12 @@ def roughness_scores(
     """
     scores = {}
     for name, is_seen in zip(ROUGHNESS, (True, False), strict=True):
-        predicted_roughness, true_roughness = (
-            None if pair is None else roughness(pair[0].some(pair[1] == is_seen)) for pair in (predicted, truth)
-        )
-        if predicted_roughness is None:
+        true_roughness = roughness(truth[0].some(truth[1] == is_seen))
+        rough = None if predicted is None else roughness(predicted[0].some(predicted[1] == is_seen))
+        if rough is None:
             scores[name] = 0.0 if true_roughness is None and predicted is not None else np.inf
         else:
-            scores[name] = predicted_roughness - (true_roughness or 0.0)
+            scores[name] = rough - (true_roughness or 0.0)
     return scores
 
 

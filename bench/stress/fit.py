@@ -54,10 +54,8 @@ def depth_noise(observation: Observation, severity: float, draw: np.random.Gener
 
 def depth_outliers(observation: Observation, severity: float, draw: np.random.Generator) -> Observation:
     """Replaces a fraction of the depths by random ones between 1.5 and 3.5."""
-    outliers = torch.from_numpy(draw.uniform(1.5, 3.5, observation.depth.shape)).float()
-    return replace(
-        observation, depth=torch.where(_random_pixels(observation, severity, draw), outliers, observation.depth)
-    )
+    depth = torch.from_numpy(draw.uniform(1.5, 3.5, observation.depth.shape)).float()
+    return replace(observation, depth=depth.where(_random_pixels(observation, severity, draw), observation.depth))
 
 
 def depth_steps(observation: Observation, severity: float, draw: np.random.Generator) -> Observation:
@@ -118,15 +116,14 @@ def judge_fit(
     observation = _observe(_sphere(true_parameters), fit.resolution, draw)
     if name in DISTURBANCES:
         observation = DISTURBANCES[name](observation, severity, draw)
-    view = View(observation.camera, observation.depth, torch.zeros(*observation.depth.shape, 3), observation.mask)
-    observed_view = GivenView.of(
-        view, fit, renderer, observed=observation.observed, mask=observation.mask, device=conditions.device
-    )
-    problem = SphereProblem(initial.to(conditions.device).requires_grad_(), observed_view, conditions.limits)
+    depth, mask, device = observation.depth, observation.mask, conditions.device
+    view = View(observation.camera, depth, torch.zeros(*depth.shape, 3), mask)
+    observed_view = GivenView.of(view, fit, renderer, observed=observation.observed, mask=mask, device=device)
+    problem = SphereProblem(initial.to(device).requires_grad_(), observed_view, conditions.limits)
     history = History()
     settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
-    optimise(problem, settings, conditions.device, history=history, on_step=lambda line: None)
-    error = float(problem.field()(_surface_points(true_parameters, draw).to(conditions.device)).abs().mean())
+    optimise(problem, settings, device, history=history, on_step=lambda line: None)
+    error = float(problem.field()(_surface_points(true_parameters, draw).to(device)).abs().mean())
     evaluations_per_ray = history.counts.value / observation.observed.numel() / max(len(history.curve), 1)
     return Outcome(
         _failure(history, error, conditions.criteria.surface_error),
@@ -194,7 +191,5 @@ def _failure(history: History, error: float, max_error: float) -> Failure:
     return Failure.NONE if error <= max_error else Failure.NOT_REACHED
 
 
-def _random_pixels(
-    observation: Observation, fraction: float, draw: np.random.Generator
-) -> Bool[Tensor, "height width"]:
+def _random_pixels(observation: Observation, fraction: float, draw: np.random.Generator) -> Bool[Tensor, "_ _"]:
     return torch.from_numpy(draw.uniform(size=observation.depth.shape) < fraction)

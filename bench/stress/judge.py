@@ -105,12 +105,10 @@ def judge_gradient(exam: Exam, renderer: Renderer, conditions: Conditions) -> Ou
     found_fraction = float(compared.sum() / first.hit.sum().clamp_min(1))
     if found_fraction < conditions.criteria.hits or not rendering.distance.requires_grad:
         return Outcome(Failure.LOST, {"found": found_fraction})
-    signs = torch.randn(
-        GRADIENT_SUMS, int(compared.sum()), generator=torch.Generator().manual_seed(SIGN_SEED), dtype=torch.float64
-    )
-    computed = _gradients(
-        rendering.distance.flatten()[compared.to(device)].double(), parameters, signs.to(device)
-    ).cpu()
+    generator = torch.Generator().manual_seed(SIGN_SEED)
+    signs = torch.randn(GRADIENT_SUMS, int(compared.sum()), generator=generator, dtype=torch.float64)
+    distance = rendering.distance.flatten()[compared.to(device)].double()
+    computed = _gradients(distance, parameters, signs.to(device)).cpu()
     true = _gradients(first.distance[compared], exact, signs)
     cosine = float((computed * true).sum() / (computed.norm() * true.norm()).clamp_min(torch.finfo(true.dtype).tiny))
     scale = float((computed * true).sum() / true.square().sum())

@@ -15,7 +15,7 @@ import numpy as np
 
 from renderers.checks import check_at_least
 
-CURVE_WIDTHS = (0.003, 0.01, 0.03, 0.08, 0.2)  # candidates; unit: the whole range of levels
+WIDTHS = (0.003, 0.01, 0.03, 0.08, 0.2)  # candidates; unit: the whole range of levels
 LAPSE_PROBABILITY = 0.02  # a trial fails, or succeeds, independently of its level
 MAX_MIDDLE_OUTSIDE = 0.15  # the middle may lie this far outside the range of levels
 MIDDLES_PER_LEVEL = 4
@@ -62,15 +62,13 @@ class Search:
         self.max_trials = self.grid_trials // 2
         step = 1.0 / (settings.levels - 1) / MIDDLES_PER_LEVEL
         self.middles = np.arange(-MAX_MIDDLE_OUTSIDE, 1.0 + MAX_MIDDLE_OUTSIDE + step / 2, step)
-        self.probabilities = np.full(
-            (len(self.middles), len(CURVE_WIDTHS)), 1.0 / len(self.middles) / len(CURVE_WIDTHS)
-        )
+        self.probabilities = np.full((len(self.middles), len(WIDTHS)), 1.0 / len(self.middles) / len(WIDTHS))
         self.trials: list[tuple[int, bool]] = []  # the index of the level, and whether the trial succeeded
 
     @cached_property
     def _success(self) -> np.ndarray:
         """The chance of success [level, middle, width]."""
-        scaled = (self.middles[None, :, None] - self.levels[:, None, None]) / np.array(CURVE_WIDTHS)
+        scaled = (self.middles[None, :, None] - self.levels[:, None, None]) / np.array(WIDTHS)
         return LAPSE_PROBABILITY + (1 - 2 * LAPSE_PROBABILITY) / (1 + np.exp(-np.clip(scaled, -50, 50)))
 
     def next(self) -> int | None:
@@ -103,7 +101,7 @@ class Search:
     def result(self) -> Breakdown:
         """The breakdown according to the current table."""
         low, high = self._interval()
-        return Breakdown(self._quantile(0.5), low, high, CURVE_WIDTHS[int(self.probabilities.sum(axis=0).argmax())])
+        return Breakdown(self._quantile(0.5), low, high, WIDTHS[int(self.probabilities.sum(axis=0).argmax())])
 
     def _interval(self) -> tuple[float, float]:
         return self._quantile((1 - CREDIBLE_PROBABILITY) / 2), self._quantile((1 + CREDIBLE_PROBABILITY) / 2)
