@@ -118,7 +118,7 @@ def field_scores(state: State, shots: Sequence[Shot]) -> dict[str, float]:
 def image_scores(
     views: Sequence[View], images: Sequence[Float[Tensor, "_ _ 3"]], shots: Sequence[Shot]
 ) -> dict[str, float]:
-    """The metrics of `IMAGE_SCORES` of images, black outside of the shape; without masks, those that need none."""
+    """The metrics of `IMAGE_SCORES` of images, black outside of the shape; without masks, only PSNR and SSIM."""
     pairs = [_compare_image(view, image, shot) for view, image, shot in zip(views, images, shots, strict=True)]
     means = {
         name: float(np.mean([pair[name] for pair in pairs])) for name in ("psnr", "psnr_image", "ssim", "mask_iou")

@@ -75,7 +75,7 @@ def test_the_smallest_that_no_larger_one_improves_on_is_kept(tmp_path):
         assert problem.asked == [0, *range(10)]  # one to warm up, then a quarter of 40
     assert "field=auto: middle, 10 numbers; error of colours on 2 photographs set aside" in choice.note
     assert "small 0.3, middle 0.1, large 0.1" in choice.note
-    metrics = choice.metrics(loop=2 * choice.seconds)
+    metrics = choice.metrics(runtime=2 * choice.seconds)
     assert metrics["field_overhead"] == pytest.approx(1.5)
     assert (metrics["field"], metrics["field_free"], metrics["field_bytes"], metrics["fields_tried"]) == (
         "middle", 10, 40, 3,

@@ -85,7 +85,7 @@ def test_neighbours_are_the_nearest_by_angle_within_bounds(sphere, monkeypatch, 
         found.append(f"{shot.name}-{other.name}")
         return Cloud(np.zeros((0, 3)), shot.camera)
 
-    monkeypatch.setattr(stereo, "_matched", matched)
+    monkeypatch.setattr(stereo, "_match", matched)
     clouds = stereo_clouds(shots, matching)
     assert found == pairs and len(clouds) == len(pairs)
 
