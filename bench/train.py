@@ -15,7 +15,7 @@ def train(run: Identity) -> None:
     from bench.machine.environment import flushing_denormals
     from bench.progress import run_progress
     from bench.setup.inputs import cell_of
-    from bench.tasks.single_view import OneImage, told
+    from bench.tasks.single_view import OneImage, describe_training
 
     cell = cell_of(run.config)
     if not isinstance(cell.task, OneImage):
@@ -28,7 +28,7 @@ def train(run: Identity) -> None:
         inputs = cell.inputs
         recipe = cell.task.recipe(inputs, run.config)
         path = recipe.make(inputs.cache, inputs.device, progress)
-    print(told(recipe.load(path)[1]), file=sys.stderr)
+    print(describe_training(recipe.load(path)[1]), file=sys.stderr)
     print(path)
 
 

@@ -1,4 +1,4 @@
-"""The fields with colours that a shape can be learnt as, and the one that a reconstruction takes with `field=auto`."""
+"""The fields with colours for a reconstruction, and the choice among them by `field=auto`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ from renderers.checks import BadInput, check_at_least, check_fraction, check_pos
 from renderers.fields.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
 
 FORMS = "task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
-ASIDE = 8  # of so many given photographs one is set aside for the trials
+VALIDATION_STEP = 8  # the trials do not learn from every 8th input photograph: it measures their error
 DEFINITIONS = {
     "field": "the field that field=auto ended on",
     "field_free, field_stored, field_bytes": "the numbers of its field and its colours, all of which are learnt, and "
@@ -42,12 +42,12 @@ DEFINITIONS = {
 
 @dataclass(frozen=True)
 class Appearance:
-    """What fields with colours are made of, beside their size.
+    """The settings of fields with colours, except their size.
 
     Args:
-        octaves: of the positional encoding of a distance network.
+        octaves: octaves of a distance network's positional encoding.
         directional: whether colours of a distance network depend on the view direction.
-        radius: of the sphere that all begin as, in scene units.
+        radius: radius of the initial sphere, in scene units.
     """
 
     octaves: int
@@ -59,10 +59,10 @@ class Appearance:
         check_positive("task.appearance.radius", self.radius, "0.5 lies within most objects")
 
     def make(self, name: str) -> Learnt:
-        """The field of that name at its start.
+        """Builds the initial field of a name.
 
         Raises:
-            BadInput: for a name that has no colours.
+            BadInput: for the name of a field without colours.
         """
         kind, sizes = (name, ()) if name in (PRIOR, AUTO) else parsed(name)
         if kind == "network":
@@ -81,12 +81,12 @@ Make = Callable[[str, Subject], ReconstructionProblem]
 
 @dataclass(frozen=True)
 class AutoField:
-    """How `field=auto` tries candidates, each from the start, for a share of a whole run.
+    """The settings of `field=auto`: each candidate is learnt from the start, for a fraction of a run's iterations.
 
     Args:
-        candidates: their names, each once, in any order; see `Appearance.make`.
-        trial: share of the iterations.
-        patience: successive larger candidates that may be tried without improvement.
+        candidates: names of fields, each once, in any order; see `Appearance.make`.
+        trial: fraction of the iterations.
+        patience: number of successive larger candidates that may be tried without improvement.
     """
 
     candidates: tuple[str, ...]
@@ -103,79 +103,81 @@ class AutoField:
     def choose(
         self, make: Make, sizes: dict[str, int], subject: Subject, settings: OptimiserSettings, run: RunContext
     ) -> "Choice":
-        """Tries candidates from the smallest on, and keeps the one that `bench.models.growth.climb` ends on.
+        """Tries candidates from the smallest to larger ones, and chooses by `bench.models.growth.climb`.
 
-        Errors are of photographs that are given, but not to the trials; groups are tiles of these. A trial whose loss
-        fails has no error.
+        Errors are measured on input photographs that the trials do not learn from, in groups of tiles. A trial whose
+        optimisation fails has no error.
 
         Args:
-            make: the problem of a candidate and photographs.
-            sizes: the free numbers of each candidate.
-            subject: all photographs; those that are held out are not used.
-            settings: of the whole run.
+            make: builds the problem of a candidate and photographs.
+            sizes: the number of free parameters of each candidate.
+            subject: all photographs; the held-out ones are not used.
+            settings: the settings of the full run.
         """
-        aside, rest = subject.given[::ASIDE], [shot for place, shot in enumerate(subject.given) if place % ASIDE]
-        part, device = replace(subject, given=tuple(rest)), run.inputs.device
-        brief = replace(settings, iterations=max(round(self.trial * settings.iterations), 1))
+        validation, device = subject.input_shots[::VALIDATION_STEP], run.inputs.device
+        fitted = tuple(shot for index, shot in enumerate(subject.input_shots) if index % VALIDATION_STEP)
+        trial_subject = replace(subject, input_shots=fitted)
+        trial_settings = replace(settings, iterations=max(round(self.trial * settings.iterations), 1))
 
         def trial(name: str, trials: Trials) -> Evidence:
-            torch.manual_seed(run.inputs.seed)  # each begins as it would alone
-            problem, history = make(name, part), History()
+            torch.manual_seed(run.inputs.seed)  # each trial starts as it would alone
+            problem, history = make(name, trial_subject), History()
 
             def on_step(line: dict[str, Any]) -> None:
-                run.progress(f"trying {name}", line["iteration"] + 1, brief.iterations, line["total"])
+                run.progress(f"trying {name}", line["iteration"] + 1, trial_settings.iterations, line["total"])
 
-            optimise(problem, brief, device, history=history, on_step=on_step)
-            found = Evidence(name, Size(sizes[name], sizes[name]), status=history.status)
-            found.seconds = history.seconds["forward"] + history.seconds["backward"]
-            found.evaluations = history.counts.value
+            optimise(problem, trial_settings, device, history=history, on_step=on_step)
+            evidence = Evidence(name, Size(sizes[name], sizes[name]), status=history.status)
+            evidence.seconds = history.seconds["forward"] + history.seconds["backward"]
+            evidence.evaluations = history.counts.value
             if history.status is RunStatus.OK:
-                found.error = tiled(problem.colour_errors(Stack.of(aside, None, device).pixels).cpu(), aside)
-            return found
+                pixels = Stack.build(validation, None, device).pixels
+                evidence.error = tiled(problem.colour_errors(pixels).cpu(), validation)
+            return evidence
 
         ordered = sorted(self.candidates, key=lambda name: sizes[name])
-        return Choice(climb(ordered, trial, patience=self.patience), len(aside))
+        return Choice(climb(ordered, trial, patience=self.patience), len(validation))
 
 
 @dataclass(frozen=True)
 class Choice:
-    """All trials, and the number of photographs that were set aside for them."""
+    """All trials, and the number of photographs that measured their errors."""
 
     trials: Trials
-    aside: int
+    validation_count: int
 
     @property
     def kept(self) -> Evidence:
-        """The trial of the field that is taken."""
+        """The trial of the chosen field."""
         return self.trials.kept[-1]
 
     @property
     def seconds(self) -> float:
-        """Of the loops of all trials."""
+        """The total runtime of all trials."""
         return sum(trial.seconds for trial in self.trials.tried)
 
     @property
     def note(self) -> str:
-        """The result, in words."""
+        """The result as text, for the record."""
         errors = ", ".join(f"{trial.candidate} {trial.mean:.3g}" for trial in self.trials.tried)
         values = sum(trial.evaluations for trial in self.trials.tried)
-        found = f"field=auto: {self.kept.candidate}, {self.kept.size.free:,} numbers"
+        text = f"field=auto: {self.kept.candidate}, {self.kept.size.free:,} numbers"
         if self.kept.error is None:
-            found += ", though no trial ended well: lower task.optimiser.learning_rate"
-        aside = f"{plural(self.aside, 'photograph')} set aside"
+            text += ", though no trial ended well: lower task.optimiser.learning_rate"
+        photographs = f"{plural(self.validation_count, 'photograph')} set aside"
         spent = f"the trials took {self.seconds:.1f} s and {values:,} values"
-        return f"{found}; error of colours on {aside}, after the trials: {errors}; {spent}"
+        return f"{text}; error of colours on {photographs}, after the trials: {errors}; {spent}"
 
-    def metrics(self, loop: float) -> dict[str, Any]:
-        """The metrics of `DEFINITIONS`, for a run whose loop took so many seconds."""
-        overhead = {"field_overhead": 1 + self.seconds / max(loop, 1e-9), "fields_tried": len(self.trials.tried)}
+    def metrics(self, runtime: float) -> dict[str, Any]:
+        """The metrics of `DEFINITIONS`, for a run with this runtime in seconds."""
+        overhead = {"field_overhead": 1 + self.seconds / max(runtime, 1e-9), "fields_tried": len(self.trials.tried)}
         return self.kept.field() | overhead
 
 
 def tiled(errors: Float[Tensor, " pixels"], shots: Sequence[Shot]) -> HeldOutError:
-    """The mean over tiles of the mean error of their pixels, which are those of all photographs in a row."""
-    places = [tiles(shot.camera.height, shot.camera.width) + k * TILES**2 for k, shot in enumerate(shots)]
-    groups = torch.cat(places)
+    """The mean over tiles of each tile's mean error; `errors` has the pixels of all photographs in a row."""
+    tile_numbers = [tiles(shot.camera.height, shot.camera.width) + k * TILES**2 for k, shot in enumerate(shots)]
+    groups = torch.cat(tile_numbers)
     means = (torch.bincount(groups, errors.double()) / torch.bincount(groups)).numpy()
-    one = np.ones_like(means)
-    return HeldOutError(np.stack([means, one, 0 * one, one], axis=1), 1.0)
+    ones = np.ones_like(means)
+    return HeldOutError(np.stack([means, ones, 0 * ones, ones], axis=1), 1.0)

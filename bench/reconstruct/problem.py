@@ -1,4 +1,4 @@
-"""The inverse problem of a shape with colours, learnt from random pixels of photographs."""
+"""The inverse problem of learning a shape with colours from random pixels of photographs."""
 
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -25,13 +25,13 @@ from renderers.field import Counts, Meter
 from renderers.fields.coloured import Coloured, ColouredDistance, ColouredGrid, ColouredOccupancy
 from renderers.rendering import Renderer, at_iteration
 
-COMPARED = 4096  # pixels of which the objective before and after is made
+OBJECTIVE_PIXELS = 4096  # compared before and after the optimisation
 Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid  # modules whose `field` is a Coloured
 
 
 @dataclass
 class ReconstructionProblem:
-    """The problem of learning a field with colours, from pixels that are drawn anew in each of `iterations`."""
+    """The problem of learning a field with colours; each of `iterations` draws new pixels."""
 
     subject: Subject
     stack: Stack
@@ -50,19 +50,18 @@ class ReconstructionProblem:
 
     @property
     def tracked(self) -> tuple[str, ...]:
-        """Metrics of checkpoints: of held-out photographs and, where it is known, of the true surface."""
+        """Metrics of checkpoints: on held-out photographs and, if it is known, on the true surface."""
         return ("psnr", *(["seen_chamfer_l1"] if self.subject.truth is not None else []))
 
     @property
     def observed(self) -> Bool[Tensor, "1 n"]:
-        """The pixels whose depth is given, of all photographs in one row."""
-        distance = self.stack.pixels.distance
-        known = torch.zeros_like(self.stack.pixels.at_one).bool() if distance is None else distance.isfinite()
-        return known[None]
+        """A mask of the pixels with a given depth, of all photographs in one row."""
+        distance, colours = self.stack.pixels.distance, self.stack.pixels.colours
+        return (torch.zeros_like(colours[:, 0]).bool() if distance is None else distance.isfinite())[None]
 
     @property
     def shown(self) -> Shown:
-        """The held-out photograph that the strip shows."""
+        """The held-out photograph for the filmstrip."""
         shot = self.subject.held_out[0]
         blank = torch.zeros(shot.camera.height, shot.camera.width)
         mask = torch.ones_like(blank).bool() if shot.mask is None else shot.mask
@@ -70,7 +69,7 @@ class ReconstructionProblem:
         return Shown(View(shot.camera, blank, normals, mask), shot.colours, shot.mask is not None)
 
     def field(self) -> Coloured:
-        """The shape at the current parameters, which stays as it is; it counts operations as one that is learnt."""
+        """A copy of the field at the current parameters; it counts operations like the learnt field."""
         return deepcopy(self.model).field
 
     def camera(self) -> Camera:
@@ -78,7 +77,7 @@ class ReconstructionProblem:
         return self.subject.held_out[0].camera
 
     def evaluate(self, state: State) -> Evaluation:
-        """The current shape against held-out photographs and the truth."""
+        """Compares the current shape with held-out photographs and the truth."""
         return judge(state, self.subject)
 
     def checkpoint(self, state: State) -> dict[str, float]:
@@ -92,27 +91,27 @@ class ReconstructionProblem:
         draw_reconstruction(folder, states[1], self.subject, curve, title)
 
     def loss(self, iteration: int) -> Terms:
-        """The terms and their sum, over pixels that are drawn anew in each iteration."""
+        """The terms and their sum, over new random pixels in each iteration."""
         patches = self.losses.colour_gradient > 0
         seed = self.seed * self.iterations + iteration
-        pixels = self.stack.drawn(self.rays_per_iteration, patches=patches, seed=seed)
+        pixels = self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed)
         shape = self.model.field
         return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
 
     def objective(self) -> float:
-        """The mean difference of colours over the same given pixels.
+        """The mean difference of colours over a fixed set of input pixels.
 
-        The loss itself compares what is hit: it falls where a surface is lost.
+        The loss is not used, because it compares hits only: it falls if the surface disappears.
         """
-        return float(self.colour_errors(self.stack.drawn(COMPARED, patches=False, seed=self.seed)).mean())
+        return float(self.colour_errors(self.stack.draw(OBJECTIVE_PIXELS, patches=False, seed=self.seed)).mean())
 
     def colour_errors(self, pixels: Pixels) -> Float[Tensor, " n"]:
         """The mean difference of the three colours of each pixel, black outside of the shape and of masks."""
         shape = self.field()
         with torch.no_grad():
             rendering = render_checked(at_iteration(self.renderer, self.iterations), shape, pixels.rays)
-        true = pixels.colours if pixels.mask is None else pixels.colours * pixels.mask[:, None]
-        found = torch.zeros_like(true)
-        at, towards = rendering.points[rendering.hit], pixels.rays.directions[rendering.hit]
-        found[rendering.hit] = colours_at(shape, at, towards, at.device).to(true)
-        return (found - true).abs().mean(dim=-1)
+        true_colours = pixels.colours if pixels.mask is None else pixels.colours * pixels.mask[:, None]
+        rendered_colours = torch.zeros_like(true_colours)
+        points, directions = rendering.points[rendering.hit], pixels.rays.directions[rendering.hit]
+        rendered_colours[rendering.hit] = colours_at(shape, points, directions, points.device).to(true_colours)
+        return (rendered_colours - true_colours).abs().mean(dim=-1)

@@ -1,4 +1,4 @@
-"""Failures that users of volume renderers report: weight before the surface, and bumps where no photograph looks."""
+"""Failures that users of volume renderers report: weight in front of the surface, and bumps in unseen regions."""
 
 from collections.abc import Sequence
 
@@ -13,14 +13,14 @@ from datasets.scene import Surface, View
 from renderers.boundary import render_checked
 from renderers.field import Field
 
-NEIGHBOURS = 0.05  # scene units: farthest apart that two points of the surface are compared
-EARLY = 0.05  # scene units in front of the surface, where no weight should be
-LEAST_WEIGHT = 1e-3  # of all samples of a ray; one with less sees no surface
+MAX_NEIGHBOUR_DISTANCE = 0.05  # scene units: normals of surface points up to this distance are compared
+EARLY_WEIGHT_GAP = 0.05  # scene units: weight farther in front of the surface than this is early
+MIN_RAY_WEIGHT = 1e-3  # a ray with a smaller sum of weights sees no surface
 ROUGHNESS = {
-    f"{part}_roughness": "Mean angle between the normals of two points sampled on the surface at most 0.05 scene units "
+    f"{name}_roughness": "Mean angle between the normals of two points sampled on the surface at most 0.05 scene units "
     f"apart, that {others} given photograph sees, less the same of the true surface, in degrees; normals count without "
     "their sign. Above 0 the surface is bumpier than the true one, below it is smoother."
-    for part, others in (("seen", "some"), ("unseen", "no"))
+    for name, others in (("seen", "some"), ("unseen", "no"))
 }
 WEIGHT = {
     OWN + "early_weight": "Share of the weight of a ray that lies more than 0.05 scene units in front of the first hit "
@@ -30,27 +30,28 @@ WEIGHT = {
 
 
 def roughness_scores(
-    found: tuple[Surface, Bool[np.ndarray, " n"]] | None, true: tuple[Surface, Bool[np.ndarray, " m"]]
+    predicted: tuple[Surface, Bool[np.ndarray, " n"]] | None, truth: tuple[Surface, Bool[np.ndarray, " m"]]
 ) -> dict[str, float]:
-    """The metrics of `ROUGHNESS` of a surface with those of its points that are seen, against the true one.
+    """The metrics of `ROUGHNESS`, from the points of both surfaces and the masks of seen points.
 
-    They are infinite without a surface, and without the part where the true one has it.
+    They are infinite without a predicted surface, and if only the true surface has the region.
     """
     scores = {}
-    for name, seen in zip(ROUGHNESS, (True, False), strict=True):
-        here, there = (None if one is None else roughness(one[0].some(one[1] == seen)) for one in (found, true))
-        if here is None:
-            scores[name] = 0.0 if there is None and found is not None else np.inf
+    for name, is_seen in zip(ROUGHNESS, (True, False), strict=True):
+        true_roughness = roughness(truth[0].some(truth[1] == is_seen))
+        rough = None if predicted is None else roughness(predicted[0].some(predicted[1] == is_seen))
+        if rough is None:
+            scores[name] = 0.0 if true_roughness is None and predicted is not None else np.inf
         else:
-            scores[name] = here - (there or 0.0)
+            scores[name] = rough - (true_roughness or 0.0)
     return scores
 
 
 def roughness(surface: Surface) -> float | None:
-    """The mean angle between the normals of points that are neighbours, in degrees; None where there are none."""
+    """The mean angle between the normals of neighbouring points, in degrees; None if no two points are neighbours."""
     if len(surface.points) < 2:
         return None
-    first, second = cKDTree(surface.points).query_pairs(NEIGHBOURS, output_type="ndarray").T
+    first, second = cKDTree(surface.points).query_pairs(MAX_NEIGHBOUR_DISTANCE, output_type="ndarray").T
     if not len(first):
         return None
     normals = surface.normals / np.linalg.norm(surface.normals, axis=1, keepdims=True).clip(1e-12)
@@ -60,9 +61,9 @@ def roughness(surface: Surface) -> float | None:
 
 @torch.no_grad()
 def early_weight(field: Field, views: Sequence[View], inputs: RunInputs) -> dict[str, float]:
-    """The metric of `WEIGHT`; none of a renderer that sees hits alone, and none where no ray hits.
+    """The metric of `WEIGHT`; empty if the renderer gives no volume, and if no ray hits.
 
-    The views are of the field's mesh, by exact first hits.
+    The views show the field's mesh, by exact first hits.
     """
     shares: list[Float[torch.Tensor, " rays"]] = []
     for view in views:
@@ -73,9 +74,9 @@ def early_weight(field: Field, views: Sequence[View], inputs: RunInputs) -> dict
         volume = render_checked(inputs.renderer, field, rays).volume
         if volume is None:
             return {}
-        early = (volume.distance < surface[volume.ray] - EARLY).to(surface)
-        both = volume.weighted_sum(torch.stack([early, torch.ones_like(early)], dim=-1), len(surface))
-        opaque = both[:, 1] > LEAST_WEIGHT
-        shares.append((both[opaque, 0] / both[opaque, 1]).cpu())
-    known = torch.cat(shares) if shares else torch.zeros(0)
-    return {name: float(known.mean()) for name in WEIGHT} if len(known) else {}
+        early = (volume.distance < surface[volume.ray] - EARLY_WEIGHT_GAP).to(surface)
+        summed = volume.weighted_sum(torch.stack([early, torch.ones_like(early)], dim=-1), len(surface))
+        opaque = summed[:, 1] > MIN_RAY_WEIGHT
+        shares.append((summed[opaque, 0] / summed[opaque, 1]).cpu())
+    ray_shares = torch.cat(shares) if shares else torch.zeros(0)
+    return {name: float(ray_shares.mean()) for name in WEIGHT} if len(ray_shares) else {}

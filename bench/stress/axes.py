@@ -1,4 +1,4 @@
-"""The axes of stress tests: a scene, what is tested there, and the range of severities."""
+"""The axes of stress tests: a scene, the tested property, and the range of severities."""
 
 from dataclasses import dataclass, fields, is_dataclass, replace
 from math import exp, isfinite, log
@@ -27,7 +27,7 @@ class Sweep:
     """The range of severities of a stress.
 
     Args:
-        mild, severe: its ends; mild may be the larger number.
+        mild, severe: the ends of the range; mild may be the larger number.
         log: whether levels between them are spaced evenly in the logarithm.
         unit: of a severity, in words.
     """
@@ -62,7 +62,7 @@ class Stress:
         group: of axes in the atlas.
         sweep: the range of severities.
         setting: the renderer's setting that takes the severity, if it is one.
-        repeats: 1 where repeats of a trial cannot differ, so that no interval is given; else null, for task.search's.
+        repeats: 1 if repeats of a trial cannot differ, then there is no interval; else null, for task.search.repeats.
     """
 
     scene: str
@@ -82,24 +82,24 @@ class Stress:
             raise ValueError(f"task.stress.repeats must be 1 or null, not {self.repeats}: set task.search.repeats")
 
     def stressed(self, renderer: Renderer, severity: float) -> Renderer:
-        """The renderer with its setting at the severity; unchanged where the severity is not a setting.
+        """The renderer with its setting at the severity; unchanged if the severity is not a renderer's setting.
 
         Raises:
-            Unsupported: where it has no such setting, or has switched it off by null.
+            Unsupported: if the renderer has no such setting, or has switched it off by null.
         """
         if self.setting is None:
             return renderer
         settings = {field.name for field in fields(renderer)} if is_dataclass(renderer) else set()
-        present: Any = getattr(renderer, self.setting) if self.setting in settings else None
-        if present is None:
+        unstressed: Any = getattr(renderer, self.setting) if self.setting in settings else None
+        if unstressed is None:
             raise Unsupported(
                 f"{type(renderer).__name__} has no {self.setting}, or it is null: choose another renderer"
             )
-        value = max(round(severity), 1) if isinstance(present, int) else severity
+        value = max(round(severity), 1) if isinstance(unstressed, int) else severity
         return replace(renderer, **{self.setting: value})  # type: ignore[type-var]
 
-    def made(self, conditions: Conditions) -> Scene:
-        """What makes the exams of a rendering or its gradient."""
+    def exam_generator(self, conditions: Conditions) -> Scene:
+        """The function that generates the exams of a rendering or its gradient."""
         if (prior := conditions.prior) is None or self.scene not in NETWORK_DISTORTIONS:
             return SCENES[self.scene]
         return network_scene(self.scene, prior.decoder.to(conditions.device), prior.codes.to(conditions.device))
@@ -108,7 +108,7 @@ class Stress:
         """Trial number `repeat` at a level, the same one for every renderer. An exception is recorded as a failure.
 
         Raises:
-            Unsupported: where the renderer lacks what is tested, or has no such setting.
+            Unsupported: if the renderer lacks the tested property, or has no such setting.
         """
         seed = crc32(f"{self.scene} {level:.6f} {repeat}".encode())
         torch.manual_seed(seed)  # for renderers and losses with random draws
@@ -127,5 +127,5 @@ class Stress:
         stressed = self.stressed(renderer, severity)
         if self.measure == "fit":
             return judge_fit(self.scene, severity, draw, renderer=stressed, conditions=conditions)
-        exam = self.made(conditions)(severity, draw, conditions.resolution)
+        exam = self.exam_generator(conditions)(severity, draw, conditions.resolution)
         return (judge_rendering if self.measure == "rendering" else judge_gradient)(exam, stressed, conditions)

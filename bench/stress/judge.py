@@ -1,4 +1,4 @@
-"""Stress tests of a rendering and of its gradient, compared with the closed-form truth in float64."""
+"""Stress tests that compare a rendering and its gradient with the closed-form truth in float64."""
 
 import torch
 from jaxtyping import Float
@@ -13,9 +13,9 @@ from renderers.camera import Rays
 from renderers.field import Meter
 from renderers.rendering import Renderer
 
-SUMS = 8  # random sums of distances, whose gradients are compared
-SEED = 0
-OF_RENDERINGS = {
+GRADIENT_SUMS = 8  # gradients of this many random sums of distances are compared
+SIGN_SEED = 0
+RENDERING_NUMBERS = {
     "lost": "true hits that were missed",
     "false": "spurious hits: on rays that have no true hit, or begin inside",
     "wrong": "true hits found with an error larger than the pixel's footprint: its width at the true distance, over "
@@ -23,7 +23,7 @@ OF_RENDERINGS = {
     "hits": "true hits",
     "evaluations_per_ray": "field values computed, divided by rays",
 }
-OF_GRADIENTS = {
+GRADIENT_NUMBERS = {
     "gradient_cosine": "cosine between the gradients of 8 random sums of distances towards the scene's parameters, and "
     "the true ones, over true hits that were found",
     "gradient_scale": "projection of that gradient on the true one, divided by the true one's length",
@@ -36,7 +36,7 @@ def judge_rendering(exam: StressCase, renderer: Renderer, conditions: Conditions
     """Renders an exam, and compares each ray with the truth in float64.
 
     Raises:
-        LimitReached: where the rendering exceeds its time or memory.
+        LimitReached: if the rendering exceeds its time or memory.
     """
     camera = exam.camera
     true, footprint = truth(exam)
@@ -75,7 +75,7 @@ def truth(exam: StressCase) -> tuple[FirstHit, Float[Tensor, " n"]]:
 
 
 def _failure_of_pixels(numbers: dict[str, float], rays: int, criteria: Criteria) -> Failure:
-    """The most frequent kind of failure, where failures exceed the criteria."""
+    """The most frequent kind of failure, if failures exceed the criteria."""
     bad = {Failure.LOST: numbers["lost"], Failure.WRONG: numbers["wrong"], Failure.NAN: numbers["nan"]}
     kinds = {}
     if sum(bad.values()) > (1 - criteria.hits) * numbers["hits"]:
@@ -89,28 +89,30 @@ def judge_gradient(exam: StressCase, renderer: Renderer, conditions: Conditions)
     """Renders an exam with gradient, and compares the gradient with the true one.
 
     Raises:
-        Unsupported: where the renderer has no gradient towards the field.
-        LimitReached: where the rendering exceeds its time or memory.
+        Unsupported: if the renderer has no gradient for the field.
+        LimitReached: if the rendering exceeds its time or memory.
     """
     check_field_gradient(renderer)
     if exam.solid is None or exam.parameters is None:
         raise ValueError("task.stress.scene has no parameters: choose grazing_plane for measure=gradient")
     device = conditions.device
-    free = exam.parameters.float().to(device).requires_grad_()
-    watched = conditions.limits.watch(exam.solid(free).field, device)
-    found = render_checked(renderer, watched, exam.camera.rays().to(device))
+    parameters = exam.parameters.float().to(device).requires_grad_()
+    watched = conditions.limits.watch(exam.solid(parameters).field, device)
+    rendering = render_checked(renderer, watched, exam.camera.rays().to(device))
     exact = exam.parameters.double().requires_grad_()
     first = exam.solid(exact).trace(exam.camera.double().rays().flat())
-    compared = first.hit & found.hit.flatten().cpu()
-    share = float(compared.sum() / first.hit.sum().clamp_min(1))
-    if share < conditions.criteria.hits or not found.distance.requires_grad:
-        return Outcome(Failure.LOST, {"found": share})
-    signs = torch.randn(SUMS, int(compared.sum()), generator=torch.Generator().manual_seed(SEED), dtype=torch.float64)
-    computed = _gradients(found.distance.flatten()[compared.to(device)].double(), free, signs.to(device)).cpu()
+    compared = first.hit & rendering.hit.flatten().cpu()
+    found_fraction = float(compared.sum() / first.hit.sum().clamp_min(1))
+    if found_fraction < conditions.criteria.hits or not rendering.distance.requires_grad:
+        return Outcome(Failure.LOST, {"found": found_fraction})
+    generator = torch.Generator().manual_seed(SIGN_SEED)
+    signs = torch.randn(GRADIENT_SUMS, int(compared.sum()), generator=generator, dtype=torch.float64)
+    distance = rendering.distance.flatten()[compared.to(device)].double()
+    computed = _gradients(distance, parameters, signs.to(device)).cpu()
     true = _gradients(first.distance[compared], exact, signs)
     cosine = float((computed * true).sum() / (computed.norm() * true.norm()).clamp_min(torch.finfo(true.dtype).tiny))
     scale = float((computed * true).sum() / true.square().sum())
-    numbers = {"gradient_cosine": cosine, "gradient_scale": scale, "found": share}
+    numbers = {"gradient_cosine": cosine, "gradient_scale": scale, "found": found_fraction}
     return Outcome(_failure_of_gradient(cosine, scale, conditions.criteria), numbers)
 
 

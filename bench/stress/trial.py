@@ -19,11 +19,11 @@ class Criteria:
     """The criteria of success.
 
     Args:
-        hits: least share of the true hits that must be found within the pixel's footprint.
-        false_hits: largest number of spurious hits over true ones; over all rays where there are no true ones.
-        cosine: least cosine between the gradient and the true one.
-        scale: largest relative error of its length.
-        surface_error: largest mean distance from the true surface to the fitted one, in scene units.
+        hits: minimum fraction of the true hits that are found within the pixel's footprint.
+        false_hits: maximum ratio of spurious hits to true hits; to all rays if the scene has no true hits.
+        cosine: minimum cosine between the gradient and the true one.
+        scale: maximum relative error of the gradient's length.
+        surface_error: maximum mean distance from the true surface to the fitted one, in scene units.
     """
 
     hits: float
@@ -44,10 +44,10 @@ class FitSettings:
     """The fit of a stress test with measure=fit.
 
     Args:
-        resolution: height and width of its image, in pixels.
-        iterations, learning_rate: of Adam; the rate falls to zero along half a cosine.
+        resolution: height and width of the image, in pixels.
+        iterations, learning_rate: settings of Adam; the rate falls to zero along half a cosine.
         depth_loss, depth_weight, silhouette, silhouette_weight: as in completion.
-        offset: of the sphere's centre at the start, in scene units.
+        offset: initial distance of the sphere's centre from the true one, in scene units.
     """
 
     resolution: int
@@ -68,7 +68,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions of all trials: W of a W x W rendering, the fit, criteria, limits, device, and any network."""
+    """The conditions of all trials: W of a W x W rendering, the fit, criteria, limits, device, and any prior."""
 
     resolution: int
     fit: FitSettings

@@ -1,4 +1,4 @@
-"""Renderers that were timed in turn in one process: their costs over those of the first one, and their errors."""
+"""Renderers timed in turn in one process: their costs relative to the first renderer, and their errors."""
 
 from dataclasses import replace
 from typing import Any
@@ -7,7 +7,7 @@ from bench.report.data.records import Record, measured, setting
 from bench.report.study import Result, Runs, Selection, format, table
 
 PLACE = 15
-BASE = "base"  # the run's own renderer among the numbers of a record, as in bench.tasks.ablation
+BASE = "base"  # prefix of the run's renderer in the metrics, as in bench.tasks.ablation
 READS = (
     Selection(
         "benchmark",
@@ -33,9 +33,9 @@ NOTES = (
 
 def make(runs: Runs) -> Result:
     """A line per image size, number of threads and renderer."""
-    # The task sets its own number of threads: a column has it, and no caption.
+    # The task sets the number of threads: it is a column, not part of the caption.
     records = [record | {"environment": record["environment"] | {"threads": None}} for record in runs.records]
-    lines = [line for record in sorted(records, key=_place) for line in _lines(record)]
+    lines = [line for record in sorted(records, key=_size_and_threads) for line in _lines(record)]
     rounds = sorted({line["rounds"] for line in lines if line["rounds"]})
     return Result(
         replace(runs, records=records),
@@ -51,19 +51,19 @@ def make(runs: Runs) -> Result:
 
 
 def _verdict(lines: list[dict[str, Any]]) -> str:
-    """The ratios of a step at the largest size that ended ok."""
-    known = [line for line in lines if line["status"] == "ok" and line.get("step_ratio") is not None]
-    size = max((line["size"] for line in known), default=0)
+    """The ratios of a step's time at the largest size that ended ok."""
+    measured_lines = [line for line in lines if line["status"] == "ok" and line.get("step_ratio") is not None]
+    size = max((line["size"] for line in measured_lines), default=0)
     ratios = {
         f"{line['renderer']}, {format.plural(line['threads'], 'thread')}": line["step_ratio"]
-        for line in known
+        for line in measured_lines
         if line["size"] == size and not line["first"]
     }
-    first = next((line["renderer"] for line in known if line["first"]), "")
+    first = next((line["renderer"] for line in measured_lines if line["first"]), "")
     return format.ends(f"A step at {size} × {size} pixels over that of {first}", ratios, "one shape")
 
 
-def _place(record: Record) -> tuple[int, int]:
+def _size_and_threads(record: Record) -> tuple[int, int]:
     """The size of the image and the number of threads."""
     return setting(record["config"], "task", "size"), setting(record["config"], "task", "threads")
 
@@ -75,25 +75,25 @@ def _lines(record: Record) -> list[dict[str, Any]]:
         name, _, metric = key.rpartition(".")
         if name:
             numbers.setdefault(name, {})[metric] = measured(record, key)
-    size, threads = _place(record)
-    about = {"size": size, "threads": threads, "rounds": record["metrics"].get("rounds")}
-    about |= {key: record[key] for key in ("status", "reason", "folder")}
+    size, threads = _size_and_threads(record)
+    shared = {"size": size, "threads": threads, "rounds": record["metrics"].get("rounds")}
+    shared |= {key: record[key] for key in ("status", "reason", "folder")}
     return [
-        {**about, "renderer": record["renderer"] if name == BASE else name, "first": name == BASE, **own}
-        for name, own in (numbers or {BASE: {}}).items()
+        {**shared, "renderer": record["renderer"] if name == BASE else name, "first": name == BASE, **renderer_numbers}
+        for name, renderer_numbers in (numbers or {BASE: {}}).items()
     ]
 
 
 def _ratio(cost: str) -> table.Column:
-    """The median of a ratio, and between which ends it lay."""
+    """The median of a ratio, with its minimum and maximum."""
 
-    def words(line: dict[str, Any]) -> str:
-        middle, low, high = (line.get(f"{cost}_ratio{end}") for end in ("", "_low", "_high"))
-        if middle is None:
+    def text(line: dict[str, Any]) -> str:
+        median, low, high = (line.get(f"{cost}_ratio{end}") for end in ("", "_low", "_high"))
+        if median is None:
             return format.MISSING
-        return "1" if line["first"] else f"{middle:.2f} ({low:.2f}–{high:.2f})"
+        return "1" if line["first"] else f"{median:.2f} ({low:.2f}–{high:.2f})"
 
-    return table.Column(f"{cost}_ratio", COSTS[cost], words=words)
+    return table.Column(f"{cost}_ratio", COSTS[cost], words=text)
 
 
 COLUMNS = (

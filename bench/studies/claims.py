@@ -17,15 +17,15 @@ CONDITIONS = tuple(
 )
 READS = tuple(Selection(name, CONDITIONS, setup=()) for name in EXPERIMENTS)
 SHAPE = ["family", "solid"]
-PAPERS_FAMILIES = ("sofa", "plane", "table")  # of DIST, Table 2
-SAME = 1.25  # a ratio between this and its inverse is called the same; the margin is ours
-SMALLER, NO_LARGER = (0.0, 1.0), (0.0, SAME)  # the ratios that a claim allows
-Settings = Mapping[str, float | str | bool]  # of a run; a run with others, of an older version too, is not read
-CLAMPED = {"renderer.step_clamp": 0.1}  # both rows, as the official code
-LONG = {"task.images.views": 72, "task.optimiser.iterations": 180}  # as the paper's photographs are
-FIRST = {**LONG, "task.focal": 1.0, "task.start_scale": 1.0}
-PLACED = {**LONG, "task.similarity": True, "task.degrees": 0.0, "task.shift": 0.0, "task.scale": 1.0}
-UNREAD = "needs runs with the settings of this version, which the command makes"
+DIST_TABLE2_FAMILIES = ("sofa", "plane", "table")
+MAX_SAME_RATIO = 1.25  # a ratio between this and its inverse is called the same; the paper has no such margin
+SMALLER, NO_LARGER = (0.0, 1.0), (0.0, MAX_SAME_RATIO)  # the ratios that a claim allows
+RunSettings = Mapping[str, float | str | bool]  # only runs with these settings are read
+CLAMPED = {"renderer.step_clamp": 0.1}  # both rows, as in the official code
+PAPER_VIEWS = {"task.images.views": 72, "task.optimiser.iterations": 180}  # as many photographs as in the paper
+FIG10 = {**PAPER_VIEWS, "task.focal": 1.0, "task.start_scale": 1.0}
+FIG12 = {**PAPER_VIEWS, "task.similarity": True, "task.degrees": 0.0, "task.shift": 0.0, "task.scale": 1.0}
+NO_RUNS = "needs runs with the settings of this version, which the command makes"
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class Claim:
         source: the paper, and its table, figure or section.
         text: the claim.
         published: the paper's ratio; None where it gives no number.
-        experiment: whose runs measure it; empty where nothing does.
-        command: the experiment that makes them, where it has another name.
-        top, bottom: presets of the rows whose ratio is taken.
-        metric: an error or a cost, of which less is better.
+        experiment: name of the experiment whose runs measure it; empty if it is not measured.
+        command: name of the experiment that makes the runs, if it is another one.
+        top, bottom: presets of the rows whose ratio is computed.
+        metric: an error or a cost; less is better.
         expected: the least and the largest ratio that the claim allows.
-        of_top, of_bottom: settings of the runs of `top` and, where they differ from these, of `bottom`.
-        families: of shapes; empty for all.
-        test: of this project's own, which checks it and fails where it does not hold; else empty.
-        why: the cause where the claim is not found to hold, or what a measurement needs.
+        top_settings, bottom_settings: settings of the runs of `top` and of `bottom`; None: the same.
+        families: families of shapes; empty for all.
+        test: name of a test of this project that fails if the claim does not hold; else empty.
+        why: the cause if the claim does not hold here, or what a measurement needs.
     """
 
     source: str
@@ -55,8 +55,8 @@ class Claim:
     bottom: str = ""
     metric: str = "chamfer_l2"
     expected: tuple[float, float] = SMALLER
-    of_top: Settings = field(default_factory=dict)
-    of_bottom: Settings | None = None
+    top_settings: RunSettings = field(default_factory=dict)
+    bottom_settings: RunSettings | None = None
     families: tuple[str, ...] = ()
     command: str = ""
     test: str = ""
@@ -64,8 +64,8 @@ class Claim:
 
 
 def _table2(points: str, ratios: list[float], top: str, bottom: str, text: str, why: str) -> Claim:
-    about = {"of_top": {"task.points": points}, "families": PAPERS_FAMILIES, "why": why}
-    return Claim("DIST, Table 2", text, _mean(ratios), "table2", top, bottom, **about)
+    settings = {"top_settings": {"task.points": points}, "families": DIST_TABLE2_FAMILIES, "why": why}
+    return Claim("DIST, Table 2", text, _mean(ratios), "table2", top, bottom, **settings)
 
 
 def _mean(ratios: list[float]) -> float:
@@ -76,17 +76,17 @@ DENSE = [4.12 / 5.37, 2.18 / 3.71, 5.37 / 12.93]  # DIST with mask over DeepSDF
 TWENTY = [4.94 / 7.63, 3.60 / 5.39, 7.62 / 15.77]
 TWENTY_MASK = [4.94 / 6.95, 3.60 / 5.30, 7.62 / 15.83]  # over DIST without the mask
 AVERAGE = "the mean of the mask loss over all pixels, which the text does not give: see the next line, and `as_printed`"
-LONGER = "DIST has 100 iterations, DeepSDF's samples 300: see `as_printed`"
-CARS = ("car",)  # of DVR, Table 1: 0.196 by RGB, 0.179 by depth, 0.181 by 3D supervision
-SEEN, COST = "seen_chamfer_l1", "queries"
+ITERATIONS = "DIST has 100 iterations, DeepSDF's samples 300: see `as_printed`"
+CARS = ("car",)  # DVR, Table 1: 0.196 with RGB, 0.179 with depth, 0.181 with 3D supervision
+SEEN_ERROR, COST = "seen_chamfer_l1", "queries"
 CLAIMS = (
     Claim(
         "DIST, Table 1", "aggressive marching saves field evaluations (both clamped)", 1.43 / 1.99, "table1_large",
-        "dist_aggressive", "dist_dynamic", COST, of_top=CLAMPED,
+        "dist_aggressive", "dist_dynamic", COST, top_settings=CLAMPED,
     ),
     Claim(
         "DIST, Table 1", "coarse to fine saves further evaluations", 887 / 1430, "table1_large", "dist_coarse_to_fine",
-        "dist_aggressive", COST, of_top=CLAMPED,
+        "dist_aggressive", COST, top_settings=CLAMPED,
     ),
     Claim(
         "DIST, Table 1", "100 steps cost as many evaluations as 50", 898 / 887, "table1_large",
@@ -99,7 +99,7 @@ CLAIMS = (
     ),
     _table2(
         "dense", DENSE, "dist_mask_official", "deepsdf_truncated",
-        "dense depth: DIST is better than DeepSDF (official code's mask loss)", LONGER,
+        "dense depth: DIST is better than DeepSDF (official code's mask loss)", ITERATIONS,
     ),
     _table2(
         "20", TWENTY, "dist_mask_paper", "deepsdf_truncated",
@@ -107,7 +107,7 @@ CLAIMS = (
     ),
     _table2(
         "20", TWENTY, "dist_mask_official", "deepsdf_truncated",
-        "20 points and mask: DIST is better than DeepSDF (official code's mask loss)", LONGER,
+        "20 points and mask: DIST is better than DeepSDF (official code's mask loss)", ITERATIONS,
     ),
     _table2(
         "20", TWENTY_MASK, "dist_mask_paper", "dist_depth_paper", "20 points: the mask helps (paper's setting)", AVERAGE
@@ -118,7 +118,7 @@ CLAIMS = (
     ),
     Claim(
         "DIST, Table 3", "from random codes, DIST is better than PMO", _mean([0.919 / 1.187, 1.595 / 6.124]),
-        "table3", "multiview_paper", "multiview_mesh_long", "chamfer_gt_to_pred", of_top=LONG,
+        "table3", "multiview_paper", "multiview_mesh_long", "chamfer_gt_to_pred", top_settings=PAPER_VIEWS,
         why="needs runs of the method `multiview_mesh_long`, with as many views and iterations",
     ),
     Claim(
@@ -131,17 +131,17 @@ CLAIMS = (
     ),
     Claim(
         "DIST, Fig. 10", "robust to the focal length (our test: half of it)", None, "fig10", "multiview_paper",
-        "multiview_paper", "chamfer_gt_to_pred", NO_LARGER, {**FIRST, "task.focal": 0.5}, FIRST, command="fig10_focal",
+        "multiview_paper", "chamfer_gt_to_pred", NO_LARGER, {**FIG10, "task.focal": 0.5}, FIG10, command="fig10_focal",
     ),
     Claim(
         "DIST, Fig. 10", "not affected by noise in the initial code (our test: twice the noise)", None, "fig10",
         "multiview_paper", "multiview_paper", "chamfer_gt_to_pred", NO_LARGER,
-        {**FIRST, "task.start_scale": 2.0}, FIRST, command="fig10_start",
+        {**FIG10, "task.start_scale": 2.0}, FIG10, command="fig10_start",
     ),
     Claim(
         "DIST, Fig. 12", "a similarity is optimised with the shape (our test: 20 degrees off)", None, "fig12",
-        "multiview_paper", "multiview_paper", "chamfer_gt_to_pred", NO_LARGER, {**PLACED, "task.degrees": 20.0},
-        PLACED,
+        "multiview_paper", "multiview_paper", "chamfer_gt_to_pred", NO_LARGER, {**FIG12, "task.degrees": 20.0},
+        FIG12,
     ),
     Claim(
         "DIST, Sec. 4.2", "it generalises to images of another data set and to real photographs",
@@ -167,13 +167,15 @@ CLAIMS = (
     ),
     Claim(
         "DVR, Fig. 7", "RGB alone has a smaller error than the visual hull", None, "dvr_table2", "dvr_paper", "hull",
-        SEEN,
+        SEEN_ERROR,
     ),
     Claim(
         "DVR, Table 2", "RGB is better than stereo with trim 5 (not trim 7)", 0.907 / 1.091, "dvr_table2", "dvr_paper",
-        "stereo_5", SEEN,
+        "stereo_5", SEEN_ERROR,
     ),
-    Claim("DVR, Table 2", "depth improves on RGB", 0.782 / 0.907, "dvr_table2", "dvr_paper_depth", "dvr_paper", SEEN),
+    Claim(
+        "DVR, Table 2", "depth improves on RGB", 0.782 / 0.907, "dvr_table2", "dvr_paper_depth", "dvr_paper", SEEN_ERROR
+    ),
     Claim(
         "DVR, Table 2", "on DTU's photographs, in mm",
         why="needs DTU's data: `+experiment=photos dataset.truth=DTU`",
@@ -192,8 +194,8 @@ NOTES = (
     "A claim of a smaller error “holds” where the interval lies below 1, and “does not hold” where it lies above. "
     "Where the interval lies above half of the published effect, in the logarithm, the claim is “weaker” below 1, and "
     "“less than half the effect” around it.",
-    f"A claim of no larger an error allows ratios up to {SAME}; that margin is ours. It “holds” where the interval "
-    "lies below, and is “larger (size not decided)” where the interval lies above 1 and includes the margin.",
+    f"A claim of no larger an error allows ratios up to {MAX_SAME_RATIO}; that margin is ours. It “holds” where the "
+    "interval lies below, and is “larger (size not decided)” where the interval lies above 1 and includes the margin.",
     "Below six shapes the verdict says whether the median is as claimed. Counts of evaluations in Table 1 follow "
     "nearly from the algorithm: one shape shows their size. All else is “not decided”.",
     "No correction for the number of claims is made: each is a question of its own.",
@@ -201,10 +203,10 @@ NOTES = (
 CHECKED, UNTESTED = "checked by a test", "not tested"
 
 
-def make(*read: Runs | None) -> Result:
+def make(*sources: Runs | None) -> Result:
     """A line per claim."""
-    experiments: dict[str, Runs | None] = dict(zip(EXPERIMENTS, read, strict=True))
-    first = next(runs for runs in read if runs is not None)
+    experiments: dict[str, Runs | None] = dict(zip(EXPERIMENTS, sources, strict=True))
+    first = next(runs for runs in sources if runs is not None)
     lines = [_line(claim, experiments.get(claim.experiment)) for claim in CLAIMS]
     return Result(
         first,
@@ -236,36 +238,36 @@ def _line(claim: Claim, runs: Runs | None) -> dict[str, Any]:
         **{"source": claim.source, "claim": claim.text, "published": claim.published, "ratio": ratio},
         **{"shapes": None if ratio is None else len(ratio.points), "verdict": verdict},
         "families": "" if ratio is None or runs is None else ", ".join(claim.families or runs.families()),
-        "why": "" if explained else claim.why or (UNREAD if ratio is None else ""),
+        "why": "" if explained else claim.why or (NO_RUNS if ratio is None else ""),
         "command": f"-m +experiment={claim.command or claim.experiment}" if claim.experiment else claim.test,
     }
 
 
 def ratio_of(claim: Claim, runs: Runs) -> statistics.Interval | None:
-    """The median over shapes of the ratio of a claim's two rows; None without a shape that both have."""
+    """The median over shapes of the ratio of a claim's two rows; None without a common shape."""
     runs = runs.made
     frame = runs.frame[[*SHAPE, "preset"]].assign(error=runs.error(claim.metric, 1))
     sides = []
-    of_bottom = claim.of_top if claim.of_bottom is None else claim.of_bottom
-    for preset, settings in ((claim.top, claim.of_top), (claim.bottom, of_bottom)):
+    bottom_settings = claim.top_settings if claim.bottom_settings is None else claim.bottom_settings
+    for preset, settings in ((claim.top, claim.top_settings), (claim.bottom, bottom_settings)):
         chosen = frame.preset == preset
         for key, value in settings.items():
-            chosen &= runs.setting(key).map(_plain) == _plain(str(value))
+            chosen &= runs.setting(key).map(_as_number) == _as_number(str(value))
         if claim.families:
             chosen &= frame.family.isin(claim.families)
         errors = frame.loc[chosen].groupby(SHAPE, sort=False).error
-        sides.append(errors.agg(lambda of_shape: statistics.geometric_mean(of_shape.to_numpy())))
-    both = pd.concat(sides, axis=1, join="inner")
-    finite = np.isfinite(both)
-    both = both[finite.all(axis=1) if claim.metric == COST else finite.any(axis=1)]  # a failed run has no cost
-    if both.empty:
+        sides.append(errors.agg(lambda shape: statistics.geometric_mean(shape.to_numpy())))
+    pairs = pd.concat(sides, axis=1, join="inner")
+    finite = np.isfinite(pairs)
+    pairs = pairs[finite.all(axis=1) if claim.metric == COST else finite.any(axis=1)]  # a failed run has no cost
+    if pairs.empty:
         return None
-    above, below = ([np.array([error]) for error in side] for side in both.to_numpy().T)
+    above, below = ([np.array([error]) for error in side] for side in pairs.to_numpy().T)
     return statistics.ratio(above, below)
 
 
-def _plain(text: str) -> float | str:
-    """A setting as a number, so that 20 and 20.0 are the same; as it is where it is none."""
+def _as_number(text: str) -> float | str:
+    """A setting as a number, so that 20 and 20.0 are equal; unchanged if it is no number."""
     try:
         return float(text)
     except ValueError:
@@ -273,11 +275,11 @@ def _plain(text: str) -> float | str:
 
 
 def verdict_of(claim: Claim, ratio: statistics.Interval) -> str:
-    """What a measured ratio says of a claim, by the rules in `NOTES`."""
+    """The verdict of a measured ratio on a claim, by the rules in `NOTES`."""
     least, most = claim.expected
     if not ratio.known:
-        close = least <= ratio.value <= most
-        return f"{'as claimed' if close else 'against the claim'}, {format.plural(len(ratio.points), 'shape')}"
+        as_claimed = least <= ratio.value <= most
+        return f"{'as claimed' if as_claimed else 'against the claim'}, {format.plural(len(ratio.points), 'shape')}"
     if ratio.low > most:
         return "does not hold"
     if claim.expected != SMALLER:

@@ -1,20 +1,10 @@
-"""Table 1 and Figs. 4 and 5 of DVR: shape from one image, by what the training may know."""
+"""Table 1 and Figs. 4 and 5 of DVR: shape from one image, by the observations that the training uses."""
 
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.data.records import (
-    SHAPENET,
-    Record,
-    Row,
-    by_shape,
-    error,
-    grouped,
-    median_of_known,
-    row_of,
-    setting,
-)
+from bench.report.data.records import SHAPENET, Record, Row, by_shape, error, grouped, median_of_known, row_of, setting
 from bench.report.data.statistics import typical
 from bench.report.study import Result, Runs, Selection, compare, format, gallery, medians, table
 
@@ -55,24 +45,24 @@ COLUMNS = (
 )
 RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*MEDIANS, "chamfer_l2", "mask_iou_least"), *table.LOOP)
 IMAGES = {"given": "given", "photograph": "another\nimage"}  # arrays of images.npz
-PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics("chamfer_l1", "iou"))
+PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics("chamfer_l1", "iou"))
 
 
 def make(runs: Runs) -> Result:
     """A line per family and row, and the published ones."""
-    of_family = {name: _lines_of(runs, name) for name in runs.families()}
+    family_lines = {name: _lines_of(runs, name) for name in runs.families()}
     lines = []
-    for name, own in of_family.items():
+    for name, rows in family_lines.items():
         published = PUBLISHED.get(name.removeprefix(SHAPENET), {}).items()
-        lines += own
-        lines += [{"family": name, "method": f"published: {who}", "published": f"{x:.3f}"} for who, x in published]
+        lines += rows
+        lines += [{"family": name, "method": f"published: {row}", "published": f"{x:.3f}"} for row, x in published]
     return Result(
         runs,
         "Shape from one image.",
         "Medians over shapes, of costs over those that ended ok, by what the training of the network may know; "
         "Chamfer-L1 in scene units, times 1000.",
         question="How much must a training know, so that one image gives a shape?",
-        verdict=" ".join(filter(None, (_verdict(name, own) for name, own in of_family.items()))),
+        verdict=" ".join(filter(None, (_verdict(name, rows) for name, rows in family_lines.items()))),
         interval=compare.INTERVAL,
         estimates=[line["interval"] for line in lines if "interval" in line],
         remarks=NOTES,
@@ -84,26 +74,26 @@ def make(runs: Runs) -> Result:
 
 
 def _lines_of(runs: Runs, family: str) -> list[dict[str, Any]]:
-    """A line per row of one family, with its ratio to the row of each of `BASELINES` under that preset."""
-    own = runs.where(runs.frame.family == family).made
-    errors = {row: medians.errors_of(records, "chamfer_l1") for row, records in own.rows().items()}
-    others = {row: values for row, values in errors.items() if row.preset in BASELINES}
+    """A line per row of one family; under each preset of `BASELINES`, the ratio to its row."""
+    runs = runs.where(runs.frame.family == family).made
+    errors = {row: medians.errors_of(records, "chamfer_l1") for row, records in runs.rows().items()}
+    baselines = {row: values for row, values in errors.items() if row.preset in BASELINES}
     return [
         line
         | {"family": family, "interval": typical(by_shape(errors[row]))}
         | {"training": median_of_known(setting(record, "seconds", "training") for record in records)}
-        | {other.preset: medians.paired_ratio(errors[row], values) for other, values in others.items() if other != row}
-        for line, (row, records) in zip(medians.medians(own, MEDIANS), own.rows().items(), strict=True)
+        | {base.preset: medians.paired_ratio(errors[row], values) for base, values in baselines.items() if base != row}
+        for line, (row, records) in zip(medians.medians(runs, MEDIANS), runs.rows().items(), strict=True)
     ]
 
 
 def _verdict(family: str, lines: list[dict]) -> str:
-    """The trainings of a family by their Chamfer-L1, those that have as many shapes as any."""
+    """The trainings of a family by their Chamfer-L1; only trainings with the most shapes."""
     shapes = {line["method"]: len(line["interval"].points) for line in lines if line["training"] is not None}
-    most = max(shapes.values(), default=0)
-    errors = {line["method"]: line["chamfer_l1"] for line in lines if shapes.get(line["method"]) == most}
-    what = f"Median Chamfer-L1 × 1000 of {family}"
-    return format.ends(what, errors, format.plural(most, "shape"), show=table.thousandfold)
+    max_shapes = max(shapes.values(), default=0)
+    errors = {line["method"]: line["chamfer_l1"] for line in lines if shapes.get(line["method"]) == max_shapes}
+    title = f"Median Chamfer-L1 × 1000 of {family}"
+    return format.ends(title, errors, format.plural(max_shapes, "shape"), show=table.thousandfold)
 
 
 def draw(runs: Runs) -> Figure:
@@ -119,10 +109,10 @@ def draw(runs: Runs) -> Figure:
 def figures(runs: Runs) -> Result:
     """A line for a success and a failure of each family."""
     runs = runs.made
-    rows, of_scene = list(runs.rows()), grouped(runs.records, medians.scene_of)
-    shown = {scene: end for of in runs.families().values() for scene, end in _ends(of, rows[0]).items()}
-    scenes = {name: gallery.Scene(runs, of_scene[name], (*IMAGES, "normals", "hit")) for name in shown}
-    lines = {f"{name}, {end}": _line(rows, of_scene[name], scenes[name]) for name, end in shown.items()}
+    rows, by_scene = list(runs.rows()), grouped(runs.records, medians.scene_of)
+    shown = {scene: end for group in runs.families().values() for scene, end in _ends(group, rows[0]).items()}
+    scenes = {name: gallery.Scene(runs, by_scene[name], (*IMAGES, "normals", "hit")) for name in shown}
+    lines = {f"{name}, {end}": _line(rows, by_scene[name], scenes[name]) for name, end in shown.items()}
     return Result(
         runs,
         "Shapes from one image in pictures.",
@@ -133,22 +123,22 @@ def figures(runs: Runs) -> Result:
             "are seen by the camera of another image, which no row was given.",
             *gallery.missing(scenes.values()),
         ),
-        run_columns=PICTURED,
+        run_columns=PICTURE_COLUMNS,
         figure=gallery.draw([gallery.Block("", [*IMAGES.values(), *(row.name for row in rows)], lines)]),
     )
 
 
 def _line(rows: list[Row], records: list[Record], scene: gallery.Scene) -> list[gallery.Cell]:
-    at = {row_of(record): record for record in reversed(records)}  # of several trainings the first
+    record_by_row = {row_of(record): record for record in reversed(records)}  # the first of several trainings
     images = [scene.whole(records, name) for name in IMAGES]
-    return [*images, *(scene.cell(at.get(row), gallery.normals()) for row in rows)]
+    return [*images, *(scene.cell(record_by_row.get(row), gallery.normals()) for row in rows)]
 
 
 def _ends(records: list[Record], row: Row) -> dict[str, str]:
-    """The scenes of a family's shapes with the least and the largest error of a row, and which it is."""
+    """The scenes of a family's best and worst shape by the error of a row, each with its label."""
     ordered = sorted((r for r in records if row_of(r) == row), key=lambda record: error(record, "chamfer_l1"))
     ends = {0: "best", -1: "worst"} if ordered else {}
-    return {medians.scene_of(ordered[place]): end for place, end in ends.items()}
+    return {medians.scene_of(ordered[index]): end for index, end in ends.items()}
 
 
 PAGES = {"dvr_table1": make, "single_view_figures": figures}

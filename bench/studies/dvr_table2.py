@@ -12,8 +12,8 @@ from bench.report.tuning import TUNED
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
-SEEN, SEEN_LABEL = "seen_chamfer_l1", "Chamfer-L1, seen × 1000"
-NAMES = ("seen_accuracy", "seen_completeness", SEEN, "chamfer_l1", "psnr", "ssim", "mask_iou")
+SEEN_ERROR, SEEN_LABEL = "seen_chamfer_l1", "Chamfer-L1, seen × 1000"
+NAMES = ("seen_accuracy", "seen_completeness", SEEN_ERROR, "chamfer_l1", "psnr", "ssim", "mask_iou")
 NOTES = (
     "“Seen” is what a given photograph sees of either surface, as none sees the underside; distances are in scene "
     "units, times 1000, and two samplings of one surface by 30,000 points have a Chamfer-L1 of 5.7 to 7.1.",
@@ -25,7 +25,7 @@ NOTES = (
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
     "measured rows.",
 )
-SETTINGS = {  # of rows that are optimised, by their names in the note
+NOTED_SETTINGS = {  # names in the note on optimised rows, and configuration keys
     "field": ("field",),
     "learning rate": ("task", "optimiser", "learning_rate"),
     "iterations": ("task", "optimiser", "iterations"),
@@ -37,7 +37,7 @@ COLUMNS = (
     table.text("method", "Method"),
     table.Column("seen_accuracy", "Accuracy", show=table.thousandfold),
     table.Column("seen_completeness", "Completeness", show=table.thousandfold),
-    table.Column(SEEN, "Chamfer-L1, seen", show=table.thousandfold),
+    table.Column(SEEN_ERROR, "Chamfer-L1, seen", show=table.thousandfold),
     table.Column("chamfer_l1", "all", show=table.thousandfold),
     *(table.Column("psnr", "PSNR"), table.Column("ssim", "SSIM"), table.Column("mask_iou", "Mask IoU")),
     *medians.COST,
@@ -47,11 +47,11 @@ RUNS = (
     *table.IDENTITY,
     *table.metrics(*NAMES, "seen_fscore", "mask_iou_least", "own_psnr", "own_mask_iou"),
     *table.LOOP,
-    *(table.configured(name.replace(" ", "_"), *path) for name, path in SETTINGS.items()),
+    *(table.configured(name.replace(" ", "_"), *path) for name, path in NOTED_SETTINGS.items()),
 )
-PICTURED = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN, "psnr"))
+PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN_ERROR, "psnr"))
 
-COURSE = (
+CURVE_COLUMNS = (
     table.text("method", "Method"),
     table.Column("iterations", "Iterations", show=table.whole),
     table.Column("at", "Nearest to half", show=table.whole),
@@ -59,12 +59,12 @@ COURSE = (
     table.Column("end", "At the end", show=table.thousandfold),
     table.Column("fell", "Fell by", show=table.percent),
 )
-SCENES = 2  # of `figures`
-ALIKE = {  # rows that are not shown there, since they look as another does
+MAX_SCENES = 2
+LOOKALIKES = {  # presets not shown in figures, because they look like another row
     *("rgb_dist", "rgb_idr", "rgb_naive", "rgb_relaxed_boundary", "rgb_volsdf", "rgb_unisurf"),
     *("rgb_newton_auto", "rgbd_dvr", "dvr_paper_depth", "stereo", "poisson_5"),
 }
-GIVEN_DEPTHS = ("rgbd_", "poisson", "dvr_paper_depth")  # beginnings of presets of rows that see depths as well
+DEPTH_PRESETS = ("rgbd_", "poisson", "dvr_paper_depth")  # prefixes of presets that also use depths
 ARRAYS = ("photograph", "colours", "normals", "hit")
 
 
@@ -77,22 +77,22 @@ def make(runs: Runs) -> Result:
     ]
     optimised = [record for record in runs.records if setting(record["config"], "task", "optimiser")]
     panels = {
-        f"{SEEN_LABEL} (scene units)": SCALE * medians.scored(runs, SEEN),
+        f"{SEEN_LABEL} (scene units)": SCALE * medians.scored(runs, SEEN_ERROR),
         **medians.cost(runs),
     }
     return Result(
         runs,
         "Shape and colour from photographs.",
         f"Medians over {scenes} of errors on what the photographs see; in the figure a point per scene, and the "
-        f"median.{_conditions(runs)}",
+        f"median.{_photograph_settings(runs)}",
         question="Which method finds shape and colour from photographs?",
         verdict=format.ends(
             "From photographs alone, the median Chamfer-L1 × 1000 of what they see",
-            medians.whole([line for line in lines if not line["preset"].startswith(GIVEN_DEPTHS)], SEEN),
+            medians.whole([line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR),
             scenes,
             show=table.thousandfold,
         ),
-        remarks=(shared_settings(optimised, SETTINGS), *NOTES),
+        remarks=(shared_settings(optimised, NOTED_SETTINGS), *NOTES),
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
@@ -101,22 +101,22 @@ def make(runs: Runs) -> Result:
 
 
 def _error(line: dict[str, Any]) -> float:
-    """The median error on what is seen, by which lines are in order; infinite where a run has none."""
-    return math.inf if line[SEEN] is None else line[SEEN]
+    """The median error on the seen surface, for sorting; infinite if it is missing."""
+    return math.inf if line[SEEN_ERROR] is None else line[SEEN_ERROR]
 
 
-def _unlike(runs: Runs) -> dict[Row, list[Record]]:
-    """One row of those that look alike, or all where no other is there."""
-    unlike = {row: of for row, of in runs.rows().items() if row.preset.removeprefix(TUNED) not in ALIKE}
-    return unlike or runs.rows()
+def _distinct(runs: Runs) -> dict[Row, list[Record]]:
+    """The rows except `LOOKALIKES`; all rows if nothing else is left."""
+    distinct = {row: group for row, group in runs.rows().items() if row.preset.removeprefix(TUNED) not in LOOKALIKES}
+    return distinct or runs.rows()
 
 
 def _scenes(runs: Runs) -> str:
     return format.plural(len(grouped(runs.records, medians.scene_of)), "scene")
 
 
-def _conditions(runs: Runs) -> str:
-    """What photographs there were, and how long was optimised."""
+def _photograph_settings(runs: Runs) -> str:
+    """The settings of the photographs, and the numbers of iterations."""
     tasks = [r["config"]["task"] for r in runs.records if setting(r["config"], "task", "optimiser")]
     if not tasks or setting(tasks[0], "images", "views") is None:
         return ""
@@ -128,17 +128,17 @@ def _conditions(runs: Runs) -> str:
 
 
 def convergence(runs: Runs) -> Result:
-    """The error on what is seen over the iterations, as the median of a row's scenes; a level without iterations."""
+    """The error on the seen surface over the iterations, median over scenes; a level for rows without iterations."""
     runs = runs.made
-    ends = {Row(line["preset"], line["method"]): line[SEEN] for line in medians.medians(runs, (SEEN,))}
-    courses = {row: _course(runs, records, ends[row]) for row, records in runs.rows().items()}
-    longest = max(course.index[-1] for course in courses.values())
-    levels = {row: pd.Series([course[0]] * 2, [1, longest]) for row, course in courses.items() if 0 in course}
-    shown = courses | levels
+    ends = {Row(line["preset"], line["method"]): line[SEEN_ERROR] for line in medians.medians(runs, (SEEN_ERROR,))}
+    curves_by_row = {row: _error_curve(runs, records, ends[row]) for row, records in runs.rows().items()}
+    longest = max(curve.index[-1] for curve in curves_by_row.values())
+    levels = {row: pd.Series([curve[0]] * 2, [1, longest]) for row, curve in curves_by_row.items() if 0 in curve}
+    shown = curves_by_row | levels
     drawn = [
-        chart.curve(row.name, row.preset, shown[row].index, style.finite(SCALE * shown[row])) for row in _unlike(runs)
+        chart.curve(row.name, row.preset, shown[row].index, style.finite(SCALE * shown[row])) for row in _distinct(runs)
     ]
-    lines = [_fall(row, course) for row, course in courses.items() if row not in levels]
+    lines = [_fall(row, curve) for row, curve in curves_by_row.items() if row not in levels]
     return Result(
         runs,
         "Error over the iterations on photographs.",
@@ -156,58 +156,58 @@ def convergence(runs: Runs) -> Result:
             "In the figure, of rows that look alike one is shown, and a row without iterations is a level.",
         ),
         data=pd.concat(
-            course.rename(SEEN).rename_axis("iteration").reset_index().assign(row=row.name)
-            for row, course in courses.items()
+            curve.rename(SEEN_ERROR).rename_axis("iteration").reset_index().assign(row=row.name)
+            for row, curve in curves_by_row.items()
         ),
-        columns=COURSE,
+        columns=CURVE_COLUMNS,
         lines=lines,
         figure=chart.draw([chart.panel_data("", "iteration", f"{SEEN_LABEL} (scene units)", drawn)], 3.6),
     )
 
 
-def _course(runs: Runs, records: list[Record], end: float | None) -> pd.Series:
-    """The error of a row by the iteration, from the first one to its end; that at 0 alone without any."""
-    own = [curves.read(runs.folder(record), ("iteration", "seconds", SEEN))[0] for record in records]
-    course = curves.median(own, [record["status"] != "ok" for record in records], SEEN)
-    course = course.set_index("iteration")["median"]
-    last = max(int(curve["iteration"].max()) + 1 for curve in own if len(curve)) if len(course) else 0
-    return pd.concat([course[course.index > 0], pd.Series({last: end}, dtype=float)])
+def _error_curve(runs: Runs, records: list[Record], end: float | None) -> pd.Series:
+    """The error of a row by iteration, up to its end; only an error at 0 for rows without iterations."""
+    histories = [curves.read(runs.folder(record), ("iteration", "seconds", SEEN_ERROR))[0] for record in records]
+    medians = curves.median(histories, [record["status"] != "ok" for record in records], SEEN_ERROR)
+    medians = medians.set_index("iteration")["median"]
+    last = max(int(curve["iteration"].max()) + 1 for curve in histories if len(curve)) if len(medians) else 0
+    return pd.concat([medians[medians.index > 0], pd.Series({last: end}, dtype=float)])
 
 
-def _fall(row: Row, course: pd.Series) -> dict[str, Any]:
-    """A row's line: by how much its error fell at last; nan where that is infinite or not measured."""
-    *before, last = course.index
-    at = min(before, key=lambda at: abs(at - last / 2), default=0)
-    known = 4 * abs(at - last / 2) <= last
-    half, end = course[at] if known else math.nan, course[last]
+def _fall(row: Row, curve: pd.Series) -> dict[str, Any]:
+    """A row's line, with the relative fall of its error in the last half; nan if it is infinite or not measured."""
+    *earlier, last = curve.index
+    middle = min(earlier, key=lambda middle: abs(middle - last / 2), default=0)
+    near_half = 4 * abs(middle - last / 2) <= last
+    half, end = curve[middle] if near_half else math.nan, curve[last]
     return {
         "method": row.name,
         "preset": row.preset,
         "iterations": last,
-        **({"at": at, "half": half} if known else {}),
+        **({"at": middle, "half": half} if near_half else {}),
         "end": end,
         "fell": 1 - end / half if 0 < half < math.inf and end < math.inf else math.nan,
     }
 
 
 def figures(runs: Runs) -> Result:
-    """The first scenes in pictures, one row of those that look alike."""
-    rows, every = list(_unlike(runs)), grouped(runs.records, medians.scene_of)
-    shown = {name: [record for record in of if row_of(record) in rows] for name, of in list(every.items())[:SCENES]}
-    scenes = {name: gallery.Scene(runs, of, ARRAYS) for name, of in shown.items()}
-    photograph = ("held out", lambda found: [found["photograph"]])
-    blocks = [gallery.colours_above_normals(scenes[name], name, rows, of, photograph) for name, of in shown.items()]
+    """The first scenes in pictures, without rows that look like another."""
+    rows, by_scene = list(_distinct(runs)), grouped(runs.records, medians.scene_of)
+    shown = {name: [r for r in group if row_of(r) in rows] for name, group in list(by_scene.items())[:MAX_SCENES]}
+    scenes = {name: gallery.Scene(runs, group, ARRAYS) for name, group in shown.items()}
+    photo = ("held out", lambda arrays: [arrays["photograph"]])
+    blocks = [gallery.colours_above_normals(scenes[name], name, rows, group, photo) for name, group in shown.items()]
     return Result(
         runs,
         "Shapes from photographs in pictures.",
         f"Colours, and normals (right, up, towards the camera as red, green, blue), of {len(shown)} of "
-        f"{format.plural(len(every), 'scene')}, seen by the camera of a held-out photograph.",
+        f"{format.plural(len(by_scene), 'scene')}, seen by the camera of a held-out photograph.",
         remarks=(
             "A mesh row has the colours of the photographs that see a vertex, another row those of its field.",
             "Of rows that look alike one is shown; summary.png in a run's folder is its own picture.",
             *gallery.missing(scenes.values()),
         ),
-        run_columns=PICTURED,
+        run_columns=PICTURE_COLUMNS,
         figure=gallery.draw(blocks),
     )
 

@@ -12,7 +12,7 @@ CONDITIONS = (
     conditions.Condition("focal", "focal length / the scene's", 1.0),
     conditions.Condition("start_scale", "noise in the initial code (prior's σ)", 1.0),
 )
-READS = (Selection("fig10", tuple(f"task.{one.key}" for one in CONDITIONS)),)
+READS = (Selection("fig10", tuple(f"task.{condition.key}" for condition in CONDITIONS)),)
 NOTES = (
     "One condition varies, the other is at 1; the noise is in standard deviations of the prior's training codes, so "
     "that 0 is the mean shape or, of a row with an encoder, that of the encoder's code.",
@@ -43,33 +43,33 @@ def make(runs: Runs) -> Result:
 
 
 def draw(lines: Sequence[dict[str, Any]]) -> Figure:
-    """Draws a panel per condition: a line per method, with the ratio of its error to that at 1."""
+    """Draws a panel per condition: a line per method, with the ratio of its error to its error at 1."""
     panels = []
-    for one in CONDITIONS:
-        own = records.grouped([x for x in lines if x["key"] == one.key], lambda line: (line["method"], line["preset"]))
-        changes = {row: _changes(of_row) for row, of_row in own.items()}
-        drawn = [chart.curve(*row, change, change.values()) for row, change in changes.items() if change]
-        panels.append(chart.panel_data("", one.label, "error / error at 1", drawn))
+    for condition in CONDITIONS:
+        varied = [line for line in lines if line["key"] == condition.key]
+        rows = records.grouped(varied, lambda line: (line["method"], line["preset"]))
+        drawn = [chart.curve(*row, ratio, ratio.values()) for row, group in rows.items() if (ratio := _ratios(group))]
+        panels.append(chart.panel_data("", condition.label, "error / error at 1", drawn))
     return chart.draw(panels, 2.9, legend=3)
 
 
-def _changes(lines: Sequence[dict[str, Any]]) -> dict[float, statistics.Interval]:
-    """By the value of a condition, the ratio of a method's errors to those of the same runs where the value is 1."""
+def _ratios(lines: Sequence[dict[str, Any]]) -> dict[float, statistics.Interval]:
+    """For each value of a condition, the ratio of a method's errors to its errors on the same shapes at value 1."""
     errors = {
-        value: medians.errors_of((run for line in own for run in line["runs"]), records.ONE_WAY)
-        for value, own in sorted(records.grouped(lines, lambda line: line["at"]).items())
+        value: medians.errors_of((run for line in value_lines for run in line["runs"]), records.ONE_WAY)
+        for value, value_lines in sorted(records.grouped(lines, lambda line: line["at"]).items())
     }
-    ratios = {value: medians.paired_ratio(own, errors.get(1.0, {})) for value, own in errors.items()}
+    ratios = {value: medians.paired_ratio(value_lines, errors.get(1.0, {})) for value, value_lines in errors.items()}
     return {value: ratio for value, ratio in ratios.items() if ratio}
 
 
 def _verdict(runs: Runs) -> str:
-    """By which factor the median error of each row and family changes between conditions."""
-    keys = [runs.frame.row, runs.frame.family, *(runs.setting(f"task.{one.key}") for one in CONDITIONS)]
-    of_rows = runs.error(records.ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
-    spread = {", ".join(names): ratio for names, ratio in (of_rows.max() / of_rows.min()).items()}
+    """The factor between the smallest and largest median error over conditions, of each row and family."""
+    keys = [runs.frame.row, runs.frame.family, *(runs.setting(f"task.{condition.key}") for condition in CONDITIONS)]
+    errors = runs.error(records.ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
+    factors = {", ".join(names): ratio for names, ratio in (errors.max() / errors.min()).items()}
     shapes = format.plural(len(runs.frame[["family", "solid"]].drop_duplicates()), "shape")
-    return format.ends("Largest over least median error of all conditions", spread, shapes)
+    return format.ends("Largest over least median error of all conditions", factors, shapes)
 
 
 PAGES = {"fig10": make}

@@ -1,4 +1,4 @@
-"""After Figs. 12 and 24 of DIST: shape from many views where the initial similarity is wrong, and optimised as well."""
+"""After Figs. 12 and 24 of DIST: shape from many views if the initial similarity is wrong, and optimised too."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,10 +12,10 @@ CONDITIONS = (
     conditions.Condition("degrees", "rotation (degrees)", 0.0),
     conditions.Condition("scale", "size / true size", 1.0),
 )
-READS = (Selection("fig12", (*(f"task.{one.key}" for one in CONDITIONS), "task.similarity")),)
-SUCCESS = 1.0  # squared scene units x 1000, about what DIST publishes in its Table 3
+READS = (Selection("fig12", (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity")),)
+MAX_ERROR = 1.0  # squared scene units x 1000: about the errors of DIST, Table 3; a success has less
 NOTES = (
-    f"A success ended ok with an error below {SUCCESS:g}; its interval is Clopper and Pearson's, over shapes.",
+    f"A success ended ok with an error below {MAX_ERROR:g}; its interval is Clopper and Pearson's, over shapes.",
     "One condition varies, the others are neutral; a shift's direction, a rotation's axis and the initial code are "
     "random, the same for every method.",
     "At zero displacement a similarity is optimised as well; “place known” is without one, and has no point.",
@@ -23,24 +23,22 @@ NOTES = (
     "The paper (Fig. 12) shows pictures of real chairs and no numbers; here shapes and photographs are synthetic.",
 )
 RUNS = conditions.run_columns(CONDITIONS, "similarity")
-KNOWN = "place known"
+PLACE_KNOWN = "place known"
 UNITS = {"shift": "shifted by {:g}", "degrees": "turned by {:g}°", "scale": "{:g} times\nas large"}
 
 
-def place_known(record: Record) -> bool:
-    """Whether a run began in place, and no similarity was optimised."""
-    return not setting(record["config"], "task", "similarity") and all(
-        one.of(record) == one.neutral for one in CONDITIONS
-    )
+def is_place_known(record: Record) -> bool:
+    """Whether a run began in place, and optimised no similarity."""
+    return not setting(record["config"], "task", "similarity") and all(c.of(record) == c.neutral for c in CONDITIONS)
 
 
 def make(runs: Runs) -> Result:
     """A line per family, method and value of a condition."""
-    lines = conditions.lines_of([record for record in runs.made.records if not place_known(record)], CONDITIONS)
-    known = grouped(filter(place_known, runs.records), lambda record: (family(record), row_of(record)))
-    others = [
-        {"family": name, "method": row.name, "condition": KNOWN, "runs": own, "error": conditions.middle(own)}
-        for (name, row), own in known.items()
+    lines = conditions.lines_of([record for record in runs.made.records if not is_place_known(record)], CONDITIONS)
+    records_by_row = grouped(filter(is_place_known, runs.records), lambda record: (family(record), row_of(record)))
+    lines_of_known = [
+        {"family": name, "method": row.name, "condition": PLACE_KNOWN, "runs": group, "error": conditions.middle(group)}
+        for (name, row), group in records_by_row.items()
     ]
     return Result(
         runs,
@@ -52,35 +50,34 @@ def make(runs: Runs) -> Result:
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
         columns=(*conditions.NAMED, table.shown("Success", lambda line: _successes(line["runs"])), *conditions.MEDIAN),
-        lines=lines + others,
+        lines=lines + lines_of_known,
         run_columns=RUNS,
-        figure=conditions.draw(lines, CONDITIONS, SUCCESS) if lines else None,
+        figure=conditions.draw(lines, CONDITIONS, MAX_ERROR) if lines else None,
     )
 
 
 def _succeeded(record: Record) -> bool:
-    return record["status"] == "ok" and SCALE * error(record, ONE_WAY) < SUCCESS
+    return record["status"] == "ok" and SCALE * error(record, ONE_WAY) < MAX_ERROR
 
 
 def _successes(records: Sequence[Record]) -> str:
-    of_shape = [[_succeeded(run) for run in runs] for runs in grouped(records, solid).values()]
-    return table.counted(
-        sum(map(sum, of_shape)), len(records), statistics.share(list(map(sum, of_shape)), list(map(len, of_shape)))
-    )
+    by_shape = [[_succeeded(run) for run in runs] for runs in grouped(records, solid).values()]
+    successes = list(map(sum, by_shape))
+    return table.counted(sum(successes), len(records), statistics.share(successes, list(map(len, by_shape))))
 
 
 def _verdict(runs: Runs) -> str:
-    """The share of successes of each row, over the runs that did not begin in place."""
-    off = [record for record in runs.records if any(one.of(record) != one.neutral for one in CONDITIONS)]
-    shares = {row.name: sum(map(_succeeded, own)) / len(own) for row, own in grouped(off, row_of).items()}
-    shapes = format.plural(len({solid(record) for record in off}), "shape")
+    """The fraction of successes of each row, over the runs that did not begin in place."""
+    misplaced = [record for record in runs.records if any(c.of(record) != c.neutral for c in CONDITIONS)]
+    shares = {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(misplaced, row_of).items()}
+    shapes = format.plural(len({solid(record) for record in misplaced}), "shape")
     return format.ends(
-        f"Misplaced runs that end with an error below {SUCCESS:g}", shares, shapes, show=table.percent, most=True
+        f"Misplaced runs that end with an error below {MAX_ERROR:g}", shares, shapes, show=table.percent, most=True
     )
 
 
 def pictures(runs: Runs) -> Result:
-    """A block per family: the start over the displacement, and what each row found below it."""
+    """A block per family: the start over the displacement, and below it the shape of each row."""
     first = gallery.first_shapes(runs, 1)
     scenes = {name: gallery.Scene(first, records, gallery.SHAPES) for name, records in first.families().items()}
     return Result(
@@ -95,29 +92,29 @@ def pictures(runs: Runs) -> Result:
             *gallery.missing(scenes.values()),
         ),
         run_columns=RUNS,
-        figure=gallery.draw([_block(name, own, scenes[name]) for name, own in first.families().items()]),
+        figure=gallery.draw([_block(name, records, scenes[name]) for name, records in first.families().items()]),
     )
 
 
 def _block(name: str, records: list[Record], scene: gallery.Scene) -> gallery.Block:
-    of_place = dict(sorted(grouped(records, _place).items()))
-    starts = [scene.shared(of, gallery.normals(gallery.START)) for of in of_place.values()]
+    by_start = dict(sorted(grouped(records, _start).items()))
+    starts = [scene.shared(group, gallery.normals(gallery.START)) for group in by_start.values()]
     rows: dict[str, Any] = {"start": [*starts, scene.shared(records, gallery.normals(gallery.TRUE))]}
-    for row, of_row in grouped(records, row_of).items():
-        at = {_place(record): record for record in of_row}
-        rows[row.name] = [scene.cell(at.get(place), gallery.normals(gallery.FOUND)) for place in of_place]
-    return gallery.Block(name, [*map(_words, of_place), "truth"], rows)
+    for row, row_records in grouped(records, row_of).items():
+        record_of = {_start(record): record for record in row_records}
+        rows[row.name] = [scene.cell(record_of.get(start), gallery.normals(gallery.FOUND)) for start in by_start]
+    return gallery.Block(name, [*map(_heading, by_start), "truth"], rows)
 
 
-def _place(record: Record) -> tuple[float, ...]:
-    """How far off a run's start is, in each condition, and whether its place is known."""
-    return (*(one.of(record) - one.neutral for one in CONDITIONS), place_known(record))
+def _start(record: Record) -> tuple[float, ...]:
+    """The displacement of a run's start in each condition, and whether its place is known."""
+    return (*(c.of(record) - c.neutral for c in CONDITIONS), is_place_known(record))
 
 
-def _words(place: tuple[float, ...]) -> str:
-    *offs, known = place
-    found = [UNITS[one.key].format(off + one.neutral) for one, off in zip(CONDITIONS, offs, strict=True) if off]
-    return "\n".join(found) or ("known\nplace" if known else "in place")
+def _heading(start: tuple[float, ...]) -> str:
+    *offsets, place_known = start
+    parts = [UNITS[c.key].format(offset + c.neutral) for c, offset in zip(CONDITIONS, offsets, strict=True) if offset]
+    return "\n".join(parts) or ("known\nplace" if place_known else "in place")
 
 
 PAGES = {"fig12": make, "misplaced_gallery": pictures}

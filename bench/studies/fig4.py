@@ -8,8 +8,8 @@ NOTES = (
     "Pictures are cropped to the part with hits.",
     "A row that did not finish at the requested size is shown at the largest size at which it did.",
 )
-MOST_COLUMNS = 5
-COLUMNS = (  # of a record and the counts of its picture
+MAX_COLUMNS = 5
+COLUMNS = (  # a line is a record and the counts of its picture
     *table.through(lambda line: line[0], *table.IDENTITY),
     *table.through(lambda line: line[1], *map(table.Column, gallery.COUNTED)),
     *table.through(lambda line: line[0], table.metric("depth_error_median")),
@@ -19,8 +19,8 @@ COLUMNS = (  # of a record and the counts of its picture
 def make(runs: Runs) -> Result:
     """The reference and a column per row; rows without pictures keep their place."""
     chosen = runs.of_newest_scene()
-    found = gallery.compared(chosen, MOST_COLUMNS)
-    data = table.to_data(COLUMNS, zip(chosen.records, found.counts, strict=True))
+    comparison = gallery.compared(chosen, MAX_COLUMNS)
+    data = table.to_data(COLUMNS, zip(chosen.records, comparison.counts, strict=True))
     wrong = dict(zip(chosen.names(), (data["lost"] + data["false"]).astype(float), strict=True))
     return Result(
         chosen,
@@ -29,9 +29,9 @@ def make(runs: Runs) -> Result:
         "normals.",
         question="Which pixels does each strategy get wrong?",
         verdict=format.ends("Missed and spurious pixels", wrong, "one shape", show=table.whole),
-        remarks=(*found.missing, *NOTES),
+        remarks=(*comparison.missing, *NOTES),
         data=data,
-        figure=gallery.draw(found.blocks, largest=found.largest),
+        figure=gallery.draw(comparison.blocks, largest=comparison.largest),
     )
 
 

@@ -15,7 +15,7 @@ from bench.report.study import Result, Runs, Selection, chart, curves, format, s
 PLACE = 220
 READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
 QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", SCALE)}
-ALONG = {"iteration": "iteration", "seconds": "time (seconds)"}
+TIME_AXES = {"iteration": "iteration", "seconds": "time (seconds)"}
 COLUMNS = (
     *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.whole)),
     *(
@@ -24,7 +24,7 @@ COLUMNS = (
     ),
     *(table.Column("seconds", "Loop", show=format.seconds), table.Column("spearman", "ρ")),
 )
-HIGH = 0.7  # a correlation that is called high
+HIGH_RHO = 0.7  # a larger correlation is called high
 NOTES = (
     "Chamfer distance is chamfer_l2, in squared scene units, times 1000; it is measured during the optimisation, but "
     "not used by it.",
@@ -32,25 +32,25 @@ NOTES = (
     "ρ is Spearman's rank correlation of loss and Chamfer over the iterations of a run that have both, in the median "
     "of a row's runs: points of one run are not independent, so it is no test.",
 )
-Medians = dict[str, pd.DataFrame]  # of each quantity
+Medians = dict[str, pd.DataFrame]  # a row's median curve by quantity
 
 
 def make(runs: Runs) -> Result:
     """A curve per row, the median over its runs, and a line with its end."""
-    read = {record["folder"]: curves.read(runs.folder(record)) for record in runs.records}
-    unread = [f"{record['name']}: {why}." for record in runs.named() if (why := read[record["folder"]][1])]
+    histories = {record["folder"]: curves.read(runs.folder(record)) for record in runs.records}
+    unread = [f"{record['name']}: {why}." for record in runs.named() if (why := histories[record["folder"]][1])]
     medians: dict[Row, Medians] = {}
     lines: list[dict[str, Any]] = []
     for row, records in runs.rows().items():
-        own = [read[record["folder"]][0] for record in records]
+        row_curves = [histories[record["folder"]][0] for record in records]
         failed = [record["status"] != "ok" for record in records]
-        medians[row] = {name: curves.median(own, failed, name) for name in QUANTITIES}
-        found = [curves.spearman(curve.dropna(subset=[*QUANTITIES]), *QUANTITIES) for curve in own]
-        # Each of one run: losses of shapes do not compare.
-        correlation = {"spearman": median_of_known(found), "n": len(found) - found.count(None)}
+        medians[row] = {name: curves.median(row_curves, failed, name) for name in QUANTITIES}
+        # A correlation per run, because losses of different shapes cannot be compared.
+        rhos = [curves.spearman(curve.dropna(subset=[*QUANTITIES]), *QUANTITIES) for curve in row_curves]
+        correlation = {"spearman": median_of_known(rhos), "n": len(rhos) - rhos.count(None)}
         seconds = medians[row]["chamfer_l2"]["seconds"]
-        about = {"row": row.name, "runs": len(records), "seconds": seconds.iloc[-1] if len(seconds) else None}
-        lines.append({**about, **_end(own, failed), **correlation})
+        identity = {"row": row.name, "runs": len(records), "seconds": seconds.iloc[-1] if len(seconds) else None}
+        lines.append({**identity, **_end_errors(row_curves, failed), **correlation})
     return Result(
         runs,
         "Loss and Chamfer distance as shapes are completed.",
@@ -58,23 +58,23 @@ def make(runs: Runs) -> Result:
         question="Does the error fall with the loss?",
         verdict=f"{_verdict(lines)} {_ends(lines)}".strip(),
         remarks=(*unread, _loss(runs), *NOTES),
-        data=_data(runs, {folder: found for folder, (found, _) in read.items()}, medians, lines),
+        data=_data(runs, {folder: history for folder, (history, _) in histories.items()}, medians, lines),
         columns=COLUMNS,
         lines=lines,
-        figure=draw(medians, [along for along in ALONG if along != "seconds" or runs.timed]),
+        figure=draw(medians, [axis for axis in TIME_AXES if axis != "seconds" or runs.timed]),
     )
 
 
 def _verdict(lines: list[dict[str, Any]]) -> str:
-    """In which rows loss and error fall together, of rows equal in every digit once; the paper says in all."""
+    """The rows in which loss and error fall together; rows with equal numbers count once. The paper: in all rows."""
     numbers = ("end", "low", "high", "spearman")
     with_rank = [line for line in lines if line["spearman"] is not None]
     same = grouped(with_rank, lambda line: tuple(line.get(name) for name in numbers)).values()
-    ranks = {" = ".join(line["row"] for line in of): of[0]["spearman"] for of in same}  # one computation counts once
-    apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < HIGH]
-    alike = f"{len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')} (ρ of {HIGH} or more)"
-    said = f"not in {', '.join(apart)}" if apart else "as in the paper"
-    return f"Loss and error fall together in {alike}; {said}." if ranks else ""
+    ranks = {" = ".join(line["row"] for line in group): group[0]["spearman"] for group in same}
+    apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < HIGH_RHO]
+    alike = f"{len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')} (ρ of {HIGH_RHO} or more)"
+    judgement = f"not in {', '.join(apart)}" if apart else "as in the paper"
+    return f"Loss and error fall together in {alike}; {judgement}." if ranks else ""
 
 
 def _ends(lines: list[dict[str, Any]]) -> str:
@@ -86,14 +86,14 @@ def _ends(lines: list[dict[str, Any]]) -> str:
     )
 
 
-def _end(own: list[pd.DataFrame], failed: list[bool]) -> dict[str, Any]:
-    """The errors at the end of a row's runs, infinite of failed ones; nothing where one is not known."""
+def _end_errors(histories: list[pd.DataFrame], failed: list[bool]) -> dict[str, Any]:
+    """The errors at the end of a row's runs, infinite for failed runs; empty if one is missing."""
     ends = []
-    for curve, lost in zip(own, failed, strict=True):
-        known = curve["chamfer_l2"].dropna()
-        if known.empty and not lost:
+    for curve, has_failed in zip(histories, failed, strict=True):
+        errors = curve["chamfer_l2"].dropna()
+        if errors.empty and not has_failed:
             return {}
-        ends.append(math.inf if lost else known.iloc[-1])
+        ends.append(math.inf if has_failed else errors.iloc[-1])
     return {"end": float(np.median(ends)), "low": min(ends), "high": max(ends)}
 
 
@@ -104,34 +104,34 @@ def _loss(runs: Runs) -> str:
         f"depths, normals over {width} scene units (weight {weight or 0:g}) and the silhouette, as the paper's Fig. 5"
     )
     terms = normals if weight else "depths and the silhouette; the paper's Fig. 5 has normals as well"
-    own = "each row has the silhouette loss of its renderer, so that losses of different rows do not compare"
-    return f"The loss has {terms}; {'it is the same for every row' if shared_loss(runs.records) else own}."
+    differing = "each row has the silhouette loss of its renderer, so that losses of different rows do not compare"
+    return f"The loss has {terms}; {'it is the same for every row' if shared_loss(runs.records) else differing}."
 
 
-def draw(medians: dict[Row, Medians], over: list[str]) -> Figure:
+def draw(medians: dict[Row, Medians], axes: list[str]) -> Figure:
     """Draws loss above and Chamfer below, over iterations and seconds, a line per row."""
     panels = []
-    for (name, (label, scale)), along in product(QUANTITIES.items(), over):
+    for (name, (label, scale)), axis in product(QUANTITIES.items(), axes):
         lines = [
-            chart.curve(row.name, row.preset, style.finite(own[name][along]), style.finite(scale * own[name]["median"]))
-            for row, own in medians.items()
+            chart.curve(row.name, row.preset, style.finite(curve[axis]), style.finite(scale * curve["median"]))
+            for row, curve in ((row, by_name[name]) for row, by_name in medians.items())
         ]
-        panels.append(chart.panel_data("", ALONG[along], label, lines))
+        panels.append(chart.panel_data("", TIME_AXES[axis], label, lines))
     return chart.draw(panels, 4.6, len(QUANTITIES))
 
 
-def _data(runs: Runs, read: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list[Any]) -> pd.DataFrame:
-    """The CSV, with three kinds of lines: of runs, of medians over a row's runs, and of a row's rank correlation."""
+def _data(runs: Runs, histories: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list) -> pd.DataFrame:
+    """The CSV, with three kinds of lines: runs, medians over a row's runs, and a row's rank correlation."""
     rows: list[dict[str, Any]] = []
     for record, identity in zip(
         runs.records, table.to_data(table.IDENTITY, runs.records).to_dict("records"), strict=True
     ):
-        rows += [{"kind": "run", **identity, **point} for point in _points(read[record["folder"]]) or [{}]]
-    for (row, own), line in zip(medians.items(), lines, strict=True):
-        for name, shown in own.items():
+        rows += [{"kind": "run", **identity, **point} for point in _points(histories[record["folder"]]) or [{}]]
+    for (row, by_name), line in zip(medians.items(), lines, strict=True):
+        for name, curve in by_name.items():
             names = {"median": name, "low": f"{name}_low", "high": f"{name}_high"}
-            found = _points(shown.rename(columns=names))
-            rows += [{"kind": "median", "row": row.name, "n": line["runs"], **point} for point in found]
+            points = _points(curve.rename(columns=names))
+            rows += [{"kind": "median", "row": row.name, "n": line["runs"], **point} for point in points]
         rows.append({"kind": "correlation", "row": row.name, "n": line["n"], "spearman": line["spearman"]})
     return pd.DataFrame(rows, dtype=object)
 

@@ -9,7 +9,7 @@ from bench.report.study import Result, Runs, Selection, chart, format, records, 
 
 PLACE = 60
 READS = (Selection("fig6", ("task.degrees",), setup=("scenes", "pixels", "machine")),)
-PLOTTED = (
+CAPTION = (
     "Share of runs that end within {success_degrees:g} degrees and {success_distance:g} scene units of the true pose, "
     "over the initial error in rotation."
 )
@@ -31,9 +31,9 @@ RUNS = (
 
 def make(runs: Runs) -> Result:
     """A line per method: its success rate at each angle, and its costs."""
-    found = _poses(runs.made)
-    rows = dict(list(found.groupby(["row", "preset"], sort=False)))
-    angles = sorted(found.degrees.unique())
+    poses = _poses(runs.made)
+    rows = dict(list(poses.groupby(["row", "preset"], sort=False)))
+    angles = sorted(poses.degrees.unique())
     settings = records.setting(runs.requested(), "task") or {}
     columns = [
         table.text("method", "Method"),
@@ -44,62 +44,62 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Camera pose from a depth image and a silhouette of a known shape.",
-        PLOTTED.format(**settings),
+        CAPTION.format(**settings),
         question="From how far off is the camera of a known shape found?",
-        verdict=_verdict(found),
+        verdict=_verdict(poses),
         interval="95 % intervals over shapes (Clopper and Pearson)",
-        estimates=[_rate(own) for _, own in found.groupby(["row", "preset", "degrees"])],
+        estimates=[_rate(row_poses) for _, row_poses in poses.groupby(["row", "preset", "degrees"])],
         remarks=[note.format(**settings) for note in NOTES],
         columns=columns,
-        lines=[_line(row, own) for (row, _), own in rows.items()],
+        lines=[_line(row, row_poses) for (row, _), row_poses in rows.items()],
         run_columns=RUNS,
         figure=draw(rows),
     )
 
 
 def _poses(runs: Runs) -> pd.DataFrame:
-    """A line per run: row, shape, angle, whether the pose was found, and costs; a failed run found none."""
+    """A line per run: row, shape, angle, whether the pose was found, and costs; a failed run found no pose."""
     ok = (runs.frame.status == "ok").to_numpy(bool)
     return runs.frame[["row", "preset", "family", "solid"]].assign(
         degrees=runs.number("config.task.degrees"),
         starts=runs.number("config.task.starts").fillna(1),
-        found=ok & (runs.number("success") == 1).to_numpy(),
+        success=ok & (runs.number("success") == 1).to_numpy(),
         seconds=runs.frame.loop.where(ok),
         evaluations=runs.frame["values"].where(ok),
     )
 
 
-def _verdict(found: pd.DataFrame) -> str:
-    """The most and the fewest cameras found from the largest angle, by the number of starts, which costs apart."""
-    farthest, shapes = found.degrees.max(), format.plural(len(found[["family", "solid"]].drop_duplicates()), "shape")
-    said = []
-    for starts, own in found[found.degrees == farthest].groupby("starts"):
-        what = f"Cameras found from {farthest:g} degrees by {format.plural(int(starts), 'start')}"
-        said.append(format.ends(what, own.groupby("row").found.mean(), shapes, show=table.percent, most=True))
-    return " ".join(said)
+def _verdict(poses: pd.DataFrame) -> str:
+    """The rows with the most and the fewest cameras found from the largest angle, for each number of starts."""
+    farthest, shapes = poses.degrees.max(), format.plural(len(poses[["family", "solid"]].drop_duplicates()), "shape")
+    sentences = []
+    for starts, group in poses[poses.degrees == farthest].groupby("starts"):
+        title = f"Cameras found from {farthest:g} degrees by {format.plural(int(starts), 'start')}"
+        sentences.append(format.ends(title, group.groupby("row").success.mean(), shapes, show=table.percent, most=True))
+    return " ".join(sentences)
 
 
-def _line(row: str, own: pd.DataFrame) -> dict[str, Any]:
-    """The runs of a method by their angle, and its median costs."""
-    costs = own[["seconds", "evaluations"]].median()
-    return {"method": row, **costs, **{str(angle): of_angle for angle, of_angle in own.groupby("degrees")}}
+def _line(row: str, poses: pd.DataFrame) -> dict[str, Any]:
+    """The runs of a method by angle, and its median costs."""
+    costs = poses[["seconds", "evaluations"]].median()
+    return {"method": row, **costs, **{str(angle): angle_poses for angle, angle_poses in poses.groupby("degrees")}}
 
 
-def _rate(found: pd.DataFrame) -> statistics.Interval:
-    """The share of poses that were found, with its interval over shapes, each of which may have several views."""
-    shapes = found.groupby(["family", "solid"], sort=False, dropna=False).found
+def _rate(poses: pd.DataFrame) -> statistics.Interval:
+    """The fraction of poses that were found, with its interval over shapes. A shape may have several views."""
+    shapes = poses.groupby(["family", "solid"], sort=False, dropna=False).success
     return statistics.share(shapes.sum().to_numpy(float), shapes.size().to_numpy(float))
 
 
-def _share(found: pd.DataFrame | None) -> str:
-    return "" if found is None else table.counted(float(found.found.sum()), len(found), _rate(found))
+def _share(poses: pd.DataFrame | None) -> str:
+    return "" if poses is None else table.counted(float(poses.success.sum()), len(poses), _rate(poses))
 
 
 def draw(rows: dict[tuple[str, str], pd.DataFrame]) -> Figure:
     """Draws success over the initial angle."""
     lines = []
-    for (row, preset), found in rows.items():
-        rates = {angle: _rate(own).times(100) for angle, own in found.groupby("degrees")}
+    for (row, preset), poses in rows.items():
+        rates = {angle: _rate(angle_poses).times(100) for angle, angle_poses in poses.groupby("degrees")}
         lines.append(chart.curve(row, preset, rates, rates.values()))
     return chart.draw([chart.panel_data("", "initial error in rotation (degrees)", "poses found (%)", lines)], 2.8)
 

@@ -12,16 +12,16 @@ NOTES = (
     "Missed and spurious pixels, the paper's erosion and dilation, are shares of the number of the reference's hits.",
     "The depth error is over pixels that both hit; epsilon is in scene units.",
 )
-MOST_COLUMNS = 7
-COUNTED = ("size", "hits", "lost", "false")  # which a record has, and else its picture
+MAX_COLUMNS = 7
+COUNTED = ("size", "hits", "lost", "false")  # from the record, or if missing from its picture
 
 
 def make(runs: Runs) -> Result:
     """A column of pictures and a line per epsilon, the largest first."""
     chosen = runs.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
-    found = gallery.compared(chosen, MOST_COLUMNS)
-    lines = [(record, _counts(record, drawn)) for record, drawn in zip(chosen.records, found.counts, strict=True)]
+    comparison = gallery.compared(chosen, MAX_COLUMNS)
+    lines = [(record, _counts(record, shown)) for record, shown in zip(chosen.records, comparison.counts, strict=True)]
     return Result(
         chosen,
         "Missed and spurious pixels by the convergence threshold.",
@@ -31,31 +31,31 @@ def make(runs: Runs) -> Result:
         verdict=_verdict(
             [counts | {"epsilon": _epsilon(record)} for record, counts in lines if record["status"] == "ok"]
         ),
-        remarks=(*found.missing, *NOTES),
+        remarks=(*comparison.missing, *NOTES),
         columns=COLUMNS,
         lines=lines,
-        figure=gallery.draw(found.blocks, largest=found.largest),
+        figure=gallery.draw(comparison.blocks, largest=comparison.largest),
     )
 
 
 def _verdict(counts: list[dict[str, Any]]) -> str:
-    """The least share of wrong pixels, and the thresholds whose number of them is within its standard deviation."""
+    """The smallest fraction of wrong pixels, and the thresholds within one standard deviation of its count."""
     measured = [line for line in counts if "lost_share" in line and line["epsilon"] is not None]
     if not measured:
         return ""
     wrong = {line["epsilon"]: line["lost"] + line["false"] for line in measured}
     least, (worst, most) = min(wrong.values()), max(wrong.items(), key=lambda item: item[1])
-    alike = [f"{epsilon:g}" for epsilon, pixels in wrong.items() if pixels - least <= math.sqrt(least)]
+    similar = [f"{epsilon:g}" for epsilon, pixels in wrong.items() if pixels - least <= math.sqrt(least)]
     share, largest = (table.small_percent(pixels / measured[0]["hits"]) for pixels in (least, most))
     return (
-        f"Missed and spurious pixels are fewest, *{share}* of the hits, at epsilon = {' or '.join(alike)}, and at "
+        f"Missed and spurious pixels are fewest, *{share}* of the hits, at epsilon = {' or '.join(similar)}, and at "
         f"{worst:g} they are {largest}; n = one shape."
     )
 
 
-def _counts(record: records.Record, drawn: dict[str, Any]) -> dict[str, Any]:
-    """The counts of a record, or else of its picture, and their shares of the reference's hits."""
-    counts = drawn | {name: x for name in COUNTED if (x := records.measured(record, name)) is not None}
+def _counts(record: records.Record, picture_counts: dict[str, Any]) -> dict[str, Any]:
+    """The counts of a record, or if missing of its picture, and their fractions of the reference's hits."""
+    counts = picture_counts | {name: x for name in COUNTED if (x := records.measured(record, name)) is not None}
     hits = counts.get("hits")
     return counts | {f"{name}_share": counts[name] / hits for name in ("lost", "false") if hits and name in counts}
 
@@ -65,7 +65,7 @@ def _epsilon(record: records.Record) -> float | None:
     return value if isinstance(value, int | float) and value > 0 else None
 
 
-COLUMNS = (  # of a record and its counts
+COLUMNS = (  # a line is a record and its counts
     table.shown("Renderer", lambda line: line[0]["renderer"]),
     *table.through(lambda line: line[0], *table.IDENTITY, table.Column("epsilon", "Epsilon", _epsilon)),
     *table.through(lambda line: line[1], *map(table.Column, gallery.COUNTED)),

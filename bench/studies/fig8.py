@@ -1,4 +1,4 @@
-"""Figs. 8 and 19 of DIST: shapes with colours, as codes, rendered in sizes, from sides and under lights."""
+"""Figs. 8 and 19 of DIST: shapes and colours from codes, rendered at several sizes, from several sides and lights."""
 
 import numpy as np
 
@@ -13,15 +13,15 @@ SIDES = {  # prefixes in images.npz, see `bench.pictures.colours.rendered_again`
     "turned by 120°": "turned_0_",
     "turned by 240°": "turned_1_",
 }
-LIGHTS = {  # towards the light; axes to the right, up, towards the camera
+LIGHTS = {  # directions to the light; axes to the right, up, towards the camera
     "light from the left": (-0.8, 0.3, 0.5),
     "light from above": (0.0, 0.9, 0.45),
     "light from the right": (0.8, 0.3, 0.5),
 }
-AMBIENT = 0.25  # of a light; the rest falls off with the cosine
+AMBIENT = 0.25  # ambient fraction of a light; the rest is proportional to the cosine
 KINDS = {"true_": "mesh", "trained_": "code of training", "": "code of the image"}
-BYTES = ("code_bytes", "mesh_bytes", "texture_bytes", "network_bytes")
-DEFINED = {key: f"{key.partition('_')[0].capitalize()} (bytes)" for key in BYTES} | {"colour_error": "Error of colour"}
+SIZES = ("code_bytes", "mesh_bytes", "texture_bytes", "network_bytes")
+DEFINED = {key: f"{key.partition('_')[0].capitalize()} (bytes)" for key in SIZES} | {"colour_error": "Error of colour"}
 
 
 def _name(record: records.Record) -> str:
@@ -30,25 +30,25 @@ def _name(record: records.Record) -> str:
 
 COLUMNS = (
     table.text("shape", "Shape", _name),
-    *(table.metric(key, DEFINED[key], table.whole) for key in BYTES),
+    *(table.metric(key, DEFINED[key], table.whole) for key in SIZES),
     table.metric("colour_error", DEFINED["colour_error"]),
     table.metric("chamfer_l2", "Chamfer-L2 × 1000", table.thousandfold),
 )
 
 
 def make(runs: Runs) -> Result:
-    """A line per shape, and pictures of its mesh, of its code of training, and of the code of one image."""
-    code, *whole, network = (runs.number(key).median() for key in BYTES)
+    """A line per shape, and pictures of its mesh, its training code, and the code optimised from one image."""
+    code, *mesh_and_texture, network = (runs.number(key).median() for key in SIZES)
     errors = runs.number("colour_error").groupby(runs.setting("split"), sort=False).median()
-    told = ", ".join(f"*{error:.2g}* ({split})" for split, error in errors.items())
+    texts = ", ".join(f"*{error:.2g}* ({split})" for split, error in errors.items())
     scenes = {_name(record): gallery.Scene(runs, [record], _arrays(record)) for record in runs.records}
     return Result(
         runs,
         "Shapes with colours as codes, rendered in sizes, from sides and under lights.",
         "Renderings of the mesh, and of codes of shape and colour; a test shape has no code of training.",
         question="What does a code of shape and colour show?",
-        verdict=f"Error of colour {told}; a code has {code:.0f} bytes, the network that all codes of a family share "
-        f"{network / 1000:.0f} kB, mesh and texture as they come {sum(whole) / 1000:.0f} kB (medians, "
+        verdict=f"Error of colour {texts}; a code has {code:.0f} bytes, the network that all codes of a family share "
+        f"{network / 1000:.0f} kB, mesh and texture as they come {sum(mesh_and_texture) / 1000:.0f} kB (medians, "
         f"n = {format.plural(len(runs.records), 'shape')}).",
         remarks=(
             "Meshes are as finely cut as they come: one with the error of its code has far fewer triangles.",
@@ -71,7 +71,7 @@ def _kinds(record: records.Record) -> dict[str, str]:
 
 def _arrays(record: records.Record) -> list[str]:
     sides = [kind + side for kind in _kinds(record) for side in SIDES.values()]
-    return ["photograph", *(side + part for side in sides for part in ("colours", "normals", "hit"))]
+    return ["photograph", *(side + array for side in sides for array in ("colours", "normals", "hit"))]
 
 
 def _block(scene: gallery.Scene, record: records.Record) -> gallery.Block:
@@ -84,8 +84,8 @@ def _block(scene: gallery.Scene, record: records.Record) -> gallery.Block:
 
 
 def _lit(prefix: str, light: tuple[float, float, float]) -> gallery.Paint:
-    def paint(found: gallery.Arrays) -> list[np.ndarray]:
-        colours, normals, hit = (found[prefix + part] for part in ("colours", "normals", "hit"))
+    def paint(arrays: gallery.Arrays) -> list[np.ndarray]:
+        colours, normals, hit = (arrays[prefix + name] for name in ("colours", "normals", "hit"))
         cosine = (normals @ light / np.linalg.norm(light)).clip(0)[..., None]
         return [gallery.coloured(colours * (AMBIENT + (1 - AMBIENT) * cosine), hit)]
 

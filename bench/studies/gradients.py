@@ -1,4 +1,4 @@
-"""Errors of gradients against central differences: at hits by the angle of the ray, and at the outline by the blur."""
+"""Errors of gradients against central differences: at hits by angle of incidence, at the outline by blur."""
 
 from collections.abc import Iterable, Sequence
 
@@ -14,10 +14,10 @@ OUTLINE = "silhouette"
 BANDS = (*ANGLES, OUTLINE, "colour")
 ERRORS = ("pooled_cosine", "pooled_scale", "cosine", "scale", "median_error", "p99_error")
 COUNTS = ("pixels", "excluded")
-OF_IMAGE = ("image_cosine", "image_scale")
-NUMBERS = (*COUNTS, *(f"{of}_{error}" for of in ("code", "camera", "texture") for error in ERRORS), *OF_IMAGE)
-VISIBLE = {  # numbers of the image at the outline, and their headings
-    **dict(zip(OF_IMAGE, ("Cosine", "Scale"), strict=True)),
+IMAGE_METRICS = ("image_cosine", "image_scale")
+NUMBERS = (*COUNTS, *(f"{to}_{error}" for to in ("code", "camera", "texture") for error in ERRORS), *IMAGE_METRICS)
+VISIBILITY_HEADINGS = {  # headings of the metrics of the image at the outline
+    **dict(zip(IMAGE_METRICS, ("Cosine", "Scale"), strict=True)),
     **{"image_error": "Error", "image_spread": "Noise of a ray", "values_per_ray": "Values per ray"},
 }
 NOTES = (
@@ -44,9 +44,9 @@ VISIBLE_NOTES = (
 
 
 def make(runs: Runs) -> Result:
-    """A line per renderer and band, failed runs too."""
-    told = _of_bands(runs, BANDS, NUMBERS)
-    unseen = int((told.loc[told["band"].isin(ANGLES), ["code_median_error", "camera_median_error"]] == 0).sum().sum())
+    """A line per renderer and band, also of failed runs."""
+    data = _band_lines(runs, BANDS, NUMBERS)
+    unseen = int((data.loc[data["band"].isin(ANGLES), ["code_median_error", "camera_median_error"]] == 0).sum().sum())
     return Result(
         runs,
         "Errors of the gradients.",
@@ -54,94 +54,94 @@ def make(runs: Runs) -> Result:
         "pixel (1 where it is exact), and the relative error; in the figure the median error and, at the silhouette, "
         "cosine and scale.",
         question="Are the gradients true?",
-        verdict=_verdict(told),
+        verdict=_verdict(data),
         remarks=(*NOTES, f"{unseen} errors of exactly zero lie below the figure's logarithmic axes." if unseen else ""),
         columns=COLUMNS,
-        lines=told.to_dict("records"),
-        data=told.drop(columns=["name", "preset"]),
-        figure=draw(told),
+        lines=data.to_dict("records"),
+        data=data.drop(columns=["name", "preset"]),
+        figure=draw(data),
     )
 
 
 def make_visibility(runs: Runs) -> Result:
-    """A line per renderer and blur, failed runs too."""
-    told = _by_blur(runs)
+    """A line per renderer and blur, also of failed runs."""
+    data = _blur_lines(runs)
     return Result(
         runs,
         "Gradients of what comes into view.",
         "At the outline, the gradient of the image of distances towards the code against the true one: cosine and "
         "scale are 1 and the error is 0 where it is exact.",
         question="Does what comes into view have a gradient?",
-        verdict=_verdict_visible(told),
+        verdict=_visibility_verdict(data),
         remarks=VISIBLE_NOTES,
-        columns=COLUMNS_VISIBLE,
-        lines=told.to_dict("records"),
-        data=told.drop(columns=["name", "preset", "band"]),
-        figure=draw_visibility(told),
+        columns=VISIBILITY_COLUMNS,
+        lines=data.to_dict("records"),
+        data=data.drop(columns=["name", "preset", "band"]),
+        figure=draw_visibility(data),
     )
 
 
-def _of_bands(runs: Runs, bands: Iterable[str], names: Sequence[str]) -> pd.DataFrame:
+def _band_lines(runs: Runs, bands: Iterable[str], names: Sequence[str]) -> pd.DataFrame:
     """A line per run and band, with the run's preset and readable name."""
     identity = table.to_data(table.IDENTITY, runs.records).assign(preset=list(runs.frame.preset), name=runs.names())
-    found = [identity.assign(band=band, **{name: runs.number(f"{band}.{name}") for name in names}) for band in bands]
-    return pd.concat(found).sort_index(kind="stable")
+    tables = [identity.assign(band=band, **{name: runs.number(f"{band}.{name}") for name in names}) for band in bands]
+    return pd.concat(tables).sort_index(kind="stable")
 
 
-def _by_blur(runs: Runs) -> pd.DataFrame:
-    """A line per run and blur of which it has numbers, the least first; nan where a renderer has no blur."""
-    begin = f"{OUTLINE}_"
-    keys = {key.partition(".")[0].removeprefix(begin) for key in runs.frame if key.startswith(begin)}
-    data = _of_bands(runs, [*(begin + blur for blur in sorted(keys, key=float)), OUTLINE], [*VISIBLE])
-    data.insert(data.columns.get_loc("band"), "blur", pd.to_numeric(data["band"].str.removeprefix(begin), "coerce"))
-    blurred = data["blur"].notna() & data[[*VISIBLE]].notna().any(axis=1)
+def _blur_lines(runs: Runs) -> pd.DataFrame:
+    """A line per run and measured blur, the smallest first; nan for a renderer without a blur."""
+    prefix = f"{OUTLINE}_"
+    keys = {key.partition(".")[0].removeprefix(prefix) for key in runs.frame if key.startswith(prefix)}
+    data = _band_lines(runs, [*(prefix + blur for blur in sorted(keys, key=float)), OUTLINE], [*VISIBILITY_HEADINGS])
+    data.insert(data.columns.get_loc("band"), "blur", pd.to_numeric(data["band"].str.removeprefix(prefix), "coerce"))
+    blurred = data["blur"].notna() & data[[*VISIBILITY_HEADINGS]].notna().any(axis=1)
     sharp = data["blur"].isna() & ~data.index.isin(data.index[blurred])
     return data[blurred | sharp].reset_index(drop=True)
 
 
 def _verdict(data: pd.DataFrame) -> str:
-    """The least pooled cosine of each renderer in the bands of hits."""
+    """The smallest pooled cosine of each renderer in the bands of hits."""
     hits = data[data["band"].isin(ANGLES)]
     cosines = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False)
-    least = cosines.min(min_count=len(ANGLES))  # unknown where a band is
-    said = f"Least pooled cosine in any band of hits, {(least >= 0.99).sum()} of {len(least)} of 0.99 or more"
-    return format.ends(said, least.to_dict(), "one shape", show=_cosine, most=True)
+    least = cosines.min(min_count=len(ANGLES))  # NaN if a band is missing
+    title = f"Least pooled cosine in any band of hits, {(least >= 0.99).sum()} of {len(least)} of 0.99 or more"
+    return format.ends(title, least.to_dict(), "one shape", show=_cosine, most=True)
 
 
-def _verdict_visible(data: pd.DataFrame) -> str:
-    """The best cosine at the outline, and the best of the renderers that differentiate hits alone."""
-    known = data[(data["status"] == "ok") & data["image_cosine"].notna()]
-    blurred, sharp = known[known["blur"].notna()], known[known["blur"].isna()]
-    said = []
+def _visibility_verdict(data: pd.DataFrame) -> str:
+    """The best cosine at the outline, and the best of the renderers that differentiate hits only."""
+    measured = data[(data["status"] == "ok") & data["image_cosine"].notna()]
+    blurred, sharp = measured[measured["blur"].notna()], measured[measured["blur"].isna()]
+    parts = []
     if len(blurred):
         best = blurred.loc[blurred["image_cosine"].idxmax()]
-        said.append(
+        parts.append(
             f"{best['name']} has a cosine of *{best['image_cosine']:.2f}* and a scale of {best['image_scale']:.2f} at "
             f"a blur of {best['blur']:g} scene units"
         )
     if len(sharp):
-        most = sharp[[*OF_IMAGE]].max()
-        said.append(f"renderers that differentiate hits alone have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
-    return f"{'; '.join(said)} (n = one shape)." if said else ""
+        most = sharp[[*IMAGE_METRICS]].max()
+        parts.append(f"renderers that differentiate hits alone have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
+    return f"{'; '.join(parts)} (n = one shape)." if parts else ""
 
 
 def draw(data: pd.DataFrame) -> Figure:
     """Draws a line per renderer: the median errors of each band for code and camera, and the silhouette's numbers."""
     status = dict(zip(data["name"], data["status"], strict=True))
-    rows = [name if of == "ok" else f"{name} ({of.replace('_', ' ')})" for name, of in status.items()]
+    rows = [name if end == "ok" else f"{name} ({end.replace('_', ' ')})" for name, end in status.items()]
 
     def points(name: str, column: str, band: str, colour: str, symbol: str) -> chart.Series:
-        own = data[data["band"] == band]
-        places = own["name"].map(list(status).index).tolist()
-        return {"name": name, "x": style.finite(own[column]), "y": places, "colour": colour, "symbol": symbol}
+        band_data = data[data["band"] == band]
+        positions = band_data["name"].map(list(status).index).tolist()
+        return {"name": name, "x": style.finite(band_data[column]), "y": positions, "colour": colour, "symbol": symbol}
 
     panels = []
-    for of in ("code", "camera"):
-        drawn = [points(band, f"{of}_median_error", band, colour, "o") for band, colour in ANGLES.items()]
-        panels.append(chart.panel_data(f"gradient for the {of}", "median relative error (ratio)", "", drawn, rows=rows))
+    for to in ("code", "camera"):
+        drawn = [points(band, f"{to}_median_error", band, colour, "o") for band, colour in ANGLES.items()]
+        panels.append(chart.panel_data(f"gradient for the {to}", "median relative error (ratio)", "", drawn, rows=rows))
     drawn = [
         points(name.replace("image_", ""), name, OUTLINE, "#444444", symbol)
-        for name, symbol in zip(OF_IMAGE, "DP", strict=True)
+        for name, symbol in zip(IMAGE_METRICS, "DP", strict=True)
     ]
     panels.append(chart.panel_data(OUTLINE, "cosine and scale (exact: 1)", "", drawn, rows=rows))
     panels[-1]["x"]["log"] = False
@@ -149,18 +149,18 @@ def draw(data: pd.DataFrame) -> Figure:
 
 
 def draw_visibility(data: pd.DataFrame) -> Figure:
-    """Draws cosine and scale over the blur, a line per renderer; those without a blur are a range."""
+    """Draws cosine and scale over the blur, a line per renderer; renderers without a blur are a range."""
     sharp, blurs, panels = data[data["blur"].isna() & data["image_cosine"].notna()], data["blur"].dropna(), []
-    for name in OF_IMAGE if len(blurs) else ():
+    for name in IMAGE_METRICS if len(blurs) else ():
         lines = [
-            chart.curve(row, preset, own["blur"], style.finite(own[name]))
-            for (row, preset), own in data[data["blur"].notna()].groupby(["name", "preset"], sort=False)
+            chart.curve(row, preset, row_data["blur"], style.finite(row_data[name]))
+            for (row, preset), row_data in data[data["blur"].notna()].groupby(["name", "preset"], sort=False)
         ]
         for end in ("min", "max") if len(sharp) else ():
             label = f"without a blur ({sharp['name'].nunique()} renderers)"
             lines.append(chart.level(label, blurs, getattr(sharp[name], end)()))
         lines.append(chart.level("exact", blurs, 1.0, dash=":"))
-        panels.append(chart.panel_data("", "blur (scene units)", VISIBLE[name].lower(), lines))
+        panels.append(chart.panel_data("", "blur (scene units)", VISIBILITY_HEADINGS[name].lower(), lines))
     return chart.draw(panels, 2.8)
 
 
@@ -180,10 +180,10 @@ COLUMNS = (
     *map(_column, NUMBERS),
     table.text("status", "Status"),
 )
-COLUMNS_VISIBLE = (
+VISIBILITY_COLUMNS = (
     table.text("name", "Renderer"),
     table.Column("blur", "Blur (scene units)", show=lambda x: "" if x is None else f"{x:g}"),
-    *(table.Column(name, heading) for name, heading in VISIBLE.items()),
+    *(table.Column(name, heading) for name, heading in VISIBILITY_HEADINGS.items()),
     table.text("status", "Status"),
 )
 

@@ -1,4 +1,4 @@
-"""How much field a scene needs: the smallest sufficient candidate."""
+"""The smallest field that is sufficient for a scene."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ NOTES = (
     "Pixel precision: the recommended candidate fitted again with renderer.epsilon=auto, renderer.steps=auto and rays "
     "that follow the loss, over its plain fit.",
 )
-Line = dict[str, Any]  # of a run
+Line = dict[str, Any]  # a run
 
 
 def make(runs: Runs) -> Result:
@@ -37,7 +37,7 @@ def make(runs: Runs) -> Result:
         verdict=_verdict([line for line in lines if line["ok"]]),
         interval="± is one standard error, by the jackknife over views",
         remarks=[*(note.format(size=AXES[size]) for note in NOTES), _falling(lines)],
-        data=table.to_data(CANDIDATES, [line | own for line in lines for own in _candidates(line)]),
+        data=table.to_data(CANDIDATES, [line | candidate for line in lines for candidate in _candidates(line)]),
         columns=COLUMNS,
         lines=lines,
         figure=draw(lines, size),
@@ -45,44 +45,44 @@ def make(runs: Runs) -> Result:
 
 
 def scenes(runs: Runs) -> tuple[list[Line], str]:
-    """A line per run, the smallest need first, those that did not end ok last; and the size that decides the choice."""
+    """A line per run, the smallest recommended field first, failed runs last; and the measure of size."""
     lines = [_scene(record, medians.scene_of(record)) for record in runs.records]
     size = next((line["candidates"].measure for line in lines if line["ok"]), "stored")
     return sorted(lines, key=lambda line: (not line["ok"], line.get(f"recommended_{size}") or 0, line["scene"])), size
 
 
 def _scene(record: records.Record, name: str) -> Line:
-    """The run's identity, its metrics, and its recommended and best candidate; `said` tells why it has none of them."""
+    """The run's identity, metrics, and recommended and best candidate; `problem` says why these are missing."""
     metrics = record["metrics"] if record["status"] == "ok" else {}
-    found = Candidates.of(metrics)
-    line = {"scene": name, "candidates": found} | {column.key: column.of(record) for column in table.IDENTITY}
-    if found.chosen is None or found.best is None:
+    candidates = Candidates.of(metrics)
+    line = {"scene": name, "candidates": candidates} | {column.key: column.of(record) for column in table.IDENTITY}
+    if candidates.chosen is None or candidates.best is None:
         status = record["status"].replace("_", " ") if record["status"] != "ok" else "no field recommended"
-        return line | {"ok": False, "said": status, "lost": format.MISSING}
-    for end, one in (("chosen", found.chosen), ("best", found.best)):
-        line |= {f"{end}.name": one.label} | {f"{end}.{key}": value for key, value in one.numbers.items()}
-    frugal, plain = metrics.get("frugal.evaluations"), found.chosen.numbers.get("evaluations")
+        return line | {"ok": False, "problem": status, "lost": format.MISSING}
+    for role, candidate in (("chosen", candidates.chosen), ("best", candidates.best)):
+        line |= {f"{role}.name": candidate.label} | {f"{role}.{key}": value for key, value in candidate.numbers.items()}
+    frugal, plain = metrics.get("frugal.evaluations"), candidates.chosen.numbers.get("evaluations")
     fitted = metrics.get("frugal.error") is not None and frugal is not None and plain
-    lost = sum(one.error is None for one in found.results)
-    line |= {"frugal_evaluations": frugal / plain if fitted else None, "lost": f"{lost} of {len(found.results)}"}
-    return line | metrics | {"ok": True, "said": ""}
+    lost = sum(candidate.error is None for candidate in candidates.results)
+    line |= {"frugal_evaluations": frugal / plain if fitted else None, "lost": f"{lost} of {len(candidates.results)}"}
+    return line | metrics | {"ok": True, "problem": ""}
 
 
 def _candidates(line: Line) -> list[Line]:
-    """The candidates of a run with their kind and numbers; one without any where it did not end ok."""
-    found = line["candidates"]
+    """The candidates of a run with their kind and numbers; one empty line for a failed run."""
+    candidates = line["candidates"]
     return [
-        {**one.numbers, "rung": one.name, "kind": KINDS[one.kind][0]}
-        | {"recommended": one is found.chosen, "best": one is found.best}
-        for one in (found.results if line["ok"] else ())
+        {**candidate.numbers, "rung": candidate.name, "kind": KINDS[candidate.kind][0]}
+        | {"recommended": candidate is candidates.chosen, "best": candidate is candidates.best}
+        for candidate in (candidates.results if line["ok"] else ())
     ] or [{}]
 
 
 def _falling(lines: list[Line]) -> str:
-    """Which candidates are not at their end, and on which scenes."""
-    fits = [(one, line["scene"]) for line in lines for one in line["candidates"].results]
-    found = [f"{one.label} ({scene})" for one, scene in fits if one.numbers.get("falling")]
-    return f"Not at their end, as the last round still lowered their error: {', '.join(found)}." if found else ""
+    """A sentence on the fits that still improved at their end, with their scenes."""
+    fits = [(candidate, line["scene"]) for line in lines for candidate in line["candidates"].results]
+    names = [f"{candidate.label} ({scene})" for candidate, scene in fits if candidate.numbers.get("falling")]
+    return f"Not at their end, as the last round still lowered their error: {', '.join(names)}." if names else ""
 
 
 def _verdict(lines: list[Line]) -> str:
@@ -99,19 +99,19 @@ def _verdict(lines: list[Line]) -> str:
 
 @style.styled
 def draw(lines: list[Line], size: str) -> Figure:
-    """Draws the candidates of each scene over their size, filled those that suffice, a ring around the recommended."""
+    """Draws the candidates of each scene over their size: filled if sufficient, with a ring if recommended."""
     figure, ((axis,),) = chart.sheet(0.26 * len(lines) + 1.2)
     ring = {"ms": 10, "mfc": "none", "mec": "#111111", "mew": 1.2, "ls": "none"}
-    for place, line in enumerate(lines):
+    for index, line in enumerate(lines):
         if not line["ok"]:
             continue
-        enough = max(line["best.error"] + line["best.standard_error"], line["footprint"])
-        for one in line["candidates"].results:
-            _, colour, marker = KINDS[one.kind]
-            fill = colour if one.error is not None and one.error <= enough else "none"
-            marker = "x" if one.error is None else marker
-            axis.plot(one.numbers[size], place, marker, color=colour, mfc=fill, ms=5, mew=1)
-        axis.plot(line[f"chosen.{size}"], place, "o", **ring)
+        max_error = max(line["best.error"] + line["best.standard_error"], line["footprint"])
+        for candidate in line["candidates"].results:
+            _, colour, marker = KINDS[candidate.kind]
+            fill = colour if candidate.error is not None and candidate.error <= max_error else "none"
+            marker = "x" if candidate.error is None else marker
+            axis.plot(candidate.numbers[size], index, marker, color=colour, mfc=fill, ms=5, mew=1)
+        axis.plot(line[f"chosen.{size}"], index, "o", **ring)
     for label, colour, marker in KINDS.values():
         axis.plot([], [], marker, color=colour, label=label)
     how = {"ls": "none", "color": "#666666"}
@@ -119,7 +119,7 @@ def draw(lines: list[Line], size: str) -> Figure:
     axis.plot([], [], "x", label="failed fit", **how)
     axis.plot([], [], "o", label="recommended", **ring)
     axis.set(xscale="log", xlabel=AXES[size], ylim=(len(lines) - 0.5, -0.5))
-    names = [f"{line['scene']} ({line['said']})" if line["said"] else line["scene"] for line in lines]
+    names = [f"{line['scene']} ({line['problem']})" if line["problem"] else line["scene"] for line in lines]
     axis.set_yticks(range(len(lines)), names)
     style.legend_below(figure, axis, columns=4)
     return figure
@@ -136,16 +136,16 @@ def _whole(count: int | None) -> str:
     return format.MISSING if count is None else f"{count:,}"
 
 
-def _label(line: Line, of: str) -> str:
-    """The name of the recommended or of the best candidate; of the first, else why there is none."""
-    return line.get(f"{of}.name") or (line["said"] if of == "chosen" else format.MISSING)
+def _label(line: Line, role: str) -> str:
+    """The name of the recommended or best candidate; without a recommended one, the problem."""
+    return line.get(f"{role}.name") or (line["problem"] if role == "chosen" else format.MISSING)
 
 
-def _spread(line: Line, of: str) -> str:
+def _spread(line: Line, role: str) -> str:
     """The mean error of a candidate with its standard error, times 1000."""
-    if f"{of}.error" not in line:
+    if f"{role}.error" not in line:
         return format.MISSING
-    return " ± ".join(table.thousandfold(line[f"{of}.{name}"]) for name in ("error", "standard_error"))
+    return " ± ".join(table.thousandfold(line[f"{role}.{name}"]) for name in ("error", "standard_error"))
 
 
 def _why(line: Line) -> str:
@@ -155,7 +155,7 @@ def _why(line: Line) -> str:
 
 SIZES = ("stored", "free", "bytes")
 SCENE = (table.text("scene", "Scene"), *(table.text(column.key) for column in table.IDENTITY))
-CANDIDATES = (  # of a run and a candidate
+CANDIDATES = (  # a line is a run and a candidate
     *SCENE,
     *map(table.Column, ("footprint", "chamfer_l2", "recommended_within", "recommended_enough")),
     *map(table.Column, ("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held")),
@@ -165,7 +165,7 @@ CANDIDATES = (  # of a run and a candidate
     ),
     *map(table.Column, (*COSTS, "iterations", "falling", "failed", *(f"{cost}_at_auto" for cost in COSTS))),
 )
-COLUMNS = (  # of a run
+COLUMNS = (  # a line is a run
     SCENE[0],
     table.shown("Recommended", lambda line: _label(line, "chosen")),
     table.Column("chosen.stored", "Stored numbers", show=_whole),

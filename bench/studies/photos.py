@@ -1,4 +1,4 @@
-"""Shape and colour from real photographs: the rows of DVR's Table 2, and its columns where a true surface is given."""
+"""Shape and colour from real photographs: the rows of DVR's Table 2, and its columns if a true surface is given."""
 
 from math import isfinite
 
@@ -8,7 +8,7 @@ PLACE = 46
 READS = (Selection("photos", setup=("scenes", "machine")),)
 NAMES = ("psnr", "ssim", "mask_iou", "mask_iou_least")
 DEFINED = {"psnr": "PSNR", "ssim": "SSIM", "mask_iou": "Mask IoU"}
-OF_TRUTH = (  # columns of runs with dataset.truth
+TRUTH_COLUMNS = (  # for runs with dataset.truth
     table.Column("dtu_accuracy", "Accuracy (mm)"),
     table.Column("dtu_completeness", "Completeness (mm)"),
     table.Column("dtu_overall", "Chamfer-L1 (mm)"),
@@ -21,14 +21,15 @@ COLUMNS = (
     table.Column("mask_iou_least", "least"),
     *medians.COST,
 )
-TRUTH = tuple(column.key for column in OF_TRUTH)
+TRUTH = tuple(column.key for column in TRUTH_COLUMNS)
 RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*NAMES, *TRUTH, "own_psnr", "own_mask_iou"), *table.LOOP)
 
 
 def make(runs: Runs) -> Result:
     """A line per row."""
     lines, folders = medians.medians(runs, (*NAMES, *TRUTH)), format.plural(len(runs.families()), "folder")
-    judged = [one for one in OF_TRUTH if any(isfinite(line[one.key]) for line in lines if line[one.key] is not None)]
+    measured = {key for line in lines for key in TRUTH if line[key] is not None and isfinite(line[key])}
+    truth_columns = [column for column in TRUTH_COLUMNS if column.key in measured]
     return Result(
         runs,
         "Shape and colour from real photographs.",
@@ -37,7 +38,7 @@ def make(runs: Runs) -> Result:
         question="Which method is best on real photographs?",
         verdict=format.ends("PSNR of held-out photographs (dB)", medians.whole(lines, "psnr"), folders, most=True),
         remarks=records.definitions(runs.records, DEFINED),
-        columns=(table.text("method", "Method"), *judged, *COLUMNS),
+        columns=(table.text("method", "Method"), *truth_columns, *COLUMNS),
         lines=lines,
         run_columns=RUNS,
         figure=medians.draw_runs(runs, {"PSNR (dB)": medians.scored(runs, "psnr"), **medians.cost(runs)}),

@@ -1,4 +1,4 @@
-"""The oracle of each prior: its best fit to unseen shapes, with pictures and the length of its gradient."""
+"""The best possible fit of each prior to unseen shapes, with pictures and the length of its gradient."""
 
 import math
 
@@ -6,7 +6,7 @@ from bench.report.study import Result, Runs, compare, format, gallery, records, 
 
 PLACE = 70
 READS = (compare.PRIORS,)
-SHOWN = 3  # shapes per family in the figure
+PICTURED_SHAPES = 3  # per family
 DEFINED = {
     "chamfer_l2": "Fit",
     "floor_chamfer_l2": "Floor",
@@ -42,31 +42,31 @@ def make(runs: Runs) -> Result:
         ratio=[math.inf if ratio is None else ratio for ratio in ratios],
     )
     lines = [
-        {"family": name, "shapes": len(own), "largest": float(own.ratio.max())}
-        | {column: float(statistics.median(own[column].to_numpy())) for column in (*DEFINED, "ratio")}
-        for name, own in values.groupby("family", sort=False)
+        {"family": name, "shapes": len(shapes), "largest": float(shapes.ratio.max())}
+        | {column: float(statistics.median(shapes[column].to_numpy())) for column in (*DEFINED, "ratio")}
+        for name, shapes in values.groupby("family", sort=False)
     ]
-    middle, most = (format.number(float(of(values.ratio.to_numpy()))) for of in (statistics.median, max))
+    median, largest = (format.number(float(summary(values.ratio.to_numpy()))) for summary in (statistics.median, max))
     return Result(
         runs,
         "The best fit of each prior to unseen shapes.",
         "Chamfer distance times 1000 (squared scene units) of each prior's best fit, and its floor; medians over "
         "shapes. Pictures: normals of the truth and of the fit.",
         question="How well can a prior show an unseen shape?",
-        verdict=f"The best fit has *{middle}* times the least error that can be measured (median), at most {most} "
+        verdict=f"The best fit has *{median}* times the least error that can be measured (median), at most {largest} "
         f"times; n = {format.plural(len(values), 'shape')}.",
         remarks=(*NOTES, *records.definitions(runs.records, DEFINED)),
         columns=COLUMNS,
         lines=lines,
         run_columns=RUNS,
-        figure=gallery.draw([_block(runs, name, own[:SHOWN]) for name, own in runs.families().items()]),
+        figure=gallery.draw([_block(runs, name, shapes[:PICTURED_SHAPES]) for name, shapes in runs.families().items()]),
     )
 
 
-def _block(runs: Runs, name: str, own: list[records.Record]) -> gallery.Block:
-    """The truth and the fit of each record, which names how far the fit is from the floor."""
+def _block(runs: Runs, name: str, shown: list[records.Record]) -> gallery.Block:
+    """The truth and the fit of each record, titled by the ratio of the fit's error to the floor."""
     cells, titles = [], []
-    for record in own:
+    for record in shown:
         scene, ratio = gallery.Scene(runs, [record], gallery.REFERENCE), _ratio(record)
         cells += [scene.shared([record], gallery.normals("reference_")), scene.cell(record, gallery.normals())]
         titles += ["truth", "fit" if ratio is None else f"fit: {format.number(ratio)} × floor"]

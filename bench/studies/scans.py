@@ -1,4 +1,4 @@
-"""Completion from depths that a scanner measured, against exact ones at the same pixels."""
+"""Completion from a scanner's measured depths, compared with exact depths at the same pixels."""
 
 from typing import Any
 
@@ -9,13 +9,13 @@ from bench.report.study import Result, Runs, Selection, format, records, statist
 PLACE = 48
 READS = (Selection("scans", ("task.depths",), setup=("scenes", "pixels", "machine")),)
 METRICS = {"chamfer_l2": "Chamfer", records.ONE_WAY: "truth to prediction", "depth_mae": "depth error"}
-EXACT, MEASURED, RATIO = "exact", "measured", "ratio"  # values of task.depths, and what is between their errors
+EXACT, MEASURED, RATIO = "exact", "measured", "ratio"  # two values of task.depths, and the ratio of their errors
 COLUMNS = (
     table.text("row", "Method"),
     *(
-        table.Column(f"{name}_{part}", f"{label.capitalize()}, {part}")
+        table.Column(f"{name}_{kind}", f"{label.capitalize()}, {kind}")
         for name, label in METRICS.items()
-        for part in (EXACT, MEASURED, RATIO)
+        for kind in (EXACT, MEASURED, RATIO)
     ),
     table.text("failed", "Failed"),
 )
@@ -58,7 +58,7 @@ def make(runs: Runs) -> Result:
 
 
 def _pairs(runs: Runs, metric: str) -> pd.DataFrame:
-    """The error with exact and with measured depths of each row, scan and seed that has runs with both."""
+    """The errors with exact and with measured depths, of each row, scan and seed with both runs."""
     frame = runs.frame.assign(error=runs.error(metric), depths=runs.setting("task.depths"))
     both = frame.pivot(index=["row", "preset", "family", "solid", "view", "seed"], columns="depths", values="error")
     return both.reindex(columns=[EXACT, MEASURED]).dropna()
@@ -67,11 +67,11 @@ def _pairs(runs: Runs, metric: str) -> pd.DataFrame:
 def _line(row: str, runs: Runs, pairs: dict[str, pd.DataFrame]) -> Line:
     status = runs.frame.status[runs.frame.row == row]
     line: Line = {"row": row, "failed": f"{(status != 'ok').sum()} of {len(status)}"}
-    for metric, found in pairs.items():
-        mine = found[found.index.get_level_values("row") == row]
-        if len(mine):
-            line |= {f"{metric}_{depths}": float(mine[depths].median()) for depths in (EXACT, MEASURED)}
-            exact, measured = (mine[depths].to_numpy()[:, None] for depths in (EXACT, MEASURED))
+    for metric, errors in pairs.items():
+        row_errors = errors[errors.index.get_level_values("row") == row]
+        if len(row_errors):
+            line |= {f"{metric}_{depths}": float(row_errors[depths].median()) for depths in (EXACT, MEASURED)}
+            exact, measured = (row_errors[depths].to_numpy()[:, None] for depths in (EXACT, MEASURED))
             line[f"{metric}_{RATIO}"] = statistics.ratio([*measured], [*exact]).value
     return line
 

@@ -10,32 +10,32 @@ from bench.report.study import Result, Runs, Selection, chart, curves, format, s
 
 PLACE = 90
 READS = (Selection("speed_completion"),)
-TARGET = 1e-3  # Chamfer distance (squared scene units); the time to reach it is measured
-ALONG = {"seconds": "time (seconds)", "value_evaluations": "field values"}
+TARGET_ERROR = 1e-3  # Chamfer distance in squared scene units
+COST_AXES = {"seconds": "time (seconds)", "value_evaluations": "field values"}
 ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
     "The figure has a line per run of each renderer's first setting, as far as the run came.",
-    f"The table has all settings, how many of their runs reached {SCALE * TARGET:g} × 10⁻³, and the median time to it "
-    "over all runs, infinite for a run that did not end ok or never was at it.",
+    f"The table has all settings, how many of their runs reached {SCALE * TARGET_ERROR:g} × 10⁻³, and the median time "
+    "to it over all runs, infinite for a run that did not end ok or never was at it.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (
     *(table.text("setting", "Setting"), table.text("runs", "Runs"), table.text("reached", "Reached")),
     *(table.Column("time", "Median time to it", show=format.seconds), table.Column("rank", "ρ of loss and error")),
 )
-Line = dict[str, Any]  # of a setting of a renderer, with its records and histories
+Line = dict[str, Any]  # a setting of a renderer, with its records and histories
 
 
 def make(runs: Runs) -> Result:
     """A line per setting: its runs, how many reached the target, and their median time."""
     lines = [_line(runs, records) | {"setting": row.name, "preset": row.preset} for row, records in runs.rows().items()]
-    own = (*table.IDENTITY, table.FAMILY)
+    identity_columns = (*table.IDENTITY, table.FAMILY)
     data = [
-        history.assign(**{column.key: column.of(record) for column in own})
+        history.assign(**{column.key: column.of(record) for column in identity_columns})
         for line in lines
         for record, history in zip(line["records"], line["histories"], strict=True)
     ]
-    panels = [_panel(lines, along) for along in ALONG if along != "seconds" or runs.timed]
+    panels = [_panel(lines, axis) for axis in COST_AXES if axis != "seconds" or runs.timed]
     return Result(
         runs,
         "Error over time and over field values.",
@@ -43,7 +43,7 @@ def make(runs: Runs) -> Result:
         question="How fast does the error fall?",
         verdict=_verdict(lines),
         remarks=NOTES,
-        data=pd.concat(data)[[*(column.key for column in own), *curves.HISTORY]],
+        data=pd.concat(data)[[*(column.key for column in identity_columns), *curves.HISTORY]],
         columns=COLUMNS,
         lines=lines,
         figure=chart.draw(panels, 2.9, legend=5, sharey=True),
@@ -62,35 +62,35 @@ def _line(runs: Runs, records: list[Record]) -> Line:
 
 
 def time_to(history: pd.DataFrame, record: Record) -> float:
-    """The seconds at a run's first checkpoint at the target; infinite where it did not end ok or reach it."""
-    below = history[history["error"] <= SCALE * TARGET]
+    """The seconds at a run's first checkpoint at the target; infinite if it failed or did not reach the target."""
+    below = history[history["error"] <= SCALE * TARGET_ERROR]
     return float(below["seconds"].iloc[0]) if record["status"] == "ok" and len(below) else math.inf
 
 
 def _verdict(lines: list[Line]) -> str:
-    """The times of the settings that reach the target on most shapes."""
+    """The times of the settings that reach the target in most runs."""
     reached = {line["setting"]: line["time"] for line in lines if math.isfinite(line["time"])}
-    what = f"Median time to an error of {SCALE * TARGET:g} (Chamfer × 1000)"
+    title = f"Median time to an error of {SCALE * TARGET_ERROR:g} (Chamfer × 1000)"
     n = min(line["runs"] for line in lines)
     runs = f"{n} runs each, and {len(reached)} of {len(lines)} settings reach it in most"
-    return format.ends(what, reached, runs, show=format.seconds)
+    return format.ends(title, reached, runs, show=format.seconds)
 
 
-def _panel(lines: list[Line], along: str) -> dict[str, Any]:
-    """A line per run over seconds or field values; of the first setting of each renderer at first."""
-    first = {line["renderer"]: line["setting"] for line in reversed(lines)}
+def _panel(lines: list[Line], axis: str) -> dict[str, Any]:
+    """A line per run over seconds or field evaluations; only the first setting of each renderer is switched on."""
+    first_settings = {line["renderer"]: line["setting"] for line in reversed(lines)}
     drawn = []
     for line in lines:
         for record, history in zip(line["records"], line["histories"], strict=True):
-            one = history[history[along] > 0]
+            shown = history[history[axis] > 0]
             scene = f"{family(record)} {index(record)}, seed {record['seed']}"
             costs = [
-                f"{format.seconds(s)}, error × 1000 {format.number(e)}" for s, e in one[["seconds", "error"]].values
+                f"{format.seconds(s)}, error × 1000 {format.number(e)}" for s, e in shown[["seconds", "error"]].values
             ]
-            look = {"text": [[scene, cost] for cost in costs], "link": [f"#/run/{record['folder']}"] * len(one)}
-            look |= {"size": 4} | ({} if first[line["renderer"]] == line["setting"] else {"off": True})
-            drawn.append(chart.curve(line["setting"], record["renderer"], one[along], one["error"], **look))
-    return chart.panel_data("", ALONG[along], ERROR, drawn, height=420)
+            look = {"text": [[scene, cost] for cost in costs], "link": [f"#/run/{record['folder']}"] * len(shown)}
+            look |= {"size": 4} | ({} if first_settings[line["renderer"]] == line["setting"] else {"off": True})
+            drawn.append(chart.curve(line["setting"], record["renderer"], shown[axis], shown["error"], **look))
+    return chart.panel_data("", COST_AXES[axis], ERROR, drawn, height=420)
 
 
 PAGES = {"speed_curves": make}

@@ -1,4 +1,4 @@
-"""The front of error over time: completing a shape, and rendering an image, by every setting of each renderer."""
+"""The Pareto front of error over time, for completing a shape and rendering an image, of all renderers' settings."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from bench.report.write.caption import undefined
 
 PLACE = 80
 READS = (Selection("speed_completion"), Selection("speed_rendering", alike=("view",)))
-QUANTITIES = ("seconds", "error", "evaluations")  # of a run
-LEAST = 1e-9  # smaller errors are raised to this, so that their logarithms are bounded
+QUANTITIES = ("seconds", "error", "evaluations")
+MIN_PLOTTED_ERROR = 1e-9  # smaller errors are raised to this, so that their logarithms are bounded
 NOTES = (
     "Left: final error of a completion over the seconds of its loop; right: depth error of one rendering (95th "
     "percentile over pixels, missed and spurious ones infinite) over its seconds.",
@@ -26,13 +26,13 @@ NOTES = (
     "that compute the same share their times.",
 )
 POINT = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
-RUNS = "#/runs?task=all&view=runs&"  # the page's list of runs
-Line = dict[str, Any]  # of a setting
+RUNS_PAGE = "#/runs?task=all&view=runs&"  # the page's list of runs
+Line = dict[str, Any]  # a setting
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A task of the chart: its error metric, and the columns of a run's seconds and of its field values."""
+    """A task of the chart: its error metric, and the columns of a run's seconds and field evaluations."""
 
     title: str
     error: str
@@ -50,10 +50,10 @@ RENDERING = Trial(
 
 def make(completion: Runs | None, rendering: Runs | None) -> Result:
     """A point per setting: its median error and seconds, and its probability on the front."""
-    found = {COMPLETION: completion, RENDERING: rendering}
-    panels = {trial: points(runs, trial) for trial, runs in found.items() if runs is not None}
+    runs_by_trial = {COMPLETION: completion, RENDERING: rendering}
+    panels = {trial: points(runs, trial) for trial, runs in runs_by_trial.items() if runs is not None}
     lines = [line for panel in panels.values() for line in panel]
-    own = dict.fromkeys(key for line in lines for key in line if key.startswith("renderer."))
+    renderer_columns = dict.fromkeys(key for line in lines for key in line if key.startswith("renderer."))
     drawn = [_panel(trial, panel) for trial, panel in panels.items()]
     return Result(
         together(completion, rendering),
@@ -64,7 +64,7 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
         interval="in the CSV, 95 % bootstrap intervals of interquartile means over {shapes and seeds}",
         estimates=[line["middle"] for line in lines],
         remarks=(*NOTES, undefined(line["on_front"] for line in lines)),
-        columns=[*COLUMNS, *map(table.Column, own), table.text("resolution")],
+        columns=[*COLUMNS, *map(table.Column, renderer_columns), table.text("resolution")],
         lines=lines,
         figure=draw(drawn, [*map(_front, panels.values())]),
         chart={"panels": drawn, "note": POINT},
@@ -76,22 +76,22 @@ def points(runs: Runs, trial: Trial) -> list[Line]:
     keys = sorted({records.run_key(record) for record in runs.records}, key=str)
     cells = _cells(runs, trial, keys)
     groups = {
-        row.name: [records.by_shape(dict(zip(keys, cells.loc[row.name, of], strict=True))) for of in QUANTITIES]
+        row.name: [records.by_shape(dict(zip(keys, cells.loc[row.name, q], strict=True))) for q in QUANTITIES]
         for row in runs.rows()
     }
-    medians = np.array([[float(statistics.median(statistics.flat(g))) for g in of_row] for of_row in groups.values()])
-    beaten = statistics.dominated(*medians.T[:2])
+    medians = np.array([[float(statistics.median(statistics.flat(g))) for g in group] for group in groups.values()])
+    dominated = statistics.dominated(*medians.T[:2])
     chances = statistics.front([(costs, errors) for costs, errors, *_ in groups.values()])
     lines = []
-    for i, (row, own) in enumerate(runs.rows().items()):
-        config, errors = own[0]["config"], groups[row.name][1]
+    for i, (row, row_records) in enumerate(runs.rows().items()):
+        config, errors = row_records[0]["config"], groups[row.name][1]
         lines.append(
-            {"trial": trial.title, "setting": row.name, "renderer": records.base_renderer(own[0])}
+            {"trial": trial.title, "setting": row.name, "renderer": records.base_renderer(row_records[0])}
             | dict(zip(QUANTITIES, medians[i].tolist(), strict=True))
             | {"middle": statistics.bootstrap(errors, statistics.interquartile_mean), "shapes": len(errors)}
-            | {"failed": sum(record["status"] != "ok" for record in own), "runs": len(own)}
-            | {"missing": len(keys) - len({*map(records.run_key, own)})}
-            | {"on_front": chances[i], "dominated": bool(beaten[i])}
+            | {"failed": sum(record["status"] != "ok" for record in row_records), "runs": len(row_records)}
+            | {"missing": len(keys) - len({*map(records.run_key, row_records)})}
+            | {"on_front": chances[i], "dominated": bool(dominated[i])}
             | {"resolution": records.setting(config, "view", "resolution")}
             | {f"renderer.{key}": value for key, value in (config.get("renderer") or {}).items() if key[0] != "_"}
         )
@@ -99,24 +99,24 @@ def points(runs: Runs, trial: Trial) -> list[Line]:
 
 
 def _cells(runs: Runs, trial: Trial, keys: list[records.RunKey]) -> pd.DataFrame:
-    """The quantities of each row by the place of a run's key; infinite what did not end ok or is missing.
+    """The quantities of each row by the index of a run's key; infinite for failed and missing runs.
 
-    Rows of a renderer with equal errors after equal numbers of field values compute the same: they share their times,
-    or else noise would rank them.
+    Rows of a renderer with equal errors after equal numbers of field evaluations compute the same. They share their
+    times, because otherwise noise would rank them.
     """
-    values, *further = map(runs.number, trial.values)
+    values, *coarse_values = map(runs.number, trial.values)
     quantities = {
         "seconds": runs.number(trial.seconds),
-        "error": runs.error(trial.error).clip(lower=records.SCALE * LEAST),
-        "evaluations": values + sum(one.fillna(0) for one in further),
+        "error": runs.error(trial.error).clip(lower=records.SCALE * MIN_PLOTTED_ERROR),
+        "evaluations": values + sum(counts.fillna(0) for counts in coarse_values),
     }
     cells = pd.DataFrame(quantities)
     cells.loc[(runs.frame.status != "ok").to_numpy(bool)] = math.inf
     cells = cells.assign(row=runs.frame.row, key=[keys.index(records.run_key(record)) for record in runs.records])
     wide = cells.pivot(index="row", columns="key", values=[*QUANTITIES]).fillna(math.inf)
-    renderers = {row.name: records.base_renderer(own[0]) for row, own in runs.rows().items()}
-    alike = [(renderers[row], *wide.loc[row, ["error", "evaluations"]]) for row in wide.index]
-    wide["seconds"] = wide["seconds"].groupby(pd.factorize(pd.Series(alike))[0]).transform("median")
+    renderers = {row.name: records.base_renderer(row_records[0]) for row, row_records in runs.rows().items()}
+    results = [(renderers[row], *wide.loc[row, ["error", "evaluations"]]) for row in wide.index]
+    wide["seconds"] = wide["seconds"].groupby(pd.factorize(pd.Series(results))[0]).transform("median")
     return wide
 
 
@@ -130,7 +130,7 @@ def _front(panel: list[Line]) -> list[Line]:
 
 
 def _verdict(panels: dict[Trial, list[Line]]) -> str:
-    """The ends of the front of the first trial that has one; empty where none has."""
+    """The ends of the first non-empty front; empty if all fronts are empty."""
     for trial, panel in panels.items():
         if front := _front(panel):
             ends = [
@@ -146,7 +146,7 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
 
 @style.styled
 def draw(panels: list[chart.Panel], fronts: list[list[Line]]) -> Figure:
-    """Draws a panel per trial; the settings on the front have numbers, which lead to their names below."""
+    """Draws a panel per trial; settings on the front are numbered, with their names below."""
     figure = chart.draw(panels, 4.4, legend=5)
     for axis, front in zip(figure.axes, fronts, strict=True):
         for number, line in enumerate(front, 1):
@@ -159,27 +159,27 @@ def draw(panels: list[chart.Panel], fronts: list[list[Line]]) -> Figure:
 
 
 def _name(line: Line) -> str:
-    """The setting, and the probability of being on the front where there is one."""
+    """The setting, and the probability of being on the front if it is known."""
     return line["setting"] + ("" if math.isnan(line["on_front"]) else f" ({line['on_front']:.2f})")
 
 
 def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
-    """A series per renderer of what is on the front, one of what is dominated, and the line of the front."""
-    drawn, at = [], ("seconds", "error")
-    for (renderer, dominated), own in records.grouped(
+    """For each renderer a series on the front and a dominated series; and the line of the front."""
+    drawn, axes = [], ("seconds", "error")
+    for (renderer, dominated), settings in records.grouped(
         _finite(panel), lambda p: (p["renderer"], p["dominated"])
     ).items():
-        links = [RUNS + urlencode({"q": p["setting"]}) for p in own]
-        look = {"text": [*map(_hover, own)], "link": links, "size": 11}
+        links = [RUNS_PAGE + urlencode({"q": p["setting"]}) for p in settings]
+        look = {"text": [*map(_hover, settings)], "link": links, "size": 11}
         look |= {"hollow": True} if dominated else {}
-        drawn.append(chart.series(renderer, renderer, *([p[key] for p in own] for key in at), **look))
+        drawn.append(chart.series(renderer, renderer, *([p[key] for p in settings] for key in axes), **look))
     line = {"colour": chart.GREY, "symbol": "", "dash": "-", "step": True, "quiet": True}
-    drawn.append(chart.series("front", "", *([p[key] for p in _front(panel)] for key in at), **line))
+    drawn.append(chart.series("front", "", *([p[key] for p in _front(panel)] for key in axes), **line))
     return chart.panel_data(trial.title, "time (seconds)", trial.heading, drawn, height=440)
 
 
 def _hover(line: Line) -> list[str]:
-    """What the mouse is told of a setting."""
+    """The text that appears when the mouse points at a setting."""
     return [
         _name(line),
         f"{format.seconds(line['seconds'])}, error × 1000 {format.number(line['error'])}",
@@ -191,7 +191,7 @@ def _failed(line: Line) -> str:
     return f"{line['failed']} of {line['runs']}" + (f", {line['missing']} missing" if line["missing"] else "")
 
 
-COLUMNS = (  # of a line
+COLUMNS = (
     *(table.text("trial", "Trial"), table.text("setting", "Setting"), table.text("renderer")),
     table.Column("seconds", "Time", show=format.seconds),
     table.Column("evaluations", "Evaluations", show=format.count),

@@ -12,8 +12,8 @@ from bench.report.study import Result, Runs, Selection, chart, format, records, 
 
 PLACE = 120
 READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
-FAILED = "failed_"  # beginning of the metrics that count failed trials by kind
-ENDS = ("mild", "severe")  # of a sweep
+FAILED = "failed_"  # prefix of the metrics that count failed trials by kind
+ENDS = ("mild", "severe")
 COST_AXES = ("field values per ray at the mild end, median over axes", "mean rank over axes (1 is best)")
 NOTES = (
     "The adaptive search makes {share:.0f} % of a full grid's trials, and every renderer gets the same trials at a "
@@ -46,8 +46,8 @@ NUMBERS = (
     *("level", "breakdown", "breakdown_low", "breakdown_high", "trials", "grid_trials", "evaluations_per_ray"),
     *(f"{end}_{name}" for end in ENDS for name in ("successes", "trials")),
 )
-SHARES = ("level", "severity", "successes", "trials", "share", "low", "high")
-COSTS = (
+SHARE_COLUMNS = ("level", "severity", "successes", "trials", "share", "low", "high")
+COST_COLUMNS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
     table.text("at_once", "At once"),
     table.text("never", "None"),
@@ -62,9 +62,9 @@ def make(runs: Runs) -> Result:
     cells = cells_of(runs)
     axes, rows = axes_of(cells), list(cells["row"].unique())
     task, trials = runs.requested().get("task"), cells["trials"].sum()
-    about = {name: float(records.setting(task, "criteria", name) or math.nan) for name in CRITERIA}
-    about["resolution"] = records.setting(task, "resolution")
-    about["share"] = 100 * trials / max(cells["grid_trials"].sum(), 1)
+    settings = {name: float(records.setting(task, "criteria", name) or math.nan) for name in CRITERIA}
+    settings["resolution"] = records.setting(task, "resolution")
+    settings["share"] = 100 * trials / max(cells["grid_trials"].sum(), 1)
     words = _grid(cells, axes, "words").fillna("").reset_index(drop=True)
     words.insert(0, "Axis", [title(axis) for axis in axes.index])
     words.insert(1, "Unit", list(axes["unit"]))
@@ -82,7 +82,7 @@ def make(runs: Runs) -> Result:
         ),
         n=f"{trials:.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
         interval="95 % credible intervals, the milder end first",
-        remarks=[note.format(**about) for note in NOTES],
+        remarks=[note.format(**settings) for note in NOTES],
         data=_data(runs, cells, axes),
         columns=[table.text(name, name) for name in words],
         lines=words.to_dict("records"),
@@ -97,15 +97,15 @@ def make_cost(runs: Runs) -> Result:
     cells = cells_of(runs)
     cells = cells[cells["row"].isin(_ranked(runs))]
     rendered = cells[cells["measure"] == "rendering"]
-    lacking = set(rendered.loc[rendered["status"] == "unsupported", "axis"])
-    shared = rendered[~rendered["axis"].isin(lacking)]
-    # A run that did not end ok, or is missing, has no shade, so it ranks last.
+    unsupported = set(rendered.loc[rendered["status"] == "unsupported", "axis"])
+    shared = rendered[~rendered["axis"].isin(unsupported)]
+    # A failed or missing run has no shade, so it ranks last.
     shades = shared.pivot(index="axis", columns="row", values="shade").reindex(columns=cells["row"].unique())
-    ranks = statistics.rank({str(row): (1.0 - own).to_dict() for row, own in shades.items()})
+    ranks = statistics.rank({str(row): (1.0 - row_shades).to_dict() for row, row_shades in shades.items()})
     lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
     lines["preset"] = list(cells.drop_duplicates("row")["preset"])
     means = lines["rank"].map(lambda rank: rank.value)
-    lines["behind"] = lines.groupby(["cost", means]).cumcount()  # of points at one place
+    lines["behind"] = lines.groupby(["cost", means]).cumcount()  # points at the same position are drawn smaller
     points = [
         chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
         for line in lines[lines["cost"].notna() & means.notna()].itertuples()
@@ -122,7 +122,7 @@ def make_cost(runs: Runs) -> Result:
         verdict=f"{ends} {_alike(ranks)}".strip(),
         n=f"{len(shades)} axes and {len(lines)} renderers",
         remarks=COST_NOTES,
-        columns=COSTS,
+        columns=COST_COLUMNS,
         lines=lines.to_dict("records"),
         figure=chart.draw([panel], 3.6),
         chart={"panels": [panel]},
@@ -130,19 +130,20 @@ def make_cost(runs: Runs) -> Result:
 
 
 def make_curves(runs: Runs) -> Result:
-    """The shares of successes at each severity, a panel of the page's atlas per axis."""
+    """The fraction of successes at each severity; a panel of the page's atlas per axis."""
     runs = runs.of_newest_scene()
     cells = cells_of(runs)
     shares = [_shares(runs, record, cell) for record, cell in zip(runs.records, cells.to_dict("records"), strict=True)]
     data = pd.concat(shares, ignore_index=True)
     panels = []
-    for axis, found in data.groupby("axis", sort=False):
+    for axis, axis_data in data.groupby("axis", sort=False):
         lines = []
-        for (row, preset), own in found.groupby(["row", "preset"], sort=False):
-            told = [
-                f"{s.successes:.0f} of {s.trials:.0f} succeed at {format.number(s.severity)}" for s in own.itertuples()
+        for (row, preset), points in axis_data.groupby(["row", "preset"], sort=False):
+            texts = [
+                f"{x.successes:.0f} of {x.trials:.0f} succeed at {format.number(x.severity)}"
+                for x in points.itertuples()
             ]
-            lines.append(chart.curve(row, preset, own["severity"], 100 * own["share"], size=5, text=told))
+            lines.append(chart.curve(row, preset, points["severity"], 100 * points["share"], size=5, text=texts))
         panels.append(chart.panel_data(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))
     return Result(
         runs,
@@ -157,14 +158,14 @@ def make_curves(runs: Runs) -> Result:
 
 
 def title(axis: str) -> str:
-    """An axis's name, in words."""
+    """An axis's readable name."""
     return axis.replace("_", " ")
 
 
 def cells_of(runs: Runs) -> pd.DataFrame:
-    """A line per run: its axis and row, whether its search finished, its breakdown as a number, shade and words.
+    """A line per run: axis, row, whether its search finished, and its breakdown as number, shade and text.
 
-    A level is 0 at the mild end of the sweep and 1 at the severe one; the shade is the level clipped to these.
+    A level is 0 at the mild end of the sweep and 1 at the severe end; the shade is the level clipped to 0 and 1.
     """
     cells = runs.frame[["row", "preset"]].assign(
         axis=runs.frame["dataset"].astype(object),
@@ -175,29 +176,29 @@ def cells_of(runs: Runs) -> pd.DataFrame:
         **{key: runs.number(key) for key in NUMBERS},
     )
     level = cells["level"]
-    known = cells["status"].eq("ok") & level.notna() & cells["unit"].ne("")
+    is_measured = cells["status"].eq("ok") & level.notna() & cells["unit"].ne("")
     mild, severe = ((cells[f"{end}_successes"] / cells[f"{end}_trials"]).fillna(0) for end in ENDS)
-    cells = cells.assign(known=known, at_once=known & (level < 0), never=known & (level > 1))
-    cells = cells.assign(shade=level.clip(0, 1).where(known), rises=known & (severe > mild))
+    cells = cells.assign(is_measured=is_measured, at_once=is_measured & (level < 0), never=is_measured & (level > 1))
+    cells = cells.assign(shade=level.clip(0, 1).where(is_measured), rises=is_measured & (severe > mild))
     return cells.assign(
-        short=[_told(cell, "")[0] for cell in cells.itertuples()],
-        words=[_told(cell, "")[1] for cell in cells.itertuples()],
-        full=[_told(cell, f" {cell.unit}")[1] for cell in cells.itertuples()],
+        short=[_breakdown_texts(cell, "")[0] for cell in cells.itertuples()],
+        words=[_breakdown_texts(cell, "")[1] for cell in cells.itertuples()],
+        full=[_breakdown_texts(cell, f" {cell.unit}")[1] for cell in cells.itertuples()],
     )
 
 
 def axes_of(cells: pd.DataFrame) -> pd.DataFrame:
-    """The axes as index, with the group, the measure and the unit of each; groups in the order of their runs."""
+    """The axes as index, with their group, measure and unit; groups in the order of their runs."""
     axes = cells.drop_duplicates("axis").set_index("axis")
     groups = list(axes["group"].unique())
     return axes.iloc[np.argsort([groups.index(group) for group in axes["group"]], kind="stable")]
 
 
-def _told(cell: Any, unit: str) -> tuple[str, str]:
-    """The breakdown in a few characters; and with its interval, or the failures at an end of the sweep."""
+def _breakdown_texts(cell: Any, unit: str) -> tuple[str, str]:
+    """The breakdown as a short text, and as a text with its interval or the failures at an end of the sweep."""
     mild, severe = (_failures(cell, end) for end in ENDS)
     low, high = ("" if math.isnan(end) else format.number(end) for end in (cell.breakdown_low, cell.breakdown_high))
-    if not cell.known:
+    if not cell.is_measured:
         return (format.MISSING if cell.status == "unsupported" else cell.status,) * 2
     if cell.rises:
         return "rises", f"success rises with severity (mild: {mild}; severe: {severe})"
@@ -211,7 +212,7 @@ def _told(cell: Any, unit: str) -> tuple[str, str]:
 
 
 def _failures(cell: Any, end: str) -> str:
-    """The number of failed trials at an end of the sweep; where there are repeats, the interval of their share."""
+    """The number of failed trials at an end of the sweep; with repeats, the interval of their fraction too."""
     successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
     if not trials > 0:
         return "not tried"
@@ -221,7 +222,7 @@ def _failures(cell: Any, end: str) -> str:
 
 
 def _grid(cells: pd.DataFrame, axes: pd.DataFrame, values: str) -> pd.DataFrame:
-    """A column of the cells as a table of axes and rows, missing where a row was not run."""
+    """A column of the cells as a table of axes and rows; missing for rows that were not run."""
     return cells.pivot(index="axis", columns="row", values=values).reindex(axes.index, columns=cells["row"].unique())
 
 
@@ -237,40 +238,40 @@ def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
         )
         for record in runs.records
     ]
-    about, rows = cells[["axis", "group", "unit", "short", "full"]], list(cells["row"].unique())
-    data = pd.concat([about, table.to_data(table.IDENTITY, runs.records)], axis=1).assign(**metrics, failures=kinds)
+    leading, rows = cells[["axis", "group", "unit", "short", "full"]], list(cells["row"].unique())
+    data = pd.concat([leading, table.to_data(table.IDENTITY, runs.records)], axis=1).assign(**metrics, failures=kinds)
     order = np.lexsort((cells["row"].map(rows.index), cells["axis"].map(axes.index.get_loc)))
     return data.iloc[order].reset_index(drop=True)
 
 
 def _atlas(cells: pd.DataFrame, axes: pd.DataFrame) -> dict[str, Any]:
-    """The grid for the page: axes, rows, and of each cell its breakdown as text, its shade and its run."""
+    """The grid for the page: axes, rows, and each cell's breakdown as text, shade and run."""
     rows = list(cells["row"].unique())
-    told = cells[["short", "full", "status", "reason", "shade", "folder"]].astype({"shade": object})
-    told["shade"] = told["shade"].where(told["shade"].notna(), None)
-    found = dict(zip(zip(cells["axis"], cells["row"], strict=True), told.to_dict("records"), strict=True))
+    shown = cells[["short", "full", "status", "reason", "shade", "folder"]].astype({"shade": object})
+    shown["shade"] = shown["shade"].where(shown["shade"].notna(), None)
+    cell_data = dict(zip(zip(cells["axis"], cells["row"], strict=True), shown.to_dict("records"), strict=True))
     return {
         "axes": [
             {"axis": a.Index, "title": title(a.Index), "group": a.group, "unit": a.unit} for a in axes.itertuples()
         ],
         "rows": rows,
-        "cells": [[found.get((axis, row)) for row in rows] for axis in axes.index],
+        "cells": [[cell_data.get((axis, row)) for row in rows] for axis in axes.index],
     }
 
 
 @style.styled
 def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
-    """Draws the heat map: red where a renderer breaks at a mild severity, blue where it does not break."""
+    """Draws the heat map: red if a renderer breaks at a mild severity, blue if it does not break."""
     shades, words = (_grid(cells, axes, name) for name in ("shade", "short"))
     rows, n = list(shades.columns), len(axes)
     width = max(style.WIDTH, 0.39 * len(rows) + 2.2)  # inches: a number has room in its cell
     figure, ((panel,),) = chart.sheet(0.19 * n + 1.7, width=width)
     image = panel.imshow(np.ma.masked_invalid(shades.to_numpy(float)), cmap="RdYlBu", vmin=0, vmax=1, aspect="auto")
     panel.set_facecolor("#f2f2f2")
-    for line, place in np.argwhere((words.notna() & ~words.isin(["at once", "none"])).to_numpy()):
-        told, shade = words.iloc[line, place], shades.iloc[line, place]
-        how = {"color": "white" if shade < 0.1 or shade > 0.9 else "black", "fontsize": 5.5 if len(told) < 8 else 4.5}
-        panel.text(place, line, told, ha="center", va="center", **how)
+    for line, column in np.argwhere((words.notna() & ~words.isin(["at once", "none"])).to_numpy()):
+        text, shade = words.iloc[line, column], shades.iloc[line, column]
+        how = {"color": "white" if shade < 0.1 or shade > 0.9 else "black", "fontsize": 5.5 if len(text) < 8 else 4.5}
+        panel.text(column, line, text, ha="center", va="center", **how)
     panel.set_xticks(range(len(rows)), rows, rotation=35, ha="left", rotation_mode="anchor")
     panel.xaxis.tick_top()
     panel.set_yticks(range(n), [f"{title(axis.Index)} ({axis.unit})" for axis in axes.itertuples()])
@@ -284,52 +285,52 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
 
 
 def _ranked(runs: Runs) -> list[str]:
-    """The name of one row of each of our renderers: its own preset's, or else its first one; and all rows of others."""
+    """One row of each renderer of this project, by its default preset or else the first; all rows of the user's."""
     firsts = [records_of_row[0] for records_of_row in runs.rows().values()]
     is_ours = {
         record["row"]: str(records.setting(record["config"], *TARGET)).startswith(records.OURS) for record in firsts
     }
-    of_renderer = records.grouped([one for one in firsts if is_ours[one["row"]]], records.base_renderer)
+    of_renderer = records.grouped([record for record in firsts if is_ours[record["row"]]], records.base_renderer)
     chosen = [
         next((record for record in group if record["renderer"].replace("_", "") == renderer), group[0])["row"]
         for renderer, group in of_renderer.items()
     ]
-    return [name for name, ours in is_ours.items() if not ours or name in chosen]
+    return [name for name, is_our_row in is_ours.items() if not is_our_row or name in chosen]
 
 
 def _alike(ranks: dict[str, statistics.Interval]) -> str:
-    """Which rows cannot be distinguished from that of the best rank; empty without intervals: all have one or none."""
+    """A sentence on the rows that cannot be distinguished from the best rank; empty without intervals."""
     best = min(ranks, key=lambda row: ranks[row].value)
     if not ranks[best].known:
         return ""
-    found = statistics.as_good(ranks, best)
-    if not found:
+    similar = statistics.as_good(ranks, best)
+    if not similar:
         return f"All others differ from {best} by the interval of the difference of ranks."
-    listed = f"*{len(found)}* of the {len(ranks) - 1} others ({'; '.join(found)})"
+    listed = f"*{len(similar)}* of the {len(ranks) - 1} others ({'; '.join(similar)})"
     return f"By the interval of the difference of ranks, {listed} cannot be distinguished from {best}."
 
 
 def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:
-    """The line of a renderer on the shared axes; where it breaks at once it may be cheap but find nothing."""
+    """The line of a renderer on the shared axes. Its cost leaves out axes on which it breaks at once."""
     ends = {name: int(cells[name].sum()) for name in ("at_once", "never")}
     cost = cells["evaluations_per_ray"][~cells["at_once"]].median()
     return {"row": row, "axes": len(cells), "rank": rank, **ends, "cost": cost}
 
 
 def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.DataFrame:
-    """Successes, trials, their share and its interval for each level that a finished search tried, mild to severe."""
-    lines = curve_lines(runs.folder(record)) if cell["known"] else None
+    """The successes, trials, their ratio and its interval at each level of a finished search, mild to severe."""
+    lines = curve_lines(runs.folder(record)) if cell["is_measured"] else None
     tried = pd.DataFrame(lines or [], columns=["level", "severity", "success"])
     numbers = tried[["level", "severity"]].apply(pd.to_numeric, errors="coerce").astype(float)
     tried = numbers.assign(success=tried["success"].eq(True))
     levels = tried[np.isfinite(tried["level"] + tried["severity"])].groupby("level", as_index=False)
-    found = levels.agg(severity=("severity", "first"), successes=("success", "sum"), trials=("success", "size"))
-    rates = [statistics.clopper_pearson(k / n, n) for k, n in zip(found["successes"], found["trials"], strict=True)]
+    counts = levels.agg(severity=("severity", "first"), successes=("success", "sum"), trials=("success", "size"))
+    rates = [statistics.clopper_pearson(k / n, n) for k, n in zip(counts["successes"], counts["trials"], strict=True)]
     ends = {end: [math.nan if cell["one_trial"] else getattr(rate, end) for rate in rates] for end in ("low", "high")}
-    found = found.assign(
+    counts = counts.assign(
         axis=cell["axis"], row=cell["row"], preset=cell["preset"], share=[rate.value for rate in rates]
     )
-    return found.assign(**ends)[["axis", "row", "preset", *SHARES]]
+    return counts.assign(**ends)[["axis", "row", "preset", *SHARE_COLUMNS]]
 
 
 PAGES = {"stability": make, "stability_cost": make_cost, "stability_curves": make_curves}

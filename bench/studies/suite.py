@@ -1,4 +1,4 @@
-"""The suite: how much progress each renderer makes over its cost, which differ, and what a run costs in each set."""
+"""The suite: progress of each renderer over its cost, significant differences, and the cost of a run in each set."""
 
 from dataclasses import replace
 from functools import partial
@@ -43,7 +43,7 @@ WRONG_PIXELS = (
 
 
 def make(*several: Runs | None) -> Result:
-    """The chart of all sets and of each, and a line per row."""
+    """Charts of all sets together and of each set, and a line per row."""
     runs = together(*several)
     gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
     made = Standing(gathered)
@@ -53,7 +53,7 @@ def make(*several: Runs | None) -> Result:
         for name in BUDGETS
     }
     return Result(
-        replace(runs, records=[], left_out=0),  # what is kept counts, with or without its run
+        replace(runs, records=[], left_out=0),  # kept attempts count even if their run folders are gone
         "The suite.",
         "Progress of each renderer from the initial to the best possible error over its cost, with the ranks that it "
         "can have (in brackets). A cross: all runs failed.",
@@ -76,7 +76,7 @@ def make(*several: Runs | None) -> Result:
 
 
 def make_sets(*several: Runs | None) -> Result:
-    """A line per set and row, with what a whole run costs over DIST's; tuned rows too."""
+    """A line per set and row, with the cost of a whole run relative to DIST's; also for tuned rows."""
     runs = together(*several)
     made = Standing(gather(paper.SHIPPED, runs.results_dir, runs.records))
     reached = made.reached[made.reached["whole"] | made.reached["tuned"]]
@@ -151,7 +151,7 @@ def _sample(made: Standing) -> str:
 
 
 def _panel(made: Standing, of_set: str | None) -> chart.Panel:
-    """The progress of each row over its cost, in one set or in all."""
+    """The progress of each row over its cost, in one set or in all sets."""
     runs = made.whole if of_set is None else made.whole[made.whole["set"] == of_set]
     lines = [line for row in made.rows if (line := _line(runs[(runs["row"] == row) & (runs["unit"] > 0)]))]
     title = f"{of_set or 'Progress over cost, all sets'}, {format.plural(runs['scene'].nunique(), 'scene')}"
@@ -161,7 +161,7 @@ def _panel(made: Standing, of_set: str | None) -> chart.Panel:
 
 
 def _line(runs: pd.DataFrame) -> chart.Series | None:
-    """The mean progress of a row's runs, to the median of their costs; none of runs that cost nothing."""
+    """The mean progress of a row's runs, up to the median of their costs; None for runs without cost."""
     end = float((runs["cost"] / runs["unit"]).median()) if len(runs) else 0.0
     if not end:
         return None
@@ -174,7 +174,7 @@ def _line(runs: pd.DataFrame) -> chart.Series | None:
 
 
 def verdict(made: Standing) -> str:
-    """The answer by rule: which renderers lead at the cost of one run of DIST, which differ at the end, what failed."""
+    """The verdict by rule: leaders at the cost of one run of DIST, differences at the end, failures."""
     if len(made.rows) < 2:
         return ""
     if not made.rankings[END].decidable:
@@ -184,7 +184,7 @@ def verdict(made: Standing) -> str:
 
 
 def leaders(ranked: Ranking, when: str = "At the cost of one run of DIST") -> str:
-    """The rows that none is significantly better than, if they are better than all others; else the first row."""
+    """The rows that no row significantly beats, if they beat all others; else the first row."""
     if not ranked.decidable:
         return f"{when}: {format.plural(ranked.scenes, 'scene')} cannot decide."
     beaten = {second for _, second in ranked.better}
@@ -201,7 +201,7 @@ def leaders(ranked: Ranking, when: str = "At the cost of one run of DIST") -> st
 
 
 def at_end(made: Standing) -> str:
-    """How many pairs differ at the end of the runs, and what a run costs."""
+    """The number of significantly different pairs at the end of the runs, and the cost of a run."""
     rows = min(made.costs, key=made.costs.__getitem__), max(made.costs, key=made.costs.__getitem__)
     pairs = f"{len(made.rankings[END].better) or 'none'} of {made.rankings[END].pairs} pairs"
     costs = " to ".join(f"*{made.costs[row]:.2g}* ({row})" for row in rows)
@@ -209,7 +209,7 @@ def at_end(made: Standing) -> str:
 
 
 def failures(made: Standing) -> str:
-    """The rows that failed in most problems of a set by name, the other failures as a sum."""
+    """The rows that failed in most problems of a set, and the number of other failures."""
     groups = made.whole.groupby(["row", "set"])["ok"].agg(runs="size", failed=lambda ok: (~ok).sum())
     most = groups[2 * groups["failed"] > groups["runs"]]
     failed, runs = (total - most["failed"].sum() for total in (groups["failed"].sum(), len(made.whole)))
@@ -222,7 +222,7 @@ def failures(made: Standing) -> str:
 
 
 def _notes(made: Standing) -> list[str]:
-    """Notes that depend on the runs: rows without a number, bounds, the order without each set, machines."""
+    """Notes that depend on the runs: missing numbers, bounds, the order without each set, machines."""
     runs, notes = made.whole, []
     if (rows := made.hidden[AT_1]) and made.rankings[AT_1].decidable:
         later = runs.assign(**{AT_1: runs[AT_1].where(~runs["row"].isin(rows), runs[f"{AT_1}_next"])})

@@ -29,11 +29,11 @@ NOTES = (
     "Behind the surface is the share of field values, coarse ones too, that are negative (DIST, Fig. 14).",
     "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: compare ratios, not numbers.",
 )
-_TIMES = ("forward_seconds", "backward_seconds", "step_seconds")
-# Metrics of the CSV: at the requested size, and none where a smaller one alone was finished.
-MEASURED = (
-    *("queries", "coarse_queries", "step_queries", "step_coarse_queries", "step_gradients", *_TIMES),
-    *(f"{time}_{end}" for time in _TIMES for end in ("low", "high")),
+_TIME_METRICS = ("forward_seconds", "backward_seconds", "step_seconds")
+# Metrics of the CSV at the requested size; empty if only a smaller size was finished.
+CSV_METRICS = (
+    *("queries", "coarse_queries", "step_queries", "step_coarse_queries", "step_gradients", *_TIME_METRICS),
+    *(f"{time}_{end}" for time in _TIME_METRICS for end in ("low", "high")),
     *("repeats", "forward_gemm", "step_gemm", "rays", "peak_memory_bytes", "hits", "lost", "false", "wrong", "behind"),
     *("depth_error_p99", "depth_error_max", "depth_error_median"),
 )
@@ -42,12 +42,12 @@ MEASURED = (
 def make(small: Runs | None, large: Runs | None) -> Result:
     """A line per size and strategy: the paper's in its order, then others in the order of their runs."""
     runs = together(small, large)
-    place = {preset: number for number, preset in enumerate(PUBLISHED)}
+    rank = {preset: number for number, preset in enumerate(PUBLISHED)}
     runs = replace(
         runs,
         records=sorted(
             runs.records,
-            key=lambda record: (_requested(record) or 0, place.get(records.row_of(record).preset, len(place))),
+            key=lambda record: (_requested(record) or 0, rank.get(records.row_of(record).preset, len(rank))),
         ),
     )
     times = records.repeated(runs.records)
@@ -66,7 +66,7 @@ def make(small: Runs | None, large: Runs | None) -> Result:
 
 
 def _verdict(runs: Runs) -> str:
-    """What each strategy of the paper saves of the time of a step over the one before it, at the smallest size."""
+    """The speedup of a step by each strategy of the paper over the previous one, at the smallest size."""
     least = _requested(runs.records[0])
     steps = {
         records.row_of(record).preset: (records.row_of(record).name, _at_size(record, "step_seconds"))
@@ -74,11 +74,11 @@ def _verdict(runs: Runs) -> str:
         if _requested(record) == least and record["status"] == "ok"
     }
     chain = [steps.get(preset, ("", None)) for preset in list(PUBLISHED)[:-1]]
-    saved = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
-    if not saved:
+    factors = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
+    if not factors:
         return format.ends(f"A step at {least} pixels", dict(steps.values()), "one shape", show=format.seconds)
-    said = f"A step at {least} pixels is faster than with the strategy before, by factors"
-    return f"{said}: {', '.join(saved)}; n = one shape."
+    title = f"A step at {least} pixels is faster than with the strategy before, by factors"
+    return f"{title}: {', '.join(factors)}; n = one shape."
 
 
 def _requested(record: records.Record) -> int | None:
@@ -91,17 +91,17 @@ def _at_size(record: records.Record, metric: str) -> float | None:
 
 
 def _size(record: records.Record) -> str:
-    """The size at which the row was measured, with the requested size and the status where these differ."""
+    """The measured size; if it is not the requested size, also that size and the status."""
     size, requested = records.measured(record, "size"), _requested(record)
     status = "" if record["status"] == "ok" else record["status"]
     if size is not None and size == requested:
         return f"{requested} ({status})" if status else str(requested)
-    asked = f"{requested}: " if requested else ""
-    return f"{table.whole(size)} ({asked}{record['status']})"
+    prefix = f"{requested}: " if requested else ""
+    return f"{table.whole(size)} ({prefix}{record['status']})"
 
 
 def _step(record: records.Record) -> str:
-    """The median of the step's time and, in brackets, its minimum and maximum, without units where these are equal."""
+    """The median of the step's time, with minimum and maximum in brackets, without units if these are equal."""
     spread = [records.measured(record, f"step_seconds{end}") for end in ("", "_low", "_high")]
     texts = [format.seconds(x) for x in spread]
     if None in spread or len({*spread}) == 1:
@@ -110,13 +110,13 @@ def _step(record: records.Record) -> str:
     return f"{texts[0]} ({texts[1].split()[0]}–{texts[2].split()[0]})" if same else "{} ({}–{})".format(*texts)
 
 
-def _published(record: records.Record, part: int) -> int | str | None:
-    return PUBLISHED.get(records.row_of(record).preset, (None,) * 4)[part]
+def _published(record: records.Record, column: int) -> int | str | None:
+    return PUBLISHED.get(records.row_of(record).preset, (None,) * 4)[column]
 
 
-def _shown(record: records.Record, part: int) -> str:
-    """A published value as text, where the row has the published size."""
-    return str(_published(record, part) or "") if _published(record, 0) == _requested(record) else ""
+def _shown(record: records.Record, column: int) -> str:
+    """A published value as text, if the row has the published size."""
+    return str(_published(record, column) or "") if _published(record, 0) == _requested(record) else ""
 
 
 RUNS = (
@@ -125,14 +125,14 @@ RUNS = (
     table.configured("steps", "renderer", "steps"),
     *(
         table.Column(name.replace("_seconds", "_s"), value=lambda record, name=name: _at_size(record, name))
-        for name in MEASURED
+        for name in CSV_METRICS
     ),
     *(
-        table.Column(f"published_{name}", value=lambda record, at=at: _published(record, at))
-        for at, name in enumerate(("size", "steps", "queries", "time"))
+        table.Column(f"published_{name}", value=lambda record, index=index: _published(record, index))
+        for index, name in enumerate(("size", "steps", "queries", "time"))
     ),
 )
-COLUMNS = (  # of a record, for readers; metrics are those of the largest size that was finished
+COLUMNS = (  # shown columns of a record; metrics are those of the largest finished size
     table.text("name", "Strategy"),
     table.shown("Size", _size),
     table.configured("", "renderer", "steps", heading="Marching steps"),

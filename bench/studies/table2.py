@@ -7,7 +7,7 @@ from bench.report.study import Result, Runs, Selection, chart, compare, gallery,
 PLACE = 20
 READS = (Selection("table2", ("task.points",)),)
 REFERENCE = "dist_mask"
-VARIANTS = ("_paper", "_official")  # ends of presets that the figure leaves out, to be read
+HIDDEN_SUFFIXES = ("_paper", "_official")  # the figure leaves out these presets, to stay readable
 # DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, in the order of `compare.ORDER`.
 PUBLISHED = {
     "sofa": {
@@ -41,67 +41,68 @@ RUNS = (
     table.Column("chamfer_l2_start", value=lambda record: record["metrics_start"].get("chamfer_l2")),
     *table.LOOP,
 )
-PICTURED = ("deepsdf", "dist_depth", "dist_mask")  # presets of the rows in pictures, where they were run
-ARRAYS = ("given", *(kind + part for kind in (gallery.FOUND, gallery.TRUE) for part in ("normals", "hit")))
-BOTH = (gallery.FRONT, gallery.BEHIND)
+PICTURED_PRESETS = ("deepsdf", "dist_depth", "dist_mask")
+ARRAYS = ("given", *(kind + array for kind in (gallery.FOUND, gallery.TRUE) for array in ("normals", "hit")))
+BOTH_SIDES = (gallery.FRONT, gallery.BEHIND)
 
 
 def make(runs: Runs) -> Result:
-    """A line per family and row, with the oracle and published numbers beside each family."""
-    found, oracle = compare.Compared(runs, lambda _: REFERENCE), compare.oracles(runs, compare.METRIC)
+    """A line per family and row, with the oracle and published numbers of each family."""
+    compared, oracle = compare.Compared(runs, lambda _: REFERENCE), compare.oracles(runs, compare.METRIC)
     published = {
         family: {row: dict(zip(compare.ORDER, numbers, strict=True)) for row, numbers in rows.items()}
         for family, rows in PUBLISHED.items()
     }
-    columns = found.columns("Ratio to DIST with mask")
-    return found.result(
+    columns = compared.columns("Ratio to DIST with mask")
+    return compared.result(
         "Shape completion from one depth image, over its sparsity.",
         "Which method completes a shape best from sparse depth?",
         plotted="Median error over {shapes and seeds} at each number of given depth points, and over all.",
-        verdict=found.best("errors × 1000 over all numbers of points"),
-        remarks=(compare.ERROR, f"{_shapes(found)} {_iterations(runs)}", *NOTES),
+        verdict=compared.best("errors × 1000 over all numbers of points"),
+        remarks=(compare.ERROR, f"{_shapes(compared)} {_iterations(runs)}", *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
-        lines=found.beside({compare.ORACLE: oracle}, published),
+        lines=compared.beside({compare.ORACLE: oracle}, published),
         run_columns=RUNS,
-        figure=draw(found, oracle),
+        figure=draw(compared, oracle),
     )
 
 
-def draw(found: compare.Compared, oracle: dict[str, float]) -> Figure:
+def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
     """Draws a panel per family: the median of each row over the number of points, and the oracle."""
-    places, panels = range(len(found.conditions)), []
-    for family in found.families:
+    conditions, panels = compared.conditions, []
+    positions = range(len(conditions))
+    for family in compared.families:
         lines = []
-        for row in found.rows:
-            medians = [found.median(family, row, at) for at in found.conditions]
-            if not row.preset.endswith(VARIANTS) and any(median is not None for median in medians):
-                lines.append(chart.curve(row.name, row.preset, places, style.finite(medians)))
+        for row in compared.rows:
+            medians = [compared.median(family, row, condition) for condition in conditions]
+            if not row.preset.endswith(HIDDEN_SUFFIXES) and any(median is not None for median in medians):
+                lines.append(chart.curve(row.name, row.preset, positions, style.finite(medians)))
         if family in oracle:
-            lines.append(chart.level(compare.ORACLE, places, oracle[family]))
-            lines.append(chart.level("1.5 times that", places, 1.5 * oracle[family], dash=":"))
-        panels.append(chart.panel_data(family, "given depth points", compare.LABEL, lines, ticks=found.conditions))
+            lines.append(chart.level(compare.ORACLE, positions, oracle[family]))
+            lines.append(chart.level("1.5 times that", positions, 1.5 * oracle[family], dash=":"))
+        panels.append(chart.panel_data(family, "given depth points", compare.LABEL, lines, ticks=conditions))
     height = -(-len(panels) // 4)
     return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
 
 
-def _shapes(found: compare.Compared) -> str:
-    counts = found.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
+def _shapes(compared: compare.Compared) -> str:
+    counts = compared.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
     return f"Shapes per cell: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
 
 
 def _iterations(runs: Runs) -> str:
-    """The rows' iterations: the most frequent number, then the rows with another one."""
-    counts = records.grouped(runs.records, records.iterations_of)
-    names = {n: list(dict.fromkeys(records.row_of(record).name for record in own)) for n, own in counts.items() if n}
-    most = max(names, key=lambda count: len(names[count]), default=None)
-    others = [f"{', '.join(rows)} {count}" for count, rows in names.items() if count != most]
-    return f"Iterations: {'; '.join([str(most), *others])}." if names else ""
+    """The numbers of iterations: the most frequent one, then rows with another one."""
+    groups = records.grouped(runs.records, records.iterations_of)
+    names = {n: list(dict.fromkeys(records.row_of(r).name for r in group)) for n, group in groups.items() if n}
+    usual = max(names, key=lambda count: len(names[count]), default=None)
+    others = [f"{', '.join(rows)} {count}" for count, rows in names.items() if count != usual]
+    return f"Iterations: {'; '.join([str(usual), *others])}." if names else ""
 
 
 def pictures(runs: Runs) -> Result:
-    """A block per family: the given depths over their number, and each row's shape below them."""
-    shown = gallery.first_shapes(runs, 1, PICTURED)
-    scenes = {name: gallery.Scene(shown, own, ARRAYS) for name, own in shown.families().items()}
+    """A block per family: the given depths over the number of points, and below them each row's shape."""
+    shown = gallery.first_shapes(runs, 1, PICTURED_PRESETS)
+    scenes = {name: gallery.Scene(shown, group, ARRAYS) for name, group in shown.families().items()}
     return Result(
         shown,
         "Completed shapes in pictures.",
@@ -115,19 +116,19 @@ def pictures(runs: Runs) -> Result:
             *gallery.missing(scenes.values()),
         ),
         run_columns=(*RUNS[:2], *table.COMPLETION),
-        figure=gallery.draw([_block(name, of, scenes[name]) for name, of in shown.families().items()], across=2),
+        figure=gallery.draw([_block(name, group, scenes[name]) for name, group in shown.families().items()], across=2),
     )
 
 
-def _block(name: str, of_family: list[records.Record], scene: gallery.Scene) -> gallery.Block:
-    """The rows of a family over the number of points, behind them the truth."""
-    found = records.grouped(of_family, _points)
-    points = compare.ordered(found)
-    given = [scene.shared(found[p][:1], gallery.depth) for p in points]
-    rows = {"given depths": [*given, scene.shared(of_family, gallery.normals(gallery.TRUE), BOTH)]}
-    for row, own in records.grouped(of_family, records.row_of).items():
-        at = {_points(record): record for record in own}
-        rows[row.name] = [scene.cell(at.get(p), gallery.normals(gallery.FOUND), BOTH) for p in points]
+def _block(name: str, family_records: list[records.Record], scene: gallery.Scene) -> gallery.Block:
+    """The rows of a family over the number of points, with the truth in the last column."""
+    by_points = records.grouped(family_records, _points)
+    points = compare.ordered(by_points)
+    given_depths = [scene.shared(by_points[p][:1], gallery.depth) for p in points]
+    rows = {"given depths": [*given_depths, scene.shared(family_records, gallery.normals(gallery.TRUE), BOTH_SIDES)]}
+    for row, row_records in records.grouped(family_records, records.row_of).items():
+        by_row_points = {_points(record): record for record in row_records}
+        rows[row.name] = [scene.cell(by_row_points.get(p), gallery.normals(gallery.FOUND), BOTH_SIDES) for p in points]
     return gallery.Block(name, [*map(compare.heading, points), "truth"], rows)
 
 

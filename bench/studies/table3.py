@@ -19,8 +19,8 @@ NOTES = (
     "“Published” is DIST, Table 3, which does not say whether it has means or medians: 50 shapes of PMO's renderings "
     "of ShapeNet, with another prior and metric scale, which cannot be compared directly with the measured rows.",
 )
-ENCODED = "task.encoder.batch"  # set where a row starts from an encoder's code
-PMO = {"multiview_mesh": "PMO, random start", "multiview_mesh_encoder": "PMO"}  # published rows to read presets beside
+ENCODER_KEY = "task.encoder.batch"  # set if a row starts from an encoder's code
+PMO = {"multiview_mesh": "PMO, random start", "multiview_mesh_encoder": "PMO"}  # comparable published row of a preset
 ON_MESH = (
     "“{row}” has its gradients through vertices of the prior's mesh, as PMO (Lin et al. 2019), but changes the code "
     "alone: read it beside “published: {published}”."
@@ -29,53 +29,53 @@ ENCODER = (
     "The encoder learns from photographs of decoded training codes by the same kind of cameras; a run starts from its "
     "mean over all photographs (PMO: one). Its training is in no column."
 )
-SEEN = table.metrics(records.ONE_WAY, "chamfer_l2")
+ERROR_COLUMNS = table.metrics(records.ONE_WAY, "chamfer_l2")
 RUNS = (
-    *(table.FAMILY, *table.IDENTITY, *SEEN, *table.metrics("accuracy", "completeness", "mask_iou")),
+    *(table.FAMILY, *table.IDENTITY, *ERROR_COLUMNS, *table.metrics("accuracy", "completeness", "mask_iou")),
     table.Column(f"{records.ONE_WAY}_start", value=lambda record: record["metrics_start"].get(records.ONE_WAY)),
     *table.LOOP,
 )
-MOST_SHAPES = 4  # of each family, in pictures
+MAX_SHAPES = 4  # per family in pictures
 
 
 def make(runs: Runs) -> Result:
-    """A line per family and method, with the start, the oracle and published numbers beside each family."""
-    found = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, conditions.LABEL)
+    """A line per family and method, with the start, the oracle and published numbers of each family."""
+    compared = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, conditions.LABEL)
     starts = records.SCALE * runs.number(f"start_{records.ONE_WAY}")
-    encoded = runs.setting(ENCODED) != ""
-    of_kind = {"start: random codes": starts[~encoded], "start: encoder's codes": starts[encoded]}
+    encoded = runs.setting(ENCODER_KEY) != ""
+    starts_by_kind = {"start: random codes": starts[~encoded], "start: encoder's codes": starts[encoded]}
     above = {
         **{
-            name: own.groupby(runs.frame.family, sort=False).median().dropna().to_dict()
-            for name, own in of_kind.items()
+            name: errors.groupby(runs.frame.family, sort=False).median().dropna().to_dict()
+            for name, errors in starts_by_kind.items()
         },
         compare.ORACLE: compare.oracles(runs, records.ONE_WAY),
     }
     published = {name: {row: {"": str(number)} for row, number in rows.items()} for name, rows in PUBLISHED.items()}
     on_mesh = [ON_MESH.format(row=row.name, published=PMO[row.preset]) for row in runs.rows() if row.preset in PMO]
-    return found.result(
+    return compared.result(
         "Shape from many views, without a mask.",
         "Which method finds a shape by photographs from many views, without a mask?",
         plotted="Median error over {shapes and seeds}, over shapes alone, its ratio, and the median cost of runs that "
         "ended ok.",
-        verdict=found.best("errors × 1000, from truth to prediction"),
+        verdict=compared.best("errors × 1000, from truth to prediction"),
         remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
-        columns=found.columns("Ratio to DIST"),
-        lines=found.beside(above, published),
+        columns=compared.columns("Ratio to DIST"),
+        lines=compared.beside(above, published),
         run_columns=RUNS,
     )
 
 
 def pictures(runs: Runs) -> Result:
-    """A line per shape: the truth, the start, and what each row found."""
-    shown = gallery.first_shapes(runs, MOST_SHAPES)
-    names, of_scene = [row.name for row in shown.rows()], records.grouped(shown.records, medians.scene_of)
-    scenes = {name: gallery.Scene(shown, own, gallery.SHAPES) for name, own in of_scene.items()}
-    lines = {name: _cells(names, own, scenes[name]) for name, own in of_scene.items()}
+    """A line per shape: the truth, the start, and the shape of each row."""
+    shown = gallery.first_shapes(runs, MAX_SHAPES)
+    names, records_by_scene = [row.name for row in shown.rows()], records.grouped(shown.records, medians.scene_of)
+    scenes = {name: gallery.Scene(shown, group, gallery.SHAPES) for name, group in records_by_scene.items()}
+    lines = {name: _cells(names, group, scenes[name]) for name, group in records_by_scene.items()}
     return Result(
         shown,
         "Shapes from many views in pictures.",
-        f"The truth, the start, and the shape that each row found, of the {MOST_SHAPES} shapes of each family with the "
+        f"The truth, the start, and the shape that each row found, of the {MAX_SHAPES} shapes of each family with the "
         "least numbers.",
         remarks=(
             f"{gallery.JUDGED}, seen from the first photograph's side.",
@@ -84,16 +84,16 @@ def pictures(runs: Runs) -> Result:
             "DIST, Figs. 11 and 23, shows shapes of ShapeNet beside PMO; these are of other families.",
             *gallery.missing(scenes.values()),
         ),
-        run_columns=(table.FAMILY, *table.IDENTITY, *SEEN),
+        run_columns=(table.FAMILY, *table.IDENTITY, *ERROR_COLUMNS),
         figure=gallery.draw([gallery.Block("", ["truth", "start", *names], lines)]),
     )
 
 
-def _cells(names: list[str], own: list[records.Record], scene: gallery.Scene) -> list[gallery.Cell]:
-    of_row = {records.row_of(record).name: record for record in own}
-    drawn = [r for r in own if records.setting(r["config"], *ENCODED.split(".")) is None]
-    shared = [scene.shared(own, gallery.normals(gallery.TRUE)), scene.shared(drawn, gallery.normals(gallery.START))]
-    return [*shared, *(scene.cell(of_row.get(name), gallery.normals(gallery.FOUND)) for name in names)]
+def _cells(names: list[str], group: list[records.Record], scene: gallery.Scene) -> list[gallery.Cell]:
+    record_by_row = {records.row_of(record).name: record for record in group}
+    drawn = [r for r in group if records.setting(r["config"], *ENCODER_KEY.split(".")) is None]
+    shared = [scene.shared(group, gallery.normals(gallery.TRUE)), scene.shared(drawn, gallery.normals(gallery.START))]
+    return [*shared, *(scene.cell(record_by_row.get(name), gallery.normals(gallery.FOUND)) for name in names)]
 
 
 PAGES = {"table3": make, "multiview_gallery": pictures}

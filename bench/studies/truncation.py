@@ -1,4 +1,4 @@
-"""Aggressive marching on distances and on truncated distances: pixels that are lost, and field evaluations."""
+"""Aggressive marching on distances and on truncated distances: wrong pixels and field evaluations."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from bench.report.study import Result, Runs, Selection, chart, compare, statisti
 
 PLACE = 24
 READS = (Selection("truncation", ("renderer.alpha", "renderer.step_clamp", "prior.truncation")),)
-SERIES = {  # by whether the prior is truncated, and steps clamped: the name, and a row that has the same look
+SERIES = {  # (truncated prior, clamped steps): name, and the preset that gives the line style
     (True, True): ("truncated field, clamped steps: DIST's own", "dist_aggressive"),
     (True, False): ("truncated field", "dist_step_floor"),
     (False, True): ("distances, clamped steps", "dist_dynamic"),
@@ -46,9 +46,9 @@ def make(runs: Runs) -> Result:
         wrong=sum(runs.number(name) for name in ("lost", "false", "wrong")) / runs.number("hits"),
         queries=runs.number("queries"),
     )
-    plain = _of(frame, DISTANCES)
-    once = plain[plain.alpha == 1].groupby(SHAPE).queries.mean()
-    lines = [line for kind in SERIES for line in _lines(_of(frame, kind), kind, once)]
+    plain = _of_kind(frame, DISTANCES)
+    plain_queries = plain[plain.alpha == 1].groupby(SHAPE).queries.mean()
+    lines = [line for kind in SERIES for line in _lines(_of_kind(frame, kind), kind, plain_queries)]
     return Result(
         runs,
         "Aggressive marching on distances and on truncated distances.",
@@ -63,29 +63,29 @@ def make(runs: Runs) -> Result:
     )
 
 
-def _of(frame: pd.DataFrame, kind: Kind) -> pd.DataFrame:
+def _of_kind(frame: pd.DataFrame, kind: Kind) -> pd.DataFrame:
     return frame.loc[(frame.truncated == kind[0]) & (frame.clamped == kind[1])]
 
 
-def _lines(frame: pd.DataFrame, kind: Kind, once: pd.Series) -> list[Line]:
+def _lines(frame: pd.DataFrame, kind: Kind, plain_queries: pd.Series) -> list[Line]:
     lines = []
-    for alpha, own in frame.groupby("alpha"):
-        shapes = own.groupby(SHAPE)[["wrong", "queries"]].mean()
-        shapes = shapes.assign(ratio=shapes.queries / once).dropna()
-        share, ratio = (statistics.typical([np.array([x]) for x in of]) for of in (shapes.wrong, shapes.ratio))
-        about = {
+    for alpha, group in frame.groupby("alpha"):
+        shapes = group.groupby(SHAPE)[["wrong", "queries"]].mean()
+        shapes = shapes.assign(ratio=shapes.queries / plain_queries).dropna()
+        share, ratio = (statistics.typical([np.array([x]) for x in values]) for values in (shapes.wrong, shapes.ratio))
+        identity = {
             "field": SERIES[kind][0],
             "preset": SERIES[kind][1],
             "kind": kind,
             "alpha": alpha,
             "shapes": len(shapes),
         }
-        lines.append({**about, "wrong": share.value, "share": share, "cost": ratio.value, "ratio": ratio})
+        lines.append({**identity, "wrong": share.value, "share": share, "cost": ratio.value, "ratio": ratio})
     return lines
 
 
 def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
-    """What alpha = 1.5 loses on distances without the clamp and with it, and on a truncated field with it."""
+    """Wrong pixels at alpha = 1.5 on distances without and with the clamp, and on a truncated field with it."""
     kinds = {"plain": DISTANCES, "clamped": (False, True), "both": (True, True)}
     if not all((kind, alpha) in lines for kind in kinds.values() for alpha in (1.0, 1.5)):
         return ""
@@ -103,9 +103,9 @@ def _panels(lines: list[Line]) -> list[chart.Panel]:
     panels = []
     for label, key in ((WRONG, "share"), (COST, "ratio")):
         curves = [
-            chart.curve(name, preset, [line["alpha"] for line in of], [line[key] for line in of])
+            chart.curve(name, preset, [line["alpha"] for line in kind_lines], [line[key] for line in kind_lines])
             for kind, (name, preset) in SERIES.items()
-            if (of := [line for line in lines if line["kind"] == kind])
+            if (kind_lines := [line for line in lines if line["kind"] == kind])
         ]
         panels.append(chart.panel_data("", "alpha", label, curves))
     return panels

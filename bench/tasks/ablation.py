@@ -1,8 +1,8 @@
 """The rendering benchmark: a renderer's cost and error on one view of a fitted network (DIST, Table 1).
 
-With `beside`, several renderers are timed in turn in one process: what they cost over the run's own renderer. With
-`device=cuda` all seconds are those of the GPU's own events, after a warm-up at full size; not yet run on a GPU. There
-are no CUDA graphs, since the shapes of a march change from one rendering to the next.
+With `beside`, several renderers are timed in turn in one process, and compared with the run's renderer. With
+`device=cuda`, CUDA events measure all seconds, after a warm-up at full size; not yet run on a GPU. CUDA graphs are not
+used, because the sizes of a march's tensors differ between renderings.
 """
 
 import time
@@ -43,9 +43,9 @@ from renderers.field import (
 from renderers.rendering import RayObservation, Renderer, Rendering, check_kind
 from renderers.waits import active_mask
 
-BASE = "base"  # the run's renderer, where others are timed beside it
-SMALLER = 8  # factor by which the side of the image shrinks where a limit was reached
-WARM_UP = 8  # pixels per side of the image that is rendered before the timing, on a CPU
+BASE = "base"  # the run's renderer, if it is compared with others
+SHRINK_FACTOR = 8  # after a limit was reached, the image's side is divided by this
+WARM_UP_PIXELS = 8  # side of the image that is rendered before the timing, on a CPU
 DEFINITIONS = {
     "size": "pixels per side of the image for which the other numbers were measured",
     "queries": "points whose field value was computed in one rendering without gradient; counted at the field, without "
@@ -78,7 +78,7 @@ DEFINITIONS = {
     "one of them hits counts as infinite; in scene units",
     "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
 }
-IN_TURN = {
+IN_TURN_DEFINITIONS = {
     "rounds": "how often each renderer was timed, in turn, each round in the opposite order of the last one",
     "forward_cpu, step_cpu": "seconds of all threads together: median over rounds",
     "forward_ratio, step_ratio, forward_cpu_ratio, step_cpu_ratio": "over the first renderer's of the same round: "
@@ -91,21 +91,21 @@ IN_TURN = {
 class Ablation:
     """Renders a training shape of the prior, forward and backward, and compares it with the reference.
 
-    Where a limit is reached at the requested resolution, the run's status says so, and an eighth of the side is tried
-    next, until the measurement finishes or the side is below `smallest`.
+    If a limit is reached at the requested resolution, the run's status reports it. An eighth of the side is tried next,
+    until the measurement finishes or the side is below `smallest`.
 
     Args:
-        repeats: timed repeats of the renderer alone; fewer where they take more than a quarter of the limit together,
-            one at smaller sizes.
-        limits: on each rendering and each step.
-        smallest: fewest pixels per side that are tried.
+        repeats: timed repeats of the renderer alone; fewer if together they take more than a quarter of the limit, one
+            at smaller sizes.
+        limits: limits of each rendering and each step.
+        smallest: minimum pixels per side.
         wrong: difference of depth, in scene units, above which a pixel is wrong.
-        beside: names of other renderers that are timed in turn with the run's own.
-        rounds: of these, in each of which every renderer takes one step and renders once.
-        size: of the image, in pixels per side; None: as `view` has it.
-        threads: of the CPU; None: those of the run.
-        normal_width: of the differences that give the normals of pictures (DIST, Eq. 3: 2 delta), in scene units; None:
-            the field's gradients.
+        beside: names of other renderers that are timed in turn with the run's renderer.
+        rounds: number of rounds with `beside`; in each, every renderer takes one step and renders once.
+        size: pixels per side of the image; None: the size in `view`.
+        threads: number of CPU threads; None: the run's number.
+        normal_width: width of the finite differences for the normals of pictures (DIST, Eq. 3: 2 delta), in scene
+            units; None: normals are the field's gradients.
     """
 
     repeats: int
@@ -136,7 +136,7 @@ class Ablation:
 
     def execute(self, run: RunContext) -> None:
         """Measures costs and errors, and writes them to the record, images.npz and a picture."""
-        run.record.definitions = DEFINITIONS | (IN_TURN if self.beside else {})
+        run.record.definitions = DEFINITIONS | (IN_TURN_DEFINITIONS if self.beside else {})
         if self.normal_width is not None:
             note = f"normals of pictures are differences over {self.normal_width:g} scene units (DIST, Eq. 3)"
             run.record.notes = [*run.record.notes, note]
@@ -144,7 +144,7 @@ class Ablation:
             self._measure(run)
 
     def _measure(self, run: RunContext) -> None:
-        """Measures at the requested resolution, else at the first smaller one at which no limit is reached."""
+        """Measures at the requested resolution, or at the first smaller one at which no limit is reached."""
         record, requested = run.record, run.inputs.scene.view.camera
         requested = requested.resized(self.size, self.size) if self.size else requested
         camera, measured = requested, None
@@ -154,7 +154,7 @@ class Ablation:
                 measured = self._timed(run, camera, repeats=1 if failure else self.repeats)
             except LimitReached as limit:
                 failure = failure or (limit.status, str(limit))  # not the exception, which keeps all tensors alive
-                smaller = camera.height // SMALLER, camera.width // SMALLER
+                smaller = camera.height // SHRINK_FACTOR, camera.width // SHRINK_FACTOR
                 if min(smaller) < self.smallest:
                     break
                 camera = camera.resized(*smaller)
@@ -170,7 +170,7 @@ class Ablation:
         """Times all renderers at one resolution.
 
         Raises:
-            LimitReached: where a rendering or a step exceeds a limit.
+            LimitReached: if a rendering or a step exceeds a limit.
         """
         inputs, size = run.inputs, f"{camera.height} x {camera.width}"
         run.progress(f"making the reference at {size}", 0, 1)
@@ -181,25 +181,25 @@ class Ablation:
         }
         if not self.beside:
             run.progress(f"timing steps at {size}", 0, 1)
-            benches[BASE].steps(repeats)  # first: it costs more, and where it exceeds a limit the rest would be wasted
+            benches[BASE].steps(repeats)  # first: it costs more, and if it exceeds a limit, renderings were wasted
             run.progress(f"timing renderings at {size}", 0, 1)
             benches[BASE].renderings(repeats)
             return benches
-        for done in range(self.rounds):
-            run.progress("timing renderers in turn", done, self.rounds)
-            for name in list(benches)[:: -1 if done % 2 else 1]:
-                of = "" if name == BASE else f" of {name}"
-                benches[name].renderings(1, of)
-                benches[name].steps(1, of)
+        for completed in range(self.rounds):
+            run.progress("timing renderers in turn", completed, self.rounds)
+            for name in list(benches)[:: -1 if completed % 2 else 1]:
+                suffix = "" if name == BASE else f" of {name}"
+                benches[name].renderings(1, suffix)
+                benches[name].steps(1, suffix)
         return benches
 
     def _note(self, run: RunContext, benches: "dict[str, Workbench]") -> None:
         record, bench = run.record, benches[BASE]
-        machine, again = record.environment, gemm_peak(bench.device)  # measured close to the times
-        machine["gemm_peak_flops"] = max(machine["gemm_peak_flops"], again)
+        machine, peak_flops = record.environment, gemm_peak(bench.device)  # measured close to the times
+        machine["gemm_peak_flops"] = max(machine["gemm_peak_flops"], peak_flops)
         numbers = {
-            name: costs(one.forward, one.step, machine) | one.errors(self.wrong) | {"behind": one.behind()}
-            for name, one in benches.items()
+            name: costs(b.forward, b.step, machine) | b.errors(self.wrong) | {"behind": b.negative_fraction()}
+            for name, b in benches.items()
         }
         record.metrics = {"size": bench.camera.height, **numbers[BASE], "cost": bench.forward.counts.cost}
         record.metrics_start = {"pixel_errors": record.metrics["hits"]}
@@ -209,42 +209,42 @@ class Ablation:
         record.peak_memory_bytes = bench.step.memory
         if self.beside:
             record.metrics = {"size": bench.camera.height, "rounds": self.rounds}
-            for name, one in benches.items():
-                found = numbers[name] | ratios(one.forward, bench.forward, "forward")
-                found |= ratios(one.step, bench.step, "step")
-                if (over := one.step.counts.over_bound(one.decoder.at(one.code))) is not None:
-                    found["work_over_bound"] = over
-                record.metrics |= {f"{name}.{key}": number for key, number in found.items()}
-        found, true = bench.views(self.normal_width)
-        save_images(run.folder, found, true)
-        draw_against(run.folder / "summary.png", found, true, title=f"{record.name}, {record.scene}: {record.status}")
+            for name, timed in benches.items():
+                metrics = numbers[name] | ratios(timed.forward, bench.forward, "forward")
+                metrics |= ratios(timed.step, bench.step, "step")
+                if (work_ratio := timed.step.counts.over_bound(timed.decoder.at(timed.code))) is not None:
+                    metrics["work_over_bound"] = work_ratio
+                record.metrics |= {f"{name}.{key}": number for key, number in metrics.items()}
+        views = bench.views(self.normal_width)
+        save_images(run.folder, *views)
+        draw_against(run.folder / "summary.png", *views, title=f"{record.name}, {record.scene}: {record.status}")
 
 
 @dataclass
-class Clocked:
+class Timings:
     """The costs of repeats of the same work.
 
     Args:
-        seconds: of each.
-        second: of the second part of each, the backward pass.
-        cpu: seconds of all threads together.
-        counts: of the last one.
-        memory: bytes by which the largest rose.
-        flops, coarse_flops: operations of the last one, those in bfloat16 apart; None where they are not stated.
+        seconds: seconds of each repeat.
+        backward_seconds: seconds of each repeat's backward pass.
+        cpu_seconds: seconds of all threads together.
+        counts: field evaluations of the last repeat.
+        memory: largest rise of memory in a repeat, in bytes.
+        flops, coarse_flops: operations of the last repeat in float32 and in bfloat16; None if the field has no count.
     """
 
     seconds: list[float] = field(default_factory=list)
-    second: list[float] = field(default_factory=list)
-    cpu: list[float] = field(default_factory=list)
+    backward_seconds: list[float] = field(default_factory=list)
+    cpu_seconds: list[float] = field(default_factory=list)
     counts: Counts = field(default_factory=Counts)
     memory: int | None = None
     flops: int | None = None
     coarse_flops: int = 0
 
 
-def costs(forward: Clocked, step: Clocked, machine: dict[str, Any]) -> dict[str, float]:
-    """The costs of renderings and steps by their names in DEFINITIONS; `machine` has its peak rates."""
-    found: dict[str, float] = {
+def costs(forward: Timings, step: Timings, machine: dict[str, Any]) -> dict[str, float]:
+    """The metrics of renderings and steps by their names in DEFINITIONS; `machine` has the machine's peak rates."""
+    metrics: dict[str, float] = {
         "queries": forward.counts.value,
         "coarse_queries": forward.counts.coarse,
         "step_queries": step.counts.value,
@@ -252,49 +252,50 @@ def costs(forward: Clocked, step: Clocked, machine: dict[str, Any]) -> dict[str,
         "step_gradients": step.counts.gradient,
         "repeats": len(step.seconds),
     }
-    for name, seconds in (("forward", forward.seconds), ("step", step.seconds), ("backward", step.second)):
-        found |= {f"{name}_seconds": median(seconds), f"{name}_seconds_low": min(seconds)}
-        found[f"{name}_seconds_high"] = max(seconds)
-    for name, clocked in (("forward", forward), ("step", step)):
-        if clocked.flops is not None:
-            at_peak = seconds_at_peak(machine, clocked.flops, clocked.coarse_flops)
-            found[f"{name}_gemm"] = at_peak / median(clocked.seconds)
+    for name, seconds in (("forward", forward.seconds), ("step", step.seconds), ("backward", step.backward_seconds)):
+        metrics |= {f"{name}_seconds": median(seconds), f"{name}_seconds_low": min(seconds)}
+        metrics[f"{name}_seconds_high"] = max(seconds)
+    for name, timings in (("forward", forward), ("step", step)):
+        if timings.flops is not None:
+            at_peak = seconds_at_peak(machine, timings.flops, timings.coarse_flops)
+            metrics[f"{name}_gemm"] = at_peak / median(timings.seconds)
     if step.memory is not None:
-        found["peak_memory_bytes"] = step.memory
-    return found
+        metrics["peak_memory_bytes"] = step.memory
+    return metrics
 
 
-def ratios(mine: Clocked, base: Clocked, name: str) -> dict[str, float]:
-    """The costs of one rendering or step in each round, over the first renderer's in the same round."""
-    found = {f"{name}_cpu": median(mine.cpu)}
-    for of, times, others in ((name, mine.seconds, base.seconds), (f"{name}_cpu", mine.cpu, base.cpu)):
-        over = [one / other for one, other in zip(times, others, strict=True)]
-        found |= {f"{of}_ratio": median(over), f"{of}_ratio_low": min(over), f"{of}_ratio_high": max(over)}
-    return found
+def ratios(timings: Timings, base: Timings, name: str) -> dict[str, float]:
+    """The runtime of one rendering or step over the first renderer's in the same round, over all rounds."""
+    metrics = {f"{name}_cpu": median(timings.cpu_seconds)}
+    pairs = {name: (timings.seconds, base.seconds), f"{name}_cpu": (timings.cpu_seconds, base.cpu_seconds)}
+    for key, pair in pairs.items():
+        over = [seconds / base_seconds for seconds, base_seconds in zip(*pair, strict=True)]
+        metrics |= {f"{key}_ratio": median(over), f"{key}_ratio_low": min(over), f"{key}_ratio_high": max(over)}
+    return metrics
 
 
 @dataclass
-class Signs(Wrapper):
-    """A Field that counts its values that are asked for, coarse ones too, and the negative ones among them."""
+class SignCounter(Wrapper):
+    """A Field that counts its evaluations, also coarse ones, and the negative values among them."""
 
     inner: Field
-    asked: int = 0
+    evaluated: int = 0
     negative: int = 0
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return self._noted(self.inner(points))
+        return self._counted(self.inner(points))
 
-    def _noted(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        flat, active = values.flatten(), active_mask(values.numel())
-        asked = flat if active is None else flat[active]
-        self.asked += asked.numel()
-        self.negative += int((asked < 0).sum())
+    def _counted(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        all_values, active = values.flatten(), active_mask(values.numel())
+        evaluated = all_values if active is None else all_values[active]
+        self.evaluated += evaluated.numel()
+        self.negative += int((evaluated < 0).sum())
         return values
 
     @property
     def coarse(self) -> Coarse | None:
-        offered = coarse_version(self.inner)
-        return offered and replace(offered, values=lambda points: self._noted(offered.values(points)))
+        coarse = coarse_version(self.inner)
+        return coarse and replace(coarse, values=lambda points: self._counted(coarse.values(points)))
 
     @property
     def bounds(self) -> Bounds | None:
@@ -314,17 +315,17 @@ class Workbench:
         self.rays = camera.rays().to(self.device)
         self.mask = reference.hit.to(self.device)
         self.rendering: Rendering | None = None
-        self.forward, self.step = Clocked(), Clocked()
+        self.forward, self.step = Timings(), Timings()
         check_kind(self.renderer, self.decoder.at(self.code))
         check_field_gradient(self.renderer)
         field = self.decoder.at(self.code)
         if self.device.type == "cpu":
-            small = camera.resized(WARM_UP, WARM_UP)
-            self._step(field, small.rays(), torch.ones(WARM_UP, WARM_UP).bool())
-        else:  # which loads kernels and takes memory by the size of the work
+            small = camera.resized(WARM_UP_PIXELS, WARM_UP_PIXELS)
+            self._step(field, small.rays(), torch.ones(WARM_UP_PIXELS, WARM_UP_PIXELS).bool())
+        else:  # at full size: a GPU loads kernels and allocates memory according to the size
             self._step(limits.watch(field, self.device, "a step"), self.rays, self.mask)
 
-    def renderings(self, repeats: int, of: str = "") -> None:
+    def renderings(self, repeats: int, suffix: str = "") -> None:
         """Times renderings without gradient; `of` names the renderer where a limit is reached."""
 
         def work(field: Field) -> float:
@@ -332,38 +333,38 @@ class Workbench:
                 self.rendering = render_checked(self.renderer, field, self.rays)
             return 0.0
 
-        self._clock(self.forward, f"a rendering{of}", work, repeats)
+        self._clock(self.forward, f"a rendering{suffix}", work, repeats)
 
-    def steps(self, repeats: int, of: str = "") -> None:
+    def steps(self, repeats: int, suffix: str = "") -> None:
         """Times steps of an optimisation of the code."""
-        self._clock(self.step, f"a step{of}", lambda field: self._step(field, self.rays, self.mask), repeats)
+        self._clock(self.step, f"a step{suffix}", lambda field: self._step(field, self.rays, self.mask), repeats)
 
     def errors(self, wrong: float) -> dict[str, float]:
         """The errors of the rendering against the reference, by their names in DEFINITIONS."""
-        found, true = self.views()
-        error = (found.depth - true.depth).abs()[found.mask & true.mask].double()
+        predicted, reference = self.views()
+        error = (predicted.depth - reference.depth).abs()[predicted.mask & reference.mask].double()
         numbers = {
-            "rays": found.mask.numel(),
-            "hits": int(true.mask.sum()),
-            "lost": int((true.mask & ~found.mask).sum()),
-            "false": int((found.mask & ~true.mask).sum()),
+            "rays": predicted.mask.numel(),
+            "hits": int(reference.mask.sum()),
+            "lost": int((reference.mask & ~predicted.mask).sum()),
+            "false": int((predicted.mask & ~reference.mask).sum()),
             "wrong": int((error > wrong).sum()),
         }
         numbers["pixel_errors"] = numbers["lost"] + numbers["false"] + numbers["wrong"]
-        beyond = torch.cat([error, torch.full((numbers["lost"] + numbers["false"],), torch.inf, dtype=error.dtype)])
-        if beyond.numel():
-            numbers["error_p95"] = beyond.sort().values[ceil(0.95 * len(beyond)) - 1].item()
+        all_errors = torch.cat([error, torch.full((numbers["lost"] + numbers["false"],), torch.inf, dtype=error.dtype)])
+        if all_errors.numel():
+            numbers["error_p95"] = all_errors.sort().values[ceil(0.95 * len(all_errors)) - 1].item()
         if error.numel():
             middle, high = error.quantile(torch.tensor([0.5, 0.99], dtype=torch.float64)).tolist()
             numbers |= {"depth_error_median": middle, "depth_error_p99": high, "depth_error_max": error.max().item()}
         return numbers
 
-    def behind(self) -> float:
-        """The share of the values of a rendering that are negative."""
-        signs = Signs(self.decoder.at(self.code.detach()))
+    def negative_fraction(self) -> float:
+        """The fraction of negative values among the field evaluations of a rendering."""
+        signs = SignCounter(self.decoder.at(self.code.detach()))
         with torch.no_grad():
             render_checked(self.renderer, signs, self.rays)
-        return signs.negative / max(signs.asked, 1)
+        return signs.negative / max(signs.evaluated, 1)
 
     def views(self, normal_width: float | None = None) -> tuple[View, View]:
         """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes.
@@ -386,7 +387,7 @@ class Workbench:
         )
 
     def _step(self, field: Field, rays: Rays, mask: Tensor) -> float:
-        """Takes one step and gives the seconds of its backward pass."""
+        """Takes one step, and returns the seconds of its backward pass."""
         rendering = render_checked(self.renderer, field, rays)
         silhouette = silhouette_loss(self.renderer, field, rays, rendering, RayObservation(mask.to(self.device)))
         loss = rendering.distance[rendering.hit].sum() + silhouette
@@ -394,19 +395,19 @@ class Workbench:
         torch.autograd.grad(loss, self.code, allow_unused=True)
         return stopwatch.seconds()
 
-    def _clock(self, clocked: Clocked, name: str, work: Callable[[Field], float], repeats: int) -> None:
-        """Times the same work `repeats` times, or until all took a quarter of the values that one may take."""
-        spent = 0
+    def _clock(self, timings: Timings, name: str, work: Callable[[Field], float], repeats: int) -> None:
+        """Times the same work `repeats` times, or until all took a quarter of one repeat's limit of evaluations."""
+        evaluations = 0
         for _ in range(repeats):
-            clocked.counts = Counts()
+            timings.counts = Counts()
             field = self.limits.watch(self.decoder.at(self.code), self.device, name)
-            stopwatch, ran = Stopwatch(self.device), time.process_time()
-            clocked.second.append(work(Meter(field, clocked.counts)))
-            clocked.seconds.append(stopwatch.seconds())
-            clocked.cpu.append(time.process_time() - ran)
-            spent, grew = spent + field.spent, field.memory.repeatable()
-            clocked.memory = grew if clocked.memory is None else max(clocked.memory, grew or 0)
-            if spent >= self.limits.values / 4:
+            stopwatch, cpu_start = Stopwatch(self.device), time.process_time()
+            timings.backward_seconds.append(work(Meter(field, timings.counts)))
+            timings.seconds.append(stopwatch.seconds())
+            timings.cpu_seconds.append(time.process_time() - cpu_start)
+            evaluations, memory_rise = evaluations + field.spent, field.memory.repeatable()
+            timings.memory = memory_rise if timings.memory is None else max(timings.memory, memory_rise or 0)
+            if evaluations >= self.limits.values / 4:
                 break
         shape = self.decoder.at(self.code)
-        clocked.flops, clocked.coarse_flops = clocked.counts.flops(shape), clocked.counts.coarse_flops(shape)
+        timings.flops, timings.coarse_flops = timings.counts.flops(shape), timings.counts.coarse_flops(shape)

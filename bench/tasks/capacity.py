@@ -1,4 +1,4 @@
-"""Model selection: fields from four parameters to the papers' network are fitted to views of a shape, one is chosen."""
+"""Model selection: fits fields from four parameters to the papers' network to views of a shape, and chooses one."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,8 +23,8 @@ from renderers.checks import check_at_least, check_choice, check_fraction, check
 from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss
 
-TINY = 1e-9  # seconds: for a clock that did not move
-NEEDS = {
+MIN_SECONDS = 1e-9  # avoids division by zero if the clock did not advance
+CHOICE_DEFINITIONS = {
     "recommended_field, recommended_error": "the smallest candidate, by recommended_by, whose held-out error is within "
     "one standard error of the best one's or under the footprint; its error",
     "recommended_by": "models.size: stored numbers, free numbers or bytes",
@@ -64,9 +64,9 @@ class Capacity:
 
     Args:
         depth_loss, depth_weight, silhouette, silhouette_weight: see `bench.tasks.completion.Completion`.
-        rounds: of `models.fit.iterations` that a fit has at most; see `bench.models.fit.Fitter.finish`.
-        frugal_rays: share of the rays that the recommended candidate's fit at pixel precision begins with.
-        checks: of the choice on further views.
+        rounds: maximum rounds of `models.fit.iterations` in a fit; see `bench.models.fit.Fitter.finish`.
+        frugal_rays: initial fraction of the rays in the recommended candidate's fit at pixel precision.
+        checks: settings of the checks of the choice on further views.
     """
 
     depth_loss: str
@@ -88,15 +88,15 @@ class Capacity:
         """Fits all candidates, chooses one, checks the choice, and compares the chosen field with the truth."""
         inputs, record = run.inputs, run.record
         check_field_gradient(inputs.renderer)
-        record.definitions = DEFINITIONS | COSTS | NEEDS
+        record.definitions = DEFINITIONS | COSTS | CHOICE_DEFINITIONS
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
         views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
-        longest = self.rounds * models.fit.iterations
+        max_iterations = self.rounds * models.fit.iterations
         with curve_file(run.folder) as write_line:
 
             def on_line(name: str, line: dict[str, Any]) -> None:
                 write_line({"candidate": name, **line})
-                run.progress(f"fitting {name}", line["iteration"] + 1, longest, line["total"])
+                run.progress(f"fitting {name}", line["iteration"] + 1, max_iterations, line["total"])
 
             candidates = by_size(models.candidates, models.size)
             fitter = Fitter(views.observations(inputs.seed), models.fit, inputs.seed, inputs.device, on_line)
@@ -114,12 +114,12 @@ class Capacity:
             chosen = next(fitted for fitted in fits if fitted.evidence is choice.chosen)
             checked = check(chosen, fits, views, self.checks, seed=inputs.seed)
             frugal = refit(chosen, fitter, renderer, fewest_rays=self.frugal_rays)
-            metrics = needs(choice, evidence, growth) | checked | costs("frugal", frugal)
-        result, name = evaluate(State(chosen.model.frozen(), inputs)), chosen.candidate.name
-        metrics = result.metrics | {"footprint": views.footprint} | metrics
-        precise = [f"pixel precision: {note}" for note in (*settings_notes, precision(frugal, chosen.evidence))]
-        notes = summary(choice, growth), *final_notes(chosen.renderer), *precise, *result.notes
-        note_result(run, replace(result, metrics=metrics, notes=notes))
+            metrics = choice_metrics(choice, evidence, growth) | checked | costs("frugal", frugal)
+        evaluation, name = evaluate(State(chosen.model.frozen(), inputs)), chosen.candidate.name
+        metrics = evaluation.metrics | {"footprint": views.footprint} | metrics
+        comments = [f"pixel precision: {note}" for note in (*settings_notes, precision_text(frugal, chosen.evidence))]
+        notes = summary(choice, growth), *final_notes(chosen.renderer), *comments, *evaluation.notes
+        note_result(run, replace(evaluation, metrics=metrics, notes=notes))
         filmstrip.save(run.folder, f"{record.title}: needs {name.replace('_', ' ')}", name)
         if inputs.evaluation.picture is not None:
             draw_candidates(run.folder, record.metrics, record.title)
@@ -127,18 +127,18 @@ class Capacity:
 
 def costs(name: str, evidence: Evidence) -> dict[str, Any]:
     """A fit's error and costs as metrics NAME.…; for a failed fit, its reason."""
-    known = {measure: evidence.size.by(measure) for measure in SIZE_WORDS}
+    sizes = {measure: evidence.size.by(measure) for measure in SIZE_WORDS}
     if evidence.size.sparse_bytes is not None:
-        known["sparse_bytes"] = evidence.size.sparse_bytes
-    known["flops_per_query"] = evidence.flops_per_query
-    spent = {key: getattr(evidence, key) for key in ("seconds", "evaluations", "flops", "iterations", "falling")}
+        sizes["sparse_bytes"] = evidence.size.sparse_bytes
+    sizes["flops_per_query"] = evidence.flops_per_query
+    fit_costs = {key: getattr(evidence, key) for key in ("seconds", "evaluations", "flops", "iterations", "falling")}
     error = evidence.error
     failure = {"failed": f"{evidence.status}: {evidence.reason}"} if error is None else {}
     errors = {} if error is None else {"error": error.mean, "standard_error": error.standard_error}
-    return {f"{name}.{key}": value for key, value in {**known, **spent, **errors, **failure}.items()}
+    return {f"{name}.{key}": value for key, value in {**sizes, **fit_costs, **errors, **failure}.items()}
 
 
-def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str, Any]:
+def choice_metrics(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str, Any]:
     """The choice and the evidence of every candidate, as metrics."""
     chosen, last = choice.chosen, growth.fitted.evidence
     metrics = {
@@ -163,32 +163,32 @@ def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str,
             metrics |= {
                 f"{fit.candidate}.{key}_at_auto": reached.get(key) for key in ("seconds", "flops", "evaluations")
             }
-    return metrics | saved(chosen, evidence)
+    return metrics | savings(chosen, evidence)
 
 
-def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
-    """Costs of the papers' network over the chosen candidate's; its time only where it was fitted in this run."""
-    fitted = next((one for one in evidence if one.candidate == PAPERS and one.error is not None), None)
+def savings(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
+    """Costs of the papers' network over the chosen candidate's; runtime only if it was fitted in this run."""
+    fitted = next((fit for fit in evidence if fit.candidate == PAPERS and fit.error is not None), None)
     papers = candidate(PAPERS)
     size = Size(papers.stored, papers.stored)
     ratios = {measure: size.by(measure) / chosen.size.by(measure) for measure in SIZE_WORDS}
     ratios["flops_per_query"] = papers.flops / chosen.flops_per_query
     if fitted is not None:
-        ratios["seconds"] = fitted.seconds / max(chosen.seconds, TINY)
+        ratios["seconds"] = fitted.seconds / max(chosen.seconds, MIN_SECONDS)
     return {f"saved_{key}": ratio for key, ratio in ratios.items()}
 
 
-def precision(frugal: Evidence, plain: Evidence) -> str:
-    """The fit at pixel precision compared with the plain one."""
-    if frugal.error is None:
-        return f"the fit ended as {frugal.status}: {frugal.reason}"
-    share = frugal.evaluations / max(plain.evaluations, 1)
-    error = f"error (x1000) {1000 * frugal.mean:.3g} instead of {1000 * plain.mean:.3g}"
-    return f"{error}, {100 * share:.0f} % of the field values"
+def precision_text(precise: Evidence, plain: Evidence) -> str:
+    """Text that compares the fit at pixel precision with the plain one."""
+    if precise.error is None:
+        return f"the fit ended as {precise.status}: {precise.reason}"
+    fraction = precise.evaluations / max(plain.evaluations, 1)
+    error = f"error (x1000) {1000 * precise.mean:.3g} instead of {1000 * plain.mean:.3g}"
+    return f"{error}, {100 * fraction:.0f} % of the field values"
 
 
 def summary(choice: Choice, growth: Growth) -> str:
-    """The recommendation in words."""
+    """The recommendation as text."""
     chosen, best = choice.chosen, choice.best
     rules = {"within one standard error of the best": choice.within, "under half a pixel": choice.enough}
     why = " and ".join(rule for rule, holds in rules.items() if holds)

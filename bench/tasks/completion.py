@@ -1,4 +1,4 @@
-"""Shape completion: optimise the code of a shape to match a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
+"""Shape completion: optimises a latent code to match a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +24,7 @@ from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
 MEASURED, EXACT = "measured", "exact"
-HELD_OUT = 0.2  # share of the observations that is held out, by tiles of the view
+HELD_OUT_FRACTION = 0.2  # a field without a prior does not learn from these observations, chosen by tiles of the view
 
 
 @dataclass(frozen=True)
@@ -32,24 +32,24 @@ class Completion:
     """Shape from one sparse depth image, with or without its mask, and shape and colour from a colour image.
 
     Args:
-        points: amount of depth that is given; see `datasets.views.observed_pixels`. Dense depth implies the mask.
-        depths: "measured", those of a scanner where the dataset has one; "exact", those of the mesh at the same pixels.
-        mask: whether the silhouette is given.
-        depth_loss: over pixels that are observed and hit, the mean of "depth", the error of the camera's depth (DIST,
-            B.3), or of "points", the distance in space between the points (DVR's official code).
-        depth_weight: of that mean.
-        normal_weight: of 1 less the cosine between the normals of the rendered surface and the true ones, the mean over
-            the same pixels (DIST, B.3); beyond 0 the normals of these pixels are given as well.
-        normal_width: scene units over which the rendered surface's normals are taken; see
+        points: amount of given depth; see `datasets.views.observed_pixels`. Dense depth implies the mask.
+        depths: "measured": the scanner's depths if the dataset has them; "exact": the mesh's depths at the same pixels.
+        mask: whether the mask is given.
+        depth_loss: mean over observed pixels that hit, of "depth", the error of the camera's depth (DIST, B.3), or of
+            "points", the distance in space between the points (DVR's official code).
+        depth_weight: weight of the depth loss.
+        normal_weight: weight of 1 minus the cosine between the normals of the rendered surface and the true ones, the
+            mean over the same pixels (DIST, B.3). Above 0, the normals of these pixels are given too.
+        normal_width: width of the finite differences for the rendered surface's normals, in scene units; see
             `bench.solve.observed_view.slopes_over`.
-        colour_weight: of the mean absolute error of colours, over all pixels that show the shape and are hit (DIST,
-            B.3); beyond 0 the colours of these pixels are given, and the prior must have colours.
-        silhouette: loss of the mask.
-        silhouette_weight: of that loss.
+        colour_weight: weight of the mean absolute error of colours over pixels on the shape that hit (DIST, B.3).
+            Above 0, the colours of these pixels are given, and the prior must have colours.
+        silhouette: the silhouette loss.
+        silhouette_weight: weight of the silhouette loss.
         code: penalty on the code.
-        similarity: whether a shift, a rotation and a size of the prior's shape are optimised as well.
-        rotations: their number, about the vertical axis, that the similarity begins from.
-        trial: iterations of each, see `bench.solve.optimise.StartSettings`.
+        similarity: whether a shift, a rotation and a size of the prior's shape are also optimised.
+        rotations: number of initial rotations of the similarity, about the vertical axis.
+        trial: iterations of each start; see `bench.solve.optimise.StartSettings`.
         optimiser: iterations and learning rates.
     """
 
@@ -84,7 +84,7 @@ class Completion:
             StartSettings(self.rotations, self.trial).check(self.optimiser.iterations)
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput where a prior is asked for, and there is none, or none of colours."""
+        """Raises BadInput if the settings need a prior, or one with colours, and there is none."""
         if inputs.field.of_prior:
             inputs.check_prior()
         if self.colour_weight and not (inputs.prior_choice.coloured and inputs.field.of_prior):
@@ -103,8 +103,8 @@ class Completion:
         else:
             check_field_gradient(inputs.renderer)
             scene, renderer = inputs.scene, inputs.renderer
-            observations, given = self.observations(scene, renderer, seed=inputs.seed, device=inputs.device)
-            solve_by_growth(observations, given, run, iterations=self.optimiser.iterations)
+            observations, shown = self.observations(scene, renderer, seed=inputs.seed, device=inputs.device)
+            solve_by_growth(observations, shown, run, iterations=self.optimiser.iterations)
         if inputs.scene.to_world is not None:
             save_in_world(run.folder, inputs.scene.to_world)
 
@@ -113,10 +113,10 @@ class Completion:
     ) -> CodeProblem:
         """The problem of a scene; it starts from code zero, the mean shape, in each rotation."""
         check_field_gradient(renderer)
-        given = self._given(scene, renderer, seed=seed, device=device)
-        compared = given.observed & (self.depth_weight > 0)
-        problem = partial(CodeProblem, prior, self.code, given.compare, compared, compared.numel(), device)
-        problem = partial(problem, mask=given.mask is not None, coloured=self.colour_weight > 0)
+        observed_view = self._observed_view(scene, renderer, seed=seed, device=device)
+        compared = observed_view.observed & (self.depth_weight > 0)
+        problem = partial(CodeProblem, prior, self.code, observed_view.compare, compared, compared.numel(), device)
+        problem = partial(problem, mask=observed_view.mask is not None, coloured=self.colour_weight > 0)
         if not self.similarity:
             return problem()
         codes = torch.zeros(self.rotations, prior.decoder.code_length)
@@ -125,24 +125,24 @@ class Completion:
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
     ) -> tuple[RayObservations, Given]:
-        """The observations for a field without a prior; a fifth of them, by tiles of the view, is held out."""
-        view = self._given(scene, renderer, seed=seed, device=device)
+        """The observations for a field without a prior, of which a fifth is held out, and the view for pictures."""
+        view = self._observed_view(scene, renderer, seed=seed, device=device)
         observed, camera = view.observed.cpu(), scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
-        group = tiles(*observed.shape)
-        held = hold_out(together([view]), group, share=HELD_OUT, whole=(), footprint=half_pixel, seed=seed)
-        return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
+        tile_ids = tiles(*observed.shape)
+        rays = hold_out(together([view]), tile_ids, share=HELD_OUT_FRACTION, whole=(), footprint=half_pixel, seed=seed)
+        return rays, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
-    def _given(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> GivenView:
-        """The given part of a scene's view."""
-        view, known = scene.given(exact=self.depths == EXACT)
-        observed = observed_pixels(known, self.points, seed)
+    def _observed_view(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> GivenView:
+        """The observed part of a scene's view."""
+        view, measured = scene.given(exact=self.depths == EXACT)
+        observed = observed_pixels(measured, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
-        given = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
+        observed_view = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
         if self.normal_weight:
-            more = {"normal_weight": self.normal_weight, "normal_width": self.normal_width}
-            given = replace(given, normals=view.normals.to(device), **more)
+            normal_settings = {"normal_weight": self.normal_weight, "normal_width": self.normal_width}
+            observed_view = replace(observed_view, normals=view.normals.to(device), **normal_settings)
         if self.colour_weight:
             image = painted(view, scene.texture).where(view.mask[..., None], torch.nan)
-            given = replace(given, colours=image.to(device), colour_weight=self.colour_weight)
-        return given
+            observed_view = replace(observed_view, colours=image.to(device), colour_weight=self.colour_weight)
+        return observed_view

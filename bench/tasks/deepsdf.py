@@ -16,7 +16,7 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
 from renderers.rendering import Renderer
 
-FREE = 8  # samples of a ray, evenly spaced from the unit sphere to the offset before the surface
+FREE_SPACE_SAMPLES = 8  # per ray, evenly spaced from the unit sphere to the offset in front of the surface
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,16 @@ class DeepSDF:
     """Shape from one sparse depth image whose true normals are given: the baseline of DIST, Table 2.
 
     Each observed point p with normal n gives the samples p + offset n and p - offset n, whose distances are +offset and
-    -offset. DeepSDF's samples of free space, on the rays in front of these, are switched on by `free_space`: there the
-    field must not be negative. The renderer takes no part in the optimisation: it renders only the pictures and the
-    evaluated images.
+    -offset. `free_space` switches on DeepSDF's samples of free space, on the rays in front of the surface: there the
+    field must not be negative. The renderer is not used in the optimisation, only for pictures and the evaluation.
 
     Args:
-        points: amount of depth that is given; see `datasets.views.observed_pixels`.
+        points: amount of given depth; see `datasets.views.observed_pixels`.
         offset: distance of the samples from the surface, in scene units.
-        distance_weight: of the mean absolute error of the distances.
+        distance_weight: weight of the mean absolute error of the distances.
         code: penalty on the code.
         optimiser: iterations and learning rates.
-        free_space: weight of the mean of what lies below zero at `FREE` samples of each ray in free space.
+        free_space: weight of the mean magnitude of negative values at `FREE_SPACE_SAMPLES` samples of each ray.
     """
 
     points: str
@@ -68,15 +67,16 @@ class DeepSDF:
         points = torch.cat([surface + shift, surface - shift]).to(device)
         distances = self.offset * torch.tensor([1.0, -1.0]).repeat_interleave(len(distance)).to(device)
         entry = sphere_span(rays)[0][:, None]
-        ahead = (distance[:, None] - self.offset - entry).clamp_min(0)
-        free = rays.at_each(entry + ahead * (torch.arange(FREE) + 0.5) / FREE).to(device)
+        free_length = (distance[:, None] - self.offset - entry).clamp_min(0)
+        steps = torch.arange(FREE_SPACE_SAMPLES) + 0.5
+        free = rays.at_each(entry + free_length * steps / FREE_SPACE_SAMPLES).to(device)
 
         def compare(field: Field, iteration: int) -> Terms:
-            """The weighted mean absolute error (DeepSDF, Eq. 10, without its clamp), and that of free space."""
+            """The weighted mean absolute error (DeepSDF, Eq. 10, without its clamp), and the term of free space."""
             terms = {"distance": self.distance_weight * (field(points) - distances).abs().mean()}
             if self.free_space:
                 terms["free_space"] = self.free_space * torch.relu(-field(free)).mean()
             return terms
 
-        asked = len(points) + (free.numel() // 3 if self.free_space else 0)
-        return CodeProblem(prior, self.code, compare, observed, asked, device, mask=False)
+        points_per_iteration = len(points) + (free.numel() // 3 if self.free_space else 0)
+        return CodeProblem(prior, self.code, compare, observed, points_per_iteration, device, mask=False)

@@ -22,8 +22,8 @@ from renderers.fields.mlp import Decoder
 from renderers.rendering import Blurred, Renderer, Rendering, check_kind
 
 BANDS = {"frontal": (0.0, 30.0), "oblique": (30.0, 70.0), "grazing": (70.0, 90.0)}  # degrees of incidence
-NEAR = 0.01  # scene units within which a hit is on the true hit's surface
-BETWEEN = 32  # places from a hit to the true one at which it is asked whether they are on one surface
+SAME_SURFACE_DISTANCE = 0.01  # scene units: a closer hit is on the true hit's surface
+POINTS_BETWEEN = 32  # for farther hits, the field is checked at these points between the hit and the true one
 
 DEFINITIONS = {
     "BAND": "angle between ray and inward normal: frontal to 30 degrees, oblique to 70, grazing beyond; silhouette: "
@@ -57,13 +57,13 @@ class Gradients:
     """Compares gradients of distance with central differences, at a training shape of the prior, in float64.
 
     Args:
-        pixels: number drawn in each band of angles.
+        pixels: number of pixels drawn in each band of angles.
         directions: number of random orthogonal directions of the code.
         outline: number of pixels drawn next to the outline.
-        outline_directions: number of directions of the code for these.
-        outline_shift: pixels by which a step of the code moves most of these, to either side.
-        supersampling: rays per side of a pixel for these.
-        blurs: in scene units, at which a renderer that has a blur is compared there beside its own.
+        outline_directions: number of directions of the code for the outline.
+        outline_shift: distance in pixels by which a step of the code moves most of the outline, to either side.
+        supersampling: rays per side of a pixel next to the outline.
+        blurs: blurs, in scene units, at which a renderer with a blur is also compared next to the outline.
     """
 
     pixels: int
@@ -91,16 +91,16 @@ class Gradients:
         """Compares the gradients, and fills the record."""
         inputs, record = run.inputs, run.record
         record.definitions = DEFINITIONS
-        twin = in_float64(inputs.fitted())
+        prior = in_float64(inputs.fitted())
         reference = reference_for(inputs.fitted(), inputs.scene.view.camera, inputs.cache)
         subject = Subject(
             inputs.renderer,
-            twin.decoder.requires_grad_(False),
-            twin.codes[0],
+            prior.decoder.requires_grad_(False),
+            prior.codes[0],
             inputs.scene.view.camera.double(),
             Counts(),
         )
-        check_kind(inputs.renderer, twin.decoder.at(twin.codes[0]))
+        check_kind(inputs.renderer, prior.decoder.at(prior.codes[0]))
         check_field_gradient(inputs.renderer)
         generator = torch.Generator().manual_seed(inputs.seed)
         axes = torch.randn(len(subject.code), self.directions, generator=generator, dtype=torch.float64)
@@ -115,9 +115,9 @@ class Gradients:
         outline = _draw(_outline(reference.hit), self.outline, generator)
         metrics |= self._evaluate_outline(subject, outline, directions[:, : self.outline_directions])
         run.progress("comparing gradients", len(BANDS) + 1, len(BANDS) + 2)
-        seen = _draw(torch.cat([bands["frontal"], bands["oblique"]]), self.pixels, generator)
+        visible = _draw(torch.cat([bands["frontal"], bands["oblique"]]), self.pixels, generator)
         paint = Paint.drawn(generator)
-        numbers = self._evaluate(subject, seen, reference.distance.flatten()[seen], directions, paint)
+        numbers = self._evaluate(subject, visible, reference.distance.flatten()[visible], directions, paint)
         record.metrics = metrics | {f"colour.{name}": value for name, value in numbers.items()}
         record.evaluations = {"value": subject.counts.value, "gradient": subject.counts.gradient}
         record.status, record.reason = RunStatus.OK, ""
@@ -132,7 +132,7 @@ class Gradients:
     ) -> dict[str, float]:
         """The metrics of distances in one band, or of colours at the hits."""
         if not pixels.numel():
-            return _compared({}, pixels.bool())
+            return _gradient_metrics({}, pixels.bool())
         truth = differences(
             subject.decoder,
             subject.code,
@@ -142,19 +142,19 @@ class Gradients:
             distance=distance,
             paint=paint,
         )
-        (by_code, by_camera, *by_weight), found, hit = subject.gradients(pixels, paint)
-        valid = truth.valid & hit & subject.same_surface(pixels, found, distance)
+        (by_code, by_camera, *by_weight), hit_distance, hit = subject.gradients(pixels, paint)
+        valid = truth.valid & hit & subject.same_surface(pixels, hit_distance, distance)
         pairs = {"code": (by_code @ directions, truth.code)}
         if subject.renderer.capabilities.ray_gradient:
             pairs["camera"] = (by_camera, truth.camera)
         if by_weight:
             pairs["texture"] = (by_weight[0], truth.texture)
-        return _compared(pairs, valid)
+        return _gradient_metrics(pairs, valid)
 
     def _evaluate_outline(
         self, subject: "Subject", pixels: Int[Tensor, " m"], directions: Float[Tensor, "code_length directions"]
     ) -> dict[str, float]:
-        """The metrics across the silhouette, at the renderer's own blur, and at those of `blurs` if it has one."""
+        """The metrics across the outline, at the renderer's blur, and at each of `blurs` if it has a blur."""
         if not pixels.numel():
             return {"silhouette.pixels": 0}
         lipschitz = estimate_lipschitz(subject.decoder.at(subject.code), radius=RADIUS)
@@ -162,18 +162,18 @@ class Gradients:
         def field_at(shift: Tensor) -> Field:
             return subject.decoder.at(subject.code + shift)
 
-        seen: Any = {"camera": subject.camera, "pixels": pixels, "lipschitz": lipschitz}
-        steps = outline_steps(field_at, directions, shift=self.outline_shift, **seen)
-        truth = image_differences(field_at, directions, steps=steps, supersampling=self.supersampling, **seen)
+        settings: Any = {"camera": subject.camera, "pixels": pixels, "lipschitz": lipschitz}
+        steps = outline_steps(field_at, directions, shift=self.outline_shift, **settings)
+        truth = image_differences(field_at, directions, steps=steps, supersampling=self.supersampling, **settings)
         rays = subrays(subject.camera, pixels, self.supersampling)
         numbers = {
             "silhouette.pixels": float(len(pixels)),
-            **_visibility(subject, rays, directions, truth, "silhouette"),
+            **_image_metrics(subject, rays, directions, truth, "silhouette"),
         }
         if isinstance(subject.renderer, Blurred):
             for blur in self.blurs:
                 blurred = replace(subject, renderer=subject.renderer.with_blur(blur))
-                numbers |= _visibility(blurred, rays, directions, truth, f"silhouette_{blur:.0e}")
+                numbers |= _image_metrics(blurred, rays, directions, truth, f"silhouette_{blur:.0e}")
         return numbers
 
 
@@ -188,22 +188,22 @@ class Subject:
     counts: Counts
 
     def same_surface(
-        self, pixels: Int[Tensor, " m"], found: Float[Tensor, " m"], distance: Float[Tensor, " m"]
+        self, pixels: Int[Tensor, " m"], hits: Float[Tensor, " m"], distance: Float[Tensor, " m"]
     ) -> Bool[Tensor, " m"]:
-        """Whether hits are on the surface of the true ones: near, or the field falls all the way from them to there."""
+        """Whether hits are on the surface of the true ones: close, or the field's magnitude falls all along between."""
         rays = self.camera.rays().flat()[pixels]
-        between = torch.lerp(found[:, None], distance[:, None], torch.linspace(0, 1, BETWEEN, dtype=found.dtype))
+        samples = torch.lerp(hits[:, None], distance[:, None], torch.linspace(0, 1, POINTS_BETWEEN, dtype=hits.dtype))
         with torch.no_grad():
-            falls = (self.decoder.at(self.code)(rays.at_each(between)).abs().diff(dim=1) <= 0).all(dim=1)
-        return ((found - distance).abs() < NEAR) | falls
+            decreasing = (self.decoder.at(self.code)(rays.at_each(samples)).abs().diff(dim=1) <= 0).all(dim=1)
+        return ((hits - distance).abs() < SAME_SURFACE_DISTANCE) | decreasing
 
     def gradients(
         self, pixels: Int[Tensor, " m"], paint: Paint | None
     ) -> tuple[list[Float[Tensor, "m seen _"]], Float[Tensor, " m"], Bool[Tensor, " m"]]:
-        """For each pixel the gradients of what is seen, the distance, and whether it hits.
+        """The gradients of each pixel's outputs for code, camera and paint; the distance; whether it hits.
 
-        What is seen is the distance, or with a paint the three colours of it at the renderer's points, by the field's
-        gradients there, as a reconstruction asks for them. Its gradients are those for code, camera and paint.
+        The output is the distance. With a paint, the outputs are its three colours at the renderer's points and the
+        field's gradients at these points, as in a reconstruction.
         """
         code = self.code.clone().requires_grad_(True)
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
@@ -212,85 +212,85 @@ class Subject:
         field = Meter(self.decoder.at(code), self.counts)
         rendering = render_checked(self.renderer, field, rays[pixels])
         rows = rendering.hit.nonzero().squeeze(-1)
-        seen = rendering.distance[rows, None]
+        outputs = rendering.distance[rows, None]
         if paint is not None:
             points = rendering.points[rows]
-            seen = Paint(*weights)(points, slopes_at(field, points)) if len(rows) else seen.expand(-1, 3)
+            outputs = Paint(*weights)(points, slopes_at(field, points)) if len(rows) else outputs.expand(-1, 3)
         parameters = (code, twist, *weights)
-        tables = [torch.zeros(len(pixels), seen.shape[1], len(one), dtype=torch.float64) for one in parameters]
-        for place, row in enumerate(rows.tolist()):
-            for part, output in enumerate(seen[place]):
-                found = torch.autograd.grad(output, parameters, retain_graph=True, allow_unused=True)
+        tables = [torch.zeros(len(pixels), outputs.shape[1], len(values), dtype=torch.float64) for values in parameters]
+        for index, row in enumerate(rows.tolist()):
+            for channel, output in enumerate(outputs[index]):
+                gradients = torch.autograd.grad(output, parameters, retain_graph=True, allow_unused=True)
                 if paint is None:
-                    check_gradients(self.renderer, *found)
-                for table, gradient in zip(tables, found, strict=True):
+                    check_gradients(self.renderer, *gradients)
+                for table, gradient in zip(tables, gradients, strict=True):
                     if gradient is not None:
-                        table[row, part] = gradient
+                        table[row, channel] = gradient
         return tables, rendering.distance.detach(), rendering.hit
 
     def image_gradients(
         self, rays: Rays, directions: Float[Tensor, "code_length directions"]
     ) -> Float[Tensor, "rays directions"]:
-        """The derivatives, along directions of the code, of the distance that each ray sees.
+        """The derivatives of the distance visible on each ray, along directions of the code.
 
-        The gradient towards the directions' coordinates is linear in the weights of the rays, so that its derivatives
-        towards these are the derivatives of all rays at once.
+        The gradient for the directions' coordinates is linear in the weights of the rays. Its derivatives with respect
+        to the weights are therefore the derivatives of all rays at once.
         """
         shift = torch.zeros(directions.shape[1], dtype=torch.float64, requires_grad=True)
         field = Meter(self.decoder.at(self.code + directions @ shift), self.counts)
         rendering = render_checked(self.renderer, field, rays)
         weights = torch.ones(rays.shape, dtype=torch.float64, requires_grad=True)
-        (gradient,) = torch.autograd.grad(_seen(rendering, rays), shift, weights, create_graph=True)
-        columns = [torch.autograd.grad(part, weights, retain_graph=True)[0] for part in gradient]
+        (gradient,) = torch.autograd.grad(_visible_distance(rendering, rays), shift, weights, create_graph=True)
+        columns = [torch.autograd.grad(component, weights, retain_graph=True)[0] for component in gradient]
         return torch.stack(columns, dim=-1)
 
 
-def _visibility(
+def _image_metrics(
     subject: Subject,
     rays: Rays,
     directions: Float[Tensor, "code_length directions"],
     truth: Float[Tensor, "pixels directions"],
     name: str,
 ) -> dict[str, float]:
-    """The metrics of the image of distances, of which each pixel is the mean over a row of `rays`."""
-    counted = replace(subject, counts=Counts())  # apart: differences of differences are not evaluations of a method
-    found = counted.image_gradients(rays.flat(), directions).view(*rays.shape, -1)
-    mean, scale = found.mean(dim=1), truth.square().sum()
+    """The metrics of the image of distances; each pixel is the mean over a row of `rays`."""
+    counted = replace(subject, counts=Counts())  # separate: these evaluations are not part of the renderer's cost
+    gradients = counted.image_gradients(rays.flat(), directions).view(*rays.shape, -1)
+    mean, scale = gradients.mean(dim=1), truth.square().sum()
     return {
         f"{name}.image_cosine": torch.cosine_similarity(mean.flatten(), truth.flatten(), dim=0).item(),
         f"{name}.image_scale": ((mean * truth).sum() / scale).item(),
         f"{name}.image_error": ((mean - truth).square().sum() / scale).sqrt().item(),
-        f"{name}.image_spread": ((found - mean[:, None]).square().mean(dim=1).sum() / scale).sqrt().item(),
-        f"{name}.values_per_ray": counted.counts.value / found[..., 0].numel(),
+        f"{name}.image_spread": ((gradients - mean[:, None]).square().mean(dim=1).sum() / scale).sqrt().item(),
+        f"{name}.values_per_ray": counted.counts.value / gradients[..., 0].numel(),
     }
 
 
-def _seen(rendering: Rendering, rays: Rays) -> Float[Tensor, "*rays"]:
-    """The distance that each ray sees: that of the shape, and behind it that to the far side of the unit sphere."""
-    leave = sphere_span(rays)[1]
+def _visible_distance(rendering: Rendering, rays: Rays) -> Float[Tensor, "*rays"]:
+    """The distance visible on each ray: to the shape, or to the far side of the unit sphere behind it."""
+    exit_distance = sphere_span(rays)[1]
     if rendering.volume is None:
-        return torch.where(rendering.hit, rendering.distance, leave)
-    beside = rendering.volume.distance - leave.flatten()[rendering.volume.ray]
-    return leave + rendering.volume.weighted_sum(beside, leave.numel()).view(leave.shape)
+        return torch.where(rendering.hit, rendering.distance, exit_distance)
+    relative = rendering.volume.distance - exit_distance.flatten()[rendering.volume.ray]
+    return exit_distance + rendering.volume.weighted_sum(relative, exit_distance.numel()).view(exit_distance.shape)
 
 
-def _compared(
+def _gradient_metrics(
     pairs: dict[str, tuple[Float[Tensor, "m *seen _"], Float[Tensor, "m *seen _"]]], valid: Bool[Tensor, " m"]
 ) -> dict[str, float]:
-    """The metrics of the valid pixels' gradients, found and true, and how many are valid."""
+    """The metrics of the valid pixels' computed and true gradients, and the number of valid pixels."""
     numbers: dict[str, float] = {"pixels": int(valid.sum()), "excluded": int((~valid).sum())}
     if not valid.any():
         return numbers
     for name, pair in pairs.items():
-        found, true = (gradients[valid].flatten(0, -2) for gradients in pair)
+        computed, true = (gradients[valid].flatten(0, -2) for gradients in pair)
         length = torch.linalg.vector_norm(true, dim=1)
-        error = torch.linalg.vector_norm(found - true, dim=1) / length
+        error = torch.linalg.vector_norm(computed - true, dim=1) / length
         middle, high = error.quantile(torch.tensor([0.5, 0.99], dtype=torch.float64)).tolist()
         numbers |= {
-            f"{name}_cosine": torch.cosine_similarity(found, true, dim=1).median().item(),
-            f"{name}_pooled_cosine": torch.cosine_similarity(found.flatten(), true.flatten(), dim=0).item(),
-            f"{name}_pooled_scale": ((found * true).sum() / true.square().sum()).item(),
-            f"{name}_scale": ((found * true).sum(1) / length.square()).median().item(),
+            f"{name}_cosine": torch.cosine_similarity(computed, true, dim=1).median().item(),
+            f"{name}_pooled_cosine": torch.cosine_similarity(computed.flatten(), true.flatten(), dim=0).item(),
+            f"{name}_pooled_scale": ((computed * true).sum() / true.square().sum()).item(),
+            f"{name}_scale": ((computed * true).sum(1) / length.square()).median().item(),
             f"{name}_median_error": middle,
             f"{name}_p99_error": high,
         }
@@ -309,8 +309,8 @@ def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, " some
 
 def _outline(hit: Bool[Tensor, "height width"]) -> Int[Tensor, " some"]:
     """Pixels whose 3 x 3 neighbourhood has both hits and misses, as indices into the flattened image."""
-    around = torch.nn.functional.max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 3, stride=1, padding=1)
-    return (around.amin(dim=0)[0] > 0).flatten().nonzero().squeeze(-1)
+    has_both = torch.nn.functional.max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 3, stride=1, padding=1)
+    return (has_both.amin(dim=0)[0] > 0).flatten().nonzero().squeeze(-1)
 
 
 def _draw(pixels: Int[Tensor, " some"], count: int, generator: torch.Generator) -> Int[Tensor, " few"]:

@@ -1,4 +1,4 @@
-"""Shape from many views: optimise the code for photometric consistency between views (DIST, Sec. 4.2.2)."""
+"""Shape from many views: optimises the code for photometric consistency between views (DIST, Sec. 4.2.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -31,8 +31,8 @@ from renderers.rendering import RayObservation, Renderer, at_iteration, check_ki
 from renderers.silhouette import SilhouetteLoss
 
 MIN_SCALE, MAX_SHIFT = 0.8, 0.2
-SURE = 0.999  # least weight of neighbouring pixels on the shape for a depth to be interpolated between them
-FAR_APART = 60.0  # degrees between compared photographs, above which the record has a note
+MIN_INTERPOLATION_WEIGHT = 0.999  # a depth is interpolated only if pixels on the shape have this weight
+MAX_NEIGHBOUR_DEGREES = 60.0  # above this angle between compared photographs, the record has a note
 
 
 @dataclass(frozen=True)
@@ -40,27 +40,26 @@ class Multiview(PhotographTask):
     """Shape from photographs whose cameras are known.
 
     Args:
-        images, longest, held_out, masks: see `PhotographTask`; all but the first are of photographs of one's own.
+        images, longest, held_out, masks: see `PhotographTask`; all except the first are for the user's photographs.
         focal: focal length of the photographs' cameras over that of the scene's camera (DIST, Fig. 10 a).
-        views_per_step: views that an iteration compares, evenly spaced; they shift by one with each iteration.
-        neighbour: a view is compared with the one that is this many views further.
+        views_per_step: number of views in an iteration, evenly spaced; they shift by one with each iteration.
+        neighbour: a view is compared with the view that follows by this many.
         visible: squared difference of depths below which both views see a point, in squared scene units (DIST, B.3).
-        photometric_weight: of the mean absolute difference of colours (Eq. 6).
+        photometric_weight: weight of the mean absolute difference of colours (Eq. 6).
         code: penalty on the code.
-        start_scale: standard deviation of the random initial code over that of the prior's training codes; 0 is the
+        start_scale: standard deviation of the random initial code, relative to the prior's training codes; 0 is the
             mean shape.
         starts, trial: see `bench.solve.optimise.StartSettings`.
-        coarse_blur: standard deviation of the initial Gaussian blur of the images, as a share of their height; it falls
-            to 0 over the first half of a start's iterations.
-        rotations: their number, about the vertical axis, from which a similarity of one's own photographs begins.
-        silhouette, silhouette_weight: loss of the masks, and its weight; 0 compares none. Eq. 6 is a mean over pixels
-            that the shape covers, and pixels of the object that it leaves free cost nothing.
-        scale, degrees, shift: scale, rotation and shift of the initial shape against the true one; where one is not
-            neutral, a similarity transform is optimised as well (DIST, Fig. 12). Ratio, degrees, scene units.
-        similarity: whether one is optimised in any case.
+        coarse_blur: standard deviation of the initial Gaussian blur of the images, as a fraction of their height; it
+            falls to 0 over the first half of a start's iterations.
+        rotations: number of initial rotations about the vertical axis, for a similarity on the user's photographs.
+        silhouette, silhouette_weight: the silhouette loss and its weight; 0 switches it off. Eq. 6 is a mean over
+            pixels that the shape covers: without this loss, pixels of the object that it does not cover cost nothing.
+        scale, degrees, shift: scale (ratio), rotation (degrees) and shift (scene units) of the initial shape relative
+            to the true one. If one is not neutral, a similarity transform is optimised too (DIST, Fig. 12).
+        similarity: whether a similarity transform is optimised in any case.
         optimiser: iterations and learning rates.
-        encoder: gives the code about which initial ones are drawn, the mean of the photographs'; None: zero, the mean
-            shape's.
+        encoder: gives the mean of the initial codes, averaged over the photographs; None: zero, the mean shape.
     """
 
     focal: float
@@ -89,8 +88,8 @@ class Multiview(PhotographTask):
         check_at_least("task.views_per_step", self.views_per_step, 1, "the paper uses 8")
         check_at_least("task.neighbour", self.neighbour, 1, "1 is the closest next view")
         if self.neighbour % self.images.views == 0:
-            both = f"task.neighbour={self.neighbour} compares each of {self.images.views} views with itself"
-            raise ValueError(f"{both}: set task.neighbour=1")
+            reason = f"task.neighbour={self.neighbour} compares each of {self.images.views} views with itself"
+            raise ValueError(f"{reason}: set task.neighbour=1")
         check_positive("task.visible", self.visible, "the paper uses 0.001")
         check_positive("task.focal", self.focal, "1 is the scene's; from 1.07 on shapes may leave the image")
         check_positive("task.scale", self.scale, "1 is the true size")
@@ -104,69 +103,69 @@ class Multiview(PhotographTask):
             )
         check_at_least("task.rotations", self.rotations, 1, "12 are 30 degrees apart")
         check_at_least("task.silhouette_weight", self.silhouette_weight, 0, "0 switches the term off")
-        self.turns.check(self.optimiser.iterations)
+        self.start_settings.check(self.optimiser.iterations)
 
     @property
-    def turns(self) -> StartSettings:
-        """The number of starts, and the iterations of each one's trial."""
+    def start_settings(self) -> StartSettings:
+        """The number of starts, and the iterations of each start's trial."""
         return StartSettings(self.starts, self.trial)
 
     @property
-    def sought(self) -> bool:
-        """Whether a similarity is optimised as well."""
+    def optimises_similarity(self) -> bool:
+        """Whether a similarity transform is also optimised."""
         return self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput without a prior or with an encoder of made photographs, ValueError for too many rotations."""
+        """Raises BadInput without a prior, or for an encoder with real photographs; ValueError for many rotations."""
         inputs.check_prior()
         if inputs.photographed is not None:
-            _ = self._turning
+            _ = self._with_rotations
             if self.encoder is not None:
                 raise BadInput("an encoder learns made photographs, not yours: take +method=multiview_dist")
 
     @property
-    def _turning(self) -> "Multiview":
-        """The same with the mean shape in each of the rotations as starts, where the place of an object is sought."""
+    def _with_rotations(self) -> "Multiview":
+        """The same task; with `similarity`, its starts are the mean shape in each of the rotations."""
         return replace(self, starts=self.rotations, start_scale=0.0) if self.similarity else self
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, and evaluates the shape before and after."""
         if run.inputs.photographed is not None:
-            self._turning._of_photographs(run)
+            self._with_rotations._execute_on_photographs(run)
             return
-        apart = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
-        if apart > FAR_APART:
-            note = f"compared photographs are {apart:.0f} degrees apart and share little: task.images.views=24 has 15"
+        angle = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
+        if angle > MAX_NEIGHBOUR_DEGREES:
+            note = f"compared photographs are {angle:.0f} degrees apart and share little: task.images.views=24 has 15"
             run.record.notes = [*run.record.notes, note]
         inputs = run.inputs
 
         def problem() -> CodeProblem:
-            made = self.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
-            if self.encoder is not None and made.photographs is not None:
-                first = self.encoder.start(run, self.images, torch.from_numpy(made.photographs))
-                for code in made.codes:
-                    code.data += first.to(code)
-            return made
+            built = self.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
+            if self.encoder is not None and built.photographs is not None:
+                mean_code = self.encoder.start(run, self.images, torch.from_numpy(built.photographs))
+                for code in built.codes:
+                    code.data += mean_code.to(code)
+            return built
 
         solve(problem, self.optimiser, run, defined(inputs), gallery=True)
 
-    def _of_photographs(self, run: RunContext) -> None:
-        """The same for photographs of one's own, by which the shape is judged, with the colours of those given."""
+    def _execute_on_photographs(self, run: RunContext) -> None:
+        """Optimises the code for the user's photographs, and evaluates the shape on the held-out ones."""
         inputs, record = run.inputs, run.record
         check_field_gradient(inputs.renderer)
         record.definitions = COLOURED_DEFINITIONS | COSTS
         subject = self.subject(inputs)
-        record.notes = [*record.notes, subject.found]
-        given = GivenPhotographs(self, inputs.renderer, subject.given, inputs.device, own=True)
-        problem = self._problem(inputs.prior, given, torch.Generator().manual_seed(inputs.seed))
+        record.notes = [*record.notes, subject.summary]
+        photometric_loss = PhotometricLoss(self, inputs.renderer, subject.input_shots, inputs.device, from_user=True)
+        problem = self._problem(inputs.prior, photometric_loss, torch.Generator().manual_seed(inputs.seed))
         check_kind(inputs.renderer, problem.field())
 
         def mesh() -> Mesh | None:
             return coloured(problem.field(), subject, inputs)
 
         def scores(iteration: int) -> dict[str, float]:
-            found = judge_mesh(mesh(), subject, inputs).metrics
-            return {name: found[name] for name in ("psnr", "seen_chamfer_l1") if name in found}
+            metrics = judge_mesh(mesh(), subject, inputs).metrics
+            return {name: metrics[name] for name in ("psnr", "seen_chamfer_l1") if name in metrics}
 
         with run.off_clock():
             record.metrics_start = judge_mesh(mesh(), subject, inputs).metrics
@@ -177,58 +176,58 @@ class Multiview(PhotographTask):
         subject.finish(run)
 
     def subject(self, inputs: RunInputs) -> Subject:
-        """See `PhotographTask`; set upright where a place is looked for."""
-        found = super().subject(inputs)
-        return upright(found) if self.similarity else found
+        """See `PhotographTask`; with `similarity`, the subject is set upright."""
+        subject = super().subject(inputs)
+        return upright(subject) if self.similarity else subject
 
     def judged(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a field that a run ended on; see `bench.setup.inputs.Judges`."""
+        """The metrics of a run's final field; see `bench.setup.inputs.Judges`."""
         if run.inputs.photographed is None:
             return evaluate(State(field, run.inputs)).metrics
         subject = self.subject(run.inputs)
-        found = judge_mesh(coloured(field, subject, run.inputs), subject, run.inputs)
-        return found.metrics | subject.judged(found.mesh, run.inputs)
+        evaluation = judge_mesh(coloured(field, subject, run.inputs), subject, run.inputs)
+        return evaluation.metrics | subject.point_metrics(evaluation.mesh, run.inputs)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
-        """The problem of a scene: the code, and where it is misplaced at the start a similarity transform."""
+        """The problem of a scene: the code and, if the initial shape is misplaced, a similarity transform."""
         check_field_gradient(renderer)
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
         photographs = self.images.take(scene.cast_on, scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        return self._problem(prior, GivenPhotographs(self, renderer, photographs, device), generator)
+        return self._problem(prior, PhotometricLoss(self, renderer, photographs, device), generator)
 
-    def _problem(self, prior: Prior, given: "GivenPhotographs", generator: torch.Generator) -> CodeProblem:
+    def _problem(self, prior: Prior, photometric_loss: "PhotometricLoss", generator: torch.Generator) -> CodeProblem:
         if len(prior.codes) < 2:
             raise BadInput("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")
-        spread = self.start_scale * prior.codes.std(0)
-        codes = spread * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
-        misplaced = self._misplaced(generator) if self.sought else None
-        observed = torch.zeros(given.colours.shape[1:3], dtype=torch.bool, device="cpu")
+        code_std = self.start_scale * prior.codes.std(0)
+        codes = code_std * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
+        misplaced = self._initial_similarity(generator) if self.optimises_similarity else None
+        observed = torch.zeros(photometric_loss.colours.shape[1:3], dtype=torch.bool, device="cpu")
         return CodeProblem(
             prior,
             self.code,
-            given.compare,
+            photometric_loss.compare,
             observed,
-            2 * given.per_step * observed.numel(),
-            given.colours.device,
+            2 * photometric_loss.per_step * observed.numel(),
+            photometric_loss.colours.device,
             initial=codes,
-            misplaced=turned(self.starts) if given.own and self.similarity else misplaced,
+            misplaced=turned(self.starts) if photometric_loss.from_user and self.similarity else misplaced,
             trial=self.trial,
-            photographs=given.colours.cpu().numpy(),
-            compared_at=self.optimiser.iterations,  # where images are no longer blurred
+            photographs=photometric_loss.colours.cpu().numpy(),
+            compared_at=self.optimiser.iterations,  # images are no longer blurred
         )
 
-    def _misplaced(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
-        """A similarity transform of the given size in random directions, the same for all starts."""
+    def _initial_similarity(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
+        """A similarity transform of the set magnitude in random directions, the same for all starts."""
         axis, direction = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=1)
         similarity = torch.cat([self.shift * direction, radians(self.degrees) * axis, torch.tensor([self.scale]).log()])
         return similarity.expand(self.starts, -1)
 
 
-class GivenPhotographs:
-    """The given photographs; `compare` renders a field's depths and warps the photographs by them."""
+class PhotometricLoss:
+    """Compares photographs: `compare` renders a field's depths and warps the photographs by them."""
 
     def __init__(
         self,
@@ -237,14 +236,14 @@ class GivenPhotographs:
         photographs: Sequence[Shot],
         device: torch.device,
         *,
-        own: bool = False,
+        from_user: bool = False,
     ):
-        """Keeps what is compared; photographs of one's own have any order, and perhaps masks that are compared, too.
+        """Stores the photographs. The user's photographs have any order: neighbours are chosen by distance.
 
         Raises:
-            BadInput: where photographs differ in size.
+            BadInput: if photographs differ in size.
         """
-        self.settings, self.renderer, self.own = settings, renderer, own
+        self.settings, self.renderer, self.from_user = settings, renderer, from_user
         if len({photograph.colours.shape for photograph in photographs}) > 1:
             raise BadInput("task=multiview compares photographs of one size, and these differ: leave others out")
         self.cameras = [photograph.camera.to(device) for photograph in photographs]
@@ -252,49 +251,49 @@ class GivenPhotographs:
         self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
         self.per_step = min(settings.views_per_step, len(photographs))
         count = len(photographs)
-        masks = [one.mask for one in photographs if settings.silhouette_weight and one.mask is not None]
-        self.others = [(view + settings.neighbour) % count for view in range(count)]
-        if own:
-            places = torch.stack([camera.center for camera in self.cameras])
-            nearest = torch.cdist(places, places).argsort(dim=1)  # the first is the view itself
-            self.others = nearest[:, min(settings.neighbour, count - 1)].tolist()
+        masks = [shot.mask for shot in photographs if settings.silhouette_weight and shot.mask is not None]
+        self.neighbours = [(view + settings.neighbour) % count for view in range(count)]
+        if from_user:
+            centres = torch.stack([camera.center for camera in self.cameras])
+            nearest = torch.cdist(centres, centres).argsort(dim=1)  # the first is the view itself
+            self.neighbours = nearest[:, min(settings.neighbour, count - 1)].tolist()
         self.masks = torch.stack(masks).to(device) if masks else None
 
     def pairs(self, iteration: int) -> list[tuple[int, int]]:
         """The views that an iteration compares, evenly spaced, each paired with its neighbour; they shift by one."""
         count = len(self.cameras)
         views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
-        return [(view, self.others[view]) for view in views]
+        return [(view, self.neighbours[view]) for view in views]
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
 
         Raises:
-            NotReached: where no pixel is seen by both views.
+            NotReached: if no pixel is visible in both views.
         """
         renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration)
-        colours = self.blurred(iteration)
+        colours = self.images_at(iteration)
         views, neighbours = map(list, zip(*pairs, strict=True))
-        rays = self._together(views)
-        mine = render_checked(renderer, field, rays)
+        rays = self._stack_rays(views)
+        rendering = render_checked(renderer, field, rays)
         with torch.no_grad():
-            others = render_checked(renderer, field, self._together(neighbours))
+            neighbour_rendering = render_checked(renderer, field, self._stack_rays(neighbours))
         differences = []
         for k, (view, other) in enumerate(pairs):
-            pixels, depth = self.cameras[other].project(mine.points[k])
+            pixels, depth = self.cameras[other].project(rendering.points[k])
             with torch.no_grad():
-                there = self.cameras[other].depth(others.distance[k])
-                seen = mine.hit[k] & self._sees(there, others.hit[k], pixels, depth)
-            warped, _ = sample(colours[other], pixels[seen])
-            differences.append((warped - colours[view][seen]).abs().mean(-1))
-        together = torch.cat(differences)
-        if not len(together):
+                neighbour_depth = self.cameras[other].depth(neighbour_rendering.distance[k])
+                visible = rendering.hit[k] & self._sees(neighbour_depth, neighbour_rendering.hit[k], pixels, depth)
+            warped, _ = sample(colours[other], pixels[visible])
+            differences.append((warped - colours[view][visible]).abs().mean(-1))
+        errors = torch.cat(differences)
+        if not len(errors):
             raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
-        terms = {"photometric": self.settings.photometric_weight * together.mean()}
+        terms = {"photometric": self.settings.photometric_weight * errors.mean()}
         if self.masks is not None:
-            given = RayObservation(self.masks[views], torch.full_like(mine.distance, torch.nan))
-            off = self.settings.silhouette(renderer, field, rays, mine, given)
-            terms["silhouette"] = self.settings.silhouette_weight * off
+            observation = RayObservation(self.masks[views], torch.full_like(rendering.distance, torch.nan))
+            silhouette = self.settings.silhouette(renderer, field, rays, rendering, observation)
+            terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
 
     def _sees(
@@ -304,34 +303,34 @@ class GivenPhotographs:
         pixels: Float[Tensor, "height width 2"],
         expected: Float[Tensor, "height width"],
     ) -> Bool[Tensor, "height width"]:
-        """Where a view's depth agrees with that of points of another view that project to `pixels` (DIST, B.3)."""
-        both = torch.stack([depth * hit, hit.to(depth.dtype)], dim=-1)
-        known, inside = sample(both, pixels)
-        close = (known[..., 0] - expected).square() < self.settings.visible
-        return inside & close & (known[..., 1] > SURE)
+        """Whether a view's depth agrees with `expected`, of another view's points at `pixels` (DIST, B.3)."""
+        depth_and_weight = torch.stack([depth * hit, hit.to(depth.dtype)], dim=-1)
+        interpolated, inside = sample(depth_and_weight, pixels)
+        close = (interpolated[..., 0] - expected).square() < self.settings.visible
+        return inside & close & (interpolated[..., 1] > MIN_INTERPOLATION_WEIGHT)
 
-    def _together(self, views: list[int]) -> Rays:
+    def _stack_rays(self, views: list[int]) -> Rays:
         chosen = [self.rays[view] for view in views]
         origins = torch.stack([rays.origins for rays in chosen])
         return Rays(origins, torch.stack([rays.directions for rays in chosen]), image=True)
 
-    def blurred(self, iteration: int) -> Float[Tensor, "views height width 3"]:
-        """The images at an iteration, blurred at first where `coarse_blur` is set."""
-        iterations = self.settings.turns.iterations_of_last(self.settings.optimiser.iterations)
+    def images_at(self, iteration: int) -> Float[Tensor, "views height width 3"]:
+        """The images at an iteration; `coarse_blur` blurs them in the first half."""
+        iterations = self.settings.start_settings.iterations_of_last(self.settings.optimiser.iterations)
         sigma = self.settings.coarse_blur * self.colours.shape[1] * (1 - 2 * iteration / iterations)
-        return self.colours if sigma <= 0 else blurred(self.colours, sigma)
+        return self.colours if sigma <= 0 else blur(self.colours, sigma)
 
 
-def blurred(images: Float[Tensor, "views height width 3"], sigma: float) -> Float[Tensor, "views height width 3"]:
+def blur(images: Float[Tensor, "views height width 3"], sigma: float) -> Float[Tensor, "views height width 3"]:
     """Images convolved with a Gaussian of standard deviation `sigma` in pixels; mirrored at their edges."""
-    reach = min(int(3 * sigma) + 1, images.shape[1] - 1, images.shape[2] - 1)
-    offsets = torch.arange(-reach, reach + 1, dtype=images.dtype, device=images.device)
+    radius = min(int(3 * sigma) + 1, images.shape[1] - 1, images.shape[2] - 1)
+    offsets = torch.arange(-radius, radius + 1, dtype=images.dtype, device=images.device)
     weights = torch.softmax(-0.5 * (offsets / sigma).square(), dim=0)
-    flat = images.permute(0, 3, 1, 2).reshape(-1, 1, *images.shape[1:3])
-    padded = torch.nn.functional.pad(flat, (reach, reach, reach, reach), mode="reflect")
-    across = torch.nn.functional.conv2d(padded, weights.view(1, 1, 1, -1))
-    both = torch.nn.functional.conv2d(across, weights.view(1, 1, -1, 1))
-    return both.view(len(images), 3, *images.shape[1:3]).permute(0, 2, 3, 1)
+    channels = images.permute(0, 3, 1, 2).reshape(-1, 1, *images.shape[1:3])
+    padded = torch.nn.functional.pad(channels, (radius, radius, radius, radius), mode="reflect")
+    horizontal = torch.nn.functional.conv2d(padded, weights.view(1, 1, 1, -1))
+    smoothed = torch.nn.functional.conv2d(horizontal, weights.view(1, 1, -1, 1))
+    return smoothed.view(len(images), 3, *images.shape[1:3]).permute(0, 2, 3, 1)
 
 
 def sample(
@@ -345,12 +344,12 @@ def sample(
     """
     height, width, _ = image.shape
     inside = (pixels >= 0.5).all(-1) & (pixels[..., 0] <= width - 0.5) & (pixels[..., 1] <= height - 0.5)
-    place = torch.where(inside[..., None], pixels, 0.5) - 0.5
-    last = torch.tensor([max(width - 2, 0), max(height - 2, 0)], dtype=place.dtype, device=place.device)
-    low = torch.minimum(place.detach().floor(), last)
-    across, down = (place - low)[..., :1], (place - low)[..., 1:]
-    column, row = low.long().unbind(-1)
+    position = torch.where(inside[..., None], pixels, 0.5) - 0.5
+    last = torch.tensor([max(width - 2, 0), max(height - 2, 0)], dtype=position.dtype, device=position.device)
+    corner = torch.minimum(position.detach().floor(), last)
+    right_weight, lower_weight = (position - corner)[..., :1], (position - corner)[..., 1:]
+    column, row = corner.long().unbind(-1)
     right, below = (column + 1).clamp_max(width - 1), (row + 1).clamp_max(height - 1)
-    upper = image[row, column] * (1 - across) + image[row, right] * across
-    lower = image[below, column] * (1 - across) + image[below, right] * across
-    return (upper * (1 - down) + lower * down) * inside[..., None], inside
+    upper = image[row, column] * (1 - right_weight) + image[row, right] * right_weight
+    lower = image[below, column] * (1 - right_weight) + image[below, right] * right_weight
+    return (upper * (1 - lower_weight) + lower * lower_weight) * inside[..., None], inside

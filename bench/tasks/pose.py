@@ -1,4 +1,4 @@
-"""Camera pose: optimise the camera of a depth image and silhouette of a known shape (DIST, Sec. 4.1, Fig. 6)."""
+"""Camera pose: optimises the camera of a depth image and mask of a known shape (DIST, Sec. 4.1, Fig. 6)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -33,8 +33,8 @@ DEFINITIONS = {
     "success": "1 where both errors are at most task.success_degrees and task.success_distance, else 0",
 }
 TRACKED = tuple(DEFINITIONS)
-SEEN = "By exact first hits of the known mesh, the same for every method."
-SEEN_DEFINITIONS = DEFINITIONS | {name: f"{text} {SEEN}" for name, text in IMAGE.items()}
+MESH_VIEW_NOTE = "By exact first hits of the known mesh, the same for every method."
+MESH_VIEW_DEFINITIONS = DEFINITIONS | {name: f"{text} {MESH_VIEW_NOTE}" for name, text in IMAGE.items()}
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class PoseTask(ABC):
     """A task that finds a camera: its initial cameras, and its criteria of success.
 
     Args:
-        degrees: error in rotation of the initial camera, about a random axis through the object's origin.
-        shift: its error in translation, in a random direction, in scene units.
-        starts: number of starts: the initial camera, and others that are rotated from it at random.
+        degrees: rotation error of the initial camera, about a random axis through the object's origin.
+        shift: translation error of the initial camera, in a random direction, in scene units.
+        starts: number of starts: the initial camera, and random rotations of it.
         spread: largest angle of these rotations, in degrees.
         success_degrees, success_distance: largest errors that count as success, in degrees and scene units.
     """
@@ -73,28 +73,28 @@ class PoseTask(ABC):
         """The initial cameras; the first one's errors are exactly `degrees` and `shift`."""
         generator = torch.Generator().manual_seed(seed)
         axis, direction = _directions(2, generator)
-        turned = true.with_object_moved(torch.cat([torch.zeros(3), radians(self.degrees) * axis]))
-        given = turned.with_object_moved(torch.cat([self.shift * direction, torch.zeros(3)]))
+        rotated = true.with_object_moved(torch.cat([torch.zeros(3), radians(self.degrees) * axis]))
+        initial = rotated.with_object_moved(torch.cat([self.shift * direction, torch.zeros(3)]))
         angles = radians(self.spread) * torch.rand(self.starts - 1, 1, generator=generator)
         turns = angles * _directions(self.starts - 1, generator)
-        return [given, *(given.with_object_moved(torch.cat([torch.zeros(3), turn])) for turn in turns)]
+        return [initial, *(initial.with_object_moved(torch.cat([torch.zeros(3), turn])) for turn in turns)]
 
-    def metrics(self, found: Camera, true: Camera) -> dict[str, float]:
+    def metrics(self, estimate: Camera, true: Camera) -> dict[str, float]:
         """The metrics of `DEFINITIONS`."""
-        rotation, translation = pose_error(found, true)
+        rotation, translation = pose_error(estimate, true)
         success = rotation <= self.success_degrees and translation <= self.success_distance
         return {"rotation_error_deg": rotation, "translation_error": translation, "success": float(success)}
 
-    def evaluate(self, found: Camera, scene: Scene, own: View | None = None) -> Evaluation:
-        """The metrics of the pose and of its view; a note where it was not found, which changes no status.
+    def evaluate(self, estimate: Camera, scene: Scene, rendering: View | None = None) -> Evaluation:
+        """The metrics of the pose and of its view; a note if the pose is wrong, which does not change the status.
 
         Args:
-            scene: the known mesh and the given view.
-            own: what the renderer under test sees from the found camera, where there is one.
+            scene: the known mesh and the observed view.
+            rendering: the view of the renderer under test from the estimated camera, if any.
         """
-        seen, true = see(scene.cast_on, found), scene.view
-        images = view_metrics(seen, true) | ({} if own is None else view_metrics(own, true, OWN))
-        metrics = self.metrics(found, true.camera)
+        mesh_view, true = see(scene.cast_on, estimate), scene.view
+        images = view_metrics(mesh_view, true) | ({} if rendering is None else view_metrics(rendering, true, OWN))
+        metrics = self.metrics(estimate, true.camera)
         rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
         note = f"the pose was not found: it is {rotation:.1f} degrees and {distance:.3f} scene units off"
         return Evaluation(metrics | images, notes=() if metrics["success"] else (note,))
@@ -102,19 +102,19 @@ class PoseTask(ABC):
 
 @dataclass(frozen=True)
 class Pose(PoseTask):
-    """Finds the camera of a depth image and a silhouette from a perturbed start; the shape is known.
+    """Finds the camera of a depth image and a mask from a perturbed start; the shape is known.
 
     Args:
         degrees, shift, starts, spread, success_degrees, success_distance: see `PoseTask`.
-        trial: iterations of each start, where there are several; see `bench.solve.optimise.StartSettings`.
+        trial: iterations of each start if there are several; see `bench.solve.optimise.StartSettings`.
         shape: field of the known shape: "grid", distances of the mesh on a grid; "prior", the network at the scene's
             code, which must be a training shape.
         grid: samples per axis of the grid.
-        depth_loss, depth_weight: over pixels that both hit; see `bench.tasks.completion.Completion`.
-        silhouette: loss of the mask.
-        silhouette_weight: of that loss.
-        normal_weight: of the mean of one minus the cosine between normals there, in camera axes; its gradient rotates
-            the normals and does not move the points.
+        depth_loss, depth_weight: over pixels on the object that hit; see `bench.tasks.completion.Completion`.
+        silhouette: the silhouette loss.
+        silhouette_weight: weight of the silhouette loss.
+        normal_weight: weight of one minus the cosine between normals in camera axes, the mean over the same pixels. Its
+            gradient rotates the normals and does not move the points.
         optimiser: iterations and learning rates.
     """
 
@@ -138,7 +138,7 @@ class Pose(PoseTask):
         super().__post_init__()
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput where the shape is to be known by a network that was not fitted to it."""
+        """Raises BadInput if the known shape should be a network, but none was fitted to it."""
         if self.shape == "prior":
             inputs.check_fitted()
 
@@ -146,22 +146,22 @@ class Pose(PoseTask):
         """Optimises the pose, and evaluates it before and after.
 
         Raises:
-            Unsupported: where the renderer has no gradient towards rays, or does not support the shape's field.
+            Unsupported: if the renderer has no gradient for rays, or does not support the shape's field.
         """
         inputs, view = run.inputs, run.inputs.scene.view
         if not inputs.renderer.capabilities.ray_gradient:
             name = type(inputs.renderer).__name__
             raise Unsupported(f"{name} has no gradient towards rays, so none towards a camera")
-        known = known_shape(self, inputs)
+        shape_field = build_shape_field(self, inputs)
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
 
         def problem() -> PoseProblem:
-            return PoseProblem(self, inputs.renderer, known, view, cameras, inputs.device)
+            return PoseProblem(self, inputs.renderer, shape_field, view, cameras, inputs.device)
 
-        solve(problem, self.optimiser, run, SEEN_DEFINITIONS | OWN_DEFINITIONS)
+        solve(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | OWN_DEFINITIONS)
 
 
-def known_shape(settings: Pose, inputs: RunInputs) -> Field:
+def build_shape_field(settings: Pose, inputs: RunInputs) -> Field:
     """The field of the scene's shape, of the kind that `settings.shape` names."""
     if settings.shape == "prior":
         fitted = inputs.fitted()
@@ -172,11 +172,11 @@ def known_shape(settings: Pose, inputs: RunInputs) -> Field:
 
 @dataclass
 class PoseProblem:
-    """The problem of a camera: its parameters are a rigid motion of the object from each start."""
+    """The problem of a camera. Its parameters are a rigid motion of the object for each start."""
 
     settings: Pose
     renderer: Renderer
-    known: Field
+    shape_field: Field
     view: View
     cameras: list[Camera]  # one per start
     device: torch.device
@@ -195,15 +195,15 @@ class PoseProblem:
 
     def field(self) -> Field:
         """The known shape."""
-        return self.known
+        return self.shape_field
 
     def objective(self) -> None:
         """None: the losses of all iterations are comparable."""
 
     def evaluate(self, state: State) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""
-        own = render_view(self.known, self.camera(), state.inputs)
-        return self.settings.evaluate(own.camera, state.inputs.scene, own)
+        view = render_view(self.shape_field, self.camera(), state.inputs)
+        return self.settings.evaluate(view.camera, state.inputs.scene, view)
 
     def checkpoint(self, state: State) -> dict[str, float]:
         """The errors of the current camera."""
@@ -214,31 +214,33 @@ class PoseProblem:
         draw_curve(folder / "curve.png", curve)
 
     def camera(self) -> Camera:
-        """The current camera, on the CPU; its initial one where the parameters are not finite."""
+        """The current camera, on the CPU; the initial one if the parameters are not finite."""
         best = self.starts.best()
         twist = self.parameters[best].detach()
-        found = self.cameras[best].with_object_moved(twist) if bool(twist.isfinite().all()) else self.cameras[best]
-        return found.to(torch.device("cpu"))
+        camera = self.cameras[best].with_object_moved(twist) if bool(twist.isfinite().all()) else self.cameras[best]
+        return camera.to(torch.device("cpu"))
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
         start, step = self.starts.turn(iteration)
         camera = self.cameras[start].with_object_moved(self.parameters[start])
-        renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.known, self.counts)
+        renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.shape_field, self.counts)
         rendering = render_checked(renderer, metered, rays)
         compared = self.observed & rendering.hit
         count = compared.sum().clamp_min(1)
-        found, at_one = camera.depth(rendering.distance), camera.depth(torch.ones_like(self.depth))
-        error = depth_error(self.settings.depth_loss, found, self.depth, at_one)
-        given = RayObservation(self.observed, torch.where(self.observed, self.depth / at_one, torch.nan))
-        silhouette = self.settings.silhouette(renderer, metered, rays, rendering, given)
+        depth, depth_per_distance = camera.depth(rendering.distance), camera.depth(torch.ones_like(self.depth))
+        error = depth_error(self.settings.depth_loss, depth, self.depth, depth_per_distance)
+        observation = RayObservation(
+            self.observed, torch.where(self.observed, self.depth / depth_per_distance, torch.nan)
+        )
+        silhouette = self.settings.silhouette(renderer, metered, rays, rendering, observation)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,
             "silhouette": self.settings.silhouette_weight * silhouette,
         }
         if self.settings.normal_weight:
-            found = in_camera_axes(autograd_normals(metered, rendering.points[compared].detach()), camera)
-            terms["normals"] = self.settings.normal_weight * normal_error(found, self.normals[compared])
+            normals = in_camera_axes(autograd_normals(metered, rendering.points[compared].detach()), camera)
+            terms["normals"] = self.settings.normal_weight * normal_error(normals, self.normals[compared])
         total = torch.stack(list(terms.values())).sum()
         self.starts.note(start, step, total)
         return {"total": total, **terms}
@@ -249,12 +251,12 @@ def in_camera_axes(normals: Float[Tensor, "*batch 3"], camera: Camera) -> Float[
     return normals @ camera.world_to_camera[:3, :3].T
 
 
-def pose_error(found: Camera, true: Camera) -> tuple[float, float]:
-    """The errors in rotation (degrees) and translation (scene units) between two cameras; see `DEFINITIONS`."""
-    mine, theirs = found.world_to_camera.detach().double().cpu(), true.world_to_camera.double().cpu()
-    between = mine[:3, :3] @ theirs[:3, :3].T
-    sine, cosine = (between - between.T).norm() / sqrt(8), (between.diagonal().sum() - 1) / 2
-    return degrees(atan2(sine.item(), cosine.item())), (mine[:3, 3] - theirs[:3, 3]).norm().item()
+def pose_error(estimate: Camera, true: Camera) -> tuple[float, float]:
+    """The rotation error (degrees) and translation error (scene units) between two cameras; see `DEFINITIONS`."""
+    estimated, expected = estimate.world_to_camera.detach().double().cpu(), true.world_to_camera.double().cpu()
+    difference = estimated[:3, :3] @ expected[:3, :3].T
+    sine, cosine = (difference - difference.T).norm() / sqrt(8), (difference.diagonal().sum() - 1) / 2
+    return degrees(atan2(sine.item(), cosine.item())), (estimated[:3, 3] - expected[:3, 3]).norm().item()
 
 
 def _directions(count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:

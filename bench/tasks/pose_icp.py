@@ -11,7 +11,7 @@ from torch import Tensor
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.solve import note_result
-from bench.tasks.pose import SEEN_DEFINITIONS, PoseTask
+from bench.tasks.pose import MESH_VIEW_DEFINITIONS, PoseTask
 from datasets.scene import Surface, View, sample_surface
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
@@ -35,7 +35,7 @@ class PoseICP(PoseTask):
         method: "point_to_point" (Besl and McKay 1992) or "point_to_plane" (Chen and Medioni 1992).
         points: number of points sampled on the known mesh.
         reach: largest distance of corresponding points in each pass, in scene units.
-        iterations: most iterations in each pass.
+        iterations: maximum iterations in each pass.
     """
 
     method: str
@@ -56,25 +56,25 @@ class PoseICP(PoseTask):
     def execute(self, run: RunContext) -> None:
         """Registers the points of the depth image to the mesh, and evaluates the camera before and after."""
         inputs, record, view = run.inputs, run.record, run.inputs.scene.view
-        record.definitions = SEEN_DEFINITIONS | COSTS
+        record.definitions = MESH_VIEW_DEFINITIONS | COSTS
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
         record.metrics_start = self.evaluate(cameras[0], inputs.scene).metrics
         sampled = sample_surface(inputs.scene.mesh, self.points, inputs.seed)
-        tried = []
+        registered = []
         with run.on_clock():
             for camera in cameras:
-                run.progress("registering points", len(tried), len(cameras))
-                tried.append(self._register(camera, view, sampled))
-        run.progress("registering points", len(tried), len(cameras))
-        found, distance = min(tried, key=lambda result: result[1])
+                run.progress("registering points", len(registered), len(cameras))
+                registered.append(self._register(camera, view, sampled))
+        run.progress("registering points", len(registered), len(cameras))
+        best, distance = min(registered, key=lambda result: result[1])
         record.evaluations = {"value": 0, "gradient": 0, "starts": len(cameras), "observed": int(view.mask.sum())}
         with run.off_clock():
-            after = self.evaluate(found, inputs.scene)
+            after = self.evaluate(best, inputs.scene)
         failure = (RunStatus.NOT_REACHED, "no point of the depth image came within task.reach of the mesh")
         note_result(run, replace(after, failure=None if np.isfinite(distance) else failure))
 
     def _register(self, camera: Camera, view: View, sampled: Surface) -> tuple[Camera, float]:
-        """The camera found from one start, and the mean distance of its points from the known ones."""
+        """The registered camera of one start, and the mean distance of its points from the mesh's points."""
         import open3d
 
         registration = open3d.pipelines.registration
@@ -82,26 +82,26 @@ class PoseICP(PoseTask):
             "point_to_point": registration.TransformationEstimationPointToPoint,
             "point_to_plane": registration.TransformationEstimationPointToPlane,
         }[self.method]()
-        seen, known = open3d.geometry.PointCloud(), open3d.geometry.PointCloud()
-        seen.points = open3d.utility.Vector3dVector(world_points(view, camera).double().numpy())
-        known.points = open3d.utility.Vector3dVector(sampled.points)
-        known.normals = open3d.utility.Vector3dVector(sampled.normals)
+        depth_cloud, mesh_cloud = open3d.geometry.PointCloud(), open3d.geometry.PointCloud()
+        depth_cloud.points = open3d.utility.Vector3dVector(world_points(view, camera).double().numpy())
+        mesh_cloud.points = open3d.utility.Vector3dVector(sampled.points)
+        mesh_cloud.normals = open3d.utility.Vector3dVector(sampled.normals)
         motion = np.eye(4)
         criteria = registration.ICPConvergenceCriteria(max_iteration=self.iterations)
         for reach in self.reach:
-            result = registration.registration_icp(seen, known, reach, motion, estimate, criteria)
+            result = registration.registration_icp(depth_cloud, mesh_cloud, reach, motion, estimate, criteria)
             motion = result.transformation
-        seen.transform(motion)
-        distance = float(np.mean(seen.compute_point_cloud_distance(known))) if result.fitness > 0 else np.inf
-        back = torch.from_numpy(np.linalg.inv(motion).copy()).float()
-        moved = Camera(camera.intrinsics, _rigid_part(camera.world_to_camera @ back), camera.height, camera.width)
-        return moved, distance
+        depth_cloud.transform(motion)
+        distances = depth_cloud.compute_point_cloud_distance(mesh_cloud) if result.fitness > 0 else [np.inf]
+        inverse = torch.from_numpy(np.linalg.inv(motion).copy()).float()
+        moved = Camera(camera.intrinsics, _rigid_part(camera.world_to_camera @ inverse), camera.height, camera.width)
+        return moved, float(np.mean(distances))
 
 
 def world_points(view: View, camera: Camera) -> Float[Tensor, "n 3"]:
     """The points of a depth image in world axes, if `camera` had taken it."""
-    along = camera.depth(torch.ones(view.depth.shape))  # camera z of a point at distance 1
-    return camera.rays().at(view.depth / along)[view.mask]
+    depth_per_distance = camera.depth(torch.ones(view.depth.shape))
+    return camera.rays().at(view.depth / depth_per_distance)[view.mask]
 
 
 def _rigid_part(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -1,4 +1,4 @@
-"""The oracle: a prior's code fitted to the true distances of a shape, a bound for all methods that use the prior."""
+"""The best possible fit of a prior: its code fitted to the true distances of a shape."""
 
 from dataclasses import dataclass
 
@@ -16,25 +16,25 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, autograd_gradients
 from renderers.rendering import Renderer
 
-NEAR = 0.02  # scene units: the field is evaluated as a distance within this of the true surface
+MAX_OFFSET = 0.02  # scene units: the field's distance error is measured this close to the true surface
 DEFINITIONS = {
     "floor_chamfer_l2": "chamfer_l2 between two independent samplings of the true surface, the least that can be "
     "measured; in squared scene units.",
-    "distance_error": f"Mean absolute error of the field within {NEAR} of the true surface, in scene units.",
-    "slope_median": f"Median length of the field's gradient within {NEAR} of the true surface; 1 for a distance.",
+    "distance_error": f"Mean absolute error of the field within {MAX_OFFSET} of the true surface, in scene units.",
+    "slope_median": f"Median length of the field's gradient within {MAX_OFFSET} of the true surface; 1 for a distance.",
     "slope_p99": "99th percentile of the length of the gradient there.",
 }
 
 
 @dataclass(frozen=True)
 class PriorFit:
-    """Fits a code to signed distances of the true mesh: the oracle.
+    """Fits a code to signed distances of the true mesh: the best possible result of methods that use the prior.
 
-    The renderer takes no part in the fit: it renders only the pictures and the evaluated images.
+    The renderer is not used in the fit, only for pictures and the evaluation.
 
     Args:
         distances: number of signed distances of the shape.
-        batch: number of them that an iteration draws.
+        batch: number of distances in an iteration.
         surface_width: see `bench.shape_prior.PriorSettings`.
         code: penalty on the code.
         optimiser: iterations and learning rates.
@@ -56,25 +56,25 @@ class PriorFit:
         inputs, record = run.inputs, run.record
         state = solve_task(self, run)
         record.definitions |= DEFINITIONS
-        again = sample_surface(inputs.scene.mesh, inputs.evaluation.points, inputs.seed + 1)
-        floor = surface_metrics(again, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
+        resampled = sample_surface(inputs.scene.mesh, inputs.evaluation.points, inputs.seed + 1)
+        floor = surface_metrics(resampled, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
         points, distances = sample_distances(inputs.scene.mesh, self.distances, inputs.seed + 1)
-        close = distances.abs() < NEAR
+        close = distances.abs() < MAX_OFFSET
         points, distances = points[close].to(inputs.device), distances[close].to(inputs.device)
-        lengths = autograd_gradients(state.field, points).norm(dim=-1)
-        middle, high = lengths.double().quantile(torch.tensor([0.5, 0.99], dtype=torch.float64).to(lengths.device))
+        slopes = autograd_gradients(state.field, points).norm(dim=-1)
+        median, p99 = slopes.double().quantile(torch.tensor([0.5, 0.99], dtype=torch.float64).to(slopes.device))
         with torch.no_grad():
             error = (state.field(points) - distances).abs().mean()
         record.metrics |= {
             "floor_chamfer_l2": floor["chamfer_l2"],
             "distance_error": error.item(),
-            "slope_median": middle.item(),
-            "slope_p99": high.item(),
+            "slope_median": median.item(),
+            "slope_p99": p99.item(),
         }
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
-        found, true = state.pictured(camera), see(inputs.scene.cast_on, camera)
-        save_images(run.folder, found, true)
+        predicted, true = state.pictured(camera), see(inputs.scene.cast_on, camera)
+        save_images(run.folder, predicted, true)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device

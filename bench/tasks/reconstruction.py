@@ -20,8 +20,8 @@ from renderers.checks import check_at_least, check_choice
 from renderers.field import Field
 from renderers.rendering import check_kind
 
-UNMASKED = "without masks nothing says where the object ends: expect the shape to keep what is behind it"
-UNCOUNTED = {
+UNMASKED_WARNING = "without masks nothing says where the object ends: expect the shape to keep what is behind it"
+COUNT_DEFINITIONS = {
     "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "
     "foreground in each iteration, in a volume one per sample with a weight, nor second derivatives"
 }
@@ -29,16 +29,16 @@ UNCOUNTED = {
 
 @dataclass(frozen=True)
 class Reconstruction(PhotographTask):
-    """A field with colours, from a sphere, such that its renderings are the photographs.
+    """Learns a field with colours, starting from a sphere, so that its renderings match the photographs.
 
     Args:
         images, longest, held_out, masks, depths: see `PhotographTask`.
         guide: distances that a silhouette loss may use, such as `silhouette=occupancy` with `occupied_at: depth` (DVR,
-            Sec. 3.4): "none", "given" depths, or where rays meet the visual "hull", and given depths before these.
-        rays: pixels that are drawn in each iteration.
-        appearance: of the field, beside its size.
-        auto: the fields that `field=auto` tries, and how.
-        losses: of the renderings.
+            Sec. 3.4): "none", "given" depths, or "hull": given depths, and at other pixels the visual hull's.
+        rays: number of pixels drawn in each iteration.
+        appearance: settings of the field, except its size.
+        auto: settings of `field=auto`.
+        losses: losses of the renderings.
         optimiser: iterations and learning rates.
     """
 
@@ -59,26 +59,26 @@ class Reconstruction(PhotographTask):
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
 
     def execute(self, run: RunContext) -> None:
-        """Learns the field, and judges it before and after."""
+        """Learns the field, and evaluates it before and after."""
         name, inputs = run.inputs.field.name, run.inputs
         check_field_gradient(inputs.renderer)
         with torch.random.fork_rng():
             candidates = self.auto.candidates if name == AUTO else (name,)
             models = {candidate: self.appearance.make(candidate) for candidate in candidates}
-        for model in models.values():  # told before photographs are read
+        for model in models.values():  # before the slow reading of photographs
             check_kind(inputs.renderer, model.field)
-        definitions = COLOURED_DEFINITIONS | UNCOUNTED | (DEFINITIONS if name == AUTO else {})
+        definitions = COLOURED_DEFINITIONS | COUNT_DEFINITIONS | (DEFINITIONS if name == AUTO else {})
         run.record.definitions = dict(definitions)
         subject = self.subject(inputs)
-        doubts = [UNMASKED] if subject.given[0].mask is None else []
-        run.record.notes = [*run.record.notes, subject.found, *doubts]
+        warnings = [UNMASKED_WARNING] if subject.input_shots[0].mask is None else []
+        run.record.notes = [*run.record.notes, subject.summary, *warnings]
         if name != AUTO:
             solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
             subject.finish(run)
             return
-        with torch.random.fork_rng():  # so that the run is that of the field which it ends on
-            sizes = {name: sum(one.numel() for one in model.parameters()) for name, model in models.items()}
-            choice = self.auto.choose(lambda n, part: self.problem(n, part, run), sizes, subject, self.optimiser, run)
+        with torch.random.fork_rng():  # the final run is the same as a run of the chosen field alone
+            sizes = {name: sum(tensor.numel() for tensor in model.parameters()) for name, model in models.items()}
+            choice = self.auto.choose(lambda n, s: self.problem(n, s, run), sizes, subject, self.optimiser, run)
         run.record.notes.append(choice.note)
         solve(lambda: self.problem(choice.kept.candidate, subject, run), self.optimiser, run, definitions)
         subject.finish(run)
@@ -87,17 +87,17 @@ class Reconstruction(PhotographTask):
         seconds["trials"] = choice.seconds
 
     def judged(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a field that a run ended on; see `bench.setup.inputs.Judges`."""
+        """The metrics of a run's final field; see `bench.setup.inputs.Judges`."""
         subject = self.subject(run.inputs)
-        found = judge(State(field, run.inputs), subject)
-        return found.metrics | subject.judged(found.mesh, run.inputs)
+        evaluation = judge(State(field, run.inputs), subject)
+        return evaluation.metrics | subject.point_metrics(evaluation.mesh, run.inputs)
 
     def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
-        """The problem of photographs with the field of a name."""
+        """The problem of learning the named field from photographs."""
         inputs = run.inputs
         model = self.appearance.make(name).to(inputs.device)
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
-        stack = Stack.of(subject.given, guide and guide(subject.given), inputs.device)
+        stack = Stack.build(subject.input_shots, guide and guide(subject.input_shots), inputs.device)
         iterations = self.optimiser.iterations
         return ReconstructionProblem(
             subject, stack, model, self.losses, inputs.renderer, self.rays, iterations, inputs.seed

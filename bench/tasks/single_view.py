@@ -37,46 +37,46 @@ DEFINITIONS = COLOURED_DEFINITIONS | {
     "iou": "intersection over union of the volumes, by points drawn evenly in the cube (DVR, Sec. 4.1), from 0 to 1; "
     "before: of the mean code of all training images"
 }
-TRAINING = {
+TRAINING_DEFINITIONS = {
     "seconds.training": "of the network, once for all shapes; not part of the run's time",
     "evaluations.training": "field values that the renderer asked for in the training of the network; not of the run",
 }
-SHIPPED_ROW = "+method=single_view"  # the settings of the networks that are shipped
+SHIPPED_ROW = "+method=single_view"  # has the settings of the shipped networks
 REMEDY = "add task.train=true, or give the same command to `python -m bench.train` first"
-COLOURS = ("psnr", "psnr_image", "ssim")  # scores of colours
-DECIDING = (  # settings that determine the network
+COLOUR_SCORES = ("psnr", "psnr_image", "ssim")
+NETWORK_SETTINGS = (  # settings that determine the network
     *("images", "image_pixels", "elevation", "shapes", "views"),
     *("network", "supervision", "training"),
 )
 FITTED = "fitted_mask_iou"
-OF_PICTURE = {
+PICTURE_DEFINITIONS = {
     FITTED: "Of the mask of the given picture and the silhouette of the shape from the best of many views, both scaled "
     "to the same box: number of pixels that are foreground in both divided by the number that are foreground in at "
     "least one. The camera of the picture is not known, so that nothing else can be judged."
 }
-TRIED = 200  # views in the search for that of a picture
+SEARCHED_VIEWS = 200  # candidates for the view of a picture
 
 
 @dataclass(frozen=True)
 class OneImage:
-    """A shape from one image of it; the other images of the shape judge it.
+    """Infers a shape from one image of it; the other images evaluate it.
 
     Args:
-        method: "network"; or without one, the prior's "code" that is found by the image's mask, the "mean" of the
-            training shapes, that with the "nearest" image, or the one that is "best" by the truth.
-        images: that are rendered of each shape, from random cameras of `view`.
-        image_pixels: height and width of these.
-        elevation: range of the cameras' angles above the horizon, in degrees; their azimuths are those of `view`.
-        shapes: of the training.
-        views: images of each that the training uses, the first ones.
-        given: number of the image that is given.
-        network: its sizes.
-        supervision: what its training may know.
-        training: of the network, by `python -m bench.train`.
-        search: of the prior's code.
-        train: whether a run trains the network where there is none; else it is refused.
-        image_path: of a picture of one's own, which takes the place of the dataset's shape; None without.
-        mask_path: of its mask; None: its alpha channel.
+        method: "network"; or without a network, the prior's "code" that matches the image's mask, the "mean" of the
+            training shapes, the training shape with the "nearest" image, or the "best" one by the truth.
+        images: settings of the images of each shape, from random cameras of `view`.
+        image_pixels: height and width of the images.
+        elevation: range of the cameras' angles above the horizon, in degrees; `view` has the range of azimuths.
+        shapes: number of training shapes.
+        views: number of images per training shape, the first ones.
+        given: index of the input image.
+        network: sizes of the network.
+        supervision: observations that the training may use.
+        training: settings of the training by `python -m bench.train`.
+        search: search of the prior's code.
+        train: whether a run trains a missing network; else the run is refused.
+        image_path: path of the user's picture, which replaces the dataset's shape; None: no picture.
+        mask_path: path of the picture's mask; None: its alpha channel.
     """
 
     method: str
@@ -115,16 +115,16 @@ class OneImage:
 
     @property
     def knows_colours(self) -> bool:
-        """Whether the training knows any colour."""
+        """Whether the training uses colours."""
         return self.supervision.losses.colour > 0
 
     def recipe(self, inputs: RunInputs, config: dict[str, Any]) -> Recipe:
-        """What determines the network that a run's configuration asks for."""
+        """The recipe that determines the network of a run's configuration."""
         check_field_gradient(inputs.renderer)
         sampler = replace(inputs.views, resolution=self.image_pixels, elevation=self.elevation)
-        settings = {name: config["task"][name] for name in DECIDING} | {"view": asdict(sampler)}
-        unsaid = {"keep_every": config["task"]["training"]["keep_every"], "schedule": "cosine"}  # as it always was
-        settings["training"] = {name: x for name, x in settings["training"].items() if unsaid.get(name) != x}
+        settings = {name: config["task"][name] for name in NETWORK_SETTINGS} | {"view": asdict(sampler)}
+        defaults = {"keep_every": config["task"]["training"]["keep_every"], "schedule": "cosine"}  # not in old hashes
+        settings["training"] = {name: x for name, x in settings["training"].items() if defaults.get(name) != x}
         if self.supervision.renders:
             renderer = {k: v for k, v in config["renderer"].items() if not k.startswith("_") or k == "_target_"}
             settings["renderer"] = renderer | ({"auto": config["auto"]} if AUTO in renderer.values() else {})
@@ -141,87 +141,85 @@ class OneImage:
         )
 
     def execute(self, run: RunContext) -> None:
-        """Infers the shape and judges it."""
+        """Infers the shape and evaluates it."""
         inputs, record = run.inputs, run.record
         recipe = self.recipe(inputs, record.config)
         record.evaluations = {"value": 0, "gradient": 0}
         if self.image_path is not None:
-            self._see(run, recipe, Path(self.image_path))
+            self._infer_picture(run, recipe, Path(self.image_path))
             return
-        record.definitions = DEFINITIONS | COSTS | TRAINING
+        record.definitions = DEFINITIONS | COSTS | TRAINING_DEFINITIONS
         images, subject = self._images(run, recipe)
         if self.method == NETWORK:
-            self._infer(run, recipe, images, subject)
+            self._infer_shape(run, recipe, images, subject)
         elif self.method == CODE:
             self._search(run, images, subject)
         else:
             self._look_up(run, recipe, images, subject)
 
     def judged(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a field that a run ended on; none for a picture of one's own, whose camera is not known."""
+        """The metrics of a run's final field; empty for the user's picture, whose camera is not known."""
         if self.image_path is not None:
             return {}
         images, subject = self._images(run, self.recipe(run.inputs, run.record.config))
         if self.method == NETWORK:
-            return self._judged(State(field, run.inputs), images, subject).metrics
+            return self._evaluate(State(field, run.inputs), images, subject).metrics
         mesh = coloured(field, subject, run.inputs)
         return judge_mesh(mesh, subject, run.inputs).metrics | {"iou": overlap(field, images, run.inputs.device)}
 
     def _images(self, run: RunContext, recipe: Recipe) -> tuple[ImagesOf, Subject]:
-        """The images of the scene's shape, and as photographs, of which one is given and all others judge."""
+        """The images of the scene's shape, and the subject: the input image, with all others held out."""
         config = run.record.config
         images = recipe.imaging.of_shape(recipe.dataset, Split(config["split"]), config["index"])
         shots = images.shots()
-        others = tuple(shot for place, shot in enumerate(shots) if place != self.given)
+        others = tuple(shot for index, shot in enumerate(shots) if index != self.given)
         return images, Subject((shots[self.given],), others or shots, run.inputs.scene.mesh, "")
 
-    def _infer(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
-        """The shape that the network gives; before, that of the mean code."""
+    def _infer_shape(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
+        """Infers the shape by the network; the initial metrics are the mean code's."""
         inputs, record = run.inputs, run.record
         model, trained = self._network(run, recipe)
         mean = torch.tensor(trained["mean_code"], device=inputs.device)
         check_kind(inputs.renderer, model.at(mean))
-        part = "took part in the training, and" if self.supervision.renders else "took no part in the training; it"
-        record.notes = [*record.notes, f"the renderer {part} judges as own_"]
+        role = "took part in the training, and" if self.supervision.renders else "took no part in the training; it"
+        record.notes = [*record.notes, f"the renderer {role} judges as own_"]
         with run.off_clock():
-            record.metrics_start = self._judged(State(model.at(mean), inputs), images, subject).metrics
-        state = _inferred(run, model, images.image(self.given))
+            record.metrics_start = self._evaluate(State(model.at(mean), inputs), images, subject).metrics
+        state = _infer_state(run, model, images.image(self.given))
         with run.off_clock():
-            note_result(run, self._judged(state, images, subject))
+            note_result(run, self._evaluate(state, images, subject))
             if inputs.evaluation.picture is not None:
                 draw_reconstruction(run.folder, state, subject, [], run.record.outcome)
 
     def _network(self, run: RunContext, recipe: Recipe) -> tuple[SingleView, dict[str, Any]]:
-        """The network and the record of its training, which is told in the run's notes."""
+        """The network and the record of its training, which is described in the run's notes."""
         inputs = run.inputs
         path = recipe.find(inputs.cache)
         if path is None and self.train:
             with run.off_clock():
                 path = recipe.make(inputs.cache, inputs.device, run.progress)
         if path is None:
-            known = recipe.shipped()
-            other = (
-                f"; the shipped one of {recipe.dataset.name} has those of {SHIPPED_ROW} at scale=desk" if known else ""
-            )
-            raise BadInput(f"no network was trained for {recipe.dataset.name} with these settings: {REMEDY}{other}")
-        model, trained = recipe.load(path)
-        run.record.notes = [*run.record.notes, told(trained)]
-        run.record.seconds |= {"training": trained["seconds"]["training"]}
-        run.record.evaluations |= {"training": trained["evaluations"]["value"]}
+            hint = f"; the shipped one of {recipe.dataset.name} has those of {SHIPPED_ROW} at scale=desk"
+            hint = hint if recipe.shipped() else ""
+            raise BadInput(f"no network was trained for {recipe.dataset.name} with these settings: {REMEDY}{hint}")
+        model, training = recipe.load(path)
+        run.record.notes = [*run.record.notes, describe_training(training)]
+        run.record.seconds |= {"training": training["seconds"]["training"]}
+        run.record.evaluations |= {"training": training["evaluations"]["value"]}
         if not self.knows_colours:
             for weights in model.decoder.texture_head.parameters():
-                weights.zero_()  # grey, in place of the colours that the training began with
-        return model.to(inputs.device), trained
+                weights.zero_()  # grey, instead of the untrained initial colours
+        return model.to(inputs.device), training
 
-    def _see(self, run: RunContext, recipe: Recipe, path: Path) -> None:
-        """The shape that the network gives for a picture of one's own, and the view from which it looks most alike."""
+    def _infer_picture(self, run: RunContext, recipe: Recipe, path: Path) -> None:
+        """Infers the shape of the user's picture, and finds the view that matches the picture best."""
         inputs, record = run.inputs, run.record
-        record.scene, record.definitions = path.name, OF_PICTURE | COSTS | TRAINING
+        record.scene, record.definitions = path.name, PICTURE_DEFINITIONS | COSTS | TRAINING_DEFINITIONS
         model, trained = self._network(run, recipe)
         mask = None if self.mask_path is None else Path(self.mask_path)
-        picture, doubts = read_picture(path, mask, self.image_pixels, trained["filled"])
-        record.notes = [*record.notes, *doubts]
-        state = _inferred(run, model, picture)
+        picture, warnings = read_picture(path, mask, self.image_pixels, trained["filled"])
+        record.notes = [*record.notes, *warnings]
+        state = _infer_state(run, model, picture)
         mesh = state.mesh
         with run.off_clock():
             if mesh is None:
@@ -229,25 +227,24 @@ class OneImage:
                 return
             if self.knows_colours:
                 mesh = replace(mesh, colours=vertex_colours(state.field, mesh, inputs.device))
-            cameras = [recipe.imaging.sampler.draw(place) for place in range(TRIED)]
-            camera, overlapping = best_view(mesh, cameras, picture[3] > 0.5, trained["filled"])
-            note_result(run, Evaluation({FITTED: overlapping}, mesh, field=state.field))
+            cameras = [recipe.imaging.sampler.draw(index) for index in range(SEARCHED_VIEWS)]
+            camera, mask_iou = best_view(mesh, cameras, picture[3] > 0.5, trained["filled"])
+            note_result(run, Evaluation({FITTED: mask_iou}, mesh, field=state.field))
             record.notes.append("it knows shapes of the dataset alone, whatever a picture shows")
             if inputs.evaluation.picture is not None:
                 draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, record.outcome)
 
-    def _judged(self, state: State, images: ImagesOf, subject: Subject) -> Evaluation:
-        """The scores of a network's shape; of its colours only where its training knew some."""
-        found = judge(state, subject)
-        scores = {
-            name: x for name, x in found.metrics.items() if self.knows_colours or name.removeprefix(OWN) not in COLOURS
-        }
-        return replace(found, metrics=scores | {"iou": overlap(state.field, images, state.inputs.device)})
+    def _evaluate(self, state: State, images: ImagesOf, subject: Subject) -> Evaluation:
+        """The scores of a network's shape; scores of colours only if its training used colours."""
+        evaluation = judge(state, subject)
+        excluded = () if self.knows_colours else COLOUR_SCORES
+        scores = {name: x for name, x in evaluation.metrics.items() if name.removeprefix(OWN) not in excluded}
+        return replace(evaluation, metrics=scores | {"iou": overlap(state.field, images, state.inputs.device)})
 
     def _search(self, run: RunContext, images: ImagesOf, subject: Subject) -> None:
-        """The shape of the code that is found, with the colours of the given image."""
+        """Searches the prior's code; the shape gets the colours of the input image."""
         inputs = run.inputs
-        problem = self.search.problem(subject.given[0], inputs)
+        problem = self.search.problem(subject.input_shots[0], inputs)
         check_kind(inputs.renderer, problem.field())
         settings, least = self.search.optimiser, self.search.least_reference
         history = descend(problem, settings, run, lambda iteration: {}, least_reference=least)
@@ -257,24 +254,24 @@ class OneImage:
             note_surface(run, coloured(field, subject, inputs), subject, scores, history, field)
 
     def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
-        """A shape that needs no network, with the colours of its images."""
+        """Takes a training shape or the mean shape, with the colours of its images."""
         inputs, record, count = run.inputs, run.record, self.shapes
         record.notes = [*record.notes, "no network and no renderer took part"]
         if self.method == MEAN:
-            mesh, seen = mean_shape(recipe.dataset, count, inputs.cache, run.progress), subject.given
+            mesh, shots = mean_shape(recipe.dataset, count, inputs.cache, run.progress), subject.input_shots
         else:
             others = recipe.imaging.images(recipe.dataset, Split.TRAIN, count, inputs.cache, run.progress)
             with run.on_clock():
                 if self.method == NEAREST:
-                    place = most_alike(images.image(self.given), others)
+                    index = most_alike(images.image(self.given), others)
                 else:
-                    place = best_shape(inputs.scene.mesh, recipe.dataset, count)
-            mesh, seen = recipe.dataset.mesh(Split.TRAIN, place), others[place].shots()
-            record.notes.append(f"training shape {place}")
+                    index = best_shape(inputs.scene.mesh, recipe.dataset, count)
+            mesh, shots = recipe.dataset.mesh(Split.TRAIN, index), others[index].shots()
+            record.notes.append(f"training shape {index}")
         with run.off_clock():
             scores = {"iou": 0.0}
             if mesh is not None:
-                truth, mesh = Truth(mesh), with_colours(mesh, seen)
+                truth, mesh = Truth(mesh), with_colours(mesh, shots)
                 scores["iou"] = overlap(
                     lambda points: torch.from_numpy(truth.signed_distance(points.numpy())), images, torch.device("cpu")
                 )
@@ -282,20 +279,20 @@ class OneImage:
 
 
 @torch.no_grad()
-def _inferred(run: RunContext, model: SingleView, image: Float[Tensor, "4 height width"]) -> State:
-    """The shape that an image shows, with its mesh, on the run's clock."""
+def _infer_state(run: RunContext, model: SingleView, image: Float[Tensor, "4 height width"]) -> State:
+    """Infers the shape of an image, with its mesh, on the run's clock."""
     with run.on_clock():
         state = State(model.at(model(image[None].to(run.inputs.device))[0]), run.inputs)
         _ = state.mesh
     return state
 
 
-def told(trained: dict[str, Any]) -> str:
-    """What a network was trained on, in words."""
-    settings, found = trained["settings"], trained["validation"]
+def describe_training(training: dict[str, Any]) -> str:
+    """Text about a network's training and its validation error."""
+    settings, validation = training["settings"], training["validation"]
     return (
-        f"the network was trained on {settings['shapes']} shapes of {trained['dataset']['name']}, "
+        f"the network was trained on {settings['shapes']} shapes of {training['dataset']['name']}, "
         f"{settings['views']} images each, for {settings['training']['steps']} steps, "
-        f"{np.round(trained['seconds']['training'] / 60, 1)} min; on validation shapes its IoU is "
-        f"{found['iou_network']:.3f}, that of the mean code {found['iou_mean_code']:.3f}"
+        f"{np.round(training['seconds']['training'] / 60, 1)} min; on validation shapes its IoU is "
+        f"{validation['iou_network']:.3f}, that of the mean code {validation['iou_mean_code']:.3f}"
     )

@@ -32,7 +32,7 @@ DEFINITIONS = {
     "failed_...": "trials that failed in this way; each counts once, as its most frequent kind of failure",
     "evaluations_per_ray": "field values per ray; median of the trials at the mild end",
 }
-MEASURED = {"rendering": judge.OF_RENDERINGS, "gradient": judge.OF_GRADIENTS, "fit": fit.DEFINITIONS}
+MEASURE_DEFINITIONS = {"rendering": judge.RENDERING_NUMBERS, "gradient": judge.GRADIENT_NUMBERS, "fit": fit.DEFINITIONS}
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class Stability:
 
     Args:
         stress: the axis of the test.
-        search: its resolution and length.
+        search: resolution and length of the search.
         fit_search: the same for measure=fit, whose trials take longer.
-        criteria: of success.
+        criteria: criteria of success.
         fit: the fit of measure=fit.
         resolution: height and width of a rendering, in pixels.
-        limits: of each trial; for a fit, of all its steps together.
+        limits: limits of each trial; for a fit, of all its steps together.
     """
 
     stress: Stress | None
@@ -63,13 +63,13 @@ class Stability:
         check_at_least("task.resolution", self.resolution, 8, "64 resolves thin parts")
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput for a network of the user's under a stress that it has no part in."""
+        """Raises BadInput for a user's network under a stress that does not use it."""
         if not isinstance(inputs.dataset, Networked):
             return
-        own, some = self.stress.scene, ", ".join(NETWORK_DISTORTIONS)
-        if own not in NETWORK_DISTORTIONS:
-            raise BadInput(f"the stress {own} renders no network: remove field=file, or set stress={some}")
-        if own == "far_code" and inputs.prior.decoder.placed:
+        scene, stresses = self.stress.scene, ", ".join(NETWORK_DISTORTIONS)
+        if scene not in NETWORK_DISTORTIONS:
+            raise BadInput(f"the stress {scene} renders no network: remove field=file, or set stress={stresses}")
+        if scene == "far_code" and inputs.prior.decoder.placed:
             raise BadInput("the network has no code that the stress far_code could change: set stress=noisy_weights")
 
     def execute(self, run: RunContext) -> None:
@@ -77,7 +77,7 @@ class Stability:
         record, renderer = run.record, run.inputs.renderer
         prior = run.inputs.prior if self.stress.scene in NETWORK_DISTORTIONS else None
         conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device, prior)
-        record.definitions = DEFINITIONS | MEASURED[self.stress.measure]
+        record.definitions = DEFINITIONS | MEASURE_DEFINITIONS[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")
         self._check(renderer)
         search = Bisection(self._settings) if self.stress.repeats == 1 else Search(self._settings)
@@ -85,23 +85,23 @@ class Stability:
         with curve_file(run.folder) as write_line:
             while (index := search.next()) is not None:
                 level = float(search.levels[index])
-                outcome = self.stress.trial(renderer, level, trials.at(level)[1], conditions)
+                outcome = self.stress.trial(renderer, level, trials.successes_at(level)[1], conditions)
                 search.note(index, outcome.success)
-                trials.note(Trial(level, self.stress.sweep.severity(level), outcome))
+                trials.add(Trial(level, self.stress.sweep.severity(level), outcome))
                 write_line(trials.line())
-                run.progress("searching", len(trials.all), search.most, None)
+                run.progress("searching", len(trials.all), search.max_trials, None)
         record.metrics = self._metrics(search, trials)
         record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
-        record.status, record.reason = trials.verdict()
+        record.status, record.reason = trials.status()
         record.notes = [*record.notes, *trials.warnings()]
         if trials.first_failure is not None:
-            first, what = trials.first_failure, f"{record.name}, {record.scene}"
-            kind = PIXEL_NAMES.get(first.outcome.failure or "", first.outcome.failure)
-            title = f"{what}: first failure ({kind}) at {first.severity:.3g} {self.stress.sweep.unit}"
-            draw_failure(run.folder, first.outcome.images, first.severity, title)
+            failure, subject = trials.first_failure, f"{record.name}, {record.scene}"
+            kind = PIXEL_NAMES.get(failure.outcome.failure or "", failure.outcome.failure)
+            title = f"{subject}: first failure ({kind}) at {failure.severity:.3g} {self.stress.sweep.unit}"
+            draw_failure(run.folder, failure.outcome.images, failure.severity, title)
 
     def _check(self, renderer: Renderer) -> None:
-        """Raises Unsupported, before the first trial, where the renderer rejects the setting of the mild end."""
+        """Raises Unsupported before the first trial if the renderer rejects the setting at the mild end."""
         try:
             self.stress.stressed(renderer, self.stress.sweep.mild)
         except (ValueError, TypeError) as error:
@@ -112,21 +112,21 @@ class Stability:
         return self.fit_search if self.stress.measure == "fit" else self.search
 
     def _metrics(self, search: Search | Bisection, trials: "_Trials") -> dict[str, float | None]:
-        found = search.result()
-        levels, severity = {"": found.level, "_low": found.low, "_high": found.high}, self.stress.sweep.severity
-        (mild, milds), (severe, severes) = trials.at(0), trials.at(1)
+        breakdown, severity = search.result(), self.stress.sweep.severity
+        levels = {"": breakdown.level, "_low": breakdown.low, "_high": breakdown.high}
+        (mild, milds), (severe, severes) = trials.successes_at(0), trials.successes_at(1)
         failed = Counter(trial.outcome.failure for trial in trials.all)
         return {
             **{f"breakdown{end}": severity(x) if x is not None and 0 <= x <= 1 else None for end, x in levels.items()},
             **{f"level{end}": level for end, level in levels.items()},
-            "width": found.width,
+            "width": breakdown.width,
             "trials": len(trials.all),
-            "grid_trials": search.grid,
+            "grid_trials": search.grid_trials,
             "mild_successes": mild,
             "mild_trials": milds,
             "severe_successes": severe,
             "severe_trials": severes,
-            "evaluations_per_ray": trials.spent(),
+            "evaluations_per_ray": trials.median_cost(),
             **{f"failed_{kind.replace(' ', '_')}": failed[kind] for kind in Failure if kind and failed[kind]},
         }
 
@@ -138,15 +138,15 @@ class _Trials:
     all: list[Trial] = field(default_factory=list)
     first_failure: Trial | None = None
 
-    def note(self, trial: Trial) -> None:
-        """Keeps a trial; images only of the mildest failure."""
-        shown = bool(trial.outcome.images) and not trial.outcome.success
-        if shown and (self.first_failure is None or trial.level < self.first_failure.level):
+    def add(self, trial: Trial) -> None:
+        """Stores a trial; images only of the mildest failure."""
+        has_images = bool(trial.outcome.images) and not trial.outcome.success
+        if has_images and (self.first_failure is None or trial.level < self.first_failure.level):
             self.first_failure = trial
         self.all.append(replace(trial, outcome=replace(trial.outcome, images={})))
 
-    def verdict(self) -> tuple[RunStatus, str]:
-        """The status of the run: crashed where every trial raised an error."""
+    def status(self) -> tuple[RunStatus, str]:
+        """The status of the run and its reason: crashed if every trial raised an error."""
         if all(trial.outcome.failure is Failure.CRASHED for trial in self.all):
             return RunStatus.CRASHED, f"every trial raised an error: {self.all[-1].outcome.message}"
         return RunStatus.OK, ""
@@ -154,14 +154,14 @@ class _Trials:
     def warnings(self) -> list[str]:
         """Reasons to doubt the breakdown: trials that raised errors, or success that grows with severity."""
         raised = [trial.outcome.message for trial in self.all if trial.outcome.failure is Failure.CRASHED]
-        found = [f"{len(raised)} of {len(self.all)} trials raised an error, the last: {raised[-1]}"] if raised else []
-        (mild, milds), (severe, severes) = self.at(0), self.at(1)
+        notes = [f"{len(raised)} of {len(self.all)} trials raised an error, the last: {raised[-1]}"] if raised else []
+        (mild, milds), (severe, severes) = self.successes_at(0), self.successes_at(1)
         if severe * milds > mild * severes:
-            found.append("success does not fall with severity: more trials succeed at the severe end than at the mild")
-        return found
+            notes.append("success does not fall with severity: more trials succeed at the severe end than at the mild")
+        return notes
 
-    def at(self, level: float) -> tuple[int, int]:
-        """How many trials at a level succeeded, and how many there were."""
+    def successes_at(self, level: float) -> tuple[int, int]:
+        """The number of successful trials at a level, and of all trials there."""
         outcomes = [trial.outcome.success for trial in self.all if trial.level == level]
         return sum(outcomes), len(outcomes)
 
@@ -172,8 +172,8 @@ class _Trials:
         failed = {"failure": str(last.outcome.failure), "message": last.outcome.message}
         return {"trial": len(self.all) - 1, **numbers, **failed, **last.outcome.numbers}
 
-    def spent(self) -> float | None:
-        """Median field values per ray at the mild end."""
+    def median_cost(self) -> float | None:
+        """Median field evaluations per ray at the mild end."""
         mild = [trial.outcome.numbers for trial in self.all if trial.level == 0]
         costs = [numbers["evaluations_per_ray"] for numbers in mild if "evaluations_per_ray" in numbers]
         return float(np.median(costs)) if costs else None

@@ -1,4 +1,4 @@
-"""The surface of photographs without a renderer: what a user would run instead, as rows beside `reconstruction`."""
+"""Surfaces from photographs without a renderer: baselines for `reconstruction`."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.pictures import note_surface
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
-from bench.reconstruct.surfaces import fused, given_clouds, measured_clouds, poisson, with_colours
+from bench.reconstruct.surfaces import fuse_clouds, given_clouds, measured_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import COSTS
 from datasets.captures.hull import hull_mesh
@@ -19,22 +19,22 @@ from renderers.checks import BadInput, check_at_least
 
 @dataclass(frozen=True)
 class _Surface(PhotographTask):
-    """A task that makes a surface in one go."""
+    """A task that computes a surface without an optimisation loop."""
 
     @abstractmethod
     def surface(self, subject: Subject) -> Mesh | None:
-        """The surface of the given photographs."""
+        """The surface of the input photographs."""
 
     def execute(self, run: RunContext) -> None:
-        """Makes a surface of the given photographs, gives it their colours, and judges it by the others."""
+        """Computes the surface of the input photographs with their colours, and evaluates it on the held-out ones."""
         record = run.record
         record.definitions = COLOURED_DEFINITIONS | COSTS
         subject = self.subject(run.inputs)
-        record.notes = [*record.notes, subject.found, "no renderer took part"]
+        record.notes = [*record.notes, subject.summary, "no renderer took part"]
         with run.on_clock():
             surface = self.surface(subject)
             mesh = None if surface is None else surface.cut_off()
-            mesh = None if mesh is None else with_colours(mesh, subject.given)
+            mesh = None if mesh is None else with_colours(mesh, subject.input_shots)
         record.evaluations = {"value": 0, "gradient": 0}
         with run.off_clock():
             note_surface(run, mesh, subject, {})
@@ -43,7 +43,7 @@ class _Surface(PhotographTask):
 
 @dataclass(frozen=True)
 class Fusing:
-    """How points become a surface; see `bench.reconstruct.surfaces.poisson`."""
+    """Settings of the surface from points; see `bench.reconstruct.surfaces.poisson`."""
 
     octree: int
     trim: float
@@ -54,7 +54,7 @@ class Fusing:
 
     def surface(self, clouds: Sequence[Cloud]) -> Mesh | None:
         """The surface of all points."""
-        return poisson(*fused(clouds), depth=self.octree, trim=self.trim)
+        return poisson(*fuse_clouds(clouds), depth=self.octree, trim=self.trim)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Hull(_Surface):
     """The visual hull of the masks (Laurentini 1994).
 
     Args:
-        samples: per axis.
+        samples: samples per axis.
     """
 
     samples: int
@@ -72,26 +72,26 @@ class Hull(_Surface):
         super().__post_init__()
 
     def surface(self, subject: Subject) -> Mesh | None:
-        """The hull, carved."""
-        if any(shot.mask is None for shot in subject.given):
+        """The mesh of the hull."""
+        if any(shot.mask is None for shot in subject.input_shots):
             raise BadInput(f"{NO_HULL}, or set task=stereo")
-        return hull_mesh(subject.given, self.samples)
+        return hull_mesh(subject.input_shots, self.samples)
 
 
 @dataclass(frozen=True)
 class Poisson(_Surface):
-    """Given depths, or points that something else made of the photographs, fused by screened Poisson reconstruction.
+    """Given depths or a given point cloud, fused by screened Poisson reconstruction.
 
     Args:
-        fusing: of their points.
-        cloud: a file of points in the cameras' world, such as a multi-view stereo's; None takes the given depths.
+        fusing: settings of the surface.
+        cloud: a file of points in the cameras' world, for example from multi-view stereo; None: the given depths.
     """
 
     fusing: Fusing
     cloud: str | None = None
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput where there is no such file."""
+        """Raises BadInput if the file does not exist."""
         if self.cloud is not None and not Path(self.cloud).is_file():
             raise BadInput(f"task.cloud={self.cloud} is no file: check the path")
 
@@ -99,23 +99,23 @@ class Poisson(_Surface):
         """The fused points."""
         if self.cloud is not None:
             return self.fusing.surface(measured_clouds(self.cloud, subject))
-        if all(shot.depth is None for shot in subject.given):
+        if all(shot.depth is None for shot in subject.input_shots):
             raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task.cloud=POINTS.ply")
-        return self.fusing.surface(given_clouds(subject.given))
+        return self.fusing.surface(given_clouds(subject.input_shots))
 
 
 @dataclass(frozen=True)
 class Stereo(_Surface):
-    """Points that neighbouring photographs agree on, fused by screened Poisson reconstruction.
+    """Points on which neighbouring photographs agree, fused by screened Poisson reconstruction.
 
     Args:
-        matching: of neighbouring photographs.
-        fusing: of the points.
+        matching: choice of matched photographs.
+        fusing: settings of the surface.
     """
 
     matching: Matching
     fusing: Fusing
 
     def surface(self, subject: Subject) -> Mesh | None:
-        """The fused points that the photographs agree on."""
-        return self.fusing.surface(stereo_clouds(subject.given, self.matching))
+        """The fused points on which the photographs agree."""
+        return self.fusing.surface(stereo_clouds(subject.input_shots, self.matching))

@@ -40,7 +40,7 @@ class Known:
         return {"total": self.parameters[0].square().sum() + (torch.nan if self.failing else 1.0)}
 
     def colour_errors(self, pixels: Any) -> torch.Tensor:
-        return torch.full((len(pixels.at_one),), self.wrong)
+        return torch.full((len(pixels.depth_per_distance),), self.wrong)
 
 
 def shot(name: str) -> Shot:
@@ -69,13 +69,13 @@ def test_the_smallest_that_no_larger_one_improves_on_is_kept(tmp_path):
     assert choice.kept.candidate == "middle"
     assert len(seen) == 3
     for part in seen:  # photographs 0 and 8 are set aside, those that are held out are not there
-        assert [one.name for one in part.given] == ["1", "2", "3", "4", "5", "6", "7"]
-    assert choice.aside == 2
+        assert [one.name for one in part.input_shots] == ["1", "2", "3", "4", "5", "6", "7"]
+    assert choice.validation_count == 2
     for problem in known.values():
         assert problem.asked == [0, *range(10)]  # one to warm up, then a quarter of 40
     assert "field=auto: middle, 10 numbers; error of colours on 2 photographs set aside" in choice.note
     assert "small 0.3, middle 0.1, large 0.1" in choice.note
-    metrics = choice.metrics(loop=2 * choice.seconds)
+    metrics = choice.metrics(runtime=2 * choice.seconds)
     assert metrics["field_overhead"] == pytest.approx(1.5)
     assert (metrics["field"], metrics["field_free"], metrics["field_bytes"], metrics["fields_tried"]) == (
         "middle", 10, 40, 3,

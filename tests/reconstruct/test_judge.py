@@ -83,7 +83,7 @@ def test_the_seen_part_is_judged_alone(subject, inputs):
     side = tuple(shot_of(painted(), camera_of(24, angles=(across, 0.0))) for across in (-30.0, 0.0, 30.0))
     vertices = subject.truth.vertices.copy()
     vertices[vertices[:, 2] < CENTRE[2], 2] -= 0.2
-    metrics = surface_scores(replace(subject.truth, vertices=vertices), replace(subject, given=side), inputs)
+    metrics = surface_scores(replace(subject.truth, vertices=vertices), replace(subject, input_shots=side), inputs)
     assert metrics["seen_chamfer_l1"] < 0.75 * metrics["chamfer_l1"]
 
 

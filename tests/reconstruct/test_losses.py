@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.reconstruct.losses import ANYWHERE, BESIDE, Losses
+from bench.reconstruct.losses import EIKONAL_POINTS, NEIGHBOUR_CUBE_SIDE, Losses
 from bench.reconstruct.pixels import Pixels
 from bench.solve.latent_code import Terms
 from datasets.shot import Shot
@@ -92,7 +92,7 @@ def pixels_of(camera: Camera, **known: Tensor) -> Pixels:
     at_one = camera.depth(torch.ones(camera.height, camera.width, dtype=torch.float64)).flatten()
     colours = torch.linspace(0, 1, 3 * count, dtype=torch.float64).view(count, 3)
     known = {"colours": colours, "mask": None, "distance": None, "guide": None, "normals": None} | known
-    return Pixels(rays=camera.rays().flat(), at_one=at_one, **known)
+    return Pixels(rays=camera.rays().flat(), depth_per_distance=at_one, **known)
 
 
 def losses(**weights: Any) -> Losses:
@@ -152,7 +152,7 @@ def test_the_depth_term_is_the_error_of_hits_with_a_depth_over_all_rays(kind):
     given = torch.where(HALF, DISTANCE + torch.linspace(-0.2, 0.3, 64, dtype=torch.float64), torch.nan)
     known = given.isfinite()  # some of them miss the ball: given there too, they do not count
     given = torch.where(DISTANCE.isnan() & HALF, 2.0, given)
-    error = (DISTANCE - given).abs() * (PIXELS.at_one if kind == "depth" else 1.0)
+    error = (DISTANCE - given).abs() * (PIXELS.depth_per_distance if kind == "depth" else 1.0)
     pixels = replace(PIXELS, distance=given, mask=~HALF)  # which has no say in depths
     terms = terms_of(losses(depth=2.0, depth_loss=kind), BALL, pixels)
     assert set(terms) == {"total", "depth"} and 10 < int(known.sum()) < 50
@@ -185,10 +185,10 @@ def test_the_smoothness_term_compares_normals_with_those_beside():
     terms = terms_of(losses(smoothness=5.0), BALL, PIXELS)
     torch.manual_seed(3)
     points = POINTS[DISTANCE.isfinite()]
-    beside = points + BESIDE * (torch.rand(len(points), 3, dtype=torch.float64) - 0.5)
+    beside = points + NEIGHBOUR_CUBE_SIDE * (torch.rand(len(points), 3, dtype=torch.float64) - 0.5)
     away = beside - BALL.centre
     off = (BALL.normals(points) - away / away.norm(dim=-1, keepdim=True)).norm(dim=-1)
-    assert 0 < off.max() < BESIDE / 0.6
+    assert 0 < off.max() < NEIGHBOUR_CUBE_SIDE / 0.6
     assert terms["smoothness"].item() == pytest.approx(5.0 * off.sum().item() / 64, rel=1e-6)
 
 
@@ -213,7 +213,7 @@ def test_the_eikonal_term_is_of_the_slope_at_hits_and_anywhere(slope):
     assert terms["eikonal"].item() == pytest.approx(
         0.5 * 2 * (slope - 1) ** 2, abs=1e-7
     )  # points anywhere are in float32
-    assert meter.counts.value > ANYWHERE
+    assert meter.counts.value > EIKONAL_POINTS
 
 
 def test_what_is_not_given_has_no_term_and_the_total_is_the_sum():

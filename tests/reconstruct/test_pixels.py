@@ -32,7 +32,7 @@ def places(pixels) -> torch.Tensor:
 
 
 def test_pixels_stand_in_one_row_with_their_own_rays():
-    stack = Stack.of(SHOTS, None, CPU)
+    stack = Stack.build(SHOTS, None, CPU)
     assert len(stack.pixels.colours) == 12 * 20 + 18 * 8
     for shot, (photograph, row, column) in ((SHOTS[0], (0, 3, 7)), (SHOTS[1], (1, 11, 5))):
         place = photograph * 12 * 20 + row * SIZES[photograph][1] + column
@@ -43,11 +43,13 @@ def test_pixels_stand_in_one_row_with_their_own_rays():
         assert torch.equal(stack.pixels.rays.origins[place], rays.origins[row, column])
         assert stack.pixels.mask is not None and stack.pixels.mask[place] == ((row + column) % 3 == 0)
         forward = shot.camera.world_to_camera[2, :3]
-        assert stack.pixels.at_one[place].item() == pytest.approx((rays.directions[row, column] @ forward).item())
+        assert stack.pixels.depth_per_distance[place].item() == pytest.approx(
+            (rays.directions[row, column] @ forward).item()
+        )
 
 
 def test_patches_are_neighbours_in_one_photograph():
-    drawn = places(Stack.of(SHOTS, None, CPU).drawn(2000, patches=True, seed=0)).view(-1, 4, 3)
+    drawn = places(Stack.build(SHOTS, None, CPU).draw(2000, patches=True, seed=0)).view(-1, 4, 3)
     assert len(drawn) == 500 and set(drawn[:, 0, 0].tolist()) == {0, 1}
     offsets = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]])
     assert (drawn == drawn[:, :1] + offsets).all()
@@ -58,14 +60,14 @@ def test_patches_are_neighbours_in_one_photograph():
 
 def test_only_rays_that_meet_the_unit_sphere_are_drawn_and_all_of_them():
     wide = [numbered(camera_of(16, field_of_view=100.0), 0), numbered(camera_of(9, field_of_view=90.0), 1)]
-    stack = Stack.of(wide, None, CPU)
+    stack = Stack.build(wide, None, CPU)
     meets = sphere_span(stack.pixels.rays)[2]
     assert 0.1 < meets.float().mean() < 0.5
     assert torch.equal(stack.useful, meets.nonzero().squeeze(-1))
-    drawn = stack.drawn(4000, patches=False, seed=0)
+    drawn = stack.draw(4000, patches=False, seed=0)
     assert sphere_span(drawn.rays)[2].all()
     assert len(torch.unique(places(drawn), dim=0)) == int(meets.sum())
-    patches = stack.drawn(4000, patches=True, seed=0)
+    patches = stack.draw(4000, patches=True, seed=0)
     assert sphere_span(patches.rays)[2][::4].all()  # the upper left pixel of each
 
 
@@ -74,26 +76,26 @@ def test_cameras_that_look_away_are_told():
     turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     away = replace(camera, world_to_camera=turn @ camera.world_to_camera)
     with pytest.raises(BadInput, match="no ray meets the unit sphere"):
-        Stack.of([numbered(away, 0)], None, CPU)
+        Stack.build([numbered(away, 0)], None, CPU)
 
 
 def test_given_depths_are_distances_along_rays_and_nan_elsewhere():
     shape, cameras = ball(), (WIDE, TALL)
     shots = [shot_of(shape, camera) for camera in cameras]
-    stack = Stack.of(shots, None, CPU)
+    stack = Stack.build(shots, None, CPU)
     true = torch.cat([shape.distance(camera.double().rays()).flatten() for camera in cameras]).float()
     assert stack.pixels.distance is not None and 20 < int(true.isfinite().sum()) < len(true)
     torch.testing.assert_close(stack.pixels.distance, true, rtol=0, atol=1e-5, equal_nan=True)
     assert stack.pixels.normals is not None and stack.pixels.normals.shape == (len(true), 3)
-    alone = Stack.of([shots[0], replace(shots[1], depth=None)], None, CPU).pixels.distance
+    alone = Stack.build([shots[0], replace(shots[1], depth=None)], None, CPU).pixels.distance
     assert alone is not None and alone[12 * 20 :].isnan().all() and alone[: 12 * 20].isfinite().any()
 
 
 def test_a_guide_is_kept_in_its_order_and_what_is_not_known_is_none():
     guide = [torch.full(size, 1.0 + number) for number, size in enumerate(SIZES)]
-    pixels = Stack.of([replace(shot, mask=None) for shot in SHOTS], guide, CPU).pixels
+    pixels = Stack.build([replace(shot, mask=None) for shot in SHOTS], guide, CPU).pixels
     assert pixels.guide is not None and pixels.guide.tolist() == [1.0] * 240 + [2.0] * 144
     assert (pixels.mask, pixels.distance, pixels.normals) == (None, None, None)
     some = pixels[torch.tensor([239, 240])]
     assert some.guide is not None and some.guide.tolist() == [1.0, 2.0] and some.mask is None
-    assert Stack.of(SHOTS, None, CPU).pixels.guide is None
+    assert Stack.build(SHOTS, None, CPU).pixels.guide is None

@@ -85,7 +85,7 @@ def test_neighbours_are_the_nearest_by_angle_within_bounds(sphere, monkeypatch, 
         found.append(f"{shot.name}-{other.name}")
         return Cloud(np.zeros((0, 3)), shot.camera)
 
-    monkeypatch.setattr(stereo, "_matched", matched)
+    monkeypatch.setattr(stereo, "_match", matched)
     clouds = stereo_clouds(shots, matching)
     assert found == pairs and len(clouds) == len(pairs)
 
@@ -94,7 +94,7 @@ def test_a_photograph_that_is_turned_by_nothing_is_itself(sphere):
     """OpenCV has the first pixel's centre at (0, 0): half a pixel less."""
     (shot,) = taken(sphere, (10.0, 20.0))
     own = shot.camera.intrinsics.double().numpy() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    turned = stereo._turned(shot, shot.camera.world_to_camera.double().numpy()[:3, :3], own, PIXELS)
+    turned = stereo._rectify(shot, shot.camera.world_to_camera.double().numpy()[:3, :3], own, PIXELS)
     np.testing.assert_allclose(turned.astype(float), 255 * shot.colours.numpy(), atol=2)
 
 

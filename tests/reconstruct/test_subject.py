@@ -8,7 +8,14 @@ import torch
 import trimesh
 from scipy.ndimage import binary_dilation
 
-from bench.reconstruct.subject import HULL_SAMPLES, ON_SURFACE, Depths, Subject, given_distances, hull_distances
+from bench.reconstruct.subject import (
+    HULL_SAMPLES,
+    VISIBILITY_TOLERANCE,
+    Depths,
+    Subject,
+    given_distances,
+    hull_distances,
+)
 from bench.tasks.surfaces import Hull
 from datasets.mesh import Mesh, joined
 from datasets.photographs import around
@@ -37,13 +44,13 @@ def found(inputs, depths: Depths = NO_DEPTHS, *, longest: int = 16, every: int =
 def test_every_nth_photograph_is_held_out(inputs):
     subject = found(inputs, every=3)
     assert [shot.name for shot in subject.held_out] == ["0", "3", "6"]
-    assert [shot.name for shot in subject.given] == ["1", "2", "4", "5", "7", "8"]
+    assert [shot.name for shot in subject.input_shots] == ["1", "2", "4", "5", "7", "8"]
     assert subject.truth is inputs.scene.mesh
-    assert "9 rendered photographs of 16 x 16 pixels" in subject.found
-    assert subject.found.endswith(f"{len(subject.held_out)} of them are held out")
-    assert all(shot.colours.shape == (16, 16, 3) for shot in subject.given)
+    assert "9 rendered photographs of 16 x 16 pixels" in subject.summary
+    assert subject.summary.endswith(f"{len(subject.held_out)} of them are held out")
+    assert all(shot.colours.shape == (16, 16, 3) for shot in subject.input_shots)
     blind = found(inputs, masks=False)
-    assert all(shot.mask is None for shot in blind.given)
+    assert all(shot.mask is None for shot in blind.input_shots)
     assert all(shot.mask is not None for shot in blind.held_out)
 
 
@@ -51,38 +58,40 @@ def test_too_few_photographs_are_told(inputs):
     few = replace(IMAGES, views=4)
     with pytest.raises(BadInput, match="4 photographs with every 2th held out leave 2: give more"):
         Hull(few, 16, 2, True, NO_DEPTHS, samples=8).subject(inputs)
-    assert len(Hull(few, 16, 4, True, NO_DEPTHS, samples=8).subject(inputs).given) == 3
+    assert len(Hull(few, 16, 4, True, NO_DEPTHS, samples=8).subject(inputs).input_shots) == 3
 
 
 @each("points, count", [("dense", None), ("25%", None), ("30", 30)])
 def test_depths_are_given_in_the_amount_that_is_asked_for(points, count):
     shot = shot_of(ball(), CAMERA)
-    given = Depths(points, 0.0).of(shot, (0, 3)).depth
+    given = Depths(points, 0.0).apply(shot, (0, 3)).depth
     assert shot.mask is not None and given is not None and shot.depth is not None
     foreground = int(shot.mask.sum())
     expected = count or round(foreground * (0.25 if "%" in points else 1))
     known = given > 0
     assert int(known.sum()) == expected and not (known & ~shot.mask).any()
     assert torch.equal(given[known], shot.depth[known])
-    again, other = (Depths(points, 0.0).of(shot, (0, seed)).depth for seed in (3, 4))
+    again, other = (Depths(points, 0.0).apply(shot, (0, seed)).depth for seed in (3, 4))
     assert torch.equal(given, again) and torch.equal(given, other) == (points == "dense")
 
 
 def test_depths_have_noise_of_the_standard_deviation():
     shot = shot_of(ball(), camera_of(64))
     assert shot.mask is not None and shot.depth is not None
-    given = Depths("dense", 0.05).of(shot, (0, 0)).depth
+    given = Depths("dense", 0.05).apply(shot, (0, 0)).depth
     assert given is not None and (given[~shot.mask] == 0).all()
     off = (given - shot.depth)[shot.mask]
     assert off.std().item() == pytest.approx(0.05, rel=0.1) and abs(off.mean().item()) < 0.01
-    assert NO_DEPTHS.of(shot, (0, 0)).depth is None
+    assert NO_DEPTHS.apply(shot, (0, 0)).depth is None
     with pytest.raises(ValueError, match=r"task\.depths\.noise must be at least 0"):
         Depths("dense", -0.1)
 
 
 def seen_by(*cameras, surface: Mesh, points: np.ndarray) -> np.ndarray:
     shots = tuple(shot_of(ball(), camera) for camera in cameras)
-    return Subject(shots, (), surface, "").seen(surface, Surface(points, np.tile([0.0, 0.0, 1.0], (len(points), 1))))
+    return Subject(shots, (), surface, "").visible_points(
+        surface, Surface(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    )
 
 
 def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
@@ -97,19 +106,21 @@ def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
     points = np.array([[0.1, 0.0, 0.6 + np.sqrt(0.3**2 - 0.1**2)], [0.2, 0.0, 0.6 + np.sqrt(0.3**2 - 0.2**2)]])
     assert seen_by(narrow, surface=front, points=points).tolist() == [True, False]
     assert seen_by(camera, surface=front, points=points).tolist() == [True, True]
-    within = points[:1] - [0.0, 0.0, 5 * ON_SURFACE]
+    within = points[:1] - [0.0, 0.0, 5 * VISIBILITY_TOLERANCE]
     assert seen_by(narrow, surface=front, points=within).tolist() == [False]
 
 
 @each("wound", [1, -1])
 def test_the_far_side_of_a_plate_is_not_seen_however_thin_and_whichever_way_it_is_wound(wound):
-    box = trimesh.creation.box(extents=(0.8, 0.8, 0.9 * ON_SURFACE))
+    box = trimesh.creation.box(extents=(0.8, 0.8, 0.9 * VISIBILITY_TOLERANCE))
     plate = Mesh(box.vertices, box.faces[:, ::wound])
     sampled = sample_surface(plate, 2000, 0)
     towards = sampled.points[:, 2] > 0
     sides = np.abs(sampled.points[:, :2]).max(axis=1) < 0.38  # beside the rim, through which a camera sees a little
     for angle, expected in ((0.0, towards), (45.0, towards), (180.0, ~towards)):
-        seen = Subject((shot_of(ball(), camera_of(16, angles=(angle, 0.0))),), (), plate, "").seen(plate, sampled)
+        seen = Subject((shot_of(ball(), camera_of(16, angles=(angle, 0.0))),), (), plate, "").visible_points(
+            plate, sampled
+        )
         assert np.array_equal(seen[sides], expected[sides])
 
 

@@ -9,7 +9,7 @@ import torch
 from bench.evaluate.state import GREY
 from bench.reconstruct import surfaces
 from bench.reconstruct.stereo import Cloud
-from bench.reconstruct.surfaces import fused, given_clouds, poisson, with_colours
+from bench.reconstruct.surfaces import fuse_clouds, given_clouds, poisson, with_colours
 from tests.looped import each
 from tests.reconstruct.test_judge import CENTRE
 from tests.reconstruct.test_judge import painted as coloured_ball
@@ -49,7 +49,7 @@ def test_given_depths_become_points_of_the_surface():
 def test_normals_look_at_the_camera_of_their_cloud(outward):
     towards = directions(600)
     cameras = (FRONT, BACK) if outward else (BACK, FRONT)
-    points, normals = fused(halves(RADIUS * towards, *cameras))
+    points, normals = fuse_clouds(halves(RADIUS * towards, *cameras))
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
     cosines = (normals * points).sum(axis=1) / RADIUS * (1 if outward else -1)
     steep = np.abs(points[:, 2]) > 0.3  # where the plane of the neighbours is clearly in front of or behind a camera
@@ -57,9 +57,9 @@ def test_normals_look_at_the_camera_of_their_cloud(outward):
 
 
 def test_too_few_points_have_no_surface():
-    few = surfaces.NEIGHBOURS - 1
+    few = surfaces.NORMAL_NEIGHBOURS - 1
     for clouds, count in (([], 0), ([Cloud(directions(few), FRONT)], few)):
-        points, normals = fused(clouds)
+        points, normals = fuse_clouds(clouds)
         assert points.shape == normals.shape == (count, 3) and not normals.any()
         assert poisson(points, normals, depth=4, trim=0.0) is None
 

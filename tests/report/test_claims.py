@@ -7,7 +7,7 @@ import pytest
 
 from bench.config import names
 from bench.report.data.statistics import Interval
-from bench.studies.claims import CLAIMS, NO_LARGER, SMALLER, UNREAD, Claim, verdict_of
+from bench.studies.claims import CLAIMS, NO_LARGER, NO_RUNS, SMALLER, Claim, verdict_of
 from tests.looped import each
 from tests.report.test_report_paper import page_of, write_run
 
@@ -99,7 +99,7 @@ def test_a_claim_is_not_tested_by_runs_of_other_settings_than_it_names(tmp_path)
     (line,) = [
         line for line in page_of(tmp_path, "claims").lines if line["claim"].startswith("aggressive marching saves")
     ]
-    assert (line["verdict"], line["why"]) == ("not tested", UNREAD)
+    assert (line["verdict"], line["why"]) == ("not tested", NO_RUNS)
 
 
 def test_a_claim_is_not_tested_by_runs_that_are_only_planned(tmp_path):

@@ -131,7 +131,7 @@ def rendered(results, split, *, dataset="sofa", status="ok", kinds=()):
         "fig8",
         "DIST, one colour image",
         **{"task": "completion", "dataset": dataset, "method": "dist_colour", "status": status},
-        **({"metrics": dict(zip(fig8.BYTES, (256, 3000, 500, 9000), strict=True))} if kinds else {}),
+        **({"metrics": dict(zip(fig8.SIZES, (256, 3000, 500, 9000), strict=True))} if kinds else {}),
         settings={"task": {"_target_": "completion"}, "split": split},
     )
     arrays = {"photograph": np.ones((8, 8, 3), np.float16)}

@@ -115,7 +115,7 @@ def test_a_look_costs_what_was_spent_before_it(three):
 
 
 def test_the_time_to_the_target_is_infinite_for_what_did_not_reach_it(three):
-    assert speed_curves.TARGET == 1e-3
+    assert speed_curves.TARGET_ERROR == 1e-3
     page = page_of(three, "speed_curves")
     table = page.table.set_index("Setting")
     assert table.loc["good"].tolist() == ["3", "3", "3.00 s", "1.00"]

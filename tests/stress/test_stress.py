@@ -93,7 +93,7 @@ def test_every_stress_begins_where_a_careful_renderer_succeeds(name):
 def test_every_stress_has_the_same_trial_for_every_renderer(name):
     stress = stress_named(name)
     severity = stress.sweep.severity(0.3)
-    one, same = (stress.made(conditions())(severity, drawn(0), 24) for _ in range(2))
+    one, same = (stress.exam_generator(conditions())(severity, drawn(0), 24) for _ in range(2))
     assert torch.equal(one.camera.world_to_camera, same.camera.world_to_camera)
     first, again = truth(one)[0], truth(same)[0]
     assert torch.equal(first.hit, again.hit)
@@ -154,7 +154,7 @@ MOVED = {
 @each("name, severity", MOVED.items())
 def test_a_moved_surface_is_where_the_disturbed_field_first_is_zero_in_float64(name, severity):
     before = {key: tensor.clone() for key, tensor in BALL.decoder.state_dict().items()}
-    exam = stress_named(name).made(conditions())(severity, drawn(), 20)
+    exam = stress_named(name).exam_generator(conditions())(severity, drawn(), 20)
     assert all(torch.equal(tensor, before[key]) for key, tensor in BALL.decoder.state_dict().items())
     assert judge_rendering(exam, load("renderer", "dvr", n_ray_samples=512), conditions()).success
     first, rays = truth(exam)[0], exam.camera.double().rays().flat()
@@ -231,8 +231,8 @@ def test_a_disturbed_fit_ends_further_off(scene):
 
 
 def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
-    fits, draw_spheres = [], fit._draw_spheres
-    monkeypatch.setattr(fit, "_draw_spheres", lambda draw, offset: fits.append(offset) or draw_spheres(draw, offset))
+    fits, draw_spheres = [], fit._draw_parameters
+    monkeypatch.setattr(fit, "_draw_parameters", lambda draw, offset: fits.append(offset) or draw_spheres(draw, offset))
     for name in ("far_start", "a_ball"):
         few = replace(conditions(), fit=replace(FIT, resolution=8, iterations=1))
         judge_fit(name, 0.7, drawn(), renderer=load("renderer", "dist"), conditions=few)
@@ -305,7 +305,7 @@ def test_the_interval_of_a_noisy_breakdown_holds(width, least):
         )
         found = search.result()
         holds += found.low <= middle <= found.high
-        assert len(search.trials) <= search.most
+        assert len(search.trials) <= search.max_trials
     assert holds / 20 >= least
 
 
@@ -332,7 +332,7 @@ def test_without_repeats_the_breakdown_lies_between_neighbours_and_has_no_interv
     found = search.result()
     assert abs(found.level - middle) <= 0.5 / (levels - 1) + 1e-12
     assert (found.low, found.high, found.width) == (None, None, None)
-    assert len(search.outcomes) <= search.most < levels + 1 == search.grid + 1
+    assert len(search.outcomes) <= search.max_trials < levels + 1 == search.grid_trials + 1
 
 
 def test_without_repeats_an_end_is_tried_once():

@@ -17,7 +17,7 @@ from bench.machine.limits import Limits
 from bench.records.record import RunStatus, to_json
 from bench.setup.inputs import RunContext
 from bench.tasks import ablation
-from bench.tasks.ablation import BASE, DEFINITIONS, SMALLER, WARM_UP, Ablation, Clocked
+from bench.tasks.ablation import BASE, DEFINITIONS, SHRINK_FACTOR, WARM_UP_PIXELS, Ablation, Timings
 from renderers import waits
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
@@ -130,8 +130,8 @@ def test_rates_are_compared_with_the_best_that_the_machine_did_before_and_after(
 
 
 def test_costs_are_medians_with_least_and_largest():
-    clocked = Clocked([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], [0.0], Counts(10, 4, coarse=7), 77, 600, 80)
-    forward = Clocked([2.0], [0.0], [0.0], Counts(5, 0), None, None)
+    clocked = Timings([3.0, 1.0, 8.0], [0.5, 0.25, 0.75], [0.0], Counts(10, 4, coarse=7), 77, 600, 80)
+    forward = Timings([2.0], [0.0], [0.0], Counts(5, 0), None, None)
     assert ablation.costs(forward, clocked, {"gemm_peak_flops": 100.0, "bfloat16_peak_flops": 400.0}) == {
         "queries": 5, "coarse_queries": 0, "step_queries": 10, "step_coarse_queries": 7, "step_gradients": 4,
         "repeats": 3, "peak_memory_bytes": 77,
@@ -248,17 +248,17 @@ class Costly(Fake):
 def test_where_the_work_is_done_a_smaller_image_is_measured(tmp_path):
     costly = Costly(above=16 * 16 - 1, values=10_000)
     run = measured(tmp_path, costly, replace(SETTINGS, limits=Limits(9000, 8)))
-    side = SIZE // SMALLER
+    side = SIZE // SHRINK_FACTOR
     assert run.record.status is RunStatus.TIMEOUT
     assert run.record.reason == f"more than 9,000 field values in a step at 16 x 16; it finishes at {side} x {side}"
     assert run.record.metrics["size"] == side
     assert run.record.metrics["rays"] == side**2
     assert np.load(run.folder / "images.npz")["hit"].shape == (side, side)
     # Each size begins with a warm-up. What is too much once is not tried again.
-    assert costly.rendered[:4] == [WARM_UP**2, SIZE**2, WARM_UP**2, side**2]
+    assert costly.rendered[:4] == [WARM_UP_PIXELS**2, SIZE**2, WARM_UP_PIXELS**2, side**2]
 
 
-@each("smallest", [SIZE // SMALLER + 1, 1])
+@each("smallest", [SIZE // SHRINK_FACTOR + 1, 1])
 def test_where_no_size_finishes_there_are_no_numbers(tmp_path, smallest):
     costly = Costly(above=0, values=1000)
     record = measured(tmp_path, costly, replace(SETTINGS, limits=Limits(900, 8), smallest=smallest)).record
@@ -268,11 +268,11 @@ def test_where_no_size_finishes_there_are_no_numbers(tmp_path, smallest):
 
 @each("values, times", [(0, 5), (1000, 1)])
 def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, values, times):
-    costly = Costly(above=WARM_UP**2, values=values)
+    costly = Costly(above=WARM_UP_PIXELS**2, values=values)
     run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
     assert run.record.status is RunStatus.OK
     assert run.record.metrics["repeats"] == times
-    assert costly.rendered == [WARM_UP**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
+    assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
 
 
 def test_renderers_that_cannot_are_unsupported(tmp_path):
@@ -287,7 +287,10 @@ TURNS = replace(SETTINGS, repeats=1, beside=["newton", "dvr"], rounds=2, size=16
 
 
 def test_ratios_are_of_the_same_round():
-    mine, base = Clocked([2.0, 9.0, 2.0], cpu=[4.0, 4.0, 4.0]), Clocked([1.0, 3.0, 1.0], cpu=[8.0, 2.0, 8.0])
+    mine, base = (
+        Timings([2.0, 9.0, 2.0], cpu_seconds=[4.0, 4.0, 4.0]),
+        Timings([1.0, 3.0, 1.0], cpu_seconds=[8.0, 2.0, 8.0]),
+    )
     assert ablation.ratios(mine, base, "step") == {
         "step_cpu": 4.0, "step_ratio": 2.0, "step_ratio_low": 2.0, "step_ratio_high": 3.0,
         "step_cpu_ratio": 0.5, "step_cpu_ratio_low": 0.5, "step_cpu_ratio_high": 2.0,

@@ -18,7 +18,7 @@ from bench.run.execute import execute
 from bench.run.process import Job
 from bench.run.summary import show
 from bench.setup.fields import FieldChoice, ModelSettings
-from bench.tasks.capacity import Capacity, saved
+from bench.tasks.capacity import Capacity, savings
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of
@@ -120,9 +120,9 @@ def test_saved_time_is_given_only_where_the_network_was_fitted():
     chosen = Evidence("sphere", Size(4, 4), 10, error, seconds=2.0)
     network = Evidence(PAPERS.name, Size(PAPERS.stored, PAPERS.stored), PAPERS.flops, error, seconds=300.0)
     failed = replace(network, error=None, status=RunStatus.DIVERGED)
-    assert saved(chosen, [chosen, network])["saved_seconds"] == 150
-    assert "saved_seconds" not in saved(chosen, [chosen, failed])
-    assert saved(chosen, [chosen])["saved_flops_per_query"] == PAPERS.flops / 10
+    assert savings(chosen, [chosen, network])["saved_seconds"] == 150
+    assert "saved_seconds" not in savings(chosen, [chosen, failed])
+    assert savings(chosen, [chosen])["saved_flops_per_query"] == PAPERS.flops / 10
 
 
 def test_a_choice_is_checked_by_the_best_candidate_of_each_draw():

@@ -113,6 +113,6 @@ def test_a_prior_that_can_show_a_shape_is_fitted_to_it_and_the_record_is_filled(
         assert 0 < record.metrics["floor_chamfer_l2"] < record.metrics_start["chamfer_l2"]
         assert record.metrics["slope_median"] == pytest.approx(1.0, abs=0.25)
         assert record.metrics["distance_error"] < 0.012
-        assert Truth(ball.mesh).distance(asked[0].numpy()).max() < prior_fit.NEAR + 1e-4
+        assert Truth(ball.mesh).distance(asked[0].numpy()).max() < prior_fit.MAX_OFFSET + 1e-4
         with np.load(images) as arrays:
             assert arrays["normals"].shape == (8, 8, 3)

@@ -12,7 +12,7 @@ from bench.evaluate.reference import Reference, in_float64
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
-from bench.tasks.gradients import BANDS, DEFINITIONS, NEAR, Gradients, Subject, _bands, _draw, _outline
+from bench.tasks.gradients import BANDS, DEFINITIONS, SAME_SURFACE_DISTANCE, Gradients, Subject, _bands, _draw, _outline
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind
 from renderers.rendering import Capabilities, Renderer, Rendering, Unsupported
@@ -184,7 +184,7 @@ def test_pixels_whose_hit_lies_on_another_surface_are_excluded_and_counted(tmp_p
         assert metrics[f"{band}.pixels"] + metrics[f"{band}.excluded"] == SETTINGS.pixels
         assert metrics[f"{band}.code_median_error"] < 1e-6
     # A bias on the same surface is an error of the renderer, and compared.
-    off = judged(tmp_path, Changed(EXACT["idr"], EXACT["idr"].capabilities, -2 * NEAR)).record.metrics
+    off = judged(tmp_path, Changed(EXACT["idr"], EXACT["idr"].capabilities, -2 * SAME_SURFACE_DISTANCE)).record.metrics
     assert min(off[f"{band}.pixels"] for band in HITS) >= SETTINGS.pixels - 3
 
 

@@ -13,7 +13,7 @@ from bench.shape_prior import Prior
 from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
-from bench.tasks.multiview import GivenPhotographs, Multiview, blurred, sample
+from bench.tasks.multiview import Multiview, PhotometricLoss, blur, sample
 from datasets.mesh import extract
 from datasets.meshes import read_mesh
 from datasets.scene import Scene, Truth
@@ -47,9 +47,9 @@ def problem_of(scene, **changed):
     return replace(SETTINGS, **changed).problem(scene, PRIOR, RENDERER, seed=0, device=CPU)
 
 
-def given(scene, **changed) -> GivenPhotographs:
+def given(scene, **changed) -> PhotometricLoss:
     settings = replace(SETTINGS, **changed)
-    return GivenPhotographs(settings, RENDERER, settings.images.take(Truth(scene.mesh), CAMERA, seed=0), CPU)
+    return PhotometricLoss(settings, RENDERER, settings.images.take(Truth(scene.mesh), CAMERA, seed=0), CPU)
 
 
 def test_the_truth_costs_least(scene):
@@ -130,27 +130,27 @@ def test_a_similarity_is_sought_in_place_where_that_is_asked_for(scene):
 
 def test_coarse_images_come_first(scene):
     photographs = given(scene, coarse_blur=0.0625)
-    roughness = [photographs.blurred(i).diff(dim=1).abs().mean().item() for i in (0, 8, 15, 29)]
+    roughness = [photographs.images_at(i).diff(dim=1).abs().mean().item() for i in (0, 8, 15, 29)]
     assert roughness[0] < roughness[1] < roughness[2] == roughness[3]
-    assert torch.equal(photographs.blurred(15), photographs.colours)
+    assert torch.equal(photographs.images_at(15), photographs.colours)
 
 
 def test_blurring_keeps_what_is_constant_and_the_mean():
     flat = torch.full((2, 9, 7, 3), 0.3)
-    assert torch.allclose(blurred(flat, 1.5), flat, atol=1e-6)
+    assert torch.allclose(blur(flat, 1.5), flat, atol=1e-6)
     spot = torch.zeros(1, 21, 21, 3)
     spot[0, 10, 10] = 1.0
-    soft = blurred(spot, 1.5)
+    soft = blur(spot, 1.5)
     assert soft.sum().item() == pytest.approx(3.0, rel=1e-4)
     variance = (soft[0, :, :, 0].sum(1) * (torch.arange(21) - 10) ** 2).sum().item()
     assert variance == pytest.approx(1.5**2, rel=0.05)
-    assert blurred(torch.rand(1, 2, 2, 3), 5.0).isfinite().all()  # wider than the image
+    assert blur(torch.rand(1, 2, 2, 3), 5.0).isfinite().all()  # wider than the image
 
 
 def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
     with pytest.raises(NotReached, match="no point of the shape is seen by two neighbouring views"):
         level = replace(PLAINLY, views=2).take(Truth(scene.mesh), camera_of(32), seed=0)  # from opposite sides
-        GivenPhotographs(SETTINGS, RENDERER, level, CPU).compare(sphere(0.5), 0)
+        PhotometricLoss(SETTINGS, RENDERER, level, CPU).compare(sphere(0.5), 0)
     with pytest.raises(NotReached):
         given(scene).compare(sphere(1e-3, (0.0, 0.0, 0.9)), 0)
 

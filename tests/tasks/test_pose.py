@@ -11,7 +11,7 @@ import trimesh
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import History, OptimiserSettings, optimise
-from bench.tasks.pose import Pose, PoseProblem, known_shape, pose_error
+from bench.tasks.pose import Pose, PoseProblem, build_shape_field, pose_error
 from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.scene import Scene
 from renderers.fields.analytic import box
@@ -140,7 +140,7 @@ def test_restarts_find_what_one_start_misses(scene):
 def test_a_known_shape_is_the_scenes(run):
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
     grid, network = (
-        known_shape(replace(SETTINGS, shape=shape, grid=48), run.inputs)(points) for shape in ("grid", "prior")
+        build_shape_field(replace(SETTINGS, shape=shape, grid=48), run.inputs)(points) for shape in ("grid", "prior")
     )
     assert (grid - box(SIZES)(points)).abs().max() < 0.02
     prior = run.inputs.prior

@@ -45,7 +45,7 @@ def fewer():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store, "VALIDATION", 1)
         patch.setattr(baselines, "SAMPLES", 32)
-        patch.setattr(single_view, "TRIED", 20)
+        patch.setattr(single_view, "SEARCHED_VIEWS", 20)
         yield
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN_PREFIX
 from bench.reconstruct.stereo import Matching
 from bench.reconstruct.subject import Depths
-from bench.reconstruct.surfaces import fused, measured_clouds, with_colours
+from bench.reconstruct.surfaces import fuse_clouds, measured_clouds, with_colours
 from bench.solve.solve import COSTS
 from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
@@ -51,7 +51,9 @@ def test_a_surface_has_colours_metrics_and_pictures_and_no_evaluations(scene, tm
     assert record.evaluations == {"value": 0, "gradient": 0}
     assert record.seconds["forward"] > 0 and record.seconds["backward"] == 0 and record.seconds["evaluation"] > 0
     chamfer, overlap, psnr = WORST[name]
-    assert metrics[SEEN + "chamfer_l1"] < chamfer and metrics["mask_iou"] > overlap and metrics["psnr_image"] > psnr
+    assert (
+        metrics[SEEN_PREFIX + "chamfer_l1"] < chamfer and metrics["mask_iou"] > overlap and metrics["psnr_image"] > psnr
+    )
     assert assert_coloured_mesh(tmp_path).std(axis=0).max() > 5
     count, size = task.images.views, task.longest
     found = f"{count} rendered photographs of {size} x {size} pixels; {-(-count // task.held_out)} of them are held out"
@@ -122,7 +124,7 @@ def test_points_are_turned_to_a_camera_that_sees_them_not_to_the_nearest(scene, 
     subject = POISSON.subject(run_in(tmp_path / "run", scene).inputs)
     plate = trimesh.creation.box((0.2, 0.9, 0.9)).apply_translation([0.6, 0.0, 0.0])
     trimesh.PointCloud(trimesh.sample.sample_surface(plate, 6000, seed=0)[0]).export(tmp_path / "plate.ply")
-    bare = replace(subject, given=tuple(replace(shot, mask=None) for shot in subject.given))
-    points, normals = fused(measured_clouds(str(tmp_path / "plate.ply"), bare))
+    bare = replace(subject, input_shots=tuple(replace(shot, mask=None) for shot in subject.input_shots))
+    points, normals = fuse_clouds(measured_clouds(str(tmp_path / "plate.ply"), bare))
     for inner, side in ((points[:, 0] < 0.52, -1), (points[:, 0] > 0.68, 1)):
         assert (side * normals[inner, 0] > 0).mean() > 0.95
