@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bench.records.folder import content_of, put_into, set_aside
+from bench.records.folder import archive_run, content_hash, copy_atomically
 from bench.records.read import check_links, read_plans, read_run, run_folders
-from bench.records.record import file_lock, leads_out, link_out, read_record, write_text
+from bench.records.record import escaping_link, file_lock, is_outside, read_record, write_text
 from bench.report.suite.attempts import place, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
@@ -35,7 +35,7 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
     for source in sources:
         if not (source / "runs").is_dir() and not place(source).is_dir():
             raise ValueError(f"{source} is not a results folder: it has no folder runs")
-        if not leads_out(into, source):
+        if not is_outside(into, source):
             raise ValueError(f"{into} is {source} or lies within it: --into must be another folder, outside of it")
     if into.is_file():
         raise ValueError(f"{into} is a file: --into must be a folder, or a new name")
@@ -48,17 +48,17 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
         if kept:
             write_attempts(kept, into)
         for folder in [*run_folders(source), *sorted((source / "earlier").glob("[!.]*/"))]:
-            if link := link_out(folder, source):
+            if link := escaping_link(folder, source):
                 problems.append(f"{folder}: not copied, since {link} is a link out of its results folder")
             elif folder.parent.name == "earlier":
-                put_into(into / "earlier" / folder.name, folder)
+                copy_atomically(into / "earlier" / folder.name, folder)
             else:
                 lines += _join(folder, into)
                 if problem := read_run(folder, source)[1]:
                     problems.append(f"{source}: {UNREADABLE}{problem}")
         problems += [f"{source}: this plan cannot be read: {problem}" for problem in read_plans(source)[1]]
         for plan in sorted((source / "sweeps").glob("*/plan.json")):  # of one name: of the same cells
-            if not leads_out(plan, source):
+            if not is_outside(plan, source):
                 (into / "sweeps" / plan.parent.name).mkdir(parents=True, exist_ok=True)
                 _keep_later(into / "sweeps" / plan.parent.name / plan.name, plan)
     return lines, problems
@@ -82,7 +82,7 @@ def _join(folder: Path, into: Path) -> list[str]:
     place, earlier = into / "runs" / folder.name, into / "earlier"
     with file_lock(into, folder.name):
         if not place.exists():
-            put_into(place, folder)
+            copy_atomically(place, folder)
             return []
         (mine, kept), (theirs, other) = _ranked(place), _ranked(folder)
         if mine[-1] == theirs[-1]:  # the same run
@@ -90,10 +90,10 @@ def _join(folder: Path, into: Path) -> list[str]:
             return []
         if theirs > mine:
             kept, other = other, kept
-            set_aside(place, earlier)
-            put_into(place, folder)
+            archive_run(place, earlier)
+            copy_atomically(place, folder)
         else:
-            put_into(earlier / f"{folder.name}-{theirs[-1]}", folder)
+            copy_atomically(earlier / f"{folder.name}-{theirs[-1]}", folder)
     return [f"{folder.name}: kept {kept}, set aside in earlier: {other}"]
 
 
@@ -105,7 +105,7 @@ def _ranked(folder: Path) -> tuple[tuple[Any, ...], str]:
         record = {}
     status, started = record.get("status", "unreadable"), str(record.get("started"))
     finished = bool(record) and status not in UNFINISHED
-    return (status == "ok", finished, bool(record), started, content_of(folder)), f"{status} of {started}"
+    return (status == "ok", finished, bool(record), started, content_hash(folder)), f"{status} of {started}"
 
 
 def main(arguments: list[str]) -> int:

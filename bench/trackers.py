@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import NUMERIC, as_number, started
+from bench.records.record import NUMERIC_FIELDS, as_number, started
 from datasets.extras import install
 
 METRICS, PARAMETERS, LONGEST = 1000, 100, 500  # most of them in a call of MLflow; characters of a parameter's value
@@ -102,7 +102,7 @@ def settings(config: dict[str, Any]) -> dict[str, str]:
 
 def values(record: dict[str, Any]) -> dict[str, float]:
     """All finite numbers of a record, such as `metrics.chamfer_l2`."""
-    return _finite(flat({name: record[name] for name in NUMERIC}))
+    return _finite(flat({name: record[name] for name in NUMERIC_FIELDS}))
 
 
 def curve(folder: Path) -> list[tuple[int, dict[str, float]]]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bench.evaluate.state import painted
 from bench.pictures.run_figures import normals_image, shaded
-from bench.records.record import leads_out, read_record
+from bench.records.record import is_outside, read_record
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import SUFFIXES, read_mesh
 from datasets.scene import Truth, View, see
@@ -134,7 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
             better = into.parent / f"{into.stem or 'turn'}.webp"
             raise ValueError(f"--into must end in .webp or .gif, found '{into}'; type --into {better}")
         for file in (into, given.shape / "mesh.ply"):
-            if run and file.parent == given.shape and leads_out(file, given.shape):
+            if run and file.parent == given.shape and is_outside(file, given.shape):
                 raise ValueError(f"{file} is a link out of the run folder: remove it")
         mesh = read_mesh(mesh_of_run(given.shape) if run else given.shape)
         frames = [Image.fromarray(frame) for frame in turntable(stand(mesh, given.up), given.frames, given.size)]

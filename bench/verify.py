@@ -22,7 +22,7 @@ from bench.machine.environment import describe, flushing_denormals
 from bench.records.folder import Identity
 from bench.records.format import number, plural
 from bench.records.read import run_folders
-from bench.records.record import Record, RunStatus, link_out, read_record
+from bench.records.record import Record, RunStatus, escaping_link, read_record
 from bench.setup.inputs import Judges, RunContext, cell_of
 from datasets.field_files import FIELD, load_field
 from renderers.checks import BadInput
@@ -72,7 +72,7 @@ def _agrees(folder: Path) -> bool | None:
     None where there is nothing to compare.
     """
     try:
-        if link := link_out(folder, folder.parent):
+        if link := escaping_link(folder, folder.parent):
             raise BadInput(f"{link} is a link out of the folder")
         record = Record.of(read_record(folder))
         metrics, device = _from_field(folder, record)

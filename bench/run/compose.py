@@ -28,8 +28,8 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from bench.config import PACKAGE, Config, type_of, wrong_type
-from bench.records.folder import Identity, identify, resolved
+from bench.config import CLASS_PACKAGE_KEY, Config, type_of, wrong_type_message
+from bench.records.folder import Identity, identify, resolve_config
 from bench.tables import CONF, folders, listed, nearest, register_resolvers, register_rows
 
 NOT_BY_DEFAULT = ("method", "experiment")  # groups that take a plus in front
@@ -160,7 +160,7 @@ def set_value(override: Override, config: DictConfig) -> bool:
             raise unknown_key(str(error.full_key), config) from error
         return False
     except OmegaConfBaseException as error:
-        raise ValueError(wrong_type(key, str(override.input_line).partition("=")[2], type_of(key))) from error
+        raise ValueError(wrong_type_message(key, str(override.input_line).partition("=")[2], type_of(key))) from error
     return True
 
 
@@ -197,7 +197,7 @@ def unknown_choice(group: str, name: str, options: Sequence[str]) -> ValueError:
 
 def unknown_key(key: str, config: DictConfig) -> ValueError:
     """The error of a key that a configuration lacks, with the nearest ones."""
-    if key.startswith("renderer.") and PACKAGE in (config.get("renderer") or ()):
+    if key.startswith("renderer.") and CLASS_PACKAGE_KEY in (config.get("renderer") or ()):
         return ValueError(f"unknown key {key!r}: an argument of your class is set by +{key}=VALUE, with a plus")
     names = dotted(config.hydra, "hydra.") if key.startswith("hydra.") else dotted(config)
     return ValueError(f"unknown key {key!r}{nearest(key, names)}")
@@ -276,7 +276,7 @@ class Composer:
                 raise _several(override)
         self.check_keys()
         tree = _tree(config)
-        return identify(resolved(tree.config, tree.choices), tree.choices, self.task)
+        return identify(resolve_config(tree.config, tree.choices), tree.choices, self.task)
 
     def swept(self, config: DictConfig) -> list[list[str]]:
         """The overrides of each cell of the sweep that `whole` describes.
@@ -351,7 +351,7 @@ class Composer:
             else:
                 left_out.add(key)
                 self.lacking.setdefault(key, config)
-        return config, Resolved(resolved(config, tree.choices), tree.choices, left_out)
+        return config, Resolved(resolve_config(config, tree.choices), tree.choices, left_out)
 
 
 def without_hydra(config: DictConfig) -> DictConfig:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.progress import notice
 from bench.records.folder import Identity
-from bench.records.record import BESIDE
+from bench.records.record import CONCURRENT_RUNS_VARIABLE
 from bench.run.process import catch_signals, raise_if_stopped, signals_delayed, stopped_by
 from datasets.extras import install
 
@@ -190,7 +190,7 @@ class Pack:
 
         job, messages = JobEnvironment(), list[str]()
         os.chdir(self.folder)
-        os.environ |= self.variables | {BESIDE: str(job.num_tasks)}
+        os.environ |= self.variables | {CONCURRENT_RUNS_VARIABLE: str(job.num_tasks)}
         catch_signals()
         for number in (signal.SIGUSR1, signal.SIGUSR2):  # of a scheduler, before it ends a job
             signal.signal(number, signal.getsignal(signal.SIGTERM))

@@ -101,7 +101,7 @@ def _of_sweep(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
     """One line on a sweep that is refused: its first invalid cell, why, and how many are invalid."""
     if count == len(plan.cells):
         return reason
-    where = " ".join(plan.differing(cell)) or cell.id
+    where = " ".join(plan.distinct_overrides(cell)) or cell.id
     others = f"; {count} of {len(plan.cells)} cells are invalid" if count > 1 else ""
     return f"cell {plan.cells.index(cell) + 1} of {len(plan.cells)} ({where}): {reason}{others}; nothing was run"
 
@@ -155,7 +155,9 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
         file = Path((cell.config["dataset"] or {}).get("path") or "").name
         named = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {f'{cell.dataset} {file}'.strip()}"
         about = "reused" if cell.id in reused else about_as_long(taken[cell.id])
-        print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named, about) if part))
+        print(
+            "  ".join(part for part in (f"{number:>4}", " ".join(plan.distinct_overrides(cell)), named, about) if part)
+        )
     parts = [f"{len(plan.cells)} planned: {len(taken)} to run"]
     if reused:
         parts.append(f"{len(reused)} reused")

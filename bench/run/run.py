@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from bench.config import Isolation, build
 from bench.progress import Report, notice, run_progress
-from bench.records.folder import Identity, claimed, release, reusable
+from bench.records.folder import Identity, free_reserve, locked_folder, reusable
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
 from bench.run.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, unwritten
@@ -105,7 +105,7 @@ def run(identity: Identity) -> tuple[Path, Record]:
         RunInterrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
     config = identity.config
-    with claimed(Path(config["results_dir"]), identity, config["rerun"]) as (folder, finished):
+    with locked_folder(Path(config["results_dir"]), identity, config["rerun"]) as (folder, finished):
         if finished is not None:
             return folder, _reuse(folder, finished)
         hashes = {"config_hash": identity.config_hash, "code": identity.code}
@@ -150,7 +150,7 @@ def _run_anew(job: Job) -> Record:
             record.ended = now()
             if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
                 record.log = _last_lines(folder / "log.txt")
-            release(folder)
+            free_reserve(folder)
             record.write(folder)
             write_log(folder, record)
     if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:

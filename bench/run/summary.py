@@ -13,9 +13,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.records.format import count, number, plural, seconds
-from bench.records.metrics import SHOWN, Metric
+from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.read import RESULTS, Plan
-from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
+from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus
 
 CUSTOM = "custom"  # the choice of renderer that is a class of the user's own
 CONTRACT = "python -m pytest tests/renderers/test_renderer_contract.py -k custom --renderer="  # as in CONTRIBUTING.md
@@ -37,7 +37,7 @@ def show(folder: Path, record: Record) -> None:
         console.print(_costs(record))
     for note in record.notes:
         print(f"note: {note}")
-    for picture in [path for name in PICTURES if (path := folder / name).is_file()][:1]:
+    for picture in [path for name in PICTURE_FILES if (path := folder / name).is_file()][:1]:
         print(f"picture: {picture}")
     _print_contract(folder.parent, [] if record.reused else [vars(record)])
     _print_next(folder.parents[1])
@@ -115,7 +115,7 @@ def _logged(record: Record) -> Iterator[str]:
 
 def _compared(record: Record) -> Iterator[tuple[str, str, str, str]]:
     """The errors of a task that optimises: heading, before, after, and which direction is better."""
-    for name, metric in SHOWN.items():
+    for name, metric in TABLE_METRICS.items():
         if record.metrics_start and name in {*record.metrics_start, *record.metrics}:
             before, after = record.metrics_start.get(name), record.metrics.get(name)
             yield metric.label, number(before, metric.factor), number(after, metric.factor), metric.better
@@ -125,7 +125,7 @@ def _measured(record: Record) -> Iterator[tuple[str, str]]:
     """The metrics of a task that measures without optimising; of one that recommends a field, what it recommends."""
     recommended = [name for name in record.metrics if name.startswith("recommended")]
     for name in recommended or record.metrics:
-        metric = SHOWN.get(name, Metric(name))
+        metric = TABLE_METRICS.get(name, Metric(name))
         yield metric.label, number(record.metrics[name], metric.factor)
 
 

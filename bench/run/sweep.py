@@ -15,7 +15,7 @@ from bench.config import Isolation
 from bench.progress import display, notice
 from bench.records.folder import Identity
 from bench.records.format import number, plural, seconds
-from bench.records.metrics import SHOWN, Metric
+from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.read import Plan
 from bench.records.record import RunStatus, row_name
 from bench.run.compose import Composer
@@ -28,7 +28,7 @@ from bench.run.run import run_cell
 
 IN_LINE = {  # metrics in the line of a cell
     "recommended_field": Metric("recommended"),
-    **{name: SHOWN[name] for name in ("chamfer_l2", "rotation_error_deg")},
+    **{name: TABLE_METRICS[name] for name in ("chamfer_l2", "rotation_error_deg")},
 }
 INTERVAL = 0.5  # seconds between two checks of which cells have ended
 
@@ -173,7 +173,7 @@ def followed(plan: Plan, reused: set[str]) -> Iterator[None]:
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
+                    text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.distinct_overrides(cell)))
                     print(place(run_by_now()) + text, flush=True)
             shown.update(progress, completed=run_by_now(), said=f"{failed} failed")
 
@@ -192,13 +192,13 @@ def followed(plan: Plan, reused: set[str]) -> Iterator[None]:
             shown.remove_task(progress)
 
 
-def line(folder: Path, record: dict[str, Any], differing: str) -> str:
+def line(folder: Path, record: dict[str, Any], distinct_overrides: str) -> str:
     """The outcome of a cell in a line that ends with its folder; `differing` are overrides that not all cells have."""
     name, spent = row_name(record["config"], record["renderer"]), record["seconds"]
     loop = spent.get("forward", 0.0) + spent.get("backward", 0.0) or spent.get("total")
     parts = [
         record["status"] + (" (reused)" if record["reused"] else ""),
-        differing,
+        distinct_overrides,
         ", ".join((record["task"], name, record["scene"] or record["dataset"])),
         seconds(loop),
     ]

@@ -260,7 +260,7 @@ def test_a_disk_that_fills_up_during_a_run_is_an_error(bench, monkeypatch):
         for name in ("curve.jsonl", "log.txt"):
             (folder / name).symlink_to("/dev/full")
 
-    monkeypatch.setattr(run_folder, "_reserve", fill_up)
+    monkeypatch.setattr(run_folder, "_reserve_bytes", fill_up)
     code, out, err = bench(*TINY, "task.optimiser.iterations=2")
     assert code == 1
     assert "Traceback" not in out + err

@@ -7,7 +7,7 @@ import pytest
 from hydra import compose
 
 from bench.prior import main as prior_main
-from bench.records.folder import identify, resolved
+from bench.records.folder import identify, resolve_config
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus
 from bench.run import plan as plan_module
@@ -113,7 +113,7 @@ def test_a_cell_is_what_hydra_makes_of_it(arguments):
         for cell, overrides in zip(cells, swept, strict=True):
             whole = compose("config", overrides, return_hydra_config=True)
             choices = dict(whole.hydra.runtime.choices)
-            assert cell == identify(resolved(without_hydra(whole), choices), choices, overrides)
+            assert cell == identify(resolve_config(without_hydra(whole), choices), choices, overrides)
     assert len({cell.name for cell in cells}) == len(cells)
 
 
