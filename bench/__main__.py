@@ -25,10 +25,10 @@ def _summarise(plan: Plan) -> list[str]:
     """Writes and prints the summary of a sweep; returns the status of each of its cells."""
     from bench.report.sweeps import write_sweep
     from bench.report.write.html import write_index
-    from bench.run.summary import show_sweep
+    from bench.run.summary import print_sweep_summary
 
     table = write_sweep(plan)
-    return show_sweep(plan, write_index(plan.results_dir), table)
+    return print_sweep_summary(plan, write_index(plan.results_dir), table)
 
 
 def console() -> int:

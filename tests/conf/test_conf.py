@@ -92,7 +92,7 @@ def cells(name: str) -> list[list[str]]:
     """The first and the last cell of an experiment at desk scale, as overrides."""
     with composing():
         composer = Composer([f"+experiment={name}"])
-        swept = composer.swept(composer.whole())
+        swept = composer.swept(composer.shared_config())
     return [[text for text in cell if not text.startswith("+experiment=")] for cell in (swept[0], swept[-1])]
 
 
