@@ -17,15 +17,8 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.tables import LABEL_KEY, LOOK_KEY, ROWS_KEY, choice, names, nearest, register_resolvers
 
 MIN_VALUES = {
-    "seed": 0,
-    "index": 0,
-    "draw": 0,
-    "threads": 1,
-    "evaluation.grid": 8,
-    "evaluation.points": 1,
-    "evaluation.picture": 4,
-    "evaluation.gallery": 4,
-    "evaluation.every": 1,
+    **{"seed": 0, "index": 0, "draw": 0, "threads": 1, "evaluation.grid": 8, "evaluation.points": 1},
+    **{"evaluation.picture": 4, "evaluation.gallery": 4, "evaluation.every": 1},
 }
 REMEDY_IF_NOT_POSITIVE = {
     "time_limit": "600 is ten minutes, null no limit",
@@ -360,11 +353,8 @@ def _build_dataclass(cls: type, arguments: dict[str, Any], name: str, packages: 
         target = _class_path(child) if child else ""
         values[key] = build(arguments[key], f"{name}.{key}", packages, target, role=child or types[key])
     for item in fields(cls):
-        if (
-            item.name not in values
-            and item.default is dataclasses.MISSING
-            and item.default_factory is dataclasses.MISSING
-        ):
+        has_default = item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING
+        if item.name not in values and not has_default:
             raise ValueError(_missing_value_message(cls, name, item.name))
     try:
         return cls(**values)

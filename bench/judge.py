@@ -32,7 +32,7 @@ from renderers.checks import BadInput
 
 SURFACE_POINTS = choice("scale", "desk")["points"]  # as in runs
 SPHERE_RADIUS = choice("dataset", "mesh")["radius"]  # runs move a mesh into this sphere
-DEFAULT_THRESHOLD = "1%"  # of the truth's extent; runs have 0.02, for shapes about 2 across
+DEFAULT_THRESHOLD = "1%"  # runs have 0.02, for shapes about 2 across
 # Maximum size ratio and minimum overlap of boxes; see `_mismatch_warnings`. A mesh may have more than was scanned.
 SCAN_LIMITS = (10.0, 0.0)
 SHAPE_LIMITS = (1.2, 0.5)
@@ -40,7 +40,7 @@ BOX_MARGIN_FRACTION = 0.02  # boxes are enlarged by it on each side, so that the
 MAX_CULLING_PIXELS = 800  # longer side of a photograph whose mask culls a mesh
 UNIT_SUFFIXES = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None, "normal_consistency": None}
 WORLD_MESH_FILE = "mesh_world.ply"  # the mesh of a run on photographs, in the world of their cameras
-DEFAULT_TASK = "judge"  # the task of rows without --like
+JUDGE_TASK = "judge"  # the task of rows without --like
 
 
 @dataclass(frozen=True)
@@ -156,18 +156,16 @@ def _photographs(folder: Path) -> Capture:
     return read_capture(folder, Reading(MAX_CULLING_PIXELS, unchecked=True))
 
 
-def _mismatch_warnings(
-    mesh: Mesh, truth_points: Float[np.ndarray, "n 3"], max_ratio: float, min_overlap: float
-) -> list[str]:
+def _mismatch_warnings(mesh: Mesh, truth: Float[np.ndarray, "n 3"], max_ratio: float, min_overlap: float) -> list[str]:
     """A warning if a mesh is probably in another world or in other units than its truth.
 
     Args:
         max_ratio: largest ratio of the sizes without a warning.
         min_overlap: smallest intersection over union of the boxes without a warning.
     """
-    extent = float(np.linalg.norm(np.ptp(truth_points, axis=0)))
+    extent = float(np.linalg.norm(np.ptp(truth, axis=0)))
     ratio, margin = mesh.diagonal / max(extent, 1e-300), BOX_MARGIN_FRACTION * max(mesh.diagonal, extent)
-    boxes = [(points.min(axis=0) - margin, points.max(axis=0) + margin) for points in (mesh.used, truth_points)]
+    boxes = [(points.min(axis=0) - margin, points.max(axis=0) + margin) for points in (mesh.used, truth)]
     low, high = np.stack(boxes, axis=1)
     common_volume = (high.min(axis=0) - low.max(axis=0)).clip(0).prod()
     overlap = common_volume / ((high - low).prod(axis=1).sum() - common_volume)
@@ -245,8 +243,7 @@ def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: a
     else:
         truth = str(options.truth or options.dtu)
         config = {"task": {"points": judge.points}, "dataset": {"path": truth}, "index": index, "split": "test"}
-        names = {"task": DEFAULT_TASK, "dataset": DEFAULT_TASK, "scene": item.name}
-        fields = {**names, "seed": judge.seed, "config": config}
+        fields = {"task": JUDGE_TASK, "dataset": JUDGE_TASK, "seed": judge.seed, "scene": item.name, "config": config}
     fields["config"] |= {"label": options.method, "renderer": {}, "silhouette": None, "results_dir": str(options.into)}
     key = digest([method, fields["task"], fields["config"], fields["seed"], item.name])
     record = Record(f"{fields['task']}-{method}-{key}", renderer=method, **fields)
@@ -289,8 +286,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Judges the meshes of the command line; returns 0 for success, 1 if some could not be judged, 2 if none could."""
     options = parse_arguments(arguments)
     try:
-        settings = ("dtu", "threshold", "points", "seed", "unit_sphere", "to_world", "cull")
-        judge = Judge(*(getattr(options, name) for name in settings))
+        judge = Judge(
+            *(options.dtu, options.threshold, options.points, options.seed),
+            *(options.unit_sphere, options.to_world, options.cull),
+        )
         if options.into is not None and not (options.method and is_plain_name(options.method)):
             raise ValueError("--into writes rows of a method: add --method NAME")
         if options.like is not None and options.mesh.is_dir() and not (options.mesh / "record.json").is_file():

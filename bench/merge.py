@@ -12,7 +12,7 @@ from typing import Any
 
 from bench.records.folder import archive_run, content_hash, copy_atomically
 from bench.records.read import check_links, read_plans, read_run, run_folders
-from bench.records.record import escaping_link, file_lock, is_outside, read_record, write_text
+from bench.records.record import bad_link, file_lock, is_outside, read_record, write_text
 from bench.report.suite.attempts import place, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
@@ -47,7 +47,7 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
         if attempts:
             write_attempts(attempts, into)
         for folder in [*run_folders(source), *sorted((source / "earlier").glob("[!.]*/"))]:
-            if link := escaping_link(folder, source):
+            if link := bad_link(folder, source):
                 problems.append(f"{folder}: not copied, since {link} is a link out of its results folder")
             elif folder.parent.name == "earlier":
                 copy_atomically(into / "earlier" / folder.name, folder)

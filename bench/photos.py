@@ -16,7 +16,7 @@ from renderers.camera import sphere_span
 
 MAX_SHOWN_PHOTOGRAPHS = 8
 OUTLINE_COLOUR = "#e5007d"
-MAX_NAMED_PHOTOGRAPHS = 5  # of those with the worst fit
+MAX_NAMED_PHOTOGRAPHS = 5
 
 
 def describe_fit(fit: Fit, capture: Capture) -> list[str]:

@@ -41,7 +41,6 @@ from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 PAGE = "suite"  # its file name in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
 TUNED_LABEL = f"label='${{renderer._label_}}{BY_ITSELF}'"
-# Keys that the user must not set.
 STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*STATED, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one
 SETTING_VALUES = ("stated", "tuned")  # the set's setting for all renderers, or that of conf/tuned.yaml

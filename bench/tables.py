@@ -101,12 +101,8 @@ def register_rows(folders: Sequence[Path] = ()) -> None:
     _user_folders[:] = folders
     _choices.clear()
     _choices.update({group: {**choices} for group, choices in _conf_choices().items()})
-    for group, name, choice in (
-        (group, name, choice)
-        for folder in folders
-        for group, choices in choices_of(folder).items()
-        for name, choice in choices.items()
-    ):
+    user_groups = [group for folder in folders for group in choices_of(folder).items()]
+    for group, name, choice in ((group, *item) for group, choices in user_groups for item in choices.items()):
         existing = _choices.setdefault(group, {}).get(name)
         if existing is None or group == TUNED:  # settings that the user tuned replace ours
             _choices[group][name] = choice

@@ -47,11 +47,8 @@ class MLflow:
 
         client = MlflowClient(tracking_uri=self.uri)
         experiment = client.get_experiment_by_name(self.experiment)
-        artifact_uri = Path(self.artifacts).resolve().as_uri()
-        if experiment is None:
-            experiment_id = client.create_experiment(self.experiment, artifact_location=artifact_uri)
-        else:
-            experiment_id = experiment.experiment_id
+        uri = Path(self.artifacts).resolve().as_uri()
+        experiment_id = experiment.experiment_id if experiment else client.create_experiment(self.experiment, uri)
         start_ms = int(started(record).timestamp() * 1000)
         tags = {"mlflow.runName": record["id"], "status": record["status"], "reason": record["reason"]}
         run = client.create_run(experiment_id, start_time=start_ms, tags=tags).info.run_id

@@ -74,10 +74,8 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
     rows = (read_yaml(path) if path.is_file() else {}) | new
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, HEADER + yaml.safe_dump(rows, sort_keys=False, width=LINE_WIDTH))
-    lines = left_out(experiment, methods)
-    for row, values in settings.items():
-        lines.append(f"{path}: {row}: {', '.join(f'{key} {number(value)}' for key, value in values.items())}")
-    return lines
+    texts = {row: ", ".join(f"{key} {number(x)}" for key, x in values.items()) for row, values in settings.items()}
+    return left_out(experiment, methods) + [f"{path}: {row}: {text}" for row, text in texts.items()]
 
 
 def _origin_keys(method: Tuning, experiment: Runs) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from datasets.meshes import SUFFIXES, read_mesh
 from datasets.scene import Truth, View, see
 from datasets.views import ViewSampler
 
-DISTANCE, FIELD_OF_VIEW_DEGREES = 2.5, 50.0  # in scene units: the whole unit sphere is in the picture
+DISTANCE, FIELD_OF_VIEW_DEGREES = 2.5, 50.0  # scene units: the unit sphere fills the picture
 ELEVATION_DEGREES = 20.0
 SUPERSAMPLES = 2  # rendered pixels along each side of a written pixel
 MIN_PIXELS, MAX_PIXELS = 16, 1024
@@ -112,7 +112,7 @@ def mesh_of_run(folder: Path) -> Path:
     raise ValueError(f"{folder} has no mesh.ply: the run has no mesh ({reason}); name another run, or a mesh file")
 
 
-def stand_upright(mesh: Mesh, up: str) -> Mesh:
+def make_upright(mesh: Mesh, up: str) -> Mesh:
     """Rotates the axis `up` of a mesh to y; moves and scales the mesh into the unit sphere if it lies outside."""
     turntable_views = replace(mesh, vertices=mesh.vertices @ np.array(UPRIGHT[up], dtype=float).T)
     radius = np.linalg.norm(turntable_views.used, axis=1).max()
@@ -140,8 +140,7 @@ def main(arguments: list[str] | None = None) -> int:
             if is_run and file.parent == options.shape and is_outside(file, options.shape):
                 raise ValueError(f"{file} is a link out of the run folder: remove it")
         mesh = read_mesh(mesh_of_run(options.shape) if is_run else options.shape)
-        arrays = turntable(stand_upright(mesh, options.up), options.frames, options.size)
-        frames = [Image.fromarray(array) for array in arrays]
+        frames = [*map(Image.fromarray, turntable(make_upright(mesh, options.up), options.frames, options.size))]
         into.parent.mkdir(parents=True, exist_ok=True)
         duration = round(TURN_MILLISECONDS / options.frames)
         frames[0].save(into, save_all=True, append_images=frames[1:], duration=duration, loop=0, quality=WEBP_QUALITY)

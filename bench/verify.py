@@ -22,13 +22,13 @@ from bench.machine.environment import describe, flushing_denormals
 from bench.records.folder import Identity
 from bench.records.format import number, plural
 from bench.records.read import run_folders
-from bench.records.record import Record, RunStatus, escaping_link, read_record
+from bench.records.record import Record, RunStatus, bad_link, read_record
 from bench.setup.inputs import Judges, RunContext, cell_of
 from datasets.field_files import FIELD, load_field
 from renderers.checks import BadInput
 
 METRIC_TOLERANCE = 1e-4  # relative: other machines add numbers in another order
-ABSOLUTE_TOLERANCE = 1e-9  # in the unit of the metric
+ABSOLUTE_TOLERANCE = 1e-9
 MACHINE_KEYS = ("cpu", "device", "torch", "numpy", "python", "threads", "kernels")
 EXCLUDED_METRICS = re.compile(r"\.|seconds|overhead|saved|gemm")  # metrics of several fits or of the clock
 
@@ -72,7 +72,7 @@ def _agrees(folder: Path) -> bool | None:
     None if there is nothing to compare.
     """
     try:
-        if link := escaping_link(folder, folder.parent):
+        if link := bad_link(folder, folder.parent):
             raise BadInput(f"{link} is a link out of the folder")
         record = Record.of(read_record(folder))
         metrics, device = _from_field(folder, record)
@@ -96,12 +96,9 @@ def _agrees(folder: Path) -> bool | None:
         metrics = plural(len(recomputed), "metric")
         print(f"agrees: {folder.name}, from its field: {metrics}, at most {largest:.1g} apart{rest}")
         return True
-    texts = []
-    for name in wrong:
-        old = number(recorded[name]) if name in recorded else "not there"
-        texts.append(f"{name} is {old} in the record, now {number(recomputed[name])}")
-    reason = "; ".join(_environment_differences(record, describe(device)))
-    reason = reason or "code and machine are the same: was the record edited?"
+    old = {name: number(recorded[name]) if name in recorded else "not there" for name in wrong}
+    texts = [f"{name} is {old[name]} in the record, now {number(recomputed[name])}" for name in wrong]
+    reason = "; ".join(_changes(record, describe(device))) or "code and machine are the same: was the record edited?"
     print(f"differs: {folder.name}, from its field: {'; '.join(texts)}. {reason}")
     return False
 
@@ -138,7 +135,7 @@ def _relative_difference(first: float, second: float) -> float:
     return abs(first - second) / max(abs(first), abs(second))
 
 
-def _environment_differences(record: Record, environment: dict[str, Any]) -> list[str]:
+def _changes(record: Record, environment: dict[str, Any]) -> list[str]:
     """The differences in code and machine between a record and this process, as texts."""
     code = Identity({}, record.config).code
     differences = [f"the code differs: {record.code[:12]} then, {code[:12]} now"] if code != record.code else []

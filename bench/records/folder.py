@@ -15,16 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import OUR_PACKAGES, Rerun, check, check_draw
-from bench.records.record import (
-    NEUTRAL_KEYS,
-    RunStatus,
-    digest,
-    escaping_link,
-    file_lock,
-    is_outside,
-    read_record,
-    to_json,
-)
+from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.tables import without_row_keys
 from datasets.extras import named_files, version
 
@@ -146,7 +137,7 @@ def locked_folder(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterat
     for path in (folder, results_dir / "earlier", results_dir / ".locks" / identity.name):
         if is_outside(path, results_dir):
             raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")
-    if link := escaping_link(folder, results_dir):
+    if link := bad_link(folder, results_dir):
         raise ValueError(f"{folder / link} is a link out of the results folder: remove that folder")
     with file_lock(results_dir, identity.name):
         record = reusable(folder, identity, rerun)

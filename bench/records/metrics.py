@@ -20,7 +20,7 @@ class Metric(NamedTuple):
     better: str = ""
 
 
-TABLE_METRICS = {  # in the order of tables
+TABLE_METRICS = {  # the order is that of tables
     "chamfer_l2": Metric("Chamfer (x1000)", 1000.0, LOWER),
     "seen_chamfer_l1": Metric("Chamfer-L1 of what is seen (x1000)", 1000.0, LOWER),
     "accuracy": Metric("accuracy (x1000)", 1000.0, LOWER),
@@ -39,7 +39,7 @@ TABLE_METRICS = {  # in the order of tables
     "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
     "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),
 }
-MEASUREMENT_METRICS = {  # of tasks that measure without optimising
+MEASUREMENT_METRICS = {  # for tasks that measure without optimising
     "forward_seconds": Metric("forward (s)", better=LOWER),
     "step_seconds": Metric("step (s)", better=LOWER),
     "queries": Metric("values of a rendering", better=LOWER),

@@ -8,7 +8,7 @@ from typing import Any
 from bench.records.record import NEUTRAL_KEYS, renderer_name, row_name
 
 CHOICE_FIELDS = ("task", "method", "renderer", "dataset")  # fields of a record whose values need no key
-KEY_LABELS = {"index": "shape", "dataset.path": "", "_target_": ""}  # in place of the key, before its value
+KEY_LABELS = {"index": "shape", "dataset.path": "", "_target_": ""}  # text before the value, instead of the key
 MAX_DEPTH = 20
 EXCLUDED_KEYS = NEUTRAL_KEYS | {"label", "packages"}
 

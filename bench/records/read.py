@@ -16,7 +16,7 @@ from bench.records.record import (
     NOT_RUN,
     SCHEMA,
     Record,
-    escaping_link,
+    bad_link,
     from_json_values,
     is_outside,
     is_plain_name,
@@ -203,7 +203,7 @@ def run_folders(results_dir: Path) -> list[Path]:
 
 def read_run(folder: Path, results_dir: Path) -> tuple[dict[str, Any] | None, str]:
     """The record of a run's folder, or None and a message with the folder's name and the reason."""
-    if link := escaping_link(folder, results_dir):
+    if link := bad_link(folder, results_dir):
         return None, f"{folder.name}: not read, since {link} is a link out of the results folder"
     try:
         return read_record(folder), ""

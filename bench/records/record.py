@@ -227,7 +227,7 @@ def is_outside(path: Path, root: Path) -> bool:
     return not path.resolve().is_relative_to(root.resolve())
 
 
-def escaping_link(folder: Path, root: Path) -> str:
+def bad_link(folder: Path, root: Path) -> str:
     """The path of the first link that leads out of `root`: the folder or a link in it at any depth; else empty."""
     if folder.is_symlink() and is_outside(folder, root):
         return folder.name
@@ -237,7 +237,7 @@ def escaping_link(folder: Path, root: Path) -> str:
                 if entry.is_symlink():
                     if is_outside(Path(entry), root):
                         return entry.name
-                elif entry.is_dir(follow_symlinks=False) and (inner_link := escaping_link(Path(entry), root)):
+                elif entry.is_dir(follow_symlinks=False) and (inner_link := bad_link(Path(entry), root)):
                     return f"{entry.name}/{inner_link}"
     except OSError:  # the reader of the folder will report the error
         return ""

@@ -231,7 +231,7 @@ def _print_error(message: str, code: int = EXIT_FAILURE) -> int:
 def message_of(error: Exception) -> str:
     """The error message in one line."""
     if isinstance(error, OverrideParseException):
-        return _parse_error_message(error.override)
+        return _override_message(error.override)
     return " ".join(str(error).split())
 
 
@@ -244,7 +244,7 @@ def _add_file(message: str) -> str:
     return message + next((f" It is in {path}" for path in files if key.search(path.read_text("utf-8", "replace"))), "")
 
 
-def _parse_error_message(override: str) -> str:
+def _override_message(override: str) -> str:
     """The error message for an override that Hydra cannot parse."""
     for group in LISTED_GROUPS:
         if override in _choice_names(group):

@@ -18,23 +18,17 @@ from bench.records.read import RESULTS, Plan
 from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus
 
 CUSTOM_RENDERER = "custom"  # the choice of renderer for a class of the user
-CONTRACT_TEST = (
-    "python -m pytest tests/renderers/test_renderer_contract.py -k custom --renderer="  # see CONTRIBUTING.md
-)
+# See CONTRIBUTING.md.
+CONTRACT_TEST = "python -m pytest tests/renderers/test_renderer_contract.py -k custom --renderer="
 
 
 def print_run_summary(folder: Path, record: Record) -> None:
     """Prints the results of a run; the last line on standard output is its folder."""
     console = Console(highlight=False)
-    table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
-    for heading in ("", "before", "after", "better"):
-        table.add_column(heading, justify="left" if heading in ("", "better") else "right")
-    for row in _compared_metrics(record):
-        table.add_row(*row)
-    if table.row_count:
-        console.print(table)
+    if rows := [*_compared_metrics(record)]:
+        console.print(_table(record.title, ("", "before", "after", "better"), rows))
     elif record.metrics:
-        console.print(_measured_table(record))
+        console.print(_table(record.title, ("", "measured"), [*_measured_metrics(record)]))
     if "iterations" in record.evaluations:
         console.print(_cost_line(record))
     for note in record.notes:
@@ -131,12 +125,11 @@ def _measured_metrics(record: Record) -> Iterator[tuple[str, str]]:
         yield metric.label, number(record.metrics[name], metric.factor)
 
 
-def _measured_table(record: Record) -> Table:
-    """The table of the metrics that a run measured."""
-    table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
-    table.add_column("")
-    table.add_column("measured", justify="right")
-    for row in _measured_metrics(record):
+def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, title=escape(title))
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in ("", "better") else "right")
+    for row in rows:
         table.add_row(*row)
     return table
 

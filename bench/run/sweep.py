@@ -107,9 +107,8 @@ def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
     make, jobs = RunOnce(replace(plan, cells=[])), [[cell] for cell in plan.cells]
     try:
         if launcher.executor != "basic":
-            execute(
-                make, [[identity_of(cell) for cell in plan.cells if cell.id in reused]], replace(launcher, settings={})
-            )
+            finished = [identity_of(cell) for cell in plan.cells if cell.id in reused]
+            execute(make, [finished], replace(launcher, settings={}))
             jobs = [[cell] for cell in plan.cells if cell.id not in reused]
         if launcher.packs_runs and (jobs := split_into_jobs(plan, launcher.settings, reused)):
             notice(describe_jobs(jobs, launcher.settings))
