@@ -179,7 +179,7 @@ def _run_job(job: Job, limits: RunLimits, progress: Report, ready: Callable[[], 
             vars(job.record).update(vars(message))
             job.record.write(job.folder)
         elif isinstance(message, Step):
-            progress(message.phase, message.done, message.total, message.loss)
+            progress(message.phase, message.finished, message.total, message.loss)
         elif isinstance(message, Notice):
             notice(message.text)
 

@@ -148,10 +148,8 @@ def test_a_broken_file_of_the_users_is_named(tmp_path, file, text, message):
 
 
 def test_a_sweep_composes_each_combination_of_choices_once(monkeypatch):
-    composed = []
-    monkeypatch.setattr(
-        compose, "composed", lambda choices, do=compose.composed: (composed.append(choices), do(choices))[1]
-    )
+    composed, do = [], compose.compose_choices
+    monkeypatch.setattr(compose, "compose_choices", lambda choices: (composed.append(choices), do(choices))[1])
     plan = swept("seed=0,1,2", "renderer=dist,dvr", "task.points=20,30")
     assert len(plan.cells) == 12 and len(composed) == 1 + 2  # the first says what is swept over
 
