@@ -309,7 +309,7 @@ def load(group: str, name: str, **arguments: Any) -> Any:
     """
     if name not in names(group):
         raise ValueError(f"unknown {group} {name!r}{nearest(name, names(group))}")
-    register_resolvers()  # only the command line has registered them
+    register_resolvers()  # otherwise only the command line registers them
     node = cast(DictConfig, OmegaConf.merge(_with_defaults(group, name), arguments))
     for key in RESERVED_KEYS[1:]:
         node.pop(key, None)

@@ -62,15 +62,15 @@ def columns(width: int) -> list[ProgressColumn]:
     return [name, BarColumn(), count, status, TimeElapsedColumn(), TextColumn("left"), left]
 
 
-_shown: Progress | None = None  # the display of this process, shared by the lines of a sweep and of its run
+_active_display: Progress | None = None  # shared by the lines of a sweep and of its run
 
 
 @contextmanager
 def display() -> Iterator[Progress]:
     """The live display of this process, on standard error."""
-    global _shown
-    if _shown is not None:
-        yield _shown
+    global _active_display
+    if _active_display is not None:
+        yield _active_display
         return
     console = Console(stderr=True)
     with Progress(
@@ -80,18 +80,18 @@ def display() -> Iterator[Progress]:
         refresh_per_second=5,
         speed_estimate_period=SPEED_WINDOW_SECONDS,
         transient=True,
-    ) as _shown:
+    ) as _active_display:
         try:
-            yield _shown
+            yield _active_display
         finally:
-            _shown = None
+            _active_display = None
 
 
 @contextmanager
 def run_progress(name: str) -> Iterator[Report]:
     """Shows one line for a run: its phase, its progress, and its loss."""
-    with display() as shown:
-        line = shown.add_task(name, total=None, status="")
+    with display() as live:
+        line = live.add_task(name, total=None, status="")
         current_phase, start, last_print = "", 0.0, 0.0
 
         def report(phase: str, finished: int, total: int, loss: float | None = None) -> None:
@@ -100,9 +100,9 @@ def run_progress(name: str) -> Iterator[Report]:
             now = time.monotonic()
             if phase != current_phase:  # another phase has another speed
                 current_phase, start, last_print = phase, now, now
-                shown.reset(line, total=total, description=f"{name}: {phase}", status=status)
-            shown.update(line, completed=finished, status=status)
-            if shown.disable and now - last_print >= PRINT_INTERVAL_SECONDS and 0 < finished < total:
+                live.reset(line, total=total, description=f"{name}: {phase}", status=status)
+            live.update(line, completed=finished, status=status)
+            if live.disable and now - last_print >= PRINT_INTERVAL_SECONDS and 0 < finished < total:
                 last_print = now
                 left = (now - start) * (total / finished - 1)
                 _print(f"{name}: {phase}, {finished / total:.0%}, about {left:.0f} s left")
@@ -110,4 +110,4 @@ def run_progress(name: str) -> Iterator[Report]:
         try:
             yield report
         finally:
-            shown.remove_task(line)
+            live.remove_task(line)

@@ -111,7 +111,7 @@ def register_rows(folders: Sequence[Path] = ()) -> None:
             raise ValueError(f"{choice.path}: {name} is a {group} of {CONF} already: give the {kind} another name")
 
 
-def listed(group: str) -> dict[str, Choice]:
+def group_choices(group: str) -> dict[str, Choice]:
     """The choices of a group by name, including those of the user's folders; empty for an unknown group."""
     return _choices.get(group, {})
 
@@ -196,7 +196,7 @@ def _rows_of(path: Path, group: str, text: str) -> list[tuple[str, str, Node]]:
         rows.append((group, name, {group: None} if row is None else _row_node(group, row)))
         if row and "space" in row:
             bases = [f"/{METHOD}/{name}", f"/{METHOD}/_drawn", "_self_"]
-            rows.append((SPACE, name, {"defaults": bases} | nested(row["space"])))
+            rows.append((SPACE, name, {"defaults": bases} | nest_keys(row["space"])))
     return rows
 
 
@@ -207,8 +207,7 @@ def look_of(name: str) -> Node:
     """
     name = name.rpartition("/")[2]
     group = METHOD if name in names(METHOD) else "renderer"
-    # The name may also be that of a class in lower case, without underscores.
-    candidates = [name, *(other for other in names("renderer") if other.replace("_", "") == name)]
+    candidates = [name, *(other for other in names("renderer") if other.replace("_", "") == name)]  # or a class name
     return next((_look(group, candidate) for candidate in candidates if candidate in names(group)), {})
 
 
@@ -226,11 +225,11 @@ def _row_node(group: str, row: Node) -> Node:
     chosen = [key for key in METHOD_ROW_GROUPS if group.startswith(METHOD) and isinstance(row.get(key), str)]
     base = [row["base"]] if "base" in row else []
     defaults = [*base, *({f"override /{key}": row[key]} for key in chosen)]
-    node = nested({key: value for key, value in row.items() if key not in (*chosen, *TABLE_KEYS)})
+    node = nest_keys({key: value for key, value in row.items() if key not in (*chosen, *TABLE_KEYS)})
     return ({"defaults": [*defaults, "_self_"]} if defaults else {}) | node
 
 
-def nested(row: Node) -> Node:
+def nest_keys(row: Node) -> Node:
     """The row with nested nodes in place of dotted keys."""
     root: Node = {}
     for key, value in row.items():
@@ -280,7 +279,7 @@ def without_row_keys(renderer: dict[str, Any], choice: str) -> dict[str, Any]:
     Args:
         choice: the name of its file or row.
     """
-    content = listed("renderer")[choice].content if choice in listed("renderer") else {}
+    content = group_choices("renderer")[choice].content if choice in group_choices("renderer") else {}
     inherited = {LABEL_KEY} if "defaults" in content and LABEL_KEY not in content else set[str]()
     return {key: value for key, value in renderer.items() if key not in {ROWS_KEY, LOOK_KEY} | inherited}
 
@@ -288,7 +287,7 @@ def without_row_keys(renderer: dict[str, Any], choice: str) -> dict[str, Any]:
 def renderers_of(experiment: str) -> list[str]:
     """The renderers that have a row in an experiment, in the order of their ranks, then by name."""
     ranks = {}
-    for name, choice in listed("renderer").items():
+    for name, choice in group_choices("renderer").items():
         rank = choice.content.get(ROWS_KEY, {experiment: inf}).get(experiment)
         if rank is not None and choice.content.get("_target_") != MISSING:  # without renderer=custom
             ranks[name] = rank
@@ -311,7 +310,7 @@ def _spaces(*without: str) -> str:
     Raises:
         ValueError: if such a method has no search space.
     """
-    spaces = listed(SPACE)
+    spaces = group_choices(SPACE)
     if unknown := {*without} - {*spaces}:
         raise ValueError(f"${{spaces:...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
     return ",".join(f"space/{name}" for name in sorted(spaces) if name not in without)

@@ -140,7 +140,7 @@ def locked_folder(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterat
     if link := bad_link(folder, results_dir):
         raise ValueError(f"{folder / link} is a link out of the results folder: remove that folder")
     with file_lock(results_dir, identity.name):
-        record = reusable(folder, identity, rerun)
+        record = reusable_record(folder, identity, rerun)
         if record is None:
             archive_run(folder, results_dir / "earlier")
             folder.mkdir(parents=True)
@@ -151,7 +151,7 @@ def locked_folder(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterat
             free_reserve(folder)
 
 
-def reusable(folder: Path, identity: Identity, rerun: Rerun) -> dict[str, Any] | None:
+def reusable_record(folder: Path, identity: Identity, rerun: Rerun) -> dict[str, Any] | None:
     """The record of a finished run of the same configuration and code; None if it must be run."""
     if rerun == Rerun.all:
         return None

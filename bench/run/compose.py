@@ -30,7 +30,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from bench.config import CLASS_PACKAGE_KEY, Config, type_of, wrong_type_message
 from bench.records.folder import Identity, identify, resolve_config
-from bench.tables import CONF, folders, listed, nearest, register_resolvers, register_rows
+from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
 OPTIONAL_GROUPS = ("method", "experiment")  # they take a plus: +method=NAME
 NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")
@@ -51,22 +51,22 @@ class ChoiceSource(ConfigSource):
 
     def is_group(self, config_path: str) -> bool:
         """Whether a path is a group with choices."""
-        return bool(listed(config_path.strip("/")))
+        return bool(group_choices(config_path.strip("/")))
 
     def is_config(self, config_path: str) -> bool:
         """Whether a path is a choice of a group."""
         group, _, name = config_path.rpartition("/")
-        return name.removesuffix(".yaml") in listed(group)
+        return name.removesuffix(".yaml") in group_choices(group)
 
     def load_config(self, config_path: str) -> ConfigResult:
         """The content of a choice, and the package of its keys."""
         group, _, name = config_path.rpartition("/")
-        node, package = listed(group)[name.removesuffix(".yaml")].load()
+        node, package = group_choices(group)[name.removesuffix(".yaml")].load()
         return ConfigResult(self.provider, self.full_path(), node, {"package": package})
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         """The choices of a group."""
-        return [] if results_filter == ObjectType.GROUP else sorted(listed(config_path.strip("/")))
+        return [] if results_filter == ObjectType.GROUP else sorted(group_choices(config_path.strip("/")))
 
 
 class SearchPath(SearchPathPlugin):
@@ -142,7 +142,8 @@ def combinations(texts: Sequence[str]) -> list[list[str]]:
 def sets_value(override: Override) -> bool:
     """Whether an override sets an existing key. Hydra applies the others, which choose, add or remove."""
     key = override.key_or_group
-    chooses = override.package is not None or "/" in key or (listed(key) and not isinstance(override.value(), dict))
+    is_group = group_choices(key) and not isinstance(override.value(), dict)
+    chooses = override.package is not None or "/" in key or is_group
     return override.type == OverrideType.CHANGE and not chooses and key != "hydra.searchpath"
 
 
@@ -176,7 +177,7 @@ def compose_choices(overrides: Sequence[str]) -> DictConfig:
         nested = str(error.missing_cfg_file).rpartition("/")[0]
         group = nested if nested.startswith("hydra/") else nested.partition("/")[0]
         path = str(error.missing_cfg_file).removeprefix(f"{group}/")
-        raise unknown_choice(group, path, [*(error.options or listed(nested))]) from error
+        raise unknown_choice(group, path, [*(error.options or group_choices(nested))]) from error
     except (HydraException, OmegaConfBaseException) as error:
         for override in map(parse_override, overrides):
             if (group := override.key_or_group) in OPTIONAL_GROUPS and not override.is_add():
@@ -377,7 +378,7 @@ def _several_values_error(override: Override) -> ValueError:
 
 def _needs_class(group: str, name: Any) -> bool:
     """Whether a choice needs a class on the command line, as `renderer=custom` does."""
-    choice = listed(group).get(str(name))
+    choice = group_choices(group).get(str(name))
     return choice is not None and choice.content.get("_target_") == MISSING
 
 

@@ -89,15 +89,15 @@ def _command(arguments: list[str]) -> CommandResult:
 
 def _override(key: str, value: Any) -> str:
     """A keyword as an override of the command line."""
-    return f"{'+' if key in OPTIONAL_GROUPS else ''}{key}={_text(value)}"
+    return f"{'+' if key in OPTIONAL_GROUPS else ''}{key}={_as_typed(value)}"
 
 
-def _text(value: Any) -> str:
+def _as_typed(value: Any) -> str:
     """A value as the command line reads it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(_text, value))}]"
+        return f"[{','.join(map(_as_typed, value))}]"
     text = str(value)
     if isinstance(value, int | float) or UNQUOTED_TEXT.fullmatch(text):
         return text

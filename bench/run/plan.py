@@ -12,7 +12,7 @@ from statistics import median
 from typing import Any
 
 from bench.config import Isolation, Rerun
-from bench.records.folder import Identity, reusable
+from bench.records.folder import Identity, reusable_record
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import digest, row_name
@@ -47,7 +47,7 @@ def identity_of(cell: PlannedCell) -> Identity:
 def is_reused(plan: Plan, cell: PlannedCell) -> bool:
     """Whether a finished run of a cell exists and will be reused."""
     folder = plan.results_dir / "runs" / cell.id
-    return reusable(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
+    return reusable_record(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
 
 
 def refusal_reason(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:

@@ -29,7 +29,7 @@ STARTUP_TIMEOUT_SECONDS = 120.0  # long, because a cold disk is slow
 GIB = 2**30
 # Signals from outside: from a user, a batch system, or the operating system when memory runs out.
 EXTERNAL_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
-# Signals are noted as well as raised: an interrupted library may swallow or replace the exception.
+# A signal is also stored, because an interrupted library may swallow or replace the exception.
 _stopped = ""  # the signal that stopped this command, in words
 _delayed = False  # within `signals_delayed`
 _server_started_early = False  # before the command line was read
@@ -94,7 +94,7 @@ def preloaded_modules() -> list[str]:
 def fork_server() -> ForkServerContext:
     """The context of processes that are forked from a server, which has imported the slow modules once for all."""
     if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
-        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one of their own
+        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set another one
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(preloaded_modules())
     return context

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from bench.config import Isolation, build
 from bench.progress import Report, notice, run_progress
-from bench.records.folder import Identity, free_reserve, locked_folder, reusable
+from bench.records.folder import Identity, free_reserve, locked_folder, reusable_record
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
 from bench.run.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, write_error_message
@@ -89,7 +89,7 @@ def _check(identity: Identity) -> None:
     """
     config = identity.config
     results_dir = Path(config["results_dir"])
-    reused = reusable(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
+    reused = reusable_record(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
     if not reused and (reason := refusal_reasons([config])[0]):
         raise ValueError(reason)
     if config["plan"]:
@@ -127,7 +127,7 @@ def _start_run(job: Job) -> Record:
     folder, record = job.folder, job.record
     started, stopped, tracker = time.perf_counter(), "", None
 
-    def ready() -> None:
+    def restart_clock() -> None:
         nonlocal started
         started = time.perf_counter()
 
@@ -138,7 +138,7 @@ def _start_run(job: Job) -> Record:
         tracker = build(config["tracker"], "tracker", config["packages"])
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
         with run_progress(record.name) as progress:
-            _run_job(job, limits, progress, ready)
+            _run_job(job, limits, progress, restart_clock)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness, such as a full disk
         stopped = stopped_by(error)
         record.status, record.reason = RunStatus.CRASHED, reason_of(error, folder)
@@ -160,11 +160,11 @@ def _start_run(job: Job) -> Record:
     return record
 
 
-def _run_job(job: Job, limits: RunLimits, progress: Report, ready: Callable[[], None]) -> None:
+def _run_job(job: Job, limits: RunLimits, progress: Report, on_ready: Callable[[], None]) -> None:
     """Runs the job in a child process or, for debugging, in this one, and fills its record.
 
     Args:
-        ready: called when the child has imported its modules.
+        on_ready: called when the child has imported its modules.
     """
     if job.record.config["isolation"] == Isolation.off:
         from bench.run.execute import execute  # imports torch, which a launcher's worker does not need
@@ -174,7 +174,7 @@ def _run_job(job: Job, limits: RunLimits, progress: Report, ready: Callable[[], 
 
     def receive(message: Message) -> None:
         if isinstance(message, Started):
-            ready()
+            on_ready()
         elif isinstance(message, Record):
             vars(job.record).update(vars(message))
             job.record.write(job.folder)

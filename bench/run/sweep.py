@@ -149,14 +149,14 @@ def follow_progress(plan: Plan, reused: set[str]) -> Iterator[None]:
     Args:
         reused: ids of cells that take no time, because their finished run is reused.
     """
-    with display() as shown:
-        progress = shown.add_task("sweep", total=len(plan.cells) - len(reused), status="")
+    with display() as live:
+        task = live.add_task("sweep", total=len(plan.cells) - len(reused), status="")
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
         start = time.monotonic()
 
         def progress_prefix(finished: int) -> str:
             """The text before a cell's line if there is no terminal; `finished` counts the cells that were run."""
-            if not shown.disable:
+            if not live.disable:
                 return ""
             parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
             if finished and (to_run := len(pending.keys() - reused)):
@@ -175,7 +175,7 @@ def follow_progress(plan: Plan, reused: set[str]) -> Iterator[None]:
                     overrides = " ".join(plan.distinct_overrides(cell))
                     text = cell_line(plan.results_dir / "runs" / cell.id, record, overrides)
                     print(progress_prefix(count_run()) + text, flush=True)
-            shown.update(progress, completed=count_run(), status=f"{failed} failed")
+            live.update(task, completed=count_run(), status=f"{failed} failed")
 
         def follow() -> None:
             while not stop.wait(max(FOLLOW_INTERVAL_SECONDS, 1e-3 * len(pending))):
@@ -189,7 +189,7 @@ def follow_progress(plan: Plan, reused: set[str]) -> Iterator[None]:
             stop.set()
             thread.join()
             update()
-            shown.remove_task(progress)
+            live.remove_task(task)
 
 
 def cell_line(folder: Path, record: dict[str, Any], overrides: str) -> str:
