@@ -1,7 +1,7 @@
 """The benchmark: tasks, the runner, records and reports.
 
-From Python, `bench.load()` gives all runs as a pandas table, and `bench.run(task="completion")` makes one;
-`bench.load_field(RUN)` gives the field that it ended on.
+From Python, `bench.load()` returns all runs as a pandas table, `bench.run(task="completion")` makes a run, and
+`bench.load_field(RUN)` loads the final field of a run.
 """
 
 import os
@@ -11,19 +11,19 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-# Threads of OpenMP that wait must sleep: where they spin, a second process on the same cores makes both 4 to 20 times
-# slower. Read by the runtime once, when torch is first imported, hence here.
+# Waiting OpenMP threads must sleep: if they spin, a second process on the same cores makes both 4 to 20 times slower.
+# OpenMP reads these variables once, at the first import of torch, so they are set here.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
 __all__ = ["load", "load_field", "run"]
 
-BESIDE = ("conf", "datasets", "renderers")  # our other packages; `datasets` is also the name of Hugging Face's
-OURS = "implicit-bench"  # stands in the first line of each
+SIBLING_PACKAGES = ("conf", "datasets", "renderers")  # `datasets` is also the name of a Hugging Face package
+PROJECT = "implicit-bench"  # the first line of each sibling package contains it
 
 
 def __getattr__(name: str) -> Any:
-    """What `__all__` names, imported when first asked for: pandas alone takes half a second."""
+    """Imports the names of `__all__` at their first use: pandas alone takes half a second."""
     if name == "load":
         return import_module("bench.report.data.frame").load
     if name == "load_field":
@@ -33,32 +33,32 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'bench' has no attribute {name!r}")
 
 
-def _foreign() -> str:
-    """One line on a package of another project that has the place of one of ours; empty where all are ours.
+def _foreign_package_message() -> str:
+    """Returns an error message if one of our package names leads to a package of another project, else "".
 
-    Nothing is imported: one that is not ours would fail somewhere else, or run.
+    Nothing is imported: a foreign package might fail or run code.
     """
-    beside = Path(__file__).resolve().parent.parent
-    for name in BESIDE:
-        if name == "conf":  # read by its path, so that a conf.py of the current folder does no harm
-            file = beside / name / "__init__.py"
+    root = Path(__file__).resolve().parent.parent
+    for name in SIBLING_PACKAGES:
+        if name == "conf":  # found by its path, so that a conf.py in the current folder does no harm
+            file = root / name / "__init__.py"
         elif (spec := find_spec(name)) is None:
-            continue  # the import will say so
+            continue  # the import will report it
         else:
             file = Path(spec.origin or next(iter(spec.submodule_search_locations or [name])))
         try:
-            first = file.read_text(encoding="utf-8").partition("\n")[0]
+            first_line = file.read_text(encoding="utf-8").partition("\n")[0]
         except (OSError, UnicodeError):
-            first = ""
-        if OURS not in first:
+            first_line = ""
+        if PROJECT not in first_line:
             return (
-                f"{file} is not the package {name} of {OURS}, but another of that name: give {OURS} an environment of "
-                "its own (python -m venv), or start where no such file is found first"
+                f"{file} is not the package {name} of {PROJECT}, but another of that name: give {PROJECT} an "
+                "environment of its own (python -m venv), or start where no such file is found first"
             )
     return ""
 
 
-if foreign := _foreign():
-    if sys.argv[:1] == ["-m"]:  # of `python -m bench`, while the command is looked for
-        sys.exit(f"error: {foreign}")
-    raise ImportError(foreign)
+if foreign_package := _foreign_package_message():
+    if sys.argv[:1] == ["-m"]:  # `python -m bench` is still looking for the command
+        sys.exit(f"error: {foreign_package}")
+    raise ImportError(foreign_package)

@@ -1,6 +1,6 @@
 """`python -m bench task=completion renderer=dist`: one run, or with -m a sweep."""
 
-from __future__ import annotations  # of a run's process, which imports this module again, nothing else is loaded
+from __future__ import annotations  # a run's process imports this module again and must not load more
 
 import os
 import re
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def main() -> int:
-    """Runs the command line; 0 if every run ended ok."""
+    """Runs the command line; returns 0 if every run ended ok."""
     from bench.run.command import command_line
     from bench.run.run import run_one
     from bench.run.sweep import run_sweep
@@ -22,39 +22,39 @@ def main() -> int:
 
 
 def _summarise(plan: Plan) -> list[str]:
-    """Writes and prints what a sweep came to; gives the status of each of its cells."""
+    """Writes and prints the summary of a sweep; returns the status of each of its cells."""
     from bench.report.sweeps import write_sweep
     from bench.report.write.html import write_index
-    from bench.run.summary import show_sweep
+    from bench.run.summary import print_sweep_summary
 
     table = write_sweep(plan)
-    return show_sweep(plan, write_index(plan.results_dir), table)
+    return print_sweep_summary(plan, write_index(plan.results_dir), table)
 
 
 def console() -> int:
     """`implicit-bench WORD ...` is `python -m bench.WORD ...`, and with the word run it is `python -m bench ...`."""
-    word, *more = sys.argv[1:] or ["--help"]
-    known = _words()
-    if word in ("-h", "--help"):
-        print("usage: implicit-bench WORD ...", *known.values(), sep="\n  ")
+    command, *more = sys.argv[1:] or ["--help"]
+    commands = _commands()
+    if command in ("-h", "--help"):
+        print("usage: implicit-bench WORD ...", *commands.values(), sep="\n  ")
         return 0
-    if word not in known:
+    if command not in commands:
         from bench.tables import nearest
 
-        print(f"error: unknown word {word!r}{nearest(word, [*known])}", file=sys.stderr)
+        print(f"error: unknown word {command!r}{nearest(command, [*commands])}", file=sys.stderr)
         return 2
-    os.execv(sys.executable, [sys.executable, "-m", "bench" if word == "run" else f"bench.{word}", *more])
+    os.execv(sys.executable, [sys.executable, "-m", "bench" if command == "run" else f"bench.{command}", *more])
 
 
-def _words() -> dict[str, str]:
-    """The words of `implicit-bench`, which are the modules that `python -m` runs, with the first lines of these."""
-    here, found = Path(__file__).parent, {}
+def _commands() -> dict[str, str]:
+    """The usage line of each command of `implicit-bench`, from the first line of the module that `python -m` runs."""
+    here, usage_lines = Path(__file__).parent, {}
     for file in sorted([*here.glob("*.py"), *here.glob("*/__main__.py")]):
-        first = file.read_text(encoding="utf-8").partition("\n")[0].strip('"').replace("`", "")
-        if first.startswith("python -m bench"):
-            word = file.stem if file.stem != "__main__" else "run" if file.parent == here else file.parent.name
-            found[word] = re.sub(r"python -m bench[.\w]*", f"implicit-bench {word}", first)
-    return found
+        first_line = file.read_text(encoding="utf-8").partition("\n")[0].strip('"').replace("`", "")
+        if first_line.startswith("python -m bench"):
+            command = file.stem if file.stem != "__main__" else "run" if file.parent == here else file.parent.name
+            usage_lines[command] = re.sub(r"python -m bench[.\w]*", f"implicit-bench {command}", first_line)
+    return usage_lines
 
 
 if __name__ == "__main__":

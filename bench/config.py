@@ -14,32 +14,27 @@ from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hi
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.tables import LABEL, LOOK, ROWS, choice, names, nearest, register_resolvers
+from bench.tables import LABEL_KEY, LOOK_KEY, ROWS_KEY, choice, names, nearest, register_resolvers
 
-LEAST = {
-    "seed": 0,
-    "index": 0,
-    "draw": 0,
-    "threads": 1,
-    "evaluation.grid": 8,
-    "evaluation.points": 1,
-    "evaluation.picture": 4,
-    "evaluation.gallery": 4,
-    "evaluation.every": 1,
+MIN_VALUES = {
+    **{"seed": 0, "index": 0, "draw": 0, "threads": 1, "evaluation.grid": 8, "evaluation.points": 1},
+    **{"evaluation.picture": 4, "evaluation.gallery": 4, "evaluation.every": 1},
 }
-POSITIVE = {  # where they are not null: with what to type
+REMEDY_IF_NOT_POSITIVE = {
     "time_limit": "600 is ten minutes, null no limit",
     "memory_limit": "8 is 8 GiB, null all but a tenth",
 }
 DOUBLING = "doubling"
-SELF, HERE = "_self_", "@_here_"  # of a list of defaults: the file itself; where one of another group goes
-OURS = ("renderers", "datasets", "bench")  # packages that a `_target_` may always name
-PACKAGE = "_package_"  # of the node `renderer`: one more, that of the class typed for renderer=custom
-OF = "of"  # of a prior: a dataset whose prior it is
-# Keys of a dataset or a task that other keys follow.
-DEFAULTS = ("_prior_", "_field_", "_similarity_", "_iterations_", "_silhouette_weight_")
-RESERVED = ("_target_", PACKAGE, *DEFAULTS, OF, LABEL, ROWS, LOOK)  # of a node; its other keys are arguments
-ROLES = {  # what the class of a node of the top level must be
+SELF_ENTRY = "_self_"  # the file itself, in a list of defaults
+GROUP_MARK = "@_here_"  # follows a choice of another group, in a list of defaults
+OUR_PACKAGES = ("renderers", "datasets", "bench")  # a `_target_` may always name them
+CLASS_PACKAGE_KEY = "_package_"  # key of the node `renderer`: the package of the class typed for renderer=custom
+PRIOR_DATASET_KEY = "of"  # key of the node `prior`: the dataset that it was trained on
+# Keys of a dataset or a task that other nodes refer to.
+FOLLOWED_KEYS = ("_prior_", "_field_", "_similarity_", "_iterations_", "_silhouette_weight_")
+# All other keys of a node are arguments.
+RESERVED_KEYS = ("_target_", CLASS_PACKAGE_KEY, *FOLLOWED_KEYS, PRIOR_DATASET_KEY, LABEL_KEY, ROWS_KEY, LOOK_KEY)
+ROLE_OF_NODE = {  # the protocol or base class that the class of a node must have
     "task": "bench.setup.inputs.Task",
     "renderer": "renderers.rendering.Renderer",
     "dataset": "datasets.scene.Dataset",
@@ -48,14 +43,14 @@ ROLES = {  # what the class of a node of the top level must be
     "prior": "datasets.network_files.Networked",
     "supervision": "bench.single_view.training.Supervision",
 }
-TARGETS = {  # classes of nodes without a _target_
+CLASS_OF_NODE = {  # for nodes without a _target_
     "view": "datasets.views.ViewSampler",
     "auto": "bench.setup.auto.AutoSettings",
     "prior": "bench.shape_prior.PriorSettings",
     "models": "bench.setup.fields.ModelSettings",
     "evaluation": "bench.config.EvaluationSettings",
 }
-WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "null"}
+TYPE_LABELS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "null"}
 
 
 class Device(StrEnum):
@@ -67,14 +62,14 @@ class Device(StrEnum):
 
 
 class Isolation(StrEnum):
-    """Where a run takes place: in a process of its own, or for debugging in that of the command, without limits."""
+    """The process of a run: a new one, or for debugging that of the command, without limits on time and memory."""
 
     process = "process"
     off = "off"
 
 
 class Rerun(StrEnum):
-    """Which finished runs are run again; one that was killed always is."""
+    """Which finished runs are run again; a killed run always is."""
 
     none = "none"
     failed = "failed"
@@ -83,7 +78,7 @@ class Rerun(StrEnum):
 
 @dataclass
 class EvaluationSettings:
-    """How a result is judged; see conf/config.yaml."""
+    """Settings of the evaluation of a result; see conf/config.yaml."""
 
     grid: int = MISSING
     points: int = MISSING
@@ -133,7 +128,7 @@ class Config:
 
 
 def check(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Raises ValueError for what is invalid in a resolved configuration and needs no torch to be found."""
+    """Raises ValueError if a resolved configuration is invalid, as far as this can be checked without torch."""
     check_names(config)
     check_label(config, overrides)
     check_top_level(config)
@@ -141,27 +136,27 @@ def check(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
 
 
 def check_label(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Raises ValueError where a renderer takes the place of a method's, whose label the run would keep."""
-    given = dict(text.lstrip("+").partition("=")[::2] for text in overrides)
-    if config.get("label") and {"renderer", "method"} <= given.keys() and "label" not in given:
+    """Raises ValueError if a renderer replaces that of a method, because the run would keep the method's label."""
+    typed = dict(text.lstrip("+").partition("=")[::2] for text in overrides)
+    if config.get("label") and {"renderer", "method"} <= typed.keys() and "label" not in typed:
         raise ValueError(
-            f"renderer={given['renderer']} beside +method={given['method']} would run under the name "
+            f"renderer={typed['renderer']} beside +method={typed['method']} would run under the name "
             f"{config['label']!r}: add label=NAME, in a sweep 'label=\\${{renderer._label_}}'"
         )
 
 
 def check_draw(config: DictConfig) -> None:
-    """Raises ValueError where a draw is set that no value asks for; the configuration is not resolved yet."""
+    """Raises ValueError if a draw is set and no value of the unresolved configuration uses it."""
     if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
         raise ValueError("only a method of method/space reads draw: add +method=space/NAME, or remove draw")
 
 
 def check_names(config: Mapping[str, Any]) -> None:
-    """Raises ValueError for a key of the top level that there is not, and for a choice that nothing reads."""
-    names = [item.name for item in fields(Config)]
+    """Raises ValueError for an unknown key of the top level, and for a silhouette loss that the task does not read."""
+    keys = [item.name for item in fields(Config)]
     for key in map(str, config):
-        if key not in names:
-            raise ValueError(f"unknown key {key!r}{nearest(key, names)}")
+        if key not in keys:
+            raise ValueError(f"unknown key {key!r}{nearest(key, keys)}")
     loss, task = config.get("silhouette") or {}, config.get("task") or {}
     if not str(loss.get("_target_", ".Own")).endswith(".Own") and "silhouette" not in {
         *task,
@@ -175,7 +170,7 @@ def check_names(config: Mapping[str, Any]) -> None:
 
 
 def check_top_level(config: Mapping[str, Any]) -> None:
-    """Raises ValueError for a value of the top level that no part checks by itself."""
+    """Raises ValueError for an invalid value of the top level that no component checks."""
     evaluation = config["evaluation"]
     if not evaluation["fscore_threshold"] > 0:
         raise ValueError(f"evaluation.fscore_threshold must be positive, not {evaluation['fscore_threshold']}")
@@ -189,11 +184,11 @@ def check_top_level(config: Mapping[str, Any]) -> None:
         raise ValueError("only task=stability reads stress: remove it, or set task=stability")
     if evaluation["film"] is not None and evaluation["picture"] is None:
         raise ValueError("evaluation.film needs pictures: set evaluation.picture=256")
-    for name, least in LEAST.items():
+    for name, minimum in MIN_VALUES.items():
         value = (evaluation if "." in name else config)[name.rpartition(".")[2]]
-        if isinstance(value, int) and value < least:
-            raise ValueError(f"{name} must be at least {least}, not {value}: set {name}={least} or more")
-    for name, remedy in POSITIVE.items():
+        if isinstance(value, int) and value < minimum:
+            raise ValueError(f"{name} must be at least {minimum}, not {value}: set {name}={minimum} or more")
+    for name, remedy in REMEDY_IF_NOT_POSITIVE.items():
         if config[name] is not None and not config[name] > 0:
             raise ValueError(f"{name} must be positive, not {config[name]}: {remedy}")
 
@@ -204,73 +199,73 @@ def build(
     """The object that a YAML node describes: its `_target_`, or `target`, with its other keys as arguments.
 
     Args:
-        node: the node. Of the renderer, its key `_package_` names one more package that its `_target_` may name.
-        name: what it is called in the configuration, for errors, and for what its class must be; see `ROLES`.
-        packages: packages of the user's that a `_target_` may name, besides ours.
-        target: the class of a node that has no `_target_`; that of one that has must be this class or extend it, or
-            be what `ROLES` has for the name.
-        role: what the class must be, where the name does not say it.
+        node: the node. In the node `renderer`, the key `_package_` names one more allowed package.
+        name: the node's key in the configuration, for error messages and for `ROLE_OF_NODE`.
+        packages: packages of the user that a `_target_` may name, in addition to ours.
+        target: the class of a node without `_target_`. A `_target_` must be this class or extend it, unless
+            `ROLE_OF_NODE` has the name.
+        role: the required protocol or base class, if the name does not determine it.
 
     Raises:
         ValueError: for an unknown package, a class of another kind, an unknown key or a value of the wrong type.
     """
     if isinstance(node, DictConfig):
         node = cast(dict[Any, Any], OmegaConf.to_container(node, resolve=True, throw_on_missing=False))
-    if role is None and target and not ("_target_" in node and name in ROLES):
+    if role is None and target and not ("_target_" in node and name in ROLE_OF_NODE):
         role = find_class(target, name, packages, object)
     if node.get("_target_") == MISSING:
         raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
-    own = [str(node[PACKAGE])] if name == "renderer" and PACKAGE in node else []
-    cls = find_class(node.get("_target_", target), name, [*packages, *own], role)
-    arguments = {str(key): value for key, value in node.items() if key not in RESERVED}
-    names = _argument_names(cls)
+    class_package = [str(node[CLASS_PACKAGE_KEY])] if name == "renderer" and CLASS_PACKAGE_KEY in node else []
+    cls = find_class(node.get("_target_", target), name, [*packages, *class_package], role)
+    arguments = {str(key): value for key, value in node.items() if key not in RESERVED_KEYS}
+    argument_names = _argument_names(cls)
     for key in (key for key, value in node.items() if value == MISSING):
-        raise ValueError(_missing(cls, name, str(key)))
+        raise ValueError(_missing_value_message(cls, name, str(key)))
     for key in arguments:
-        if names is not None and key not in names:
-            raise ValueError(f"{name} has no key {key!r}{nearest(str(key), names)}")
-    return _typed(cls, arguments, name, packages) if is_dataclass(cls) else cls(**arguments)
+        if argument_names is not None and key not in argument_names:
+            raise ValueError(f"{name} has no key {key!r}{nearest(str(key), argument_names)}")
+    return _build_dataclass(cls, arguments, name, packages) if is_dataclass(cls) else cls(**arguments)
 
 
 def find_class(path: Any, name: str, packages: Sequence[str], role: type | None) -> type:
-    """The class at a dotted path; nothing is imported of a package that is not ours and not named by the user.
+    """The class at a dotted path. Only our packages and those that the user names are imported.
 
     Args:
         path: PACKAGE.CLASS, or PACKAGE.MODULE.CLASS.
-        name: of the node, for errors.
-        packages: that may be imported besides ours.
-        role: a Protocol whose methods the class must have, or a class that it must be or extend; None asks for that of
-            the node's name, see `ROLES`.
+        name: the name of the node, for error messages.
+        packages: packages that may be imported in addition to ours.
+        role: a Protocol whose methods the class must have, or a class that it must be or extend; None takes that of
+            `ROLE_OF_NODE`.
 
     Raises:
-        ValueError: where the package is not allowed, or no such class is there.
+        ValueError: if the package is not allowed, the class does not exist, or it lacks the role.
     """
-    module, _, last = str(path).rpartition(".")
-    if (package := module.partition(".")[0]) not in (*OURS, *packages):
+    module, _, class_name = str(path).rpartition(".")
+    if (package := module.partition(".")[0]) not in (*OUR_PACKAGES, *packages):
         remedy = f"type packages=[{package}] if you trust it" if package else "it must be PACKAGE.CLASS"
         raise ValueError(f"{name}._target_ names {path!r}: {remedy}")
     try:
-        cls = getattr(import_module(module), last)
-    except Exception as error:  # of the user's module, whatever it does
+        cls = getattr(import_module(module), class_name)
+    except Exception as error:  # a module of the user may raise any error
         raise ValueError(f"{name}._target_ names {path!r}, which cannot be imported: {error}") from error
     if not isinstance(cls, type):
         raise ValueError(f"{name}._target_ names {path!r}, which is no class: name the class of a component")
-    if role is None and name in ROLES:
-        role = find_class(ROLES[name], name, (), object)
-    if role is not None and (lacks := _lacking(cls, role)):
-        raise ValueError(f"{name}._target_ names {path!r}, which is no {role.__name__}: {lacks}")
+    if role is None and name in ROLE_OF_NODE:
+        role = find_class(ROLE_OF_NODE[name], name, (), object)
+    if role is not None and (fault := _role_fault(cls, role)):
+        raise ValueError(f"{name}._target_ names {path!r}, which is no {role.__name__}: {fault}")
     return cls
 
 
-def _lacking(cls: type, role: type) -> str:
-    """What a class lacks of a role, in words; empty where it has all of it. Data may be set when it is made."""
+def _role_fault(cls: type, role: type) -> str:
+    """Why a class does not fill a role; empty if it does. Data attributes are not checked: __init__ may set them."""
     if not getattr(role, "_is_protocol", False):
-        return "" if issubclass(cls, role) else f"name a class that extends {_path(role)}"
+        return "" if issubclass(cls, role) else f"name a class that extends {_class_path(role)}"
     protocols = [base for base in role.__mro__ if getattr(base, "_is_protocol", False) and base is not Protocol]
     methods = {name for base in protocols for name, value in vars(base).items() if callable(value)}
     public = sorted(name for name in methods if not name.startswith("_") or name == "__call__")
-    own = {name for base in cls.__mro__ if base is not object for name, value in vars(base).items() if callable(value)}
-    missing = [name for name in public if name not in own]
+    bases = [base for base in cls.__mro__ if base is not object]
+    missing = [name for name in public if not any(callable(vars(base).get(name)) for base in bases)]
     return f"it lacks {', '.join(missing)}: see {role.__module__}" if missing else ""
 
 
@@ -278,14 +273,14 @@ def build_once(nodes: Mapping[str, Any], packages: Sequence[str], built: dict[st
     """The objects of nodes by name, as `build` makes them; equal nodes are built once.
 
     Args:
-        packages: that a `_target_` may name, besides ours.
-        built: objects and errors by the text of their nodes, which is extended.
+        packages: packages that a `_target_` may name, in addition to ours.
+        built: cache of objects and errors by the text of their nodes; it is extended.
     """
     texts = {name: json.dumps([name, packages, node], sort_keys=True, default=str) for name, node in nodes.items()}
     for name, text in texts.items():
         if text not in built:
             try:
-                built[text] = build(nodes[name], name, packages, TARGETS.get(name, ""))
+                built[text] = build(nodes[name], name, packages, CLASS_OF_NODE.get(name, ""))
             except ValueError as error:
                 built[text] = error
         if isinstance(built[text], ValueError):
@@ -294,7 +289,7 @@ def build_once(nodes: Mapping[str, Any], packages: Sequence[str], built: dict[st
 
 
 def _argument_names(cls: type) -> list[str] | None:
-    """The arguments of a class, which may be the user's; None where it takes any, or does not say."""
+    """The names of a class's arguments; None if it takes any argument, or has no signature."""
     if is_dataclass(cls):
         return [f.name for f in fields(cls)]
     try:
@@ -314,25 +309,28 @@ def load(group: str, name: str, **arguments: Any) -> Any:
     """
     if name not in names(group):
         raise ValueError(f"unknown {group} {name!r}{nearest(name, names(group))}")
-    register_resolvers()  # a program that uses the library has read no command line
+    register_resolvers()  # otherwise only the command line registers them
     node = cast(DictConfig, OmegaConf.merge(_with_defaults(group, name), arguments))
-    for key in RESERVED[1:]:
+    for key in RESERVED_KEYS[1:]:
         node.pop(key, None)
-    return build(node, group, [arguments.get("_target_", "").split(".")[0]])  # who names a class in Python trusts it
+    return build(node, group, [arguments.get("_target_", "").split(".")[0]])  # a class named in Python is trusted
 
 
 def _with_defaults(group: str, name: str) -> DictConfig:
-    """What a choice holds, over those that its `defaults` name, in their order, as Hydra has it."""
+    """The content of a choice, merged with the choices of its `defaults` in Hydra's order."""
     node = OmegaConf.create(choice(group, name))
-    bases = [base for base in node.pop("defaults", [SELF]) if isinstance(base, str)]  # not what it sets of others
-    places = [
-        base.removeprefix("/").removesuffix(HERE).split("/") if base[0] == "/" else [group, base] for base in bases
-    ]
-    return cast(DictConfig, OmegaConf.merge(*(node if at[1] == SELF else _with_defaults(*at) for at in places)))
+    nodes = []
+    for base in node.pop("defaults", [SELF_ENTRY]):
+        if base == SELF_ENTRY:
+            nodes.append(node)
+        elif isinstance(base, str):  # a dict chooses in another group
+            path = base[1:].removesuffix(GROUP_MARK).split("/") if base[0] == "/" else [group, base]
+            nodes.append(_with_defaults(*path))
+    return cast(DictConfig, OmegaConf.merge(*nodes))
 
 
-def _typed(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[str]) -> Any:
-    """An instance whose arguments were converted to the field types, or a ValueError that names the field."""
+def _build_dataclass(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[str]) -> Any:
+    """An instance of a dataclass, with arguments converted to the field types; a ValueError names the wrong field."""
     types = get_type_hints(cls)
     protocols = [key for key in arguments if getattr(types[key], "_is_protocol", False)]
     for key in protocols:
@@ -341,70 +339,66 @@ def _typed(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[s
                 f"{name}.{key} must have a _target_, not be {arguments[key]!r}: write {key}=NAME, without {name}"
             )
     nested = {key: _node_class(types[key]) for key, value in arguments.items() if isinstance(value, dict)}
-    nested = {key: found for key, found in nested.items() if found or key in protocols}
-    given = {key: value for key, value in arguments.items() if key not in nested}
-    schema = OmegaConf.structured(make_dataclass(cls.__name__, [(key, types[key]) for key in given]))
+    nested = {key: child for key, child in nested.items() if child or key in protocols}
+    plain_arguments = {key: value for key, value in arguments.items() if key not in nested}
+    schema = OmegaConf.structured(make_dataclass(cls.__name__, [(key, types[key]) for key in plain_arguments]))
     try:
-        flat = OmegaConf.merge(schema, given)
+        converted = OmegaConf.merge(schema, plain_arguments)
     except OmegaConfBaseException as error:
         key = re.split(r"[.\[]", str(error.full_key))[0]
-        raise ValueError(wrong_type(f"{name}.{error.full_key}", arguments[key], types[key])) from None
-    values: Any = OmegaConf.to_container(flat)
+        raise ValueError(wrong_type_message(f"{name}.{error.full_key}", arguments[key], types[key])) from None
+    values: Any = OmegaConf.to_container(converted)
     values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
-    values |= {
-        key: build(arguments[key], f"{name}.{key}", packages, _path(found) if found else "", role=found or types[key])
-        for key, found in nested.items()
-    }
+    for key, child in nested.items():
+        target = _class_path(child) if child else ""
+        values[key] = build(arguments[key], f"{name}.{key}", packages, target, role=child or types[key])
     for item in fields(cls):
-        if (
-            item.name not in values
-            and item.default is dataclasses.MISSING
-            and item.default_factory is dataclasses.MISSING
-        ):
-            raise ValueError(_missing(cls, name, item.name))
+        has_default = item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING
+        if item.name not in values and not has_default:
+            raise ValueError(_missing_value_message(cls, name, item.name))
     try:
         return cls(**values)
-    except ValueError as error:  # a class within another does not know where it stands
+    except ValueError as error:  # the class of a nested node does not know its key
         raise error if "." not in name or name in str(error) else ValueError(f"{name}: {error}") from error
 
 
-def _missing(cls: type, name: str, key: str) -> str:
-    """What is said of a key without a value, with what the docstring of its class says of it."""
-    meaning = re.search(rf"^( *){re.escape(key)}: (.+?)(?=^\1\S|^$|\Z)", getdoc(cls) or "", re.MULTILINE | re.DOTALL)
-    said = f", {' '.join(meaning[2].split()).rstrip('.')}" if meaning else ""
-    return f"{name}.{key} must be given: set {name}.{key}=...{said}"
+def _missing_value_message(cls: type, name: str, key: str) -> str:
+    """The error message for a key without a value, with the description from the docstring of its class."""
+    match = re.search(rf"^( *){re.escape(key)}: (.+?)(?=^\1\S|^$|\Z)", getdoc(cls) or "", re.MULTILINE | re.DOTALL)
+    explanation = f", {' '.join(match[2].split()).rstrip('.')}" if match else ""
+    return f"{name}.{key} must be given: set {name}.{key}=...{explanation}"
 
 
 def _node_class(wanted: Any) -> type | None:
-    """The dataclass that a field's type asks for, alone or beside None; None where it asks for no dataclass."""
+    """The dataclass in a field's type, such as `X` or `X | None`; None if there is no dataclass."""
     return next((cls for cls in (wanted, *get_args(wanted)) if isinstance(cls, type) and is_dataclass(cls)), None)
 
 
-def _path(cls: type) -> str:
+def _class_path(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def wrong_type(key: str, value: Any, wanted: Any) -> str:
-    """One line on a value of the wrong type: the key, what it must be, the value found, and how a list is written."""
-    parts = get_args(wanted)
-    listed = get_origin(wanted) is list or parts[1:] == (...,)
-    remedy = f": write {key}=[{value}]" if listed and isinstance(value, str | int | float) else ""
-    return f"{key} must be {_in_words(wanted)}, not {value!r}{remedy}"
+def wrong_type_message(key: str, value: Any, wanted: Any) -> str:
+    """The error message for a value of the wrong type: the key, the right type, the value, and how to write a list."""
+    members = get_args(wanted)
+    is_list = get_origin(wanted) is list or members[1:] == (...,)
+    remedy = f": write {key}=[{value}]" if is_list and isinstance(value, str | int | float) else ""
+    return f"{key} must be {_type_label(wanted)}, not {value!r}{remedy}"
 
 
-def _in_words(wanted: Any) -> str:
-    """What a type hint asks for."""
-    parts, of = get_args(wanted), get_origin(wanted)
+def _type_label(wanted: Any) -> str:
+    """A type hint in words."""
+    members, origin = get_args(wanted), get_origin(wanted)
     if isinstance(wanted, type) and issubclass(wanted, StrEnum):
         return f"one of {', '.join(wanted)}"
-    if of in (list, tuple):
-        return f"a list of {len(parts)}" if len(parts) > 1 and parts[-1] is not ... else "a list"
-    if of is UnionType or of is Union:
-        return " or ".join(map(_in_words, parts))
-    return WORDS.get(wanted, "keys and values")
+    if origin in (list, tuple):
+        return f"a list of {len(members)}" if len(members) > 1 and members[-1] is not ... else "a list"
+    if origin is UnionType or origin is Union:
+        return " or ".join(map(_type_label, members))
+    return TYPE_LABELS.get(wanted, "keys and values")
 
 
 def type_of(key: str) -> Any:
-    """The type that the top level asks for at a dotted key; None where a part says it by itself."""
+    """The type of a dotted key of the top level; None for keys of other nodes, whose classes define them."""
     outer, _, inner = key.partition(".")
     return get_type_hints(EvaluationSettings if outer == "evaluation" else Config).get(inner or outer)

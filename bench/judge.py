@@ -1,8 +1,8 @@
-"""`python -m bench.judge MESH --truth TRUTH`, or `--dtu FOLDER --scan 65`: judges a mesh that anything made.
+"""`python -m bench.judge MESH --truth TRUTH`, or `--dtu FOLDER --scan 65`: judges a mesh from any source.
 
-Meshes are compared as they stand: nothing is aligned or scaled, but with --unit-sphere or --to-world. Results are in
-the units of the truth's file, with --unit-sphere in scene units, with --dtu in mm. The metrics are those of runs;
-bench/README.md defines them under "Which Chamfer is it?".
+Meshes are neither aligned nor scaled, except with --unit-sphere or --to-world. Results are in the units of the truth's
+file, with --unit-sphere in scene units, with --dtu in mm. The metrics are those of runs; bench/README.md defines them
+under "Which Chamfer is it?".
 """
 
 import argparse
@@ -30,21 +30,22 @@ from datasets.own_photographs import Capture, ReadSettings, read_capture, scan_n
 from datasets.scene import sample_surface
 from renderers.checks import BadInput
 
-POINTS = choice("scale", "desk")["points"]  # sampled on each surface, as in runs
-RADIUS = choice("dataset", "mesh")["radius"]  # of the sphere into which runs move a mesh
-THRESHOLD = "1%"  # of F, of the truth's extent: in runs 0.02, of shapes about 2 across
-LIKE_A_SCAN = (10.0, 0.0)  # of a mesh, which may have more than what was scanned; see `_unlike`
-LIKE_A_SHAPE = (1.2, 0.5)  # of a mesh of the same shape
-FLAT = 0.02  # of the diagonal: boxes are enlarged by it on each side, so that those of plates have a volume
-LONGEST = 800  # pixels of a photograph whose mask culls a mesh
-POWERS = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None, "normal_consistency": None}  # of the unit
-WORLD = "mesh_world.ply"  # of a run on photographs, in the world of their cameras
-TASK = "judge"  # of rows, where no run is named that they are like
+SURFACE_POINTS = choice("scale", "desk")["points"]  # as in runs
+SPHERE_RADIUS = choice("dataset", "mesh")["radius"]  # runs move a mesh into this sphere
+DEFAULT_THRESHOLD = "1%"  # runs have 0.02, for shapes about 2 across
+# Maximum size ratio and minimum overlap of boxes; see `_mismatch_warnings`. A mesh may have more than was scanned.
+SCAN_LIMITS = (10.0, 0.0)
+SHAPE_LIMITS = (1.2, 0.5)
+BOX_MARGIN_FRACTION = 0.02  # boxes are enlarged by it on each side, so that the box of a plate has a volume
+MAX_CULLING_PIXELS = 800  # longer side of a photograph whose mask culls a mesh
+UNIT_SUFFIXES = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None, "normal_consistency": None}
+WORLD_MESH_FILE = "mesh_world.ply"  # the mesh of a run on photographs, in the world of their cameras
+JUDGE_TASK = "judge"  # the task of rows without --like
 
 
 @dataclass(frozen=True)
 class Item:
-    """A mesh and the file or the number of the scan that judge it; without a mesh none has the truth's name."""
+    """A mesh, and the truth: a file or the number of a scan. The mesh is None if no mesh has the name of the truth."""
 
     name: str
     mesh: Path | None
@@ -53,7 +54,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a mesh is worth, and notes; `failure` says why it could not be judged, and has the worst metrics."""
+    """The metrics of a mesh, and notes. If judging failed, `failure` is the reason, with the worst metrics."""
 
     name: str
     metrics: dict[str, float]
@@ -64,17 +65,17 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Judge:
-    """How meshes are judged.
+    """The settings for judging meshes.
 
     Args:
-        folder: of DTU; None for surfaces.
-        threshold: of F, in units or, with %, per cent of the truth's extent.
-        points: that are sampled on each surface.
-        seed: of what is drawn.
-        unit_sphere: whether both are moved as runs move a mesh: the truth's box to the origin, into a sphere of
-            `RADIUS`.
-        to_world: photographs from whose unit sphere meshes are moved into the world of their cameras.
-        cull: photographs whose masks cull meshes.
+        folder: the folder of DTU; None compares with surfaces.
+        threshold: threshold of the F-score, in units or, with %, in per cent of the truth's extent.
+        points: number of points sampled on each surface.
+        seed: seed of the samples.
+        unit_sphere: whether both are moved like the mesh of a run: the centre of the truth's box to the origin, scaled
+            into a sphere of `SPHERE_RADIUS`.
+        to_world: folder of photographs; meshes are moved from their unit sphere into the world of their cameras.
+        cull: folder of photographs whose masks cull meshes.
     """
 
     folder: Path | None
@@ -97,15 +98,15 @@ class Judge:
         """Judges a mesh.
 
         Raises:
-            ValueError, OSError: where files cannot be read, or nothing can be compared.
+            ValueError, OSError: if files cannot be read, or nothing can be compared.
         """
         if item.mesh is None:
             raise ValueError(f"no mesh is named '{item.name}', as {item.truth} is")
-        mesh = self.prepared(read_mesh(item.mesh))
+        mesh = self.prepare(read_mesh(item.mesh))
         if isinstance(item.truth, Path):
             return self._by_surface(item.name, mesh, item.truth)
         scan = dtu.read_scan(self.folder or Path(), item.truth)
-        notes = [*_unlike(mesh, scan.above(), *LIKE_A_SCAN), *dtu.published(item.truth)]
+        notes = [*_mismatch_warnings(mesh, scan.above(), *SCAN_LIMITS), *dtu.published(item.truth)]
         metrics = dtu.dtu_metrics(mesh, scan, seed=self.seed)
         if metrics["dtu_accuracy"] == inf:
             raise BadInput(
@@ -114,8 +115,8 @@ class Judge:
             )
         return Verdict(item.name, metrics, notes, mesh=mesh)
 
-    def prepared(self, mesh: Mesh) -> Mesh:
-        """The mesh in the world of the cameras, culled, where that is asked for."""
+    def prepare(self, mesh: Mesh) -> Mesh:
+        """The mesh after the movement and the culling of the settings."""
         if self.to_world is not None:
             mesh = mesh.moved(_photographs(self.to_world).to_world)
         if self.cull is None:
@@ -127,48 +128,48 @@ class Judge:
         return kept.moved(capture.to_world)
 
     def _by_surface(self, name: str, mesh: Mesh, truth: Path) -> Verdict:
-        """The surface metrics against a file with a mesh or a cloud of points."""
+        """The surface metrics against a file with a mesh or a point cloud."""
         cloud = read_points(truth)
         surface = None if cloud is not None else read_mesh(truth)
-        places = surface.used if surface is not None else cloud
-        notes = _unlike(mesh, places, *LIKE_A_SHAPE)
+        truth_points = surface.used if surface is not None else cloud
+        notes = _mismatch_warnings(mesh, truth_points, *SHAPE_LIMITS)
         if self.unit_sphere:
-            centre, factor = fit_in_sphere(places, RADIUS)
-            mesh, surface = (one and replace(one, vertices=(one.vertices - centre) * factor) for one in (mesh, surface))
-            places = (places - centre) * factor
-        extent = float(np.linalg.norm(np.ptp(places, axis=0)))
+            centre, factor = fit_in_sphere(truth_points, SPHERE_RADIUS)
+            mesh, surface = (old and replace(old, vertices=(old.vertices - centre) * factor) for old in (mesh, surface))
+            truth_points = (truth_points - centre) * factor
+        extent = float(np.linalg.norm(np.ptp(truth_points, axis=0)))
         threshold = float(self.threshold.rstrip("%")) * (extent / 100 if self.threshold.endswith("%") else 1)
-        at = f"{threshold:.4g}, {threshold / extent:.2%} of the truth's extent"
-        notes.append(f"{self.points} points of each; F at {at}")
-        found = sample_surface(mesh, self.points, self.seed + 1)
+        threshold_text = f"{threshold:.4g}, {threshold / extent:.2%} of the truth's extent"
+        notes.append(f"{self.points} points of each; F at {threshold_text}")
+        predicted_samples = sample_surface(mesh, self.points, self.seed + 1)
         if surface is None:
-            metrics = cloud_metrics(found, drawn(places, self.points, self.seed), threshold=threshold)
+            metrics = cloud_metrics(predicted_samples, drawn(truth_points, self.points, self.seed), threshold=threshold)
             return Verdict(name, metrics, notes, mesh=mesh)
-        true, again = (sample_surface(surface, self.points, self.seed + more) for more in (0, 2))
-        floor = surface_metrics(again, true, threshold=threshold)
-        notes.append(f"two samplings of the truth have chamfer_l1 {floor['chamfer_l1']:.4g}")
-        return Verdict(name, surface_metrics(found, true, threshold=threshold), notes, mesh=mesh)
+        true_samples, repeated_samples = (sample_surface(surface, self.points, self.seed + offset) for offset in (0, 2))
+        sampling_error = surface_metrics(repeated_samples, true_samples, threshold=threshold)
+        notes.append(f"two samplings of the truth have chamfer_l1 {sampling_error['chamfer_l1']:.4g}")
+        return Verdict(name, surface_metrics(predicted_samples, true_samples, threshold=threshold), notes, mesh=mesh)
 
 
 @cache
 def _photographs(folder: Path) -> Capture:
-    return read_capture(folder, ReadSettings(LONGEST, unchecked=True))
+    return read_capture(folder, ReadSettings(MAX_CULLING_PIXELS, unchecked=True))
 
 
-def _unlike(mesh: Mesh, places: Float[np.ndarray, "n 3"], most: float, least: float) -> list[str]:
-    """A warning about a mesh that is probably in another world or in other units than its truth.
+def _mismatch_warnings(mesh: Mesh, truth: Float[np.ndarray, "n 3"], max_ratio: float, min_overlap: float) -> list[str]:
+    """A warning if a mesh is probably in another world or in other units than its truth.
 
     Args:
-        most: times as large as the truth, or as small, without a warning.
-        least: overlap of their boxes without a warning, as a share of the volume that both fill.
+        max_ratio: largest ratio of the sizes without a warning.
+        min_overlap: smallest intersection over union of the boxes without a warning.
     """
-    extent = float(np.linalg.norm(np.ptp(places, axis=0)))
-    ratio, slack = mesh.diagonal / max(extent, 1e-300), FLAT * max(mesh.diagonal, extent)
-    boxes = [(points.min(axis=0) - slack, points.max(axis=0) + slack) for points in (mesh.used, places)]
+    extent = float(np.linalg.norm(np.ptp(truth, axis=0)))
+    ratio, margin = mesh.diagonal / max(extent, 1e-300), BOX_MARGIN_FRACTION * max(mesh.diagonal, extent)
+    boxes = [(points.min(axis=0) - margin, points.max(axis=0) + margin) for points in (mesh.used, truth)]
     low, high = np.stack(boxes, axis=1)
-    shared = (high.min(axis=0) - low.max(axis=0)).clip(0).prod()
-    overlap = shared / ((high - low).prod(axis=1).sum() - shared)
-    if 1 / most <= ratio <= most and overlap >= least:
+    common_volume = (high.min(axis=0) - low.max(axis=0)).clip(0).prod()
+    overlap = common_volume / ((high - low).prod(axis=1).sum() - common_volume)
+    if 1 / max_ratio <= ratio <= max_ratio and overlap >= min_overlap:
         return []
     return [
         f"warning: the mesh is {ratio:.3g} times as large as the truth, and their boxes overlap by {overlap:.0%}: are "
@@ -177,14 +178,14 @@ def _unlike(mesh: Mesh, places: Float[np.ndarray, "n 3"], most: float, least: fl
 
 
 def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
-    """What is judged: a mesh, a run's mesh, or one of a folder for each truth of the same name, or number of a scan.
+    """The meshes to judge: a mesh, a run's mesh, or the meshes of a folder, paired with truths by name or scan number.
 
     Raises:
-        ValueError: where the two do not fit.
+        ValueError: if meshes and truths do not fit.
     """
     name = mesh.stem
     if (mesh / "record.json").is_file():
-        name, mesh = mesh.name, mesh / (WORLD if (mesh / WORLD).is_file() else "mesh.ply")
+        name, mesh = mesh.name, mesh / (WORLD_MESH_FILE if (mesh / WORLD_MESH_FILE).is_file() else "mesh.ply")
     meshes = {file.stem: file for file in find_meshes(mesh)} if mesh.is_dir() else {name: mesh}
     if truth is None:
         return [Item(name, file, scan_number(file.stem) if scan is None else scan) for name, file in meshes.items()]
@@ -198,69 +199,69 @@ def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
     return [Item(name, meshes.get(name), file) for name, file in truths.items()]
 
 
-def units(judge: Judge) -> dict[str, str]:
+def metric_units(judge: Judge) -> dict[str, str]:
     """The unit of each metric."""
     if judge.folder is not None:
         return dict.fromkeys(dtu.NAMES, "mm")
     unit = "scene unit" if judge.unit_sphere else "unit"
-    powers = {name: POWERS.get(name, "") for name in WORST_SURFACE}
+    powers = {name: UNIT_SUFFIXES.get(name, "") for name in WORST_SURFACE}
     return {name: "" if power is None else unit + power for name, power in powers.items()}
 
 
-def show(verdicts: Sequence[Verdict], known: dict[str, str]) -> None:
-    """Prints a line per mesh, medians of several, and notes."""
+def print_verdicts(verdicts: Sequence[Verdict], units: dict[str, str]) -> None:
+    """Prints a line per mesh, the medians of several meshes, and notes."""
     rows = [(verdict.name, verdict.metrics) for verdict in verdicts]
-    names = [name for name in known if any(name in metrics for _, metrics in rows)]
+    names = [name for name in units if any(name in metrics for _, metrics in rows)]
     if len(rows) > 1:
-        worst = {name: [metrics.get(name, np.nan) for _, metrics in rows] for name in names}
-        rows.append(("median", {name: float(np.median(values)) for name, values in worst.items()}))
-    width, columns = max(len(name) for name, _ in rows), [max(len(name), len(known[name]), 10) for name in names]
-    for head in (names, [known[name] for name in names]):
-        print(" " * width, *(f"{text:>{size}}" for text, size in zip(head, columns, strict=True)), sep="  ")
+        values_by_name = {name: [metrics.get(name, np.nan) for _, metrics in rows] for name in names}
+        rows.append(("median", {name: float(np.median(values)) for name, values in values_by_name.items()}))
+    width, columns = max(len(name) for name, _ in rows), [max(len(name), len(units[name]), 10) for name in names]
+    for heads in (names, [units[name] for name in names]):
+        print(" " * width, *(f"{text:>{size}}" for text, size in zip(heads, columns, strict=True)), sep="  ")
     for name, metrics in rows:
-        values = (f"{metrics.get(one, np.nan):>{size}.4g}" for one, size in zip(names, columns, strict=True))
+        values = (f"{metrics.get(metric, np.nan):>{size}.4g}" for metric, size in zip(names, columns, strict=True))
         print(f"{name:<{width}}", *values, sep="  ")
-    told = {note: [v.name for v in verdicts if note in v.notes] for v in verdicts for note in v.notes}
-    for note, of in told.items():
-        print(note if len(of) == len(verdicts) else f"{', '.join(of)}: {note}")
+    names_by_note = {note: [v.name for v in verdicts if note in v.notes] for v in verdicts for note in v.notes}
+    for note, mesh_names in names_by_note.items():
+        print(note if len(mesh_names) == len(verdicts) else f"{', '.join(mesh_names)}: {note}")
     for verdict in verdicts:
         if verdict.failure:
             print(f"{verdict.name}: {verdict.failure}", file=sys.stderr)
 
 
-def write_row(verdict: Verdict, item: Item, place: int, judge: Judge, given: argparse.Namespace) -> None:
-    """Writes a verdict as the record of a run, which tables and page show beside renderers' runs.
+def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: argparse.Namespace) -> None:
+    """Writes a verdict as the record of a run, which tables and the page show with the runs of renderers.
 
     Args:
-        place: of the mesh in its folder.
-        given: the command line: `into`, `method`, and `like`, a run whose problem the meshes answer.
+        index: index of the mesh in its folder.
+        options: the command line: `into`, `method`, and `like`, a run with the same problem.
     """
-    words = re.sub(r"[^a-z0-9]+", "_", given.method.lower()).strip("_")
-    if given.like is not None:
-        like = read_record(given.like)
+    method = re.sub(r"[^a-z0-9]+", "_", options.method.lower()).strip("_")
+    if options.like is not None:
+        like = read_record(options.like)
         fields: dict[str, Any] = {name: like[name] for name in ("task", "dataset", "seed", "scene", "config")}
     else:
-        where = str(given.truth or given.dtu)
-        config = {"task": {"points": judge.points}, "dataset": {"path": where}, "index": place, "split": "test"}
-        fields = {"task": TASK, "dataset": TASK, "seed": judge.seed, "scene": item.name, "config": config}
-    fields["config"] |= {"label": given.method, "renderer": {}, "silhouette": None, "results_dir": str(given.into)}
-    key = digest([words, fields["task"], fields["config"], fields["seed"], item.name])
-    record = Record(f"{fields['task']}-{words}-{key}", renderer=words, **fields)
+        truth = str(options.truth or options.dtu)
+        config = {"task": {"points": judge.points}, "dataset": {"path": truth}, "index": index, "split": "test"}
+        fields = {"task": JUDGE_TASK, "dataset": JUDGE_TASK, "seed": judge.seed, "scene": item.name, "config": config}
+    fields["config"] |= {"label": options.method, "renderer": {}, "silhouette": None, "results_dir": str(options.into)}
+    key = digest([method, fields["task"], fields["config"], fields["seed"], item.name])
+    record = Record(f"{fields['task']}-{method}-{key}", renderer=method, **fields)
     record.status, record.reason = (RunStatus.EMPTY, verdict.failure) if verdict.failure else (RunStatus.OK, "")
     record.metrics, record.notes = dict(verdict.metrics), [f"judged from {item.mesh}", *verdict.notes]
     unit = "scene units" if judge.unit_sphere else "units of the truth's file"
-    known = {name: text.replace("scene units", unit) for name, text in DEFINITIONS.items()} | dtu.DEFINITIONS
-    record.definitions = {name: known[name] for name in verdict.metrics}
+    definitions = {name: text.replace("scene units", unit) for name, text in DEFINITIONS.items()} | dtu.DEFINITIONS
+    record.definitions = {name: definitions[name] for name in verdict.metrics}
     record.ended = now()
-    folder = given.into / "runs" / record.id
+    folder = options.into / "runs" / record.id
     folder.mkdir(parents=True, exist_ok=True)
     if verdict.mesh is not None:
         verdict.mesh.save(folder / "mesh.ply")
     record.write(folder)
 
 
-def parsed(arguments: list[str] | None) -> argparse.Namespace:
-    """The command line."""
+def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
+    """Parses the command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.judge", description=__doc__)
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh with faces, a run folder, or a folder of these")
     truth = parser.add_mutually_exclusive_group(required=True)
@@ -268,8 +269,9 @@ def parsed(arguments: list[str] | None) -> argparse.Namespace:
     truth.add_argument("--dtu", type=Path, metavar="FOLDER", help="DTU's, with Points/stl and ObsMask")
     parser.add_argument("--scan", type=int, help="of DTU (default: the number in the mesh's name)")
     threshold = "of F, in units or %% of the truth's extent (default: %(default)s)"
-    parser.add_argument("--threshold", default=THRESHOLD, help=threshold)
-    parser.add_argument("--points", type=int, default=POINTS, help="sampled on each surface (default: %(default)s)")
+    parser.add_argument("--threshold", default=DEFAULT_THRESHOLD, help=threshold)
+    points = "sampled on each surface (default: %(default)s)"
+    parser.add_argument("--points", type=int, default=SURFACE_POINTS, help=points)
     parser.add_argument("--seed", type=int, default=0, help="of the samples (default: %(default)s)")
     parser.add_argument("--unit-sphere", action="store_true", help="move both as runs move a mesh: scene units")
     parser.add_argument("--to-world", type=Path, metavar="PHOTOS", help="move the mesh out of their unit sphere")
@@ -281,33 +283,34 @@ def parsed(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Reads the command line; 0 where all meshes were judged, 1 where some could not be, 2 where none could."""
-    given = parsed(arguments)
+    """Judges the meshes of the command line; returns 0 for success, 1 if some could not be judged, 2 if none could."""
+    options = parse_arguments(arguments)
     try:
         judge = Judge(
-            given.dtu, given.threshold, given.points, given.seed, given.unit_sphere, given.to_world, given.cull
+            *(options.dtu, options.threshold, options.points, options.seed),
+            *(options.unit_sphere, options.to_world, options.cull),
         )
-        if given.into is not None and not (given.method and is_plain_name(given.method)):
+        if options.into is not None and not (options.method and is_plain_name(options.method)):
             raise ValueError("--into writes rows of a method: add --method NAME")
-        if given.like is not None and given.mesh.is_dir() and not (given.mesh / "record.json").is_file():
-            raise ValueError(f"--like names the problem of one run, and {given.mesh} is a folder: name one mesh")
-        if given.like is not None and not given.unit_sphere and read_record(given.like)["dataset"] != "photos":
+        if options.like is not None and options.mesh.is_dir() and not (options.mesh / "record.json").is_file():
+            raise ValueError(f"--like names the problem of one run, and {options.mesh} is a folder: name one mesh")
+        if options.like is not None and not options.unit_sphere and read_record(options.like)["dataset"] != "photos":
             raise ValueError("--like names a run, whose metrics are in scene units: add --unit-sphere, and its truth")
-        items, verdicts = items_of(given.mesh, given.truth, given.scan), list[Verdict]()
+        items, verdicts = items_of(options.mesh, options.truth, options.scan), list[Verdict]()
         for item in items:
             try:
                 verdicts.append(judge.verdict(item))
             except (OSError, ValueError) as error:
                 if len(items) == 1:
                     raise
-                worst = WORST_SURFACE if given.dtu is None else dtu.WORST
+                worst = WORST_SURFACE if options.dtu is None else dtu.WORST
                 verdicts.append(Verdict(item.name, dict(worst), failure=" ".join(str(error).split())))
-        show(verdicts, units(judge))
-        if given.into is not None:
-            check_links(given.into)
-            for place, (item, verdict) in enumerate(zip(items, verdicts, strict=True)):
-                write_row(verdict, item, place, judge, given)
-            print(write_index(given.into))
+        print_verdicts(verdicts, metric_units(judge))
+        if options.into is not None:
+            check_links(options.into)
+            for index, (item, verdict) in enumerate(zip(items, verdicts, strict=True)):
+                write_row(verdict, item, index, judge, options)
+            print(write_index(options.into))
     except (OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

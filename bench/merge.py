@@ -1,8 +1,7 @@
 """`python -m bench.merge A B C --into D`: joins the results folders of several machines.
 
-The order does not matter, and merging again changes nothing: of two runs of one cell, `runs` keeps the one that ranks
-highest, and `earlier` gets the other, named after a hash of its content. Priors are not copied: they can be trained
-again.
+The order does not matter, and merging again changes nothing. Of two runs of one cell, `runs` keeps the run with the
+higher rank, and `earlier` gets the other, with a hash of its content in its name. Priors are not copied.
 """
 
 import argparse
@@ -11,31 +10,31 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bench.records.folder import content_of, put_into, set_aside
+from bench.records.folder import archive_run, content_hash, copy_atomically
 from bench.records.read import check_links, read_plans, read_run, run_folders
-from bench.records.record import file_lock, leads_out, link_out, read_record, write_text
+from bench.records.record import bad_link, file_lock, is_outside, read_record, write_text
 from bench.report.suite.attempts import place, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
 UNREADABLE = "copied, but it cannot be read and no table shows it: "
-UNFINISHED = ("killed", "crashed", "refused")  # these rank below every other status, and ok above
+UNFINISHED = ("killed", "crashed", "refused")  # they rank below all other statuses, and ok above
 
 
 def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
     """Copies all runs and plans of the sources to `into`.
 
-    A run with a link that leads out of its results folder is not copied. A run whose record cannot be read is copied.
+    A run with a link that leads out of its results folder is not copied. A run with an unreadable record is copied.
 
     Returns:
-        a line for each run that another one replaced, and a message for each that is not copied or cannot be read.
+        a line for each replaced run, and a message for each run that is not copied or cannot be read.
 
     Raises:
-        ValueError: for a source that is not a results folder, or that is or contains `into`; where `into` is a file.
+        ValueError: if a source is not a results folder, or is or contains `into`, or if `into` is a file.
     """
     for source in sources:
         if not (source / "runs").is_dir() and not place(source).is_dir():
             raise ValueError(f"{source} is not a results folder: it has no folder runs")
-        if not leads_out(into, source):
+        if not is_outside(into, source):
             raise ValueError(f"{into} is {source} or lies within it: --into must be another folder, outside of it")
     if into.is_file():
         raise ValueError(f"{into} is a file: --into must be a folder, or a new name")
@@ -43,76 +42,76 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
     (into / "runs").mkdir(parents=True, exist_ok=True)
     lines, problems = list[str](), list[str]()
     for source in sources:
-        kept, unread = read_attempts(source)
-        problems += [f"{source}: not copied: {problem}" for problem in unread]
-        if kept:
-            write_attempts(kept, into)
+        attempts, problems_of_attempts = read_attempts(source)
+        problems += [f"{source}: not copied: {problem}" for problem in problems_of_attempts]
+        if attempts:
+            write_attempts(attempts, into)
         for folder in [*run_folders(source), *sorted((source / "earlier").glob("[!.]*/"))]:
-            if link := link_out(folder, source):
+            if link := bad_link(folder, source):
                 problems.append(f"{folder}: not copied, since {link} is a link out of its results folder")
             elif folder.parent.name == "earlier":
-                put_into(into / "earlier" / folder.name, folder)
+                copy_atomically(into / "earlier" / folder.name, folder)
             else:
-                lines += _join(folder, into)
+                lines += _copy_run(folder, into)
                 if problem := read_run(folder, source)[1]:
                     problems.append(f"{source}: {UNREADABLE}{problem}")
         problems += [f"{source}: this plan cannot be read: {problem}" for problem in read_plans(source)[1]]
-        for plan in sorted((source / "sweeps").glob("*/plan.json")):  # of one name: of the same cells
-            if not leads_out(plan, source):
+        for plan in sorted((source / "sweeps").glob("*/plan.json")):  # plans of the same name have the same cells
+            if not is_outside(plan, source):
                 (into / "sweeps" / plan.parent.name).mkdir(parents=True, exist_ok=True)
                 _keep_later(into / "sweeps" / plan.parent.name / plan.name, plan)
     return lines, problems
 
 
-def _keep_later(place: Path, path: Path) -> None:
-    """Writes a record or a plan to where another request of the same run or sweep is, if it was requested later."""
-    if not place.exists() or _asked(path) > _asked(place):
-        write_text(place, path.read_text("utf-8", "replace"))
+def _keep_later(target: Path, path: Path) -> None:
+    """Replaces a record or a plan by that of another request of the same run or sweep, if this was later."""
+    if not target.exists() or _request_time(path) > _request_time(target):
+        write_text(target, path.read_text("utf-8", "replace"))
 
 
-def _asked(path: Path) -> str:
+def _request_time(path: Path) -> str:
     try:
         return str(json.loads(path.read_text(encoding="utf-8"))["asked"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return ""
 
 
-def _join(folder: Path, into: Path) -> list[str]:
-    """Copies a run; gives a line where there is another run of its cell, which one is kept and which set aside."""
-    place, earlier = into / "runs" / folder.name, into / "earlier"
+def _copy_run(folder: Path, into: Path) -> list[str]:
+    """Copies a run; if `into` has another run of its cell, returns a line on which is kept and which archived."""
+    target, earlier = into / "runs" / folder.name, into / "earlier"
     with file_lock(into, folder.name):
-        if not place.exists():
-            put_into(place, folder)
+        if not target.exists():
+            copy_atomically(target, folder)
             return []
-        (mine, kept), (theirs, other) = _ranked(place), _ranked(folder)
-        if mine[-1] == theirs[-1]:  # the same run
-            _keep_later(place / "record.json", folder / "record.json")
+        (target_rank, kept), (folder_rank, archived) = _rank(target), _rank(folder)
+        if target_rank[-1] == folder_rank[-1]:  # the same run
+            _keep_later(target / "record.json", folder / "record.json")
             return []
-        if theirs > mine:
-            kept, other = other, kept
-            set_aside(place, earlier)
-            put_into(place, folder)
+        if folder_rank > target_rank:
+            kept, archived = archived, kept
+            archive_run(target, earlier)
+            copy_atomically(target, folder)
         else:
-            put_into(earlier / f"{folder.name}-{theirs[-1]}", folder)
-    return [f"{folder.name}: kept {kept}, set aside in earlier: {other}"]
+            copy_atomically(earlier / f"{folder.name}-{folder_rank[-1]}", folder)
+    return [f"{folder.name}: kept {kept}, set aside in earlier: {archived}"]
 
 
-def _ranked(folder: Path) -> tuple[tuple[Any, ...], str]:
-    """The rank of a run, and what it is in words: ok above all others, unfinished below, then by time and content."""
+def _rank(folder: Path) -> tuple[tuple[Any, ...], str]:
+    """The rank of a run (ok first, unfinished last, then by time and content), and its status and time as text."""
     try:
         record = read_record(folder)
     except (OSError, ValueError, RecursionError):
         record = {}
     status, started = record.get("status", "unreadable"), str(record.get("started"))
     finished = bool(record) and status not in UNFINISHED
-    return (status == "ok", finished, bool(record), started, content_of(folder)), f"{status} of {started}"
+    return (status == "ok", finished, bool(record), started, content_hash(folder)), f"{status} of {started}"
 
 
 def main(arguments: list[str]) -> int:
-    """Merges; prints a line for each run that another one replaced, what is wrong, and the report's path last.
+    """Merges; prints a line for each replaced run, warnings, and the report's path last.
 
     Returns:
-        the exit status: 1 where a run is not copied or cannot be read, 2 where nothing can be merged.
+        the exit status: 1 if a run is not copied or cannot be read, 2 if nothing can be merged.
     """
     parser = argparse.ArgumentParser(prog="python -m bench.merge", description="Joins results folders.")
     parser.add_argument("sources", nargs="+", type=Path, metavar="FOLDER", help="results folders to join")

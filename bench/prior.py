@@ -10,7 +10,7 @@ def train(run: Identity) -> None:
     """Finds or trains the prior; prints its path.
 
     Raises:
-        ValueError: for what cannot be trained.
+        ValueError: if nothing can be trained.
     """
     from bench.machine.environment import flushing_denormals
     from bench.progress import run_progress
@@ -28,7 +28,7 @@ def train(run: Identity) -> None:
 
 
 def main() -> int:
-    """Trains what the command line describes; gives the exit status."""
+    """Runs the command line; returns the exit status."""
     return command_line(train)
 
 

@@ -1,6 +1,6 @@
 """Shows progress on a terminal: a line for the run and one for the sweep.
 
-Where there is no terminal, a line is printed of a phase that takes long, again and again.
+Without a terminal, it prints a line of a long phase at intervals.
 """
 
 import sys
@@ -20,19 +20,19 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-PLAIN = 15.0  # seconds between two printed lines of a phase, where there is no terminal
-NARROW = 80  # columns of a terminal, below which a line of progress has no room for a bar
-HOUR = 3600.0  # seconds over which the speed is estimated; a sweep's cells may take minutes each
+PRINT_INTERVAL_SECONDS = 15.0
+MIN_BAR_COLUMNS = 80  # a narrower terminal has no room for a bar
+SPEED_WINDOW_SECONDS = 3600.0  # long, because a sweep's cells may take minutes each
 
 
 @runtime_checkable
 class Report(Protocol):
-    """Reports that `done` of `total` steps of a phase are done, with the loss if there is one.
+    """Reports that `finished` of `total` steps of a phase are finished, with the loss if there is one.
 
-    A phase says what is being done, such as "training the prior"; the message of a limit that is reached names it.
+    A phase is an activity, such as "training the prior"; the message of a reached limit names it.
     """
 
-    def __call__(self, phase: str, done: int, total: int, loss: float | None = None) -> None: ...
+    def __call__(self, phase: str, finished: int, total: int, loss: float | None = None) -> None: ...
 
 
 def _print(text: str) -> None:
@@ -43,7 +43,7 @@ _receive: Callable[[str], None] = _print
 
 
 def notice(text: str) -> None:
-    """Prints a message for the user, also where there is no terminal."""
+    """Prints a message for the user, also without a terminal."""
     _receive(text)
 
 
@@ -54,23 +54,23 @@ def notices_to(receive: Callable[[str], None]) -> None:
 
 
 def columns(width: int) -> list[ProgressColumn]:
-    """What a line of progress shows; on a narrow terminal its name, how many are done, and the time left."""
+    """The columns of a line of progress; on a narrow terminal name, number of finished steps, and time left."""
     name, count, left = TextColumn("{task.description}", markup=False), MofNCompleteColumn(), TimeRemainingColumn()
-    if width < NARROW:
+    if width < MIN_BAR_COLUMNS:
         return [name, count, left]
-    padded, said = TextColumn("{task.description:<28}", markup=False), TextColumn("{task.fields[said]}", markup=False)
-    return [padded, BarColumn(), count, said, TimeElapsedColumn(), TextColumn("left"), left]
+    name, status = TextColumn("{task.description:<28}", markup=False), TextColumn("{task.fields[status]}", markup=False)
+    return [name, BarColumn(), count, status, TimeElapsedColumn(), TextColumn("left"), left]
 
 
-_shown: Progress | None = None  # the display of this process, shared by the lines of a sweep and of its run
+_active_display: Progress | None = None  # shared by the lines of a sweep and of its run
 
 
 @contextmanager
 def display() -> Iterator[Progress]:
     """The live display of this process, on standard error."""
-    global _shown
-    if _shown is not None:
-        yield _shown
+    global _active_display
+    if _active_display is not None:
+        yield _active_display
         return
     console = Console(stderr=True)
     with Progress(
@@ -78,35 +78,36 @@ def display() -> Iterator[Progress]:
         console=console,
         disable=not console.is_terminal,
         refresh_per_second=5,
-        speed_estimate_period=HOUR,
+        speed_estimate_period=SPEED_WINDOW_SECONDS,
         transient=True,
-    ) as _shown:
+    ) as _active_display:
         try:
-            yield _shown
+            yield _active_display
         finally:
-            _shown = None
+            _active_display = None
 
 
 @contextmanager
 def run_progress(name: str) -> Iterator[Report]:
     """Shows one line for a run: its phase, its progress, and its loss."""
-    with display() as shown:
-        line = shown.add_task(name, total=None, said="")
-        current, begun, printed = "", 0.0, 0.0
+    with display() as live:
+        line = live.add_task(name, total=None, status="")
+        current_phase, start, last_print = "", 0.0, 0.0
 
-        def report(phase: str, done: int, total: int, loss: float | None = None) -> None:
-            nonlocal current, begun, printed
-            said = "" if loss is None else f"loss {loss:.4g}"
+        def report(phase: str, finished: int, total: int, loss: float | None = None) -> None:
+            nonlocal current_phase, start, last_print
+            status = "" if loss is None else f"loss {loss:.4g}"
             now = time.monotonic()
-            if phase != current:  # another phase has another speed
-                current, begun, printed = phase, now, now
-                shown.reset(line, total=total, description=f"{name}: {phase}", said=said)
-            shown.update(line, completed=done, said=said)
-            if shown.disable and now - printed >= PLAIN and 0 < done < total:
-                printed = now
-                _print(f"{name}: {phase}, {done / total:.0%}, about {(now - begun) * (total / done - 1):.0f} s left")
+            if phase != current_phase:  # another phase has another speed
+                current_phase, start, last_print = phase, now, now
+                live.reset(line, total=total, description=f"{name}: {phase}", status=status)
+            live.update(line, completed=finished, status=status)
+            if live.disable and now - last_print >= PRINT_INTERVAL_SECONDS and 0 < finished < total:
+                last_print = now
+                left = (now - start) * (total / finished - 1)
+                _print(f"{name}: {phase}, {finished / total:.0%}, about {left:.0f} s left")
 
         try:
             yield report
         finally:
-            shown.remove_task(line)
+            live.remove_task(line)

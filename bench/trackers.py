@@ -1,4 +1,4 @@
-"""Exports finished runs to experiment trackers; never during a run, and a failed export loses no run."""
+"""Exports finished runs to experiment trackers, never during a run; a failed export loses no run."""
 
 import math
 from dataclasses import dataclass
@@ -8,10 +8,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import NUMERIC, as_number, started
+from bench.records.record import NUMERIC_FIELDS, as_number, started
 from datasets.extras import install
 
-METRICS, PARAMETERS, LONGEST = 1000, 100, 500  # most of them in a call of MLflow; characters of a parameter's value
+MAX_METRICS_PER_CALL, MAX_PARAMETERS_PER_CALL, MAX_PARAMETER_CHARACTERS = 1000, 100, 500  # limits of MLflow
 
 
 @runtime_checkable
@@ -32,7 +32,7 @@ class Nothing:
 
 @dataclass(frozen=True)
 class MLflow:
-    """Exports to an MLflow server, or a database; pictures go to the folder that its experiment was made with."""
+    """Exports to an MLflow server or database; pictures go to the artifact folder of the experiment."""
 
     uri: str
     experiment: str
@@ -42,29 +42,30 @@ class MLflow:
         _check_installed("mlflow", f"MLflow: {install('mlflow')}")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
-        """Makes a run in MLflow; its status is FINISHED where the run ended ok, else FAILED."""
+        """Makes a run in MLflow with the status FINISHED if the run ended ok, else FAILED."""
         from mlflow import MlflowClient, entities  # slow to import, and needed only here
 
         client = MlflowClient(tracking_uri=self.uri)
-        known = client.get_experiment_by_name(self.experiment)
-        place = Path(self.artifacts).resolve().as_uri()
-        made = known.experiment_id if known else client.create_experiment(self.experiment, artifact_location=place)
-        begun = int(started(record).timestamp() * 1000)
+        experiment = client.get_experiment_by_name(self.experiment)
+        uri = Path(self.artifacts).resolve().as_uri()
+        experiment_id = experiment.experiment_id if experiment else client.create_experiment(self.experiment, uri)
+        start_ms = int(started(record).timestamp() * 1000)
         tags = {"mlflow.runName": record["id"], "status": record["status"], "reason": record["reason"]}
-        run = client.create_run(made, start_time=begun, tags=tags).info.run_id
-        now = begun + int(1000 * record["seconds"].get("total", 0.0))
-        points = [entities.Metric(name, value, now, 0) for name, value in values(record).items()]
+        run = client.create_run(experiment_id, start_time=start_ms, tags=tags).info.run_id
+        end_ms = start_ms + int(1000 * record["seconds"].get("total", 0.0))
+        points = [entities.Metric(name, value, end_ms, 0) for name, value in values(record).items()]
         for iteration, line in curve(folder):
-            at = begun + int(1000 * line.get("seconds", 0.0))
-            points += [entities.Metric(f"curve.{name}", value, at, iteration) for name, value in line.items()]
-        parameters = [entities.Param(name, text[:LONGEST]) for name, text in settings(record["config"]).items()]
-        for first in range(0, len(points), METRICS):
-            client.log_batch(run, metrics=points[first : first + METRICS])
-        for first in range(0, len(parameters), PARAMETERS):
-            client.log_batch(run, params=parameters[first : first + PARAMETERS])
+            time_ms = start_ms + int(1000 * line.get("seconds", 0.0))
+            points += [entities.Metric(f"curve.{name}", value, time_ms, iteration) for name, value in line.items()]
+        texts = {name: text[:MAX_PARAMETER_CHARACTERS] for name, text in settings(record["config"]).items()}
+        parameters = [entities.Param(name, text) for name, text in texts.items()]
+        for index in range(0, len(points), MAX_METRICS_PER_CALL):
+            client.log_batch(run, metrics=points[index : index + MAX_METRICS_PER_CALL])
+        for index in range(0, len(parameters), MAX_PARAMETERS_PER_CALL):
+            client.log_batch(run, params=parameters[index : index + MAX_PARAMETERS_PER_CALL])
         for path in sorted(folder.glob("*.png")):
             client.log_artifact(run, str(path))
-        client.set_terminated(run, "FINISHED" if record["status"] == "ok" else "FAILED", end_time=now)
+        client.set_terminated(run, "FINISHED" if record["status"] == "ok" else "FAILED", end_time=end_ms)
 
 
 @dataclass(frozen=True)
@@ -102,14 +103,14 @@ def settings(config: dict[str, Any]) -> dict[str, str]:
 
 def values(record: dict[str, Any]) -> dict[str, float]:
     """All finite numbers of a record, such as `metrics.chamfer_l2`."""
-    return _finite(flat({name: record[name] for name in NUMERIC}))
+    return _finite(flat({name: record[name] for name in NUMERIC_FIELDS}))
 
 
 def curve(folder: Path) -> list[tuple[int, dict[str, float]]]:
-    """The lines of `curve.jsonl` as iteration and finite numbers by name; empty where there is no curve."""
+    """The lines of `curve.jsonl` as iteration and finite numbers by name; empty without a curve."""
     return [(line.pop("iteration"), _finite(line)) for line in curve_lines(folder) or () if line]
 
 
-def _finite(found: dict[str, Any]) -> dict[str, float]:
-    numbers = {name: as_number(value) for name, value in found.items()}
+def _finite(values: dict[str, Any]) -> dict[str, float]:
+    numbers = {name: as_number(value) for name, value in values.items()}
     return {name: float(x) for name, x in numbers.items() if x is not None and math.isfinite(x)}

@@ -7,10 +7,10 @@ from bench.run.command import command_line
 
 
 def train(run: Identity) -> None:
-    """Finds or trains the network; prints its path. A training that was stopped goes on where it was.
+    """Finds or trains the network; prints its path. A stopped training continues.
 
     Raises:
-        ValueError: for what cannot be trained.
+        ValueError: if the task has no network.
     """
     from bench.machine.environment import flushing_denormals
     from bench.progress import run_progress
@@ -33,7 +33,7 @@ def train(run: Identity) -> None:
 
 
 def main() -> int:
-    """Trains what the command line describes; gives the exit status."""
+    """Runs the command line; returns the exit status."""
     return command_line(train)
 
 

@@ -1,8 +1,8 @@
 """`python -m bench.tune --into conf/tuned.yaml`: writes each method's best drawn setting as a row of a table.
 
-It reads the runs of `+experiment=tuning`. The best draw is that with the smallest geometric mean of Chamfer distances
-on the validation shapes, of those with the fewest failures; the test shapes take no part in the choice. With
-`--experiment tuning_photographs` the settings are of reconstruction, chosen by the Chamfer distance of what is seen.
+It reads the runs of `+experiment=tuning`. Of the draws with the fewest failures, the best has the smallest geometric
+mean of Chamfer distances on the validation shapes; test shapes are not used. `--experiment tuning_photographs` chooses
+settings of reconstruction, by the Chamfer distance of the seen surface.
 """
 
 import argparse
@@ -33,21 +33,21 @@ from bench.report.tuning import (
 from bench.tables import read_yaml
 
 SELECTIONS = {selection.experiment: selection for selection in (TUNING, PHOTOGRAPHS)}
-HEAD = "# Settings of methods, chosen on validation shapes. Written by `python -m bench.tune`; do not edit.\n"
-WIDTH = 118  # of its lines
-CHOSEN = (
+HEADER = "# Settings of methods, chosen on validation shapes. Written by `python -m bench.tune`; do not edit.\n"
+LINE_WIDTH = 118
+CHOSEN_TEXT = (
     "draw {draw} of {draws} of {space}: geometric mean of {error} x 1000 on {runs} validation runs at scale={scale} of "
     "{families}{loss}: {best}, of the median draw {middle}; runs of commit {commit}"
 )
 
 
 def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> list[str]:
-    """Writes a row per method of the experiment of that name to a table; gives a line for each.
+    """Writes a row per method of an experiment to a table; returns a line for each.
 
     Other rows of the table stay.
 
     Raises:
-        ValueError: where runs of the tuning are missing, or have not ended; for a table that is no YAML.
+        ValueError: if runs of the tuning are missing or have not ended, or the table is not a YAML file.
     """
     if path.suffix != ".yaml":
         raise ValueError(f"{path} is no table of settings: type --into conf/tuned.yaml")
@@ -58,53 +58,53 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
         raise ValueError(
             f"{waiting} runs of the tuning have not ended: type the command of the sweep again, it goes on"
         )
-    found = tunings(experiment)
-    if not found:
+    methods = tunings(experiment)
+    if not methods:
         raise ValueError("no draw has a run on every shape for every method: sweep over them all")
-    if len(found[0].draws) < 2:
+    if len(methods[0].draws) < 2:
         raise ValueError(
-            f"draw {found[0].draws[0]} alone has a run on every shape for every method, and one is no choice: type the "
-            "command of the sweep again, it makes the others"
+            f"draw {methods[0].draws[0]} alone has a run on every shape for every method, and one is no choice: type "
+            "the command of the sweep again, it makes the others"
         )
-    for method in found:
+    for method in methods:
         if not is_plain_name(method.method):
             raise ValueError(f"runs name the method {method.method!r}, which is no name of a row: leave these runs out")
-    settings = {method.method: method.settings[method.best] for method in found}
-    new = {method.method: _origin(method, experiment) | settings[method.method] for method in found}
+    settings = {method.method: method.settings[method.best] for method in methods}
+    new = {method.method: _origin_keys(method, experiment) | settings[method.method] for method in methods}
     rows = (read_yaml(path) if path.is_file() else {}) | new
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, HEAD + yaml.safe_dump(rows, sort_keys=False, width=WIDTH))
-    told = {row: ", ".join(f"{key} {number(value)}" for key, value in own.items()) for row, own in settings.items()}
-    return left_out(experiment, found) + [f"{path}: {row}: {text}" for row, text in told.items()]
+    write_text(path, HEADER + yaml.safe_dump(rows, sort_keys=False, width=LINE_WIDTH))
+    texts = {row: ", ".join(f"{key} {number(x)}" for key, x in values.items()) for row, values in settings.items()}
+    return left_out(experiment, methods) + [f"{path}: {row}: {text}" for row, text in texts.items()]
 
 
-def _origin(method: Tuning, experiment: Runs) -> dict[str, Any]:
-    """What the row of a method has beside its settings: how these were chosen, its base and its label."""
+def _origin_keys(method: Tuning, experiment: Runs) -> dict[str, Any]:
+    """The keys of a method's row that are not settings: how the settings were chosen, base and label."""
     records = [record for record in experiment.records if record["method"].removeprefix(SPACE) == method.method]
-    chosen = _chosen(method, records, experiment)
+    chosen = _chosen_text(method, records, experiment)
     return {"chosen": chosen, "base": f"/method/{method.method}", "label": f"{method.label}, tuned"}
 
 
-def _chosen(method: Tuning, records: list[Record], experiment: Runs) -> str:
-    """What was drawn, chosen, and from which runs."""
+def _chosen_text(method: Tuning, records: list[Record], experiment: Runs) -> str:
+    """A sentence on the draws, the choice and the runs."""
     commits = {str(record["environment"].get("commit", "unknown"))[:9] for record in records if record["environment"]}
     name, metric = records[0]["method"], metric_of(experiment)
-    return CHOSEN.format(
+    return CHOSEN_TEXT.format(
         **{"draw": method.draws[method.best], "draws": len(method.draws), "runs": method.validation.shape[1]},
         space=name if name.startswith(SPACE) else experiment.selection.experiment,
         error="Chamfer" if metric == CHAMFER else metric,
         best=number(np.exp(method.scores[method.best])),
         middle=number(np.exp(np.median(method.scores))),
-        scale=_names(record["config"]["scale"]["name"] for record in records),
-        families=_names(record["config"]["dataset"]["name"] for record in records),
-        commit=_names(commits),
-        loss=f", all under {loss}" if (loss := _names([shared_loss(records)])) else "",
+        scale=_join_names(record["config"]["scale"]["name"] for record in records),
+        families=_join_names(record["config"]["dataset"]["name"] for record in records),
+        commit=_join_names(commits),
+        loss=f", all under {loss}" if (loss := _join_names([shared_loss(records)])) else "",
     )
 
 
-def _names(found: Iterable[Any]) -> str:
-    """Names from records in one line."""
-    return " and ".join(sorted({" ".join(str(name).split()) for name in found}))
+def _join_names(names: Iterable[Any]) -> str:
+    """The different names in one line."""
+    return " and ".join(sorted({" ".join(str(name).split()) for name in names}))
 
 
 def main(arguments: list[str]) -> int:

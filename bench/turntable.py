@@ -15,23 +15,23 @@ from torch import Tensor
 
 from bench.evaluate.state import painted
 from bench.pictures.run_figures import normals_image, shaded
-from bench.records.record import leads_out, read_record
+from bench.records.record import is_outside, read_record
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import SUFFIXES, read_mesh
 from datasets.scene import Truth, View, see
 from datasets.views import ViewSampler
 
-DISTANCE, FIELD_OF_VIEW = 2.5, 50.0  # scene units, degrees: the whole unit sphere is in the picture
-ELEVATION = 20.0  # degrees, of the camera
-FINER = 2  # pixels that are rendered, along each side of one that is written
-SMALLEST, LARGEST = 16, 1024  # pixels of a part's side
-MOST = 720  # frames
-THINNEST = 1e-6  # scene units of depth that the scale spans at least
-ENDINGS = (".webp", ".gif")
-QUALITY = 90  # of WebP, of 100: at the usual 80 edges leave traces on the white of later frames
+DISTANCE, FIELD_OF_VIEW_DEGREES = 2.5, 50.0  # scene units: the unit sphere fills the picture
+ELEVATION_DEGREES = 20.0
+SUPERSAMPLES = 2  # rendered pixels along each side of a written pixel
+MIN_PIXELS, MAX_PIXELS = 16, 1024
+MAX_FRAMES = 720
+MIN_DEPTH_RANGE = 1e-6  # scene units
+IMAGE_SUFFIXES = (".webp", ".gif")
+WEBP_QUALITY = 90  # with the default of 80, edges leave traces on the white of later frames
 TURN_MILLISECONDS = 3600
-SLACK = 1e-6  # of the unit sphere, since files round
-UPRIGHT = {  # rotations that make an axis the vertical one, y
+RADIUS_TOLERANCE = 1e-6  # files round coordinates
+UPRIGHT = {  # rotations of an axis to the vertical axis y
     "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -41,11 +41,12 @@ UPRIGHT = {  # rotations that make an axis the vertical one, y
 }
 
 
-def turned(truth: Truth, frames: int, size: int) -> Iterator[View]:
-    """The views of a full turn, finer than written; a mesh may be wound inward, so all normals face the camera."""
-    sampler = ViewSampler(DISTANCE, FIELD_OF_VIEW, (0.0, 360.0), (ELEVATION, ELEVATION), FINER * size)
+def turntable_views(truth: Truth, frames: int, size: int) -> Iterator[View]:
+    """The supersampled views of a full turn; all normals face the camera, because a mesh may be wound inward."""
+    elevations = (ELEVATION_DEGREES, ELEVATION_DEGREES)
+    sampler = ViewSampler(DISTANCE, FIELD_OF_VIEW_DEGREES, (0.0, 360.0), elevations, SUPERSAMPLES * size)
     for frame in range(frames):
-        view = see(truth, sampler.camera(360.0 * frame / frames, ELEVATION))
+        view = see(truth, sampler.camera(360.0 * frame / frames, ELEVATION_DEGREES))
         away = (view.normals * view.camera.rays().directions).sum(-1, keepdim=True) > 0
         yield replace(view, normals=torch.where(away, -view.normals, view.normals))
 
@@ -54,70 +55,72 @@ def turntable(mesh: Mesh, frames: int, size: int) -> list[UInt8[np.ndarray, "hei
     """The frames of a full turn of a mesh in the unit sphere: colours, normals and depth side by side.
 
     Args:
-        mesh: without colours, it is grey.
-        size: of each part, in pixels.
+        mesh: a mesh without colours is shown grey.
+        size: the side of each part, in pixels.
 
     Raises:
-        ValueError: where a number is out of range, or the mesh is too small to be seen.
+        ValueError: if a number is out of range, or the mesh is too small to be seen.
     """
-    if not 2 <= frames <= MOST:
-        raise ValueError(f"--frames must be 2 to {MOST}, found {frames}; 36 is a good number")
-    if not SMALLEST <= size <= LARGEST:
-        raise ValueError(f"--size must be {SMALLEST} to {LARGEST} pixels, found {size}; 256 is a good size")
+    if not 2 <= frames <= MAX_FRAMES:
+        raise ValueError(f"--frames must be 2 to {MAX_FRAMES}, found {frames}; 36 is a good number")
+    if not MIN_PIXELS <= size <= MAX_PIXELS:
+        raise ValueError(f"--size must be {MIN_PIXELS} to {MAX_PIXELS} pixels, found {size}; 256 is a good size")
     truth = Truth(mesh, closed=False)
     parts, depths = [], []
-    for view in turned(truth, frames, size):
+    for view in turntable_views(truth, frames, size):
         shown = np.repeat(shaded(view)[..., None], 3, -1) if mesh.colours is None else painted(mesh, truth, view.camera)
-        parts.append([_written(np.where(view.mask[..., None], shown, 1.0)), _written(normals_image(view))])
+        parts.append([_downsample(np.where(view.mask[..., None], shown, 1.0)), _downsample(normals_image(view))])
         depths.append(torch.where(view.mask, view.depth, torch.nan))
     if not any(bool(depth.isfinite().any()) for depth in depths):
         raise ValueError(f"the mesh must be large enough to be seen, found {mesh.diagonal:.3g} across; scale it to 1")
-    return [np.concatenate([*two, depth], axis=1) for two, depth in zip(parts, _depth_images(depths), strict=True)]
+    return [np.concatenate([*pair, depth], axis=1) for pair, depth in zip(parts, _depth_images(depths), strict=True)]
 
 
 def _depth_images(depths: list[Float[Tensor, "fine_height fine_width"]]) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """Depths, nan where nothing is seen, as colours on one scale: near yellow, far violet, nothing white."""
-    known = [depth[depth.isfinite()] for depth in depths]
-    low = min(float(depth.min()) for depth in known if depth.numel())
-    high = max(float(depth.max()) for depth in known if depth.numel())
+    """Depths as colours on one scale: near yellow, far violet, background (nan) white."""
+    finite = [depth[depth.isfinite()] for depth in depths]
+    low = min(float(depth.min()) for depth in finite if depth.numel())
+    high = max(float(depth.max()) for depth in finite if depth.numel())
     colours = colormaps["viridis_r"].with_extremes(bad="white")
-    return [_written(colours(((depth - low) / max(high - low, THINNEST)).numpy())[..., :3]) for depth in depths]
+    scale = max(high - low, MIN_DEPTH_RANGE)
+    return [_downsample(colours(((depth - low) / scale).numpy())[..., :3]) for depth in depths]
 
 
-def _written(image: Float[np.ndarray, "fine_height fine_width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+def _downsample(image: Float[np.ndarray, "fine_height fine_width 3"]) -> UInt8[np.ndarray, "height width 3"]:
     """The mean of each square of pixels."""
-    height, width = image.shape[0] // FINER, image.shape[1] // FINER
-    return (255 * image.reshape(height, FINER, width, FINER, 3).mean(axis=(1, 3))).round().astype(np.uint8)
+    height, width = image.shape[0] // SUPERSAMPLES, image.shape[1] // SUPERSAMPLES
+    squares = image.reshape(height, SUPERSAMPLES, width, SUPERSAMPLES, 3)
+    return (255 * squares.mean(axis=(1, 3))).round().astype(np.uint8)
 
 
 def mesh_of_run(folder: Path) -> Path:
     """The mesh of a run folder.
 
     Raises:
-        ValueError: there is none; the message has the run's status and reason.
+        ValueError: if the run has no mesh; the message has its status and reason.
     """
     if (folder / "mesh.ply").is_file():
         return folder / "mesh.ply"
     try:
         record = read_record(folder)
     except (OSError, ValueError, RecursionError):
-        known = " ".join(SUFFIXES)
+        suffixes = " ".join(SUFFIXES)
         raise ValueError(
-            f"{folder} has no mesh.ply: name a run folder that has one, or a mesh file ({known})"
+            f"{folder} has no mesh.ply: name a run folder that has one, or a mesh file ({suffixes})"
         ) from None
-    why = ": ".join(str(record[key]) for key in ("status", "reason") if record.get(key))
-    raise ValueError(f"{folder} has no mesh.ply: the run has no mesh ({why}); name another run, or a mesh file")
+    reason = ": ".join(str(record[key]) for key in ("status", "reason") if record.get(key))
+    raise ValueError(f"{folder} has no mesh.ply: the run has no mesh ({reason}); name another run, or a mesh file")
 
 
-def stand(mesh: Mesh, up: str) -> Mesh:
-    """A mesh turned until the axis `up` is y, and moved and scaled into the unit sphere where it does not lie in it."""
-    turned = replace(mesh, vertices=mesh.vertices @ np.array(UPRIGHT[up], dtype=float).T)
-    reach = np.linalg.norm(turned.used, axis=1).max()
-    return turned if reach <= 1 + SLACK else normalise(turned, 1.0)
+def make_upright(mesh: Mesh, up: str) -> Mesh:
+    """Rotates the axis `up` of a mesh to y; moves and scales the mesh into the unit sphere if it lies outside."""
+    turntable_views = replace(mesh, vertices=mesh.vertices @ np.array(UPRIGHT[up], dtype=float).T)
+    radius = np.linalg.norm(turntable_views.used, axis=1).max()
+    return turntable_views if radius <= 1 + RADIUS_TOLERANCE else normalise(turntable_views, 1.0)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Reads the command line, writes the animation and prints its path last; 2 where it cannot."""
+    """Writes the animation and prints its path last; returns the exit status, 2 for an error."""
     parser = argparse.ArgumentParser(prog="python -m bench.turntable", description=__doc__)
     parser.add_argument("shape", type=Path, metavar="RUN_OR_MESH", help=f"a run folder, or a file {' '.join(SUFFIXES)}")
     into = "a .webp or .gif file (default: turntable.webp in the run folder; for a mesh file, in the current folder)"
@@ -126,26 +129,26 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=256, help="pixels of each part's side (default: %(default)s)")
     up = "the mesh's axis up, such as --up=-y (default: %(default)s)"
     parser.add_argument("--up", choices=tuple(UPRIGHT), default="y", help=up)
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        run = given.shape.is_dir()
-        into = given.into or (given.shape if run else Path()) / "turntable.webp"
-        if into.suffix.lower() not in ENDINGS:
-            better = into.parent / f"{into.stem or 'turn'}.webp"
-            raise ValueError(f"--into must end in .webp or .gif, found '{into}'; type --into {better}")
-        for file in (into, given.shape / "mesh.ply"):
-            if run and file.parent == given.shape and leads_out(file, given.shape):
+        is_run = options.shape.is_dir()
+        into = options.into or (options.shape if is_run else Path()) / "turntable.webp"
+        if into.suffix.lower() not in IMAGE_SUFFIXES:
+            suggestion = into.parent / f"{into.stem or 'turn'}.webp"
+            raise ValueError(f"--into must end in .webp or .gif, found '{into}'; type --into {suggestion}")
+        for file in (into, options.shape / "mesh.ply"):
+            if is_run and file.parent == options.shape and is_outside(file, options.shape):
                 raise ValueError(f"{file} is a link out of the run folder: remove it")
-        mesh = read_mesh(mesh_of_run(given.shape) if run else given.shape)
-        frames = [Image.fromarray(frame) for frame in turntable(stand(mesh, given.up), given.frames, given.size)]
+        mesh = read_mesh(mesh_of_run(options.shape) if is_run else options.shape)
+        frames = [*map(Image.fromarray, turntable(make_upright(mesh, options.up), options.frames, options.size))]
         into.parent.mkdir(parents=True, exist_ok=True)
-        lasting = round(TURN_MILLISECONDS / given.frames)
-        frames[0].save(into, save_all=True, append_images=frames[1:], duration=lasting, loop=0, quality=QUALITY)
+        duration = round(TURN_MILLISECONDS / options.frames)
+        frames[0].save(into, save_all=True, append_images=frames[1:], duration=duration, loop=0, quality=WEBP_QUALITY)
     except (OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    for doubt in mesh.repairs:
-        print(f"note: {doubt}")
+    for note in mesh.repairs:
+        print(f"note: {note}")
     print(into)
     return 0
 

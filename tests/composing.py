@@ -15,7 +15,7 @@ def composed(*overrides: str, hydra: bool = False) -> DictConfig:
     """The configuration of some overrides, with Hydra's own node where it is asked for: only to be read."""
     with composing():
         composer = Composer(overrides)
-        config = composer.whole()
+        config = composer.shared_config()
         composer.check_keys()
     return config if hydra else without_hydra(config)
 
@@ -24,7 +24,7 @@ def identified(*arguments: str) -> Identity:
     """The run that a command line describes."""
     with composing():
         composer = Composer(options_of([*arguments]).overrides)
-        return composer.single(composer.whole())
+        return composer.single_run(composer.shared_config())
 
 
 def cells_of(*overrides: str, folder: Path | None = None) -> list[Identity]:
@@ -35,4 +35,4 @@ def cells_of(*overrides: str, folder: Path | None = None) -> list[Identity]:
     """
     with composing(*([folder] if folder else [])):
         composer = Composer(overrides)
-        return composer.cells(composer.swept(composer.whole()))
+        return composer.cells(composer.swept(composer.shared_config()))

@@ -119,8 +119,8 @@ def asked_once() -> Iterator[None]:
         patch.setattr(environment, "_git", cache(environment._git))
         patch.setattr(environment, "gemm_peak", lambda *on: rate(*on, torch.get_num_threads()))
         # One server of processes serves all tests: it loads all that runs import, pytest too, which is their program.
-        loaded = [*process.preloaded(), "pytest", "tests.run.spared"]
-        patch.setattr(process, "preloaded", lambda: loaded)
+        loaded = [*process.preloaded_modules(), "pytest", "tests.run.spared"]
+        patch.setattr(process, "preloaded_modules", lambda: loaded)
         yield
 
 

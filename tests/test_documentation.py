@@ -20,7 +20,7 @@ from bench.config import build, check_names
 from bench.records.folder import Identity
 from bench.report.__main__ import main as report
 from bench.report.write import paper
-from bench.run.command import config_dirs, options_of, with_network
+from bench.run.command import config_dirs, expand_field_file, options_of
 from bench.run.compose import Composer, composing
 from tests import documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
@@ -62,8 +62,8 @@ def first_cell(arguments: list[str]) -> Identity:
     """The first cell of a command."""
     options = options_of(arguments)
     with composing(*config_dirs(options)):
-        composer = Composer(with_network(options.overrides))
-        cell = composer.swept(composer.whole())[0]
+        composer = Composer(expand_field_file(options.overrides))
+        cell = composer.swept(composer.shared_config())[0]
         spaces, drawn = (any(word in text for text in cell) for word in ("method=space/", "draw="))
         return composer.cells([[*cell, "draw=0"] if spaces and not drawn else cell])[0]
 
@@ -168,7 +168,7 @@ def cell_of(command: Command, made: dict[str, str]) -> list[str]:
     typed = [text.partition("=")[0] for text in options.overrides]
     with composing(*config_dirs(options)):
         composer = Composer([*options.overrides, "scale=smoke"] if options.multirun else options.overrides)
-        swept = composer.swept(composer.whole())[0] if options.multirun else options.overrides
+        swept = composer.swept(composer.shared_config())[0] if options.multirun else options.overrides
     quick = [
         "renderer=dist" if text.startswith("renderer=") and "renderer" not in typed else text  # the first is slow
         for text in swept

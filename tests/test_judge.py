@@ -10,7 +10,7 @@ import trimesh
 import bench
 from bench.evaluate.dtu import NAMES, dtu_metrics, read_scan
 from bench.evaluate.evaluate import DEFINITIONS, surface_metrics
-from bench.judge import Judge, main, units
+from bench.judge import Judge, main, metric_units
 from bench.merge import merge
 from bench.records.record import Record, read_record
 from datasets.mesh import Mesh
@@ -27,9 +27,9 @@ FEW = ("--points", "4000")
 def judged(capsys, *arguments, code: int = 0) -> dict[str, dict[str, float]]:
     """The printed metrics of each mesh; `notes` has the other lines as keys."""
     assert main([*map(str, arguments)]) == code
-    names, units, *lines = capsys.readouterr().out.splitlines()
+    names, metric_units, *lines = capsys.readouterr().out.splitlines()
     names, rows = names.split(), {"notes": {}}
-    assert len(units) == len(lines[0])
+    assert len(metric_units) == len(lines[0])
     for line in lines:
         name, *values = line.split()
         if len(values) == len(names) and re.fullmatch(r"[\d.e+-]+|inf|nan", values[0]):
@@ -222,7 +222,7 @@ def test_of_the_run_folder_of_photographs_the_mesh_in_their_world_is_judged(file
 
 
 def test_the_printed_unit_of_a_metric_is_that_of_its_definition():
-    for name, unit in units(Judge(None, "1%", 1, 0, False, None, None)).items():
+    for name, unit in metric_units(Judge(None, "1%", 1, 0, False, None, None)).items():
         kinds = {"from 0 to 1": "", "in squared scene units": "unit²", "in scene units": "unit"}
         assert unit == next(kinds[words] for words in kinds if words in DEFINITIONS[name]), name
 

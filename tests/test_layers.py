@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
 
-from bench.records.folder import PASSIVE
+from bench.records.folder import NOT_IN_CODE_HASH
 from tests.conftest import checked, forgetting_modules
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -210,7 +210,7 @@ def imported_from(*beginnings: str) -> set[str]:
 def test_an_edit_of_a_module_that_no_run_imports_repeats_no_finished_run():
     running = imported_from("bench.run.execute", "bench.tasks", "datasets", "renderers")
     others = [path for path in modules() if path.is_relative_to(ROOT / "bench") and named(path)[0] not in running]
-    acting = {path for other in others if not (path := other.relative_to(ROOT).as_posix()).startswith(PASSIVE)}
+    acting = {path for other in others if not (path := other.relative_to(ROOT).as_posix()).startswith(NOT_IN_CODE_HASH)}
     assert acting == {f"bench/{name}.py" for name in DRIVING}
 
 

@@ -17,7 +17,7 @@ import yaml
 
 from bench.__main__ import console
 from bench.records.read import RESULTS
-from bench.run.executors import EXTRAS
+from bench.run.executors import EXTRA_BY_EXECUTOR
 from datasets.extras import install, version
 from tests.test_layers import COMMANDS
 
@@ -73,7 +73,7 @@ def test_every_extra_that_a_message_names_is_there():
     sources = [(ROOT / path).read_text(encoding="utf-8") for path in of_packages(tracked()) if path.endswith(".py")]
     named = [found for source in sources for found in re.findall(r"""\binstall\(["'](\w+)["']\)""", source)]
     assert len(named) >= 4
-    assert {*named, *EXTRAS.values()} <= set(PROJECT["project"]["optional-dependencies"])
+    assert {*named, *EXTRA_BY_EXECUTOR.values()} <= set(PROJECT["project"]["optional-dependencies"])
 
 
 def started(folder: Path, *arguments: str) -> tuple[int, str]:

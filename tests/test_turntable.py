@@ -10,7 +10,7 @@ from matplotlib import colormaps
 from PIL import Image
 
 from bench.records.record import Record
-from bench.turntable import UPRIGHT, main, stand, turntable
+from bench.turntable import UPRIGHT, main, make_upright, turntable
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
 from tests.tiny import icosphere
@@ -114,8 +114,8 @@ def test_a_run_folder_gets_its_turntable_and_a_mesh_file_one_in_the_current_fold
 
 def test_a_mesh_in_the_unit_sphere_stays_and_another_is_moved_into_it():
     inside, outside = ball(0.3, at=(0.5, 0, 0)), ball(0.3, at=(0.8, 0, 0))
-    assert np.array_equal(stand(inside, "y").vertices, inside.vertices)
-    moved = stand(outside, "y").vertices
+    assert np.array_equal(make_upright(inside, "y").vertices, inside.vertices)
+    moved = make_upright(outside, "y").vertices
     assert np.linalg.norm(moved, axis=1).max() == pytest.approx(1)
     assert moved.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
 
@@ -123,7 +123,7 @@ def test_a_mesh_in_the_unit_sphere_stays_and_another_is_moved_into_it():
 def test_up_turns_an_axis_upwards():
     for up in UPRIGHT:
         way = (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
-        turned = stand(ball(0.2, at=tuple(0.5 * way)), up)
+        turned = make_upright(ball(0.2, at=tuple(0.5 * way)), up)
         assert turned.vertices.mean(axis=0) == pytest.approx([0, 0.5, 0], abs=1e-6), up
         assert turned.volume > 0  # not mirrored
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from bench.records.record import BESIDE, WAITED, Record
+from bench.records.record import CONCURRENT_RUNS_VARIABLE, MAX_WAIT_FRACTION, Record
 from datasets.extras import version
 from renderers.fields.mlp import multiplies_faster
 from renderers.kernels.library import kernels
@@ -53,7 +53,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "runs_at_once": int(os.environ.get(BESIDE, "1")),
+        "runs_at_once": int(os.environ.get(CONCURRENT_RUNS_VARIABLE, "1")),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
         "denormals_flushed": _denormals_flushed(),
         "kernels": kernels().said_of(device.type, torch.get_num_threads()),
@@ -239,7 +239,7 @@ def doubts(record: Record) -> list[str]:
     """Reasons not to trust the record's times, one line each."""
     lines = []
     share, load = record.environment.get("waited_share"), record.environment.get("load_at_start")
-    if share is not None and share > WAITED:
+    if share is not None and share > MAX_WAIT_FRACTION:
         lines.append(f"loaded machine: threads waited {share:.0%} of their time for a processor; times are too long")
     elif share is None and load is not None and load > (os.cpu_count() or 1):
         lines.append(f"loaded machine: load {load:.1f} at the start; times may be too long")

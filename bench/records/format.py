@@ -10,8 +10,8 @@ INFINITE = "∞"
 def number(x: int | float | str | None, scale: float = 1.0) -> str:
     """`x * scale` to three significant digits, such as 0.0123, 12.3, 1230 or 1.23e-7.
 
-    An int below a million stands in full; zero is "0"; None is missing; not a number is "nan". A string is returned
-    unchanged.
+    An int below a million has all its digits. Zero is "0", None is missing, and not a number is "nan". A string is
+    returned unchanged.
     """
     if isinstance(x, str):
         return x
@@ -37,7 +37,7 @@ def plural(count: int, word: str) -> str:
 
 
 def count(n: int | float | None) -> str:
-    """A count, whole below 1000 and then with k, M, G, T, P for powers of 1000, such as 999, 12.3k or 1.43M."""
+    """A count, with k, M, G, T, P for powers of 1000, such as 999, 12.3k or 1.43M."""
     if n is None or not math.isfinite(n):
         return number(n)
     if abs(n) < 999.5:
@@ -47,7 +47,7 @@ def count(n: int | float | None) -> str:
 
 
 def queries(values: int | float | None, coarse: int | float | None) -> str:
-    """Counts of field values and of coarse ones, such as 39.9k + 123k coarse."""
+    """Counts of field evaluations and coarse evaluations, such as 39.9k + 123k coarse."""
     return f"{count(values)} + {count(coarse)} coarse" if coarse else count(values)
 
 
@@ -60,7 +60,7 @@ def size(n: int | float | None) -> str:
 
 
 def seconds(x: int | float | None) -> str:
-    """A length of time with its unit: 12.3 ms, 12.3 s, 34.5 min, 2.31 h; minutes from 120 s, hours from 120 min."""
+    """A duration with its unit: 12.3 ms, 12.3 s, 34.5 min, 2.31 h; minutes from 120 s, hours from 120 min."""
     if x is None or not math.isfinite(x):
         return number(x)
     if abs(x) < 1 and x != 0:
@@ -71,24 +71,24 @@ def seconds(x: int | float | None) -> str:
 
 
 def interval(low: float | None, high: float | None) -> str:
-    """The ends of an interval, such as [0.12, 0.34]; empty where there is none."""
+    """The ends of an interval, such as [0.12, 0.34]; empty if they are missing."""
     return "" if low is None or math.isnan(low) else f"[{number(low)}, {number(high)}]"
 
 
 def ends(
     what: str, values: Mapping[str, float | None], n: str, *, show: Callable[[float], str] = number, most: bool = False
 ) -> str:
-    """A verdict: the least and the largest of known values, and whose they are; empty without a finite one.
+    """A sentence with the best and the worst value and their rows; empty if no value is finite.
 
     Args:
         n: the sample in words.
-        show: gives the text of a value.
-        most: whether the largest is the best, and stands first.
+        show: formats a value.
+        most: whether the largest value is the best; the best comes first.
     """
-    known = {row: value for row, value in values.items() if value is not None and not math.isnan(value)}
-    ordered = sorted(known, key=lambda row: -known[row] if most else known[row])
-    if not ordered or math.isinf(known[ordered[0]]):
+    numbers = {row: value for row, value in values.items() if value is not None and not math.isnan(value)}
+    ordered = sorted(numbers, key=lambda row: -numbers[row] if most else numbers[row])
+    if not ordered or math.isinf(numbers[ordered[0]]):
         return ""
-    best, worst = (f"{show(known[row])}" for row in (ordered[0], ordered[-1]))
+    best, worst = (f"{show(numbers[row])}" for row in (ordered[0], ordered[-1]))
     rest = f" to {worst} ({ordered[-1]})" if len(ordered) > 1 else ""
     return f"{what}: *{best}* ({ordered[0]}){rest}; n = {n}."

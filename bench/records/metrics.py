@@ -1,8 +1,8 @@
-"""What is known of metrics by their names: heading, factor of printed numbers, and which direction is better."""
+"""Metrics by name: their heading, the factor of printed numbers, and which direction is better."""
 
 from typing import Any, NamedTuple
 
-PREFIXES = ("own_", "seen_")  # of the same metric of the renderer's own image, and of what photographs see
+METRIC_PREFIXES = ("own_", "seen_")  # on the renderer's own image, and on the surface that photographs see
 LOWER, HIGHER = "lower", "higher"
 
 
@@ -11,8 +11,8 @@ class Metric(NamedTuple):
 
     Args:
         label: its heading, with the factor or the unit.
-        factor: of the printed number.
-        better: lower, higher, or empty where neither is.
+        factor: multiplies the printed number.
+        better: `LOWER`, `HIGHER`, or empty if neither is better.
     """
 
     label: str
@@ -20,7 +20,7 @@ class Metric(NamedTuple):
     better: str = ""
 
 
-SHOWN = {  # in the order of tables
+TABLE_METRICS = {  # the order is that of tables
     "chamfer_l2": Metric("Chamfer (x1000)", 1000.0, LOWER),
     "seen_chamfer_l1": Metric("Chamfer-L1 of what is seen (x1000)", 1000.0, LOWER),
     "accuracy": Metric("accuracy (x1000)", 1000.0, LOWER),
@@ -39,7 +39,7 @@ SHOWN = {  # in the order of tables
     "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
     "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),
 }
-MEASURED = {  # of tasks that optimise nothing
+MEASUREMENT_METRICS = {  # for tasks that measure without optimising
     "forward_seconds": Metric("forward (s)", better=LOWER),
     "step_seconds": Metric("step (s)", better=LOWER),
     "queries": Metric("values of a rendering", better=LOWER),
@@ -51,13 +51,13 @@ MEASURED = {  # of tasks that optimise nothing
     "grazing.code_pooled_cosine": Metric("gradient's cosine, grazing", better=HIGHER),
     "silhouette.image_cosine": Metric("cosine at the outline", better=HIGHER),
 }
-FURTHER = {  # that tables do not show, but whose direction is known
+OTHER_DIRECTIONS = {  # which direction is better, for metrics that tables do not show
     **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred"), LOWER),
     **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
     **dict.fromkeys(("dtu_accuracy", "dtu_completeness"), LOWER),
     "mask_iou_least": HIGHER,
 }
-NOT_NEGATIVE = frozenset(  # distances and angles; roughness is a logarithm
+NON_NEGATIVE = frozenset(  # distances and angles; roughness is a logarithm
     (
         *("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness", "depth_mae", "colour_error"),
         *("dtu_overall", "dtu_accuracy", "dtu_completeness", "rotation_error_deg", "translation_error"),
@@ -72,8 +72,8 @@ DVR_TABLE2 = {
     "DVR (RGB)": (1.054, 0.760, 0.907),
     "DVR (RGB and depth)": (0.789, 0.775, 0.782),
 }
-# The metric that a task's runs are sorted by; of a task that is not here the first of these that its runs have.
-FIRST = {
+# The metric by which the runs of a task are sorted. For other tasks it is the first table metric that the runs have.
+SORT_METRICS = {
     "pose": "rotation_error_deg",
     "pose_icp": "rotation_error_deg",
     "reconstruction": "seen_chamfer_l1",
@@ -82,31 +82,31 @@ FIRST = {
 }
 
 
-def better(name: str) -> str:
-    """Which direction of a metric is better: lower, higher, or empty where that is not known."""
-    for known in _names(name):
-        if known in SHOWN:
-            return SHOWN[known].better
-        if known in FURTHER:
-            return FURTHER[known]
+def better_direction(name: str) -> str:
+    """Which direction of a metric is better: `LOWER`, `HIGHER`, or empty if unknown."""
+    for base_name in _with_base_names(name):
+        if base_name in TABLE_METRICS:
+            return TABLE_METRICS[base_name].better
+        if base_name in OTHER_DIRECTIONS:
+            return OTHER_DIRECTIONS[base_name]
     return ""
 
 
-def unsound(metrics: dict[str, Any]) -> str:
-    """What is wrong with the first metric that cannot have its value; empty where all can.
+def metric_fault(metrics: dict[str, Any]) -> str:
+    """What is wrong with the first metric that has an impossible value; empty if there is none.
 
-    A metric of which one direction is better is a number, and a distance or an angle is not negative.
+    A metric with a better direction must be a number, and a distance or an angle must not be negative.
     """
     for name, value in metrics.items():
-        if value is None or not better(name):
+        if value is None or not better_direction(name):
             continue
         if not isinstance(value, int | float):
             return f"{name} must be a number, found {value!r}"
-        if value < 0 and not NOT_NEGATIVE.isdisjoint(_names(name)):
+        if value < 0 and not NON_NEGATIVE.isdisjoint(_with_base_names(name)):
             return f"{name} must be at least 0, found {value}"
     return ""
 
 
-def _names(name: str) -> tuple[str, ...]:
+def _with_base_names(name: str) -> tuple[str, ...]:
     """The name of a metric, and its names without a prefix."""
-    return (name, *(name.removeprefix(prefix) for prefix in PREFIXES))
+    return (name, *(name.removeprefix(prefix) for prefix in METRIC_PREFIXES))

@@ -1,4 +1,4 @@
-"""Names of runs by what differs among them: the renderer's row, the choices, and settings by key and value."""
+"""Names of runs from their differences: the renderer's row, the choices, and settings by key and value."""
 
 import json
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
@@ -7,14 +7,14 @@ from typing import Any
 
 from bench.records.record import NEUTRAL_KEYS, renderer_name, row_name
 
-CHOICES = ("task", "method", "renderer", "dataset")  # fields of a record, whose values are names by themselves
-WORDS = {"index": "shape", "dataset.path": "", "_target_": ""}  # what stands before the value in place of the key
-DEEPEST = 20  # levels of a configuration
-SKIPPED = NEUTRAL_KEYS | {"label", "packages"}
+CHOICE_FIELDS = ("task", "method", "renderer", "dataset")  # fields of a record whose values need no key
+KEY_LABELS = {"index": "shape", "dataset.path": "", "_target_": ""}  # text before the value, instead of the key
+MAX_DEPTH = 20
+EXCLUDED_KEYS = NEUTRAL_KEYS | {"label", "packages"}
 
 
-class Node(dict):
-    """Settings that several records share. Nothing may change them, so that they are looked up by what they are."""
+class SharedSettings(dict):
+    """Settings that several records share. They must not be changed; their hash is their identity."""
 
     __hash__ = object.__hash__  # type: ignore[assignment]
 
@@ -22,71 +22,73 @@ class Node(dict):
 def differences(
     records: Sequence[dict[str, Any]],
     *,
-    apart: Callable[[dict[str, Any]], Hashable] | None = None,
-    asked: Sequence[dict[str, str]] = (),
+    distinguished_by: Callable[[dict[str, Any]], Hashable] | None = None,
+    swept: Sequence[dict[str, str]] = (),
 ) -> list[str]:
-    """The name of each run: its values of the keys in which runs differ; where there are none, the name of its row.
+    """The name of each run: its values of the keys in which runs differ. If there are none, the name of its row.
 
-    A key that divides the runs no further than those before it is left out: of `scale=smoke,desk` all sizes follow. A
-    name has a key only where runs that would else have the same name differ in it.
+    A key that divides the runs no further than the keys before it is left out: `scale=smoke,desk` determines all sizes.
+    A name has a key only if runs that would otherwise have the same name differ in it.
 
     Args:
-        apart: what tells runs apart without being in their names, such as shape and seed; None for nothing.
-        asked: of each run, the keys and values that its sweep asked for, which come before other settings.
+        distinguished_by: a property that distinguishes runs without being in their names, such as shape and seed.
+        swept: the keys and values of each run's sweep, which come before other settings.
     """
-    classes = _classes([apart(record) if apart else None for record in records])
-    names = told_apart(_parts(records, asked), classes=classes, names=[""] * len(records))
+    groups = _group_numbers([distinguished_by(record) if distinguished_by else None for record in records])
+    names = make_unique(_name_parts(records, swept), groups=groups, names=[""] * len(records))
     rows = [row_name(record["config"], record["renderer"]) for record in records]
     return [name or row for name, row in zip(names, rows, strict=True)]
 
 
-def told_apart(
-    parts: Iterable[tuple[str, Sequence[str | None]]], *, classes: list[int], names: list[str], most: int | None = None
+def make_unique(
+    parts: Iterable[tuple[str, Sequence[str | None]]], *, groups: list[int], names: list[str], limit: int | None = None
 ) -> list[str]:
-    """Names with what tells runs apart behind them.
+    """Appends settings to names until the names distinguish all runs.
 
     Args:
-        parts: keys with the value of each run as text, None where it has none, in the order in which they make names.
-        classes: a number for each run; those of unequal numbers are told apart already, without it being in the name.
-        names: of the runs, before anything is added.
-        most: keys that are added; None for all that are needed.
+        parts: keys with the value of each run as text, None if a run lacks the key, in the order of a name.
+        groups: a number for each run; runs with different numbers need no different names.
+        names: the names of the runs, before anything is appended.
+        limit: the maximum number of keys; None for as many as needed.
     """
     keys: list[str] = []
     for key, values in parts:
-        if len(keys) == most or len(set(classes)) == len(classes):
+        if len(keys) == limit or len(set(groups)) == len(groups):
             break
-        refined = _classes(list(zip(classes, values, strict=True)))
-        if len(set(refined)) == len(set(classes)):
+        refined_groups = _group_numbers(list(zip(groups, values, strict=True)))
+        if len(set(refined_groups)) == len(set(groups)):
             continue
-        classes = refined
+        groups = refined_groups
         keys.append(key)
-        names = _extended(names, _heading(key, keys), values)
+        names = _append_values(names, _heading(key, keys), values)
     return names
 
 
-def in_order(settings: Sequence[dict[str, str]], first: Sequence[str] = ()) -> Iterator[tuple[str, list[str | None]]]:
-    """The keys of settings with the value of each run, in the order in which they make names.
+def ordered_settings(
+    settings: Sequence[dict[str, str]], first: Sequence[str] = ()
+) -> Iterator[tuple[str, list[str | None]]]:
+    """The keys of settings with the value of each run, in the order of a name.
 
-    Names of choices come before what follows from them, such as scale.name before view.resolution; then settings of the
-    top-level keys `first`, in their order; then outer keys.
+    Names of choices come before the settings that they determine, such as scale.name before view.resolution. Then come
+    settings of the top-level keys `first`, in their order, then outer keys.
     """
 
-    def place(key: str) -> tuple[bool, int, int]:
+    def sort_key(key: str) -> tuple[bool, int, int]:
         top = key.partition(".")[0]
         return not key.endswith(".name"), first.index(top) if top in first else len(first), key.count(".")
 
-    for key in sorted({key: None for values in settings for key in values}, key=place):
+    for key in sorted({key: None for values in settings for key in values}, key=sort_key):
         yield key, [values.get(key) for values in settings]
 
 
-def settings_of(config: dict[str, Any], without: Container[str] = SKIPPED) -> dict[str, str]:
-    """The settings that may be in a name, as text by dotted keys, but those of the top-level keys `without`."""
-    kept = flat({key: value for key, value in config.items() if key not in without})
-    return {key: _text(value) for key, value in kept.items() if _public(key)}
+def settings_of(config: dict[str, Any], without: Container[str] = EXCLUDED_KEYS) -> dict[str, str]:
+    """The settings that may be in a name, as text by dotted keys, without those of the top-level keys `without`."""
+    flat_settings = flat({key: value for key, value in config.items() if key not in without})
+    return {key: _as_typed(value) for key, value in flat_settings.items() if _is_named(key)}
 
 
-def flat(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[str, Any]:
-    """The values of nested settings by dotted keys; what lies deeper than `depth` levels is left out, as "…"."""
+def flat(node: dict[str, Any], prefix: str = "", depth: int = MAX_DEPTH) -> dict[str, Any]:
+    """The values of nested settings by dotted keys; nodes deeper than `depth` levels are replaced by "…"."""
     values: dict[str, Any] = {}
     for key, value in node.items():
         if isinstance(value, dict) and depth:
@@ -96,29 +98,29 @@ def flat(node: dict[str, Any], prefix: str = "", depth: int = DEEPEST) -> dict[s
     return values
 
 
-def _parts(
-    records: Sequence[dict[str, Any]], asked: Sequence[dict[str, str]]
+def _name_parts(
+    records: Sequence[dict[str, Any]], swept: Sequence[dict[str, str]]
 ) -> Iterator[tuple[str, list[str | None]]]:
     yield "row", [renderer_name(record["config"], record["renderer"]) for record in records]
     yield "silhouette", [(record["config"].get("silhouette") or {}).get("_label_") for record in records]
-    for key in CHOICES:
+    for key in CHOICE_FIELDS:
         yield key, [record.get(key) or None for record in records]
-    own = [settings_of(record["config"]) for record in records]
+    run_settings = [settings_of(record["config"]) for record in records]
     for key in ("dataset.path", "index", "seed"):
-        yield key, [values.get(key) for values in own]
-    for settings in (asked, own):
-        yield from in_order(settings)
+        yield key, [values.get(key) for values in run_settings]
+    for settings in (swept, run_settings):
+        yield from ordered_settings(settings)
 
 
 @cache
-def _public(key: str) -> bool:
-    """Whether a key is no mark of ours, such as `_label_`, which stands in the name of the row."""
-    last = key.rpartition(".")[2]
-    return last == "_target_" or not last.startswith("_")
+def _is_named(key: str) -> bool:
+    """Whether a key may be in a name; our marks may not, such as `_label_`, which is in the name of the row."""
+    last_part = key.rpartition(".")[2]
+    return last_part == "_target_" or not last_part.startswith("_")
 
 
-def _text(value: Any) -> str:
-    """A setting as one would type it."""
+def _as_typed(value: Any) -> str:
+    """The value of a setting as a user types it."""
     if isinstance(value, str):
         return value
     if isinstance(value, int) and not isinstance(value, bool):
@@ -126,30 +128,30 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else json.dumps(value)
 
 
-def _classes(values: list[Any]) -> list[int]:
-    """A number for each value, the same for equal ones."""
+def _group_numbers(values: list[Any]) -> list[int]:
+    """A number for each value, the same for equal values."""
     numbers: dict[Any, int] = {}
     return [numbers.setdefault(value, len(numbers)) for value in values]
 
 
 def _heading(key: str, keys: Sequence[str]) -> str:
-    """What stands before a value in a name: nothing for a choice, else the end of the key, where that is clear."""
-    last = key.rpartition(".")[2]
-    if key in (*CHOICES, "row", "silhouette", "stress"):
+    """The label before a value in a name: empty for a choice, else the last part of the key if it is unambiguous."""
+    last_part = key.rpartition(".")[2]
+    if key in (*CHOICE_FIELDS, "row", "silhouette", "stress"):
         return ""
-    if key in WORDS or last in WORDS:
-        return WORDS.get(key, WORDS.get(last, ""))
-    if last == "name":
+    if key in KEY_LABELS or last_part in KEY_LABELS:
+        return KEY_LABELS.get(key, KEY_LABELS.get(last_part, ""))
+    if last_part == "name":
         return key.removesuffix(".name")
-    return key if any(other.rpartition(".")[2] == last for other in keys if other != key) else last
+    return key if any(other.rpartition(".")[2] == last_part for other in keys if other != key) else last_part
 
 
-def _extended(names: list[str], heading: str, values: Sequence[str | None]) -> list[str]:
-    """The names with the values behind them, where runs of one name differ in these."""
-    found: dict[str, set[str | None]] = {}
+def _append_values(names: list[str], heading: str, values: Sequence[str | None]) -> list[str]:
+    """The names, with the values appended if runs of the same name differ in them."""
+    alternatives: dict[str, set[str | None]] = {}
     for name, value in zip(names, values, strict=True):
-        found.setdefault(name, set()).add(value)
+        alternatives.setdefault(name, set()).add(value)
     return [
-        ", ".join(filter(None, (name, f"{heading} {value}".strip()))) if value and len(found[name]) > 1 else name
+        ", ".join(filter(None, (name, f"{heading} {value}".strip()))) if value and len(alternatives[name]) > 1 else name
         for name, value in zip(names, values, strict=True)
     ]

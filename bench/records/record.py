@@ -1,4 +1,4 @@
-"""The record of a run, `record.json`: its schema, and how it and other plain data are written, locked and read."""
+"""The record of a run, `record.json`: its schema, and functions that write, lock and read it and other data."""
 
 import hashlib
 import json
@@ -17,22 +17,22 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from filelock import FileLock
 
-from bench.records.metrics import unsound
+from bench.records.metrics import metric_fault
 
 SCHEMA = 1
-# Keys of a configuration that change no result, and are left out of its hash.
+# Keys of a configuration that change no result. Its hash leaves them out.
 NEUTRAL_KEYS = frozenset(
     (
         *("results_dir", "priors_dir", "sizes", "verbose", "isolation", "time_limit", "memory_limit", "rerun"),
         *("tracker", "plan"),
     )
 )
-BESIDE = "IMPLICIT_BENCH_BESIDE"  # variable of the environment: how many runs a job of a cluster has at a time
-WAITED = 0.05  # share of its threads' ready time that they waited: above it, the machine was loaded
-NUMERIC = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
+CONCURRENT_RUNS_VARIABLE = "IMPLICIT_BENCH_BESIDE"  # environment variable: number of runs at a time in a cluster job
+MAX_WAIT_FRACTION = 0.05  # if threads waited for a larger fraction of their ready time, the machine was loaded
+NUMERIC_FIELDS = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
 # Fields that old records may lack.
-LATER = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked", "overrides")
-# JSON has no infinity: these strings stand for the floats.
+OPTIONAL_FIELDS = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked", "overrides")
+# JSON has no such numbers: these strings stand for them.
 _NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
@@ -53,7 +53,7 @@ class RunStatus(StrEnum):
 
 
 _STATUSES = frozenset(RunStatus)
-PICTURES = ("summary.png", "strip.png", "failure.png")  # of a run: the first that it has is looked at first
+PICTURE_FILES = ("summary.png", "strip.png", "failure.png")  # the first that a run has is its main picture
 NOT_RUN = "not_run"  # the status of a planned cell without a run, which has no record.json
 
 
@@ -64,7 +64,7 @@ def now() -> str:
 
 @dataclass(repr=False)
 class Record:
-    """The content of `record.json`. A new record has the status killed, which holds until its run ends."""
+    """The content of `record.json`. A new record has the status `killed`, which it keeps until its run ends."""
 
     id: str
     task: str
@@ -90,23 +90,23 @@ class Record:
     notes: list[str] = field(default_factory=list)
     config_hash: str = ""
     code: str = ""  # hash of the code that ran, and of the files that it read
-    asked: str = field(default_factory=now)  # when it was last requested; a reused run ran earlier
-    ended: str = ""  # empty while it is under way, and where it was killed before it could write this
-    log: list[str] = field(default_factory=list)  # the last lines of log.txt, where the run failed
+    asked: str = field(default_factory=now)  # time of the last request; a reused run ran earlier
+    ended: str = ""  # empty while the run goes on, and if it was killed before it could write this
+    log: list[str] = field(default_factory=list)  # the last lines of log.txt, if the run failed
     overrides: list[str] = field(default_factory=list)  # what the command line set, as KEY=VALUE
 
     def __repr__(self) -> str:
-        """What was run, how it ended, and where it is."""
+        """The title, the status, its reason and the run's folder name."""
         return f"<run {self.outcome}{f' ({self.reason})' if self.reason else ''}; {self.id}>"
 
     @property
     def name(self) -> str:
-        """Its name in tables: its label, or else that of its renderer, or else the renderer's name."""
+        """The run's name in tables; see `row_name`."""
         return row_name(self.config, self.renderer)
 
     @property
     def title(self) -> str:
-        """What was run, on what: for pictures and tables."""
+        """Task, name and scene, for pictures and tables."""
         return f"{self.task}, {self.name}, {self.scene or self.dataset}"
 
     @property
@@ -116,14 +116,14 @@ class Record:
 
     @property
     def folder(self) -> Path:
-        """Its folder, by the results folder of its configuration."""
+        """The run's folder, in the results folder of its configuration."""
         return Path(self.config["results_dir"]) / "runs" / self.id
 
     @classmethod
     def of(cls, data: dict[str, Any]) -> "Record":
         """The record of data that `read_record` has checked; unknown fields are ignored."""
-        known = {item.name: data[item.name] for item in fields(cls) if item.name in data}
-        return cls(**{**known, "status": RunStatus(data["status"])})
+        values = {item.name: data[item.name] for item in fields(cls) if item.name in data}
+        return cls(**{**values, "status": RunStatus(data["status"])})
 
     def write(self, folder: Path) -> None:
         """Writes `record.json` atomically."""
@@ -131,22 +131,22 @@ class Record:
 
 
 def row_name(config: dict[str, Any], renderer: str) -> str:
-    """The name of a run's row: that of `renderer_name`, with a silhouette loss that is not the renderer's own.
+    """The name of a run's row: `renderer_name`, and the silhouette loss unless it is the default of the renderer.
 
-    Where a task was told to leave the masks out, no loss of them took part.
+    If task.masks is false, the run used no silhouette loss, and the name has "without masks".
     """
-    name, loss = renderer_name(config, renderer), _labelled(config.get("silhouette"))
+    name, loss = renderer_name(config, renderer), _label_of(config.get("silhouette"))
     if (config.get("task") or {}).get("masks") is False:
         loss = "without masks"
     return f"{name}, {loss}" if loss else name
 
 
 def renderer_name(config: dict[str, Any], renderer: str) -> str:
-    """The label of a run's configuration, or of its renderer's node, or the name of the renderer's file."""
-    return str(config.get("label") or _labelled(config.get("renderer")) or renderer)
+    """The label of a run's configuration, else that of its renderer's node, else the name of the renderer's file."""
+    return str(config.get("label") or _label_of(config.get("renderer")) or renderer)
 
 
-def _labelled(node: Any) -> str:
+def _label_of(node: Any) -> str:
     return str(node.get("_label_") or "") if isinstance(node, dict) else ""
 
 
@@ -154,7 +154,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """The record of one run folder, with non-finite numbers as floats and the folder's name under `folder`.
 
     Raises:
-        OSError, ValueError, RecursionError: where it cannot be read; the message gives the reason.
+        OSError, ValueError, RecursionError: if it cannot be read; the message has the reason.
     """
     try:
         record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
@@ -166,91 +166,91 @@ def read_record(folder: Path) -> dict[str, Any]:
         raise ValueError(f"record.json must have schema {SCHEMA}, found {record.get('schema')!r}")
     record.setdefault("notes", [])
     record.setdefault("asked", record.get("started"))
-    record |= {name: decoded(record[name]) for name in NUMERIC if name in record}
-    _check(record)
-    started(record), requested(record)  # a time that cannot be read is an error here, not later in a sort
+    record |= {name: from_json_values(record[name]) for name in NUMERIC_FIELDS if name in record}
+    _check_fields(record)
+    started(record), requested(record)  # an invalid time is an error here, not later in a sort
     return record | {"folder": folder.name}
 
 
 def requested(record: dict[str, Any]) -> datetime:
-    """When the run was last requested; a reused one ran earlier."""
-    return _time(record["asked"])
+    """The time of the last request of the run; a reused run ran earlier."""
+    return _parse_time(record["asked"])
 
 
 def started(record: dict[str, Any]) -> datetime:
-    """When the run started; a time without an offset is UTC."""
-    return _time(record["started"])
+    """The start time of the run; a time without an offset is UTC."""
+    return _parse_time(record["started"])
 
 
-def _check(record: dict[str, Any]) -> None:
-    """Raises ValueError where a field of `Record` has a wrong type or value, or is missing and not in `LATER`."""
-    for name, classes in _fields().items():
+def _check_fields(record: dict[str, Any]) -> None:
+    """Raises ValueError if a field has a wrong type or value, or is missing and not in `OPTIONAL_FIELDS`."""
+    for name, types in _field_types().items():
         if name not in record:
-            if name in LATER:
+            if name in OPTIONAL_FIELDS:
                 continue
             raise ValueError(f"record.json must have the field {name!r}, found none")
-        if not isinstance(record[name], classes):
+        if not isinstance(record[name], types):
             raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
     for name in ("metrics", "metrics_start"):
-        if wrong := unsound(record[name]):
-            raise ValueError(f"{name} in record.json: {wrong}")
+        if fault := metric_fault(record[name]):
+            raise ValueError(f"{name} in record.json: {fault}")
     if record["status"] not in _STATUSES:
         raise ValueError(f"status in record.json must be one of {', '.join(RunStatus)}, found {record['status']!r}")
 
 
 @cache
-def _fields() -> dict[str, tuple[type, ...]]:
+def _field_types() -> dict[str, tuple[type, ...]]:
     hints = get_type_hints(Record)
-    return {item.name: _classes(hints[item.name]) for item in fields(Record)}
+    return {item.name: _runtime_types(hints[item.name]) for item in fields(Record)}
 
 
-def _classes(hint: Any) -> tuple[type, ...]:
+def _runtime_types(hint: Any) -> tuple[type, ...]:
     if isinstance(hint, UnionType):
-        return tuple(cls for part in get_args(hint) for cls in _classes(part))
+        return tuple(runtime_type for member in get_args(hint) for runtime_type in _runtime_types(member))
     return (get_origin(hint) or hint,)
 
 
-def _time(text: str) -> datetime:
+def _parse_time(text: str) -> datetime:
     time = datetime.fromisoformat(text)
     return time if time.tzinfo else time.replace(tzinfo=UTC)
 
 
 def file_lock(folder: Path, name: str) -> FileLock:
-    """A lock between processes on a name in a folder: one process holds it, the others wait."""
+    """A lock between processes for a name in a folder: one process holds it, the others wait."""
     locks = folder / ".locks"
     locks.mkdir(parents=True, exist_ok=True)
     return FileLock(locks / name)
 
 
-def leads_out(path: Path, root: Path) -> bool:
-    """Whether a path lies outside of a folder once links are followed; a results folder may be somebody else's."""
+def is_outside(path: Path, root: Path) -> bool:
+    """Whether a path lies outside a folder after links are followed; a results folder may come from somebody else."""
     return not path.resolve().is_relative_to(root.resolve())
 
 
-def link_out(folder: Path, root: Path) -> str:
-    """The name of the first link that leads out of `root`: the folder's own, or one in it at any depth; else empty."""
-    if folder.is_symlink() and leads_out(folder, root):
+def bad_link(folder: Path, root: Path) -> str:
+    """The path of the first link that leads out of `root`: the folder or a link in it at any depth; else empty."""
+    if folder.is_symlink() and is_outside(folder, root):
         return folder.name
     try:
         with os.scandir(folder) as entries:
             for entry in entries:
                 if entry.is_symlink():
-                    if leads_out(Path(entry), root):
+                    if is_outside(Path(entry), root):
                         return entry.name
-                elif entry.is_dir(follow_symlinks=False) and (found := link_out(Path(entry), root)):
-                    return f"{entry.name}/{found}"
-    except OSError:  # who reads it will say why it cannot be read
+                elif entry.is_dir(follow_symlinks=False) and (inner_link := bad_link(Path(entry), root)):
+                    return f"{entry.name}/{inner_link}"
+    except OSError:  # the reader of the folder will report the error
         return ""
     return ""
 
 
 def is_plain_name(text: Any) -> bool:
-    """Whether it can be the name of a file or folder in a given folder, and of nothing elsewhere."""
+    """Whether a text is a plain file name, which cannot lead to another folder."""
     return isinstance(text, str) and re.fullmatch(r"[^./\\\0][^/\\\0]*", text) is not None
 
 
 def digest(data: Any) -> str:
-    """A hash of plain data, the same whatever the order of its keys."""
+    """A hash of JSON data, independent of the order of keys."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -276,22 +276,22 @@ def write_bytes(path: Path, content: bytes, *, flushed: bool = False) -> None:
 
 @contextmanager
 def curve_file(folder: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Opens `folder/curve.jsonl` and gives a function that writes a line; each line is in the file at once."""
+    """Opens `folder/curve.jsonl` and yields a function that writes a line, which is in the file at once."""
     with (folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
-        yield lambda line: curve.write(json.dumps(plain(line), allow_nan=False) + "\n")
+        yield lambda line: curve.write(json.dumps(to_json_values(line), allow_nan=False) + "\n")
 
 
 def to_json(data: Any) -> str:
-    """JSON text of some data, with non-finite floats as the strings "inf", "-inf" and "nan"."""
-    return json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False, default=str) + "\n"
+    """The data as JSON text, with non-finite floats as the strings "inf", "-inf" and "nan"."""
+    return json.dumps(to_json_values(data), indent=1, allow_nan=False, ensure_ascii=False, default=str) + "\n"
 
 
-def plain(value: Any) -> Any:
+def to_json_values(value: Any) -> Any:
     """The same data with non-finite floats, which JSON lacks, as the strings "inf", "-inf" and "nan"."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_values(item) for item in value]
     if not isinstance(value, str | int | float | None) and hasattr(value, "item"):
         value = value.item()  # a NumPy or PyTorch scalar
     if isinstance(value, float) and not math.isfinite(value):
@@ -300,7 +300,7 @@ def plain(value: Any) -> Any:
 
 
 def as_number(value: Any) -> int | float | None:
-    """The value, if it is a number that fits into a float."""
+    """The value if it is a number that fits into a float, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -310,10 +310,10 @@ def as_number(value: Any) -> int | float | None:
     return value
 
 
-def decoded(value: Any) -> Any:
-    """The same data with the strings "inf", "-inf" and "nan" as floats: the inverse of `plain`."""
+def from_json_values(value: Any) -> Any:
+    """The same data with the strings "inf", "-inf" and "nan" as floats: the inverse of `to_json_values`."""
     if isinstance(value, dict):
-        return {name: decoded(inner) for name, inner in value.items()}
+        return {key: from_json_values(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [decoded(inner) for inner in value]
+        return [from_json_values(item) for item in value]
     return _NON_FINITE.get(value, value) if isinstance(value, str) else value

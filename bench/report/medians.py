@@ -30,7 +30,7 @@ def scene_of(record: Record) -> str:
 
 def scored(runs: Runs, name: str) -> pd.Series:
     """A metric of each run; the worst, infinite or 0, where the run did not end ok, nan where it has no such number."""
-    ok, worst = runs.frame.status == "ok", 0.0 if metrics.better(name) == "higher" else np.inf
+    ok, worst = runs.frame.status == "ok", 0.0 if metrics.better_direction(name) == "higher" else np.inf
     return runs.number(name).where(ok.to_numpy(bool), worst)
 
 

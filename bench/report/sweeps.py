@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from bench.records import format
-from bench.records.metrics import HIGHER, LOWER, SHOWN, Metric, better
+from bench.records.metrics import HIGHER, LOWER, TABLE_METRICS, Metric, better_direction
 from bench.records.names import differences
-from bench.records.read import Plan, not_run, read_plans, read_run
+from bench.records.read import Plan, not_run_record, read_plans, read_run
 from bench.report.data import records
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
@@ -48,7 +48,8 @@ class Sweep:
     def metrics(self) -> list[str]:
         """The names of all metrics that some run has as a number, those that tables show first."""
         found = {name: None for run in self.runs.records for name in run["metrics"] if measured(run, name) is not None}
-        return [*(name for name in SHOWN if name in found), *(name for name in found if name not in SHOWN)]
+        listed = [name for name in TABLE_METRICS if name in found]
+        return [*listed, *(name for name in found if name not in TABLE_METRICS)]
 
     @property
     def datasets(self) -> list[str]:
@@ -83,7 +84,7 @@ def write_sweep(plan: Plan) -> Path | None:
     known = {}
     for cell in plan.cells:
         record, _ = read_run(plan.results_dir / "runs" / cell.id, plan.results_dir)
-        known[cell.id] = record or not_run(cell, plan)
+        known[cell.id] = record or not_run_record(cell, plan)
     _write(of_plan(plan, known), plan.folder)
     return plan.folder / f"{TABLE}.md"
 
@@ -96,7 +97,7 @@ def of_plan(plan: Plan, known: dict[str, Record]) -> Sweep:
     keys = dict.fromkeys(key for one in asked for key in one)
     swept = {key: list(dict.fromkeys(one[key] for one in asked if key in one)) for key in keys}
     swept = {key: values for key, values in swept.items() if len(values) > 1}
-    names = differences(runs, apart=_apart, asked=[{k: one[k] for k in one if k in swept} for one in asked])
+    names = differences(runs, distinguished_by=_apart, swept=[{k: one[k] for k in one if k in swept} for one in asked])
     named = [run | {"row": name} for run, name in zip(runs, names, strict=True)]
     selection = Selection(plan.cells[0].config.get("experiment") or "", setup=("scenes", "pixels", "machine"))
     ended = [run for run in named if run["status"] not in UNFINISHED]
@@ -111,7 +112,7 @@ def lines(sweep: Sweep) -> list[dict[str, Any]]:
     """
     rows, names = grouped(sweep.runs.records, lambda record: record["row"]), sweep.metrics
     first = next(iter(rows.values()))
-    lead = names[0] if names and better(names[0]) == LOWER else ""
+    lead = names[0] if names and better_direction(names[0]) == LOWER else ""
     found = [_line(row, runs, names) | {"ratio": _ratio(runs, first, lead)} for row, runs in rows.items()]
     for dataset in sweep.datasets if names else ():
         for line, runs in zip(found, rows.values(), strict=True):
@@ -149,9 +150,9 @@ def median_of(runs: list[Record], metric: str) -> Interval | None:
     known = {run_key(run): value for run in runs if (value := measured(run, metric)) is not None}
     if not known or any(run["status"] == "ok" and run_key(run) not in known for run in runs):
         return None
-    if better(metric) == LOWER:
+    if better_direction(metric) == LOWER:
         return _middle({run_key(run): error(run, metric) for run in runs})
-    if better(metric) == HIGHER:  # that of a run that failed is 0, the least such metrics can be
+    if better_direction(metric) == HIGHER:  # that of a run that failed is 0, the least such metrics can be
         ended = {run_key(run): run["status"] == "ok" for run in runs}
         found = _middle({key: -known[key] if ok and known[key] == known[key] else 0.0 for key, ok in ended.items()})
         return Interval(-found.value, -found.high, -found.low, tuple(-point for point in found.points))
@@ -172,13 +173,13 @@ def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | N
 
 def table_of(sweep: Sweep) -> Result:
     found, names = lines(sweep), sweep.metrics
-    headings = {name: SHOWN[name] for name in names if name in SHOWN}
+    headings = {name: TABLE_METRICS[name] for name in names if name in TABLE_METRICS}
     headings = headings or {name: Metric(name) for name in names[:MOST_METRICS]}
     stress = any(record["config"].get("stress") for record in sweep.runs.records)
     more = [name for name in names if name not in headings]
     known = [line[name].known for line in found for name in headings if line[name] is not None]
     kinds = ["95 % bootstrap intervals over shapes" if any(known) else "", "" if all(known) else f"{FEW}: no interval"]
-    lead = names[0] if names and names[0] in headings and better(names[0]) else ""
+    lead = names[0] if names and names[0] in headings and better_direction(names[0]) else ""
     places = {_on(lead, dataset): dataset for dataset in sweep.datasets} or {lead: ""}
     panels = [_panel(found, key, title, headings[lead]) for key, title in places.items()] if lead else []
     return Result(
@@ -192,7 +193,7 @@ def table_of(sweep: Sweep) -> Result:
         remarks=(
             FAILURE,
             f"Left out: {sweep.missing} that were not run; the same command runs them." if sweep.missing else "",
-            UNDIRECTED if any(not better(name) for name in headings) else "",
+            UNDIRECTED if any(not better_direction(name) for name in headings) else "",
             f"The CSV also has {', '.join(more)}." if more else "",
             *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),
         ),
@@ -216,7 +217,7 @@ def _answer(sweep: Sweep, found: list[dict[str, Any]], lead: str, headings: dict
     known = {line["row"]: line[lead] for line in found if lead and line[lead] is not None}
     if len(known) < 2:
         return {}
-    shown, most = headings[lead], better(lead) == HIGHER
+    shown, most = headings[lead], better_direction(lead) == HIGHER
     values = {row: shown.factor * one.value for row, one in known.items()}
     shapes = format.plural(len({records.solid(run) for run in sweep.runs.records}), "shape")
     verdict = [format.ends(f"Median {shown.label}", values, shapes, most=most)]

@@ -1,4 +1,4 @@
-"""The command line: what is typed becomes a run or a sweep, and every mistake one clear line."""
+"""The command line: arguments become a run or a sweep, and every mistake becomes one clear line."""
 
 import os
 import re
@@ -17,15 +17,15 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import type_of
 from bench.progress import notice
 from bench.records.folder import Identity
-from bench.run.compose import NOT_BY_DEFAULT, Composer, composing, parsed, without_hydra
-from bench.run.job import Interrupted, unwritten
-from bench.run.process import catch_signals, forget_signals, leave_server, raise_if_stopped, stopped_by
-from bench.run.sweep import LauncherStopped, do_each
+from bench.run.compose import OPTIONAL_GROUPS, Composer, composing, parse_override, without_hydra
+from bench.run.job import Interrupted, write_error_message
+from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stop_early_server, stopped_by
+from bench.run.sweep import LauncherStopped, run_job_per_cell
 from bench.tables import names, nearest
 
-COMMA = re.compile(r"[=,]\s*,|,\s*$")  # without a value beside it
-SETTING = re.compile(r"(\+*(\w+))=(.+)", re.DOTALL)  # of the top level: before its value, its key, its value
-GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale")  # that `list` shows
+DANGLING_COMMA = re.compile(r"[=,]\s*,|,\s*$")
+SETTING_PATTERN = re.compile(r"(\+*(\w+))=(.+)", re.DOTALL)  # groups: plus signs and key, key, value
+LISTED_GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale")
 HELP = """
     python -m bench task=completion renderer=dist                          one run
     python -m bench -m renderer=dist,dvr,newton seed=0,1,2 dataset=sofa,plane     a sweep: every combination
@@ -38,70 +38,70 @@ HELP = """
 
 Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.
 --cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML."""
-USAGE = 2  # exit status of a wrong command line
-FAILED = 1
-AS_TYPED = {"dataset.path: ": "field_path: ", "dataset.module.": "field."}  # with field=file; see `with_network`
-INTERRUPTED = 130  # 128 + SIGINT, as shells have it
-KERNELS = "IMPLICIT_BENCH_KERNELS"  # see renderers/kernels/library.py, whose import takes that of torch
-SWEEP = ("--multirun", "-m")
-OPTIONS = (*SWEEP, "--config-dir", "-cd", "--cfg", "-c", "--resolve", "--help", "-h")
-Job = Callable[[Identity], object]  # does what a configuration describes, and gives the status where that is a run
-Sweep = Callable[[Composer, DictConfig], list[str]]  # makes the runs of a sweep, and gives their statuses
+EXIT_FAILURE, EXIT_USAGE = 1, 2
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
+# With field=file, messages name the keys that the user typed; see `expand_field_file`.
+FIELD_FILE_ALIASES = {"dataset.path: ": "field_path: ", "dataset.module.": "field."}
+KERNELS_VARIABLE = "IMPLICIT_BENCH_KERNELS"  # defined in renderers/kernels/library.py, which imports torch
+SWEEP_OPTIONS = ("--multirun", "-m")
+OPTIONS = (*SWEEP_OPTIONS, "--config-dir", "-cd", "--cfg", "-c", "--resolve", "--help", "-h")
+Job = Callable[[Identity], object]  # does the work of one configuration; returns the status if that is a run
+Sweep = Callable[[Composer, DictConfig], list[str]]  # makes the runs of a sweep; returns their statuses
 
 
 def command_line(job: Job, sweep: Sweep | None = None) -> int:
-    """Does what the command line describes.
+    """Runs the command line.
 
     Args:
-        job: what a single configuration asks for.
-        sweep: what a sweep asks for; None does the job of each cell, which is no run.
+        job: does the work of a single configuration.
+        sweep: makes the runs of a sweep; None does `job` for each cell, in a command that makes no runs.
 
     Returns:
-        the exit status: 0, 1 where a run did not end ok, or the status of a mistake that was printed on standard error.
+        the exit status: 0, 1 if a run did not end ok, or that of a mistake, which is printed on standard error.
     """
-    if (text := _answer(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
+    if (text := _help_text(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
         return _print(text)
     catch_signals()
-    typed = AS_TYPED if "field=file" in sys.argv else {}
+    aliases = FIELD_FILE_ALIASES if "field=file" in sys.argv else {}
     try:
-        done = _carry_out(sys.argv[1:], job, sweep)
-        raise_if_stopped()  # also where a library swallowed it
-        return 0 if done else FAILED
+        all_ok = _compose_and_run(sys.argv[1:], job, sweep)
+        raise_if_stopped()  # a library may have swallowed the exception
+        return 0 if all_ok else EXIT_FAILURE
     except KeyboardInterrupt as error:
-        return _stopped(error)
-    except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is an OSError too
-        leave_server()
+        return _report_stop(error)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is also an OSError
+        stop_early_server()
         text = message_of(error)
-        for key, short in typed.items():
-            text = text.replace(key, short)
-        return _tell(_with_file(text), USAGE)
-    except BrokenPipeError:  # `| head` has read enough
+        for key, alias in aliases.items():
+            text = text.replace(key, alias)
+        return _print_error(_add_file(text), EXIT_USAGE)
+    except BrokenPipeError:  # `| head` reads only a part
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return FAILED
+        return EXIT_FAILURE
     except OSError as error:
-        return _stopped(error) if stopped_by(error) else _tell(unwritten(error))
+        return _report_stop(error) if stopped_by(error) else _print_error(write_error_message(error))
     except LauncherStopped as error:
-        return _tell(str(error))
+        return _print_error(str(error))
     except Exception as error:
-        if stopped_by(error):  # a library made another error of it
-            return _stopped(error)
+        if stopped_by(error):  # a library turned the signal into another error
+            return _report_stop(error)
         raise
     finally:
         forget_signals()
 
 
-def _carry_out(arguments: list[str], job: Job, sweep: Sweep | None) -> bool:
-    """Composes what is typed and does it; gives whether all runs ended ok.
+def _compose_and_run(arguments: list[str], job: Job, sweep: Sweep | None) -> bool:
+    """Composes the configuration and runs it; returns whether all runs ended ok.
 
     Raises:
-        ValueError: for what cannot be.
+        ValueError: if an argument or the configuration is invalid.
     """
     options = options_of(arguments)
-    if (kernels := os.environ.get(KERNELS)) not in (None, "", "torch", "compiled"):
-        raise ValueError(f"{KERNELS} must be torch or compiled, not {kernels!r}: unset it for compiled")
+    if (kernels := os.environ.get(KERNELS_VARIABLE)) not in (None, "", "torch", "compiled"):
+        raise ValueError(f"{KERNELS_VARIABLE} must be torch or compiled, not {kernels!r}: unset it for compiled")
     with composing(*config_dirs(options)):
-        composer = Composer([text_as_typed(text) for text in with_network(options.overrides)])
-        config = composer.whole()
+        composer = Composer([quote_text(text) for text in expand_field_file(options.overrides)])
+        config = composer.shared_config()
         if options.cfg:
             composer.check_keys()
             print(OmegaConf.to_yaml(without_hydra(config), resolve=options.resolve), end="")
@@ -110,10 +110,10 @@ def _carry_out(arguments: list[str], job: Job, sweep: Sweep | None) -> bool:
             if sweep is not None:
                 return all(status == "ok" for status in sweep(composer, config))
             _refuse_plan(config)
-            return do_each(composer, config, job)
+            return run_job_per_cell(composer, config, job)
         params = OmegaConf.select(config, "hydra.sweeper.params")
         os.environ |= {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
-        identity = composer.single(config)
+        identity = composer.single_run(config)
     if sweep is None:
         _refuse_plan(identity.config)
     elif params:
@@ -122,29 +122,29 @@ def _carry_out(arguments: list[str], job: Job, sweep: Sweep | None) -> bool:
 
 
 def _refuse_plan(config: Any) -> None:
-    """Raises ValueError for plan=true in a command that makes no runs."""
+    """Raises ValueError if plan=true is set in a command that makes no runs."""
     if config["plan"]:
         raise ValueError("plan=true lists runs, and this command starts none: remove it")
 
 
-def _stopped(error: BaseException) -> int:
-    """Says by which signal a command was stopped."""
+def _report_stop(error: BaseException) -> int:
+    """Prints the signal that stopped the command; returns the exit status."""
     text = stopped_by(error)
-    return _tell(text if isinstance(error, Interrupted) else f"{text}; nothing was run", INTERRUPTED)
+    return _print_error(text if isinstance(error, Interrupted) else f"{text}; nothing was run", EXIT_INTERRUPTED)
 
 
-def _answer(arguments: list[str], about: str) -> str | None:
-    """The text that a command line asks for in place of a run; None where it asks for none."""
-    helped = bool({"--help", "-h", "help"} & {*arguments})
-    if not helped and "list" not in arguments:
+def _help_text(arguments: list[str], about: str) -> str | None:
+    """The help, or the list of choices, if the command line asks for one of them, else None."""
+    is_help = bool({"--help", "-h", "help"} & {*arguments})
+    if not is_help and "list" not in arguments:
         return None
-    groups = ("task", "renderer", "dataset", "scale") if helped else GROUPS
-    listed = "\n".join(f"{group}: {', '.join(_choices(group))}" for group in groups)
-    return f"{about.strip()}\n{HELP}\n\n{listed}" if helped else listed
+    groups = ("task", "renderer", "dataset", "scale") if is_help else LISTED_GROUPS
+    listed = "\n".join(f"{group}: {', '.join(_choice_names(group))}" for group in groups)
+    return f"{about.strip()}\n{HELP}\n\n{listed}" if is_help else listed
 
 
 def _print(text: str) -> int:
-    """Prints a text, of which `| head` may read a part; gives the exit status."""
+    """Prints a text, of which `| head` may read only a part; returns the exit status."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -153,14 +153,14 @@ def _print(text: str) -> int:
 
 
 def options_of(arguments: list[str]) -> Namespace:
-    """The options of a command line, which may stand anywhere, and its overrides.
+    """The options of a command line, in any position, and its overrides.
 
     Raises:
-        ValueError: for an unknown option, and one without its value.
+        ValueError: if an option is unknown or lacks its value.
     """
     parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("overrides", nargs="*")
-    parser.add_argument(*SWEEP, action="store_true")
+    parser.add_argument(*SWEEP_OPTIONS, action="store_true")
     parser.add_argument("--config-dir", "-cd")
     parser.add_argument("--cfg", "-c", choices=("job",))
     parser.add_argument("--resolve", action="store_true")
@@ -177,17 +177,17 @@ def options_of(arguments: list[str]) -> Namespace:
 
 
 def config_dirs(options: Namespace) -> list[Path]:
-    """The folder of configurations that a command adds, which may have tables."""
+    """The user's folder of configurations and tables, if the command names one."""
     return [Path(options.config_dir)] if options.config_dir else []
 
 
-def with_network(arguments: list[str]) -> list[str]:
-    """The arguments with `field=file field_path=PATH`, a network as the scene's field, as the dataset that it is.
+def expand_field_file(arguments: list[str]) -> list[str]:
+    """Replaces `field=file field_path=PATH`, a network file as the scene's field, by the arguments of its dataset.
 
-    With `field._target_=PACKAGE.CLASS` it is of that class; other keys of `field` are its arguments.
+    `field._target_=PACKAGE.CLASS` names the network's class, and other keys of `field` are arguments of the class.
 
     Raises:
-        ValueError: for one of the two without the other, or beside another dataset.
+        ValueError: if one of the two is missing, or another dataset is chosen.
     """
     keys = [argument.partition("=")[0] for argument in arguments]
     if "field=file" not in arguments and "field_path" not in keys:
@@ -196,31 +196,32 @@ def with_network(arguments: list[str]) -> list[str]:
         raise ValueError("a network's file is the scene's field by field=file field_path=PATH: type both")
     if "dataset" in keys:
         raise ValueError("with field=file the network's own surface is the shape: remove dataset")
-    own = "field._target_" in keys
-    places = {"^field=file$": f"dataset={'module' if own else 'network'}", "^field_path=": "dataset.path="}
-    places |= {r"^field\._target_=": "dataset.module._target_=", r"^field\.": "+dataset.module."} if own else {}
-    for pattern, text in places.items():
+    has_class = "field._target_" in keys
+    replacements = {"^field=file$": f"dataset={'module' if has_class else 'network'}", "^field_path=": "dataset.path="}
+    if has_class:
+        replacements |= {r"^field\._target_=": "dataset.module._target_=", r"^field\.": "+dataset.module."}
+    for pattern, text in replacements.items():
         arguments = [re.sub(pattern, text, argument) for argument in arguments]
     return arguments
 
 
-def text_as_typed(argument: str) -> str:
-    """The argument, with quotes around what Hydra would read as a number where the key's value is a text.
+def quote_text(argument: str) -> str:
+    """Quotes values that Hydra would read as numbers or booleans, if the key's type is text.
 
-    Without them, `label=1e3` would become 1000.0, `label=Nan` nan, and `label=true` True.
+    Without quotes, `label=1e3` would become 1000.0, `label=Nan` nan, and `label=true` True.
     """
-    setting = SETTING.fullmatch(argument)
+    setting = SETTING_PATTERN.fullmatch(argument)
     if setting is None or type_of(setting[2]) not in (str, str | None):
         return argument
     try:
-        values = [(text, parsed(f"text={text}").value()) for text in setting[3].split(",")]
+        values = [(text, parse_override(f"text={text}").value()) for text in setting[3].split(",")]
     except HydraException:  # a comma within quotes or brackets, or no value
         return argument
     typed = [f"'{text.strip()}'" if isinstance(value, int | float) else text for text, value in values]
     return f"{setting[1]}={','.join(typed)}"
 
 
-def _tell(message: str, code: int = FAILED) -> int:
+def _print_error(message: str, code: int = EXIT_FAILURE) -> int:
     if any(argument.replace(" ", "").lower() == "verbose=true" for argument in sys.argv[1:]):
         traceback.print_exc()
     print(f"error: {message}", file=sys.stderr)
@@ -228,12 +229,14 @@ def _tell(message: str, code: int = FAILED) -> int:
 
 
 def message_of(error: Exception) -> str:
-    """One line on what is wrong with what was typed."""
-    return _unreadable(error.override) if isinstance(error, OverrideParseException) else " ".join(str(error).split())
+    """The error message in one line."""
+    if isinstance(error, OverrideParseException):
+        return _override_message(error.override)
+    return " ".join(str(error).split())
 
 
-def _with_file(message: str) -> str:
-    """A message on a mistyped key, with the file of the user's folder that has it; other messages as they are."""
+def _add_file(message: str) -> str:
+    """Adds the file of the user's folder that has the key to a message on an unknown key; keeps other messages."""
     if (match := re.search(r"(?:has no|unknown) key '([^']+)'", message)) is None:
         return message
     key = re.compile(rf"\b{re.escape(match[1])}\b[\w.]*\s*:")
@@ -241,16 +244,16 @@ def _with_file(message: str) -> str:
     return message + next((f" It is in {path}" for path in files if key.search(path.read_text("utf-8", "replace"))), "")
 
 
-def _unreadable(override: str) -> str:
-    """One line on an override that Hydra cannot read."""
-    for group in GROUPS:
-        if override in _choices(group):
-            plus = "+" if group in NOT_BY_DEFAULT else ""
+def _override_message(override: str) -> str:
+    """The error message for an override that Hydra cannot parse."""
+    for group in LISTED_GROUPS:
+        if override in _choice_names(group):
+            plus = "+" if group in OPTIONAL_GROUPS else ""
             return f"{override!r} is no setting: write {plus}{group}={override}"
-    if COMMA.search(override):
+    if DANGLING_COMMA.search(override):
         return f"{override!r} has a comma without a value beside it: write key=a,b"
     return f"cannot read {override!r}: write key=value, and quote a value with special characters as 'key=\"value\"'"
 
 
-def _choices(group: str) -> list[str]:
+def _choice_names(group: str) -> list[str]:
     return [name for name in names(group) if not name.startswith("_")]

@@ -1,7 +1,7 @@
-"""Composes the runs of a command line by Hydra's `compose`: once for each combination of choices.
+"""Composes the configurations of a command line by Hydra's `compose`, once for each combination of choices.
 
-A composition takes a tenth of a second. The values of a cell are set on a copy of it. Values that refer to others take
-milliseconds; they are resolved once for all cells that differ in the shape or the seed alone.
+A composition takes a tenth of a second. The values of a cell are set on a copy of it. Resolving references between
+values takes milliseconds; it is done once for all cells that differ only in `index` or `seed`.
 """
 
 import re
@@ -28,71 +28,71 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from bench.config import PACKAGE, Config, type_of, wrong_type
-from bench.records.folder import Identity, identify, resolved
-from bench.tables import CONF, folders, listed, nearest, register_resolvers, register_rows
+from bench.config import CLASS_PACKAGE_KEY, Config, type_of, wrong_type_message
+from bench.records.folder import Identity, identify, resolve_config
+from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
-NOT_BY_DEFAULT = ("method", "experiment")  # groups that take a plus in front
-LONE = re.compile(r"(index|seed)=(0|[1-9]\d*)")  # overrides of a single number
-ASKING = re.compile(r"\$\{.*(index|seed)", re.DOTALL)  # a value that may refer to one of these
+OPTIONAL_GROUPS = ("method", "experiment")  # they take a plus: +method=NAME
+NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")
+REFERENCE_PATTERN = re.compile(r"\$\{.*(index|seed)", re.DOTALL)  # a value that may refer to index or seed
 
 
-class Listed(ConfigSource):
-    """What `bench.tables` lists, for Hydra: files and rows, each parsed once."""
+class ChoiceSource(ConfigSource):
+    """Hydra's access to the files and rows that `bench.tables` lists, each parsed once."""
 
     @staticmethod
     def scheme() -> str:
-        """The beginning of its address on Hydra's search path."""
+        """The scheme of the source's address on Hydra's search path."""
         return "listed"
 
     def available(self) -> bool:
-        """It is always there."""
+        """Always true."""
         return True
 
     def is_group(self, config_path: str) -> bool:
         """Whether a path is a group with choices."""
-        return bool(listed(config_path.strip("/")))
+        return bool(group_choices(config_path.strip("/")))
 
     def is_config(self, config_path: str) -> bool:
         """Whether a path is a choice of a group."""
         group, _, name = config_path.rpartition("/")
-        return name.removesuffix(".yaml") in listed(group)
+        return name.removesuffix(".yaml") in group_choices(group)
 
     def load_config(self, config_path: str) -> ConfigResult:
         """The content of a choice, and the package of its keys."""
         group, _, name = config_path.rpartition("/")
-        node, package = listed(group)[name.removesuffix(".yaml")].load()
+        node, package = group_choices(group)[name.removesuffix(".yaml")].load()
         return ConfigResult(self.provider, self.full_path(), node, {"package": package})
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         """The choices of a group."""
-        return [] if results_filter == ObjectType.GROUP else sorted(listed(config_path.strip("/")))
+        return [] if results_filter == ObjectType.GROUP else sorted(group_choices(config_path.strip("/")))
 
 
 class SearchPath(SearchPathPlugin):
-    """Has Hydra search `Listed` before all else, and the user's folders after it, for groups of the user's own."""
+    """Makes Hydra search `ChoiceSource` first, and the user's folders last, for groups that the user adds."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Adds these to Hydra's search path."""
+        """Adds both to Hydra's search path."""
         search_path.prepend("implicit-bench", "listed://")
         for folder in folders():
             search_path.append("command-line", f"file://{folder.absolute()}")
 
 
 def register(*config_dirs: Path) -> None:
-    """Makes known to Hydra the schema of conf/config.yaml, the choices of all groups, and what values may ask for.
+    """Registers the schema of conf/config.yaml, the choices of all groups, and the resolvers with Hydra.
 
     Args:
-        config_dirs: folders of the user's, whose files and tables have more choices.
+        config_dirs: folders of the user, whose files and tables have more choices.
 
     Raises:
-        ValueError: for a folder that is not there, and a table that cannot be read.
+        ValueError: if a folder does not exist, or a table cannot be read.
     """
     for folder in config_dirs:
         if not folder.is_dir():
             raise ValueError(f"--config-dir {folder}: there is no such folder")
     ConfigStore.instance().store(name="schema", node=Config)
-    Plugins.instance().register(Listed)
+    Plugins.instance().register(ChoiceSource)
     Plugins.instance().register(SearchPath)
     register_rows(config_dirs)
     register_resolvers()
@@ -100,10 +100,10 @@ def register(*config_dirs: Path) -> None:
 
 @contextmanager
 def composing(*config_dirs: Path) -> Iterator[None]:
-    """Within it, `Composer` composes what conf and the user's folders hold.
+    """The context in which a `Composer` can use conf and the user's folders.
 
     Raises:
-        ValueError: for a folder that is not there, and a table that cannot be read.
+        ValueError: if a folder does not exist, or a table cannot be read.
     """
     register(*config_dirs)
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -111,22 +111,22 @@ def composing(*config_dirs: Path) -> Iterator[None]:
 
 
 @cache
-def parsed(text: str) -> Override:
+def parse_override(text: str) -> Override:
     """An override of the command line, as Hydra reads it.
 
     Raises:
-        OverrideParseException: where it is none.
+        OverrideParseException: if it is not an override.
     """
     return OverridesParser.create().parse_overrides([text])[0]
 
 
 def combinations(texts: Sequence[str]) -> list[list[str]]:
-    """The overrides of each cell, from those of a sweep, such as `seed=0,1`; of two with one key the later counts.
+    """The overrides of each cell of a sweep, from overrides such as `seed=0,1`; for equal keys the last one counts.
 
     Raises:
-        ValueError: for an interval, which has no values to list.
+        ValueError: if an override is an interval, which has no list of values.
     """
-    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())  # it lists what a glob means
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())  # for globs
     cells: dict[str, list[str]] = {}
     for override in parser.parse_overrides([*texts]):
         key = override.get_key_element()
@@ -140,17 +140,18 @@ def combinations(texts: Sequence[str]) -> list[list[str]]:
 
 
 def sets_value(override: Override) -> bool:
-    """Whether an override sets a key that is there; others choose, add or remove, which Hydra does."""
+    """Whether an override sets an existing key. Hydra applies the others, which choose, add or remove."""
     key = override.key_or_group
-    chooses = override.package is not None or "/" in key or (listed(key) and not isinstance(override.value(), dict))
+    is_group = group_choices(key) and not isinstance(override.value(), dict)
+    chooses = override.package is not None or "/" in key or is_group
     return override.type == OverrideType.CHANGE and not chooses and key != "hydra.searchpath"
 
 
 def set_value(override: Override, config: DictConfig) -> bool:
-    """Sets the value of a key; gives whether the configuration has the key.
+    """Sets the value of a key; returns whether the configuration has the key.
 
     Raises:
-        ValueError: for a value of the wrong type, and an unknown key within a value.
+        ValueError: if the value has the wrong type, or an unknown key in it.
     """
     key, value = override.key_or_group, override.value()
     try:
@@ -160,15 +161,15 @@ def set_value(override: Override, config: DictConfig) -> bool:
             raise unknown_key(str(error.full_key), config) from error
         return False
     except OmegaConfBaseException as error:
-        raise ValueError(wrong_type(key, str(override.input_line).partition("=")[2], type_of(key))) from error
+        raise ValueError(wrong_type_message(key, str(override.input_line).partition("=")[2], type_of(key))) from error
     return True
 
 
-def composed(overrides: Sequence[str]) -> DictConfig:
-    """What Hydra composes of the overrides that set no value, with Hydra's own node.
+def compose_choices(overrides: Sequence[str]) -> DictConfig:
+    """Hydra's composition of the overrides that set no value, with Hydra's node.
 
     Raises:
-        ValueError: for an unknown choice, and where choices do not fit together.
+        ValueError: if a choice is unknown, or choices do not fit together.
     """
     try:
         return compose("config", [*overrides], return_hydra_config=True)
@@ -176,53 +177,53 @@ def composed(overrides: Sequence[str]) -> DictConfig:
         nested = str(error.missing_cfg_file).rpartition("/")[0]
         group = nested if nested.startswith("hydra/") else nested.partition("/")[0]
         path = str(error.missing_cfg_file).removeprefix(f"{group}/")
-        raise unknown_choice(group, path, [*(error.options or listed(nested))]) from error
+        raise unknown_choice(group, path, [*(error.options or group_choices(nested))]) from error
     except (HydraException, OmegaConfBaseException) as error:
-        for override in map(parsed, overrides):
-            if (group := override.key_or_group) in NOT_BY_DEFAULT and not override.is_add():
+        for override in map(parse_override, overrides):
+            if (group := override.key_or_group) in OPTIONAL_GROUPS and not override.is_add():
                 raise ValueError(f"{group} is not chosen by default: write +{group}=NAME, with a plus") from error
         for cause in (error, error.__cause__, error.__context__):
             if isinstance(cause, ConfigKeyError | ConfigAttributeError) and cause.full_key:
-                raise unknown_key(str(cause.full_key), composed([])) from error
+                raise unknown_key(str(cause.full_key), compose_choices([])) from error
         raise ValueError(" ".join(f"{error} {error.__cause__ or ''}".split())) from error
 
 
 def unknown_choice(group: str, name: str, options: Sequence[str]) -> ValueError:
-    """The error of a choice that there is not, with the nearest ones."""
-    what = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
-    mesh = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
-    hint = nearest(name, [option for option in options if not option.startswith("_")])  # others build on these
-    return ValueError(what + hint + (mesh if "/" in name or "." in name else ""))
+    """The error for an unknown choice, with similar choices."""
+    text = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
+    mesh_hint = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
+    hint = nearest(name, [option for option in options if not option.startswith("_")])  # choices with _ are only bases
+    return ValueError(text + hint + (mesh_hint if "/" in name or "." in name else ""))
 
 
 def unknown_key(key: str, config: DictConfig) -> ValueError:
-    """The error of a key that a configuration lacks, with the nearest ones."""
-    if key.startswith("renderer.") and PACKAGE in (config.get("renderer") or ()):
+    """The error for a key that a configuration lacks, with similar keys."""
+    if key.startswith("renderer.") and CLASS_PACKAGE_KEY in (config.get("renderer") or ()):
         return ValueError(f"unknown key {key!r}: an argument of your class is set by +{key}=VALUE, with a plus")
-    names = dotted(config.hydra, "hydra.") if key.startswith("hydra.") else dotted(config)
+    names = dotted_keys(config.hydra, "hydra.") if key.startswith("hydra.") else dotted_keys(config)
     return ValueError(f"unknown key {key!r}{nearest(key, names)}")
 
 
-def dotted(node: Any, prefix: str = "") -> list[str]:
-    """Every dotted key of a configuration, without Hydra's."""
+def dotted_keys(node: Any, prefix: str = "") -> list[str]:
+    """All dotted keys of a configuration, without Hydra's node."""
     if OmegaConf.is_config(node):
         node = OmegaConf.to_container(node)
     keys = {f"{prefix}{key}": child for key, child in node.items() if key != "hydra"}
-    within = (name for key, child in keys.items() if isinstance(child, dict) for name in dotted(child, f"{key}."))
-    return [*keys, *within]
+    inner = (name for key, child in keys.items() if isinstance(child, dict) for name in dotted_keys(child, f"{key}."))
+    return [*keys, *inner]
 
 
 @dataclass(frozen=True)
-class Tree:
-    """What a combination of choices composes to, without Hydra's node, and the names of all choices by group."""
+class ComposedChoices:
+    """The composition of a combination of choices, without Hydra's node, and the names of all choices by group."""
 
     config: DictConfig
     choices: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Resolved:
-    """The plain configuration of cells that differ in the shape or the seed alone, and overrides that go to others."""
+class ResolvedCells:
+    """The resolved configuration of cells that differ only in `index` or `seed`, and the keys left out."""
 
     values: dict[str, Any]
     choices: dict[str, Any]
@@ -230,75 +231,75 @@ class Resolved:
 
 
 class Composer:
-    """Gives the configurations of a command line's cells, within `composing`."""
+    """Composes the configurations of a command line's cells; to be used within `composing`."""
 
     def __init__(self, texts: Sequence[str]) -> None:
-        overrides = [*map(parsed, texts)]
+        overrides = [*map(parse_override, texts)]
         hydra = [override for override in overrides if override.is_hydra_override()]
-        self.task = [str(override.input_line) for override in overrides if not override.is_hydra_override()]
-        self.always = [str(override.input_line) for override in hydra if not sets_value(override)]
-        self.settings = [override for override in hydra if sets_value(override)]
+        self.run_overrides = [str(override.input_line) for override in overrides if not override.is_hydra_override()]
+        self.hydra_choices = [str(override.input_line) for override in hydra if not sets_value(override)]
+        self.hydra_settings = [override for override in hydra if sets_value(override)]
         for override in hydra:
             if override.is_sweep_override():
                 raise ValueError(
                     f"{override.key_or_group} has several values, but a sweep has one launcher: choose one"
                 )
-        self.trees: dict[tuple[str, ...], Tree] = {}
-        self.shared: dict[tuple[str, ...], Resolved] = {}
-        self.used: set[str] = set()  # keys that a cell has
-        self.lacking: dict[str, DictConfig] = {}  # a configuration that lacks a key, by the key
-        self.to_custom: set[str] = set()  # groups of which a choice waits for its class, beside choices with one
+        self.composed: dict[tuple[str, ...], ComposedChoices] = {}
+        self.resolved_cells: dict[tuple[str, ...], ResolvedCells] = {}
+        self.used_keys: set[str] = set()  # keys that at least one cell has
+        self.lacking_keys: dict[str, DictConfig] = {}  # by key: a configuration without it
+        self.mixed_groups: set[str] = set()  # groups swept over custom and other choices
 
-    def whole(self) -> DictConfig:
-        """The configuration without what is swept over, with Hydra's node; keys that it lacks are in `lacking`.
+    def shared_config(self) -> DictConfig:
+        """The configuration without swept values, with Hydra's node; `lacking_keys` gets the keys that it lacks.
 
         Raises:
-            ValueError: for an unknown choice, an unknown key of Hydra's, and a value of the wrong type.
+            ValueError: if a choice or a key of Hydra is unknown, or a value has the wrong type.
         """
-        fixed = [override for override in map(parsed, self.task) if not override.is_sweep_override()]
-        config = composed([*self.always, *(str(o.input_line) for o in fixed if not sets_value(o))])
-        for override in self.settings:
+        fixed = [override for override in map(parse_override, self.run_overrides) if not override.is_sweep_override()]
+        config = compose_choices([*self.hydra_choices, *(str(o.input_line) for o in fixed if not sets_value(o))])
+        for override in self.hydra_settings:
             if not set_value(override, config):
                 raise unknown_key(override.key_or_group, config)
         for override in filter(sets_value, fixed):
             if not set_value(override, config):
-                self.lacking.setdefault(override.key_or_group, config)
+                self.lacking_keys.setdefault(override.key_or_group, config)
         return config
 
-    def single(self, config: DictConfig) -> Identity:
-        """The run that `whole` describes.
+    def single_run(self, config: DictConfig) -> Identity:
+        """The run of the configuration `shared_config`.
 
         Raises:
-            ValueError: for an unknown key, a key of several values and an invalid value.
+            ValueError: if a key is unknown or has several values, or a value is invalid.
         """
-        for override in map(parsed, self.task):
+        for override in map(parse_override, self.run_overrides):
             if override.is_sweep_override():
-                raise _several(override)
+                raise _several_values_error(override)
         self.check_keys()
-        tree = _tree(config)
-        return identify(resolved(tree.config, tree.choices), tree.choices, self.task)
+        parts = _without_hydra_node(config)
+        return identify(resolve_config(parts.config, parts.choices), parts.choices, self.run_overrides)
 
     def swept(self, config: DictConfig) -> list[list[str]]:
-        """The overrides of each cell of the sweep that `whole` describes.
+        """The overrides of each cell of the sweep with the configuration `shared_config`.
 
         Raises:
-            ValueError: where the sweep has no cell.
+            ValueError: if the sweep has no cell.
         """
-        self.lacking.clear()  # cells may have what the whole lacks
+        self.lacking_keys.clear()  # cells may have keys that the shared configuration lacks
         params, choices = OmegaConf.select(config, "hydra.sweeper.params") or {}, config.hydra.runtime.choices
-        methods = "renderer" if choices.get("method") else ""  # a method brings its renderer
-        pairs = [f"{key}={value}" for key, value in params.items() if key != methods or value != choices.renderer]
-        swept = combinations([*pairs, *self.task])
+        method_key = "renderer" if choices.get("method") else ""  # a method sets its renderer
+        pairs = [f"{key}={value}" for key, value in params.items() if key != method_key or value != choices.renderer]
+        swept = combinations([*pairs, *self.run_overrides])
         if not swept:
-            raise ValueError(f"the sweep has no cell: {' '.join(self.task)}")
-        self.to_custom = _waiting(swept)
+            raise ValueError(f"the sweep has no cell: {' '.join(self.run_overrides)}")
+        self.mixed_groups = _groups_with_custom(swept)
         return swept
 
     def cells(self, swept: Sequence[list[str]]) -> list[Identity]:
-        """The runs of a sweep. A value goes to the cells that have its key; cells that are then equal are one.
+        """The runs of a sweep. A value goes to the cells that have its key; equal cells are merged.
 
         Raises:
-            ValueError: for an invalid cell, and a key that no cell has.
+            ValueError: if a cell is invalid, or no cell has a key.
         """
         common = set.intersection(*map(set, swept))
         cells: dict[tuple[str, ...], Identity] = {}
@@ -314,90 +315,90 @@ class Composer:
         return [*cells.values()]
 
     def check_keys(self) -> None:
-        """Raises ValueError for a key of the command line that no cell has."""
-        for key, config in self.lacking.items():
-            if key not in self.used:
+        """Raises ValueError if no cell has a key of the command line."""
+        for key, config in self.lacking_keys.items():
+            if key not in self.used_keys:
                 raise unknown_key(key, config)
 
     def identity(self, cell: list[str]) -> Identity:
-        """The run that a cell is; it shares parts of its configuration with others.
+        """The run of a cell; it shares nodes of its configuration with other cells.
 
         Raises:
-            ValueError: where it cannot be composed, or is invalid.
+            ValueError: if it cannot be composed, or is invalid.
         """
-        lone = {match[1]: int(match[2]) for text in cell if (match := LONE.fullmatch(text))}
-        alike = tuple(text.partition("=")[0] if LONE.fullmatch(text) else text for text in cell)
-        if (common := self.shared.get(alike)) is None:
-            config, common = self._resolved(cell)
-            if not _asks(OmegaConf.to_container(config)):
-                self.shared[alike] = common
-        overrides = [text for text in cell if parsed(text).get_key_element() not in common.left_out]
-        return identify(common.values | lone, common.choices, overrides)
+        numbers = {match[1]: int(match[2]) for text in cell if (match := NUMBER_OVERRIDE.fullmatch(text))}
+        cache_key = tuple(text.partition("=")[0] if NUMBER_OVERRIDE.fullmatch(text) else text for text in cell)
+        if (resolved := self.resolved_cells.get(cache_key)) is None:
+            config, resolved = self._resolve(cell)
+            if not _has_reference(OmegaConf.to_container(config)):
+                self.resolved_cells[cache_key] = resolved
+        overrides = [text for text in cell if parse_override(text).get_key_element() not in resolved.left_out]
+        return identify(resolved.values | numbers, resolved.choices, overrides)
 
-    def _resolved(self, cell: list[str]) -> tuple[DictConfig, Resolved]:
-        """A cell's configuration, and the same with all values resolved."""
-        overrides = [*map(parsed, cell)]
-        left_out = _of_custom(overrides, self.to_custom)
+    def _resolve(self, cell: list[str]) -> tuple[DictConfig, ResolvedCells]:
+        """A cell's configuration, unresolved and resolved."""
+        overrides = [*map(parse_override, cell)]
+        left_out = _keys_for_custom(overrides, self.mixed_groups)
         overrides = [override for override in overrides if override.get_key_element() not in left_out]
-        others = tuple(str(override.input_line) for override in overrides if not sets_value(override))
-        if others not in self.trees:
-            self.trees[others] = _tree(composed([*self.always, *others]))
-        tree = self.trees[others]
-        config = deepcopy(tree.config)
+        choices = tuple(str(override.input_line) for override in overrides if not sets_value(override))
+        if choices not in self.composed:
+            self.composed[choices] = _without_hydra_node(compose_choices([*self.hydra_choices, *choices]))
+        parts = self.composed[choices]
+        config = deepcopy(parts.config)
         for override in filter(sets_value, overrides):
             key = override.key_or_group
             if set_value(override, config):
-                self.used.add(key)
+                self.used_keys.add(key)
             else:
                 left_out.add(key)
-                self.lacking.setdefault(key, config)
-        return config, Resolved(resolved(config, tree.choices), tree.choices, left_out)
+                self.lacking_keys.setdefault(key, config)
+        return config, ResolvedCells(resolve_config(config, parts.choices), parts.choices, left_out)
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
-    """The same configuration, which loses Hydra's node."""
+    """Removes Hydra's node from the configuration and returns it."""
     OmegaConf.set_struct(config, False)
     del config["hydra"]
     OmegaConf.set_struct(config, True)
     return config
 
 
-def _tree(config: DictConfig) -> Tree:
+def _without_hydra_node(config: DictConfig) -> ComposedChoices:
     choices: Any = OmegaConf.to_container(config.hydra.runtime.choices)
-    return Tree(without_hydra(config), choices)
+    return ComposedChoices(without_hydra(config), choices)
 
 
-def _several(override: Override) -> ValueError:
-    """The error of a key with several values in a command that makes one run."""
+def _several_values_error(override: Override) -> ValueError:
+    """The error for a key with several values in a command that makes one run."""
     key, values = override.key_or_group, str(override.input_line).partition("=")[2]
     text = f"{key} has several values: add -m for a run of each"
     quoted = f", write {key}=[{values}] for a list, or quote it where it is one value: '{key}=\"{values}\"'"
     return ValueError(text + quoted if sets_value(override) else text)
 
 
-def _waits(group: str, name: Any) -> bool:
-    """Whether a choice waits for its class, as `renderer=custom` does."""
-    choice = listed(group).get(str(name))
+def _needs_class(group: str, name: Any) -> bool:
+    """Whether a choice needs a class on the command line, as `renderer=custom` does."""
+    choice = group_choices(group).get(str(name))
     return choice is not None and choice.content.get("_target_") == MISSING
 
 
-def _waiting(swept: Sequence[list[str]]) -> set[str]:
-    """The groups of which a sweep has a choice that waits for its class, and choices that have one."""
+def _groups_with_custom(swept: Sequence[list[str]]) -> set[str]:
+    """The groups of which a sweep has both a choice that needs a class and a choice that has one."""
     pairs = {text.partition("=")[::2] for cell in swept for text in cell}
-    waiting = {group for group, name in pairs if _waits(group, name)}
-    return {group for group, name in pairs if group in waiting and not _waits(group, name)}
+    custom_groups = {group for group, name in pairs if _needs_class(group, name)}
+    return {group for group, name in pairs if group in custom_groups and not _needs_class(group, name)}
 
 
-def _of_custom(overrides: Sequence[Override], groups: set[str]) -> set[str]:
-    """The overrides that go to `renderer=custom` alone, where a cell has another: its class, arguments and label."""
+def _keys_for_custom(overrides: Sequence[Override], groups: set[str]) -> set[str]:
+    """The keys that go only to `renderer=custom`, if a cell has another renderer: class, arguments and label."""
     keys = {override.get_key_element(): override.value() for override in overrides}
-    others = [group for group in groups if f"{group}._target_" in keys and not _waits(group, keys.get(group))]
+    others = [group for group in groups if f"{group}._target_" in keys and not _needs_class(group, keys.get(group))]
     left_out = {key for key in keys for group in others if key.startswith((f"{group}._target_", f"+{group}."))}
     return left_out | ({"label"} if others else set())
 
 
-def _asks(node: Any) -> bool:
-    """Whether a value of a configuration may refer to a single number."""
+def _has_reference(node: Any) -> bool:
+    """Whether a value of a configuration may refer to `index` or `seed`."""
     if isinstance(node, dict | list):
-        return any(map(_asks, node.values() if isinstance(node, dict) else node))
-    return ASKING.search(str(node)) is not None
+        return any(map(_has_reference, node.values() if isinstance(node, dict) else node))
+    return REFERENCE_PATTERN.search(str(node)) is not None

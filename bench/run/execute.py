@@ -1,4 +1,4 @@
-"""Executes one run, in a process of its own or in the command's; every failure is recorded with its reason."""
+"""Executes one run, in its own process or in that of the command; every failure is recorded with its reason."""
 
 import fcntl
 import os
@@ -16,12 +16,12 @@ import torch
 from bench.machine import environment
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus, now
-from bench.run.job import Ended, Job, Notice, Started, Step, reason_of
+from bench.run.job import FinalRecordSent, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext, cell_of
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 
-INTERVAL = 0.05  # least seconds between two messages on progress
+PROGRESS_INTERVAL_SECONDS = 0.05
 
 
 def main(job: Job, channel: Connection, parent: Connection) -> None:
@@ -32,36 +32,36 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
     signal.signal(signal.SIGTERM, _stop)
-    _die_with(parent)
-    _print_to(job.folder / "log.txt")
+    _exit_with_parent(parent)
+    _redirect_output(job.folder / "log.txt")
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:
         execute(job, progress=_Progress(channel), checkpoint=channel.send)
     except KeyboardInterrupt:
-        channel.send(job.record)  # what is known; then it ends by SIGTERM, as its exit code should say
+        channel.send(job.record)  # as far as it is filled; then ends by SIGTERM, so that the exit code is right
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTERM)
     channel.send(job.record)
-    channel.send(Ended())
+    channel.send(FinalRecordSent())
 
 
 @environment.flushing_denormals()
 def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None]) -> None:
-    """Runs a job, whose record gets a status, and a reason where that is not ok.
+    """Runs a job; its record gets a status, and a reason if that is not ok.
 
     Args:
         checkpoint: receives the record as soon as the machine is known.
 
     Raises:
-        KeyboardInterrupt: where the run was stopped; the record has what is known.
+        KeyboardInterrupt: if the run was stopped; the record is filled as far as possible.
     """
     folder, record = job.folder, job.record
-    before = environment.scheduled()
+    schedule_before = environment.scheduled()
     try:
         try:
             cell = cell_of(record.config, progress=progress)
-        except (ValueError, OSError) as error:  # anything invalid in it
+        except (ValueError, OSError) as error:  # the configuration is invalid
             raise BadInput(reason_of(error)) from error
         cell.start()
         inputs = cell.inputs
@@ -74,7 +74,7 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:
         record.status, record.reason = RunStatus.REFUSED, reason_of(error)
-        _note(folder, traceback.format_exc())
+        _append_to_log(folder, traceback.format_exc())
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, reason_of(error)
     except (MemoryError, torch.OutOfMemoryError) as error:
@@ -83,23 +83,23 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
         out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
         record.status = RunStatus.OOM if out_of_memory else RunStatus.CRASHED
         record.reason = reason_of(error, folder)
-        _note(folder, traceback.format_exc())
+        _append_to_log(folder, traceback.format_exc())
     finally:
-        record.environment["waited_share"] = environment.waited_share(before)
+        record.environment["waited_share"] = environment.waited_share(schedule_before)
         record.notes += environment.doubts(record)
 
 
 class _Progress:
-    """Sends progress to the parent: when a phase begins, when it ends, and between these once per `INTERVAL`."""
+    """Sends progress to the parent when a phase begins or ends, and between at intervals."""
 
     def __init__(self, channel: Connection) -> None:
         self.channel, self.sent, self.phase = channel, 0.0, ""
 
-    def __call__(self, phase: str, done: int, total: int, loss: float | None = None) -> None:
+    def __call__(self, phase: str, finished: int, total: int, loss: float | None = None) -> None:
         moment = time.perf_counter()
-        if moment - self.sent > INTERVAL or done == total or phase != self.phase:
+        if moment - self.sent > PROGRESS_INTERVAL_SECONDS or finished == total or phase != self.phase:
             self.sent, self.phase = moment, phase
-            self.channel.send(Step(phase, done, total, loss))
+            self.channel.send(Step(phase, finished, total, loss))
 
 
 def _stop(number: int, frame: object) -> None:
@@ -107,7 +107,7 @@ def _stop(number: int, frame: object) -> None:
     raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
 
 
-def _die_with(parent: Connection) -> None:
+def _exit_with_parent(parent: Connection) -> None:
     """Makes the system end this process when the pipe's other end closes, also during native code."""
     signal.signal(signal.SIGIO, signal.SIG_DFL)
     fcntl.fcntl(parent.fileno(), fcntl.F_SETOWN, os.getpid())
@@ -117,7 +117,7 @@ def _die_with(parent: Connection) -> None:
         os._exit(1)
 
 
-def _print_to(path: Path) -> None:
+def _redirect_output(path: Path) -> None:
     """Appends the output of Python and native code to a file from now on."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -127,7 +127,7 @@ def _print_to(path: Path) -> None:
     os.close(log)
 
 
-def _note(folder: Path, text: str) -> None:
-    """Adds a text to the run's log; on a full disk it is left out, since the record has the reason of a failure."""
+def _append_to_log(folder: Path, text: str) -> None:
+    """Adds a text to the run's log; on a full disk it is lost, but the record has the reason of a failure."""
     with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
         log.write(f"{now()} {text}\n")

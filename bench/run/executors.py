@@ -1,4 +1,4 @@
-"""What makes the cells of a sweep, by `hydra/launcher`: this process, some processes here, Slurm jobs or Ray."""
+"""Runs the cells of a sweep by `hydra/launcher`: in this process, in local workers, in Slurm jobs or by Ray."""
 
 import os
 import signal
@@ -16,23 +16,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.progress import notice
 from bench.records.folder import Identity
-from bench.records.record import BESIDE
+from bench.records.record import CONCURRENT_RUNS_VARIABLE
 from bench.run.process import catch_signals, raise_if_stopped, signals_delayed, stopped_by
 from datasets.extras import install
 
-Make = Callable[[Identity], list[str]]  # does what a cell describes; gives a message where that leaves no record
-EXTRAS = {"slurm": "submitit", "ray": "ray"}  # packages that executors need, each the name of its extra
-# Keys of `hydra.launcher` in conf/hydra/launcher/slurm.yaml that are not submitit's, and those that every cluster has.
-OURS = ("executor", "cluster", "minutes_per_job", "minutes_per_run", "array_size", "submitit_folder", "max_num_timeout")
-SHARED = (
-    "timeout_min",
-    "cpus_per_task",
-    "gpus_per_node",
-    "tasks_per_node",
-    "mem_gb",
-    "nodes",
-    "name",
-    "stderr_to_stdout",
+Make = Callable[[Identity], list[str]]  # runs a cell; returns messages if it leaves no record
+EXTRA_BY_EXECUTOR = {"slurm": "submitit", "ray": "ray"}  # each extra has the name of its package
+# Keys of conf/hydra/launcher/slurm.yaml: those that submitit does not know, and those that all its clusters share.
+OUR_SETTINGS = (
+    *("executor", "cluster", "minutes_per_job", "minutes_per_run", "array_size", "submitit_folder", "max_num_timeout"),
+)
+COMMON_SETTINGS = (
+    *("timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes", "name", "stderr_to_stdout"),
 )
 
 
@@ -41,9 +36,9 @@ class Launcher:
     """The choice of `hydra/launcher`.
 
     Args:
-        name: of the choice.
+        name: the name of the choice.
         settings: `hydra.launcher`.
-        variables: of the environment, for runs.
+        variables: environment variables for runs.
     """
 
     name: str
@@ -52,10 +47,10 @@ class Launcher:
 
     @classmethod
     def of(cls, config: DictConfig) -> "Launcher":
-        """That of a composed configuration.
+        """The launcher of a composed configuration.
 
         Raises:
-            ValueError: where it needs a package that is not installed, or is none of ours.
+            ValueError: if its executor is unknown, or needs a package that is not installed.
         """
         settings: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
         variables = {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
@@ -64,7 +59,7 @@ class Launcher:
             raise ValueError(
                 f"hydra.launcher.executor must be one of {', '.join(EXECUTORS)}, not {launcher.executor!r}"
             )
-        if (extra := EXTRAS.get(launcher.executor)) is not None:
+        if (extra := EXTRA_BY_EXECUTOR.get(launcher.executor)) is not None:
             try:
                 import_module(extra)
             except ImportError as error:
@@ -73,17 +68,17 @@ class Launcher:
 
     @property
     def executor(self) -> str:
-        """The key of `EXECUTORS`; without one, this process makes a cell after another."""
+        """The key of `EXECUTORS`; by default, this process runs one cell after another."""
         return str(self.settings.get("executor", "basic"))
 
     @property
-    def packs(self) -> bool:
-        """Whether it makes jobs of several runs."""
+    def packs_runs(self) -> bool:
+        """Whether a job has several runs."""
         return "minutes_per_job" in self.settings
 
     @property
-    def at_once(self) -> int:
-        """How many cells it makes at a time, as far as its settings say so; all processors for n_jobs=-1."""
+    def concurrency(self) -> int:
+        """The number of cells at a time, if its settings have it, else 1; all processors for n_jobs=-1."""
         for key in ("n_jobs", "array_parallelism"):
             if (count := self.settings.get(key)) is not None:
                 return max(int(count), 1) if count > 0 else os.cpu_count() or 1
@@ -91,14 +86,14 @@ class Launcher:
 
 
 def execute(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
-    """Makes all cells; gives whether each has what it describes. What is missing is printed as it ends.
+    """Runs all cells; returns whether each left a record. Errors are printed as they occur.
 
     Args:
-        jobs: the cells, in groups that a job of a cluster makes one after another.
+        jobs: the cells, in groups that one job of a cluster runs one after another.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM.
-        Exception: of a cluster that is not there, or a process that is lost.
+        Exception: if a cluster is missing, or a process is lost.
     """
     if not jobs:
         return True
@@ -106,36 +101,36 @@ def execute(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) 
     return EXECUTORS[launcher.executor](make, jobs, launcher)
 
 
-def _say(messages: Sequence[str]) -> bool:
-    """Prints messages on cells; gives whether there is none."""
+def _print_errors(messages: Sequence[str]) -> bool:
+    """Prints the error messages of cells; returns whether there are none."""
     for text in messages:
         notice(f"error: {text}")
     return not messages
 
 
-def _in_turn(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
-    done = []
+def _run_in_turn(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+    succeeded = []
     for identity in (identity for job in jobs for identity in job):
-        done.append(_say(make(identity)))
-        raise_if_stopped()  # also where a library swallowed it
-    return all(done)
+        succeeded.append(_print_errors(make(identity)))
+        raise_if_stopped()  # a library may have swallowed the exception
+    return all(succeeded)
 
 
-def _by_workers(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
-    """Some processes on this machine, each with a cell at a time."""
+def _run_by_workers(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+    """Runs cells in processes of this machine, each one cell at a time."""
     cells = [identity for job in jobs for identity in job]
-    left, done = iter(cells), []
-    workers = dict(_started(make) for _ in range(min(launcher.at_once, len(cells))))
+    remaining, succeeded = iter(cells), []
+    workers = dict(_start_worker(make) for _ in range(min(launcher.concurrency, len(cells))))
     try:
         for channel in workers:
-            channel.send(next(left))
+            channel.send(next(remaining))
         while workers:
             for channel in wait([*workers]):
                 assert isinstance(channel, Connection)
                 try:
-                    done.append(_say(channel.recv()))
-                    channel.send(next(left, None))
-                except (EOFError, ConnectionError):  # it has got None, or is lost
+                    succeeded.append(_print_errors(channel.recv()))
+                    channel.send(next(remaining, None))
+                except (EOFError, ConnectionError):  # the worker has received None, or is lost
                     process = workers.pop(channel)
                     process.join()
                     if process.exitcode:
@@ -145,24 +140,24 @@ def _by_workers(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launch
             process.terminate()
         for process in workers.values():
             process.join()
-    return all(done)
+    return all(succeeded)
 
 
-def _started(make: Make) -> tuple[Connection, BaseProcess]:
-    """A worker, and the connection to it."""
+def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
+    """Starts a worker; returns the connection to it, and its process."""
     context = get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(make, theirs))
+    parent_end, child_end = context.Pipe()
+    process = context.Process(target=_worker_main, args=(make, child_end))
     with signals_delayed():
         process.start()
-        theirs.close()
-    return ours, process
+        child_end.close()
+    return parent_end, process
 
 
-def _work(make: Make, channel: Connection) -> None:
-    """Makes the cells that come, until None does, or a signal."""
+def _worker_main(make: Make, channel: Connection) -> None:
+    """Runs the cells that the channel sends, until it sends None or a signal comes."""
     catch_signals()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal, which sends it to all; the driver passes it on
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent passes it on
     try:
         while (identity := channel.recv()) is not None:
             channel.send(make(identity))
@@ -171,12 +166,12 @@ def _work(make: Make, channel: Connection) -> None:
 
 
 @dataclass(frozen=True)
-class Pack:
-    """A job of submitit's: makes some cells, one after another; the tasks of a job share them.
+class PackedJob:
+    """A job of submitit, whose tasks share its cells and run them one after another.
 
     Args:
-        folder: in which the command was typed: relative paths of configurations lead from there.
-        variables: of the environment, for runs.
+        folder: the folder of the command, to which paths in configurations are relative.
+        variables: environment variables for runs.
     """
 
     make: Make
@@ -185,49 +180,49 @@ class Pack:
     variables: dict[str, str]
 
     def __call__(self) -> list[str]:
-        """Makes the cells of this task, until a signal ends the job; gives what there is to say."""
+        """Runs the cells of this task until a signal ends the job; returns error messages."""
         from submitit import JobEnvironment
 
         job, messages = JobEnvironment(), list[str]()
         os.chdir(self.folder)
-        os.environ |= self.variables | {BESIDE: str(job.num_tasks)}
+        os.environ |= self.variables | {CONCURRENT_RUNS_VARIABLE: str(job.num_tasks)}
         catch_signals()
-        for number in (signal.SIGUSR1, signal.SIGUSR2):  # of a scheduler, before it ends a job
+        for number in (signal.SIGUSR1, signal.SIGUSR2):  # a scheduler sends them before it ends a job
             signal.signal(number, signal.getsignal(signal.SIGTERM))
         try:
             for identity in self.cells[job.global_rank :: job.num_tasks]:
                 messages += self.make(identity)
         except KeyboardInterrupt as error:
-            why = stopped_by(error).removeprefix("killed: ").partition(";")[0]
-            messages.append(f"job {job.job_id}: {why}; the same command goes on")
+            reason = stopped_by(error).removeprefix("killed: ").partition(";")[0]
+            messages.append(f"job {job.job_id}: {reason}; the same command goes on")
         return messages
 
 
-def _by_slurm(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
-    """An array of jobs after another."""
-    executor, size, done = _submitit(launcher.settings), launcher.settings["array_size"], []
-    packs = [Pack(make, job, str(Path.cwd()), launcher.variables) for job in jobs]
-    for start in range(0, len(packs), size):
-        for job in executor.submit_array(packs[start : start + size]):
-            done += [_say(_messages(job.task(task))) for task in range(job.num_tasks)]
-    return all(done)
+def _run_by_slurm(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+    """Runs the cells in one array of jobs after another."""
+    executor, size, succeeded = _submitit_executor(launcher.settings), launcher.settings["array_size"], []
+    packed_jobs = [PackedJob(make, job, str(Path.cwd()), launcher.variables) for job in jobs]
+    for start in range(0, len(packed_jobs), size):
+        for job in executor.submit_array(packed_jobs[start : start + size]):
+            succeeded += [_print_errors(_task_messages(job.task(task))) for task in range(job.num_tasks)]
+    return all(succeeded)
 
 
-def _submitit(settings: dict[str, Any]) -> Any:
-    """Submitit's executor with the settings of the launcher."""
+def _submitit_executor(settings: dict[str, Any]) -> Any:
+    """The executor of submitit with the settings of the launcher."""
     from submitit import AutoExecutor
 
     if settings["cluster"] == "slurm" and which("srun") is None:
         raise ValueError("no Slurm is here: type this on a machine of the cluster, or hydra.launcher.cluster=local")
     retries = settings["max_num_timeout"]
     executor = AutoExecutor(settings["submitit_folder"], settings["cluster"], slurm_max_num_timeout=retries)
-    theirs = {key: value for key, value in settings.items() if key not in OURS}
-    executor.update_parameters(**{key if key in SHARED else f"slurm_{key}": value for key, value in theirs.items()})
+    names = {key: key if key in COMMON_SETTINGS else f"slurm_{key}" for key in settings if key not in OUR_SETTINGS}
+    executor.update_parameters(**{name: settings[key] for key, name in names.items()})
     return executor
 
 
-def _messages(task: Any) -> list[str]:
-    """What a task of a job has to say when it has ended, also where it was lost."""
+def _task_messages(task: Any) -> list[str]:
+    """Waits for a task of a job; returns its error messages, also if it was lost."""
     from submitit.core.utils import UncompletedJobError
 
     try:
@@ -236,26 +231,26 @@ def _messages(task: Any) -> list[str]:
         return [f"job {task.job_id} was lost; {task.paths.stderr} may say why; the same command goes on"]
 
 
-def _by_ray(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
-    """A Ray task for each cell."""
+def _run_by_ray(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+    """Runs each cell in a Ray task."""
     import ray
 
-    settings, done = launcher.settings["ray"], []
+    settings, succeeded = launcher.settings["ray"], []
     if not ray.is_initialized():
         ray.init(**settings["init"])
-    remote, folder = ray.remote(**settings["remote"])(_in_folder), str(Path.cwd())
-    left = [remote.remote(make, identity, folder, launcher.variables) for job in jobs for identity in job]
-    while left:
-        ended, left = ray.wait(left)
-        done += [_say(ray.get(task)) for task in ended]
-    return all(done)
+    remote, folder = ray.remote(**settings["remote"])(_make_in_folder), str(Path.cwd())
+    pending = [remote.remote(make, identity, folder, launcher.variables) for job in jobs for identity in job]
+    while pending:
+        ended, pending = ray.wait(pending)
+        succeeded += [_print_errors(ray.get(task)) for task in ended]
+    return all(succeeded)
 
 
-def _in_folder(make: Make, identity: Identity, folder: str, variables: dict[str, str]) -> list[str]:
-    """Makes a cell from the folder in which the command was typed."""
+def _make_in_folder(make: Make, identity: Identity, folder: str, variables: dict[str, str]) -> list[str]:
+    """Runs a cell in the folder of the command."""
     os.chdir(folder)
     os.environ |= variables
     return make(identity)
 
 
-EXECUTORS = {"basic": _in_turn, "workers": _by_workers, "slurm": _by_slurm, "ray": _by_ray}
+EXECUTORS = {"basic": _run_in_turn, "workers": _run_by_workers, "slurm": _run_by_slurm, "ray": _run_by_ray}

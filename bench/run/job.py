@@ -1,4 +1,4 @@
-"""What the process of a run and its parent say to each other, and errors in words."""
+"""The messages between the process of a run and its parent, and the texts of errors."""
 
 import errno
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from bench.records.record import Record
 
 @dataclass(frozen=True)
 class Job:
-    """A run for a child process: the folder for its files, and the record that it fills, with its configuration."""
+    """A run for a child process: the folder for its files, and the record with its configuration, which it fills."""
 
     folder: Path
     record: Record
@@ -20,14 +20,14 @@ class Step:
     """Progress within a phase; see `bench.progress.Report`."""
 
     phase: str
-    done: int
+    finished: int
     total: int
     loss: float | None
 
     @property
-    def when(self) -> str:
-        """The phase and the step for the reason of a failure: `while optimising (3 of 20)`."""
-        return f"{'while' if self.done < self.total else 'after'} {self.phase} ({self.done} of {self.total})"
+    def phase_text(self) -> str:
+        """The phase and step, for the reason of a failure: `while optimising (3 of 20)`."""
+        return f"{'while' if self.finished < self.total else 'after'} {self.phase} ({self.finished} of {self.total})"
 
 
 @dataclass(frozen=True)
@@ -43,28 +43,28 @@ class Started:
 
 
 @dataclass(frozen=True)
-class Ended:
+class FinalRecordSent:
     """The child has sent its final record."""
 
 
-Message = Started | Step | Notice | Record | Ended
+Message = Started | Step | Notice | Record | FinalRecordSent
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM ended a command whose runs had begun; their records and the plan are written."""
+    """Ctrl-C or SIGTERM ended a command after runs had started; their records and the plan are written."""
 
 
 def reason_of(error: BaseException, folder: Path | None = None) -> str:
-    """An error as the reason of a failure: in one line, with the remedy where the disk of the run's folder is full."""
+    """An error as the reason of a failure, in one line, with the remedy if the disk of the run's folder is full."""
     text = " ".join(str(error).split()) or type(error).__name__
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    where = f" ({folder})" if folder else ""
-    return f"{text}{where}: free space, or set results_dir to a folder on another disk" if full else text
+    is_disk_full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    suffix = f" ({folder})" if folder else ""
+    return f"{text}{suffix}: free space, or set results_dir to a folder on another disk" if is_disk_full else text
 
 
-def unwritten(error: OSError, results_dir: str | None = None) -> str:
-    """One line on what could not be written, and what to do; `results_dir` is named where the error names no file."""
+def write_error_message(error: OSError, results_dir: str | None = None) -> str:
+    """A message on a file that cannot be written, and what to do; names `results_dir` if the error names no file."""
     path = Path(named) if (named := error.filename or results_dir) else None
-    file = next((above for above in path.parents if above.is_file()), path) if path else None
-    where = f" ({file})" if file else ""
-    return f"{error.strerror or error}{where}: set results_dir to a folder you can write, or free space"
+    file = next((parent for parent in path.parents if parent.is_file()), path) if path else None
+    suffix = f" ({file})" if file else ""
+    return f"{error.strerror or error}{suffix}: set results_dir to a folder you can write, or free space"

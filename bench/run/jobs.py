@@ -1,4 +1,4 @@
-"""Slurm jobs of many runs each, by the seconds that runs are expected to take: conf/hydra/launcher/slurm.yaml."""
+"""Groups runs into Slurm jobs by their expected seconds; see conf/hydra/launcher/slurm.yaml."""
 
 from collections.abc import Mapping, Sequence
 from math import ceil, inf
@@ -7,19 +7,19 @@ from typing import Any
 
 from bench.records.format import plural
 from bench.records.read import Plan, PlannedCell
-from bench.run.plan import kind, times
+from bench.run.plan import duration_group, durations_of_similar_runs
 
 CLUSTERS = ("slurm", "local")
-POSITIVE = ("minutes_per_job", "minutes_per_run", "array_size", "tasks_per_node")
+POSITIVE_KEYS = ("minutes_per_job", "minutes_per_run", "array_size", "tasks_per_node")
 
 
 def check_jobs(cells: Sequence[PlannedCell], settings: Mapping[str, Any]) -> None:
-    """Checks the settings of a launcher for the cells that are to run.
+    """Checks the settings of a launcher for the cells to run.
 
     Raises:
-        ValueError: for a value out of range, and where a job may end before a run reaches its limit.
+        ValueError: if a value is out of range, or a job may end before a run reaches its time limit.
     """
-    for key in (key for key in (*POSITIVE, "timeout_min") if key in settings):
+    for key in (key for key in (*POSITIVE_KEYS, "timeout_min") if key in settings):
         if not (isinstance(settings[key], int | float) and settings[key] > 0):
             raise ValueError(f"hydra.launcher.{key} must be positive, not {settings[key]}: leave it out")
     timeout = settings.get("timeout_min", inf)
@@ -38,32 +38,31 @@ def check_jobs(cells: Sequence[PlannedCell], settings: Mapping[str, Any]) -> Non
         raise ValueError(f"hydra.launcher.cluster must be {' or '.join(CLUSTERS)}, not {settings['cluster']!r}")
 
 
-def packed(plan: Plan, settings: Mapping[str, Any], reused: set[str]) -> list[list[PlannedCell]]:
-    """The cells of a plan that each job makes, without those that are reused."""
-    measured, unmeasured = times(plan, reused), [60 * settings["minutes_per_run"]]
+def split_into_jobs(plan: Plan, settings: Mapping[str, Any], reused: set[str]) -> list[list[PlannedCell]]:
+    """The cells of each job, without reused cells."""
+    measured, default = durations_of_similar_runs(plan, reused), [60 * settings["minutes_per_run"]]
     cells = [cell for cell in plan.cells if cell.id not in reused]
     limits = [cell.config["time_limit"] or inf for cell in cells]
-    expected = [
-        min(median(measured[kind(vars(cell))] or unmeasured), limit) for cell, limit in zip(cells, limits, strict=True)
-    ]
-    groups = grouped(expected, 60 * settings["minutes_per_job"] * settings["tasks_per_node"])
+    expected = [median(measured[duration_group(vars(cell))] or default) for cell in cells]
+    expected = [min(duration, limit) for duration, limit in zip(expected, limits, strict=True)]
+    groups = group_by_duration(expected, 60 * settings["minutes_per_job"] * settings["tasks_per_node"])
     return [[cells[index] for index in group] for group in groups]
 
 
-def grouped(seconds: Sequence[float], most: float) -> list[list[int]]:
-    """The indices of runs in each job: in their order, as many as `most` seconds hold, and one at least."""
-    jobs, left = list[list[int]](), 0.0
-    for index, each in enumerate(seconds):
-        if not jobs or each > left:
+def group_by_duration(seconds: Sequence[float], max_seconds: float) -> list[list[int]]:
+    """The indices of the runs of each job, in order: as many as fit into `max_seconds`, but at least one."""
+    jobs, remaining = list[list[int]](), 0.0
+    for index, duration in enumerate(seconds):
+        if not jobs or duration > remaining:
             jobs.append([])
-            left = most
+            remaining = max_seconds
         jobs[-1].append(index)
-        left -= each
+        remaining -= duration
     return jobs
 
 
-def in_words(jobs: Sequence[Sequence[PlannedCell]], settings: Mapping[str, Any]) -> str:
-    """How many jobs there are, and how long they take."""
+def describe_jobs(jobs: Sequence[Sequence[PlannedCell]], settings: Mapping[str, Any]) -> str:
+    """The number of runs and jobs, as text."""
     text = f"{plural(sum(map(len, jobs)), 'run')} in {plural(len(jobs), 'job')}"
     at_once = f", {settings['tasks_per_node']} at a time in each" if settings["tasks_per_node"] > 1 else ""
     return f"{text}{at_once}, by hydra.launcher.minutes_per_job={settings['minutes_per_job']:g}"

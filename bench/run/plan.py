@@ -1,6 +1,6 @@
-"""Runs that are planned: each is checked before any starts; `plan=true` lists them, and what finished ones took.
+"""Checks all runs of a sweep before the first one starts; `plan=true` lists them with an estimate of their duration.
 
-A configuration is built by the code that its run builds it with, `bench.setup.inputs.cell_of`.
+A check builds the configuration with the same code as the run, `bench.setup.inputs.cell_of`.
 """
 
 import io
@@ -12,166 +12,169 @@ from statistics import median
 from typing import Any
 
 from bench.config import Isolation, Rerun
-from bench.records.folder import Identity, reusable
+from bench.records.folder import Identity, reusable_record
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import digest, row_name
 from bench.run.job import reason_of
-from bench.run.process import in_child
+from bench.run.process import run_in_child
 
-# Statuses of runs that did not take their whole time.
-UNMEASURED = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
-LIKE, MOST = 100, 300  # runs of one kind whose times are taken, and whose records are read
-HERE = ("basic", "workers")  # executors whose runs are on this machine
+# Statuses of runs that ended early.
+STATUSES_WITHOUT_DURATION = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
+MAX_SIMILAR_RUNS, MAX_RECORDS_READ = 100, 300  # per group of similar runs
+LOCAL_EXECUTORS = ("basic", "workers")  # they run on this machine
 
 
 def plan_of(cells: Sequence[Identity]) -> Plan:
-    """The plan of a sweep with these runs."""
+    """The plan of a sweep of these runs."""
     first = cells[0]
     name = f"{first.config['experiment'] or first.choices['task']}-{digest([cell.name for cell in cells])}"
-    return Plan(name, Path(first.config["results_dir"]), [*map(planned, cells)])
+    return Plan(name, Path(first.config["results_dir"]), [*map(planned_cell, cells)])
 
 
-def planned(identity: Identity) -> PlannedCell:
-    """The cell of a sweep that is a run."""
+def planned_cell(identity: Identity) -> PlannedCell:
+    """The planned cell of a run."""
     config = identity.config
     return PlannedCell(identity.name, identity.overrides, **identity.choices, seed=config["seed"], config=config)
 
 
 def identity_of(cell: PlannedCell) -> Identity:
-    """The identity of a planned cell's run."""
+    """The identity of a planned cell's run, the inverse of `planned_cell`."""
     choices = {name: getattr(cell, name) for name in ("task", "renderer", "dataset", "method")}
     return Identity(choices, cell.config, cell.overrides)
 
 
 def is_reused(plan: Plan, cell: PlannedCell) -> bool:
-    """Whether a cell's finished run is there already, and will be reused."""
+    """Whether a finished run of a cell exists and will be reused."""
     folder = plan.results_dir / "runs" / cell.id
-    return reusable(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
+    return reusable_record(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
 
 
-def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
-    """Why the run of a configuration would be refused; empty where it would not, or would fail in another way."""
+def refusal_reason(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
+    """Why the run of a configuration would be refused; empty if it would start, or fail in another way."""
     from bench.setup.inputs import cell_of  # it imports torch
 
     try:
-        with redirect_stdout(io.StringIO()):  # of classes of the user's
+        with redirect_stdout(io.StringIO()):  # classes of the user may print
             cell_of(config, built)
     except (ValueError, OSError) as error:
         return reason_of(error)
-    except (Exception, SystemExit):  # noqa: BLE001 - of a class of the user's; the run records it
+    except (Exception, SystemExit):  # noqa: BLE001 - a class of the user; the run will record the error
         return ""
     return ""
 
 
-def refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """For each configuration, why its run would be refused; empty where it would not.
+def refusal_reasons(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """For each configuration, why its run would be refused; empty if it would not be.
 
-    Torch is loaded in the process of runs alone, unless a run takes place in this one.
+    Torch is loaded only in the process of runs, unless a run takes place in this process.
     """
     if not configs or any(config["isolation"] == Isolation.off for config in configs):
-        return _refusals(configs)
-    return in_child(_refusals, configs) or [""] * len(configs)  # a class that ends its process does so in its run too
+        return _refusal_reasons(configs)
+    # A class that ends its process gives no reasons here, and will end the process of its run.
+    return run_in_child(_refusal_reasons, configs) or [""] * len(configs)
 
 
-def _refusals(configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    built: dict[str, Any] = {}  # what they share
-    return [refusal(config, built) for config in configs]
+def _refusal_reasons(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    built: dict[str, Any] = {}  # shared objects
+    return [refusal_reason(config, built) for config in configs]
 
 
 def check_plan(plan: Plan, executor: str, reused: set[str]) -> None:
-    """Checks all cells of a sweep, before it is written down.
+    """Checks all cells of a sweep before its plan is written.
 
     Args:
-        executor: what makes the runs; another machine may have a GPU where this one has none.
-        reused: ids of the cells whose finished run is there already, so that they need not be checked.
+        executor: the executor of the runs; runs on another machine may use a GPU that this one lacks.
+        reused: ids of cells whose finished run will be reused, which are not checked.
 
     Raises:
-        ValueError: for an invalid cell, with the cell and what is wrong with it.
+        ValueError: if a cell is invalid; the message has the cell and the reason.
     """
-    away = {} if executor in HERE else {"device": "cpu"}
+    device_override = {} if executor in LOCAL_EXECUTORS else {"device": "cpu"}
     cells = [cell for cell in plan.cells if cell.id not in reused]
-    found = refusals([cell.config | away for cell in cells])
-    bad = [(cell, reason) for cell, reason in zip(cells, found, strict=True) if reason]
-    if bad:
-        raise ValueError(_of_sweep(plan, *bad[0], len(bad)))
+    reasons = refusal_reasons([cell.config | device_override for cell in cells])
+    refused = [(cell, reason) for cell, reason in zip(cells, reasons, strict=True) if reason]
+    if refused:
+        raise ValueError(_refusal_message(plan, *refused[0], len(refused)))
 
 
-def _of_sweep(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
-    """One line on a sweep that is refused: its first invalid cell, why, and how many are invalid."""
+def _refusal_message(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
+    """The message for a refused sweep: its first invalid cell, the reason, and the number of invalid cells."""
     if count == len(plan.cells):
         return reason
-    where = " ".join(plan.differing(cell)) or cell.id
+    where = " ".join(plan.distinct_overrides(cell)) or cell.id
     others = f"; {count} of {len(plan.cells)} cells are invalid" if count > 1 else ""
     return f"cell {plan.cells.index(cell) + 1} of {len(plan.cells)} ({where}): {reason}{others}; nothing was run"
 
 
-def times(plan: Plan, reused: set[str]) -> dict[Any, list[float]]:
-    """The seconds of runs like those of a plan that took their whole time, by `kind`: of `LIKE` runs of each at most.
+def durations_of_similar_runs(plan: Plan, reused: set[str]) -> dict[Any, list[float]]:
+    """The seconds of finished runs that are similar to those of a plan, by `duration_group`.
 
-    A run's folder says whether it may be one of them; they are taken in the order of their hashes, as if by chance.
+    There are at most `MAX_SIMILAR_RUNS` per group. They are taken in the order of their hashes, which is as if random.
 
     Args:
         reused: ids of cells that will not run.
     """
-    known: dict[Any, list[float]] = {kind(vars(cell)): [] for cell in plan.cells if cell.id not in reused}
+    durations: dict[Any, list[float]] = {duration_group(vars(cell)): [] for cell in plan.cells if cell.id not in reused}
     folders = sorted(run_folders(plan.results_dir), key=lambda folder: folder.name.rpartition("-")[2])
-    for named in {like[:3] for like in known}:
-        kinds = [like for like in known if like[:3] == named]
-        for folder in islice((one for one in folders if _may_be(one.name, *named)), MOST * len(kinds)):
-            if all(len(known[like]) >= LIKE for like in kinds):
+    for names in {group[:3] for group in durations}:
+        groups = [group for group in durations if group[:3] == names]
+        candidates = (folder for folder in folders if _name_may_match(folder.name, *names))
+        for folder in islice(candidates, MAX_RECORDS_READ * len(groups)):
+            if all(len(durations[group]) >= MAX_SIMILAR_RUNS for group in groups):
                 break
             record, _ = read_run(folder, plan.results_dir)
-            if record is not None and kind(record) in kinds and (total := _whole_time(record)):
-                known[kind(record)].append(total)
-    return known
+            if record is not None and duration_group(record) in groups and (total := _full_duration(record)):
+                durations[duration_group(record)].append(total)
+    return durations
 
 
-def _may_be(folder: str, task: str, renderer: str, method: str) -> bool:
-    """Whether a run's folder may be of a task, renderer and method, by its name; see `Identity.name`."""
+def _name_may_match(folder: str, task: str, renderer: str, method: str) -> bool:
+    """Whether the name of a folder may be that of a run of a task, renderer and method; see `Identity.name`."""
     task, renderer, method = (name.replace("/", "_") for name in (task, renderer, method))
     return folder.startswith(f"{task}-{renderer}-") and (not method or f"-{method}-" in folder)
 
 
-def _whole_time(record: dict[str, Any]) -> float | None:
-    """The seconds of a run that took its whole time; None for others."""
+def _full_duration(record: dict[str, Any]) -> float | None:
+    """The seconds of a run, or None if it ended early."""
     total = record["seconds"].get("total")
-    measured = record["status"] not in UNMEASURED and isinstance(total, int | float) and 0 < total < float("inf")
-    return total if measured else None
+    is_finite = isinstance(total, int | float) and 0 < total < float("inf")
+    return total if is_finite and record["status"] not in STATUSES_WITHOUT_DURATION else None
 
 
-def kind(run: dict[str, Any]) -> Any:
-    """What runs that take about as long share: task, renderer, method and scale."""
+def duration_group(run: dict[str, Any]) -> Any:
+    """Task, renderer, method and scale: runs that share them take about the same time."""
     scale = run["config"].get("scale")
     name = str(scale.get("name")) if isinstance(scale, dict) else None
     return run["task"], run["renderer"], run.get("method", ""), name
 
 
 def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
-    """Prints a line for each cell, and one for the whole plan."""
-    known = times(plan, reused)
-    taken = {cell.id: known[kind(vars(cell))] for cell in plan.cells if cell.id not in reused}
+    """Prints a line for each cell, and one for all of them."""
+    durations = durations_of_similar_runs(plan, reused)
+    to_run = {cell.id: durations[duration_group(vars(cell))] for cell in plan.cells if cell.id not in reused}
     for number, cell in enumerate(plan.cells, 1):
         file = Path((cell.config["dataset"] or {}).get("path") or "").name
-        named = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {f'{cell.dataset} {file}'.strip()}"
-        about = "reused" if cell.id in reused else about_as_long(taken[cell.id])
-        print("  ".join(part for part in (f"{number:>4}", " ".join(plan.differing(cell)), named, about) if part))
-    parts = [f"{len(plan.cells)} planned: {len(taken)} to run"]
+        title = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {f'{cell.dataset} {file}'.strip()}"
+        estimate = "reused" if cell.id in reused else duration_estimate(to_run[cell.id])
+        parts = (f"{number:>4}", " ".join(plan.distinct_overrides(cell)), title, estimate)
+        print("  ".join(filter(None, parts)))
+    counts = [f"{len(plan.cells)} planned: {len(to_run)} to run"]
     if reused:
-        parts.append(f"{len(reused)} reused")
-    if unknown := sum(not like for like in taken.values()):
-        parts.append(f"{unknown} of unknown time (no run like them has finished here)")
-    text = ", ".join(parts) + ("" if taken else "; nothing is left to do")
-    if each := [median(like) for like in taken.values() if like]:
-        at_once = min(workers, len(taken))
-        text += f"; about {seconds(sum(each) / at_once)}, {at_once} at a time"
+        counts.append(f"{len(reused)} reused")
+    if unknown := sum(not group for group in to_run.values()):
+        counts.append(f"{unknown} of unknown time (no run like them has finished here)")
+    text = ", ".join(counts) + ("" if to_run else "; nothing is left to do")
+    if medians := [median(group) for group in to_run.values() if group]:
+        concurrency = min(workers, len(to_run))
+        text += f"; about {seconds(sum(medians) / concurrency)}, {concurrency} at a time"
         text += f", without the {unknown} of unknown time" if unknown else ""
         text += "; the training of a missing prior is not counted"
     print(text)
 
 
-def about_as_long(like: list[float]) -> str:
-    """What a run will take, in words, by what runs like it took."""
-    if not like:
+def duration_estimate(durations: list[float]) -> str:
+    """The estimated duration of a run in words, from the durations of similar runs."""
+    if not durations:
         return "time unknown"
-    return f"about {seconds(median(like))} (median of {plural(len(like), 'finished run')})"
+    return f"about {seconds(median(durations))} (median of {plural(len(durations), 'finished run')})"

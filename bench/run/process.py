@@ -1,4 +1,4 @@
-"""The process of a run, seen from its parent: its limits, how it ends, and signals."""
+"""The process of a run, on the side of its parent: limits, exit and signals."""
 
 import multiprocessing
 import os
@@ -21,18 +21,18 @@ import psutil
 import bench.tasks
 import datasets
 from bench.records.record import RunStatus
-from bench.run.job import Ended, Job, Message, Started, Step
+from bench.run.job import FinalRecordSent, Job, Message, Started, Step
 
-INTERVAL = 0.05  # seconds between two checks of clock and memory
-GRACE = 0.5  # seconds that a child has to send its record after SIGTERM
-BOOT = 120.0  # seconds in which a child must be ready; a cold disk is slow
+POLL_INTERVAL_SECONDS = 0.05
+TERMINATION_GRACE_SECONDS = 0.5  # for a child to send its record after SIGTERM
+STARTUP_TIMEOUT_SECONDS = 120.0  # long, because a cold disk is slow
 GIB = 2**30
-# Signals that come from outside: from a user, a batch system, or the operating system where memory runs out.
-EXTERNAL = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
-# Signals are noted as well as raised: an interrupted library may swallow or replace the exception.
-_stopped = ""  # by which signal, in words
+# Signals from outside: from a user, a batch system, or the operating system when memory runs out.
+EXTERNAL_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+# A signal is also stored, because an interrupted library may swallow or replace the exception.
+_stopped = ""  # the signal that stopped this command, in words
 _delayed = False  # within `signals_delayed`
-_early = False  # whether this command has started the server before it knew that it would need it
+_server_started_early = False  # before the command line was read
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class RunLimits:
     """Limits on a run's time and memory.
 
     Args:
-        seconds: wall-clock time from when the child process is ready; None for no limit.
+        seconds: wall-clock time after the child process is ready; None for no limit.
         memory: resident memory of the process in GiB; None for nine tenths of the machine's.
     """
 
@@ -53,63 +53,63 @@ class RunLimits:
 
 
 @dataclass(frozen=True)
-class Ending:
-    """How a child ended that did not report it itself."""
+class AbnormalExit:
+    """The status and reason of a child that ended without a final record."""
 
     status: RunStatus
     reason: str
 
 
-def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> Ending | None:
+def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> AbnormalExit | None:
     """Runs a job in a child process, and passes every message of the child to `receive` as it arrives.
 
     Returns:
-        None where the child finished and sent its final record; else how it ended.
+        None if the child sent its final record, else how it ended.
     """
     context = warm_up()
-    channel, childs = context.Pipe()
-    alive, ours = context.Pipe(duplex=False)  # closes when this process ends in any way, which the child notices
-    process = context.Process(target=_enter, args=(job, childs, alive))
-    with channel, ours:
+    channel, child_channel = context.Pipe()
+    child_lifeline, lifeline = context.Pipe(duplex=False)  # closes whenever this process ends, and the child notices
+    process = context.Process(target=_run_job, args=(job, child_channel, child_lifeline))
+    with channel, lifeline:
         try:
-            with signals_delayed():  # a request that breaks off would end the fork server
+            with signals_delayed():  # an interrupted request would end the fork server
                 process.start()
-                childs.close()
-                alive.close()
-            ending = _watch(process, channel, limits, receive)
-            process.join(GRACE if ending is None else 0.0)
-            return ending
+                child_channel.close()
+                child_lifeline.close()
+            failure = _watch(process, channel, limits, receive)
+            process.join(TERMINATION_GRACE_SECONDS if failure is None else 0.0)
+            return failure
         finally:
             if process.pid is not None:
-                _end(process, channel, receive)
+                _terminate(process, channel, receive)
 
 
-def preloaded() -> list[str]:
-    """Modules that runs import and that are slow to import; bench first, as it sets what torch reads at its import."""
+def preloaded_modules() -> list[str]:
+    """Slow modules that runs import; bench first, because it sets variables that torch reads at its import."""
     packages = bench.tasks, datasets
-    named = [module.name for one in packages for module in iter_modules(one.__path__, f"{one.__name__}.")]
-    return ["bench", "open3d", "bench.run.execute", *named]
+    names = [module.name for package in packages for module in iter_modules(package.__path__, f"{package.__name__}.")]
+    return ["bench", "open3d", "bench.run.execute", *names]
 
 
 def fork_server() -> ForkServerContext:
-    """The context of processes that branch off from a server, which has imported what is slow, once for all of them."""
+    """The context of processes that are forked from a server, which has imported the slow modules once for all."""
     if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
-        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set one that children lack
+        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set another one
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(preloaded())
+    context.set_forkserver_preload(preloaded_modules())
     return context
 
 
 def warm_up() -> ForkServerContext:
-    """Starts the server of processes, which loads what is slow while this process does something else.
+    """Starts the fork server, which imports the slow modules while this process does something else.
 
-    The server and its children never get Ctrl-C: their parent does, and ends them.
+    The server and its children never receive Ctrl-C: their parent does, and ends them.
     """
     context = fork_server()
-    resource_tracker.ensure_running()  # the server would start it, and it unblocks the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # which a new process inherits
+    resource_tracker.ensure_running()  # here, because it unblocks the signal that is blocked below
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a new process inherits the mask
     try:
-        with signals_delayed():  # a request that breaks off would end the server
+        with signals_delayed():  # an interrupted request would end the server
             forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -117,37 +117,37 @@ def warm_up() -> ForkServerContext:
 
 
 def start_early(arguments: Sequence[str]) -> None:
-    """Starts the server before the command line is read, where it seems to ask for runs in processes of their own.
+    """Starts the server before the command line is read, if the arguments seem to ask for runs in new processes.
 
-    Where it sets anything of Hydra's, which may set variables of the environment, the server starts after these.
+    If an argument sets a key of Hydra, the server starts later, because Hydra may set environment variables.
     """
-    global _early
-    plain = all(argument in ("-m", "--multirun") or argument[:1] != "-" for argument in arguments)
-    other = {"help", "list", "isolation=off"} & {*arguments}
-    if plain and not other and not any("hydra" in argument for argument in arguments):
-        _early = True
+    global _server_started_early
+    has_known_options = all(argument in ("-m", "--multirun") or argument[:1] != "-" for argument in arguments)
+    other_commands = {"help", "list", "isolation=off"} & {*arguments}
+    if has_known_options and not other_commands and not any("hydra" in argument for argument in arguments):
+        _server_started_early = True
         warm_up()
 
 
-def leave_server() -> None:
-    """Ends the server of a command that is refused, if it was started early: it would go on to load what is slow."""
-    number = getattr(forkserver._forkserver, "_forkserver_pid", None)
-    if _early and number is not None:
+def stop_early_server() -> None:
+    """Ends the early started server of a refused command, which would continue to import slow modules."""
+    server_id = getattr(forkserver._forkserver, "_forkserver_pid", None)
+    if _server_started_early and server_id is not None:
         with suppress(ProcessLookupError):
-            os.kill(number, signal.SIGKILL)
+            os.kill(server_id, signal.SIGKILL)
 
 
-def in_child(work: Callable[[Any], Any], argument: Any) -> Any:
-    """What `work` gives for an argument, in a process that branches off from the server; None where that one dies."""
+def run_in_child(work: Callable[[Any], Any], argument: Any) -> Any:
+    """Returns `work(argument)`, computed in a child process forked from the server; None if the child dies."""
     context = warm_up()
-    answers, answer = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(work, argument, answer))
-    with answers:
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send_result, args=(work, argument, sender))
+    with receiver:
         try:
             with signals_delayed():
                 process.start()
-                answer.close()
-            return answers.recv()
+                sender.close()
+            return receiver.recv()
         except (EOFError, ConnectionError):
             return None
         finally:
@@ -156,85 +156,86 @@ def in_child(work: Callable[[Any], Any], argument: Any) -> Any:
                 process.join()
 
 
-def _work(work: Callable[[Any], Any], argument: Any, answer: Connection) -> None:
-    answer.send(work(argument))
+def _send_result(work: Callable[[Any], Any], argument: Any, sender: Connection) -> None:
+    sender.send(work(argument))
 
 
-def _enter(job: Job, channel: Connection, parent: Connection) -> None:
-    for module in preloaded():  # what the server has left out, before `Started`: off the run's clocks
+def _run_job(job: Job, channel: Connection, lifeline: Connection) -> None:
+    for module in preloaded_modules():  # before `Started`, so that the run's time excludes it
         with suppress(ImportError):
             import_module(module)
     from bench.run.execute import main
 
-    main(job, channel, parent)
+    main(job, channel, lifeline)
 
 
 def _watch(
     process: BaseProcess, channel: Connection, limits: RunLimits, receive: Callable[[Message], None]
-) -> Ending | None:
-    begun, ready, most = time.perf_counter(), False, limits.bytes
-    when = "while setting up"  # until the first step is reported
+) -> AbnormalExit | None:
+    start, is_ready, max_bytes = time.perf_counter(), False, limits.bytes
+    phase = "while setting up"  # until the first step is reported
     with suppress(psutil.NoSuchProcess):
         memory = psutil.Process(process.pid)
     while True:
         raise_if_stopped()
-        wait([channel, process.sentinel], timeout=INTERVAL)
-        alive = process.is_alive()  # before the messages are read, so that none can arrive after the last read
+        wait([channel, process.sentinel], timeout=POLL_INTERVAL_SECONDS)
+        is_alive = process.is_alive()  # before the messages are read, so that none arrives after the last read
         while channel.poll():
             try:
-                with signals_delayed():  # what is left of a message would be taken for the next one
+                with signals_delayed():  # the rest of an interrupted message would be read as the next one
                     message = channel.recv()
             except (EOFError, OSError):
-                return _died(process)
-            if isinstance(message, Ended):
+                return _exit_reason(process)
+            if isinstance(message, FinalRecordSent):
                 return None
             if isinstance(message, Started):
-                begun, ready = time.perf_counter(), True
+                start, is_ready = time.perf_counter(), True
             elif isinstance(message, Step):
-                when = message.when
+                phase = message.phase_text
             receive(message)
-        if not alive:
-            return _died(process)
-        spent = time.perf_counter() - begun
-        if ready and limits.seconds is not None and spent > limits.seconds:
-            return Ending(RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {when}")
-        if not ready and spent > BOOT:
-            return Ending(RunStatus.CRASHED, f"its process was not ready within {BOOT:g} s")
+        if not is_alive:
+            return _exit_reason(process)
+        spent = time.perf_counter() - start
+        if is_ready and limits.seconds is not None and spent > limits.seconds:
+            return AbnormalExit(RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {phase}")
+        if not is_ready and spent > STARTUP_TIMEOUT_SECONDS:
+            return AbnormalExit(RunStatus.CRASHED, f"its process was not ready within {STARTUP_TIMEOUT_SECONDS:g} s")
         with suppress(psutil.NoSuchProcess):
-            if memory.memory_info().rss > most:
+            if memory.memory_info().rss > max_bytes:
                 process.kill()  # at once, before the machine runs out of memory
-                return Ending(RunStatus.OOM, f"more than {most / GIB:.3g} GiB of memory (memory_limit), {when}")
+                reason = f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {phase}"
+                return AbnormalExit(RunStatus.OOM, reason)
 
 
-def _end(process: BaseProcess, channel: Connection, receive: Callable[[Message], None]) -> None:
+def _terminate(process: BaseProcess, channel: Connection, receive: Callable[[Message], None]) -> None:
     """Sends the child SIGTERM, receives its last messages, and ends it."""
     if process.is_alive():
         process.terminate()
-    latest = time.perf_counter() + GRACE
+    deadline = time.perf_counter() + TERMINATION_GRACE_SECONDS
     with suppress(EOFError, OSError):
-        while (left := latest - time.perf_counter()) > 0 and channel.poll(left):
+        while (left := deadline - time.perf_counter()) > 0 and channel.poll(left):
             receive(channel.recv())
-    process.join(max(latest - time.perf_counter(), 0.0))
+    process.join(max(deadline - time.perf_counter(), 0.0))
     if process.is_alive():
         process.kill()
     process.join()
     process.close()
 
 
-def _died(process: BaseProcess) -> Ending:
+def _exit_reason(process: BaseProcess) -> AbnormalExit:
     process.join()
     code = process.exitcode or 0
     if code >= 0:
-        return Ending(RunStatus.CRASHED, f"its process ended by itself, with exit status {code}")
+        return AbnormalExit(RunStatus.CRASHED, f"its process ended by itself, with exit status {code}")
     name = signal.Signals(-code).name
-    if -code in EXTERNAL:
+    if -code in EXTERNAL_SIGNALS:
         hint = "; the operating system does that where memory runs out" if -code == signal.SIGKILL else ""
-        return Ending(RunStatus.KILLED, f"its process was ended by {name}{hint}")
-    return Ending(RunStatus.CRASHED, f"its process died of {name} in native code")
+        return AbnormalExit(RunStatus.KILLED, f"its process was ended by {name}{hint}")
+    return AbnormalExit(RunStatus.CRASHED, f"its process died of {name} in native code")
 
 
 def machine_memory() -> int:
-    """Bytes of memory that all processes may use together: the machine's, or a lower limit of its container."""
+    """Bytes of memory that all processes may use together: that of the machine, or a lower limit of its container."""
     total = psutil.virtual_memory().total
     for path in (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes")):
         with suppress(OSError, ValueError):
@@ -243,7 +244,7 @@ def machine_memory() -> int:
 
 
 def catch_signals() -> None:
-    """From now on Ctrl-C and SIGTERM raise KeyboardInterrupt, which says which of them it was."""
+    """From now on, Ctrl-C and SIGTERM raise KeyboardInterrupt with the name of the signal."""
     signal.signal(signal.SIGTERM, _stop)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background jobs ignore it
         signal.signal(signal.SIGINT, _stop)
@@ -257,7 +258,7 @@ def _stop(number: int, frame: object) -> None:
 
 
 def stopped_by(error: BaseException) -> str:
-    """The signal, in words, of which an error is the outcome; empty where it has another cause."""
+    """The signal, in words, that caused an error; empty if it has another cause."""
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "stopped by Ctrl-C"
     return _stopped
@@ -283,6 +284,6 @@ def forget_signals() -> None:
 
 
 def raise_if_stopped() -> None:
-    """Raises KeyboardInterrupt after a signal, also where nothing came of the first one."""
+    """Raises KeyboardInterrupt after a signal, also if the first exception was lost."""
     if _stopped:
         raise KeyboardInterrupt(_stopped)

@@ -1,4 +1,4 @@
-"""One run: claims its folder, runs it in a child process, and always writes its record."""
+"""One run: locks its folder, runs in a child process, and always writes its record."""
 
 import shutil
 import sys
@@ -12,16 +12,16 @@ from omegaconf import OmegaConf
 
 from bench.config import Isolation, build
 from bench.progress import Report, notice, run_progress
-from bench.records.folder import Identity, claimed, release, reusable
+from bench.records.folder import Identity, free_reserve, locked_folder, reusable_record
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.run.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, unwritten
-from bench.run.plan import planned, refusals, show_plan
+from bench.run.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, write_error_message
+from bench.run.plan import planned_cell, refusal_reasons, show_plan
 from bench.run.process import RunLimits, run_isolated, signals_delayed, stopped_by
-from bench.run.summary import show, write_log
+from bench.run.summary import print_run_summary, write_log
 from bench.trackers import Nothing, Tracker
 
-LAST_LINES, LAST_BYTES = 80, 16_384  # most of the log that the record of a failed run keeps
+LOG_TAIL_LINES, LOG_TAIL_BYTES = 80, 16_384  # limits of the log in the record of a failed run
 
 
 class RunInterrupted(Interrupted):
@@ -33,12 +33,12 @@ class RunInterrupted(Interrupted):
 
 
 def run_one(identity: Identity) -> str:
-    """Makes the run that a command describes, prints its summary and gives its status; with plan=true lists it alone.
+    """Makes a single run, prints its summary and returns its status; with plan=true only lists it.
 
     Raises:
         RunInterrupted: after Ctrl-C or SIGTERM.
-        ValueError: where the configuration cannot be run; its folder is removed.
-        OSError: where the results folder cannot be written.
+        ValueError: if the configuration cannot be run; its folder is removed.
+        OSError: if the results folder cannot be written.
     """
     config = identity.config
     if config["plan"] or config["isolation"] == Isolation.process:
@@ -48,7 +48,7 @@ def run_one(identity: Identity) -> str:
     try:
         folder, record = run(identity)
     except RunInterrupted as error:
-        show(error.folder, error.record)
+        print_run_summary(error.folder, error.record)
         raise
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), error.filename or config["results_dir"]) from error
@@ -56,12 +56,12 @@ def run_one(identity: Identity) -> str:
     if record.status == RunStatus.REFUSED:
         shutil.rmtree(folder)
         raise ValueError(record.reason)
-    show(folder, record)
+    print_run_summary(folder, record)
     return record.status
 
 
 def run_cell(identity: Identity) -> list[str]:
-    """Makes the run of a sweep's cell, or reuses it; gives a message where it has no record.
+    """Makes the run of a sweep's cell, or reuses it; returns a message if it has no record.
 
     Raises:
         RunInterrupted: after Ctrl-C or SIGTERM.
@@ -69,7 +69,7 @@ def run_cell(identity: Identity) -> list[str]:
     try:
         _print_log(run(identity)[1])
     except OSError as error:
-        return [unwritten(error, identity.config["results_dir"])]
+        return [write_error_message(error, identity.config["results_dir"])]
     except ValueError as error:
         return [str(error)]
     return []
@@ -82,75 +82,75 @@ def _print_log(record: Record) -> None:
 
 
 def _check(identity: Identity) -> None:
-    """Checks a run that is not there yet, before it has a folder; with plan=true, says what it will take.
+    """Checks a run that is not reused, before it has a folder; with plan=true, prints its estimated duration.
 
     Raises:
-        ValueError: where it would be refused.
+        ValueError: if it would be refused.
     """
     config = identity.config
     results_dir = Path(config["results_dir"])
-    reused = reusable(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
-    if not reused and (reason := refusals([config])[0]):
+    reused = reusable_record(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
+    if not reused and (reason := refusal_reasons([config])[0]):
         raise ValueError(reason)
     if config["plan"]:
-        cell = planned(identity)
+        cell = planned_cell(identity)
         show_plan(Plan("", results_dir, [cell]), {cell.id} if reused else set(), 1)
 
 
 def run(identity: Identity) -> tuple[Path, Record]:
-    """Makes a run in its folder, or reuses the finished run there; gives the folder and the record.
+    """Makes a run in its folder, or reuses the finished run there; returns the folder and the record.
 
     Raises:
-        OSError: where the results folder cannot be written.
+        OSError: if the results folder cannot be written.
         RunInterrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
     config = identity.config
-    with claimed(Path(config["results_dir"]), identity, config["rerun"]) as (folder, finished):
+    with locked_folder(Path(config["results_dir"]), identity, config["rerun"]) as (folder, finished):
         if finished is not None:
             return folder, _reuse(folder, finished)
         hashes = {"config_hash": identity.config_hash, "code": identity.code}
-        known = {"seed": config["seed"], "config": config, "overrides": identity.overrides}
-        return folder, _run_anew(Job(folder, Record(identity.name, **identity.choices, **known, **hashes)))
+        settings = {"seed": config["seed"], "config": config, "overrides": identity.overrides}
+        return folder, _start_run(Job(folder, Record(identity.name, **identity.choices, **settings, **hashes)))
 
 
 def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
-    """The record of a finished run, with its times, marked as reused."""
+    """The record of a finished run with its original times, marked as reused."""
     record = Record.of(finished)
     record.reused, record.asked = True, now()
-    with suppress(OSError):  # a folder that can only be read is enough
+    with suppress(OSError):  # a read-only folder is enough
         record.write(folder)
     return record
 
 
-def _run_anew(job: Job) -> Record:
-    """Does a job; its record says that it is under way, and at the end how it ended."""
+def _start_run(job: Job) -> Record:
+    """Runs a job; the record has the status killed until the end, then the final status."""
     folder, record = job.folder, job.record
     started, stopped, tracker = time.perf_counter(), "", None
 
-    def ready() -> None:
+    def restart_clock() -> None:
         nonlocal started
         started = time.perf_counter()
 
     try:
-        record.write(folder)  # in here, since a signal may come just after it
+        record.write(folder)  # inside the try, because a signal may follow immediately
         config = record.config
         limits = RunLimits(config["time_limit"], config["memory_limit"])
         tracker = build(config["tracker"], "tracker", config["packages"])
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
         with run_progress(record.name) as progress:
-            _carry_out(job, limits, progress, ready)
-    except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness: a full disk, an invalid limit
+            _run_job(job, limits, progress, restart_clock)
+    except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness, such as a full disk
         stopped = stopped_by(error)
         record.status, record.reason = RunStatus.CRASHED, reason_of(error, folder)
         if stopped:
             record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
     finally:
-        with signals_delayed():  # one that comes now must not lose the record
+        with signals_delayed():  # a signal now must not lose the record
             record.seconds["total"] = time.perf_counter() - started
             record.ended = now()
             if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
-                record.log = _last_lines(folder / "log.txt")
-            release(folder)
+                record.log = _log_tail(folder / "log.txt")
+            free_reserve(folder)
             record.write(folder)
             write_log(folder, record)
     if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:
@@ -160,47 +160,47 @@ def _run_anew(job: Job) -> Record:
     return record
 
 
-def _carry_out(job: Job, limits: RunLimits, progress: Report, ready: Callable[[], None]) -> None:
-    """Does the job in a child process or, for debugging, in this one, and fills its record with what is known.
+def _run_job(job: Job, limits: RunLimits, progress: Report, on_ready: Callable[[], None]) -> None:
+    """Runs the job in a child process or, for debugging, in this one, and fills its record.
 
     Args:
-        ready: is called when the child has imported what it needs.
+        on_ready: called when the child has imported its modules.
     """
     if job.record.config["isolation"] == Isolation.off:
-        from bench.run.execute import execute  # it imports torch, which a launcher's worker does without
+        from bench.run.execute import execute  # imports torch, which a launcher's worker does not need
 
         execute(job, progress=progress, checkpoint=lambda record: record.write(job.folder))
         return
 
     def receive(message: Message) -> None:
         if isinstance(message, Started):
-            ready()
+            on_ready()
         elif isinstance(message, Record):
             vars(job.record).update(vars(message))
             job.record.write(job.folder)
         elif isinstance(message, Step):
-            progress(message.phase, message.done, message.total, message.loss)
+            progress(message.phase, message.finished, message.total, message.loss)
         elif isinstance(message, Notice):
             notice(message.text)
 
-    ending = run_isolated(job, limits, receive)
-    if ending is not None:
-        job.record.status, job.record.reason = ending.status, ending.reason
+    failure = run_isolated(job, limits, receive)
+    if failure is not None:
+        job.record.status, job.record.reason = failure.status, failure.reason
 
 
 def _export(tracker: Tracker, folder: Path, record: Record) -> None:
     """Exports a finished run; a failure becomes a note in the record."""
     try:
         tracker.export(folder, read_record(folder))
-    except Exception as error:  # noqa: BLE001 - an error of a server, a database, another library
+    except Exception as error:  # noqa: BLE001 - of a server, a database or another library
         record.notes = [*record.notes, f"not exported to the tracker: {' '.join(str(error).split())}"]
         record.write(folder)
 
 
-def _last_lines(path: Path) -> list[str]:
+def _log_tail(path: Path) -> list[str]:
     try:
         with path.open("rb") as file:
-            file.seek(max(path.stat().st_size - LAST_BYTES, 0))
-            return file.read(LAST_BYTES).decode("utf-8", "replace").splitlines()[-LAST_LINES:]
+            file.seek(max(path.stat().st_size - LOG_TAIL_BYTES, 0))
+            return file.read(LOG_TAIL_BYTES).decode("utf-8", "replace").splitlines()[-LOG_TAIL_LINES:]
     except OSError:
         return []

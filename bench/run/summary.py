@@ -1,4 +1,4 @@
-"""The summary of a run or a sweep at its end: printed, and that of a run in its log."""
+"""The printed summary of a finished run or sweep, and the summary of a run in its log."""
 
 import shlex
 from collections import Counter
@@ -13,34 +13,30 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.records.format import count, number, plural, seconds
-from bench.records.metrics import SHOWN, Metric
+from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.read import RESULTS, Plan
-from bench.records.record import NOT_RUN, PICTURES, Record, RunStatus
+from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus
 
-CUSTOM = "custom"  # the choice of renderer that is a class of the user's own
-CONTRACT = "python -m pytest tests/renderers/test_renderer_contract.py -k custom --renderer="  # as in CONTRIBUTING.md
+CUSTOM_RENDERER = "custom"  # the choice of renderer for a class of the user
+# See CONTRIBUTING.md.
+CONTRACT_TEST = "python -m pytest tests/renderers/test_renderer_contract.py -k custom --renderer="
 
 
-def show(folder: Path, record: Record) -> None:
-    """Prints the outcome of a run; the last line on standard output is its folder."""
+def print_run_summary(folder: Path, record: Record) -> None:
+    """Prints the results of a run; the last line on standard output is its folder."""
     console = Console(highlight=False)
-    table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
-    for heading in ("", "before", "after", "better"):
-        table.add_column(heading, justify="left" if heading in ("", "better") else "right")
-    for row in _compared(record):
-        table.add_row(*row)
-    if table.row_count:
-        console.print(table)
+    if rows := [*_compared_metrics(record)]:
+        console.print(_table(record.title, ("", "before", "after", "better"), rows))
     elif record.metrics:
-        console.print(_table(record))
+        console.print(_table(record.title, ("", "measured"), [*_measured_metrics(record)]))
     if "iterations" in record.evaluations:
-        console.print(_costs(record))
+        console.print(_cost_line(record))
     for note in record.notes:
         print(f"note: {note}")
-    for picture in [path for name in PICTURES if (path := folder / name).is_file()][:1]:
+    for picture in [path for name in PICTURE_FILES if (path := folder / name).is_file()][:1]:
         print(f"picture: {picture}")
-    _print_contract(folder.parent, [] if record.reused else [vars(record)])
-    _print_next(folder.parents[1])
+    _print_contract_test(folder.parent, [] if record.reused else [vars(record)])
+    _print_report_command(folder.parents[1])
     if record.reused:
         print(f"reused: the run of {record.started}; rerun=all runs it again")
     if record.status != RunStatus.OK and not record.reason.startswith("stopped by"):  # the command line prints that
@@ -48,52 +44,52 @@ def show(folder: Path, record: Record) -> None:
     print(folder)
 
 
-def show_sweep(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
-    """Prints the outcome of a sweep, the plan's folder last, and gives the status of every planned cell.
+def print_sweep_summary(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
+    """Prints the results of a sweep, with the plan's folder last; returns the status of every planned cell.
 
     Args:
-        table: that of the sweep, if it has one of its own.
+        table: the file of the sweep's table, if it has one.
     """
     statuses = [record["status"] if (record := plan.record(cell)) else NOT_RUN for cell in plan.cells]
     counts = ", ".join(f"{count} {status}" for status, count in Counter(statuses).most_common())
     print(f"{len(plan.cells)} planned: {counts}")
     if set(statuses) - {"ok", "unsupported"}:
         print("the same command runs what was not run or was killed; with rerun=failed, also the cells that failed")
-    failed = [(cell, record) for cell in plan.cells if (record := plan.record(cell)) and record["status"] != "ok"]
-    for cell, record in failed[:1]:
+    failures = [(cell, record) for cell in plan.cells if (record := plan.record(cell)) and record["status"] != "ok"]
+    for cell, record in failures[:1]:
         print(f"first failure: {index.parent / 'runs' / cell.id} ({record['status']}: {record['reason']})")
     if table is not None:
         print(f"table of this sweep: {table}")
     print(f"report: {index}")
     records = [record for cell in plan.cells if (record := plan.record(cell)) and not record["reused"]]
-    _print_contract(index.parent / "runs", records)
-    _print_next(index.parent)
+    _print_contract_test(index.parent / "runs", records)
+    _print_report_command(index.parent)
     print(plan.folder)
     return statuses
 
 
-def _print_contract(runs: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Prints the command of the contract test, where the first runs of `renderer=custom` are among these new ones."""
-    first = {record["id"]: record["config"] for record in records if record["renderer"] == CUSTOM}
-    if first and {path.parent.name for path in runs.glob(f"*-{CUSTOM}-*/record.json")} <= {*first}:
-        target = next(iter(first.values()))["renderer"]["_target_"]
-        print(f"does the renderer hold its contract? in a clone: {CONTRACT}{shlex.quote(target)}")
+def _print_contract_test(runs: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """Prints the command of the contract test, if the results folder had no runs of `renderer=custom` before."""
+    new_runs = {record["id"]: record["config"] for record in records if record["renderer"] == CUSTOM_RENDERER}
+    if new_runs and {path.parent.name for path in runs.glob(f"*-{CUSTOM_RENDERER}-*/record.json")} <= {*new_runs}:
+        target = next(iter(new_runs.values()))["renderer"]["_target_"]
+        print(f"does the renderer hold its contract? in a clone: {CONTRACT_TEST}{shlex.quote(target)}")
 
 
-def _print_next(results_dir: Path) -> None:
-    """Prints the command that makes the page and the tables."""
-    where = "" if results_dir == Path(RESULTS) else f" results_dir={shlex.quote(str(results_dir))}"
-    print(f"page and tables: python -m bench.report{where}")
+def _print_report_command(results_dir: Path) -> None:
+    """Prints the command that writes the page and the tables."""
+    option = "" if results_dir == Path(RESULTS) else f" results_dir={shlex.quote(str(results_dir))}"
+    print(f"page and tables: python -m bench.report{option}")
 
 
 def write_log(folder: Path, record: Record) -> None:
-    """Adds the command, the machine and the results of a run to its `log.txt`; on a full disk they are left out."""
+    """Appends the command, the machine and the results of a run to its `log.txt`, unless the disk is full."""
     with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
-        log.writelines(f"{line}\n" for line in _logged(record))
+        log.writelines(f"{line}\n" for line in _log_lines(record))
 
 
-def _logged(record: Record) -> Iterator[str]:
-    """The command, the machine, the errors before and after, the times, the notes and the status, line by line."""
+def _log_lines(record: Record) -> Iterator[str]:
+    """Lines on the command, the machine, the errors before and after, the times, the notes and the status."""
     machine = record.environment
     yield record.title
     yield f"command: {shlex.join(('python', '-m', 'bench', *record.overrides))}"
@@ -102,45 +98,44 @@ def _logged(record: Record) -> Iterator[str]:
             f"machine: {machine['cpu']}; device {machine['device']}; {plural(machine['threads'], 'thread')}; "
             f"torch {machine['torch']}; kernels {machine['kernels']}"
         )
-    compared = list(_compared(record))
+    compared = list(_compared_metrics(record))
     yield from (f"{label}: {before} before, {after} after" for label, before, after, _ in compared)
     if not compared:
-        yield from (f"{label}: {value}" for label, value in _measured(record))
+        yield from (f"{label}: {value}" for label, value in _measured_metrics(record))
     if "iterations" in record.evaluations:
-        yield _costs(record)
+        yield _cost_line(record)
     yield f"started {record.started}, ended {record.ended}, {seconds(record.seconds['total'])} in all"
     yield from (f"note: {note}" for note in record.notes)
     yield f"status: {record.status}{f' ({record.reason})' if record.reason else ''}"
 
 
-def _compared(record: Record) -> Iterator[tuple[str, str, str, str]]:
-    """The errors of a task that optimises: heading, before, after, and which direction is better."""
-    for name, metric in SHOWN.items():
+def _compared_metrics(record: Record) -> Iterator[tuple[str, str, str, str]]:
+    """The metrics of a task that optimises: heading, before, after, and which direction is better."""
+    for name, metric in TABLE_METRICS.items():
         if record.metrics_start and name in {*record.metrics_start, *record.metrics}:
             before, after = record.metrics_start.get(name), record.metrics.get(name)
             yield metric.label, number(before, metric.factor), number(after, metric.factor), metric.better
 
 
-def _measured(record: Record) -> Iterator[tuple[str, str]]:
-    """The metrics of a task that measures without optimising; of one that recommends a field, what it recommends."""
+def _measured_metrics(record: Record) -> Iterator[tuple[str, str]]:
+    """The metrics of a task that measures without optimising; if it recommends a field, only the recommendation."""
     recommended = [name for name in record.metrics if name.startswith("recommended")]
     for name in recommended or record.metrics:
-        metric = SHOWN.get(name, Metric(name))
+        metric = TABLE_METRICS.get(name, Metric(name))
         yield metric.label, number(record.metrics[name], metric.factor)
 
 
-def _table(record: Record) -> Table:
-    """The table of what a run measured."""
-    table = Table(box=box.SIMPLE_HEAD, title=escape(record.title))
-    table.add_column("")
-    table.add_column("measured", justify="right")
-    for row in _measured(record):
+def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, title=escape(title))
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in ("", "better") else "right")
+    for row in rows:
         table.add_row(*row)
     return table
 
 
-def _costs(record: Record) -> str:
-    """The time and the field evaluations of an optimisation."""
+def _cost_line(record: Record) -> str:
+    """A line on the time and the field evaluations of an optimisation."""
     loop, spent = record.seconds["forward"] + record.seconds["backward"], record.evaluations
     return (
         f"{seconds(loop)} in the loop, {seconds(record.seconds['total'])} in all; field evaluations: "

@@ -1,4 +1,4 @@
-"""A sweep: its cells are composed, checked, planned, made by an executor, and followed by a line as each ends."""
+"""A sweep: composes, checks and plans its cells, runs them by an executor, and prints a line as each ends."""
 
 import threading
 import time
@@ -15,104 +15,103 @@ from bench.config import Isolation
 from bench.progress import display, notice
 from bench.records.folder import Identity
 from bench.records.format import number, plural, seconds
-from bench.records.metrics import SHOWN, Metric
+from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.read import Plan
 from bench.records.record import RunStatus, row_name
 from bench.run.compose import Composer
 from bench.run.executors import Launcher, execute
 from bench.run.job import Interrupted, reason_of
-from bench.run.jobs import check_jobs, in_words, packed
-from bench.run.plan import check_plan, identity_of, is_reused, plan_of, planned, show_plan
+from bench.run.jobs import check_jobs, describe_jobs, split_into_jobs
+from bench.run.plan import check_plan, identity_of, is_reused, plan_of, planned_cell, show_plan
 from bench.run.process import stopped_by, warm_up
 from bench.run.run import run_cell
 
-IN_LINE = {  # metrics in the line of a cell
+CELL_LINE_METRICS = {
     "recommended_field": Metric("recommended"),
-    **{name: SHOWN[name] for name in ("chamfer_l2", "rotation_error_deg")},
+    **{name: TABLE_METRICS[name] for name in ("chamfer_l2", "rotation_error_deg")},
 }
-INTERVAL = 0.5  # seconds between two checks of which cells have ended
+FOLLOW_INTERVAL_SECONDS = 0.5
 
 
 class LauncherStopped(RuntimeError):
-    """An executor cannot go on: a cluster that is not there, a process that is lost."""
+    """An executor cannot go on, because a cluster is missing or a process is lost."""
 
 
 @dataclass(frozen=True)
-class Once:
-    """Makes the run of a cell that has not ended since its sweep was planned: a job that is requeued goes on so."""
+class RunOnce:
+    """Runs a cell unless it has ended since its sweep was planned, so that a requeued job continues."""
 
     plan: Plan
 
     def __call__(self, identity: Identity) -> list[str]:
-        """Gives a message where it leaves no record."""
-        record = self.plan.record(planned(identity))
+        """Returns a message if the cell has no record."""
+        record = self.plan.record(planned_cell(identity))
         return run_cell(identity) if record is None or record["status"] == RunStatus.KILLED else []
 
 
 def run_sweep(composer: Composer, config: DictConfig, summarise: Callable[[Plan], list[str]]) -> list[str]:
-    """Makes the runs of a sweep, and gives their statuses; with plan=true lists them.
+    """Makes the runs of a sweep and returns their statuses; with plan=true only lists them.
 
     Args:
-        config: what all cells share; see `Composer.whole`.
-        summarise: writes and prints what a plan came to, also after a signal; gives the statuses.
+        config: the configuration that all cells share; see `Composer.shared_config`.
+        summarise: writes and prints the summary of a plan, also after a signal; returns the statuses.
 
     Raises:
-        Interrupted, KeyboardInterrupt: after Ctrl-C or SIGTERM, the first where runs had begun.
-        ValueError: for a sweep that cannot be.
-        OSError: where the results folder cannot be written.
-        LauncherStopped: where the executor cannot go on.
+        Interrupted: after Ctrl-C or SIGTERM, if runs have started, else KeyboardInterrupt.
+        ValueError: if the sweep is invalid.
+        OSError: if the results folder cannot be written.
+        LauncherStopped: if the executor cannot go on.
     """
     swept, launcher = composer.swept(config), Launcher.of(config)
     if not config.plan:
-        how = "many to a job" if launcher.packs else f"{launcher.at_once} at a time"
-        runs = f"{plural(len(swept), 'run')}, {how} (hydra/launcher={launcher.name})"
+        rate = "many to a job" if launcher.packs_runs else f"{launcher.concurrency} at a time"
+        runs = f"{plural(len(swept), 'run')}, {rate} (hydra/launcher={launcher.name})"
         notice(f"sweep: {runs}; a line follows as each ends")
     if config.isolation == Isolation.process:
         warm_up()
     plan = plan_of(composer.cells(swept))
-    _say_where(swept[0], plan)
+    _print_partial_overrides(swept[0], plan)
     reused = {cell.id for cell in plan.cells if is_reused(plan, cell)}
     check_jobs([cell for cell in plan.cells if cell.id not in reused], launcher.settings)
     check_plan(plan, launcher.executor, reused)
     if config.plan:
-        _list(plan, reused, launcher)
+        _print_plan(plan, reused, launcher)
         return []
     plan.write()
     try:
-        with followed(plan, reused):
-            _make(plan, reused, launcher)
+        with follow_progress(plan, reused):
+            _run_all(plan, reused, launcher)
     finally:
         statuses = summarise(plan)
     return statuses
 
 
-def _say_where(overrides: list[str], plan: Plan) -> None:
-    """Says of overrides that not all cells have, how many do."""
+def _print_partial_overrides(overrides: list[str], plan: Plan) -> None:
+    """Prints the number of cells for each override that only some cells have."""
     for key in (text.partition("=")[0] for text in overrides):
-        having = sum(any(text.startswith(f"{key}=") for text in cell.overrides) for cell in plan.cells)
-        if having < len(plan.cells):
-            notice(f"sweep: {key} goes to {having} of {plural(len(plan.cells), 'run')}, which have this key")
+        count = sum(any(text.startswith(f"{key}=") for text in cell.overrides) for cell in plan.cells)
+        if count < len(plan.cells):
+            notice(f"sweep: {key} goes to {count} of {plural(len(plan.cells), 'run')}, which have this key")
 
 
-def _list(plan: Plan, reused: set[str], launcher: Launcher) -> None:
-    """Prints the cells, and the jobs where a launcher makes some."""
-    if not launcher.packs or not (jobs := packed(plan, launcher.settings, reused)):
-        return show_plan(plan, reused, launcher.at_once)
-    show_plan(plan, reused, min(launcher.at_once, len(jobs) * launcher.settings["tasks_per_node"]))
-    print(in_words(jobs, launcher.settings))
+def _print_plan(plan: Plan, reused: set[str], launcher: Launcher) -> None:
+    """Prints the cells, and the number of jobs if the launcher has jobs."""
+    if not launcher.packs_runs or not (jobs := split_into_jobs(plan, launcher.settings, reused)):
+        return show_plan(plan, reused, launcher.concurrency)
+    show_plan(plan, reused, min(launcher.concurrency, len(jobs) * launcher.settings["tasks_per_node"]))
+    print(describe_jobs(jobs, launcher.settings))
 
 
-def _make(plan: Plan, reused: set[str], launcher: Launcher) -> None:
-    """Has an executor make all runs of a plan; reused ones are marked as asked for by this process."""
-    make, jobs = Once(replace(plan, cells=[])), [[cell] for cell in plan.cells]
+def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
+    """Makes all runs of a plan by the executor; this process marks the reused runs as requested."""
+    make, jobs = RunOnce(replace(plan, cells=[])), [[cell] for cell in plan.cells]
     try:
         if launcher.executor != "basic":
-            execute(
-                make, [[identity_of(cell) for cell in plan.cells if cell.id in reused]], replace(launcher, settings={})
-            )
+            finished = [identity_of(cell) for cell in plan.cells if cell.id in reused]
+            execute(make, [finished], replace(launcher, settings={}))
             jobs = [[cell] for cell in plan.cells if cell.id not in reused]
-        if launcher.packs and (jobs := packed(plan, launcher.settings, reused)):
-            notice(in_words(jobs, launcher.settings))
+        if launcher.packs_runs and (jobs := split_into_jobs(plan, launcher.settings, reused)):
+            notice(describe_jobs(jobs, launcher.settings))
         execute(make, [[*map(identity_of, job)] for job in jobs], launcher)
     except (ValueError, OSError):
         raise
@@ -122,18 +121,18 @@ def _make(plan: Plan, reused: set[str], launcher: Launcher) -> None:
         raise LauncherStopped(f"the launcher stopped: {reason_of(error)}; the same command goes on") from error
 
 
-def do_each(composer: Composer, config: DictConfig, job: Callable[[Identity], object]) -> bool:
-    """Does a job, which is no run, for each cell of a sweep; gives whether all were done.
+def run_job_per_cell(composer: Composer, config: DictConfig, job: Callable[[Identity], object]) -> bool:
+    """Does a job that is not a run, for each cell of a sweep; returns whether all succeeded.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM.
-        ValueError: for a sweep that cannot be.
+        ValueError: if the sweep is invalid.
     """
     cells = composer.cells(composer.swept(config))
-    return execute(partial(_attempted, job), [[cell] for cell in cells], Launcher.of(config))
+    return execute(partial(_run_job, job), [[cell] for cell in cells], Launcher.of(config))
 
 
-def _attempted(job: Callable[[Identity], object], identity: Identity) -> list[str]:
+def _run_job(job: Callable[[Identity], object], identity: Identity) -> list[str]:
     try:
         job(identity)
     except (OSError, ValueError) as error:
@@ -142,29 +141,29 @@ def _attempted(job: Callable[[Identity], object], identity: Identity) -> list[st
 
 
 @contextmanager
-def followed(plan: Plan, reused: set[str]) -> Iterator[None]:
-    """Prints a line for each of the plan's cells as it ends, in whichever process it runs.
+def follow_progress(plan: Plan, reused: set[str]) -> Iterator[None]:
+    """Prints a line for each of the plan's cells as it ends, in any process.
 
-    It also shows how many have ended and the time left, on a terminal at any time, else in front of each cell's line.
+    It also shows the number of ended cells and the time left: on a terminal always, else before each cell's line.
 
     Args:
-        reused: ids of cells that take no time, since their finished run is there already.
+        reused: ids of cells that take no time, because their finished run is reused.
     """
-    with display() as shown:
-        progress = shown.add_task("sweep", total=len(plan.cells) - len(reused), said="")
+    with display() as live:
+        task = live.add_task("sweep", total=len(plan.cells) - len(reused), status="")
         pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
-        begun = time.monotonic()
+        start = time.monotonic()
 
-        def place(run: int) -> str:
-            """What stands in front of a cell's line where there is no terminal; `run` cells were run."""
-            if not shown.disable:
+        def progress_prefix(finished: int) -> str:
+            """The text before a cell's line if there is no terminal; `finished` counts the cells that were run."""
+            if not live.disable:
                 return ""
             parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
-            if run and (to_run := len(pending.keys() - reused)):
-                parts.append(f"{seconds((time.monotonic() - begun) / run * to_run)} left")
+            if finished and (to_run := len(pending.keys() - reused)):
+                parts.append(f"{seconds((time.monotonic() - start) / finished * to_run)} left")
             return f"[{', '.join(parts)}] "
 
-        def run_by_now() -> int:
+        def count_run() -> int:
             return len(plan.cells) - len(reused | pending.keys())
 
         def update() -> None:
@@ -173,12 +172,13 @@ def followed(plan: Plan, reused: set[str]) -> Iterator[None]:
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
-                    text = line(plan.results_dir / "runs" / cell.id, record, " ".join(plan.differing(cell)))
-                    print(place(run_by_now()) + text, flush=True)
-            shown.update(progress, completed=run_by_now(), said=f"{failed} failed")
+                    overrides = " ".join(plan.distinct_overrides(cell))
+                    text = cell_line(plan.results_dir / "runs" / cell.id, record, overrides)
+                    print(progress_prefix(count_run()) + text, flush=True)
+            live.update(task, completed=count_run(), status=f"{failed} failed")
 
         def follow() -> None:
-            while not stop.wait(max(INTERVAL, 1e-3 * len(pending))):
+            while not stop.wait(max(FOLLOW_INTERVAL_SECONDS, 1e-3 * len(pending))):
                 update()
 
         thread = threading.Thread(target=follow, daemon=True)
@@ -189,24 +189,25 @@ def followed(plan: Plan, reused: set[str]) -> Iterator[None]:
             stop.set()
             thread.join()
             update()
-            shown.remove_task(progress)
+            live.remove_task(task)
 
 
-def line(folder: Path, record: dict[str, Any], differing: str) -> str:
-    """The outcome of a cell in a line that ends with its folder; `differing` are overrides that not all cells have."""
+def cell_line(folder: Path, record: dict[str, Any], overrides: str) -> str:
+    """A line on a cell: status, overrides that not all cells share, names, results, and its folder last."""
     name, spent = row_name(record["config"], record["renderer"]), record["seconds"]
-    loop = spent.get("forward", 0.0) + spent.get("backward", 0.0) or spent.get("total")
+    duration = spent.get("forward", 0.0) + spent.get("backward", 0.0) or spent.get("total")
     parts = [
         record["status"] + (" (reused)" if record["reused"] else ""),
-        differing,
+        overrides,
         ", ".join((record["task"], name, record["scene"] or record["dataset"])),
-        seconds(loop),
+        seconds(duration),
     ]
-    known = record["metrics"]
-    parts += [f"{m.label} {number(known[name], m.factor)}" for name, m in IN_LINE.items() if name in known]
-    if "level" in known:
+    metrics = record["metrics"]
+    shown = [(metric, metrics[name]) for name, metric in CELL_LINE_METRICS.items() if name in metrics]
+    parts += [f"{metric.label} {number(value, metric.factor)}" for metric, value in shown]
+    if "level" in metrics:
         parts.append(breakdown(record))
-    return "  ".join(part for part in [*parts, record["reason"], str(folder)] if part)
+    return "  ".join(text for text in [*parts, record["reason"], str(folder)] if text)
 
 
 def breakdown(record: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from bench.config import OF, EvaluationSettings, build_once
+from bench.config import PRIOR_DATASET_KEY, EvaluationSettings, build_once
 from bench.machine.environment import pick_device
 from bench.progress import Report
 from bench.records.record import Record
@@ -258,7 +258,7 @@ class _Builder:
         node, shown = self.config["prior"], dataset.network(index) if isinstance(dataset, Networked) else None
         with naming_prior_keys(node):
             (settings,) = self.parts("prior")
-            learnt = learnt_dataset(node.get(OF))
+            learnt = learnt_dataset(node.get(PRIOR_DATASET_KEY))
             network = shown if isinstance(settings, PriorSettings) else settings.network(0)
         if network is not None:
             return PriorChoice(network, scene_code=index if network is shown else None)

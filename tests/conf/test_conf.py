@@ -8,12 +8,12 @@ import trimesh
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import TARGETS, build, check_draw, check_names, load
+from bench.config import CLASS_OF_NODE, build, check_draw, check_names, load
 from bench.pictures import style
 from bench.pictures.style import look
 from bench.run.compose import Composer, composing
 from bench.setup.inputs import Task
-from bench.tables import CONF, GROUPS, choice, names, read_yaml
+from bench.tables import CONF, GROUP_OF_TABLE, choice, names, read_yaml
 from datasets.scene import Dataset
 from renderers import DIST, Naive
 from renderers.rendering import Renderer
@@ -92,19 +92,19 @@ def cells(name: str) -> list[list[str]]:
     """The first and the last cell of an experiment at desk scale, as overrides."""
     with composing():
         composer = Composer([f"+experiment={name}"])
-        swept = composer.swept(composer.whole())
+        swept = composer.swept(composer.shared_config())
     return [[text for text in cell if not text.startswith("+experiment=")] for cell in (swept[0], swept[-1])]
 
 
 def build_part(config: DictConfig, part: str):
-    return build(config[part], part, list(config.packages), TARGETS.get(part, ""))
+    return build(config[part], part, list(config.packages), CLASS_OF_NODE.get(part, ""))
 
 
 def test_no_yaml_lies_where_it_is_not_looked_for():
-    assert {path.stem for path in CONF.glob("*.yaml")} == {"config", "suite", *GROUPS}
+    assert {path.stem for path in CONF.glob("*.yaml")} == {"config", "suite", *GROUP_OF_TABLE}
     folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")} - {"."}
     files = {"task", "renderer", "dataset", "prior", "scale", "tracker", "experiment", "hydra/launcher"}
-    assert folders <= files | {*GROUPS.values(), "method/space"}
+    assert folders <= files | {*GROUP_OF_TABLE.values(), "method/space"}
 
 
 def test_no_yaml_sets_the_mode_of_hydra():
@@ -113,12 +113,12 @@ def test_no_yaml_sets_the_mode_of_hydra():
         assert "mode" not in (read_yaml(path).get("hydra") or {}), path
 
 
-@pytest.mark.parametrize("table", GROUPS)
+@pytest.mark.parametrize("table", GROUP_OF_TABLE)
 def test_a_table_has_no_row_twice_and_no_text_that_should_be_a_number(table):
     """Which plain YAML does not tell: of two rows it takes the last, and 1e-3 is a text to it."""
     strict = OmegaConf.to_container(OmegaConf.load(CONF / f"{table}.yaml"), resolve=False)
     assert strict == read_yaml(CONF / f"{table}.yaml")
-    assert not {path.stem for path in (CONF / GROUPS[table]).glob("*.yaml")} & {*strict}
+    assert not {path.stem for path in (CONF / GROUP_OF_TABLE[table]).glob("*.yaml")} & {*strict}
 
 
 def builds(config: DictConfig) -> None:

@@ -12,7 +12,7 @@ from bench.records.read import Plan
 from bench.records.record import row_name
 from bench.run import compose
 from bench.run.plan import plan_of
-from bench.tables import listed, names, register_rows
+from bench.tables import group_choices, names, register_rows
 from tests.composing import cells_of
 
 CLASS = (
@@ -73,7 +73,7 @@ def test_renderers_of_ones_own_have_rows_in_an_experiment_that_compares_renderer
     assert row_name(cells["mine_on_keinert"].config, "mine_on_keinert") == "Keinert, 1.1" + one_loss
     assert not any({"_rows_", "_look_"} & {*cell.config["renderer"]} for cell in plan.cells)
     register_rows()
-    assert "mine_on_keinert" not in listed("renderer")  # of another command alone
+    assert "mine_on_keinert" not in group_choices("renderer")  # of another command alone
 
 
 def test_the_command_line_narrows_and_replaces_the_rows():
@@ -148,10 +148,8 @@ def test_a_broken_file_of_the_users_is_named(tmp_path, file, text, message):
 
 
 def test_a_sweep_composes_each_combination_of_choices_once(monkeypatch):
-    composed = []
-    monkeypatch.setattr(
-        compose, "composed", lambda choices, do=compose.composed: (composed.append(choices), do(choices))[1]
-    )
+    composed, do = [], compose.compose_choices
+    monkeypatch.setattr(compose, "compose_choices", lambda choices: (composed.append(choices), do(choices))[1])
     plan = swept("seed=0,1,2", "renderer=dist,dvr", "task.points=20,30")
     assert len(plan.cells) == 12 and len(composed) == 1 + 2  # the first says what is swept over
 

@@ -10,7 +10,7 @@ from omegaconf.errors import InterpolationResolutionError
 
 from bench.config import build
 from bench.run.compose import register
-from bench.tables import DIMENSIONS, DRAWS, choice, names, sobol_points
+from bench.tables import SOBOL_DIMENSIONS, SOBOL_DRAWS, choice, names, sobol_points
 from tests.composing import composed
 from tests.looped import each
 
@@ -36,8 +36,8 @@ def ranges(space: str) -> dict[str, tuple[int, float, float]]:
 
 def test_the_points_fill_the_cube_evenly():
     points = np.array(sobol_points())
-    assert points.shape == (DRAWS, DIMENSIONS)
-    for dimension in range(DIMENSIONS):  # a point in each sixteenth, also of the first sixteen alone
+    assert points.shape == (SOBOL_DRAWS, SOBOL_DIMENSIONS)
+    for dimension in range(SOBOL_DIMENSIONS):  # a point in each sixteenth, also of the first sixteen alone
         assert sorted((16 * points[:16, dimension]).astype(int)) == list(range(16))
 
 
@@ -58,7 +58,7 @@ def test_a_space_has_its_own_dimension_for_each_setting_and_contains_the_default
         assert 0.35 <= place <= 0.65, key  # as many draws below as above it
 
 
-@each("space, draw", [("newton_mask", 31), ("newton_mask", DRAWS - 1), *((space, 0) for space in SPACES)])
+@each("space, draw", [("newton_mask", 31), ("newton_mask", SOBOL_DRAWS - 1), *((space, 0) for space in SPACES)])
 def test_a_draw_is_its_sobol_point_even_in_the_logarithm(space, draw):
     config = composed(f"+method=space/{space}", f"draw={draw}")
     for key, (dimension, least, most) in ranges(space).items():

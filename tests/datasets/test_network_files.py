@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.run.command import with_network
+from bench.run.command import expand_field_file
 from bench.setup.inputs import RunInputs
 from datasets.network_files import NetworkFile
 from datasets.scene import Split
@@ -270,7 +270,7 @@ def test_a_module_that_is_no_distance_becomes_a_bound_by_its_slope():
     (["-m", "field=sphere", "dataset=sofa"], ["-m", "field=sphere", "dataset=sofa"]),
 ])  # fmt: skip
 def test_a_file_as_the_field_is_a_dataset(given, composed):
-    assert with_network(given) == composed
+    assert expand_field_file(given) == composed
 
 
 @each("given, words", [
@@ -280,7 +280,7 @@ def test_a_file_as_the_field_is_a_dataset(given, composed):
 ])  # fmt: skip
 def test_half_of_the_two_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
-        with_network(given)
+        expand_field_file(given)
 
 
 def composed_inputs(*overrides: str) -> RunInputs:
@@ -318,7 +318,9 @@ def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkey
     monkeypatch.syspath_prepend(tmp_path)
     state = {"weight": torch.tensor([[0.6, 0.0, 0.8]]), "bias": torch.tensor([0.25])}
     torch.save({"model": {f"net.inner.{key}": value for key, value in state.items()}, "step": 3}, tmp_path / "a.pth")
-    given = with_network(["field=file", f"field_path={tmp_path}/a.pth", "field._target_=mynet.Net", "field.scale=2"])
+    given = expand_field_file(
+        ["field=file", f"field_path={tmp_path}/a.pth", "field._target_=mynet.Net", "field.scale=2"]
+    )
     inputs = composed_inputs(*given, "task=ablation", "packages=[mynet]")
     near(inputs.prior.decoder.at(inputs.prior.codes[0])(POINTS), POINTS @ state["weight"][0] + 0.25)
     several = {f"{of}.inner.{key}": value for of in "ab" for key, value in state.items()}

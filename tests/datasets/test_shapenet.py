@@ -10,7 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from bench.records.folder import Identity, _classes
+from bench.records.folder import Identity, _class_counts_hash
 from bench.report.data.records import family
 from bench.single_view.images import Imaging
 from datasets import repair
@@ -194,7 +194,7 @@ def test_a_run_is_another_one_where_the_list_or_the_shapes_on_disk_are_others(tm
     split = write_split(tmp_path / "test.json", IDS[:2])
 
     def code() -> str:
-        _classes.cache_clear()  # which is that of one command
+        _class_counts_hash.cache_clear()  # which is that of one command
         dataset = {"path": str(folder), "synset": "sofa", "split": str(split)}
         return Identity(dict.fromkeys(("task", "renderer", "dataset"), "x"), {"dataset": dataset}).code
 

@@ -1,6 +1,6 @@
 """Runs are named by what differs among them, and by nothing else."""
 
-from bench.records.metrics import better
+from bench.records.metrics import better_direction
 from bench.records.names import differences
 from tests.looped import each
 
@@ -46,14 +46,15 @@ def test_renderers_of_ones_own_are_named_by_their_classes():
 
 def test_what_keeps_runs_apart_is_not_in_their_names():
     records = [run(seed=seed, renderer__alpha=alpha) for seed in (0, 1) for alpha in (1.0, 1.5)]
-    assert differences(records, apart=lambda record: record["config"]["seed"]) == ["alpha 1", "alpha 1.5"] * 2
+    names = differences(records, distinguished_by=lambda record: record["config"]["seed"])
+    assert names == ["alpha 1", "alpha 1.5"] * 2
 
 
 def test_a_key_is_named_as_the_sweep_asked_for_it():
     records = [run(renderer__steps=n, renderer__budget=2 * n) for n in (4, 8)]
     assert differences(records) == ["steps 4", "steps 8"]
     asked = [{"renderer.budget": "8.0"}, {"renderer.budget": "1e1"}]
-    assert differences(records, asked=asked) == ["budget 8.0", "budget 1e1"]
+    assert differences(records, swept=asked) == ["budget 8.0", "budget 1e1"]
 
 
 @each(
@@ -61,4 +62,4 @@ def test_a_key_is_named_as_the_sweep_asked_for_it():
     [("chamfer_l2", "lower"), ("own_psnr", "higher"), ("seen_fscore", "higher"), ("queries", ""), ("own_queries", "")],
 )
 def test_which_direction_of_a_metric_is_better(name, direction):
-    assert better(name) == direction
+    assert better_direction(name) == direction

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bench.records.folder import Identity
-from bench.records.metrics import unsound
+from bench.records.metrics import metric_fault
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus, digest, to_json, write_text
 from tests.looped import each
@@ -104,7 +104,8 @@ def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
 
 
 def test_a_logarithm_and_a_word_may_be_metrics():
-    assert unsound({"seen_roughness": -2.8, "psnr": -1.0, "chosen": "grid_8", "accuracy": None, "depth_mae": 0}) == ""
+    metrics = {"seen_roughness": -2.8, "psnr": -1.0, "chosen": "grid_8", "accuracy": None, "depth_mae": 0}
+    assert metric_fault(metrics) == ""
 
 
 @each("key", ["path", "image_path", "mask_path"])

@@ -10,7 +10,7 @@ from bench.records.read import read_records
 from bench.report.data.runs import choose
 from bench.report.tuning import TUNING, left_out, tunings
 from bench.tables import CONF, choices_of, read_yaml
-from bench.tune import HEAD, WIDTH, main, write
+from bench.tune import HEADER, LINE_WIDTH, main, write
 from tests.report.test_report_paper import write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
@@ -138,7 +138,7 @@ def test_renderers_of_photographs_are_chosen_by_what_is_seen(tmp_path, capsys):
 
 def test_the_shipped_settings_are_as_the_command_writes_them():
     text = (CONF / "tuned.yaml").read_text()
-    assert text == HEAD + yaml.safe_dump(yaml.safe_load(text), sort_keys=False, width=WIDTH)
+    assert text == HEADER + yaml.safe_dump(yaml.safe_load(text), sort_keys=False, width=LINE_WIDTH)
 
 
 @pytest.mark.parametrize("place", ["tuned", "conf/method"])

@@ -48,7 +48,7 @@ from bench.report.suite.standing import (
     wrong_pixels,
 )
 from bench.studies import suite as study
-from bench.suite import _sweeps, main, parsed, show
+from bench.suite import _sweeps, main, parse_arguments, print_standing
 from bench.tables import choice, read_yaml
 from tests.composing import composed
 from tests.looped import each
@@ -447,7 +447,7 @@ def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alon
     dist = [attempt("Dist", scene, known, settings=mine.settings) for scene in ("car test 0", "car test 1")]
     write_attempts(dist, shipped)
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
-    assert show(own) == 0
+    assert print_standing(own) == 0
     said = capsys.readouterr().out
     assert (
         "progress on the 1 problem that all rows have, of 2 problems with results" in said
@@ -483,12 +483,12 @@ def test_a_label_of_a_shipped_row_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", tmp_path)
     for label in ("Newton", "Mine, tuned"):  # its runs would replace shipped ones, or would count as tuned
         with pytest.raises(ValueError, match=f"label={label} is the name of a shipped row, or ends in ', tuned'"):
-            parsed(["renderer=custom", f"label={label}"])
+            parse_arguments(["renderer=custom", f"label={label}"])
 
 
 def test_what_is_not_its_own_is_passed_on():
     given = ["renderer=custom", "renderer._target_=a.B", "label=Mine", "dataset=sofa", "task.points=20"]
-    own, passed = parsed(["suite=core", *given])
+    own, passed = parse_arguments(["suite=core", *given])
     assert own["suite"] == "core" and passed == given
 
 
@@ -544,7 +544,8 @@ def test_a_tuned_setting_is_free_in_its_weights_and_rate_alone(tmp_path):
 
 
 def test_tuned_settings_are_a_sweep_each_and_sets_without_one_are_left_out(capsys):
-    own, passed = parsed(["setting=tuned", "renderer=newton,mesh_proxy_48", "set=pose,reconstruct,complete", "seed=0"])
+    arguments = ["setting=tuned", "renderer=newton,mesh_proxy_48", "set=pose,reconstruct,complete", "seed=0"]
+    own, passed = parse_arguments(arguments)
     found = _sweeps(own, passed)
     assert [said for said, _ in found] == [
         "set 2 of 3: reconstruct, tuned/rgb_newton",
@@ -553,7 +554,8 @@ def test_tuned_settings_are_a_sweep_each_and_sets_without_one_are_left_out(capsy
     assert {"silhouette=cross_entropy_sharp", "+method=tuned/rgb_newton", "seed=0"} < {*found[0][1]}
     assert "silhouette=own" in found[1][1] and not any(key.startswith("renderer=") for key in found[1][1])
     assert capsys.readouterr().out == "set 1 of 3: pose: left out, since conf/tuned.yaml has no setting for it\n"
-    assert [said for said, _ in _sweeps(*parsed(["set=pose,render"]))] == ["set 1 of 2: pose", "set 2 of 2: render"]
+    sweeps = _sweeps(*parse_arguments(["set=pose,render"]))
+    assert [said for said, _ in sweeps] == ["set 1 of 2: pose", "set 2 of 2: render"]
     assert main(["setting=tuned", "renderer=mesh_proxy_48"]) == 2
     assert "no setting of mesh_proxy_48 for complete," in capsys.readouterr().err
 

@@ -20,7 +20,7 @@ from bench.machine.environment import using_threads
 from bench.records.read import PlannedCell
 from bench.records.record import Record, RunStatus
 from bench.run import process
-from bench.run.library import Outcome
+from bench.run.library import CommandResult
 
 ROOT = Path(__file__).parents[2]
 FAILING = (
@@ -58,7 +58,7 @@ def planned(*names: str) -> list[PlannedCell]:
     return [PlannedCell(name, [], "completion", "dist", "sofa", 0, {"seed": 0}) for name in names]
 
 
-def command(*arguments: str, main: Callable[[], int] = main) -> Outcome:
+def command(*arguments: str, main: Callable[[], int] = main) -> CommandResult:
     """A command line in this process; its runs have processes of their own, unless it says isolation=off."""
     out, err = io.StringIO(), io.StringIO()
     with (
@@ -69,7 +69,7 @@ def command(*arguments: str, main: Callable[[], int] = main) -> Outcome:
         contextlib.redirect_stderr(err),
     ):
         code = main()
-    return Outcome(code, out.getvalue(), err.getvalue())
+    return CommandResult(code, out.getvalue(), err.getvalue())
 
 
 class Driver:
@@ -81,18 +81,18 @@ class Driver:
         self.output, self.process = output, context.Process(target=_drive, args=(output, arguments))
         self.process.start()
 
-    def send(self, number: signal.Signals) -> Outcome:
+    def send(self, number: signal.Signals) -> CommandResult:
         """Sends a signal, unless it has ended, and waits for the end."""
         assert self.process.pid is not None
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.process.pid, number)
         return self.ended()
 
-    def ended(self) -> Outcome:
+    def ended(self) -> CommandResult:
         """Waits for the end; the exit status is negative where a signal ended it."""
         self.process.join(PATIENCE)
         assert self.process.exitcode is not None, "the driver does not end"
-        return Outcome(self.process.exitcode, *((self.output / name).read_text() for name in ("out", "err")))
+        return CommandResult(self.process.exitcode, *((self.output / name).read_text() for name in ("out", "err")))
 
 
 def _drive(output: Path, arguments: tuple[str, ...]) -> None:
@@ -103,7 +103,7 @@ def _drive(output: Path, arguments: tuple[str, ...]) -> None:
     multiprocessing.forkserver.ensure_running = server.ensure_running = lambda: (
         None
     )  # its runs come from the server that it came from; Python would start another
-    process.GRACE = PATIENCE / 4  # a run that is stopped on a busy machine takes longer to say how far it came
+    process.TERMINATION_GRACE_SECONDS = PATIENCE / 4  # a busy machine needs longer
     sys.argv = ["bench", *arguments]
     sys.exit(main())
 

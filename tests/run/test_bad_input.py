@@ -13,8 +13,8 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.records import folder as run_folder
-from bench.run.command import message_of, options_of, text_as_typed
-from bench.run.plan import refusal
+from bench.run.command import message_of, options_of, quote_text
+from bench.run.plan import refusal_reason
 from bench.setup import priors
 from tests.composing import identified
 from tests.looped import each
@@ -76,7 +76,7 @@ def explained(monkeypatch, *arguments: str) -> str:
     """What is said of a command line that cannot be; empty where it can."""
     monkeypatch.setattr(sys, "argv", ["bench", *arguments])
     try:
-        return refusal(identified(*arguments).config)
+        return refusal_reason(identified(*arguments).config)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         return message_of(error)
 
@@ -155,7 +155,7 @@ def test_options_may_stand_anywhere(typed, options, overrides):
     ("'a,1'", "a,1"), ("${seed}", "5"),
 ])  # fmt: skip
 def test_a_label_is_the_text_that_was_typed(text, label):
-    assert identified(text_as_typed(f"label={text}"), "seed=5").config["label"] == label
+    assert identified(quote_text(f"label={text}"), "seed=5").config["label"] == label
 
 
 def test_the_command_keeps_labels_as_typed_in_a_sweep_too(bench, no_prior):
@@ -165,7 +165,7 @@ def test_the_command_keeps_labels_as_typed_in_a_sweep_too(bench, no_prior):
 
 def test_a_number_stays_one_where_the_key_asks_for_one():
     for argument in ("seed=1", "time_limit=1e3", "verbose=true", "renderer.label=1", "label=", "-m"):
-        assert text_as_typed(argument) == argument
+        assert quote_text(argument) == argument
 
 
 def test_a_renderer_in_place_of_a_methods_asks_for_a_name(bench, no_prior):
@@ -260,7 +260,7 @@ def test_a_disk_that_fills_up_during_a_run_is_an_error(bench, monkeypatch):
         for name in ("curve.jsonl", "log.txt"):
             (folder / name).symlink_to("/dev/full")
 
-    monkeypatch.setattr(run_folder, "_reserve", fill_up)
+    monkeypatch.setattr(run_folder, "_reserve_bytes", fill_up)
     code, out, err = bench(*TINY, "task.optimiser.iterations=2")
     assert code == 1
     assert "Traceback" not in out + err

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from bench.run.command import USAGE
-from bench.run.compose import dotted
+from bench.run.command import EXIT_USAGE
+from bench.run.compose import dotted_keys
 from tests.composing import composed
 from tests.run.driving import FAILING, command, record_of
 
@@ -19,7 +19,7 @@ FIXED = {"results_dir", "priors_dir", "isolation", "time_limit", "memory_limit",
 GROUPS = ("task", "renderer", "dataset", "prior", "scale")
 
 
-KEYS = [key for key in dotted(composed()) if key.split(".")[0] not in FIXED and "_target_" not in key]
+KEYS = [key for key in dotted_keys(composed()) if key.split(".")[0] not in FIXED and "_target_" not in key]
 NUMBERS = st.integers(-3, 40) | st.sampled_from([0.0, 0.5, -1.5, 1e-9, 1e9, 10**30, math.inf, -math.inf, math.nan])
 WORDS = st.sampled_from(
     ["true", "false", "null", "abc", "dist", "sofa", "''", "[]", "[1,2]", "{a:1}", "[0,360]", "10%"]
@@ -39,7 +39,7 @@ def results(tmp_path_factory) -> Path:
 def check(results: Path, overrides: list[str]) -> None:
     code, out, err = command(*FAILING_DIST, *LIMITS, *overrides, f"results_dir={results}")
     assert "Traceback" not in out + err, overrides
-    if code == USAGE:
+    if code == EXIT_USAGE:
         assert len(err.strip().splitlines()) == 1, (overrides, err)
         assert err.startswith("error: "), (overrides, err)
         return

@@ -15,11 +15,11 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.write.html import write_index
-from bench.run.jobs import grouped
+from bench.run.jobs import group_by_duration
 from tests.composing import identified
 from tests.looped import each
 from tests.report.page_data import Page
-from tests.run.driving import FAILING, PATIENCE, ROOT, Outcome, command, driver, errors, wait_for
+from tests.run.driving import FAILING, PATIENCE, ROOT, CommandResult, command, driver, errors, wait_for
 from tests.run.test_process import CASES
 
 LAUNCHERS = {  # with the package that each needs, and its settings
@@ -44,7 +44,7 @@ class Swept:
     """A sweep that has ended: its results and what it printed."""
 
     results: Path
-    outcome: Outcome
+    outcome: CommandResult
 
     @property
     def statuses(self) -> dict[str, str]:
@@ -57,11 +57,11 @@ def need(launcher: str) -> None:
         pytest.skip(f"the package of {launcher} is not installed: pip install -e '.[submitit,ray]'")
 
 
-def by_program(*arguments: str) -> Outcome:
+def by_program(*arguments: str) -> CommandResult:
     """A command line in a program of its own, which has ended."""
     program = [sys.executable, "-m", "bench", *arguments]
     done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=8 * PATIENCE, check=False)
-    return Outcome(done.returncode, done.stdout, done.stderr)
+    return CommandResult(done.returncode, done.stdout, done.stderr)
 
 
 def plan_of(results: Path) -> dict:
@@ -130,7 +130,7 @@ def test_every_way_to_fail_is_a_row_under_every_launcher(tmp_path, launcher):
     assert len(plan_of(tmp_path)["cells"]) == len(records) == len(CASES)
 
 
-def stopped(tmp_path: Path, number: signal.Signals) -> Outcome:
+def stopped(tmp_path: Path, number: signal.Signals) -> CommandResult:
     """A sweep of three cells that is sent a signal when the first one is under way, which goes on for long."""
     arguments = ("-m", *FAILING, "+renderer.how=not", "+renderer.pause=900", "seed=0,1,2", f"results_dir={tmp_path}")
     with driver(tmp_path / "output", *arguments) as running:
@@ -215,7 +215,7 @@ def test_a_sweep_of_nothing_is_an_error(isolated):
     ],
 )
 def test_a_job_has_as_many_runs_as_its_minutes_hold(seconds, places):
-    assert grouped(seconds, 60.0) == places
+    assert group_by_duration(seconds, 60.0) == places
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 import bench
 from bench.report.data import frame
 from bench.run import library
-from tests.run.driving import ROOT, Outcome, command
+from tests.run.driving import ROOT, CommandResult, command
 
 SMALL = (
     "isolation=off", "threads=1", "task.points=20", "task.optimiser.iterations=8", "view.resolution=16",
@@ -63,7 +63,8 @@ def test_a_keyword_is_typed_as_on_the_command_line(compose_config):
 
 @pytest.mark.parametrize(("code", "error"), [(2, ValueError), (1, OSError)])
 def test_what_is_no_run_is_an_error_with_the_line_of_the_command(monkeypatch, code, error):
-    monkeypatch.setattr(library, "_command", lambda _: Outcome(code, "", "a note\nerror: unknown renderer 'dits'\n"))
+    result = CommandResult(code, "", "a note\nerror: unknown renderer 'dits'\n")
+    monkeypatch.setattr(library, "_command", lambda _: result)
     with pytest.raises(error, match=r"^unknown renderer 'dits'$"):
         bench.run(renderer="dits")
     with pytest.raises(ValueError, match=r"takes a list of overrides, not 'completion': bench.run\(\['task=comp"):
@@ -71,7 +72,7 @@ def test_what_is_no_run_is_an_error_with_the_line_of_the_command(monkeypatch, co
 
 
 def test_a_plan_is_no_run(monkeypatch):
-    monkeypatch.setattr(library, "_command", lambda _: Outcome(0, "1 planned: 1 to run\n", ""))
+    monkeypatch.setattr(library, "_command", lambda _: CommandResult(0, "1 planned: 1 to run\n", ""))
     with pytest.raises(ValueError, match="'renderer=dist plan=true' does not: leave out plan=true"):
         bench.run(renderer="dist", plan=True)
 

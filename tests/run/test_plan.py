@@ -7,14 +7,21 @@ import pytest
 from hydra import compose
 
 from bench.prior import main as prior_main
-from bench.records.folder import identify, resolved
+from bench.records.folder import identify, resolve_config
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus
 from bench.run import plan as plan_module
 from bench.run import run as run_module
 from bench.run import sweep
 from bench.run.compose import Composer, composing, without_hydra
-from bench.run.plan import check_plan, identity_of, kind, refusal, refusals, times
+from bench.run.plan import (
+    check_plan,
+    duration_group,
+    durations_of_similar_runs,
+    identity_of,
+    refusal_reason,
+    refusal_reasons,
+)
 from bench.train import main as train_main
 from tests import tiny
 from tests.composing import cells_of
@@ -35,7 +42,7 @@ class Mine:
 def results(tmp_path, monkeypatch) -> Path:
     """A results folder whose runs are written by hand: no cell is checked or run."""
     monkeypatch.setattr(sweep, "check_plan", lambda *_: None)
-    monkeypatch.setattr(run_module, "refusals", lambda configs: [""])
+    monkeypatch.setattr(run_module, "refusal_reasons", lambda configs: [""])
     return tmp_path / "r"
 
 
@@ -108,12 +115,12 @@ def test_a_plan_says_in_how_many_jobs_the_runs_are(results):
 def test_a_cell_is_what_hydra_makes_of_it(arguments):
     with composing():
         composer = Composer(arguments[1:])
-        swept = composer.swept(composer.whole())
+        swept = composer.swept(composer.shared_config())
         cells = composer.cells(swept)
         for cell, overrides in zip(cells, swept, strict=True):
             whole = compose("config", overrides, return_hydra_config=True)
             choices = dict(whole.hydra.runtime.choices)
-            assert cell == identify(resolved(without_hydra(whole), choices), choices, overrides)
+            assert cell == identify(resolve_config(without_hydra(whole), choices), choices, overrides)
     assert len({cell.name for cell in cells}) == len(cells)
 
 
@@ -190,7 +197,7 @@ def times_of(tmp_path, monkeypatch):
         monkeypatch.setattr(plan_module, "read_run", lambda at, _: (read.append(at), (folders[at.name], ""))[1])
         one = run(**like)
         cells = [PlannedCell("c", [], one["task"], one["renderer"], "sofa", 0, one["config"], one["method"])]
-        return times(Plan("p", tmp_path, cells), set())[kind(one)], len(read)
+        return durations_of_similar_runs(Plan("p", tmp_path, cells), set())[duration_group(one)], len(read)
 
     return of
 
@@ -213,8 +220,8 @@ def test_a_plan_names_the_file_of_a_dataset(tmp_path, capsys):
 
 def test_of_many_like_runs_a_part_is_read(times_of):
     many = [run(1.0, scale="desk")] * 50 + [run(2.0)] * 200
-    assert times_of(many) == ([2.0] * plan_module.LIKE, 50 + plan_module.LIKE)
-    assert times_of([run(1.0, scale="desk")] * 900) == ([], plan_module.MOST)
+    assert times_of(many) == ([2.0] * plan_module.MAX_SIMILAR_RUNS, 50 + plan_module.MAX_SIMILAR_RUNS)
+    assert times_of([run(1.0, scale="desk")] * 900) == ([], plan_module.MAX_RECORDS_READ)
 
 
 def test_the_cells_of_a_sweep_are_no_runs_and_a_prior_is_of_whom_it_is_asked(tmp_path):
@@ -245,7 +252,7 @@ def plain(compose_config):
 def test_a_task_on_a_fitted_network_is_refused_without_one(plain):
     for task in (("task=gradients",), ("task=pose", "task.shape=prior")):
         cells = [plain(*task), plain("+experiment=fitted", *task), plain("+experiment=fitted", *task, "index=1")]
-        refused = ["fitted to: add +experiment=fitted" in reason for reason in map(refusal, cells)]
+        refused = ["fitted to: add +experiment=fitted" in reason for reason in map(refusal_reason, cells)]
         assert refused == [True, False, True]
 
 
@@ -262,7 +269,7 @@ def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(plai
     for number, (act, words) in enumerate(acts.items()):
         module = f"acting_{number}_{tmp_path.name}"
         (tmp_path / f"{module}.py").write_text(CODE.format(act=act))
-        assert refusal(plain("renderer=custom", f"renderer._target_={module}.Mine")) == words
+        assert refusal_reason(plain("renderer=custom", f"renderer._target_={module}.Mine")) == words
     assert capsys.readouterr().out == ""
 
 
@@ -270,8 +277,8 @@ def test_a_class_that_ends_its_process_is_left_to_its_run(plain, tmp_path, monke
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / f"ends_{tmp_path.name}.py").write_text("import os\n" + CODE.format(act="os._exit(3)"))
     wrong, ends = plain("renderer.steps=0"), plain("renderer=custom", f"renderer._target_=ends_{tmp_path.name}.Mine")
-    assert refusals([wrong]) == [refusal(wrong)] != [""]
-    assert refusals([wrong, ends]) == ["", ""]
+    assert refusal_reasons([wrong]) == [refusal_reason(wrong)] != [""]
+    assert refusal_reasons([wrong, ends]) == ["", ""]
 
 
 def test_a_folder_of_the_users_may_say_that_an_experiment_is_a_sweep(results, tmp_path):

@@ -62,8 +62,8 @@ def test_a_run_that_ends_badly_says_how(request, isolated, tmp_path, how):
 
 
 def test_a_step_says_in_which_phase_a_limit_was_reached():
-    assert Step("training the prior", 100, 6500, None).when == "while training the prior (100 of 6500)"
-    assert Step("optimising", 20, 20, None).when == "after optimising (20 of 20)"
+    assert Step("training the prior", 100, 6500, None).phase_text == "while training the prior (100 of 6500)"
+    assert Step("optimising", 20, 20, None).phase_text == "after optimising (20 of 20)"
 
 
 @pytest.mark.parametrize(("how", "words"), [
@@ -93,12 +93,12 @@ def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is
     monkeypatch.setattr(process, "import_module", done.append)
     monkeypatch.setattr("bench.run.execute.main", lambda *_: done.append("main"))
     job = Job(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
-    process._enter(job, *Pipe())
-    assert done == [*process.preloaded(), "main"] and "open3d" in done
+    process._run_job(job, *Pipe())
+    assert done == [*process.preloaded_modules(), "main"] and "open3d" in done
 
 
 def test_the_server_has_what_runs_need_and_no_more():
-    found = process.in_child(eval, "{name.partition('.')[0] for name in __import__('sys').modules}")
+    found = process.run_in_child(eval, "{name.partition('.')[0] for name in __import__('sys').modules}")
     assert found >= {"torch", "open3d", "matplotlib"} and not found & {"hydra", "pandas"}
 
 
@@ -114,11 +114,11 @@ def test_the_server_has_what_runs_need_and_no_more():
 def test_the_server_starts_before_the_command_line_is_read_where_that_asks_for_runs(monkeypatch, arguments, early):
     done, ended = [], []
     monkeypatch.setattr(process, "warm_up", lambda: done.append(True))
-    monkeypatch.setattr(process, "_early", False)
+    monkeypatch.setattr(process, "_server_started_early", False)
     monkeypatch.setattr(process.forkserver._forkserver, "_forkserver_pid", 42)
     monkeypatch.setattr(process.os, "kill", lambda *of: ended.append(of))
     process.start_early(arguments)
-    process.leave_server()  # of a command that is refused
+    process.stop_early_server()  # of a command that is refused
     assert (done, ended) == (([True], [(42, signal.SIGKILL)]) if early else ([], []))
 
 

@@ -47,7 +47,7 @@ def test_a_line_of_progress_fits_its_terminal(width):
     file = io.StringIO()
     console = Console(width=width, force_terminal=True, color_system=None, file=file)
     shown = Progress(*progress.columns(width), console=console)
-    shown.add_task("sweep", total=200, completed=20, said="3 failed")
+    shown.add_task("sweep", total=200, completed=20, status="3 failed")
     console.print(shown.get_renderable())
     (line,) = file.getvalue().splitlines()
     assert len(line) <= width

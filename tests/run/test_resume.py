@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.records.folder import _package
+from bench.records.folder import _package_hash
 from bench.records.read import read_records
 from tests.run.driving import FAILING, ROOT, command, driver, record_of, wait_for
 
@@ -87,7 +87,7 @@ def test_other_code_is_no_reason_to_reuse(isolated, tmp_path, monkeypatch):
     for change in ("", "", "\n# another line\n"):
         with (package / "mypkg.py").open("a") as file:
             file.write(change)
-        _package.cache_clear()  # a command looks at the code once
+        _package_hash.cache_clear()  # a command looks at the code once
         outputs.append(isolated(*FAILING, "renderer._target_=mypkg.Failing", "isolation=off").out)
     assert ["reused: the run of" in output for output in outputs] == [False, True, False]
     assert len({output.splitlines()[-1] for output in outputs}) == 1
@@ -142,6 +142,6 @@ def test_code_that_a_package_without_an_init_holds_is_seen(tmp_path, monkeypatch
     found = set()
     for text in ("a = 1", "a = 2"):
         module.write_text(text)
-        _package.cache_clear()
-        found.add(_package("space"))
+        _package_hash.cache_clear()
+        found.add(_package_hash("space"))
     assert len(found - {""}) == 2

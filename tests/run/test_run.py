@@ -31,7 +31,7 @@ from datasets.scene import Scene
 from renderers.rendering import Unsupported
 from tests.looped import each
 from tests.report.page_data import Page
-from tests.run.driving import PATIENCE, ROOT, Outcome
+from tests.run.driving import PATIENCE, ROOT, CommandResult
 from tests.solve.test_optimise import POINTS, Toy
 from tests.tiny import ball_prior, cell_from, curve_of
 
@@ -51,7 +51,7 @@ PICTURES = {"summary", "curve"}
 class Finished:
     """A run that has ended: its command's outputs, its folder and what the folder says."""
 
-    outcome: Outcome
+    outcome: CommandResult
     results: Path
     folder: Path
     record: dict
@@ -69,7 +69,7 @@ def finished(tmp_path_factory) -> Finished:
     assert done.stdout, done.stderr
     folder = Path(done.stdout.splitlines()[-1])
     record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
-    return Finished(Outcome(done.returncode, done.stdout, done.stderr), results, folder, record, curve_of(folder))
+    return Finished(CommandResult(done.returncode, done.stdout, done.stderr), results, folder, record, curve_of(folder))
 
 
 def test_it_ends_well_and_its_last_line_is_its_folder(finished):

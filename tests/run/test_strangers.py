@@ -137,7 +137,7 @@ def test_a_run_is_not_resumed_through_a_link(theirs, tmp_path, place):
     link.symlink_to(tmp_path / "mine" / ("" if place == "runs/{}" else "secret.png"))
     with (
         pytest.raises(ValueError, match="is a link out of the results folder"),
-        run_folder.claimed(theirs, identity, run_folder.Rerun.none),
+        run_folder.locked_folder(theirs, identity, run_folder.Rerun.none),
     ):
         raise AssertionError("it was claimed")
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["secret.png"]

@@ -10,7 +10,7 @@ from bench.records.read import RESULTS, Plan
 from bench.records.record import Record, RunStatus
 from bench.run import sweep
 from bench.run.executors import Launcher
-from bench.run.summary import show, show_sweep
+from bench.run.summary import print_run_summary, print_sweep_summary
 from tests.looped import each
 from tests.run.driving import ROOT, planned
 
@@ -33,7 +33,7 @@ def test_a_run_ends_with_its_picture_and_the_command_for_page_and_tables(tmp_pat
     record, folder = ended(tmp_path / "my r", "a"), tmp_path / "my r" / "runs" / "a"
     (folder / "summary.png").touch()
     (folder / "strip.png").touch()
-    show(folder, record)
+    print_run_summary(folder, record)
     *table, picture, tables, last = capsys.readouterr().out.splitlines()
     assert [picture, last] == [f"picture: {folder}/summary.png", str(folder)]
     assert tables == f"page and tables: python -m bench.report results_dir='{tmp_path / 'my r'}'"
@@ -45,7 +45,7 @@ def test_a_run_ends_with_its_picture_and_the_command_for_page_and_tables(tmp_pat
 def test_a_metric_of_the_end_alone_is_shown_too(tmp_path, capsys):
     record = ended(tmp_path, "a")
     record.metrics = {**record.metrics, "dtu_overall": 0.7}
-    show(tmp_path / "runs" / "a", record)
+    print_run_summary(tmp_path / "runs" / "a", record)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "DTU overall (mm)" in line]
     assert line.split()[-3:] == ["–", "0.700", "lower"]
 
@@ -57,7 +57,7 @@ def contract_lines(out: str) -> list[str]:
 def test_the_first_run_of_a_renderer_of_ones_own_names_the_contract_test(tmp_path, capsys):
     def shown(name, **changed):
         record = ended(tmp_path, name, **changed)
-        show(tmp_path / "runs" / name, record)
+        print_run_summary(tmp_path / "runs" / name, record)
         return contract_lines(capsys.readouterr().out)
 
     assert shown("completion-dist-sofa-a") == []
@@ -74,19 +74,19 @@ def test_a_sweep_with_the_first_runs_of_a_renderer_of_ones_own_names_the_contrac
     plan = Plan("p", tmp_path, planned("a-dist-b", "a-custom-b", "b-custom-b"), asked="2026-01-01T00:00:00+00:00")
     ended(tmp_path, "a-dist-b")
     ended(tmp_path, "a-custom-b", renderer="custom")
-    show_sweep(plan, tmp_path / "index.html")
+    print_sweep_summary(plan, tmp_path / "index.html")
     assert len(contract_lines(capsys.readouterr().out)) == 1
     reused = ended(tmp_path, "b-custom-b", renderer="custom")
     reused.reused = True
     reused.write(tmp_path / "runs" / "b-custom-b")
-    show_sweep(plan, tmp_path / "index.html")
+    print_sweep_summary(plan, tmp_path / "index.html")
     assert contract_lines(capsys.readouterr().out) == []
 
 
 def test_a_run_without_a_picture_in_the_usual_folder_has_shorter_lines(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     record = ended(Path(RESULTS), "a")
-    show(Path(RESULTS) / "runs" / "a", record)
+    print_run_summary(Path(RESULTS) / "runs" / "a", record)
     out = capsys.readouterr().out.splitlines()
     assert out[-2:] == ["page and tables: python -m bench.report", f"{RESULTS}/runs/a"]
     assert not any(line.startswith("picture") for line in out)
@@ -96,12 +96,12 @@ def test_a_sweep_ends_with_its_first_failure(tmp_path, capsys):
     plan = Plan("p", tmp_path, planned("a", "b", "c", "d"), asked="2026-01-01T00:00:00+00:00")
     for name, status in (("a", "ok"), ("b", "empty"), ("c", "crashed")):
         ended(tmp_path, name, status)
-    assert show_sweep(plan, tmp_path / "index.html") == ["ok", "empty", "crashed", "not_run"]
+    assert print_sweep_summary(plan, tmp_path / "index.html") == ["ok", "empty", "crashed", "not_run"]
     out = capsys.readouterr().out.splitlines()
     assert out[0] == "4 planned: 1 ok, 1 empty, 1 crashed, 1 not_run"
     assert out[2] == f"first failure: {tmp_path}/runs/b (empty: why)"
     assert out[-1] == str(plan.folder)
-    show_sweep(plan, tmp_path / "index.html", plan.folder / "table.md")
+    print_sweep_summary(plan, tmp_path / "index.html", plan.folder / "table.md")
     out = capsys.readouterr().out.splitlines()
     assert {f"table of this sweep: {plan.folder}/table.md", f"report: {tmp_path}/index.html"} <= {*out}
 
@@ -118,7 +118,8 @@ def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_are_run_not_reuse
     monkeypatch.setattr(sweep, "time", SimpleNamespace(monotonic=count(0.0, 10.0).__next__))
     for name in names:
         ended(results, name)
-    with sweep.followed(Plan("p", results, planned("a", "b", "c", "d"), asked="2026-01-01T00:00:00+00:00"), reused):
+    plan = Plan("p", results, planned("a", "b", "c", "d"), asked="2026-01-01T00:00:00+00:00")
+    with sweep.follow_progress(plan, reused):
         pass
     lines = capsys.readouterr().out.splitlines()
     assert [line[: len(words)] for line, words in zip(lines, said, strict=True)] == said
@@ -131,4 +132,4 @@ def test_a_line_of_a_sweep_says_what_is_left_by_the_cells_that_are_run_not_reuse
 def test_a_sweep_says_how_many_runs_a_launcher_makes_at_a_time(launcher, workers, monkeypatch):
     """Joblib takes all processors for -1; submitit has a limit of its own."""
     monkeypatch.setattr("os.cpu_count", lambda: 7)
-    assert Launcher("workers", launcher, {}).at_once == workers
+    assert Launcher("workers", launcher, {}).concurrency == workers

@@ -16,7 +16,7 @@ from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus
 from bench.run.execute import execute
 from bench.run.process import Job
-from bench.run.summary import show
+from bench.run.summary import print_run_summary
 from bench.setup.fields import FieldChoice, ModelSettings
 from bench.tasks.capacity import Capacity, savings
 from renderers.rendering import Unsupported
@@ -85,7 +85,7 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert shares["fit_all"] == {1.0} and 0 < min(shares["frugal"]) < 1
     assert {path.name for path in tmp_path.iterdir()} >= {"mesh.ply", "ladder.png", "strip.png"}
     record.seconds["total"] = 1.0
-    show(tmp_path, record)
+    print_run_summary(tmp_path, record)
     assert re.search(r"recommended_field +rounded_box\b", capsys.readouterr().out)
 
 

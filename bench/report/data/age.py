@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 from bench.report.data.records import Record, grouped, row_of
-from bench.tables import CONF, LABEL, read_yaml
+from bench.tables import CONF, LABEL_KEY, read_yaml
 
 RESTORED = "restored"  # of a row: the page and the version from whose CSV it was made, as its run folder is gone
 CHANGED = "2026-11-26"  # the day since which compiled code computes field values on one thread of a CPU
@@ -41,7 +41,7 @@ def _arguments() -> dict[str, set[str]]:
     files = [read_yaml(path) for path in sorted((CONF / "renderer").glob("*.yaml"))]
     classes = grouped(files, lambda file: str(file["_target_"]))
     variants = read_yaml(CONF / "variants.yaml").values()
-    return {target: {LABEL}.union(*settings, *variants) for target, settings in classes.items()}
+    return {target: {LABEL_KEY}.union(*settings, *variants) for target, settings in classes.items()}
 
 
 def _old_rows(records: list[Record]) -> str:

@@ -8,7 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
-from bench.records.record import decoded, plain, write_text
+from bench.records.record import from_json_values, to_json_values, write_text
 
 Item = TypeVar("Item")
 UNREADABLE = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)  # of a damaged file
@@ -21,7 +21,8 @@ def write_lines(path: Path, kind: type, items: Iterable[Any]) -> Path:
     table.writeheader()
     for item in items:
         cells = asdict(item).items()
-        table.writerow({name: cell if isinstance(cell, str) else json.dumps(plain(cell)) for name, cell in cells})
+        row = {name: cell if isinstance(cell, str) else json.dumps(to_json_values(cell)) for name, cell in cells}
+        table.writerow(row)
     write_text(path, text.getvalue())
     return path
 
@@ -37,4 +38,4 @@ def read_lines(path: Path, kind: type[Item]) -> list[Item]:
 
 
 def _value(cell: str, kind: Any) -> Any:
-    return cell if kind is str else decoded(json.loads(cell))
+    return cell if kind is str else from_json_values(json.loads(cell))

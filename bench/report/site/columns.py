@@ -6,16 +6,16 @@ from math import isfinite
 from typing import Any
 
 from bench.records.format import plural
-from bench.records.metrics import FIRST, MEASURED, SHOWN
-from bench.records.names import Node, in_order, settings_of, told_apart
-from bench.records.record import NEUTRAL_KEYS, as_number, digest, plain, row_name, started
+from bench.records.metrics import MEASUREMENT_METRICS, SORT_METRICS, TABLE_METRICS
+from bench.records.names import SharedSettings, make_unique, ordered_settings, settings_of
+from bench.records.record import NEUTRAL_KEYS, as_number, digest, row_name, started, to_json_values
 from bench.report.data.records import OURS, Record, family, grouped, loop_seconds, run_key, setting, value_evaluations
 from bench.report.site.files import Folder
 
 DIGITS = 5  # of numbers in the list; a run's own page has all of them
 LONGEST_REASON = 300
 GIVEN = ("points", "depths", "mask", "images", "stress", "degrees", "shift", "given", "held_out", "size", "longest")
-METRICS = SHOWN | MEASURED
+METRICS = TABLE_METRICS | MEASUREMENT_METRICS
 CUSTOM = "custom"  # the choice of renderer that stands for a user's class
 MOST_TOLD = 3  # settings in a name
 # Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
@@ -60,8 +60,8 @@ def names(records: list[Record]) -> list[str]:
         different = [settings[same[0]] for same in alike]  # most runs of a list have the same
         scales = [_scale(records[same[0]]) for same in alike]
         rows = [found[places[0]]] * len(alike)
-        told = told_apart(
-            in_order(different, TOLD_FIRST), classes=[*map(scales.index, scales)], names=rows, most=MOST_TOLD
+        told = make_unique(
+            ordered_settings(different, TOLD_FIRST), groups=[*map(scales.index, scales)], names=rows, limit=MOST_TOLD
         )
         for same, name in zip(alike, told, strict=True):
             for place in same:
@@ -72,7 +72,7 @@ def names(records: list[Record]) -> list[str]:
 def _settings(config: dict[str, Any], known: dict[Hashable, dict[str, str]]) -> dict[str, str]:
     """The settings of a run that may be in its name, made once for runs that share all of them; `known` has these."""
     kept = {key: value for key, value in config.items() if key not in IN_COLUMNS}
-    parts = tuple((key, value if isinstance(value, Node) else repr(value)) for key, value in kept.items())
+    parts = tuple((key, value if isinstance(value, SharedSettings) else repr(value)) for key, value in kept.items())
     if parts not in known:
         known[parts] = settings_of(kept, ())
     return known[parts]
@@ -143,7 +143,8 @@ def _tasks(records: list[Record]) -> list[dict[str, Any]]:
         known.setdefault(record["task"], set()).update(measured)
     found = []
     for task, count in Counter(record["task"] for record in records).most_common():
-        keys = sorted((key for key in METRICS if key in known[task]), key=lambda key, task=task: key != FIRST.get(task))
+        first = SORT_METRICS.get(task)
+        keys = sorted((key for key in METRICS if key in known[task]), key=lambda key, first=first: key != first)
         found.append({"task": task, "count": count, "metrics": keys})
     return found
 
@@ -175,7 +176,7 @@ def rounded(value: Any) -> int | float | str | None:
     if type(value) is float and isfinite(value):
         return float(f"{value:.{DIGITS}g}")
     known = as_number(value)
-    return plain(float(f"{known:.{DIGITS}g}")) if isinstance(known, float) else known
+    return to_json_values(float(f"{known:.{DIGITS}g}")) if isinstance(known, float) else known
 
 
 def _safely(of: Any, record: Record, otherwise: Any) -> Any:

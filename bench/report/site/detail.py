@@ -6,8 +6,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from bench.records.names import Node, flat
-from bench.records.read import ERRORS, NO_TERMS, curve_lines
+from bench.records.names import SharedSettings, flat
+from bench.records.read import CHECKPOINT_METRICS, NOT_LOSS_TERMS, curve_lines
 from bench.records.record import as_number
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
@@ -75,7 +75,7 @@ def settings(record: Record) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     for key, value in sorted(record["config"].items(), key=lambda item: _place(item[0])):
         if key != "results_dir":
-            rows += _shared_rows(key, value) if isinstance(value, Node) else _rows(key, value)
+            rows += _shared_rows(key, value) if isinstance(value, SharedSettings) else _rows(key, value)
     return rows
 
 
@@ -108,10 +108,11 @@ def curve(folder: Folder) -> dict[str, Any] | None:
     sound = [line for line in lines or [] if as_number(line.get("iteration")) is not None]
     if not sound:
         return None
-    terms = [key for key in dict.fromkeys(key for line in sound for key in line) if key not in (*NO_TERMS, *ERRORS)]
+    keys = dict.fromkeys(key for line in sound for key in line)
+    terms = [key for key in keys if key not in (*NOT_LOSS_TERMS, *CHECKPOINT_METRICS)]
     terms = [key for key in terms if any(as_number(line.get(key)) is not None for line in sound)][:MOST_LINES]
     kept = [sound[place] for place in _kept(sound)]
-    names = [*NO_TERMS, *terms]
+    names = [*NOT_LOSS_TERMS, *terms]
     return {"terms": terms, **{name: [rounded(line.get(name)) for line in kept] for name in names}}
 
 

@@ -4,7 +4,7 @@ import os
 from functools import cached_property
 from pathlib import Path
 
-from bench.records.record import PICTURES, leads_out
+from bench.records.record import PICTURE_FILES, is_outside
 from bench.report.write.paper import key_of, link
 
 FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply", "field.safetensors")
@@ -47,16 +47,17 @@ class Folder:
         if name not in self._linked:
             return False
         linked = self.linked or self._linked[name]  # others are not resolved, which takes time
-        return not linked or not leads_out(self.path / name, self.results_dir)
+        return not linked or not is_outside(self.path / name, self.results_dir)
 
     def thumb(self) -> str:
         """The picture that stands for the run; empty without one."""
-        return next((name for name in PICTURES if self.has(name)), "")
+        return next((name for name in PICTURE_FILES if self.has(name)), "")
 
     def pictures(self) -> list[str]:
         """The names of its pictures, the one that stands for the run first."""
         found = sorted(name for name in self._linked if Path(name).suffix in SUFFIXES and self.has(name))
-        return sorted(found, key=lambda name: PICTURES.index(name) if name in PICTURES else len(PICTURES))
+        ranks = {name: rank for rank, name in enumerate(PICTURE_FILES)}
+        return sorted(found, key=lambda name: ranks.get(name, len(ranks)))
 
     def link(self, name: str) -> str:
         """The address of one of its files."""

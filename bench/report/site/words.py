@@ -113,7 +113,7 @@ def command(record: Record, results_dir: Path) -> str:
 def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
     """The lines that open the run in Python: its values of the table of all runs, its curve, its mesh and its field."""
     results, name = _quoted(folder.parents[1].as_posix()), _quoted(folder.name)
-    shown = ["status", *[metric for metric in metrics.SHOWN if metric in record["metrics"]][:MOST_SHOWN]]
+    shown = ["status", *[metric for metric in metrics.TABLE_METRICS if metric in record["metrics"]][:MOST_SHOWN]]
     opened = {
         "curve.jsonl": ("import pandas as pd", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)'),
         "mesh.ply": ("import trimesh", 'mesh = trimesh.load(folder / "mesh.ply")'),

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.records.record import WAITED
+from bench.records.record import MAX_WAIT_FRACTION
 from bench.report.data import flips, statistics
 from bench.report.data.statistics import Interval, shapes_needed
 from bench.report.suite.attempts import APART, Attempt, Gathered, problems_of, suite
@@ -67,7 +67,7 @@ def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
     frame = pd.DataFrame(lines, columns=columns, dtype=object).sort_values(["started", "final"])
     frame = frame.astype(dict.fromkeys(("start", "final", "cost", "waited", "seconds"), float))
     frame = frame.astype({"ok": bool, "tuned": bool}).assign(
-        timed=~(frame["waited"] > WAITED),
+        timed=~(frame["waited"] > MAX_WAIT_FRACTION),
         machine=frame["cpu"] + "; " + frame["device"] + "; " + frame["threads"].map(str) + "; " + frame["kernels"],
     )
     counts = frame.drop_duplicates([*KEY, "row", "settings"]).groupby(["set", "tuned", "settings"]).size()

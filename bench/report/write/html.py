@@ -17,7 +17,7 @@ from typing import Any
 from filelock import Timeout
 
 from bench.records.read import check_results, read_records
-from bench.records.record import file_lock, plain, write_bytes, write_text
+from bench.records.record import file_lock, to_json_values, write_bytes, write_text
 from bench.report.data.records import grouped
 from bench.report.site.columns import columns
 from bench.report.site.detail import bundle, detail
@@ -161,7 +161,7 @@ def safe_json(data: Any) -> str:
     try:
         text = ENCODER.encode(data)
     except ValueError:  # a number that is not finite
-        text = ENCODER.encode(plain(data))
+        text = ENCODER.encode(to_json_values(data))
     return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 

@@ -12,8 +12,8 @@ from pkgutil import iter_modules
 from typing import Any
 from urllib.parse import quote
 
-from bench.records.read import PLAN
-from bench.records.record import leads_out, write_text
+from bench.records.read import PLAN_FILE
+from bench.records.record import is_outside, write_text
 from bench.report.data import age
 from bench.report.data.kept import KEPT, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
@@ -251,14 +251,14 @@ def write_readme(results_dir: Path) -> Path | None:
 
 def _asked(folder: Path) -> float:
     """When the sweep of a folder was last asked for, as its plan was written then; 0 where there is no plan."""
-    plan = folder / PLAN
+    plan = folder / PLAN_FILE
     return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
 def found_at(base: Path, root: Path) -> Found:
     """The table or figure whose files in a results folder have that path before their suffix, but for links out."""
     files = {suffix: base.with_name(base.name + suffix) for suffix in (*SUFFIXES, ".png", ".json")}
-    within = {suffix: path for suffix, path in files.items() if path.is_file() and not leads_out(path, root)}
+    within = {suffix: path for suffix, path in files.items() if path.is_file() and not is_outside(path, root)}
     links = {suffix: link(*path.relative_to(root).parts) for suffix, path in within.items()}
     named = {suffix[1:].upper(): links[suffix] for suffix in SUFFIXES if suffix in links}
     shown = read_shown(within[".json"]) if ".json" in within else Shown()

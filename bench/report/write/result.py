@@ -15,7 +15,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import RC
-from bench.records.record import plain
+from bench.records.record import to_json_values
 from bench.report.data import age
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval
@@ -178,7 +178,8 @@ class Shown:
     def to_json(self) -> str:
         """Its content, a line per part; infinite numbers of a chart become null."""
         parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
-        lines = [f"{json.dumps(key)}: {json.dumps(plain(value), ensure_ascii=False)}" for key, value in parts.items()]
+        encoded = {key: json.dumps(to_json_values(value), ensure_ascii=False) for key, value in parts.items()}
+        lines = [f"{json.dumps(key)}: {text}" for key, text in encoded.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
