@@ -59,9 +59,6 @@ def _commands() -> dict[str, str]:
 
 if __name__ == "__main__":
     try:
-        from bench.run.process import start_early
-
-        start_early(sys.argv[1:])
         sys.exit(main())
     except KeyboardInterrupt:  # before the command line was read
         sys.exit("error: stopped by Ctrl-C; nothing was run")

@@ -19,7 +19,7 @@ from bench.progress import notice
 from bench.records.folder import Identity
 from bench.run.compose import OPTIONAL_GROUPS, Composer, composing, parse_override, without_hydra
 from bench.run.job import Interrupted, write_error_message
-from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stop_early_server, stopped_by
+from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.run.sweep import LauncherStopped, run_job_per_cell
 from bench.tables import names, nearest
 
@@ -70,7 +70,6 @@ def command_line(job: Job, sweep: Sweep | None = None) -> int:
     except KeyboardInterrupt as error:
         return _report_stop(error)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is also an OSError
-        stop_early_server()
         text = message_of(error)
         for key, alias in aliases.items():
             text = text.replace(key, alias)

@@ -1,10 +1,9 @@
 """The process of a run, on the side of its parent: limits, exit and signals."""
 
 import multiprocessing
-import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -32,7 +31,6 @@ EXTERNAL_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP
 # A signal is also stored, because an interrupted library may swallow or replace the exception.
 _stopped = ""  # the signal that stopped this command, in words
 _delayed = False  # within `signals_delayed`
-_server_started_early = False  # before the command line was read
 
 
 @dataclass(frozen=True)
@@ -114,27 +112,6 @@ def warm_up() -> ForkServerContext:
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
-
-
-def start_early(arguments: Sequence[str]) -> None:
-    """Starts the server before the command line is read, if the arguments seem to ask for runs in new processes.
-
-    If an argument sets a key of Hydra, the server starts later, because Hydra may set environment variables.
-    """
-    global _server_started_early
-    has_known_options = all(argument in ("-m", "--multirun") or argument[:1] != "-" for argument in arguments)
-    other_commands = {"help", "list", "isolation=off"} & {*arguments}
-    if has_known_options and not other_commands and not any("hydra" in argument for argument in arguments):
-        _server_started_early = True
-        warm_up()
-
-
-def stop_early_server() -> None:
-    """Ends the early started server of a refused command, which would continue to import slow modules."""
-    server_id = getattr(forkserver._forkserver, "_forkserver_pid", None)
-    if _server_started_early and server_id is not None:
-        with suppress(ProcessLookupError):
-            os.kill(server_id, signal.SIGKILL)
 
 
 def run_in_child(work: Callable[[Any], Any], argument: Any) -> Any:

@@ -14,7 +14,6 @@ import pytest
 from bench.records.record import Record
 from bench.run import process
 from bench.run.process import Job, Step
-from tests.looped import each
 from tests.run.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -100,26 +99,6 @@ def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is
 def test_the_server_has_what_runs_need_and_no_more():
     found = process.run_in_child(eval, "{name.partition('.')[0] for name in __import__('sys').modules}")
     assert found >= {"torch", "open3d", "matplotlib"} and not found & {"hydra", "pandas"}
-
-
-@each("arguments, early", [
-    ((), True),
-    (("-m", "seed=0,1"), True),
-    (("--help",), False),
-    (("list",), False),
-    (("--cfg", "job"), False),
-    (("isolation=off",), False),
-    (("-m", "hydra/launcher=workers"), False),  # it sets variables of the environment, which come first
-])  # fmt: skip
-def test_the_server_starts_before_the_command_line_is_read_where_that_asks_for_runs(monkeypatch, arguments, early):
-    done, ended = [], []
-    monkeypatch.setattr(process, "warm_up", lambda: done.append(True))
-    monkeypatch.setattr(process, "_server_started_early", False)
-    monkeypatch.setattr(process.forkserver._forkserver, "_forkserver_pid", 42)
-    monkeypatch.setattr(process.os, "kill", lambda *of: ended.append(of))
-    process.start_early(arguments)
-    process.stop_early_server()  # of a command that is refused
-    assert (done, ended) == (([True], [(42, signal.SIGKILL)]) if early else ([], []))
 
 
 def test_ctrl_c_while_the_server_loads_what_runs_need_is_told_in_one_line(tmp_path):
