@@ -29,7 +29,7 @@ def __getattr__(name: str) -> Any:
     if name == "load_field":
         return import_module("datasets.field_files").load_field
     if name == "run":
-        return import_module("bench.run")
+        return import_module("bench.runner.library").run
     raise AttributeError(f"module 'bench' has no attribute {name!r}")
 
 

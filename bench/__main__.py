@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 def main() -> int:
     """Runs the command line; returns 0 if every run ended ok."""
-    from bench.run.command import command_line
-    from bench.run.run import run_one
-    from bench.run.sweep import run_sweep
+    from bench.runner.command import command_line
+    from bench.runner.run import run_one
+    from bench.runner.sweep import run_sweep
 
     return command_line(run_one, lambda composer, config: run_sweep(composer, config, _summarise))
 
@@ -25,7 +25,7 @@ def _summarise(plan: Plan) -> list[str]:
     """Writes and prints the summary of a sweep; returns the status of each of its cells."""
     from bench.report.sweeps import write_sweep
     from bench.report.write.html import write_index
-    from bench.run.summary import print_sweep_summary
+    from bench.runner.summary import print_sweep_summary
 
     table = write_sweep(plan)
     return print_sweep_summary(plan, write_index(plan.results_dir), table)

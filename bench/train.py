@@ -3,7 +3,7 @@
 import sys
 
 from bench.records.folder import Identity
-from bench.run.command import command_line
+from bench.runner.command import command_line
 
 
 def train(run: Identity) -> None:

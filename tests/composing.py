@@ -6,8 +6,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from bench.records.folder import Identity
-from bench.run.command import options_of
-from bench.run.compose import Composer, composing, without_hydra
+from bench.runner.command import options_of
+from bench.runner.compose import Composer, composing, without_hydra
 
 
 @cache

@@ -49,7 +49,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--renderer", default="tests.user_renderer.Mine", help="class of a renderer, as PACKAGE.CLASS")
 
 
-SLOWEST = ("run/test_launchers.py", "run/test_resume.py", "conf/", "run/")  # files that take longest
+SLOWEST = ("runner/test_launchers.py", "runner/test_resume.py", "conf/", "runner/")  # files that take longest
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -104,14 +104,14 @@ def forgotten_modules(tmp_path_factory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def asked_once() -> Iterator[None]:
-    """Caches, for runs in this process, what each run would find out anew; `tests.run.spared` is for runs in others.
+    """Caches, for runs in this process, what each run would find out anew; `tests.runner.spared` is for runs in others.
 
     These are what git says, and the machine's matrix product rate.
     """
     import torch
 
     from bench.machine import environment
-    from bench.run import process
+    from bench.runner import process
 
     measure = environment.gemm_peak
     rate = cache(lambda *asked: measure(*asked[:-1]))  # for each number of threads
@@ -119,7 +119,7 @@ def asked_once() -> Iterator[None]:
         patch.setattr(environment, "_git", cache(environment._git))
         patch.setattr(environment, "gemm_peak", lambda *on: rate(*on, torch.get_num_threads()))
         # One server of processes serves all tests: it loads all that runs import, pytest too, which is their program.
-        loaded = [*process.preloaded_modules(), "pytest", "tests.run.spared"]
+        loaded = [*process.preloaded_modules(), "pytest", "tests.runner.spared"]
         patch.setattr(process, "preloaded_modules", lambda: loaded)
         yield
 
@@ -135,7 +135,7 @@ def compose_config() -> Callable:
 @pytest.fixture
 def isolated(tmp_path) -> Callable:
     """A command line in this process, whose runs have processes of their own: gives its exit status and outputs."""
-    from tests.run.driving import command
+    from tests.runner.driving import command
 
     def run(*arguments: str):
         given = any(argument.startswith("results_dir=") for argument in arguments)

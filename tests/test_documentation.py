@@ -20,12 +20,12 @@ from bench.config import build, check_names
 from bench.records.folder import Identity
 from bench.report.__main__ import main as report
 from bench.report.write import paper
-from bench.run.command import config_dirs, expand_field_file, options_of
-from bench.run.compose import Composer, composing
+from bench.runner.command import config_dirs, expand_field_file, options_of
+from bench.runner.compose import Composer, composing
 from tests import documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
-from tests.run.driving import SMALLEST
-from tests.run.driving import command as typed
+from tests.runner.driving import SMALLEST
+from tests.runner.driving import command as typed
 
 HYDRA = ("bench", "bench.prior", "bench.train")  # commands whose arguments are choices and keys
 COMMANDS = documentation.commands()

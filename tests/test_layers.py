@@ -28,16 +28,16 @@ FORBIDDEN = {  # what the modules of a package may not import
 ROOMS = (
     "tables", "config", "progress", "records", "machine", "trackers", "shape_prior",
     "setup", "evaluate", "pictures", "solve", "models", "reconstruct", "single_view", "stress", "tasks",
-    "run", "report", "studies",
+    "runner", "report", "studies",
 )  # fmt: skip
 COMMANDS = (
     "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune",
     "bench.turntable", "bench.verify",
 )  # fmt: skip
 # No run imports these, which decide what is run.
-DRIVING = ("__main__", "records/folder", "run/command", "run/process", "run/run")
+DRIVING = ("__main__", "records/folder", "runner/command", "runner/process", "runner/run")
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
-PASSES_PATH_ON = ("bench.run.library",)  # reads where this process finds modules, for the process that it starts
+PASSES_PATH_ON = ("bench.runner.library",)  # reads where this process finds modules, for the process that it starts
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
 ALSO = {"renderers.mesh_proxy": {"numpy", "open3d", "skimage"}}  # a method that is made of what others maintain
 WITHOUT_TORCH = ("bench.records", "bench.report", STUDIES, "bench.pictures.style", "bench.pictures.size_chart")
@@ -149,18 +149,18 @@ WRONG = (
     ("renderers.fields.mlp", "from ...bench import config"),
     ("datasets.scene", "import bench.records"),
     ("datasets.scene", "if True:\n    import conf"),
-    ("bench.run.run", "from tests.renderers.analytic_cases import CASES"),
-    ("bench.run.run", "from bench.report.write.html import write_index"),
+    ("bench.runner.run", "from tests.renderers.analytic_cases import CASES"),
+    ("bench.runner.run", "from bench.report.write.html import write_index"),
     ("bench.records.record", "def f():\n    import bench.report"),
     ("bench.records.record", "import torch"),
-    ("bench.run.run", "from bench.merge import merge"),
+    ("bench.runner.run", "from bench.merge import merge"),
     ("bench.report.write.html", "from torch import Tensor"),
     ("bench.report.write.html", "from bench import solve"),
     ("bench.report.write.html", "from ...solve.solve import COSTS"),
     ("bench.report", "import renderers"),
     ("bench", "import torch"),
     ("conf", "from bench import config"),
-    ("bench.run.run", "from os import *"),
+    ("bench.runner.run", "from os import *"),
     ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"),
     ("tests.test_layers", "from sys import path"),
     ("bench.__main__", "import bench.studies.completion"),
@@ -172,7 +172,7 @@ RIGHT = (
     ("renderers.dist", "import math\nimport torch\nfrom jaxtyping import Float\nfrom renderers.field import Field"),
     ("renderers.fields.mlp", "from ..field import Kind\nfrom .analytic import Shape"),
     ("datasets.scene", "import numpy\nfrom renderers.camera import Camera\nfrom datasets import mesh"),
-    ("bench.run.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
+    ("bench.runner.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
     ("bench.__main__", "from bench.report.write.html import write_index"),
     ("bench.report.write.html", "import plotly, os.path\nfrom bench.records import format\nfrom . import caption"),
     ("bench", "import os"),
@@ -208,7 +208,7 @@ def imported_from(*beginnings: str) -> set[str]:
 
 
 def test_an_edit_of_a_module_that_no_run_imports_repeats_no_finished_run():
-    running = imported_from("bench.run.execute", "bench.tasks", "datasets", "renderers")
+    running = imported_from("bench.runner.execute", "bench.tasks", "datasets", "renderers")
     others = [path for path in modules() if path.is_relative_to(ROOT / "bench") and named(path)[0] not in running]
     acting = {path for other in others if not (path := other.relative_to(ROOT).as_posix()).startswith(NOT_IN_CODE_HASH)}
     assert acting == {f"bench/{name}.py" for name in DRIVING}

@@ -17,7 +17,7 @@ import yaml
 
 from bench.__main__ import console
 from bench.records.read import RESULTS
-from bench.run.executors import EXTRA_BY_EXECUTOR
+from bench.runner.executors import EXTRA_BY_EXECUTOR
 from datasets.extras import install, version
 from tests.test_layers import COMMANDS
 

@@ -12,7 +12,7 @@ from bench.records.folder import Identity
 from bench.verify import main
 from datasets.field_files import FIELD
 from tests.composing import composed
-from tests.run.driving import command
+from tests.runner.driving import command
 from tests.tiny import cell_from
 
 SMALL = (

@@ -25,7 +25,7 @@ NOT_IN_CODE_HASH = (
     *("bench/report", "bench/studies"),
     *(f"bench/{name}.py" for name in ("judge", "merge", "photos", "prior", "progress", "suite", "trackers", "train")),
     *(f"bench/{name}.py" for name in ("tune", "turntable", "verify")),
-    *(f"bench/run/{name}.py" for name in ("compose", "executors", "jobs", "library", "plan", "summary", "sweep")),
+    *(f"bench/runner/{name}.py" for name in ("compose", "executors", "jobs", "library", "plan", "summary", "sweep")),
     *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
     *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
 )

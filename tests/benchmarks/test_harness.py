@@ -10,7 +10,7 @@ import pytest
 
 from bench.records.record import Record, RunStatus
 from bench.report.write.html import write_index
-from tests.run.driving import FAILING, ROOT
+from tests.runner.driving import FAILING, ROOT
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import CLASS_OF_NODE, build, check_draw, check_names, load
 from bench.pictures import style
 from bench.pictures.style import look
-from bench.run.compose import Composer, composing
+from bench.runner.compose import Composer, composing
 from bench.setup.inputs import Task
 from bench.tables import CONF, GROUP_OF_TABLE, choice, names, read_yaml
 from datasets.scene import Dataset

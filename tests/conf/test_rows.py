@@ -10,8 +10,8 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import build
 from bench.records.read import Plan
 from bench.records.record import row_name
-from bench.run import compose
-from bench.run.plan import plan_of
+from bench.runner import compose
+from bench.runner.plan import plan_of
 from bench.tables import group_choices, names, register_rows
 from tests.composing import cells_of
 

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from bench.config import build
-from bench.run.compose import register
+from bench.runner.compose import register
 from bench.tables import SOBOL_DIMENSIONS, SOBOL_DRAWS, choice, names, sobol_points
 from tests.composing import composed
 from tests.looped import each

@@ -16,7 +16,7 @@ from datasets.views import look_at
 from renderers.camera import Camera
 from renderers.checks import BadInput
 from tests.looped import each
-from tests.run.driving import command, record_of
+from tests.runner.driving import command, record_of
 from tests.tiny import icosphere
 
 STEP = 0.002  # units of the world for a step of the stored numbers

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.run.command import expand_field_file
+from bench.runner.command import expand_field_file
 from bench.setup.inputs import RunInputs
 from datasets.network_files import NetworkFile
 from datasets.scene import Split

@@ -19,7 +19,7 @@ from datasets.shapenet import ShapeNet
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PLAINLY
-from tests.run.driving import SMALLEST, command, record_of
+from tests.runner.driving import SMALLEST, command, record_of
 
 SOFA, TABLE = "04256520", "04379243"
 IDS = [f"{number:02x}a9" for number in (11, 3, 7, 12, 5, 10)]  # on disk; in no order

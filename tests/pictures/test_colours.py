@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.run.driving import command, record_of
+from tests.runner.driving import command, record_of
 
 
 def test_a_command_finds_shape_and_colour_from_one_image(tmp_path):

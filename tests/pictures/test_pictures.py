@@ -23,7 +23,7 @@ from datasets.mesh import Mesh
 from datasets.scene import Truth, View, see
 from renderers.fields.analytic import sphere
 from tests.reconstruct.test_losses import ball, cast, shot_of
-from tests.run.driving import command, record_of
+from tests.runner.driving import command, record_of
 from tests.tiny import ball_prior, camera_of, icosphere, run_of, scene_of
 
 CAMERA = camera_of(16)

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from bench.report.__main__ import main as report
-from tests.run.driving import command
+from tests.runner.driving import command
 
 SMALL = (
     "scale=smoke", "isolation=off", "threads=1", "evaluation.picture=null", "evaluation.grid=16",

@@ -14,9 +14,9 @@ from bench.models.held_out import HeldOutError
 from bench.models.model import Evidence, Size
 from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus
-from bench.run.execute import execute
-from bench.run.process import Job
-from bench.run.summary import print_run_summary
+from bench.runner.execute import execute
+from bench.runner.process import Job
+from bench.runner.summary import print_run_summary
 from bench.setup.fields import FieldChoice, ModelSettings
 from bench.tasks.capacity import Capacity, savings
 from renderers.rendering import Unsupported

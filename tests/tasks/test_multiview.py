@@ -21,7 +21,7 @@ from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PLAINLY
 from tests.looped import each
 from tests.made_photographs import CENTRE, RADIUS, idr
-from tests.run.driving import command, record_of
+from tests.runner.driving import command, record_of
 from tests.tiny import CPU, altered, ball_prior, camera_of, icosphere, phases_of, run_of, scene_of
 
 RENDERER = load("renderer", "dist")

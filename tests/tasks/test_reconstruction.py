@@ -31,7 +31,7 @@ from tests.looped import each
 from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE, RADIUS, nerf
-from tests.run.driving import SMALLEST, command, record_of
+from tests.runner.driving import SMALLEST, command, record_of
 from tests.tiny import Blind, altered, ball_prior, camera_of, curve_of, icosphere, run_of, scene_of
 
 PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")

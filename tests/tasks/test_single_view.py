@@ -28,7 +28,7 @@ from renderers.checks import BadInput
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.reconstruct.test_losses import PAINT, Ball, shot_of
-from tests.run.driving import CommandResult, command, record_of
+from tests.runner.driving import CommandResult, command, record_of
 from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401, a fixture
 from tests.tiny import ball_prior, camera_of, curve_of, run_of, silent
 

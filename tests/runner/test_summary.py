@@ -8,11 +8,11 @@ import pytest
 
 from bench.records.read import RESULTS, Plan
 from bench.records.record import Record, RunStatus
-from bench.run import sweep
-from bench.run.executors import Launcher
-from bench.run.summary import print_run_summary, print_sweep_summary
+from bench.runner import sweep
+from bench.runner.executors import Launcher
+from bench.runner.summary import print_run_summary, print_sweep_summary
 from tests.looped import each
-from tests.run.driving import ROOT, planned
+from tests.runner.driving import ROOT, planned
 
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 

@@ -12,9 +12,9 @@ import psutil
 import pytest
 
 from bench.records.record import Record
-from bench.run import process
-from bench.run.process import Job, Step
-from tests.run.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
+from bench.runner import process
+from bench.runner.process import Job, Step
+from tests.runner.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
 # How it fails, with which limits; the status that must come of it, and words of the reason.
@@ -90,7 +90,7 @@ def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
 def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is_ready(tmp_path, monkeypatch):
     done = []
     monkeypatch.setattr(process, "import_module", done.append)
-    monkeypatch.setattr("bench.run.execute.main", lambda *_: done.append("main"))
+    monkeypatch.setattr("bench.runner.execute.main", lambda *_: done.append("main"))
     job = Job(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
     process._run_job(job, *Pipe())
     assert done == [*process.preloaded_modules(), "main"] and "open3d" in done

@@ -9,15 +9,15 @@ import pytest
 
 import bench
 from bench.report.data import frame
-from bench.run import library
-from tests.run.driving import ROOT, CommandResult, command
+from bench.runner import library
+from tests.runner.driving import ROOT, CommandResult, command
 
 SMALL = (
     "isolation=off", "threads=1", "task.points=20", "task.optimiser.iterations=8", "view.resolution=16",
     "evaluation.picture=null", "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null",
 )  # fmt: skip
 EXAMPLES = {
-    "run": library.run_once.__doc__,
+    "run": library.run.__doc__,
     "load": frame.load.__doc__,
     "README": (ROOT / "bench" / "README.md").read_text(encoding="utf-8"),
 }
@@ -25,7 +25,7 @@ LIGHT = """
 import sys, bench
 heavy = {"torch", "pandas", "numpy", "hydra", "matplotlib", "omegaconf"} & set(sys.modules)
 assert not heavy, heavy
-assert callable(bench.run) and callable(bench.run)
+assert callable(bench.run)
 """
 
 

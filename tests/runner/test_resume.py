@@ -11,7 +11,7 @@ import pytest
 
 from bench.records.folder import _package_hash
 from bench.records.read import read_records
-from tests.run.driving import FAILING, ROOT, command, driver, record_of, wait_for
+from tests.runner.driving import FAILING, ROOT, command, driver, record_of, wait_for
 
 
 def results_of(results: Path) -> dict[str, dict]:

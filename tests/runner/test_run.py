@@ -21,7 +21,7 @@ from bench.evaluate.evaluate import Evaluation
 from bench.records.format import number, seconds
 from bench.records.record import Record, RunStatus, curve_file
 from bench.report.write.html import write_index
-from bench.run import execute
+from bench.runner import execute
 from bench.setup import inputs as inputs_module
 from bench.setup import priors as priors_module
 from bench.setup.inputs import RunContext, RunInputs
@@ -31,7 +31,7 @@ from datasets.scene import Scene
 from renderers.rendering import Unsupported
 from tests.looped import each
 from tests.report.page_data import Page
-from tests.run.driving import PATIENCE, ROOT, CommandResult
+from tests.runner.driving import PATIENCE, ROOT, CommandResult
 from tests.solve.test_optimise import POINTS, Toy
 from tests.tiny import ball_prior, cell_from, curve_of
 

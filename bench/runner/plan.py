@@ -16,8 +16,8 @@ from bench.records.folder import Identity, reusable_record
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import digest, row_name
-from bench.run.job import reason_of
-from bench.run.process import run_in_child
+from bench.runner.job import reason_of
+from bench.runner.process import run_in_child
 
 # Statuses of runs that ended early.
 STATUSES_WITHOUT_DURATION = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.run.driving import SMALLEST, record_of
+from tests.runner.driving import SMALLEST, record_of
 
 SHORT = ("task=completion", *SMALLEST, "task.optimiser.iterations=4", "view.resolution=32", "task.points=100")
 WRONG = (*SHORT, "renderer=custom", "renderer._target_=tests.wrong_hits.WrongHits")

@@ -10,7 +10,7 @@ from bench import trackers
 from bench.records.record import read_record
 from bench.trackers import MLflow, TensorBoard, curve, settings, values
 from datasets.extras import install
-from tests.run.driving import FAILING, record_of
+from tests.runner.driving import FAILING, record_of
 
 
 @pytest.fixture

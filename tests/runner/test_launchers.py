@@ -15,12 +15,12 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.write.html import write_index
-from bench.run.jobs import group_by_duration
+from bench.runner.jobs import group_by_duration
 from tests.composing import identified
 from tests.looped import each
 from tests.report.page_data import Page
-from tests.run.driving import FAILING, PATIENCE, ROOT, CommandResult, command, driver, errors, wait_for
-from tests.run.test_process import CASES
+from tests.runner.driving import FAILING, PATIENCE, ROOT, CommandResult, command, driver, errors, wait_for
+from tests.runner.test_process import CASES
 
 LAUNCHERS = {  # with the package that each needs, and its settings
     "basic": ("", ()),
@@ -191,7 +191,7 @@ def test_a_sweep_stops_also_where_a_library_makes_something_else_of_the_interrup
             if error is not None:
                 raise error from None
 
-    monkeypatch.setattr("bench.run.run.run_progress", lambda name: nullcontext(interrupted(name)))
+    monkeypatch.setattr("bench.runner.run.run_progress", lambda name: nullcontext(interrupted(name)))
     code, out, err = command("-m", *FAILING, "+renderer.how=not", "seed=0,1,2", f"results_dir={tmp_path}")
     assert code == 130
     assert "3 planned: 2 not_run, 1 killed" in out
@@ -241,7 +241,7 @@ def test_what_a_job_cannot_do_is_refused_before_anything_is_written(tmp_path, wr
 
 def test_where_no_slurm_is_nothing_runs_and_the_plan_stays(tmp_path, monkeypatch):
     need("slurm")
-    monkeypatch.setattr("bench.run.executors.which", lambda _: None)
+    monkeypatch.setattr("bench.runner.executors.which", lambda _: None)
     code, out, err = command("-m", *FAILING, "+renderer.how=not", "hydra/launcher=slurm", f"results_dir={tmp_path}")
     assert code == 2 and "error: no Slurm is here: type this on a machine of the cluster, or hydra.launcher.c" in err
     assert "1 planned: 1 not_run" in out and len(plan_of(tmp_path)["cells"]) == 1

@@ -11,7 +11,7 @@ from bench.merge import main, merge
 from bench.records.read import Plan, read_records
 from bench.report.suite.attempts import place
 from tests.looped import each
-from tests.run.driving import planned, stored
+from tests.runner.driving import planned, stored
 
 CELLS = ("completion-dist-sofa-1", "completion-dist-sofa-2", "completion-dvr-car-3")
 

@@ -4,7 +4,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ class CommandResult(NamedTuple):
     err: str
 
 
-def run_once(overrides: Sequence[str], choices: Mapping[str, Any]) -> Record:
+def run(overrides: Sequence[str] = (), **choices: Any) -> Record:
     """Makes a run like `python -m bench`, in a new process, or reuses the finished run; returns its record.
 
     It needs no `if __name__ == "__main__"`, and works in a notebook. Results go to `results/local` in the working

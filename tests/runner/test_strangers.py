@@ -15,7 +15,7 @@ from bench.records.record import SCHEMA
 from bench.report.write.html import write_index
 from bench.turntable import main as turntable
 from tests.looped import each
-from tests.run.driving import command, errors, planned, stored
+from tests.runner.driving import command, errors, planned, stored
 
 MODULE = """
 from pathlib import Path

@@ -16,7 +16,7 @@ import torch
 from bench.machine import environment
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus, now
-from bench.run.job import FinalRecordSent, Job, Notice, Started, Step, reason_of
+from bench.runner.job import FinalRecordSent, Job, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext, cell_of
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported

@@ -17,10 +17,10 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import type_of
 from bench.progress import notice
 from bench.records.folder import Identity
-from bench.run.compose import OPTIONAL_GROUPS, Composer, composing, parse_override, without_hydra
-from bench.run.job import Interrupted, write_error_message
-from bench.run.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
-from bench.run.sweep import LauncherStopped, run_job_per_cell
+from bench.runner.compose import OPTIONAL_GROUPS, Composer, composing, parse_override, without_hydra
+from bench.runner.job import Interrupted, write_error_message
+from bench.runner.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
+from bench.runner.sweep import LauncherStopped, run_job_per_cell
 from bench.tables import names, nearest
 
 DANGLING_COMMA = re.compile(r"[=,]\s*,|,\s*$")

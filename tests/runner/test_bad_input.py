@@ -13,12 +13,12 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.records import folder as run_folder
-from bench.run.command import message_of, options_of, quote_text
-from bench.run.plan import refusal_reason
+from bench.runner.command import message_of, options_of, quote_text
+from bench.runner.plan import refusal_reason
 from bench.setup import priors
 from tests.composing import identified
 from tests.looped import each
-from tests.run.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, record_of, wait_for
+from tests.runner.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, record_of, wait_for
 
 TINY = ("scale=smoke", "view.resolution=16", "task.points=20", "evaluation.grid=16", "evaluation.points=100")
 
@@ -278,7 +278,7 @@ def test_verbose_shows_where_a_mistake_was_found(bench, no_prior):
 
 def test_a_typo_and_help_are_answered_before_anything_slow_is_loaded(tmp_path):
     code = [
-        "import sys, bench.run.run",
+        "import sys, bench.runner.run",
         "from bench.__main__ import main",
         "code = main()",
         "sys.argv = ['bench', '--help']",

@@ -20,7 +20,7 @@ import psutil
 import bench.tasks
 import datasets
 from bench.records.record import RunStatus
-from bench.run.job import FinalRecordSent, Job, Message, Started, Step
+from bench.runner.job import FinalRecordSent, Job, Message, Started, Step
 
 POLL_INTERVAL_SECONDS = 0.05
 TERMINATION_GRACE_SECONDS = 0.5  # for a child to send its record after SIGTERM
@@ -86,7 +86,7 @@ def preloaded_modules() -> list[str]:
     """Slow modules that runs import; bench first, because it sets variables that torch reads at its import."""
     packages = bench.tasks, datasets
     names = [module.name for package in packages for module in iter_modules(package.__path__, f"{package.__name__}.")]
-    return ["bench", "open3d", "bench.run.execute", *names]
+    return ["bench", "open3d", "bench.runner.execute", *names]
 
 
 def fork_server() -> ForkServerContext:
@@ -141,7 +141,7 @@ def _run_job(job: Job, channel: Connection, lifeline: Connection) -> None:
     for module in preloaded_modules():  # before `Started`, so that the run's time excludes it
         with suppress(ImportError):
             import_module(module)
-    from bench.run.execute import main
+    from bench.runner.execute import main
 
     main(job, channel, lifeline)
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.progress import notice
 from bench.records.folder import Identity
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
-from bench.run.process import catch_signals, raise_if_stopped, signals_delayed, stopped_by
+from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed, stopped_by
 from datasets.extras import install
 
 Make = Callable[[Identity], list[str]]  # runs a cell; returns messages if it leaves no record

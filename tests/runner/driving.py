@@ -19,8 +19,8 @@ from bench.__main__ import main
 from bench.machine.environment import using_threads
 from bench.records.read import PlannedCell
 from bench.records.record import Record, RunStatus
-from bench.run import process
-from bench.run.library import CommandResult
+from bench.runner import process
+from bench.runner.library import CommandResult
 
 ROOT = Path(__file__).parents[2]
 FAILING = (

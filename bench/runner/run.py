@@ -15,10 +15,10 @@ from bench.progress import Report, notice, run_progress
 from bench.records.folder import Identity, free_reserve, locked_folder, reusable_record
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.run.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, write_error_message
-from bench.run.plan import planned_cell, refusal_reasons, show_plan
-from bench.run.process import RunLimits, run_isolated, signals_delayed, stopped_by
-from bench.run.summary import print_run_summary, write_log
+from bench.runner.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, write_error_message
+from bench.runner.plan import planned_cell, refusal_reasons, show_plan
+from bench.runner.process import RunLimits, run_isolated, signals_delayed, stopped_by
+from bench.runner.summary import print_run_summary, write_log
 from bench.trackers import Nothing, Tracker
 
 LOG_TAIL_LINES, LOG_TAIL_BYTES = 80, 16_384  # limits of the log in the record of a failed run
@@ -167,7 +167,7 @@ def _run_job(job: Job, limits: RunLimits, progress: Report, on_ready: Callable[[
         on_ready: called when the child has imported its modules.
     """
     if job.record.config["isolation"] == Isolation.off:
-        from bench.run.execute import execute  # imports torch, which a launcher's worker does not need
+        from bench.runner.execute import execute  # imports torch, which a launcher's worker does not need
 
         execute(job, progress=progress, checkpoint=lambda record: record.write(job.folder))
         return

@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from bench.run.command import EXIT_USAGE
-from bench.run.compose import dotted_keys
+from bench.runner.command import EXIT_USAGE
+from bench.runner.compose import dotted_keys
 from tests.composing import composed
-from tests.run.driving import FAILING, command, record_of
+from tests.runner.driving import FAILING, command, record_of
 
 LIMITS = ("time_limit=3", "memory_limit=2")
 FIXED = {"results_dir", "priors_dir", "isolation", "time_limit", "memory_limit", "rerun", "tracker", "verbose", "label"}

@@ -10,11 +10,11 @@ from bench.prior import main as prior_main
 from bench.records.folder import identify, resolve_config
 from bench.records.read import Plan, PlannedCell
 from bench.records.record import Record, RunStatus
-from bench.run import plan as plan_module
-from bench.run import run as run_module
-from bench.run import sweep
-from bench.run.compose import Composer, composing, without_hydra
-from bench.run.plan import (
+from bench.runner import plan as plan_module
+from bench.runner import run as run_module
+from bench.runner import sweep
+from bench.runner.compose import Composer, composing, without_hydra
+from bench.runner.plan import (
     check_plan,
     duration_group,
     durations_of_similar_runs,
@@ -25,7 +25,7 @@ from bench.run.plan import (
 from bench.train import main as train_main
 from tests import tiny
 from tests.composing import cells_of
-from tests.run.driving import command
+from tests.runner.driving import command
 
 SWEEP = ("-m", "scale=smoke", "isolation=off", "threads=1", "renderer=dist,dvr", "seed=0,1")
 SMALL = ("scale=smoke", "threads=1")

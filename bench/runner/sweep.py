@@ -18,13 +18,13 @@ from bench.records.format import number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.read import Plan
 from bench.records.record import RunStatus, row_name
-from bench.run.compose import Composer
-from bench.run.executors import Launcher, execute
-from bench.run.job import Interrupted, reason_of
-from bench.run.jobs import check_jobs, describe_jobs, split_into_jobs
-from bench.run.plan import check_plan, identity_of, is_reused, plan_of, planned_cell, show_plan
-from bench.run.process import stopped_by, warm_up
-from bench.run.run import run_cell
+from bench.runner.compose import Composer
+from bench.runner.executors import Launcher, execute
+from bench.runner.job import Interrupted, reason_of
+from bench.runner.jobs import check_jobs, describe_jobs, split_into_jobs
+from bench.runner.plan import check_plan, identity_of, is_reused, plan_of, planned_cell, show_plan
+from bench.runner.process import stopped_by, warm_up
+from bench.runner.run import run_cell
 
 CELL_LINE_METRICS = {
     "recommended_field": Metric("recommended"),

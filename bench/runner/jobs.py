@@ -7,7 +7,7 @@ from typing import Any
 
 from bench.records.format import plural
 from bench.records.read import Plan, PlannedCell
-from bench.run.plan import duration_group, durations_of_similar_runs
+from bench.runner.plan import duration_group, durations_of_similar_runs
 
 CLUSTERS = ("slurm", "local")
 POSITIVE_KEYS = ("minutes_per_job", "minutes_per_run", "array_size", "tasks_per_node")
