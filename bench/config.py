@@ -45,7 +45,7 @@ ROLES = {  # what the class of a node of the top level must be
     "dataset": "datasets.scene.Dataset",
     "silhouette": "renderers.silhouette.SilhouetteLoss",
     "tracker": "bench.trackers.Tracker",
-    "prior": "datasets.network_files.Networked",
+    "prior": "datasets.network_files.HasNetwork",
     "supervision": "bench.single_view.training.Supervision",
 }
 TARGETS = {  # classes of nodes without a _target_

@@ -130,7 +130,7 @@ class Judge:
         """The surface metrics against a file with a mesh or a cloud of points."""
         cloud = read_points(truth)
         surface = None if cloud is not None else read_mesh(truth)
-        places = surface.used if surface is not None else cloud
+        places = surface.used_vertices if surface is not None else cloud
         notes = _unlike(mesh, places, *LIKE_A_SHAPE)
         if self.unit_sphere:
             centre, factor = fit_in_sphere(places, RADIUS)
@@ -164,7 +164,7 @@ def _unlike(mesh: Mesh, places: Float[np.ndarray, "n 3"], most: float, least: fl
     """
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
     ratio, slack = mesh.diagonal / max(extent, 1e-300), FLAT * max(mesh.diagonal, extent)
-    boxes = [(points.min(axis=0) - slack, points.max(axis=0) + slack) for points in (mesh.used, places)]
+    boxes = [(points.min(axis=0) - slack, points.max(axis=0) + slack) for points in (mesh.used_vertices, places)]
     low, high = np.stack(boxes, axis=1)
     shared = (high.min(axis=0) - low.max(axis=0)).clip(0).prod()
     overlap = shared / ((high - low).prod(axis=1).sum() - shared)

@@ -112,7 +112,7 @@ def mesh_of_run(folder: Path) -> Path:
 def stand(mesh: Mesh, up: str) -> Mesh:
     """A mesh turned until the axis `up` is y, and moved and scaled into the unit sphere where it does not lie in it."""
     turned = replace(mesh, vertices=mesh.vertices @ np.array(UPRIGHT[up], dtype=float).T)
-    reach = np.linalg.norm(turned.used, axis=1).max()
+    reach = np.linalg.norm(turned.used_vertices, axis=1).max()
     return turned if reach <= 1 + SLACK else normalise(turned, 1.0)
 
 

@@ -24,7 +24,7 @@ from bench.records.format import number, plural
 from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, link_out, read_record
 from bench.setup.inputs import Judges, RunContext, cell_of
-from datasets.field_files import FIELD, load_field
+from datasets.field_files import FIELD_FILE, load_field
 from renderers.checks import BadInput
 
 SAME = 1e-4  # relative difference of a metric that the same field may have elsewhere: sums are rounded in other orders
@@ -114,10 +114,10 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.dev
         LeftOut: where it left none.
         BadInput: where its field or its configuration cannot be used.
     """
-    if not (folder / FIELD).is_file():
-        notes = [note for note in record.notes if FIELD in note]
+    if not (folder / FIELD_FILE).is_file():
+        notes = [note for note in record.notes if FIELD_FILE in note]
         ended = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
-        raise LeftOut(notes[0] if notes else f"it has no {FIELD}: no field was found or looked for{ended}")
+        raise LeftOut(notes[0] if notes else f"it has no {FIELD_FILE}: no field was found or looked for{ended}")
     cell = cell_of(record.config)
     cell.start()
     field = load_field(folder, cell.inputs.device)

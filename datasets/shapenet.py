@@ -13,7 +13,7 @@ import numpy as np
 from datasets.captures.formats import find_layout
 from datasets.captures.take import take
 from datasets.colours import FileColours
-from datasets.local import VERSION, deal, repaired
+from datasets.local import VERSION, load_repaired, split_files
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.meshes import read_mesh
 from datasets.repair import WRAPPED
@@ -84,7 +84,7 @@ class ShapeNet:
     def texture(self, split: Split, index: int) -> Texture:
         """The colours of a shape, as its file has them; see `Textured`."""
         file = self._file(split, index)
-        return FileColours(file, repaired(file), self.mesh(split, index))
+        return FileColours(file, load_repaired(file), self.mesh(split, index))
 
     def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
         """See `Pictured`."""
@@ -119,7 +119,7 @@ class ShapeNet:
                 "them there, or give the split of the shapes that are"
             )
         rest = {*here.values()}.difference(*listed.values())
-        files = deal(listed.get(Split.TRAIN, sorted(rest))) | listed
+        files = split_files(listed.get(Split.TRAIN, sorted(rest))) | listed
         if Split.TRAIN in listed:
             held = {*files[Split.VALIDATION], *files[Split.TEST]}
             files[Split.TRAIN] = [file for file in files[Split.TRAIN] if file not in held]
@@ -196,6 +196,6 @@ def _load(path: Path, normalised: str) -> Mesh:
     centre, factor = fit_in_sphere(points, 1 / BUFFER)
     if normalised == "onet":
         factor = 1 / float((points.max(axis=0) - points.min(axis=0)).max())
-    mesh = repaired(path)
+    mesh = load_repaired(path)
     sign = (UNKNOWN,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
     return replace(mesh, vertices=(mesh.vertices - centre) * factor, repairs=(*sign, *mesh.repairs))

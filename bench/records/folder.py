@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import OURS, Rerun, check, check_draw
 from bench.records.record import NEUTRAL_KEYS, RunStatus, digest, file_lock, leads_out, link_out, read_record, to_json
 from bench.tables import own_row
-from datasets.extras import named_files, version
+from datasets.extras import referenced_files, version
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSIVE = (
@@ -253,7 +253,7 @@ def _content(path: Path) -> str:
             found = [child for part in IN_FOLDERS for child in sorted(path.glob(part)) if child.is_file()]
             return digest([_content(child) for child in found if child.suffix not in ARCHIVES])
         own = [path.name, hashlib.sha256(path.read_bytes()).hexdigest()]
-        return digest([*own, *map(_content, named_files(path))])
+        return digest([*own, *map(_content, referenced_files(path))])
     except OSError:
         return ""
 

@@ -18,7 +18,7 @@ from bench.progress import notice
 from bench.records.folder import Identity
 from bench.records.record import BESIDE
 from bench.run.process import catch_signals, raise_if_stopped, signals_delayed, stopped_by
-from datasets.extras import install
+from datasets.extras import install_command
 
 Make = Callable[[Identity], list[str]]  # does what a cell describes; gives a message where that leaves no record
 EXTRAS = {"slurm": "submitit", "ray": "ray"}  # packages that executors need, each the name of its extra
@@ -68,7 +68,7 @@ class Launcher:
             try:
                 import_module(extra)
             except ImportError as error:
-                raise ValueError(f"this launcher needs a package: {install(extra)}") from error
+                raise ValueError(f"this launcher needs a package: {install_command(extra)}") from error
         return launcher
 
     @property

@@ -21,7 +21,7 @@ from bench.setup.auto import Node, at_pixel_precision, resolved
 from bench.setup.fields import FieldChoice
 from bench.setup.priors import PriorChoice, learnt_dataset, naming_prior_keys
 from bench.shape_prior import Prior, PriorSettings
-from datasets.network_files import Networked
+from datasets.network_files import HasNetwork
 from datasets.own_photographs import Photographed
 from datasets.scene import SPLIT_STRIDE, Dataset, OneView, Scene, Split, Surface, make_scene, sample_surface, scene_name
 from datasets.views import ViewSampler
@@ -255,7 +255,7 @@ class _Builder:
 
     def prior(self, dataset: Dataset, split: Split, index: int) -> PriorChoice:
         """The prior for shape number `index` of a dataset."""
-        node, shown = self.config["prior"], dataset.network(index) if isinstance(dataset, Networked) else None
+        node, shown = self.config["prior"], dataset.network(index) if isinstance(dataset, HasNetwork) else None
         with naming_prior_keys(node):
             (settings,) = self.parts("prior")
             learnt = learnt_dataset(node.get(OF))

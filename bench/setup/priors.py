@@ -13,7 +13,7 @@ from bench.config import load
 from bench.machine.environment import using_threads
 from bench.progress import Report
 from bench.shape_prior import Prior, PriorSettings, prior_for
-from datasets.network_files import Known
+from datasets.network_files import SceneNetwork
 from datasets.scene import Dataset, OneView, Split
 from datasets.textures import Texture
 from renderers.checks import BadInput
@@ -30,7 +30,7 @@ class PriorChoice:
         exists: False for an object of the user's, such as photographs, where no other prior is named.
     """
 
-    source: PriorSettings | Known
+    source: PriorSettings | SceneNetwork
     dataset: Dataset | None = None
     scene_code: int | None = None
     exists: bool = True

@@ -20,7 +20,7 @@ from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.optimise import FirstChecked, History, NotReached, Objective, OptimiserSettings, optimise
-from datasets.field_files import FIELD, save_field
+from datasets.field_files import FIELD_FILE, save_field
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
 from datasets.scene import Scene
@@ -200,7 +200,7 @@ def note_result(run: RunContext, after: Evaluation) -> None:
     record = run.record
     record.metrics = after.metrics
     record.status, record.reason = after.failure or (RunStatus.OK, "")
-    lost = None if after.field is None else save_field(after.field, run.folder / FIELD)
+    lost = None if after.field is None else save_field(after.field, run.folder / FIELD_FILE)
     record.notes = [*record.notes, *([lost] if lost else []), *after.notes, *depth_gap_note(after.metrics)]
     if after.mesh is not None:
         record.notes += after.mesh.repairs

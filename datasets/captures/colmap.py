@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from datasets.captures.frames import Frame, Layout, motion
 from datasets.captures.lenses import colmap_lens
 from datasets.captures.pairing import images_in, located, masks_of, without
-from datasets.extras import install
+from datasets.extras import install_command
 from renderers.checks import BadInput
 
 IMAGES = ("images", "images_2", "images_4", "images_8", "input", "image", ".")
@@ -30,7 +30,7 @@ def colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None
     try:
         import pycolmap
     except ImportError as error:
-        raise BadInput(f"{places[0]} is read by pycolmap: {install('colmap')}") from error
+        raise BadInput(f"{places[0]} is read by pycolmap: {install_command('colmap')}") from error
     models = {place: pycolmap.Reconstruction(str(place)) for place in places}
     place = max(places, key=lambda one: len(models[one].images))  # of equal ones the first
     cameras = _cameras(models[place], place)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from datasets.extras import install
+from datasets.extras import install_command
 from renderers.checks import BadInput
 
 
@@ -34,7 +34,7 @@ def stored_depths(path: Path, otherwise: str) -> Float[np.ndarray, "height width
     try:
         import cv2
     except ImportError as error:
-        raise BadInput(f"{path} is read by OpenCV: {install('stereo')}, or {otherwise}") from error
+        raise BadInput(f"{path} is read by OpenCV: {install_command('stereo')}, or {otherwise}") from error
     try:
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.config import load
 from bench.setup.auto import AutoSettings, epsilon, footprint, resolved, steps
-from datasets.families import BUILDERS, HALF_GRID, Family
+from datasets.families import BUILDERS, CUBE_HALF_SIDE, Family
 from datasets.mesh import extract, fit_in_sphere
 from datasets.scene import Split
 from datasets.views import ViewSampler
@@ -29,7 +29,7 @@ def formula(family: Family) -> Shape:
     """The formula of the first validation shape where its mesh is, divided by its slope to be a bound."""
     raw = BUILDERS[family.name](SimpleNamespace(**family.draw(Split.VALIDATION, 0)))
     steepest = max(raw.lipschitz, 1.0)
-    centre, factor = fit_in_sphere(extract(raw, grid=family.resolution, reach=HALF_GRID).used, family.radius)
+    centre, factor = fit_in_sphere(extract(raw, grid=family.resolution, reach=CUBE_HALF_SIDE).used, family.radius)
     return Shape(lambda p: raw(p) / steepest, Kind.BOUND).translate(tuple(-centre)).scale(factor)
 
 
