@@ -23,7 +23,7 @@ from bench.records.folder import Identity
 from bench.records.format import number, plural
 from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, link_out, read_record
-from bench.setup.inputs import Judges, RunContext, cell_of
+from bench.setup.inputs import EvaluatesField, RunContext, build_cell
 from datasets.field_files import FIELD_FILE, load_field
 from renderers.checks import BadInput
 
@@ -118,11 +118,11 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.dev
         notes = [note for note in record.notes if FIELD_FILE in note]
         ended = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
         raise LeftOut(notes[0] if notes else f"it has no {FIELD_FILE}: no field was found or looked for{ended}")
-    cell = cell_of(record.config)
+    cell = build_cell(record.config)
     cell.start()
     field = load_field(folder, cell.inputs.device)
     run = RunContext(cell.inputs, folder, record, lambda *_: None)
-    judged = cell.task.judged(field, run) if isinstance(cell.task, Judges) else None
+    judged = cell.task.field_metrics(field, run) if isinstance(cell.task, EvaluatesField) else None
     return evaluate(State(field, cell.inputs)).metrics if judged is None else judged, cell.inputs.device
 
 

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import EvaluationSettings
 from bench.records.record import Record
 from bench.setup.fields import FieldChoice
-from bench.setup.inputs import Cell, RunContext, RunInputs, cell_of
+from bench.setup.inputs import Cell, RunContext, RunInputs, build_cell
 from bench.setup.priors import PriorChoice
 from bench.shape_prior import Prior
 from datasets.mesh import Mesh
@@ -71,7 +71,7 @@ def plain(config: DictConfig) -> Any:
 
 def cell_from(config: DictConfig) -> Cell:
     """The cell of a composed configuration."""
-    return cell_of(plain(config))
+    return build_cell(plain(config))
 
 
 def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bench.evaluate.state import REACH
 from bench.models.model import FLOAT, Candidate, Model, Seen
-from bench.setup.fields import FREE, parsed
+from bench.setup.fields import FREE, parse_field_name
 from bench.shape_prior import initialise_to_sphere
 from renderers.checks import BadInput
 from renderers.field import Flops
@@ -161,7 +161,7 @@ def candidate(name: str) -> Candidate:
         ValueError: where no candidate has this name.
         BadInput: for a field that is learnt from images alone.
     """
-    kind, sizes = parsed(name)
+    kind, sizes = parse_field_name(name)
     if sizes and kind not in SIZED:
         raise BadInput(f"field={name} is learnt from images alone: set task=reconstruction, or another field")
     return SIZED[kind](name, *sizes) if sizes else one_part(name)

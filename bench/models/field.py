@@ -14,7 +14,7 @@ from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import Given, draw_run
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext
-from bench.solve.solve import COSTS, draw, note_costs, note_result
+from bench.solve.solve import COST_DEFINITIONS, draw, note_costs, note_result
 
 SIZES = (
     "the numbers of its field that the optimiser may change; those that a file must hold so that it can be evaluated, "
@@ -46,7 +46,7 @@ def solve_by_growth(observations: RayObservations, given: Given, run: RunContext
         Unsupported: where the renderer cannot do what the field needs.
     """
     inputs, record, choice = run.inputs, run.record, run.inputs.field
-    record.definitions = DEFINITIONS | COSTS | ENDED
+    record.definitions = DEFINITIONS | COST_DEFINITIONS | ENDED
     lines: list[dict[str, Any]] = []
     with curve_file(run.folder) as write_line:
 

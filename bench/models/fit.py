@@ -18,8 +18,8 @@ from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import slopes_at
-from bench.solve.optimise import FirstChecked, History, NotReached, OptimiserSettings, optimise
+from bench.solve.observed_view import gradients_at
+from bench.solve.optimise import CannotContinue, FirstChecked, History, OptimiserSettings, optimise
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, Unsupported, check_kind, fresh
 
@@ -170,7 +170,7 @@ class Fitter:
         try:
             checked = FirstChecked(problem, self.notes)
             optimise(checked, settings, self.device, history=history, on_step=on_step, least_reference=NEAR_ENOUGH)
-        except NotReached as error:
+        except CannotContinue as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
         for name, seconds in history.seconds.items():
             self.spent[name] = self.spent.get(name, 0.0) + seconds
@@ -215,7 +215,7 @@ class FitProblem:
         self.error = self.observations.depth_error(terms)
         if not self.model.metric and settings.eikonal_weight:
             points = scattered(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, place))
-            slopes = torch.linalg.vector_norm(slopes_at(counted, points), dim=-1)
+            slopes = torch.linalg.vector_norm(gradients_at(counted, points), dim=-1)
             terms["eikonal"] = settings.eikonal_weight * (slopes - 1).square().mean()
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 

@@ -13,7 +13,7 @@ from bench.models.held_out import HeldOut, HeldOutError
 from bench.setup.auto import footprint
 from bench.setup.fields import ViewSettings
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import GivenView, Weights
+from bench.solve.observed_view import ObservedView, ViewLossSettings
 from datasets.scene import Truth, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays, sphere_span
@@ -35,7 +35,7 @@ class RayObservations:
         seed: of the draws, which are the same for every candidate.
     """
 
-    given: GivenView
+    given: ObservedView
     held_out: HeldOut
     rays: int
     seed: int
@@ -54,7 +54,7 @@ class RayObservations:
     def points(self) -> Float[Tensor, "n 3"]:
         """Points of the surface at the pixels whose depth is given."""
         observed = self.given.observed
-        distance = self.given.depth[observed] / self.given.depth_of_distance[observed]
+        distance = self.given.depth[observed] / self.given.depth_per_distance[observed]
         return self.given.rays[observed].at(distance)
 
     @cached_property
@@ -90,7 +90,7 @@ class RayObservations:
         """Points that are known to lie outside: in front of observed depths, and on background rays."""
         given = self.given
         entry, leave, meets = sphere_span(given.rays)
-        seen_to = torch.where(given.observed, given.depth / given.depth_of_distance, leave)
+        seen_to = torch.where(given.observed, given.depth / given.depth_per_distance, leave)
         empty = given.observed if given.mask is None else given.observed | ~given.mask
         chosen = (meets & empty).nonzero().squeeze(-1)
         draw = torch.Generator().manual_seed(self.seed)
@@ -100,7 +100,7 @@ class RayObservations:
 
 
 def hold_out(
-    view: GivenView, group: Int[Tensor, " n"], *, share: float, whole: tuple[int, ...], footprint: float, seed: int
+    view: ObservedView, group: Int[Tensor, " n"], *, share: float, whole: tuple[int, ...], footprint: float, seed: int
 ) -> RayObservations:
     """Holds out whole groups, and a share of the rays of the others; an iteration draws as many rays as there are.
 
@@ -137,7 +137,7 @@ class Views:
     truth: Truth
     sampler: ViewSampler
     settings: ViewSettings
-    weights: Weights
+    weights: ViewLossSettings
     renderer: Renderer
     device: torch.device
 
@@ -172,21 +172,21 @@ class Views:
             for place, height in enumerate(heights)
         ]
 
-    def _seen(self, cameras: list[Camera]) -> tuple[GivenView, Int[Tensor, " n"]]:
+    def _seen(self, cameras: list[Camera]) -> tuple[ObservedView, Int[Tensor, " n"]]:
         views = [see(self.truth, camera) for camera in cameras]
         given = [
-            GivenView.of(view, self.weights, self.renderer, observed=view.mask, mask=view.mask, device=self.device)
+            ObservedView.of(view, self.weights, self.renderer, observed=view.mask, mask=view.mask, device=self.device)
             for view in views
         ]
         pixels = views[0].mask.numel()
         return together(given), torch.arange(len(cameras)).repeat_interleave(pixels)
 
 
-def together(views: list[GivenView]) -> GivenView:
+def together(views: list[ObservedView]) -> ObservedView:
     """Several views joined into one row of rays."""
     parts = {
         name: torch.cat([getattr(view, name).flatten() for view in views])
-        for name in ("depth", "depth_of_distance", "observed")
+        for name in ("depth", "depth_per_distance", "observed")
     }
     flat = [view.rays.flat() for view in views]
     rays = Rays(torch.cat([rays.origins for rays in flat]), torch.cat([rays.directions for rays in flat]))
@@ -196,13 +196,13 @@ def together(views: list[GivenView]) -> GivenView:
     return replace(views[0], rays=rays, **parts)
 
 
-def held(view: GivenView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], footprint: float) -> HeldOut:
+def held(view: ObservedView, out: Bool[Tensor, " n"], group: Int[Tensor, " n"], footprint: float) -> HeldOut:
     """The held-out rays `out` of a view that have an observation: a depth, or a mask."""
     known = (out & view.observed if view.mask is None else out).nonzero().squeeze(-1)
     part = view.some(known)
     mask = part.observed if part.mask is None else part.mask
     numbered = group.to(known.device)[known].unique(return_inverse=True)[1]
-    return HeldOut(part.rays, part.depth / part.depth_of_distance, part.observed, mask, numbered, footprint)
+    return HeldOut(part.rays, part.depth / part.depth_per_distance, part.observed, mask, numbered, footprint)
 
 
 def tiles(height: int, width: int) -> Int[Tensor, " pixels"]:

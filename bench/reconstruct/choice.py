@@ -20,7 +20,7 @@ from bench.reconstruct.subject import Subject
 from bench.records.format import plural
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
-from bench.setup.fields import PRIOR, parsed
+from bench.setup.fields import PRIOR, parse_field_name
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from datasets.shot import Shot
@@ -64,7 +64,7 @@ class Appearance:
         Raises:
             BadInput: for a name that has no colours.
         """
-        kind, sizes = (name, ()) if name in (PRIOR, AUTO) else parsed(name)
+        kind, sizes = (name, ()) if name in (PRIOR, AUTO) else parse_field_name(name)
         if kind == "network":
             layers, width = sizes
             shape = {"layers": layers, "width": width, "octaves": self.octaves}

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.reconstruct.pixels import Pixels
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error, slopes_at
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, normal_error
 from renderers.boundary import rendered
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice
@@ -67,7 +67,7 @@ class Losses:
         rendering = rendered(renderer, metered, pixels.rays)
         inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
         points, rays = rendering.points[inside], len(inside)
-        slopes = slopes_at(metered, points)
+        slopes = gradients_at(metered, points)
         normals = torch.nn.functional.normalize(slopes, dim=-1)
         terms: Terms = {}
         if self.colour or self.colour_gradient:
@@ -95,13 +95,13 @@ class Losses:
             terms["silhouette"] = self.silhouette_weight * loss
         if self.smoothness:
             beside = points + BESIDE * (torch.rand_like(points) - 0.5)
-            neighbours = torch.nn.functional.normalize(slopes_at(metered, beside), dim=-1)
+            neighbours = torch.nn.functional.normalize(gradients_at(metered, beside), dim=-1)
             terms["smoothness"] = self.smoothness * torch.linalg.vector_norm(normals - neighbours, dim=-1).sum() / rays
         if self.normals and pixels.normals is not None:
             terms["normals"] = self.normals * normal_error(normals, pixels.normals[inside])
         if self.eikonal and shape.kind is not Kind.LEVEL:
             anywhere = 2 * torch.rand(ANYWHERE, 3, device=points.device) - 1
-            lengths = [torch.linalg.vector_norm(of, dim=-1) for of in (slopes, slopes_at(metered, anywhere))]
+            lengths = [torch.linalg.vector_norm(of, dim=-1) for of in (slopes, gradients_at(metered, anywhere))]
             terms["eikonal"] = self.eikonal * sum((one - 1).square().sum() / max(len(one), 1) for one in lengths)
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
@@ -112,7 +112,7 @@ def _summed_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -
     """The colours that rays see in a volume in front of black: the weighted sums of its samples'."""
     some = rays[volume.ray]
     points = some.at(volume.distance)
-    return volume.summed(shape.colours(points, slopes_at(field, points), some.directions), len(rays.origins))
+    return volume.summed(shape.colours(points, gradients_at(field, points), some.directions), len(rays.origins))
 
 
 def _between_neighbours(difference: Float[Tensor, "n 3"], inside: Bool[Tensor, " n"]) -> Float[Tensor, ""]:

@@ -1,6 +1,6 @@
 """Runs that are planned: each is checked before any starts; `plan=true` lists them, and what finished ones took.
 
-A configuration is built by the code that its run builds it with, `bench.setup.inputs.cell_of`.
+A configuration is built by the code that its run builds it with, `bench.setup.inputs.build_cell`.
 """
 
 import io
@@ -52,11 +52,11 @@ def is_reused(plan: Plan, cell: PlannedCell) -> bool:
 
 def refusal(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
     """Why the run of a configuration would be refused; empty where it would not, or would fail in another way."""
-    from bench.setup.inputs import cell_of  # it imports torch
+    from bench.setup.inputs import build_cell  # it imports torch
 
     try:
         with redirect_stdout(io.StringIO()):  # of classes of the user's
-            cell_of(config, built)
+            build_cell(config, built)
     except (ValueError, OSError) as error:
         return reason_of(error)
     except (Exception, SystemExit):  # noqa: BLE001 - of a class of the user's; the run records it

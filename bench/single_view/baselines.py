@@ -18,7 +18,7 @@ from bench.setup.inputs import RunInputs
 from bench.shape_prior import kept
 from bench.single_view.images import ImagesOf
 from bench.solve.latent_code import CodePenalty, CodeProblem
-from bench.solve.observed_view import DEPTH, GivenView
+from bench.solve.observed_view import DEPTH, ObservedView
 from bench.solve.optimise import OptimiserSettings
 from datasets.mesh import Mesh, extract
 from datasets.scene import Dataset, Split, Truth, sample_surface
@@ -96,11 +96,13 @@ class MaskSearch:
         """
         size = (shot.camera.height, shot.camera.width)
         none = torch.zeros(size, dtype=torch.bool, device="cpu")
-        given = GivenView(self, inputs.renderer, shot.camera.rays(), none.float(), (~none).float(), none, shot.mask).to(
-            inputs.device
-        )
+        given = ObservedView(
+            self, inputs.renderer, shot.camera.rays(), none.float(), (~none).float(), none, shot.mask
+        ).to(inputs.device)
 
-        def wrong(field: Field) -> float:
+        def wrong_fraction(field: Field) -> float:
             return float((rendered(inputs.renderer, field, given.rays).hit != given.mask).float().mean())
 
-        return CodeProblem(inputs.prior, self.code, given.compare, none, none.numel(), inputs.device, judged=wrong)
+        return CodeProblem(
+            inputs.prior, self.code, given.compare, none, none.numel(), inputs.device, progress_measure=wrong_fraction
+        )

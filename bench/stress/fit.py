@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
-from bench.solve.observed_view import GivenView
+from bench.solve.observed_view import ObservedView
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Failure, Outcome
@@ -117,7 +117,7 @@ def judge_fit(
     if name in DISTURBANCES:
         given = DISTURBANCES[name](given, severity, draw)
     view = View(given.camera, given.depth, torch.zeros(*given.depth.shape, 3), given.mask)
-    compared = GivenView.of(view, fit, renderer, observed=given.observed, mask=given.mask, device=conditions.device)
+    compared = ObservedView.of(view, fit, renderer, observed=given.observed, mask=given.mask, device=conditions.device)
     problem = SphereProblem(start.to(conditions.device).requires_grad_(), compared, conditions.limits)
     history = History()
     settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
@@ -135,7 +135,7 @@ class SphereProblem:
     """The problem of finding a sphere's four parameters; see `bench.solve.solve.Objective`."""
 
     free: Float[Tensor, "4"]
-    given: GivenView
+    given: ObservedView
     limits: Limits
     counts: Counts = field(default_factory=Counts)
 

@@ -18,7 +18,7 @@ from bench.records.record import curve_file
 from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
-from bench.solve.solve import COSTS, check_field_gradient, note_result
+from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result
 from renderers.checks import check_at_least, check_choice, check_positive, check_share
 from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss
@@ -88,7 +88,7 @@ class Capacity:
         """Fits all candidates, chooses one, checks the choice, and compares the chosen field with the truth."""
         inputs, record = run.inputs, run.record
         check_field_gradient(inputs.renderer)
-        record.definitions = DEFINITIONS | COSTS | NEEDS
+        record.definitions = DEFINITIONS | COST_DEFINITIONS | NEEDS
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
         views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
         longest = self.rounds * models.fit.iterations

@@ -13,8 +13,8 @@ from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, turned
-from bench.solve.observed_view import DEPTH_LOSSES, GivenView
+from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
+from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
 from datasets.scene import OneView, Scene, painted
@@ -41,7 +41,7 @@ class Completion:
         normal_weight: of 1 less the cosine between the normals of the rendered surface and the true ones, the mean over
             the same pixels (DIST, B.3); beyond 0 the normals of these pixels are given as well.
         normal_width: scene units over which the rendered surface's normals are taken; see
-            `bench.solve.observed_view.slopes_over`.
+            `bench.solve.observed_view.central_differences`.
         colour_weight: of the mean absolute error of colours, over all pixels that show the shape and are hit (DIST,
             B.3); beyond 0 the colours of these pixels are given, and the prior must have colours.
         silhouette: loss of the mask.
@@ -120,7 +120,7 @@ class Completion:
         if not self.similarity:
             return problem()
         codes = torch.zeros(self.rotations, prior.decoder.code_length)
-        return problem(initial=codes, misplaced=turned(self.rotations), trial=self.trial)
+        return problem(initial=codes, initial_similarities=initial_rotations(self.rotations), trial=self.trial)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
@@ -133,12 +133,12 @@ class Completion:
         held = hold_out(together([view]), group, share=HELD_OUT, whole=(), footprint=half_pixel, seed=seed)
         return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
-    def _given(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> GivenView:
+    def _given(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:
         """The given part of a scene's view."""
         view, known = scene.given(exact=self.depths == EXACT)
         observed = observed_pixels(known, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
-        given = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
+        given = ObservedView.of(view, self, renderer, observed=observed, mask=mask, device=device)
         if self.normal_weight:
             more = {"normal_weight": self.normal_weight, "normal_width": self.normal_width}
             given = replace(given, normals=view.normals.to(device), **more)

@@ -17,9 +17,9 @@ from bench.reconstruct.subject import NONE, Depths, PhotographTask, Subject, upr
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.single_view.encoder import EncoderSettings
-from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, turned
-from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
-from bench.solve.solve import COSTS, check_field_gradient, defined, descend, solve
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
+from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings
+from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, metric_definitions, run_optimisation, solve
 from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot
@@ -148,13 +148,13 @@ class Multiview(PhotographTask):
                     code.data += first.to(code)
             return made
 
-        solve(problem, self.optimiser, run, defined(inputs), gallery=True)
+        solve(problem, self.optimiser, run, metric_definitions(inputs), gallery=True)
 
     def _of_photographs(self, run: RunContext) -> None:
         """The same for photographs of one's own, by which the shape is judged, with the colours of those given."""
         inputs, record = run.inputs, run.record
         check_field_gradient(inputs.renderer)
-        record.definitions = COLOURED_DEFINITIONS | COSTS
+        record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
         subject = self.subject(inputs)
         record.notes = [*record.notes, subject.found]
         given = GivenPhotographs(self, inputs.renderer, subject.given, inputs.device, own=True)
@@ -170,7 +170,7 @@ class Multiview(PhotographTask):
 
         with run.off_clock():
             record.metrics_start = judge_mesh(mesh(), subject, inputs).metrics
-        history = descend(problem, self.optimiser, run, scores)
+        history = run_optimisation(problem, self.optimiser, run, scores)
         with run.off_clock():
             note_surface(run, mesh(), subject, {}, history, problem.field())
             draw_curve(run.folder / "curve.png", history.curve)
@@ -181,7 +181,7 @@ class Multiview(PhotographTask):
         found = super().subject(inputs)
         return upright(found) if self.similarity else found
 
-    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
         """The metrics of a field that a run ended on; see `bench.setup.inputs.Judges`."""
         if run.inputs.photographed is None:
             return evaluate(State(field, run.inputs)).metrics
@@ -214,10 +214,10 @@ class Multiview(PhotographTask):
             2 * given.per_step * observed.numel(),
             given.colours.device,
             initial=codes,
-            misplaced=turned(self.starts) if given.own and self.similarity else misplaced,
+            initial_similarities=initial_rotations(self.starts) if given.own and self.similarity else misplaced,
             trial=self.trial,
             photographs=given.colours.cpu().numpy(),
-            compared_at=self.optimiser.iterations,  # where images are no longer blurred
+            comparison_iteration=self.optimiser.iterations,  # where images are no longer blurred
         )
 
     def _misplaced(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
@@ -270,7 +270,7 @@ class GivenPhotographs:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
 
         Raises:
-            NotReached: where no pixel is seen by both views.
+            CannotContinue: where no pixel is seen by both views.
         """
         renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration)
         colours = self.blurred(iteration)
@@ -289,7 +289,7 @@ class GivenPhotographs:
             differences.append((warped - colours[view][seen]).abs().mean(-1))
         together = torch.cat(differences)
         if not len(together):
-            raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
+            raise CannotContinue(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
         terms = {"photometric": self.settings.photometric_weight * together.mean()}
         if self.masks is not None:
             given = Observed(self.masks[views], torch.full_like(mine.distance, torch.nan))

@@ -222,7 +222,7 @@ class PoseProblem:
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
-        start, step = self.starts.turn(iteration)
+        start, step = self.starts.assignment(iteration)
         camera = self.cameras[start].with_object_moved(self.parameters[start])
         renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.known, self.counts)
         rendering = rendered(renderer, metered, rays)

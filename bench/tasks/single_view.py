@@ -24,7 +24,7 @@ from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import best_view, read_picture
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
-from bench.solve.solve import COSTS, check_field_gradient, descend, note_result
+from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result, run_optimisation
 from datasets.photographs import Photography
 from datasets.scene import Split, Truth
 from datasets.views import check_elevation
@@ -148,7 +148,7 @@ class OneImage:
         if self.image_path is not None:
             self._see(run, recipe, Path(self.image_path))
             return
-        record.definitions = DEFINITIONS | COSTS | TRAINING
+        record.definitions = DEFINITIONS | COST_DEFINITIONS | TRAINING
         images, subject = self._images(run, recipe)
         if self.method == NETWORK:
             self._infer(run, recipe, images, subject)
@@ -157,7 +157,7 @@ class OneImage:
         else:
             self._look_up(run, recipe, images, subject)
 
-    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
         """The metrics of a field that a run ended on; none for a picture of one's own, whose camera is not known."""
         if self.image_path is not None:
             return {}
@@ -216,7 +216,7 @@ class OneImage:
     def _see(self, run: RunContext, recipe: Recipe, path: Path) -> None:
         """The shape that the network gives for a picture of one's own, and the view from which it looks most alike."""
         inputs, record = run.inputs, run.record
-        record.scene, record.definitions = path.name, OF_PICTURE | COSTS | TRAINING
+        record.scene, record.definitions = path.name, OF_PICTURE | COST_DEFINITIONS | TRAINING
         model, trained = self._network(run, recipe)
         mask = None if self.mask_path is None else Path(self.mask_path)
         picture, doubts = read_picture(path, mask, self.image_pixels, trained["filled"])
@@ -250,7 +250,7 @@ class OneImage:
         problem = self.search.problem(subject.given[0], inputs)
         check_kind(inputs.renderer, problem.field())
         settings, least = self.search.optimiser, self.search.least_reference
-        history = descend(problem, settings, run, lambda iteration: {}, least_reference=least)
+        history = run_optimisation(problem, settings, run, lambda iteration: {}, least_reference=least)
         with run.off_clock():
             field = problem.field()
             scores = {"iou": overlap(field, images, inputs.device)}

@@ -11,7 +11,7 @@ from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
 from bench.reconstruct.surfaces import fused, given_clouds, measured_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.solve import COSTS
+from bench.solve.solve import COST_DEFINITIONS
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
 from renderers.checks import BadInput, check_at_least
@@ -28,7 +28,7 @@ class _Surface(PhotographTask):
     def execute(self, run: RunContext) -> None:
         """Makes a surface of the given photographs, gives it their colours, and judges it by the others."""
         record = run.record
-        record.definitions = COLOURED_DEFINITIONS | COSTS
+        record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
         subject = self.subject(run.inputs)
         record.notes = [*record.notes, subject.found, "no renderer took part"]
         with run.on_clock():

@@ -20,7 +20,7 @@ from bench.models.study import choose, fit_all, refit
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
-from bench.solve.observed_view import GivenView
+from bench.solve.observed_view import ObservedView
 from datasets.mesh import extract
 from datasets.scene import Truth, see
 from datasets.views import ViewSampler
@@ -196,7 +196,7 @@ def test_groups_give_the_standard_error_of_a_mean():
 
 def test_held_out_rays_are_not_given():
     views = [see(shape_of("box"), SAMPLER.camera(angle, 20.0)) for angle in (0.0, 90.0, 180.0)]
-    given = [GivenView.of(v, WEIGHTS, DIST, observed=v.mask, mask=v.mask, device=CPU) for v in views]
+    given = [ObservedView.of(v, WEIGHTS, DIST, observed=v.mask, mask=v.mask, device=CPU) for v in views]
     group = torch.arange(3).repeat_interleave(24 * 24)
     found = hold_out(together(given), group, share=0.25, whole=(2,), footprint=0.02, seed=0)
     pixels = 24 * 24
@@ -364,7 +364,7 @@ def test_a_renderers_random_draws_are_the_same_for_every_fit():
 def test_too_few_depths_to_hold_some_out_are_an_error():
     view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
     few = view.mask & (view.mask.flatten().cumsum(0).view_as(view.mask) <= 2)
-    given = GivenView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
+    given = ObservedView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
     with pytest.raises(ValueError, match="2 depths are too few to hold some out: give more"):
         hold_out(together([given]), torch.arange(24 * 24) // 96, share=0.2, whole=(), footprint=0.02, seed=0)
 

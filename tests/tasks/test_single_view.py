@@ -18,7 +18,7 @@ from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most
 from bench.single_view.own_image import best_view, filled_share, read_picture
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import OptimiserSettings
-from bench.solve.solve import descend, failure_of
+from bench.solve.solve import failure_of, run_optimisation
 from bench.tasks import single_view
 from bench.tasks.single_view import DEFINITIONS
 from bench.train import main
@@ -120,7 +120,9 @@ def test_a_search_has_succeeded_where_its_silhouette_is_nearer_to_the_mask_thoug
     search = MaskSearch(Own(), 10.0, CodePenalty(1.0, "sum"), OptimiserSettings(30, 0.02, "constant"))
     shot = shot_of(Ball(torch.tensor(factor * 0.5), torch.zeros(3), PAINT), camera)
     problem = search.problem(shot, run.inputs)
-    history = descend(problem, search.optimiser, run, lambda iteration: {}, least_reference=search.least_reference)
+    history = run_optimisation(
+        problem, search.optimiser, run, lambda iteration: {}, least_reference=search.least_reference
+    )
     assert failure_of(history, problem.evaluate(State(problem.field(), run.inputs))) is None
     first, last = history.objectives
     assert first == pytest.approx(abs(covered(radius) - covered(0.5)), abs=0.02) and last < 0.3 * first
