@@ -192,7 +192,7 @@ def _read_ids(file: Path, synset: str) -> list[str]:
 @lru_cache(maxsize=64)
 def _load(path: Path, normalised: str) -> Mesh:
     """The repaired mesh of a file, placed by the vertices of the file."""
-    points = read_mesh(path).used
+    points = read_mesh(path).used_vertices
     centre, factor = fit_in_sphere(points, 1 / BUFFER)
     if normalised == "onet":
         factor = 1 / float((points.max(axis=0) - points.min(axis=0)).max())

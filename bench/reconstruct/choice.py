@@ -13,7 +13,7 @@ from bench.evaluate.state import REACH
 from bench.models.growth import Trials, climb
 from bench.models.held_out import HeldOutError
 from bench.models.model import Evidence, Size
-from bench.models.observations import TILES, tiles
+from bench.models.observations import TILES_PER_SIDE, tiles
 from bench.reconstruct.pixels import Stack
 from bench.reconstruct.problem import Learnt, ReconstructionProblem
 from bench.reconstruct.subject import Subject
@@ -174,7 +174,7 @@ class Choice:
 
 def tiled(errors: Float[Tensor, " pixels"], shots: Sequence[Shot]) -> HeldOutError:
     """The mean over tiles of the mean error of their pixels, which are those of all photographs in a row."""
-    places = [tiles(shot.camera.height, shot.camera.width) + k * TILES**2 for k, shot in enumerate(shots)]
+    places = [tiles(shot.camera.height, shot.camera.width) + k * TILES_PER_SIDE**2 for k, shot in enumerate(shots)]
     groups = torch.cat(places)
     means = (torch.bincount(groups, errors.double()) / torch.bincount(groups)).numpy()
     one = np.ones_like(means)

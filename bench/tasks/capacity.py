@@ -5,7 +5,7 @@ from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
 from bench.evaluate.state import State
-from bench.models.candidates import PAPERS, by_size, candidate
+from bench.models.candidates import PAPER_NETWORK, by_size, candidate
 from bench.models.field import SIZES, note_fits
 from bench.models.fit import Fitted, Fitter
 from bench.models.growth import Growth, grow
@@ -168,8 +168,8 @@ def needs(choice: Choice, evidence: list[Evidence], growth: Growth) -> dict[str,
 
 def saved(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
     """Costs of the papers' network over the chosen candidate's; its time only where it was fitted in this run."""
-    fitted = next((one for one in evidence if one.candidate == PAPERS and one.error is not None), None)
-    papers = candidate(PAPERS)
+    fitted = next((one for one in evidence if one.candidate == PAPER_NETWORK and one.error is not None), None)
+    papers = candidate(PAPER_NETWORK)
     size = Size(papers.stored, papers.stored)
     ratios = {measure: size.by(measure) / chosen.size.by(measure) for measure in SIZE_WORDS}
     ratios["flops_per_query"] = papers.flops / chosen.flops_per_query

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 
 from bench.models.field import solve_by_growth
-from bench.models.observations import RayObservations, hold_out, tiles, together
+from bench.models.observations import RayObservations, concatenate_views, hold_out, tiles
 from bench.pictures.colours import note_colours
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
@@ -130,7 +130,7 @@ class Completion:
         observed, camera = view.observed.cpu(), scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         group = tiles(*observed.shape)
-        held = hold_out(together([view]), group, share=HELD_OUT, whole=(), footprint=half_pixel, seed=seed)
+        held = hold_out(concatenate_views([view]), group, share=HELD_OUT, held_out=(), footprint=half_pixel, seed=seed)
         return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
     def _given(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:

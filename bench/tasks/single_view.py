@@ -18,8 +18,8 @@ from bench.reconstruct.surfaces import with_colours
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext, RunInputs
-from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
-from bench.single_view.images import ImagesOf, Imaging
+from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_similar_shape
+from bench.single_view.images import Imaging, ShapeImages
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import best_view, read_picture
 from bench.single_view.store import Recipe, overlap
@@ -167,15 +167,15 @@ class OneImage:
         mesh = coloured(field, subject, run.inputs)
         return judge_mesh(mesh, subject, run.inputs).metrics | {"iou": overlap(field, images, run.inputs.device)}
 
-    def _images(self, run: RunContext, recipe: Recipe) -> tuple[ImagesOf, Subject]:
+    def _images(self, run: RunContext, recipe: Recipe) -> tuple[ShapeImages, Subject]:
         """The images of the scene's shape, and as photographs, of which one is given and all others judge."""
         config = run.record.config
-        images = recipe.imaging.of_shape(recipe.dataset, Split(config["split"]), config["index"])
+        images = recipe.imaging.shape_images(recipe.dataset, Split(config["split"]), config["index"])
         shots = images.shots()
         others = tuple(shot for place, shot in enumerate(shots) if place != self.given)
         return images, Subject((shots[self.given],), others or shots, run.inputs.scene.mesh, "")
 
-    def _infer(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
+    def _infer(self, run: RunContext, recipe: Recipe, images: ShapeImages, subject: Subject) -> None:
         """The shape that the network gives; before, that of the mean code."""
         inputs, record = run.inputs, run.record
         model, trained = self._network(run, recipe)
@@ -236,7 +236,7 @@ class OneImage:
             if inputs.evaluation.picture is not None:
                 draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, record.outcome)
 
-    def _judged(self, state: State, images: ImagesOf, subject: Subject) -> Evaluation:
+    def _judged(self, state: State, images: ShapeImages, subject: Subject) -> Evaluation:
         """The scores of a network's shape; of its colours only where its training knew some."""
         found = judge(state, subject)
         scores = {
@@ -244,7 +244,7 @@ class OneImage:
         }
         return replace(found, metrics=scores | {"iou": overlap(state.field, images, state.inputs.device)})
 
-    def _search(self, run: RunContext, images: ImagesOf, subject: Subject) -> None:
+    def _search(self, run: RunContext, images: ShapeImages, subject: Subject) -> None:
         """The shape of the code that is found, with the colours of the given image."""
         inputs = run.inputs
         problem = self.search.problem(subject.given[0], inputs)
@@ -256,7 +256,7 @@ class OneImage:
             scores = {"iou": overlap(field, images, inputs.device)}
             note_surface(run, coloured(field, subject, inputs), subject, scores, history, field)
 
-    def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
+    def _look_up(self, run: RunContext, recipe: Recipe, images: ShapeImages, subject: Subject) -> None:
         """A shape that needs no network, with the colours of its images."""
         inputs, record, count = run.inputs, run.record, self.shapes
         record.notes = [*record.notes, "no network and no renderer took part"]
@@ -266,7 +266,7 @@ class OneImage:
             others = recipe.imaging.images(recipe.dataset, Split.TRAIN, count, inputs.cache, run.progress)
             with run.on_clock():
                 if self.method == NEAREST:
-                    place = most_alike(images.image(self.given), others)
+                    place = most_similar_shape(images.image(self.given), others)
                 else:
                     place = best_shape(inputs.scene.mesh, recipe.dataset, count)
             mesh, seen = recipe.dataset.mesh(Split.TRAIN, place), others[place].shots()

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 import bench
-from bench.models.candidates import PARTS
+from bench.models.candidates import PRIMITIVES
 from bench.records.read import RESULTS
 from datasets import field_files
 from datasets.field_files import FIELD_FILE, load_field, load_network, save_field
@@ -60,7 +60,11 @@ FIELDS = {
     "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
     "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,
     "occupancy_at_code": lambda: ScaledOccupancyOf(OccupancyNetwork(width=8, code_length=3).at(numbers(3))),
-    **{name: lambda n=name: formula(n, numbers(PARTS[n].size), Flops(1, 2)) for name in FORMULAS if name != "union"},
+    **{
+        name: lambda n=name: formula(n, numbers(PRIMITIVES[n].size), Flops(1, 2))
+        for name in FORMULAS
+        if name != "union"
+    },
     "union": lambda: formula("union", numbers(3, 10), Flops(3, 6)),
 }
 

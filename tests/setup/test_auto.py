@@ -29,7 +29,9 @@ def formula(family: Family) -> Shape:
     """The formula of the first validation shape where its mesh is, divided by its slope to be a bound."""
     raw = BUILDERS[family.name](SimpleNamespace(**family.draw(Split.VALIDATION, 0)))
     steepest = max(raw.lipschitz, 1.0)
-    centre, factor = fit_in_sphere(extract(raw, grid=family.resolution, reach=CUBE_HALF_SIDE).used, family.radius)
+    centre, factor = fit_in_sphere(
+        extract(raw, grid=family.resolution, reach=CUBE_HALF_SIDE).used_vertices, family.radius
+    )
     return Shape(lambda p: raw(p) / steepest, Kind.BOUND).translate(tuple(-centre)).scale(factor)
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.models.observations import together
+from bench.models.observations import concatenate_views
 from bench.solve.observed_view import ObservedView, central_differences, gradients_at, normal_error
 from datasets.scene import View
 from renderers.fields.analytic import Shape, sphere
@@ -120,13 +120,13 @@ def test_slopes_over_a_width_move_a_code_that_those_at_a_point_do_not():
 
 def test_views_without_normals_have_no_such_term_and_parts_keep_theirs():
     view = given(OTHER, ALL)
-    flat = together([view])
+    flat = concatenate_views([view])
     some = flat.select(torch.tensor([0, 7]))
     assert torch.equal(some.normals, OTHER.flatten(0, 1)[[0, 7]])
     assert set(some.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth", "normals"}
     plain = ObservedView(WEIGHTS, RENDERERS["idr"], CAMERA.rays(), view.depth, view.depth_per_distance, ALL, None)
     assert set(plain.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth"}
-    assert together([plain]).normals is None
+    assert concatenate_views([plain]).normals is None
 
 
 def test_normals_that_are_not_given_have_no_part():

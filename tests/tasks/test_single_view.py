@@ -14,8 +14,8 @@ from bench.config import load
 from bench.evaluate.state import State
 from bench.records.read import read_records
 from bench.single_view import baselines, store
-from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
-from bench.single_view.own_image import best_view, filled_share, read_picture
+from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_similar_shape
+from bench.single_view.own_image import best_view, filled_fraction, read_picture
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import failure_of, run_optimisation
@@ -43,8 +43,8 @@ TINY = (
 def fewer():
     """Fewer validation shapes, samples of a mean shape, and views in the search for that of a picture."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "VALIDATION", 1)
-        patch.setattr(baselines, "SAMPLES", 32)
+        patch.setattr(store, "VALIDATION_SHAPES", 1)
+        patch.setattr(baselines, "GRID_SAMPLES", 32)
         patch.setattr(single_view, "TRIED", 20)
         yield
 
@@ -190,7 +190,7 @@ def test_a_picture_that_cannot_be_is_told(picture, image, mask, says):
 
 
 def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
-    filled = filled_share(torch.cat([one.masks for one in images]))
+    filled = filled_fraction(torch.cat([one.masks for one in images]))
     sides = [max(np.ptp(np.flatnonzero(m.any(0))), np.ptp(np.flatnonzero(m.any(1)))) + 1 for m in images[1].masks]
     assert filled == pytest.approx(np.median(sides) / 16, abs=1 / 16)
     framed, doubts = read_picture(picture, None, 32, 0.5)
@@ -210,7 +210,7 @@ def test_the_view_that_is_most_alike_is_that_of_the_mask():
     mesh = Mesh(Balls().mesh(Split.TEST, 1).vertices * [1.5, 0.5, 0.8], Balls().mesh(Split.TEST, 1).faces)
     cameras = [SAMPLER.draw(place) for place in range(6)]
     mask = see(Truth(mesh), cameras[4]).mask
-    filled = filled_share(mask[None])
+    filled = filled_fraction(mask[None])
     camera, overlapping = best_view(mesh, cameras, mask, filled)
     assert torch.equal(camera.world_to_camera, cameras[4].world_to_camera) and overlapping > 0.9
 
@@ -231,8 +231,8 @@ def test_rows_without_a_network_are_judged_alike(folder, method):
 
 def test_the_nearest_image_and_the_best_shape_are_those_of_the_same_shape(images):  # noqa: F811
     for place, one in enumerate(images):
-        assert most_alike(one.image(1), images) == place
-        assert most_alike((one.image(2) + 0.01).clamp(0, 1), images) == place
+        assert most_similar_shape(one.image(1), images) == place
+        assert most_similar_shape((one.image(2) + 0.01).clamp(0, 1), images) == place
         assert best_shape(Balls().mesh(Split.TEST, place), Balls(), 3) == place
 
 
@@ -244,7 +244,7 @@ def test_the_nearest_image_is_one_image_and_no_mean_over_a_shape(images):  # noq
     very = replace(same, colours=torch.cat([colours, torch.zeros_like(colours), torch.zeros_like(colours)]))
     near = (colours.int() + 20).clamp(0, 255).to(torch.uint8)
     all_near = replace(same, colours=near.repeat(3, 1, 1, 1))
-    assert most_alike(given, [all_near, very]) == 1
+    assert most_similar_shape(given, [all_near, very]) == 1
 
 
 def test_the_mean_shape_has_the_mean_distance(tmp_path):
