@@ -129,7 +129,7 @@ class DepthImage:
         seen = see(Truth(mesh, closed=False), camera)
         view = View(camera, seen.depth, seen.normals, torch.from_numpy(mask))
         mesh = replace(mesh, repairs=(*filter(None, (note, doubt)), *mesh.repairs))
-        return Scene(self.name, mesh, view, measured, to_world, part=self.truth is None)
+        return Scene(self.name, mesh, view, measured, to_world, is_partial=self.truth is None)
 
     def _off(self, height: int, width: int) -> str:
         """What is said of a principal point far from the middle of the image; "" of others."""

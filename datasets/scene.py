@@ -86,7 +86,7 @@ class Surface:
         """Search tree for the nearest points."""
         return cKDTree(self.points)
 
-    def some(self, kept: Bool[np.ndarray, " n"]) -> "Surface":
+    def select(self, kept: Bool[np.ndarray, " n"]) -> "Surface":
         """The samples that are kept."""
         return Surface(self.points[kept], self.normals[kept])
 
@@ -206,7 +206,7 @@ class Scene:
         view: its true images.
         measured: camera z measured by a scanner at the view's pixels, 0 without a measurement; None without a scanner.
         to_world: the similarity from the scene's world to the world of a file; None if no file defines one.
-        part: whether `mesh` is an open surface: the part of an unknown shape that the view shows.
+        is_partial: whether `mesh` is an open surface: the part of an unknown shape that the view shows.
         texture: the colours of the shape; None without colours.
     """
 
@@ -215,15 +215,15 @@ class Scene:
     view: View
     measured: Float[Tensor, "height width"] | None = None
     to_world: Float[np.ndarray, "4 4"] | None = None
-    part: bool = False
+    is_partial: bool = False
     texture: Texture | None = None
 
     @cached_property
-    def cast_on(self) -> Truth:
+    def raycaster(self) -> Truth:
         """The true shape, for ray casting and signed distances."""
-        return Truth(self.mesh, closed=not self.part)
+        return Truth(self.mesh, closed=not self.is_partial)
 
-    def given(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
+    def observed_view(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
         """The view whose depths a task may observe, and the pixels with a depth.
 
         Args:
@@ -235,9 +235,9 @@ class Scene:
         return self.view if exact else replace(self.view, depth=self.measured), observed
 
     @property
-    def on_depths(self) -> list[str]:
+    def measured_depth_notes(self) -> list[str]:
         """Notes on the number and the errors of a scanner's depths; empty without a scanner."""
-        if self.measured is None or self.part:
+        if self.measured is None or self.is_partial:
             return []
         compared = self.view.mask & (self.measured > 0)
         errors = (self.measured - self.view.depth)[compared].abs()
@@ -311,7 +311,7 @@ def see(truth: Truth, camera: Camera) -> View:
     return View(camera, camera.depth(distance), normals.view(*rays.shape, 3), mask)
 
 
-def painted(view: View, texture: Texture) -> Float[Tensor, "height width 3"]:
+def unshaded_image(view: View, texture: Texture) -> Float[Tensor, "height width 3"]:
     """The image of a view's surface colours without light; 0 on the background."""
     rays = view.camera.rays()
     points = rays.at(view.camera.distance(view.depth))[view.mask].numpy().astype(np.float64)

@@ -103,8 +103,8 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
     part = judged = None
     if mesh is not None and found is not None:
         there = subject.seen(mesh, found)
-        part, judged = found.some(there), (found, there)
-    seen = surface_metrics(part, true.some(visible), threshold=threshold)
+        part, judged = found.select(there), (found, there)
+    seen = surface_metrics(part, true.select(visible), threshold=threshold)
     rough = roughness_scores(judged, (true, visible))
     return whole | {SEEN + name: value for name, value in seen.items()} | rough
 

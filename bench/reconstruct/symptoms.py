@@ -38,7 +38,7 @@ def roughness_scores(
     """
     scores = {}
     for name, seen in zip(ROUGHNESS, (True, False), strict=True):
-        here, there = (None if one is None else roughness(one[0].some(one[1] == seen)) for one in (found, true))
+        here, there = (None if one is None else roughness(one[0].select(one[1] == seen)) for one in (found, true))
         if here is None:
             scores[name] = 0.0 if there is None and found is not None else np.inf
         else:

@@ -130,7 +130,7 @@ class CodeProblem:
 
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
-        view, observed = states[0].inputs.scene.given()[0], self.observed.cpu().numpy()
+        view, observed = states[0].inputs.scene.observed_view()[0], self.observed.cpu().numpy()
         observations = Given(view, observed, self.photographs, self.mask, self.coloured)
         draw_run(folder, states, observations, curve, title)
 

@@ -90,7 +90,7 @@ class Capacity:
         check_field_gradient(inputs.renderer)
         record.definitions = DEFINITIONS | COST_DEFINITIONS | NEEDS
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
-        views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
+        views = Views(inputs.scene.raycaster, inputs.views, models.views, self, inputs.renderer, inputs.device)
         longest = self.rounds * models.fit.iterations
         with curve_file(run.folder) as write_line:
 

@@ -17,7 +17,7 @@ from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
 from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
-from datasets.scene import OneView, Scene, painted
+from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.rendering import Renderer
@@ -94,7 +94,7 @@ class Completion:
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
-        run.record.notes = [*run.record.notes, *run.inputs.scene.on_depths]
+        run.record.notes = [*run.record.notes, *run.inputs.scene.measured_depth_notes]
         inputs = run.inputs
         if inputs.field.of_prior:
             state = solve_task(self, run)
@@ -131,11 +131,13 @@ class Completion:
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         group = tiles(*observed.shape)
         held = hold_out(concatenate_views([view]), group, share=HELD_OUT, held_out=(), footprint=half_pixel, seed=seed)
-        return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
+        return held, Given(
+            scene.observed_view(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None
+        )
 
     def _given(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:
         """The given part of a scene's view."""
-        view, known = scene.given(exact=self.depths == EXACT)
+        view, known = scene.observed_view(exact=self.depths == EXACT)
         observed = observed_pixels(known, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
         given = ObservedView.of(view, self, renderer, observed=observed, mask=mask, device=device)
@@ -143,6 +145,6 @@ class Completion:
             more = {"normal_weight": self.normal_weight, "normal_width": self.normal_width}
             given = replace(given, normals=view.normals.to(device), **more)
         if self.colour_weight:
-            image = painted(view, scene.texture).where(view.mask[..., None], torch.nan)
+            image = unshaded_image(view, scene.texture).where(view.mask[..., None], torch.nan)
             given = replace(given, colours=image.to(device), colour_weight=self.colour_weight)
         return given

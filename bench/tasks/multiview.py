@@ -196,7 +196,7 @@ class Multiview(PhotographTask):
         check_field_gradient(renderer)
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
-        photographs = self.images.take(scene.cast_on, scene.view.camera.zoomed(self.focal), seed=scene_seed)
+        photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
         return self._problem(prior, GivenPhotographs(self, renderer, photographs, device), generator)
 
     def _problem(self, prior: Prior, given: "GivenPhotographs", generator: torch.Generator) -> CodeProblem:

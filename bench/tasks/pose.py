@@ -92,7 +92,7 @@ class PoseTask(ABC):
             scene: the known mesh and the given view.
             own: what the renderer under test sees from the found camera, where there is one.
         """
-        seen, true = see(scene.cast_on, found), scene.view
+        seen, true = see(scene.raycaster, found), scene.view
         images = view_metrics(seen, true) | ({} if own is None else view_metrics(own, true, OWN))
         metrics = self.metrics(found, true.camera)
         rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
@@ -166,7 +166,7 @@ def known_shape(settings: Pose, inputs: RunInputs) -> Field:
     if settings.shape == "prior":
         fitted = inputs.fitted()
         return fitted.decoder.to(inputs.device).requires_grad_(False).at(fitted.codes[0].to(inputs.device))
-    values = inputs.scene.cast_on.distance_grid(settings.grid, REACH)
+    values = inputs.scene.raycaster.distance_grid(settings.grid, REACH)
     return Grid(torch.from_numpy(values).to(inputs.device), REACH)
 
 
