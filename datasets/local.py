@@ -86,13 +86,8 @@ class LocalMeshes:
         meshes = find_meshes(self.path)
         referenced = [other for file in meshes for other in referenced_files(file) if other.is_file()]
         contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in (*meshes, *referenced)]
-        return {
-            "name": "mesh",
-            "version": VERSION,
-            "contents": contents,
-            "radius": self.radius,
-            "strength": self.strength,
-        }
+        settings = {"radius": self.radius, "strength": self.strength}
+        return {"name": "mesh", "version": VERSION, "contents": contents, **settings}
 
 
 def split_files(files: list[Path]) -> dict[Split, list[Path]]:
@@ -118,12 +113,8 @@ def load_repaired(path: Path) -> Mesh:
     code = sorted(Path(__file__).parent.rglob("*.py"))
     fingerprint = b"\0".join([str(version("pymeshlab")).encode(), *(file.read_bytes() for file in (*code, path))])
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "implicit-bench", "meshes")
-    cached = folder / f"{hashlib.sha256(fingerprint).hexdigest()[:16]}.npz"
-    with (
-        suppress(OSError, EOFError, ValueError, KeyError, BadZipFile),
-        cached.open("rb") as file,
-        np.load(file) as data,
-    ):
+    entry = folder / f"{hashlib.sha256(fingerprint).hexdigest()[:16]}.npz"
+    with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), entry.open("rb") as file, np.load(file) as data:
         return Mesh(data["vertices"], data["faces"], tuple(map(str, data["repairs"])))
     started = time.perf_counter()
     mesh = load_mesh(path)
@@ -131,7 +122,7 @@ def load_repaired(path: Path) -> Mesh:
         with suppress(OSError):  # a cache that cannot be written to
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder) as scratch:  # another process may do the same
-                written = Path(scratch, cached.name)
+                written = Path(scratch, entry.name)
                 np.savez(written, vertices=mesh.vertices, faces=mesh.faces, repairs=mesh.repairs)
-                written.replace(cached)
+                written.replace(entry)
     return mesh

@@ -21,9 +21,8 @@ MERGE_DISTANCE = 1e-6  # closer vertices are merged: about ten float32 steps
 MIN_THICKNESS = 2e-6  # a closed part of less mean thickness encloses nothing
 WRAP_ALPHAS = (8.0, 4.0, 2.0, 1.0)  # % of the diagonal: gaps up to this width are closed by a wrap; coarse to fine
 WRAP_OFFSET = 0.1  # % of the diagonal: how far outside the surface a wrap lies
-# A finer wrap has entered the inside if it loses more than both: a fraction of the coarser wrap's volume, and a
-# fraction of the cubed diagonal, which a wrap around a sheet does not lose.
-MAX_WRAP_LOSS_FRACTION, MAX_WRAP_LOSS = 0.15, 0.005
+MAX_WRAP_LOSS_FRACTION = 0.15  # a finer wrap that loses more volume than this and the next has entered the inside
+MAX_WRAP_LOSS = 0.005  # cubed diagonals; a wrap around a sheet loses less
 OUTSIDE_DISTANCE = 0.005  # surface farther outside the repaired solid was cut away
 WARNING_CHANGE_FRACTION = 0.25  # closing a box that lacks one of six sides adds 20 % of area and 23 % of volume
 MIN_WRAP_THICKNESS = 0.003  # a thinner wrap encloses a sheet: it is two offsets thick
@@ -71,8 +70,8 @@ def _tidy(mesh: Mesh) -> Mesh:
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     rolled = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     side = np.where(rolled[:, 1] < rolled[:, 2], 1, -1)
-    _, first, same = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
-    net = np.bincount(same.ravel(), weights=side).astype(int)
+    _, first, face_ids = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
+    net = np.bincount(face_ids.ravel(), weights=side).astype(int)
     keep = first[net != 0]
     parts = replace(mesh, faces=faces).parts
     double_sided = first[~np.isin(parts[first], parts[keep])]

@@ -106,8 +106,8 @@ def observed_pixels(mask: Bool[Tensor, "height width"], points: str | int, seed:
     amount, is_share = parse_amount(points)
     count = max(1, round(available * amount)) if is_share else round(amount)
     if count > available:
-        most = f"points must be at most the {available} pixels of the shape, not {points}"
-        raise BadInput(f"{most}: give fewer, or raise view.resolution")
+        message = f"points must be at most the {available} pixels of the shape, not {points}"
+        raise BadInput(f"{message}: give fewer, or raise view.resolution")
     order = torch.randperm(available, generator=torch.Generator().manual_seed(seed))
     observed = torch.zeros(mask.numel(), dtype=torch.bool)
     observed[foreground[order[:count]]] = True

@@ -24,7 +24,7 @@ from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, Unsupported, check_kind, fresh
 
 EIKONAL_POINTS = 512
-COST_NAMES = ("seconds", "evaluations", "gradients", "flops")  # attributes of Evidence
+COSTS = ("seconds", "evaluations", "gradients", "flops")  # attributes of Evidence
 LEAST_REFERENCE = 0.1  # lower bound of the first loss in the divergence test
 SCREENING = 8  # each of several starts gets 1/8 of a warm start, then the best start a complete one
 EIKONAL_SEED = 7
@@ -86,7 +86,7 @@ class Fitter:
         fitted, start = min(starts, key=lambda pair: inf if pair[0].failed else pair[1].error())
         self._warm_start(fitted, start, self.settings.warm_iterations)
         all_evidence = [start.evidence for start, _ in starts] + ([] if sphere is None else [sphere.evidence])
-        for name in COST_NAMES:
+        for name in COSTS:
             setattr(fitted.evidence, name, sum(getattr(evidence, name) for evidence in all_evidence))
         fitted.evidence.seconds += start_seconds
         if previous is not None:
@@ -130,18 +130,18 @@ class Fitter:
         evidence = fitted.evidence
         self.fit(fitted, self.settings.iterations, checkpoints=True)
         for _ in range(1, rounds):
-            before, iterations = evidence.error, evidence.iterations
-            if before is None:
+            earlier, iterations = evidence.error, evidence.iterations
+            if earlier is None:
                 return
-            kept = [parameter.detach().clone() for parameter in fitted.model.parameters]
+            saved = [parameter.detach().clone() for parameter in fitted.model.parameters]
             self.fit(fitted, self.settings.iterations, checkpoints=True)
-            gain = before.mean - evidence.mean
-            evidence.falling = evidence.error is not None and gain > evidence.error.noise_of_difference(before)
+            gain = earlier.mean - evidence.mean
+            evidence.falling = evidence.error is not None and gain > evidence.error.noise_of_difference(earlier)
             if not evidence.falling:
                 if gain <= 0:
-                    for parameter, value in zip(fitted.model.parameters, kept, strict=True):
+                    for parameter, value in zip(fitted.model.parameters, saved, strict=True):
                         parameter.data.copy_(value)
-                    evidence.error, evidence.iterations = before, iterations
+                    evidence.error, evidence.iterations = earlier, iterations
                     evidence.status, evidence.reason = RunStatus.OK, ""
                 return
 
@@ -150,13 +150,13 @@ class Fitter:
     ) -> int:
         """Runs the optimisation loop, adds its cost to the evidence, and returns the number of its iterations."""
         history, evidence = History(), fitted.evidence
-        before, shape = {name: getattr(evidence, name) for name in COST_NAMES}, fitted.model.field()
+        earlier, shape = {name: getattr(evidence, name) for name in COSTS}, fitted.model.field()
 
         def on_step(line: dict[str, Any]) -> None:
             spent = {"evaluations": history.counts.value, "gradients": history.counts.gradient}
             spent |= {"seconds": line["seconds"], "flops": history.counts.flops(shape) or 0}
             for name, amount in spent.items():
-                setattr(evidence, name, before[name] + amount)
+                setattr(evidence, name, earlier[name] + amount)
             step = line["iteration"] + 1
             if checkpoints and history.status is RunStatus.OK and step in CHECKPOINTS and step < settings.iterations:
                 self._evaluate(fitted)
@@ -181,9 +181,7 @@ class Fitter:
         evidence = fitted.evidence
         if not fitted.failed:
             evidence.error = self.observations.error(fitted.model.frozen())
-            evidence.checkpoints.append(
-                {name: getattr(evidence, name) for name in COST_NAMES} | {"error": evidence.mean}
-            )
+            evidence.checkpoints.append({name: getattr(evidence, name) for name in COSTS} | {"error": evidence.mean})
 
 
 @dataclass

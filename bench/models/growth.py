@@ -117,11 +117,10 @@ def grow(fitter: Fitter, candidates: list[Candidate], settings: GrowthSettings) 
         nonlocal end
         if trials.kept:
             kept = fits[trials.kept[-1].candidate]
-            current = kept.candidate
-            spent = sum(cost(fits[evidence.candidate].candidate, trial_steps, fitter) for evidence in trials.tried)
-            spent -= cost(current, trial_steps, fitter)
-            old_limit, new_limit = ((settings.budget - 1) * cost(c, iterations, fitter) for c in (current, candidate))
-            old_cost, new_cost = (cost(c, trial_steps, fitter) for c in (current, candidate))
+            pair = (kept.candidate, candidate)
+            old_cost, new_cost = (cost(c, trial_steps, fitter) for c in pair)
+            old_limit, new_limit = ((settings.budget - 1) * cost(c, iterations, fitter) for c in pair)
+            spent = sum(cost(fits[fit.candidate].candidate, trial_steps, fitter) for fit in trials.tried) - old_cost
             if spent + new_cost > old_limit or spent + old_cost > new_limit:
                 end = "larger ones would exceed models.growth.budget"
                 return None
@@ -144,8 +143,9 @@ def cost(candidate: Candidate, iterations: int, fitter: Fitter) -> float:
     evaluations = EVALUATIONS_PER_RAY * fitter.observations.rays + EVALUATIONS_PER_POINT * EIKONAL_POINTS
     warm_step = WARM_STEP_MS + EVALUATIONS_PER_WARM_POINT * settings.warm_points * candidate.flops * MS_PER_FLOP
     start = candidate.tries * START_MS + settings.warm_iterations * warm_starts * warm_step
-    flops = evaluations * (candidate.flops + EXTRA_FLOPS_PER_EVALUATION)
-    return start + iterations * (FIT_STEP_MS + flops * MS_PER_FLOP)
+    return start + iterations * (
+        FIT_STEP_MS + evaluations * (candidate.flops + EXTRA_FLOPS_PER_EVALUATION) * MS_PER_FLOP
+    )
 
 
 def _import_slow_modules() -> None:

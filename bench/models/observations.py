@@ -31,7 +31,6 @@ class RayObservations:
     """Rays of one or more views in one row: some are held out, and iterations draw from the others.
 
     Args:
-        fitted: the rays that are not held out.
         rays: number drawn in an iteration.
         seed: of the draws, which are the same for every candidate.
     """
@@ -101,13 +100,7 @@ class RayObservations:
 
 
 def hold_out(
-    view: ObservedView,
-    group: Int[Tensor, " n"],
-    *,
-    share: float,
-    held_out: tuple[int, ...],
-    footprint: float,
-    seed: int,
+    view: ObservedView, group: Int[Tensor, " n"], *, share: float, entire: tuple[int, ...], footprint: float, seed: int
 ) -> RayObservations:
     """Holds out complete groups, and a fraction of the rays of the others; an iteration draws as many rays as exist.
 
@@ -115,14 +108,14 @@ def hold_out(
         view: of rays in one row.
         group: index of the view, or of the part of a view, of each ray, from 0.
         share: held-out fraction, from 0 to 1, of the rays with a depth and of those without.
-        held_out: the groups that are held out completely.
+        entire: the groups that are held out entirely.
         footprint: half a pixel, in scene units.
 
     Raises:
         BadInput: too few depths are observed to hold some out.
     """
     draw = torch.Generator().manual_seed(seed)
-    is_held_out = torch.isin(group, torch.tensor(held_out))
+    is_held_out = torch.isin(group, torch.tensor(entire))
     for kind in (view.observed.cpu(), ~view.observed.cpu()):
         indices = (kind & ~is_held_out).nonzero().squeeze(-1)
         count = round(share * len(indices))
@@ -158,12 +151,11 @@ class Views:
         """Evenly spaced views to fit and, between them, held-out views."""
         settings = self.settings
         turn = float(np.random.default_rng([seed, 2]).uniform(0, 360))
-        between = turn + GOLDEN_ANGLE_DEGREES / 2
-        cameras = [*self._spread(settings.fitted, turn), *self._spread(settings.held_out, between)]
-        groups = tuple(range(settings.fitted, len(cameras)))
-        view, group = self._observe(cameras)
-        options = {"share": settings.share, "held_out": groups, "footprint": self.footprint, "seed": seed}
-        return replace(hold_out(view, group, **options), rays=settings.rays)
+        cameras = self._spread(settings.fitted, turn)
+        cameras += self._spread(settings.held_out, turn + GOLDEN_ANGLE_DEGREES / 2)
+        entire, (view, group) = tuple(range(settings.fitted, len(cameras))), self._observe(cameras)
+        held = hold_out(view, group, share=settings.share, entire=entire, footprint=self.footprint, seed=seed)
+        return replace(held, rays=settings.rays)
 
     def further(self, count: int, seed: int) -> HeldOut:
         """`count` further random views, not used by any choice."""

@@ -67,9 +67,8 @@ def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: fl
     The fit starts with a fraction of the rays. It has as many rounds as the first fit, and the same evaluation.
     """
     settings = replace(fitter.settings, fewest_rays=fewest_rays)
-    frugal = replace(
-        fitter, settings=settings, observations=fitter.observations.with_renderer(renderer), stage="frugal", spent={}
-    )
+    observations = fitter.observations.with_renderer(renderer)
+    frugal = replace(fitter, settings=settings, observations=observations, stage="frugal", spent={})
     fitted = frugal.begin(chosen.candidate, chosen.previous, evaluate=False)
     for _ in range(chosen.evidence.iterations // settings.iterations):
         frugal.fit(fitted, settings.iterations, checkpoints=False)

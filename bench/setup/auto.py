@@ -33,9 +33,8 @@ class AutoSettings:
     def __post_init__(self) -> None:
         check_positive("auto.grazing", self.grazing, "DIST, A.1, takes 10")
         check_share("auto.spurious", self.spurious, "0.01 is one hit in a hundred")
-        check_positive(
-            "auto.area_over_perimeter", self.area_over_perimeter, "a disc of radius 0.5 has 0.25, a plane 0.08"
-        )
+        examples = "a disc of radius 0.5 has 0.25, a plane 0.08"
+        check_positive("auto.area_over_perimeter", self.area_over_perimeter, examples)
         if self.grazing > 90:
             raise ValueError(f"auto.grazing must be at most 90 degrees, not {self.grazing}: 10")
 
@@ -85,7 +84,6 @@ def rays_share(min_fraction: float, footprint: float, error: float) -> float:
     Pixels finer than the error are not needed. The resolution follows from DIST, Eq. 10; its square is their number.
 
     Args:
-        min_fraction: lower bound of the result.
         footprint: half a pixel of the whole image, in scene units.
         error: in scene units.
     """

@@ -9,14 +9,10 @@ from renderers.checks import check_at_least, check_choice, check_share
 
 PRIOR = "prior"
 PRIMITIVES = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
-SIZE_PATTERNS = {  # the text after the underscore
-    "union": "[0-9]+",
-    "network": "[0-9]+x[0-9]+",
-    "grid": "[0-9]+",
-    "occupancy": "[0-9]+",
-}
+# The text after the underscore.
+SIZE_PATTERNS = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+", "occupancy": "[0-9]+"}
 EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
-NAME_PATTERNS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
+NAME_FORMS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
 MAX_GRID_SAMPLES = 256  # per axis: 64 MiB of values
 STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.models.model.Size`
 SIZE_WORDS = {STORED: "stored numbers", FREE: "free numbers", BYTES: "bytes"}
@@ -32,8 +28,9 @@ def parse_field_name(name: str) -> tuple[str, tuple[int, ...]]:
         return name, ()
     kind, _, size = name.partition("_")
     if kind not in SIZE_PATTERNS or re.fullmatch(SIZE_PATTERNS[kind], size, re.ASCII) is None:
-        similar = nearest(name, [*PRIMITIVES, *EXAMPLES])
-        raise ValueError(f"unknown field {name!r}{similar}; or {NAME_PATTERNS}, in numbers")
+        raise ValueError(
+            f"unknown field {name!r}{nearest(name, [*PRIMITIVES, *EXAMPLES])}; or {NAME_FORMS}, in numbers"
+        )
     sizes = tuple(map(int, size.split("x")))
     if kind == "union":
         check_at_least("K of union_K", sizes[0], 2, "union_2 is the smallest")

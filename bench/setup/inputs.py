@@ -248,10 +248,8 @@ class _Builder:
         node, notes = resolve_auto_settings(requested, *self.parts("view", "auto"))
         (renderer,) = self.parts(renderer=node)
         if not isinstance(renderer, Renderer):
-            name = type(renderer).__name__
-            raise ValueError(
-                f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
-            )
+            lacking = f"renderer {type(renderer).__name__} lacks capabilities, render or silhouette_loss"
+            raise ValueError(f"{lacking}: see renderers/rendering.py")
         return renderer, notes
 
     def prior(self, dataset: Dataset, split: Split, index: int) -> PriorChoice:

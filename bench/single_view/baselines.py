@@ -57,8 +57,8 @@ def most_similar_shape(image: Float[Tensor, "4 height width"], images: Sequence[
 def best_shape(mesh: Mesh, dataset: Dataset, count: int) -> int:
     """The index of the training shape with the smallest Chamfer-L1 to a true shape: the best possible retrieval."""
     true = sample_surface(mesh, COMPARED_POINTS, 0)
-    others = (dataset.mesh(Split.TRAIN, index) for index in range(count))
-    scores = [surface_metrics(sample_surface(m, COMPARED_POINTS, 1), true, threshold=1.0) for m in others]
+    shapes = (dataset.mesh(Split.TRAIN, index) for index in range(count))
+    scores = [surface_metrics(sample_surface(m, COMPARED_POINTS, 1), true, threshold=1.0) for m in shapes]
     return int(np.argmin([score["chamfer_l1"] for score in scores]))
 
 

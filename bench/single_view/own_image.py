@@ -61,10 +61,8 @@ def best_view(
     """The camera with the best overlap between a mesh's silhouette, framed like the mask, and a mask; and its IoU."""
     truth, overlaps = Truth(mesh, closed=False), []
     for camera in cameras:
-        silhouette = see(truth, camera).mask
-        framed = ~mask
-        if bool(silhouette.any()):
-            framed = _framed(silhouette[None].float(), silhouette, len(mask), filled)[0] > 0.5
+        hits = see(truth, camera).mask
+        framed = _framed(hits[None].float(), hits, len(mask), filled)[0] > 0.5 if bool(hits.any()) else ~mask
         overlaps.append(mask_iou(framed.numpy(), mask.numpy()))
     best = int(np.argmax(overlaps))
     return cameras[best], overlaps[best]

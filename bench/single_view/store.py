@@ -57,8 +57,8 @@ class Recipe:
     @property
     def key(self) -> str:
         """A hash of everything that determines the weights."""
-        versions = [VERSION, IMAGES_VERSION]
-        return digest({"versions": versions, "dataset": self.dataset.identity(), "settings": self.settings})
+        dataset = self.dataset.identity()
+        return digest({"versions": [VERSION, IMAGES_VERSION], "dataset": dataset, "settings": self.settings})
 
     @property
     def stem(self) -> str:

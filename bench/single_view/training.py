@@ -160,9 +160,8 @@ class Training:
         """The mean loss over a step's shapes; its gradients are left in the weights. There is one graph at a time."""
         draw = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + step)
         torch.manual_seed(draw.initial_seed())  # for random draws of the losses
-        chosen = torch.randperm(len(self.images), generator=draw, device="cpu")[
-            : self.settings.shapes_per_step
-        ].tolist()
+        order = torch.randperm(len(self.images), generator=draw, device="cpu")
+        chosen = order[: self.settings.shapes_per_step].tolist()
         inputs = torch.randint(len(self.images[0].cameras), (len(chosen),), generator=draw, device="cpu").tolist()
         shown = torch.stack([self.images[shape].image(view) for shape, view in zip(chosen, inputs, strict=True)])
         for parameter in model.parameters():

@@ -111,12 +111,12 @@ class FirstChecked:
         if self.checked:
             return self.problem.loss(iteration)
         self.checked = True
-        with kept_hits() as kept:
+        with kept_hits() as all_hits:
             terms = self.problem.loss(iteration)
         if not bool(terms["total"].isnan()):  # else `optimise` ends before the step, with the reason
-            for hits in kept:
+            for hits in all_hits:
                 hits.check()
-            self.notes += [f"at the first iteration, {note}" for hits in kept if (note := hits.off_surface())][:1]
+            self.notes += [f"at the first iteration, {note}" for hits in all_hits if (note := hits.off_surface())][:1]
         return terms
 
 
@@ -159,11 +159,11 @@ def optimise(
     for iteration in range(settings.iterations):
         optimiser.forget_gradients()
         rate, terms = settings.rate(iteration), dict[str, Tensor]()
-        with kept_hits() as kept:
+        with kept_hits() as all_hits:
             history.seconds["forward"] += _timed(device, lambda i=iteration, t=terms: t.update(problem.loss(i)))
         numbers = dict(zip(terms, _to_floats([*terms.values()]), strict=True))
         if isnan(numbers["total"]):
-            history.status, history.reason = RunStatus.NAN, _not_a_number(numbers, iteration, kept)
+            history.status, history.reason = RunStatus.NAN, _not_a_number(numbers, iteration, all_hits)
         else:
             history.seconds["backward"] += _timed(
                 device, lambda rate=rate, loss=terms["total"]: (loss.backward(), optimiser.step(rate))
@@ -204,16 +204,9 @@ class _Adam:
         states = zip(self.parameters, self.averages, self.squares, self.steps, strict=True)
         updates = [(value, gradient, *state) for value, *state in states if (gradient := value.grad) is not None]
         if updates:
-            parameters, gradients, averages, squares, steps = map(list, zip(*updates, strict=True))
-            settings = {
-                "beta1": 0.9,
-                "beta2": 0.999,
-                "eps": 1e-8,
-                "weight_decay": 0.0,
-                "amsgrad": False,
-                "maximize": False,
-            }
-            adam(parameters, gradients, averages, squares, [], steps, lr=rate, **settings)
+            values, gradients, averages, squares, steps = map(list, zip(*updates, strict=True))
+            settings = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0}
+            adam(values, gradients, averages, squares, [], steps, lr=rate, **settings, amsgrad=False, maximize=False)
 
 
 def _largest(parameters: list[Tensor]) -> Tensor:
@@ -226,11 +219,11 @@ def _to_floats(numbers: list[Tensor]) -> list[float]:
     return torch.stack([number.detach().double() for number in numbers]).tolist()
 
 
-def _not_a_number(numbers: dict[str, float], iteration: int, kept: Sequence[Hits]) -> str:
+def _not_a_number(numbers: dict[str, float], iteration: int, all_hits: Sequence[Hits]) -> str:
     """The reason for a loss that is not a number: its terms that are not, and hits without a distance."""
     terms = [name for name, number in numbers.items() if isnan(number) and name != "total"]
     subject = f"the {' and the '.join(terms)} term{'s are' if len(terms) > 1 else ' is'}" if terms else "the loss is"
-    misses = without_distance(kept)
+    misses = without_distance(all_hits)
     return f"{subject} not a number at iteration {iteration}{f': {misses}' if misses else ''}"
 
 
@@ -299,7 +292,7 @@ class Starts:
     losses: list[dict[int, Tensor]] = field(init=False)  # by start and step
     remaining: list[int] = field(init=False)  # the best first after a round
     round_start: int = 0  # first iteration of this round
-    steps_before_round: int = 0  # of each remaining start
+    steps_before: int = 0  # steps of each remaining start before this round
 
     def __post_init__(self) -> None:
         self.losses = [{} for _ in range(self.settings.count)]
@@ -308,15 +301,14 @@ class Starts:
     def assignment(self, iteration: int) -> tuple[int, int]:
         """The start of an iteration, and the index of the start's step, from 0."""
         offset = iteration - self.round_start
-        return self.remaining[offset % len(self.remaining)], self.steps_before_round + offset // len(self.remaining)
+        return self.remaining[offset % len(self.remaining)], self.steps_before + offset // len(self.remaining)
 
     def note(self, start: int, step: int, loss: Tensor) -> None:
         """Records the loss of a start's step; the last loss of a round ends the round."""
         self.losses[start][step] = loss.detach()
-        end = self.steps_before_round + self.settings.trial
-        if len(self.remaining) > 1 and all(end - 1 in self.losses[kept] for kept in self.remaining):
-            self.round_start += len(self.remaining) * self.settings.trial
-            self.steps_before_round = end
+        end = self.steps_before + self.settings.trial
+        if len(self.remaining) > 1 and all(end - 1 in self.losses[index] for index in self.remaining):
+            self.round_start, self.steps_before = self.round_start + len(self.remaining) * self.settings.trial, end
             self.remaining = sorted(self.remaining, key=self._score)[: -(-len(self.remaining) // HALVING_FACTOR)]
 
     def best(self) -> int:
@@ -332,7 +324,6 @@ class Starts:
 
     def _score(self, start: int) -> float:
         """The mean loss of a start at the end of a round; infinite if it is NaN."""
-        end = self.steps_before_round
-        last = [self.losses[start][step] for step in range(max(end - SCORED_STEPS, 0), end)]
+        last = [self.losses[start][step] for step in range(max(self.steps_before - SCORED_STEPS, 0), self.steps_before)]
         mean = float(torch.stack(last).mean())
         return inf if isnan(mean) else mean

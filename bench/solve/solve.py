@@ -333,6 +333,6 @@ def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | N
         return after.failure
     first, last = history.objectives or (history.curve[0]["total"], history.curve[-1]["total"])
     if last >= first and last > 0 and len(history.curve) > 1:
-        what = "objective" if history.objectives else "loss"
-        return RunStatus.NOT_REACHED, f"the {what} did not fall: {first:.4g} at the start, {last:.4g} at the end"
+        measure = "objective" if history.objectives else "loss"
+        return RunStatus.NOT_REACHED, f"the {measure} did not fall: {first:.4g} at the start, {last:.4g} at the end"
     return None

@@ -130,7 +130,7 @@ class Completion:
         observed, camera = view.observed.cpu(), scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         group = tiles(*observed.shape)
-        held = hold_out(concatenate_views([view]), group, share=HELD_OUT, held_out=(), footprint=half_pixel, seed=seed)
+        held = hold_out(concatenate_views([view]), group, share=HELD_OUT, entire=(), footprint=half_pixel, seed=seed)
         return held, Given(
             scene.observed_view(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None
         )

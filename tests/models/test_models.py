@@ -201,7 +201,7 @@ def test_held_out_rays_are_not_given():
     views = [see(shape_of("box"), SAMPLER.camera(angle, 20.0)) for angle in (0.0, 90.0, 180.0)]
     given = [ObservedView.of(v, WEIGHTS, DIST, observed=v.mask, mask=v.mask, device=CPU) for v in views]
     group = torch.arange(3).repeat_interleave(24 * 24)
-    found = hold_out(concatenate_views(given), group, share=0.25, held_out=(2,), footprint=0.02, seed=0)
+    found = hold_out(concatenate_views(given), group, share=0.25, entire=(2,), footprint=0.02, seed=0)
     pixels = 24 * 24
     assert len(found.held_out.distance) == pytest.approx(pixels + 0.25 * 2 * pixels, abs=2)
     everything = torch.cat([found.fitted.rays.directions, found.held_out.rays.directions])
@@ -369,9 +369,7 @@ def test_too_few_depths_to_hold_some_out_are_an_error():
     few = view.mask & (view.mask.flatten().cumsum(0).view_as(view.mask) <= 2)
     given = ObservedView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
     with pytest.raises(ValueError, match="2 depths are too few to hold some out: give more"):
-        hold_out(
-            concatenate_views([given]), torch.arange(24 * 24) // 96, share=0.2, held_out=(), footprint=0.02, seed=0
-        )
+        hold_out(concatenate_views([given]), torch.arange(24 * 24) // 96, share=0.2, entire=(), footprint=0.02, seed=0)
 
 
 def test_half_of_the_points_of_a_warm_start_lie_near_the_surface():
