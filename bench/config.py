@@ -40,7 +40,7 @@ ROLE_OF_NODE = {  # the protocol or base class that the class of a node must hav
     "dataset": "datasets.scene.Dataset",
     "silhouette": "renderers.silhouette.SilhouetteLoss",
     "tracker": "bench.trackers.Tracker",
-    "prior": "datasets.network_files.Networked",
+    "prior": "datasets.network_files.HasNetwork",
     "supervision": "bench.single_view.training.Supervision",
 }
 CLASS_OF_NODE = {  # for nodes without a _target_

@@ -131,7 +131,7 @@ class Judge:
         """The surface metrics against a file with a mesh or a point cloud."""
         cloud = read_points(truth)
         surface = None if cloud is not None else read_mesh(truth)
-        truth_points = surface.used if surface is not None else cloud
+        truth_points = surface.used_vertices if surface is not None else cloud
         notes = _mismatch_warnings(mesh, truth_points, *SHAPE_LIMITS)
         if self.unit_sphere:
             centre, factor = fit_in_sphere(truth_points, SPHERE_RADIUS)
@@ -165,7 +165,7 @@ def _mismatch_warnings(mesh: Mesh, truth: Float[np.ndarray, "n 3"], max_ratio: f
     """
     extent = float(np.linalg.norm(np.ptp(truth, axis=0)))
     ratio, margin = mesh.diagonal / max(extent, 1e-300), BOX_MARGIN_FRACTION * max(mesh.diagonal, extent)
-    boxes = [(points.min(axis=0) - margin, points.max(axis=0) + margin) for points in (mesh.used, truth)]
+    boxes = [(points.min(axis=0) - margin, points.max(axis=0) + margin) for points in (mesh.used_vertices, truth)]
     low, high = np.stack(boxes, axis=1)
     common_volume = (high.min(axis=0) - low.max(axis=0)).clip(0).prod()
     overlap = common_volume / ((high - low).prod(axis=1).sum() - common_volume)

@@ -1,6 +1,6 @@
 """Shape priors: an auto-decoder (DeepSDF, Sec. 4) trained on the training split of a dataset.
 
-Some are shipped; others are trained at their first use and kept under a hash of shapes and settings.
+Some are shipped; others are trained at their first use and stored under a hash of shapes and settings.
 """
 
 import os
@@ -32,11 +32,11 @@ from renderers.fields.network import Published
 
 SHIPPED = Path(__file__).resolve().parents[1] / "datasets" / "priors"
 VERSION = 1  # raise it when training changes, so that no prior of the old training is used for a new one
-HELD_OUT = 8  # validation shapes on which a new prior is evaluated
-NEAR, AROUND = 0.01, 0.08  # standard deviations, in scene units, of half and of a third of the samples
-RADIUS = 1.1  # scene units, of the sphere that the other samples fill: rays start on the unit sphere
+VALIDATION_SHAPES = 8  # a new prior is evaluated on so many
+NEAR_SAMPLE_STD, FAR_SAMPLE_STD = 0.01, 0.08  # scene units, from the surface: of half and of a third of the samples
+SAMPLE_SPHERE_RADIUS = 1.1  # scene units: the other samples fill this sphere; rays start on the unit sphere
 Trained = Decoder | TexturedDecoder
-CLOSE = 0.02  # scene units, from the surface, within which a prior is judged
+EVALUATED_DISTANCE = 0.02  # scene units: a prior is evaluated at samples this close to the surface
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class NetworkSettings:
 
 @dataclass(frozen=True)
 class ColourSettings:
-    """The colours that a prior learns beside the distance.
+    """The settings of the colours that a prior learns.
 
     Args:
-        texture, size: of shapes without colours of their own; see `datasets.textures.make_texture`.
+        texture, size: of shapes whose dataset has no colours; see `datasets.textures.make_texture`.
         samples: points on the surface of each shape.
-        points_per_step: number of them that a step takes of a shape.
+        points_per_step: number of these points per shape in a step.
         weight: of the mean absolute error of colours.
     """
 
@@ -77,7 +77,7 @@ class ColourSettings:
 
 @dataclass(frozen=True)
 class PriorSettings:
-    """How a prior is trained.
+    """Settings of the training of a prior.
 
     Args:
         network: the decoder's size.
@@ -93,7 +93,7 @@ class PriorSettings:
         truncation: magnitude, in scene units, to which the field and the true distance are clamped before they are
             compared (delta of DeepSDF, Eq. 4, which takes 0.1); None compares them everywhere. Beyond it, the field is
             not constrained: a march clamps its values too (`renderer.step_clamp`).
-        colour: what is learnt of colours; None learns the distance alone.
+        colour: settings of the colours; None learns only the distance.
     """
 
     network: NetworkSettings
@@ -121,7 +121,7 @@ class PriorSettings:
 
     @property
     def of_one_shape(self) -> bool:
-        """Whether it is no prior, but a network that is fitted to one shape."""
+        """Whether it is no prior, but a network of one shape."""
         return self.shapes == 1
 
     @property
@@ -130,13 +130,13 @@ class PriorSettings:
         return {name: value for name, value in asdict(self).items() if value is not None}
 
     def new_decoder(self) -> Trained:
-        """A decoder that begins near the distance of a sphere."""
+        """A decoder initialised near the distance of a sphere."""
         decoder = (Decoder if self.colour is None else TexturedDecoder)(**asdict(self.network))
         initialise_to_sphere(decoder if isinstance(decoder, Decoder) else decoder.shape, radius=0.5)
         return decoder
 
     def texture(self, dataset: Dataset, split: Split, index: int) -> Texture:
-        """The colours of a shape where colours are learnt: its own, where its dataset has some."""
+        """The colours of a training shape: of its dataset if that has colours, else of the texture."""
         if isinstance(dataset, Textured):
             return dataset.texture(split, index)
         return make_texture(self.colour.texture, self.colour.size, seed_of(split, index))
@@ -152,12 +152,12 @@ class Prior:
 
 @dataclass(frozen=True)
 class DistanceSamples:
-    """Signed distances of some shapes, and the colours of points on their surfaces, where these are learnt."""
+    """Signed distances of shapes, and the colours of points on their surfaces if colours are learnt."""
 
     points: Float[Tensor, "shapes samples 3"]
     distances: Float[Tensor, "shapes samples"]
-    surface: Float[Tensor, "shapes places 3"] | None = None
-    colours: Float[Tensor, "shapes places 3"] | None = None
+    surface: Float[Tensor, "shapes colour_samples 3"] | None = None
+    colours: Float[Tensor, "shapes colour_samples 3"] | None = None
 
 
 def distance_samples(
@@ -165,46 +165,47 @@ def distance_samples(
 ) -> DistanceSamples:
     """Samples the signed distances of the first shapes of a split, mostly near their surfaces.
 
-    Distances are those of the mesh, not of a formula: smooth unions and sheared parts have none.
+    Distances are computed from the mesh, since smooth unions and sheared shapes have no distance formula.
     """
-    parts = []
+    arrays = []
     for index in range(shapes):
         mesh, seed = dataset.mesh(split, index), settings.seed + index
-        part = sample_distances(mesh, settings.samples, seed)
+        samples = sample_distances(mesh, settings.samples, seed)
         if settings.colour:
             surface = sample_surface(mesh, settings.colour.samples, seed)
             colours = settings.texture(dataset, split, index)(surface.points, surface.normals)
-            part += tuple(torch.from_numpy(one.astype(np.float32)) for one in (surface.points, colours))
-        parts.append(part)
+            samples += tuple(torch.from_numpy(array.astype(np.float32)) for array in (surface.points, colours))
+        arrays.append(samples)
         progress(f"sampling {split} shapes", index + 1, shapes)
-    return DistanceSamples(*map(torch.stack, zip(*parts, strict=True)))
+    return DistanceSamples(*map(torch.stack, zip(*arrays, strict=True)))
 
 
 def sample_distances(mesh: Mesh, count: int, seed: int) -> tuple[Float[Tensor, "count 3"], Float[Tensor, " count"]]:
     """Points and their signed distances, in scene units.
 
-    Half of them are close to the mesh's surface, a third farther from it, the rest anywhere in a sphere.
+    Half of them are close to the mesh's surface, a third farther from it, the rest uniform in a sphere.
     """
     generator = np.random.default_rng(seed)
-    near, around = count // 2, count // 3
-    surface = sample_surface(mesh, near + around, seed).points
-    sigma = np.repeat([NEAR, AROUND], [near, around])[:, None]
-    around_surface = surface + sigma * generator.standard_normal(surface.shape)
-    free = generator.standard_normal((count - near - around, 3))
-    free *= RADIUS * generator.random((len(free), 1)) ** (1 / 3) / np.linalg.norm(free, axis=1, keepdims=True)
-    where = np.concatenate([around_surface, free])
-    return torch.from_numpy(where.astype(np.float32)), torch.from_numpy(Truth(mesh).signed_distance(where))
+    near_count, far_count = count // 2, count // 3
+    surface = sample_surface(mesh, near_count + far_count, seed).points
+    sigma = np.repeat([NEAR_SAMPLE_STD, FAR_SAMPLE_STD], [near_count, far_count])[:, None]
+    close = surface + sigma * generator.standard_normal(surface.shape)
+    uniform = generator.standard_normal((count - near_count - far_count, 3))
+    radii = SAMPLE_SPHERE_RADIUS * generator.random((len(uniform), 1)) ** (1 / 3)
+    uniform *= radii / np.linalg.norm(uniform, axis=1, keepdims=True)
+    positions = np.concatenate([close, uniform])
+    return torch.from_numpy(positions.astype(np.float32)), torch.from_numpy(Truth(mesh).signed_distance(positions))
 
 
 def near_surface_first(
     error: Float[Tensor, "*batch"], distance: Float[Tensor, "*batch"], width: float
 ) -> Float[Tensor, "*batch"]:
-    """Errors weighted by width / (width + |distance|), which is largest at the surface."""
+    """Weights errors by width / (width + |distance|), which is largest at the surface."""
     return error * width / (width + distance.abs())
 
 
 def truncated(distance: Float[Tensor, "*batch"], truncation: float | None) -> Float[Tensor, "*batch"]:
-    """Distances clamped to a magnitude, or as they are where it is None."""
+    """Clamps distances to a magnitude; None does not change them."""
     return distance if truncation is None else distance.clamp(-truncation, truncation)
 
 
@@ -214,7 +215,7 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
     decoder = settings.new_decoder()
     codes = settings.code_sigma * torch.randn(len(samples.points), settings.network.code_length)
     decoder, codes = decoder.to(device), nn.Parameter(codes.to(device))
-    samples = DistanceSamples(*(part if part is None else part.to(device) for part in vars(samples).values()))
+    samples = DistanceSamples(*(tensor if tensor is None else tensor.to(device) for tensor in vars(samples).values()))
     optimiser = torch.optim.Adam(
         [*decoder.parameters(), codes], lr=settings.learning_rate, betas=(0.9, settings.beta2), fused=True
     )
@@ -226,8 +227,8 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
     rows = min(settings.shapes_per_step, shapes)
     for step in range(settings.steps):
         chosen = torch.randperm(shapes, device=device)[:rows]
-        picked = torch.randint(count, (rows, settings.points_per_step), device=device)
-        points, distances = samples.points[chosen[:, None], picked], samples.distances[chosen[:, None], picked]
+        indices = torch.randint(count, (rows, settings.points_per_step), device=device)
+        points, distances = samples.points[chosen[:, None], indices], samples.distances[chosen[:, None], indices]
         shape = decoder.at(codes[chosen])
         error = truncated(shape(points), settings.truncation) - truncated(distances, settings.truncation)
         weighted = near_surface_first(error.abs(), distances, settings.surface_width)
@@ -245,19 +246,19 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
 
 def _colour_error(shape: TexturedShape, samples: DistanceSamples, chosen: Tensor, count: int) -> Tensor:
     """The mean absolute error of colours at random points on the surfaces of the chosen shapes."""
-    places = torch.randint(samples.surface.shape[1], (len(chosen), count), device=chosen.device)
-    found = shape.paint(samples.surface[chosen[:, None], places])
-    return (found - samples.colours[chosen[:, None], places]).abs().mean()
+    indices = torch.randint(samples.surface.shape[1], (len(chosen), count), device=chosen.device)
+    predicted = shape.paint(samples.surface[chosen[:, None], indices])
+    return (predicted - samples.colours[chosen[:, None], indices]).abs().mean()
 
 
 def fit_error(decoder: Trained, samples: DistanceSamples, truncation: float | None, *, steps: int = 200) -> float:
-    """As `surface_error`, with codes fitted to the samples from zero.
+    """The `surface_error` with codes fitted to the samples from zero.
 
     Args:
-        decoder: not changed.
-        samples: of any shapes, in training or not.
+        decoder: is not changed.
+        samples: of training or other shapes.
         truncation: see `PriorSettings`.
-        steps: of Adam, whose rate falls to zero; 0 evaluates the mean shape.
+        steps: of Adam, with a rate that falls to zero; 0 evaluates the mean shape.
     """
     shapes, count = samples.distances.shape
     codes = torch.zeros(shapes, decoder.code_length, requires_grad=True)
@@ -265,9 +266,9 @@ def fit_error(decoder: Trained, samples: DistanceSamples, truncation: float | No
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1))
     rows = torch.arange(shapes)[:, None]
     for _ in range(steps):
-        picked = torch.randint(count, (shapes, min(count, 256)))
-        field = truncated(decoder.at(codes)(samples.points[rows, picked]), truncation)
-        error = (field - truncated(samples.distances[rows, picked], truncation)).abs()
+        indices = torch.randint(count, (shapes, min(count, 256)))
+        field = truncated(decoder.at(codes)(samples.points[rows, indices]), truncation)
+        error = (field - truncated(samples.distances[rows, indices], truncation)).abs()
         optimiser.zero_grad()
         error.mean().backward()
         optimiser.step()
@@ -277,17 +278,17 @@ def fit_error(decoder: Trained, samples: DistanceSamples, truncation: float | No
 
 @torch.no_grad()
 def surface_error(decoder: Trained, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples) -> float:
-    """Mean error of the distance within `CLOSE` of the surface, in scene units, at the codes of the samples' shapes."""
+    """Mean error of the distance within `EVALUATED_DISTANCE` of the surface, in scene units, at given codes."""
     errors = []
     for code, points, distances in zip(codes, samples.points, samples.distances, strict=True):
-        close = distances.abs() < CLOSE
+        close = distances.abs() < EVALUATED_DISTANCE
         errors.append((decoder.at(code)(points[close]) - distances[close]).abs())
     return torch.cat(errors).mean().item()
 
 
 @torch.no_grad()
 def initialise_to_sphere(decoder: Decoder, radius: float) -> None:
-    """Sets the weights so that the field begins near the distance of a sphere (SAL, Atzmon and Lipman 2020)."""
+    """Sets the weights so that the field is near the distance of a sphere (SAL, Atzmon and Lipman 2020)."""
     for index, layer in enumerate(decoder.hidden):
         assert isinstance(layer, nn.Linear)
         nn.init.normal_(layer.weight, 0.0, sqrt(2.0 / layer.out_features))
@@ -310,27 +311,27 @@ def prior_for(
 def prior_file(
     dataset: Dataset, settings: PriorSettings, priors_dir: Path, device: torch.device, progress: Report
 ) -> Path:
-    """The path of a dataset's prior: shipped, else in `priors_dir`, where a new one is stored once it is trained."""
-    path = find(dataset, settings, priors_dir)
+    """The path of a dataset's prior: shipped, else in `priors_dir`; trains and stores a missing one."""
+    path = find_prior(dataset, settings, priors_dir)
     if path is None:
         with file_lock(priors_dir, prior_key(dataset, settings)):
-            path = find(dataset, settings, priors_dir)  # another run may have made it meanwhile
+            path = find_prior(dataset, settings, priors_dir)  # another run may have made it meanwhile
             if path is None:
-                what = "fitting a network to one shape" if settings.of_one_shape else "training a prior"
-                notice(f"{what} of {dataset.name}, once; it is stored in {priors_dir}")
+                work = "fitting a network to one shape" if settings.of_one_shape else "training a prior"
+                notice(f"{work} of {dataset.name}, once; it is stored in {priors_dir}")
                 path = make_prior(dataset, settings, priors_dir, device, progress)
     return path
 
 
-def find(dataset: Dataset, settings: PriorSettings, priors_dir: Path) -> Path | None:
-    """The path of a dataset's prior, or None where it was not made yet."""
+def find_prior(dataset: Dataset, settings: PriorSettings, priors_dir: Path) -> Path | None:
+    """The path of a dataset's prior, or None if it does not exist."""
     key = prior_key(dataset, settings)
-    found = [path for folder in (SHIPPED, priors_dir) for path in folder.glob(f"*-{key}.safetensors")]
-    return found[0] if found else None
+    paths = [path for folder in (SHIPPED, priors_dir) for path in folder.glob(f"*-{key}.safetensors")]
+    return paths[0] if paths else None
 
 
 def prior_key(dataset: Dataset, settings: PriorSettings) -> str:
-    """A hash of what determines a prior: shapes, settings, and the version of the training."""
+    """A hash of the shapes, settings and training version that determine a prior."""
     return digest({"version": VERSION, "dataset": dataset.identity(), "settings": settings.identity})
 
 
@@ -356,31 +357,31 @@ def make_prior(dataset: Dataset, settings: PriorSettings, folder: Path, device: 
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{dataset.name}-{record['key']}.safetensors"
     write_text(path.with_suffix(".json"), to_json(record))
-    save_whole({**prior.decoder.state_dict(), "codes": prior.codes}, path)
+    save_atomically({**prior.decoder.state_dict(), "codes": prior.codes}, path)
     return path
 
 
-def save_whole(tensors: dict[str, Tensor], path: Path) -> None:
-    """Writes tensors atomically: another process finds all of the file, or none."""
+def save_atomically(tensors: dict[str, Tensor], path: Path) -> None:
+    """Writes tensors atomically: another process finds the complete file or none."""
     scratch = path.with_suffix(f".{os.getpid()}.partial")  # one per process: runs may be simultaneous
     save_file({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, scratch)
     scratch.replace(path)
 
 
-def kept(folder: Path, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
-    """The tensors of NAME.safetensors in a folder; made and stored there by one process where there are none."""
+def load_or_make(folder: Path, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Loads NAME.safetensors from a folder; if it is missing or broken, one process makes and stores it."""
     path = folder / f"{name}.safetensors"
     with file_lock(folder, name):
         try:
             return load_file(path)
-        except (SafetensorError, OSError):  # there is none, or it was cut short
+        except (SafetensorError, OSError):  # missing or truncated
             tensors = make()
-            save_whole(tensors, path)
+            save_atomically(tensors, path)
             return tensors
 
 
 def probe(dataset: Dataset) -> list[float]:
-    """Area and volume of the first two training shapes: a test compares them, to detect a change of the sampler."""
+    """Area and volume of the first two training shapes; a test uses them to detect a change of the sampler."""
     meshes = [dataset.mesh(Split.TRAIN, index) for index in range(2)]
     return [number for mesh in meshes for number in (mesh.area, mesh.volume)]
 
@@ -388,18 +389,19 @@ def probe(dataset: Dataset) -> list[float]:
 def _surface_errors(
     prior: Prior, dataset: Dataset, samples: DistanceSamples, settings: PriorSettings, progress: Report
 ) -> dict[str, float]:
-    """Mean |field| near the surface, in scene units, of training and unseen shapes, with newly fitted codes.
+    """Mean error near the surface, in scene units, of training and held-out shapes, with newly fitted codes.
 
-    A network of one shape has no other shapes: it is evaluated at its own code.
+    A network of one shape is evaluated at its code.
     """
     if settings.of_one_shape:
         return {"training": surface_error(prior.decoder, prior.codes, samples)}
-    unseen, delta = distance_samples(dataset, Split.VALIDATION, settings, HELD_OUT, progress), settings.truncation
-    seen = DistanceSamples(samples.points[:HELD_OUT], samples.distances[:HELD_OUT])
+    count, delta = VALIDATION_SHAPES, settings.truncation
+    validation = distance_samples(dataset, Split.VALIDATION, settings, count, progress)
+    training = DistanceSamples(samples.points[:count], samples.distances[:count])
     return {
-        "training": fit_error(prior.decoder, seen, delta),
-        "validation": fit_error(prior.decoder, unseen, delta),
-        "mean_shape": fit_error(prior.decoder, unseen, delta, steps=0),
+        "training": fit_error(prior.decoder, training, delta),
+        "validation": fit_error(prior.decoder, validation, delta),
+        "mean_shape": fit_error(prior.decoder, validation, delta, steps=0),
     }
 
 

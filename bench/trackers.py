@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from bench.records.names import flat
 from bench.records.read import curve_lines
 from bench.records.record import NUMERIC_FIELDS, as_number, started
-from datasets.extras import install
+from datasets.extras import install_command
 
 MAX_METRICS_PER_CALL, MAX_PARAMETERS_PER_CALL, MAX_PARAMETER_CHARACTERS = 1000, 100, 500  # limits of MLflow
 
@@ -39,7 +39,7 @@ class MLflow:
     artifacts: str
 
     def __post_init__(self) -> None:
-        _check_installed("mlflow", f"MLflow: {install('mlflow')}")
+        _check_installed("mlflow", f"MLflow: {install_command('mlflow')}")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
         """Makes a run in MLflow with the status FINISHED if the run ended ok, else FAILED."""
@@ -75,7 +75,7 @@ class TensorBoard:
     folder: str
 
     def __post_init__(self) -> None:
-        _check_installed("tensorboard", f"TensorBoard: {install('tensorboard')}")
+        _check_installed("tensorboard", f"TensorBoard: {install_command('tensorboard')}")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
         """Writes the curve, the final values and the settings of the run."""

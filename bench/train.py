@@ -14,10 +14,10 @@ def train(run: Identity) -> None:
     """
     from bench.machine.environment import flushing_denormals
     from bench.progress import run_progress
-    from bench.setup.inputs import cell_of
+    from bench.setup.inputs import build_cell
     from bench.tasks.single_view import OneImage, describe_training
 
-    cell = cell_of(run.config)
+    cell = build_cell(run.config)
     if not isinstance(cell.task, OneImage):
         raise ValueError(
             "bench.train trains the network of task=single_view: python -m bench.train +method=single_view "

@@ -115,7 +115,7 @@ def mesh_of_run(folder: Path) -> Path:
 def make_upright(mesh: Mesh, up: str) -> Mesh:
     """Rotates the axis `up` of a mesh to y; moves and scales the mesh into the unit sphere if it lies outside."""
     turntable_views = replace(mesh, vertices=mesh.vertices @ np.array(UPRIGHT[up], dtype=float).T)
-    radius = np.linalg.norm(turntable_views.used, axis=1).max()
+    radius = np.linalg.norm(turntable_views.used_vertices, axis=1).max()
     return turntable_views if radius <= 1 + RADIUS_TOLERANCE else normalise(turntable_views, 1.0)
 
 

@@ -23,8 +23,8 @@ from bench.records.folder import Identity
 from bench.records.format import number, plural
 from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, bad_link, read_record
-from bench.setup.inputs import Judges, RunContext, cell_of
-from datasets.field_files import FIELD, load_field
+from bench.setup.inputs import EvaluatesField, RunContext, build_cell
+from datasets.field_files import FIELD_FILE, load_field
 from renderers.checks import BadInput
 
 METRIC_TOLERANCE = 1e-4  # relative: other machines add numbers in another order
@@ -116,15 +116,15 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.dev
         NothingToCompare: if the run has no field.
         BadInput: if its field or its configuration cannot be used.
     """
-    if not (folder / FIELD).is_file():
-        notes = [note for note in record.notes if FIELD in note]
+    if not (folder / FIELD_FILE).is_file():
+        notes = [note for note in record.notes if FIELD_FILE in note]
         status = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
-        raise NothingToCompare(notes[0] if notes else f"it has no {FIELD}: no field was found or looked for{status}")
-    cell = cell_of(record.config)
+        raise NothingToCompare(notes[0] if notes else f"it has no {FIELD_FILE}: no field was found or looked for{status}")
+    cell = build_cell(record.config)
     cell.start()
     field = load_field(folder, cell.inputs.device)
     run = RunContext(cell.inputs, folder, record, lambda *_: None)
-    metrics = cell.task.judged(field, run) if isinstance(cell.task, Judges) else None
+    metrics = cell.task.field_metrics(field, run) if isinstance(cell.task, EvaluatesField) else None
     return evaluate(State(field, cell.inputs)).metrics if metrics is None else metrics, cell.inputs.device
 
 

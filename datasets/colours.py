@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from PIL import Image
 
-from datasets.extras import material_files, named_files
+from datasets.extras import material_files, referenced_files
 from datasets.mesh import Mesh
 from datasets.meshes import read_surface
 from datasets.readers.glb import UNCOLOURED_GREY
@@ -70,7 +70,7 @@ class FileColours:
 def _read_paint(path: Path, changed: int) -> Paint:
     """The surface of a file and its colours; `changed`, the time of the last change, is only a key of the cache."""
     mesh, polygons = read_surface(path)
-    if missing := [file for file in named_files(path) if not file.is_file()]:
+    if missing := [file for file in referenced_files(path) if not file.is_file()]:
         raise BadInput(f"mesh file '{path}' names '{missing[0].name}', which is not there: put it at '{missing[0]}'")
     cuts, polygon = polygons.cuts
     materials = [*_materials(path, polygons), Material()]  # the last, at -1, is for polygons without a material

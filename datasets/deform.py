@@ -1,19 +1,19 @@
-"""Seeded smooth deformations that make many shapes of one mesh."""
+"""Seeded smooth deformations that make many shapes from one mesh."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-STRETCH = 0.25  # log of the largest scale of an axis: about -22 % to +28 %
-TAPER = 0.25  # largest change of cross-section at |position| = 1 along the axis
-TWIST = np.radians(25)  # largest turn at |position| = 1
-BEND = 0.25  # largest curvature, 1 / scene unit
+MAX_LOG_SCALE = 0.25  # about -22 % to +28 % along an axis
+MAX_TAPER = 0.25  # relative change of the cross-section at |position| = 1 along the axis
+MAX_TWIST_RADIANS = np.radians(25)  # at |position| = 1
+MAX_CURVATURE = 0.25  # 1 / scene unit
 
 
 @dataclass(frozen=True)
 class Deformation:
-    """Stretch, then taper, twist and bend, each along an axis of the frame; the identity where all are zero.
+    """Stretch, then taper, twist and bend, each along an axis of the frame; the identity if all are zero.
 
     Axes are 0, 1, 2 for x, y, z. Every part preserves orientation within the unit sphere.
     """
@@ -23,15 +23,15 @@ class Deformation:
     taper_axis: int = 0
     twist: float = 0.0  # radians per unit along its axis
     twist_axis: int = 0
-    bend: float = 0.0  # curvature that the axis takes on, towards the axis after it
+    bend: float = 0.0  # curvature of the bent axis, towards the axis after it
     bend_axis: int = 0
 
     @classmethod
     def draw(cls, seed: int, strength: float = 1.0) -> "Deformation":
-        """Draws one, evenly within the limits above times `strength`.
+        """Draws a deformation uniformly within the limits above, multiplied by `strength`.
 
         Args:
-            seed: the same seed gives the same deformation; at another strength, the same kind, weaker or stronger.
+            seed: the same seed gives the same deformation; another strength scales it.
             strength: from 0, the identity, to 1.
         """
         if not 0 <= strength <= 1:
@@ -40,12 +40,12 @@ class Deformation:
         amounts = strength * generator.uniform(-1, 1, 6)
         axes = generator.integers(0, 3, 3)
         return cls(
-            stretch=tuple(float(amount) for amount in STRETCH * amounts[:3]),
-            taper=float(TAPER * amounts[3]),
+            stretch=tuple(float(amount) for amount in MAX_LOG_SCALE * amounts[:3]),
+            taper=float(MAX_TAPER * amounts[3]),
             taper_axis=int(axes[0]),
-            twist=float(TWIST * amounts[4]),
+            twist=float(MAX_TWIST_RADIANS * amounts[4]),
             twist_axis=int(axes[1]),
-            bend=float(BEND * amounts[5]),
+            bend=float(MAX_CURVATURE * amounts[5]),
             bend_axis=int(axes[2]),
         )
 

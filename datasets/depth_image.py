@@ -129,7 +129,7 @@ class DepthImage:
         surface = see(Truth(mesh, closed=False), camera)
         view = View(camera, surface.depth, surface.normals, torch.from_numpy(mask))
         mesh = replace(mesh, repairs=(*filter(None, (truth_note, warning)), *mesh.repairs))
-        return Scene(self.name, mesh, view, scene_depth, to_world, part=self.truth is None)
+        return Scene(self.name, mesh, view, scene_depth, to_world, is_partial=self.truth is None)
 
     def _principal_point_warning(self, height: int, width: int) -> str:
         """A warning about a principal point far from the middle of the image; "" for others."""

@@ -18,8 +18,8 @@ from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box, smooth_union, sphere, torus
 
 VERSION = 1  # raise it when a builder changes, so that no prior of the old shapes is used for the new ones
-HALF_GRID = 1.5  # the sampled cube reaches from -1.5 to 1.5, wider than any shape before it is normalised
-SHEAR_SCALE = 0.8  # values of sheared parts are multiplied by this; fillets depend on it, and so do the shipped priors
+CUBE_HALF_SIDE = 1.5  # the sampled cube is larger than any shape before it is normalised
+SHEAR_VALUE_FACTOR = 0.8  # multiplies the values of sheared parts; fillets and the shipped priors depend on it
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Family:
     Args:
         name: which builder, one of `BUILDERS`.
         resolution: samples per axis of the marching cubes that make the mesh.
-        radius: of the sphere about the origin that holds a shape.
+        radius: of the sphere about the origin that contains a shape.
         ranges: least and largest value of each of the builder's parameters, drawn uniformly.
     """
 
@@ -55,13 +55,13 @@ class Family:
     def mesh(self, split: Split, index: int) -> Mesh:
         """A shape as a closed mesh, by marching cubes."""
         shape = BUILDERS[self.name](SimpleNamespace(**self.draw(split, index)))
-        mesh = extract(shape, grid=self.resolution, reach=HALF_GRID)
+        mesh = extract(shape, grid=self.resolution, reach=CUBE_HALF_SIDE)
         if mesh is None:
             raise BadInput(f"{self.name} {split} {index} has no surface: check dataset.ranges")
         return normalise(mesh, self.radius)
 
     def identity(self) -> dict[str, Any]:
-        """Plain data that determines the shapes: families of equal identity hold the same ones."""
+        """Plain data that determines the shapes: families with equal identity have the same shapes."""
         return {"version": VERSION, **asdict(self)}
 
 
@@ -69,15 +69,15 @@ def _all_of(parts: list[Shape]) -> Shape:
     return reduce(or_, parts)
 
 
-def _mirror(part: Shape, axis: int) -> Shape:
-    """The part and its mirror image, for a part on the positive side of `axis`."""
-    flip = torch.ones(3)
-    flip[axis] = -1.0
-    return part | Shape(lambda p: part(p * flip), part.kind, part.lipschitz)
+def _mirror(shape: Shape, axis: int) -> Shape:
+    """The shape and its mirror image, for a shape on the positive side of `axis`."""
+    signs = torch.ones(3)
+    signs[axis] = -1.0
+    return shape | Shape(lambda p: shape(p * signs), shape.kind, shape.lipschitz)
 
 
-def _shear(part: Shape, *, along: int, by: int, slope: float) -> Shape:
-    """The part moved along one axis by `slope` times the coordinate on another.
+def _shear(shape: Shape, *, along: int, by: int, slope: float) -> Shape:
+    """The shape moved along one axis by `slope` times the coordinate on another.
 
     The shear lengthens gradients by its largest singular value at most.
     """
@@ -86,16 +86,16 @@ def _shear(part: Shape, *, along: int, by: int, slope: float) -> Shape:
     def sheared(points: torch.Tensor) -> torch.Tensor:
         moved = points.clone()
         moved[..., along] = points[..., along] - slope * points[..., by]
-        return part(moved) * SHEAR_SCALE
+        return shape(moved) * SHEAR_VALUE_FACTOR
 
-    steepest = None if part.lipschitz is None else SHEAR_SCALE * stretch * part.lipschitz
-    known = steepest is not None and steepest <= 1 and part.kind is not Kind.LEVEL
-    return Shape(sheared, Kind.BOUND if known else Kind.LEVEL, steepest)
+    lipschitz = None if shape.lipschitz is None else SHEAR_VALUE_FACTOR * stretch * shape.lipschitz
+    is_bound = lipschitz is not None and lipschitz <= 1 and shape.kind is not Kind.LEVEL
+    return Shape(sheared, Kind.BOUND if is_bound else Kind.LEVEL, lipschitz)
 
 
 def _sofa(p: SimpleNamespace) -> Shape:
-    def block(width: float, height: float, depth: float, at: tuple[float, float, float]) -> Shape:
-        return rounded_box((width / 2, height / 2, depth / 2), p.rounding).translate(at)
+    def block(width: float, height: float, depth: float, centre: tuple[float, float, float]) -> Shape:
+        return rounded_box((width / 2, height / 2, depth / 2), p.rounding).translate(centre)
 
     floor = p.leg_height
     seat = block(p.width, p.seat_height, p.depth, (0, floor + p.seat_height / 2, 0))
@@ -119,10 +119,11 @@ def _plane(p: SimpleNamespace) -> Shape:
     fin = rounded_box((p.thickness / 2, p.fin_height / 2, p.chord * 0.35), p.thickness * 0.45)
     fin = _shear(fin.translate((0, p.fin_height / 2, 0)), along=2, by=1, slope=-p.sweep)
     engine = capsule((0, 0, -0.09), (0, 0, 0.09), p.engine_radius)
-    at = (p.engine_offset, -p.body_radius * 0.4 - p.engine_radius, p.wing_position + 0.1 - p.sweep * p.engine_offset)
+    engine_z = p.wing_position + 0.1 - p.sweep * p.engine_offset
+    engine_centre = (p.engine_offset, -p.body_radius * 0.4 - p.engine_radius, engine_z)
     fuselage = smooth_union(body, wings, radius=0.06)
     parts = [fuselage, _mirror(tail.translate((0, 0.03, end)), 0), fin.translate((0, 0, end))]
-    return _all_of([*parts, _mirror(engine.translate(at), 0)])
+    return _all_of([*parts, _mirror(engine.translate(engine_centre), 0)])
 
 
 def _table(p: SimpleNamespace) -> Shape:
@@ -139,8 +140,8 @@ def _table(p: SimpleNamespace) -> Shape:
 
 
 def _car(p: SimpleNamespace) -> Shape:
-    def slab(size: tuple[float, float, float], at: tuple[float, float, float], radius: float) -> Shape:
-        return rounded_box((size[0] / 2, size[1] / 2, size[2] / 2), radius).translate(at)
+    def slab(size: tuple[float, float, float], centre: tuple[float, float, float], radius: float) -> Shape:
+        return rounded_box((size[0] / 2, size[1] / 2, size[2] / 2), radius).translate(centre)
 
     floor = p.clearance
     lower = slab((p.width, p.body_height, p.length), (0, floor + p.body_height / 2, 0), p.rounding)

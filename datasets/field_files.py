@@ -1,6 +1,6 @@
-"""The field that a run leaves, in one file: tensors, and in its metadata the tree of objects that they belong to.
+"""Saves and loads the final field of a run: a file of tensors, with the tree of their objects in its metadata.
 
-Objects are of the classes of `CLASSES` alone, with plain values: nothing in a file is run.
+Only objects of the classes in `CLASSES` with plain values are stored, and nothing in a file is executed.
 """
 
 import json
@@ -22,13 +22,13 @@ from renderers.fields.grid import Grid
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.fields.parts import Formula
 
-FIELD = "field.safetensors"  # in a run's folder
-RUNS = Path("results/local/runs")  # whose names `bench.load().folder` has
-VERSION = "1"  # raise it when a class of these changes what it holds
-MOST = 16_000_000  # bytes of a field that is stored
+FIELD_FILE = "field.safetensors"
+DEFAULT_RUNS_FOLDER = Path("results/local/runs")  # has the names of `bench.load().folder`
+VERSION = "1"  # raise it when one of `CLASSES` changes its attributes
+MAX_FIELD_BYTES = 16_000_000
 CLASSES: dict[str, type] = {
-    one.__name__: one
-    for one in (
+    class_.__name__: class_
+    for class_ in (
         *(BoundDecoder, Grid, Shape, Formula, Flops, Moved, network.Adjusted, network.AtCode),
         *(coloured.ColouredDistance, coloured.ColouredGrid, coloured.OccupancyOf, coloured.ScaledOccupancyOf),
         coloured.TexturedShape,
@@ -37,67 +37,67 @@ CLASSES: dict[str, type] = {
         *(nn.Linear, nn.LayerNorm, nn.ModuleList, nn.ModuleDict, nn.ParameterList),
     )
 }
-STATES = ("_parameters", "_buffers", "_modules")  # of an nn.Module
-OWN = {*vars(nn.Module())} - {*STATES}  # what every module has; it is not stored
-PRIVATE = ("_size",)  # the one attribute with an underscore that a module of these has, nn.ParameterList
-WIDTH = 256  # neurons of which a pass through a field of any class is thought
+STATE_ATTRIBUTES = ("_parameters", "_buffers", "_modules")
+STANDARD_ATTRIBUTES = {*vars(nn.Module())}  # every module has these
+PRIVATE_ATTRIBUTES = ("_size",)  # the only one allowed; nn.ParameterList has it
+ASSUMED_WIDTH = 256  # neurons per layer of a field of unknown structure; sets the points per pass
 
 
 def save_field(field: Field, path: Path) -> str | None:
-    """Writes a field; gives a note, and writes nothing, where it has a class that is not ours or is too large."""
+    """Writes a field. If it is too large or has a class not in `CLASSES`, writes nothing and returns a note."""
     tensors: dict[str, Tensor] = {}
     try:
-        tree = _plain(field, tensors)
-        if (size := sum(one.nbytes for one in tensors.values())) > MOST:
-            raise BadInput(f"it has {size / 1e6:.0f} MB, and {MOST / 1e6:.0f} MB are the most")
+        tree = _to_tree(field, tensors)
+        if (size := sum(tensor.nbytes for tensor in tensors.values())) > MAX_FIELD_BYTES:
+            raise BadInput(f"it has {size / 1e6:.0f} MB, and {MAX_FIELD_BYTES / 1e6:.0f} MB are the most")
     except BadInput as error:
-        return f"the run leaves no {FIELD}: {error}"
+        return f"the run leaves no {FIELD_FILE}: {error}"
     path.write_bytes(save(tensors, {"version": VERSION, "kind": field.kind.value, "field": json.dumps(tree)}))
     return None
 
 
 def load_field(run: Path | str, device: torch.device | str = "cpu") -> Field:
-    """The final field of a run, on a device, without gradients towards its numbers.
+    """The final field of a run, on a device, without gradients towards its parameters.
 
     Args:
-        run: its folder, or the file in it, or its name in `RUNS`.
-        device: of its tensors, and of points that it takes.
+        run: its folder, the file in it, or its name in `DEFAULT_RUNS_FOLDER`.
+        device: of its tensors and input points.
 
     Raises:
-        BadInput: where there is none, or it cannot be read.
+        BadInput: the run has no field, or it cannot be read.
     """
     tree, tensors = _read(Path(run))
     return _field(tree, {name: tensor.to(device) for name, tensor in tensors.items()})
 
 
 def load_network(run: Path | str) -> network.Published:
-    """The same field as a network without a code, whose code is its place."""
+    """The final field of a run as a network with a code of length 0."""
     tree, tensors = _read(Path(run))
     field = _field(tree, tensors)
     if isinstance(field, BoundDecoder):
         decoder = Decoder.of([*field.hidden, field.last], code_length=0, skip=field.skip)
         return network.Published(decoder)
-    return network.Published(network.Coded(_Held(tree, tensors), code_length=0, width=WIDTH))
+    return network.Published(network.Coded(_StoredField(tree, tensors), code_length=0, width=ASSUMED_WIDTH))
 
 
-class _Held(nn.Module):
-    """A stored field as the body of a `Coded`: its tensors are buffers, so that they move to a device."""
+class _StoredField(nn.Module):
+    """A stored field as the body of a `Coded`. Its tensors are buffers, so they move with the module to a device."""
 
     def __init__(self, tree: Any, tensors: dict[str, Tensor]) -> None:
         super().__init__()
-        self.tree, self.flops = tree, _made(tree, tensors).flops
+        self.tree, self.flops = tree, _from_tree(tree, tensors).flops
         for name, tensor in tensors.items():
             self.register_buffer(name, tensor)
 
     def forward(self, points: Float[Tensor, "n 3"], code: Tensor) -> Float[Tensor, " n"]:
-        return _made(self.tree, dict(self.named_buffers()))(points)
+        return _from_tree(self.tree, dict(self.named_buffers()))(points)
 
 
-def _plain(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """A value as JSON has it; its tensors are added to `tensors`, by numbers.
+def _to_tree(value: Any, tensors: dict[str, Tensor]) -> Any:
+    """Converts a value to JSON data; adds its tensors to `tensors` under numbered names.
 
     Raises:
-        BadInput: for an object of another class.
+        BadInput: an object's class is not in `CLASSES`.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -108,23 +108,23 @@ def _plain(value: Any, tensors: dict[str, Tensor]) -> Any:
         tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
         return {"tensor": name}
     if isinstance(value, tuple | list):
-        return [_plain(one, tensors) for one in value]
+        return [_to_tree(entry, tensors) for entry in value]
     if isinstance(value, dict):
-        return {"pairs": [[key, _plain(one, tensors)] for key, one in value.items()]}
+        return {"pairs": [[key, _to_tree(entry, tensors)] for key, entry in value.items()]}
     name = type(value).__name__
     if CLASSES.get(name) is not type(value):
         raise BadInput(f"{type(value).__module__}.{type(value).__qualname__} is no class that is stored")
     if is_dataclass(value):
-        return {"class": name, "has": {one.name: _plain(getattr(value, one.name), tensors) for one in fields(value)}}
-    states = {state: _plain(dict(vars(value)[state]), tensors) for state in STATES}
-    held = {key: one for key, one in vars(value).items() if key not in OWN and key not in STATES}
-    return {"class": name, "has": {key: _plain(one, tensors) for key, one in held.items()}, **states}
+        return {"class": name, "has": {key.name: _to_tree(getattr(value, key.name), tensors) for key in fields(value)}}
+    states = {key: _to_tree(dict(vars(value)[key]), tensors) for key in STATE_ATTRIBUTES}
+    has = {key: _to_tree(entry, tensors) for key, entry in vars(value).items() if key not in STANDARD_ATTRIBUTES}
+    return {"class": name, "has": has, **states}
 
 
-def _made(node: Any, tensors: dict[str, Tensor]) -> Any:
-    """The value of a node of JSON; the reverse of `_plain`, with tuples for lists."""
+def _from_tree(node: Any, tensors: dict[str, Tensor]) -> Any:
+    """Builds the value of a JSON node: the inverse of `_to_tree`, with tuples for lists."""
     if isinstance(node, list):
-        return tuple(_made(one, tensors) for one in node)
+        return tuple(_from_tree(entry, tensors) for entry in node)
     if not isinstance(node, dict):
         return node
     if "tensor" in node:
@@ -132,18 +132,18 @@ def _made(node: Any, tensors: dict[str, Tensor]) -> Any:
     if "kind" in node:
         return Kind(node["kind"])
     if "pairs" in node:
-        return {key: _made(one, tensors) for key, one in node["pairs"]}
+        return {key: _from_tree(entry, tensors) for key, entry in node["pairs"]}
     if node["class"] not in CLASSES:
         raise BadInput(f"it names the class {node['class']!r}, which is none of ours")
-    one, has = CLASSES[node["class"]], {key: _made(value, tensors) for key, value in node["has"].items()}
-    if is_dataclass(one):
-        return one(**has)
-    module = object.__new__(one)
+    class_, has = CLASSES[node["class"]], {key: _from_tree(value, tensors) for key, value in node["has"].items()}
+    if is_dataclass(class_):
+        return class_(**has)
+    module = object.__new__(class_)
     nn.Module.__init__(module)
-    if strange := [key for key in has if key not in PRIVATE and (key.startswith("_") or hasattr(one, key))]:
-        raise BadInput(f"{node['class']} has no attribute {strange[0]!r} that a file may set")
+    if unknown := [key for key in has if key not in PRIVATE_ATTRIBUTES and (key[:1] == "_" or hasattr(class_, key))]:
+        raise BadInput(f"{node['class']} has no attribute {unknown[0]!r} that a file may set")
     vars(module).update(has)
-    parameters, buffers, modules = (_made(node[state], tensors) for state in STATES)
+    parameters, buffers, modules = (_from_tree(node[state], tensors) for state in STATE_ATTRIBUTES)
     for key, tensor in parameters.items():
         module.register_parameter(key, None if tensor is None else nn.Parameter(tensor, requires_grad=False))
     for key, tensor in buffers.items():
@@ -154,13 +154,13 @@ def _made(node: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _field(tree: Any, tensors: dict[str, Tensor]) -> Field:
-    """The field of a tree, which has been asked for two values.
+    """Builds the field of a tree, and evaluates it at two points as a check.
 
     Raises:
-        BadInput: where it is none, or its parts do not fit.
+        BadInput: the tree is no field, or its parts do not fit together.
     """
     try:
-        field = _made(tree, tensors)
+        field = _from_tree(tree, tensors)
         like = next(iter(tensors.values()))
         with torch.no_grad():
             shape = field(like.new_zeros(2, 3)).shape
@@ -168,29 +168,30 @@ def _field(tree: Any, tensors: dict[str, Tensor]) -> Field:
             raise BadInput("it is no field")
     except (TypeError, KeyError, ValueError, AttributeError, RuntimeError, IndexError, StopIteration) as error:
         cause = "" if isinstance(error, BadInput) else ", its parts do not fit"
-        raise BadInput(f"{FIELD} cannot be used{cause}: {' '.join(str(error).split())[:160]}") from error
+        raise BadInput(f"{FIELD_FILE} cannot be used{cause}: {' '.join(str(error).split())[:160]}") from error
     return cast(Field, field)
 
 
 def _read(run: Path) -> tuple[Any, dict[str, Tensor]]:
-    place = run if run.exists() else RUNS / run
-    path = place / FIELD if place.is_dir() else place
-    if not place.exists():
-        raise BadInput(f"there is nothing at '{run}': give the folder of a run, RESULTS/runs/NAME, or a name in {RUNS}")
+    location = run if run.exists() else DEFAULT_RUNS_FOLDER / run
+    path = location / FIELD_FILE if location.is_dir() else location
+    if not location.exists():
+        remedy = f"give the folder of a run, RESULTS/runs/NAME, or a name in {DEFAULT_RUNS_FOLDER}"
+        raise BadInput(f"there is nothing at '{run}': {remedy}")
     if not path.is_file():
         raise BadInput(
-            f"{run} has no {FIELD}: a task that looks for no field, such as ablation, leaves none; of another "
+            f"{run} has no {FIELD_FILE}: a task that looks for no field, such as ablation, leaves none; of another "
             "the run's notes say why"
         )
     try:
         with safe_open(path, "pt") as opened:
-            found = opened.metadata() or {}
+            metadata = opened.metadata() or {}
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - it is no dictionary
     except (SafetensorError, OSError) as error:
         raise BadInput(f"{path} cannot be read, it may be cut short: {' '.join(str(error).split())[:160]}") from error
-    if found.get("version") != VERSION:
-        raise BadInput(f"{path} has version {found.get('version')!r} of fields, and {VERSION} is read: run it again")
+    if metadata.get("version") != VERSION:
+        raise BadInput(f"{path} has version {metadata.get('version')!r} of fields, and {VERSION} is read: run it again")
     try:
-        return json.loads(found["field"]), tensors
+        return json.loads(metadata["field"]), tensors
     except (KeyError, ValueError, RecursionError) as error:
         raise BadInput(f"{path} holds no field: {error!r}") from error

@@ -15,7 +15,7 @@ import numpy as np
 
 from datasets.colours import FileColours
 from datasets.deform import Deformation
-from datasets.extras import named_files, version
+from datasets.extras import referenced_files, version
 from datasets.mesh import Mesh, normalise
 from datasets.meshes import find_meshes, load_mesh
 from datasets.scene import Split, seed_of
@@ -23,21 +23,20 @@ from datasets.textures import Texture
 from renderers.checks import check_at_least, check_fraction
 
 VERSION = 4  # raise it when reading, repair or deformation changes the shapes
-SLOW = 2.0  # seconds from which on a repaired mesh is kept
-HELD_OUT = 0.2  # share of a folder's meshes in the validation split, and in the test split
+MIN_CACHED_SECONDS = 2.0  # a mesh whose repair takes longer is cached
+HELD_OUT_FRACTION = 0.2  # the validation split and the test split each have this fraction of a folder's meshes
 
 
 @dataclass(frozen=True)
 class LocalMeshes:
     """Shapes made from local mesh files.
 
-    One file: every shape is a seeded deformation of it, except the first of the training split, which is the mesh
-    itself. A folder: its meshes are distributed over the splits; once each mesh of a split has been used, its
-    deformations follow.
+    With one file, every shape is a seeded deformation of its mesh, except the first training shape: the mesh itself.
+    With a folder, its meshes are distributed over the splits. After all meshes of a split, their deformations follow.
 
     Args:
         path: a mesh file or a folder of them.
-        radius: of the sphere about the origin that holds a shape.
+        radius: of the sphere about the origin that contains a shape.
         strength: of the deformations; 0 leaves a mesh unchanged.
     """
 
@@ -59,19 +58,19 @@ class LocalMeshes:
         return Path(self.path).resolve().stem
 
     def mesh(self, split: Split, index: int) -> Mesh:
-        """A shape as a closed mesh; its `repairs` say what was repaired in the file."""
+        """A shape as a closed mesh; its `repairs` list the repairs of the file."""
         files, file = self.files(split), self._file(split, index)
         mesh = _load(file, file.stat().st_mtime_ns, self.radius)
         alone = len(find_meshes(self.path)) == 1
         if index < len(files) and (split is Split.TRAIN or not alone):
             return mesh
-        drawn = Deformation.draw(seed_of(split, index), self.strength)
-        return normalise(replace(mesh, vertices=drawn.apply(mesh.vertices)), self.radius)
+        deformation = Deformation.draw(seed_of(split, index), self.strength)
+        return normalise(replace(mesh, vertices=deformation.apply(mesh.vertices)), self.radius)
 
     def texture(self, split: Split, index: int) -> Texture:
-        """The colours of a shape, as its file has them; see `Textured`."""
+        """The colours that the file gives a shape; see `Textured`."""
         file = self._file(split, index)
-        return FileColours(file, repaired(file), self.mesh(split, index))
+        return FileColours(file, load_repaired(file), self.mesh(split, index))
 
     def _file(self, split: Split, index: int) -> Path:
         files = self.files(split)
@@ -80,56 +79,50 @@ class LocalMeshes:
     def files(self, split: Split) -> list[Path]:
         """The files of a split; splits share none, unless there are fewer than three."""
         files = find_meshes(self.path)
-        return files if len(files) == 1 else deal(files)[split]
+        return files if len(files) == 1 else split_files(files)[split]
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: the files' contents, not their paths."""
         meshes = find_meshes(self.path)
-        named = [other for file in meshes for other in named_files(file) if other.is_file()]
-        contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in (*meshes, *named)]
-        return {
-            "name": "mesh",
-            "version": VERSION,
-            "contents": contents,
-            "radius": self.radius,
-            "strength": self.strength,
-        }
+        referenced = [other for file in meshes for other in referenced_files(file) if other.is_file()]
+        contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in (*meshes, *referenced)]
+        settings = {"radius": self.radius, "strength": self.strength}
+        return {"name": "mesh", "version": VERSION, "contents": contents, **settings}
 
 
-def deal(files: list[Path]) -> dict[Split, list[Path]]:
-    """Distributes files over the splits; those of validation and of training are the same where there are too few."""
+def split_files(files: list[Path]) -> dict[Split, list[Path]]:
+    """Distributes files over the splits; with too few files, validation and training share theirs."""
     order = [files[i] for i in np.random.default_rng(0).permutation(len(files))]
-    held = max(1, round(HELD_OUT * len(files)))
-    test, rest = order[:held], order[held:]
-    validation, train = (rest[:held], rest[held:]) if len(rest) > held else (rest, rest)
+    count = max(1, round(HELD_OUT_FRACTION * len(files)))
+    test, rest = order[:count], order[count:]
+    validation, train = (rest[:count], rest[count:]) if len(rest) > count else (rest, rest)
     return {Split.TEST: test, Split.VALIDATION: validation, Split.TRAIN: train}
 
 
 @lru_cache(maxsize=64)
 def _load(path: Path, changed: int, radius: float) -> Mesh:
-    """The mesh of a file, read again when the file has changed."""
-    return normalise(repaired(path), radius)
+    """The normalised mesh of a file, read again when the file has changed."""
+    return normalise(load_repaired(path), radius)
 
 
-def repaired(path: Path) -> Mesh:
-    """As `load_mesh`, but what took long is kept in the user's cache, since each run loads its mesh again.
+def load_repaired(path: Path) -> Mesh:
+    """Loads a mesh like `load_mesh`; caches a mesh whose repair took long, since each run loads its mesh again.
 
-    What is kept is of this code, of PyMeshLab's version and of this file: a change of one makes it anew.
+    The cache key covers this code, PyMeshLab's version and the file: if one changes, the mesh is repaired again.
     """
     code = sorted(Path(__file__).parent.rglob("*.py"))
-    made_of = b"\0".join([str(version("pymeshlab")).encode(), *(file.read_bytes() for file in (*code, path))])
-    cached = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    kept = Path(cached, "implicit-bench", "meshes", f"{hashlib.sha256(made_of).hexdigest()[:16]}.npz")
-    with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), kept.open("rb") as file, np.load(file) as parts:
-        return Mesh(parts["vertices"], parts["faces"], tuple(map(str, parts["repairs"])))
+    fingerprint = b"\0".join([str(version("pymeshlab")).encode(), *(file.read_bytes() for file in (*code, path))])
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "implicit-bench", "meshes")
+    entry = folder / f"{hashlib.sha256(fingerprint).hexdigest()[:16]}.npz"
+    with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), entry.open("rb") as file, np.load(file) as data:
+        return Mesh(data["vertices"], data["faces"], tuple(map(str, data["repairs"])))
     started = time.perf_counter()
     mesh = load_mesh(path)
-    if time.perf_counter() - started > SLOW:
+    if time.perf_counter() - started > MIN_CACHED_SECONDS:
         with suppress(OSError):  # a cache that cannot be written to
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=kept.parent) as folder:  # another process may do the same
-                np.savez(
-                    made := Path(folder, kept.name), vertices=mesh.vertices, faces=mesh.faces, repairs=mesh.repairs
-                )
-                made.replace(kept)
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder) as scratch:  # another process may do the same
+                written = Path(scratch, entry.name)
+                np.savez(written, vertices=mesh.vertices, faces=mesh.faces, repairs=mesh.repairs)
+                written.replace(entry)
     return mesh

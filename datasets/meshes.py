@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float
 
-from datasets.mesh import Mesh, joined
+from datasets.mesh import Mesh, concatenate_meshes
 from datasets.readers.glb import read_glb
 from datasets.readers.ply import read_ply
 from datasets.readers.polygons import Polygons
@@ -19,42 +19,42 @@ from renderers.checks import BadInput
 
 READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off, ".glb": read_glb}
 SUFFIXES = tuple(READERS)
-FLAT = 1e-12  # of the squared diagonal: a mesh with less area is a line or a point
+MIN_AREA_FRACTION = 1e-12  # a mesh with less area, relative to its squared diagonal, is a line or a point
 
 
 def find_meshes(path: str | Path) -> list[Path]:
     """Lists the mesh files at `path`: the file itself, or those directly in the folder, sorted by name.
 
     Raises:
-        ValueError: nothing is there, the folder holds no meshes, or the suffix is unknown.
+        ValueError: `path` does not exist, its folder has no meshes, or its suffix is unknown.
     """
-    path, known = Path(path), " ".join(SUFFIXES)
+    path, suffixes = Path(path), " ".join(SUFFIXES)
     if path.is_dir():
         files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
-        found = sorted(file for file in files if not file.name.startswith("._"))  # a Mac's notes on files
-        if not found:
+        meshes = sorted(file for file in files if not file.name.startswith("._"))  # macOS metadata files
+        if not meshes:
             raise ValueError(
-                f"a folder must hold mesh files ({known}), found none directly in '{path}'; "
+                f"a folder must hold mesh files ({suffixes}), found none directly in '{path}'; "
                 "name the folder that has them, or one file"
             )
-        return found
+        return meshes
     if not path.exists():
         siblings = [file.name for file in path.parent.iterdir()] if path.parent.is_dir() else []
-        near = difflib.get_close_matches(path.name, siblings, n=1)
-        remedy = f"did you mean '{path.parent / near[0]}'?" if near else "check the spelling and the current folder"
+        close = difflib.get_close_matches(path.name, siblings, n=1)
+        remedy = f"did you mean '{path.parent / close[0]}'?" if close else "check the spelling and the current folder"
         raise ValueError(f"a mesh file or a folder of them is asked for, found nothing at '{path}'; {remedy}")
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(
-            f"a mesh file must end in one of {known}, found '{path.name}'; export it in one of these formats"
+            f"a mesh file must end in one of {suffixes}, found '{path.name}'; export it in one of these formats"
         )
     return [path]
 
 
 def load_mesh(path: str | Path, close: Callable[[Mesh], Mesh | None] | None = None) -> Mesh:
-    """Reads one file as a closed solid, wound outward, whose `repairs` say what was changed.
+    """Reads one file as a closed solid, wound outward; its `repairs` list the changes.
 
-    Vertices at the same place are merged, so that texture seams close. A mesh that is already closed keeps its
-    surface. Otherwise its holes are closed and overlapping parts merged; where that gives no solid, it is wrapped: a
+    Vertices at the same position are merged, so that texture seams close. A mesh that is already closed keeps its
+    surface. Otherwise its holes are closed and overlapping parts merged; if that gives no solid, it is wrapped: a
     closed surface is shrunk around it.
 
     Args:
@@ -71,7 +71,7 @@ def load_mesh(path: str | Path, close: Callable[[Mesh], Mesh | None] | None = No
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """All triangles of a file, placed by its scene's transforms, open or closed and not repaired, with their colours.
+    """All triangles of a file with their colours, open or closed and not repaired, with its scene's transforms applied.
 
     Raises:
         ValueError: the file is missing, empty, truncated or broken, or holds no surface.
@@ -93,14 +93,14 @@ def read_surface(path: str | Path) -> tuple[Mesh, Polygons]:
 
 def read_pieces(path: str | Path) -> Mesh:
     """The mesh of a file, or of all files of a folder, such as BlendedMVS's `textured_mesh`; see `read_mesh`."""
-    return joined([read_mesh(file) for file in find_meshes(path)])
+    return concatenate_meshes([read_mesh(file) for file in find_meshes(path)])
 
 
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"] | None:
-    """The points of a cloud: a file without faces, or the `pointcloud.npz` of DVR's data; None of one that has faces.
+    """The points of a file without faces or of the `pointcloud.npz` of DVR's data; None if the file has faces.
 
     Raises:
-        ValueError: the file is missing, empty, truncated or broken, or has no points, or some that are not finite.
+        ValueError: the file is missing, empty, truncated or broken, or its points are missing or not finite.
     """
     (path,) = [Path(path)] if Path(path).suffix == ".npz" else find_meshes(path)
     try:
@@ -123,33 +123,33 @@ def _stored_points(path: Path) -> Float[np.ndarray, "n 3"]:
         with path.open("rb") as file, np.load(file) as stored:
             if "points" in stored and "occupancies" not in stored:
                 return stored["points"].reshape(-1, 3).astype(np.float64)
-            what = f"found {', '.join(stored)}"
+            fault = f"found {', '.join(stored)}"
     except (OSError, EOFError, TypeError, ValueError, BadZipFile) as error:
-        what = f"but it cannot be read ({error})"
-    raise ValueError(f"must have `points` on the surface, {what}; take `pointcloud.npz` beside it, or copy it again")
+        fault = f"but it cannot be read ({error})"
+    raise ValueError(f"must have `points` on the surface, {fault}; take `pointcloud.npz` beside it, or copy it again")
 
 
 def _polygons(path: Path) -> Polygons:
     content = path.read_bytes()
     if not content:
         raise ValueError("must hold a mesh, found 0 bytes; export or copy it again")
-    if what := wrong_kind_message(path):
-        raise ValueError(what)
-    with np.errstate(all="ignore"):  # of numbers that are refused later
+    if fault := wrong_kind_message(path):
+        raise ValueError(fault)
+    with np.errstate(all="ignore"):  # bad numbers are refused later
         return READERS[path.suffix.lower()](content)
 
 
 def _read(path: Path) -> tuple[Mesh, Polygons]:
     polygons, suffix = _polygons(path), path.suffix.lower()
-    with np.errstate(all="ignore"):  # of numbers that Mesh refuses
+    with np.errstate(all="ignore"):  # Mesh refuses bad numbers
         triangles = polygons.triangles
     if not len(triangles):
         count = len(polygons.vertices)
-        held = f"{count} vertices, as points or lines" if count else f"at most points or lines, as {suffix} writes them"
+        rest = f"{count} vertices, as points or lines" if count else f"at most points or lines, as {suffix} writes them"
         remedy = "reconstruct a surface from them (Poisson), or export it as one" if count else "export it as a surface"
-        raise ValueError(f"must have faces, found none: it holds {held}; {remedy}")
+        raise ValueError(f"must have faces, found none: it holds {rest}; {remedy}")
     mesh = Mesh(polygons.vertices, triangles, colours=polygons.shaded)
-    if mesh.area <= FLAT * mesh.diagonal**2:
+    if mesh.area <= MIN_AREA_FRACTION * mesh.diagonal**2:
         raise ValueError(
             f"must have an area, found {mesh.area:.3g} in a box {mesh.diagonal:.3g} across; "
             "look for a stray vertex, or export it again"

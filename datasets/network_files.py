@@ -1,6 +1,6 @@
-"""Networks that others trained, as scenes: a file or a folder holds the field, and its surface is the true shape.
+"""Trained networks of others as scenes: the true shape is the zero set of a network in a file or a folder.
 
-Only weights are read: nothing in a file is run.
+Only weights are read: nothing in a file is executed.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from datasets.field_files import FIELD, WIDTH, load_network
+from datasets.field_files import ASSUMED_WIDTH, FIELD_FILE, load_network
 from datasets.mesh import Mesh, extract
 from datasets.scene import Split
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
@@ -34,33 +34,33 @@ from renderers.fields.network import Coded, Facts, Published, enlarged, measured
 from renderers.fields.published import LAYERS, SIGNED, Residual, deepsdf, implicit, occupancy, plain
 
 VERSION = 1  # raise it when reading or measuring changes the fields
-REACH = 1.05  # scene units: half the side of the cube in which the surface within the unit sphere is extracted
+CUBE_HALF_SIDE = 1.05  # scene units: the surface within the unit sphere is extracted in this cube
 AUTO = "auto"
-CODES = 16  # of a network, of which its sign and its steepest slope are measured
-INSIDE = {AUTO: None, "negative": 1.0, "positive": -1.0}  # signs; see `Meaning`
+MEASURED_CODES = 16  # the sign and the Lipschitz constant are measured at about so many codes
+INSIDE_SIGNS = {AUTO: None, "negative": 1.0, "positive": -1.0}  # see `Meaning`
 OWN_CLASS = "field._target_=PACKAGE.CLASS"
-PARTS = ("ModelParameters/latest.pth", "LatentCodes/latest.pth")  # of a DeepSDF folder
-TENSORS = (
+DEEPSDF_FILES = ("ModelParameters/latest.pth", "LatentCodes/latest.pth")
+SUPPORTED_CHECKPOINTS = (
     "DeepSDF (name the folder with its specs.json); IDR, NeuS, VolSDF (implicit_network.lin0, sdf_network.lin0); "
     "occupancy networks, DVR (fc_p, conv_p)"
 )
-# What the loader raises of bytes that are no pickle of weights.
-GARBLED = (pickle.UnpicklingError, LookupError, UnicodeDecodeError, struct.error)
-SCALARS = [  # of numpy, in which some checkpoints hold their best loss; plain numbers
+# The loader raises these if a file is no pickle of weights.
+CHECKPOINT_ERRORS = (pickle.UnpicklingError, LookupError, UnicodeDecodeError, struct.error)
+NUMPY_SCALAR_CLASSES = [  # some checkpoints store their best loss as a NumPy scalar
     *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
     *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
 ]
 
 
 @dataclass(frozen=True)
-class Known:
-    """The network of a scene, its codes, and what was measured at the scene's own.
+class SceneNetwork:
+    """The network of a scene, all its codes, and the measurements at the code of the scene.
 
     Args:
         decoder: `at(code)` is a field, negative inside.
         codes: of all its shapes.
-        facts: of the field as it is in the file, turned so that it is negative inside, at its level and scale.
-        notes: what was measured and done, in words.
+        facts: of the field in the file, with the sign negative inside, at its level and scale.
+        notes: the measurements and conversions, in words.
     """
 
     decoder: Decoder | Published
@@ -70,31 +70,31 @@ class Known:
 
 
 @runtime_checkable
-class Networked(Protocol):
-    """A dataset whose shapes a network holds: it is the field of its scenes, and its codes are their prior."""
+class HasNetwork(Protocol):
+    """A dataset whose shapes are codes of a network: the network is the field of its scenes and their prior."""
 
-    def network(self, index: int) -> Known:
-        """The network, and what was measured at code number `index`."""
+    def network(self, index: int) -> SceneNetwork:
+        """The network, and the measurements at code number `index`."""
         ...
 
 
 @dataclass(frozen=True)
 class NetworkFile:
-    """Shapes that a network holds, each the zero set of its field at one code, within the unit sphere.
+    """The shapes of a network, each the zero set of its field at one code, within the unit sphere.
 
-    Every split has all of its codes. A network without a code has one shape, whose code is its place.
+    Every split has all codes. A network without codes has one shape.
 
     Args:
         path: a DeepSDF folder, with specs.json; a checkpoint of IDR, NeuS, VolSDF, an occupancy network or DVR; an
-            `.npz` of neural-implicit-queries; or the folder of a run that left its field.
-        scale: makes the shapes so many times as large: the unit sphere is what renderers see.
-        inside: which values are inside, "negative" or "positive"; "auto" takes those that are rarer on the unit sphere.
-        level: of the surface, among the network's values.
-        kind: what values mean: "distance", "bound" or "level"; "auto" measures it. Of a bound, values are divided by
-            their steepest slope.
-        codes: a file of codes, `.npy` or `.pth` [shapes, length], in place of the network's own.
-        tanh: how many follow the last layer of a DeepSDF network; None: as its code has it.
-        resolution: samples along an axis of the marching cubes that give the true mesh.
+            `.npz` of neural-implicit-queries; or the folder of a run with a saved field.
+        scale: factor that enlarges the shapes; renderers see the unit sphere.
+        inside: sign of the values inside, "negative" or "positive"; "auto" takes the sign rarer on the unit sphere.
+        level: value of the network on the surface.
+        kind: kind of field: "distance", "bound" or "level"; "auto" measures it. The values of a bound are divided by
+            its Lipschitz constant.
+        codes: a file of codes, `.npy` or `.pth` [shapes, length], that replace the network's codes.
+        tanh: number of tanh after the last layer of a DeepSDF network; None takes the number of its code.
+        resolution: samples per axis of the marching cubes that give the true mesh.
     """
 
     path: str
@@ -108,7 +108,7 @@ class NetworkFile:
 
     def __post_init__(self) -> None:
         check_positive("dataset.scale", self.scale, "1 leaves the network's own units")
-        check_choice("dataset.inside", self.inside, tuple(INSIDE))
+        check_choice("dataset.inside", self.inside, tuple(INSIDE_SIGNS))
         check_choice("dataset.kind", self.kind, (AUTO, *(kind.value for kind in Kind)))
         check_at_least("dataset.resolution", self.resolution, 16, "128 keeps thin parts")
         if self.tanh is not None:
@@ -125,38 +125,38 @@ class NetworkFile:
         return Path(self.path).resolve().stem
 
     def mesh(self, split: Split, index: int) -> Mesh:
-        """The surface of a shape within the unit sphere, closed where it leaves it."""
-        known = self.network(index)
-        field = known.decoder.at(known.codes[index])
-        found = extract(Shape(field, field.kind) & sphere(1.0), grid=self.resolution, reach=REACH)
-        if found is None:
+        """The surface of a shape within the unit sphere, closed along the sphere."""
+        network = self.network(index)
+        field = network.decoder.at(network.codes[index])
+        surface = extract(Shape(field, field.kind) & sphere(1.0), grid=self.resolution, reach=CUBE_HALF_SIDE)
+        if surface is None:
             raise BadInput(f"{self.path}, code {index}: the marching cubes find no surface: set dataset.resolution=256")
-        return found
+        return surface
 
-    def network(self, index: int) -> Known:
-        """The network, whose values mean what was measured at code number `index`.
+    def network(self, index: int) -> SceneNetwork:
+        """The network, converted to a field by measurements at code number `index`.
 
         Raises:
-            BadInput: where it cannot be read, has no such code, or no surface in the unit sphere.
+            BadInput: it cannot be read, has no such code, or no surface in the unit sphere.
         """
-        return _known(self, index, _content(self.files))
+        return _load_network(self, index, _content_hash(self.files))
 
     @property
     def files(self) -> list[Path]:
         """The files that are read."""
         path = Path(self.path)
-        parts = ("specs.json", FIELD, *PARTS) if path.is_dir() else ("",)
-        return [file for file in (*(path / part for part in parts), Path(self.codes or "")) if file.is_file()]
+        names = ("specs.json", FIELD_FILE, *DEEPSDF_FILES) if path.is_dir() else ("",)
+        return [file for file in (*(path / name for name in names), Path(self.codes or "")) if file.is_file()]
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: the files' contents, not their paths."""
         settings = {key: value for key, value in asdict(self).items() if key not in ("path", "codes", "module")}
-        return {"name": "network", "version": VERSION, "contents": _content(self.files), **settings}
+        return {"name": "network", "version": VERSION, "contents": _content_hash(self.files), **settings}
 
 
 @runtime_checkable
 class Module(Protocol):
-    """A network of the user's, an nn.Module: points [n, 3] to values [n] or [n, 1]."""
+    """A network of the user, an nn.Module: points [n, 3] to values [n] or [n, 1]."""
 
     def __call__(self, points: Tensor) -> Tensor: ...
 
@@ -165,33 +165,33 @@ class Module(Protocol):
 
 @dataclass(frozen=True)
 class ModuleFile(NetworkFile):
-    """A network of a class of the user's, whose weights a file holds.
+    """A network of a class of the user, with its weights in a file.
 
     Args:
-        module: the network, whose weights are not read yet.
+        module: the network, before its weights are read.
     """
 
     module: Module
 
     def identity(self) -> dict[str, Any]:
-        """See `NetworkFile`; the network is told by what it prints, and by its own numbers and words."""
-        own = {key: value for key, value in vars(self.module).items() if isinstance(value, int | float | str)}
-        return super().identity() | {"module": f"{self.module!r} {own}"}
+        """Plain data, see `NetworkFile`, with the module's `repr` and its plain attributes."""
+        attributes = {key: value for key, value in vars(self.module).items() if isinstance(value, int | float | str)}
+        return super().identity() | {"module": f"{self.module!r} {attributes}"}
 
     def read(self) -> Published:
-        """The network with the weights of the file, whatever prefix their names have there, as it is evaluated."""
+        """The network in evaluation mode, with the weights of the file; their names may have any prefix."""
         tensors, module = _tensors(Path(self.path)), deepcopy(cast(nn.Module, self.module)).eval()
         names = [*module.state_dict()]
-        found = [name.removesuffix(names[0]) for name in tensors if f".{name}".endswith(f".{names[0]}")]
-        if len(found) > 1 and "" not in found:
-            raise BadInput(f"it has several networks, {', '.join(found)}: save the state_dict() of one of them")
-        prefix = "" if "" in found else next(iter(found), "")
+        prefixes = [name.removesuffix(names[0]) for name in tensors if f".{name}".endswith(f".{names[0]}")]
+        if len(prefixes) > 1 and "" not in prefixes:
+            raise BadInput(f"it has several networks, {', '.join(prefixes)}: save the state_dict() of one of them")
+        prefix = "" if "" in prefixes else next(iter(prefixes), "")
         try:
             module.load_state_dict({name: tensors[prefix + name] for name in names if prefix + name in tensors})
         except RuntimeError as error:
-            told = " ".join(str(error).split())
-            raise BadInput(f"its weights are not those of {type(module).__name__}: {told}") from error
-        return Published(Coded(_Body(module), code_length=0, width=WIDTH))
+            message = " ".join(str(error).split())
+            raise BadInput(f"its weights are not those of {type(module).__name__}: {message}") from error
+        return Published(Coded(_Body(module), code_length=0, width=ASSUMED_WIDTH))
 
 
 class _Body(nn.Module):
@@ -206,27 +206,27 @@ class _Body(nn.Module):
 
 
 @lru_cache(maxsize=4)
-def _known(file: NetworkFile, index: int, content: str) -> Known:
-    """The network at one code, read again when a file has changed."""
+def _load_network(file: NetworkFile, index: int, content: str) -> SceneNetwork:
+    """The network, measured at one code; read again when a file has changed."""
     try:
         network, codes = _read(file)
         enlarged(network.inner, file.scale)
         if index >= len(codes):
-            some = f"{len(codes)} codes, and index={index} is none of them: set index=0 to {len(codes) - 1}"
-            raise BadInput(f"it has {some if len(codes) > 1 else 'one code: set index=0'}")
+            message = f"{len(codes)} codes, and index={index} is none of them: set index=0 to {len(codes) - 1}"
+            raise BadInput(f"it has {message if len(codes) > 1 else 'one code: set index=0'}")
         return _measured(file, network, codes, index, content)
     except BadInput as error:
         raise BadInput(f"the network {file.path}: {error}") from error
 
 
-def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> Known:
-    """The network with a field that is negative inside and of the kind that was measured."""
-    others = [network.at(code) for code in codes[:: max(len(codes) // CODES, 1)]] if len(codes) > 1 else []
+def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> SceneNetwork:
+    """The network, converted to a field that is negative inside and of the measured kind."""
+    others = [network.at(code) for code in codes[:: max(len(codes) // MEASURED_CODES, 1)]] if len(codes) > 1 else []
     meaning = measured(
         network.at(codes[index]),
         codes,
         kind=None if file.kind == AUTO else Kind(file.kind),
-        sign=INSIDE[file.inside],
+        sign=INSIDE_SIGNS[file.inside],
         level=file.level,
         scale=file.scale,
         others=others,
@@ -245,7 +245,8 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
         side += f" of the logits, a probability of {torch.tensor(file.level).sigmoid():.2g} (occupancy networks' own "
         side += "meshes are at 0.2, dataset.level=-1.386)"
     divided = f", by values divided by {meaning.divisor:.3g}" if kind is Kind.BOUND else ""
-    return Known(decoder, codes, facts, (f"{file.name}: {side}; {facts.in_words}; taken as a {kind.value}{divided}",))
+    note = f"{file.name}: {side}; {facts.in_words}; taken as a {kind.value}{divided}"
+    return SceneNetwork(decoder, codes, facts, (note,))
 
 
 def _read(file: NetworkFile) -> tuple[Published, Tensor]:
@@ -253,14 +254,14 @@ def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     path = Path(file.path)
     if isinstance(file, ModuleFile):
         network, codes = file.read(), None
-    elif (path / FIELD).is_file() or (path / "record.json").is_file():
+    elif (path / FIELD_FILE).is_file() or (path / "record.json").is_file():
         network, codes = load_network(path), None
     elif path.is_dir():
         network, codes = _read_folder(path, file.tanh)
     elif path.suffix == ".npz":
         network, codes = plain(_arrays(path)), None
     else:
-        network, codes = _of_names(_tensors(path)), None
+        network, codes = _by_tensor_names(_tensors(path)), None
     if file.codes is not None:
         codes = _codes(Path(file.codes))
     length = network.code_length
@@ -277,30 +278,29 @@ def _read(file: NetworkFile) -> tuple[Published, Tensor]:
 
 
 def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | None]:
-    """A DeepSDF folder's network and codes; None where it has none."""
+    """The network of a DeepSDF folder, and its codes; None without codes."""
     try:
         specs = json.loads((path / "specs.json").read_text("utf-8"))
     except OSError:
         raise BadInput("the folder has no specs.json: name a DeepSDF folder, or a file") from None
     except ValueError as error:
         raise BadInput(f"specs.json must be JSON: {error}") from error
-    weights, latent = (path / part for part in PARTS)
+    weights, latent = (path / name for name in DEEPSDF_FILES)
     if not weights.is_file():
-        raise BadInput(f"the folder has no {PARTS[0]}")
+        raise BadInput(f"the folder has no {DEEPSDF_FILES[0]}")
     network = deepsdf(_tensors(weights), specs, squash=squash)
     return network, _codes(latent) if latent.is_file() and not network.placed else None
 
 
-def _of_names(tensors: dict[str, Tensor]) -> Published:
-    """The network of a checkpoint whose format its names tell."""
+def _by_tensor_names(tensors: dict[str, Tensor]) -> Published:
+    """The network of a checkpoint; its tensors' names determine its format."""
     if any(re.search(rf"(?:^|\.){SIGNED}\.{LAYERS}", name) for name in tensors):
         return implicit(tensors)
     if any(f".{first}_p." in f".{name}" for name in tensors for first in ("fc", "conv")):
         return occupancy(tensors)
     names = ", ".join([*tensors][:6]) or "no tensors"
-    raise BadInput(
-        f"it is of no format that is read, which are {TENSORS}; .npz; a class of yours, by {OWN_CLASS}: it has {names}"
-    )
+    formats = f"{SUPPORTED_CHECKPOINTS}; .npz; a class of yours, by {OWN_CLASS}"
+    raise BadInput(f"it is of no format that is read, which are {formats}: it has {names}")
 
 
 def _codes(path: Path) -> Tensor:
@@ -310,10 +310,10 @@ def _codes(path: Path) -> Tensor:
             return torch.from_numpy(np.load(path, allow_pickle=False)).float()
         except (OSError, ValueError, EOFError) as error:
             raise BadInput(f"{path.name} cannot be read: {error}") from error
-    found = [tensor for tensor in _tensors(path).values() if tensor.dim() > 1]
-    if len(found) != 1:
-        raise BadInput(f"{path.name} must hold one table of codes, not {len(found)}")
-    return (found[0].squeeze(1) if found[0].dim() == 3 else found[0]).float()
+    tables = [tensor for tensor in _tensors(path).values() if tensor.dim() > 1]
+    if len(tables) != 1:
+        raise BadInput(f"{path.name} must hold one table of codes, not {len(tables)}")
+    return (tables[0].squeeze(1) if tables[0].dim() == 3 else tables[0]).float()
 
 
 def _arrays(path: Path) -> dict[str, Tensor]:
@@ -326,31 +326,31 @@ def _arrays(path: Path) -> dict[str, Tensor]:
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a checkpoint by their dotted names, on the CPU; whatever else it holds is left out."""
+    """The tensors of a checkpoint by their dotted names, on the CPU; all other contents are left out."""
     try:
-        with torch.serialization.safe_globals(SCALARS), warnings.catch_warnings(action="ignore"):
-            return dict(_flat(torch.load(path, weights_only=True, map_location="cpu")))
-    except GARBLED as error:
-        what = "is no network file, or is broken: name a checkpoint of weights, an .npz or a folder"
+        with torch.serialization.safe_globals(NUMPY_SCALAR_CLASSES), warnings.catch_warnings(action="ignore"):
+            return dict(_flatten(torch.load(path, weights_only=True, map_location="cpu")))
+    except CHECKPOINT_ERRORS as error:
+        message = "is no network file, or is broken: name a checkpoint of weights, an .npz or a folder"
         if blocked := re.search(r"GLOBAL (\S+)", str(error)):
-            what = f"holds more than weights, which is not run ({blocked[1]}): save its state_dict() alone"
-        raise BadInput(f"{path.name} {what}") from error
+            message = f"holds more than weights, which is not run ({blocked[1]}): save its state_dict() alone"
+        raise BadInput(f"{path.name} {message}") from error
     except (OSError, RuntimeError, EOFError, ValueError, zipfile.BadZipFile) as error:
         if "TorchScript" in str(error):
-            what = f"a program, which is not run: save its state_dict(), and name its class by {OWN_CLASS}"
-            raise BadInput(f"{path.name} is TorchScript, {what}") from error
+            message = f"a program, which is not run: save its state_dict(), and name its class by {OWN_CLASS}"
+            raise BadInput(f"{path.name} is TorchScript, {message}") from error
         raise BadInput(f"{path.name} cannot be read: it may be cut short, copy it again") from error
 
 
-def _flat(found: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
-    if isinstance(found, Tensor):
-        yield prefix.removesuffix(".") or "tensor", found
-    elif isinstance(found, Mapping):
-        for key, value in found.items():
-            yield from _flat(value, f"{prefix}{key}.")
+def _flatten(node: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
+    if isinstance(node, Tensor):
+        yield prefix.removesuffix(".") or "tensor", node
+    elif isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from _flatten(value, f"{prefix}{key}.")
 
 
-def _content(files: list[Path]) -> str:
-    """A hash of files."""
-    each = (file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest() for file in files)
-    return hashlib.sha256(b"".join(each)).hexdigest()
+def _content_hash(files: list[Path]) -> str:
+    """A hash of the names and contents of files."""
+    hashes = (file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest() for file in files)
+    return hashlib.sha256(b"".join(hashes)).hexdigest()

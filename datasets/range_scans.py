@@ -16,7 +16,7 @@ from datasets.mesh import Mesh, fit_in_sphere, normalise
 from datasets.meshes import load_mesh
 from datasets.readers.ply import read_ply
 from datasets.readers.text import wrong_kind_message
-from datasets.repair import OUTSIDE_BY, OUTSIDE_SHARE, apply, current, mesh_set, meshlab, with_note
+from datasets.repair import MAX_OUTSIDE_FRACTION, OUTSIDE_DISTANCE, apply, current, mesh_set, meshlab, with_note
 from datasets.scene import Split, Truth, sample_surface
 from renderers.checks import BadInput, check_fraction
 
@@ -134,7 +134,7 @@ class RangeScans:
 
     def seen(self, index: int) -> Mesh:
         """See `Scanned`."""
-        centre, factor = fit_in_sphere(self._read.used, self.radius)
+        centre, factor = fit_in_sphere(self._read.used_vertices, self.radius)
         surface = self._scan(index).surface()
         return replace(surface, vertices=(surface.vertices - centre) * factor)
 
@@ -177,8 +177,8 @@ def _scan(conf: Path, number: int, words: list[str]) -> Scan:
 def smooth(mesh: Mesh) -> Mesh | None:
     """The screened Poisson reconstruction of a mesh (Kazhdan and Hoppe 2013), for scans with holes and tangled faces.
 
-    None without PyMeshLab, or if more than `OUTSIDE_SHARE` of one surface is farther than `OUTSIDE_BY` from the other.
-    This happens if faces are oriented inconsistently or a hole is wide.
+    None without PyMeshLab, or if more than `MAX_OUTSIDE_FRACTION` of one surface is farther than `OUTSIDE_DISTANCE` from
+    the other. This happens if faces are oriented inconsistently or a hole is wide.
     """
     if meshlab() is None:
         return None
@@ -190,6 +190,6 @@ def smooth(mesh: Mesh) -> Mesh | None:
         return None
     for near, far in ((mesh, smooth_mesh), (smooth_mesh, mesh)):
         points = sample_surface(near, 5000, seed=0).points
-        if (Truth(far, closed=False).distance(points) > OUTSIDE_BY * mesh.diagonal).mean() > OUTSIDE_SHARE:
+        if (Truth(far, closed=False).distance(points) > OUTSIDE_DISTANCE * mesh.diagonal).mean() > MAX_OUTSIDE_FRACTION:
             return None
     return with_note(smooth_mesh, "replaced by its Poisson reconstruction, since its parts do not close into a solid")

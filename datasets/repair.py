@@ -1,6 +1,6 @@
 """Repairs triangle meshes: makes them closed solids, and notes every change.
 
-PyMeshLab does it. Where it is not installed, Open3D closes holes and manifold3d merges parts; a wrap is refused.
+PyMeshLab does it. If it is not installed, Open3D closes holes and manifold3d merges parts; a wrap is refused.
 """
 
 import contextlib
@@ -15,31 +15,32 @@ from datasets.mesh import Mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 
-WRAPPED = "wrapped"  # begins the note of a mesh whose inside is what a closed surface around it encloses
-WELD = 1e-6  # of the diagonal: vertices closer than this, about ten float32 steps, are merged
-THIN = 2e-6  # of the diagonal: a closed part of less mean thickness encloses nothing
+WRAPPED = "wrapped"  # first word of the note on a mesh that was replaced by a closed surface around it
+# Distances without a unit in their name are fractions of the bounding box's diagonal.
+MERGE_DISTANCE = 1e-6  # closer vertices are merged: about ten float32 steps
+MIN_THICKNESS = 2e-6  # a closed part of less mean thickness encloses nothing
 WRAP_ALPHAS = (8.0, 4.0, 2.0, 1.0)  # % of the diagonal: gaps up to this width are closed by a wrap; coarse to fine
 WRAP_OFFSET = 0.1  # % of the diagonal: how far outside the surface a wrap lies
-HOLLOW_SHARE = 0.15  # of the coarser wrap's volume: a finer wrap that loses more has entered the inside,
-HOLLOW_SIZE = 0.005  # unless it loses less than this share of the cubed diagonal, as around a sheet
-OUTSIDE_BY = 0.005  # of the diagonal: surface farther outside the repaired solid than this was cut away
-CHANGED = 0.25  # of area or volume: more gives a warning. Closing a box that lacks one of six sides adds 20 and 23 %
-SHEET = 0.003  # of the diagonal: a wrap of less mean thickness is that of a sheet, two offsets thick
-UNSEEN = "without PyMeshLab, faces of a part that cut through others were not looked for"
-WIDEST = 10.0  # diagonals: every hole is narrower
-OUTSIDE_SHARE = 0.01  # of the area: more cut away than this is not accepted
+MAX_WRAP_LOSS_FRACTION = 0.15  # a finer wrap that loses more volume than this and the next has entered the inside
+MAX_WRAP_LOSS = 0.005  # cubed diagonals; a wrap around a sheet loses less
+OUTSIDE_DISTANCE = 0.005  # surface farther outside the repaired solid was cut away
+WARNING_CHANGE_FRACTION = 0.25  # closing a box that lacks one of six sides adds 20 % of area and 23 % of volume
+MIN_WRAP_THICKNESS = 0.003  # a thinner wrap encloses a sheet: it is two offsets thick
+NOT_CHECKED_NOTE = "without PyMeshLab, faces of a part that cut through others were not looked for"
+MAX_HOLE_SIZE = 10.0  # every hole is narrower
+MAX_OUTSIDE_FRACTION = 0.01  # largest fraction of the area that may be cut away
 
 
 def repair(mesh: Mesh, close: Callable[[Mesh], Mesh | None] | None = None) -> Mesh:
     """Makes a mesh a closed solid, wound outward and without overlaps, with as little change as possible.
 
-    Where that changes its area or volume by more than `CHANGED`, the first entry of `repairs` is a warning.
+    If its area or volume changes by more than `WARNING_CHANGE_FRACTION`, the first entry of `repairs` is a warning.
 
     Args:
         close: another way to close a mesh whose holes cannot be closed, tried before it is wrapped.
 
     Raises:
-        ValueError: where it encloses no volume.
+        ValueError: the mesh encloses no volume.
     """
     mesh = _tidy(mesh)
     closed = _drop_flat_parts(_close(mesh))
@@ -62,44 +63,44 @@ def _tidy(mesh: Mesh) -> Mesh:
     Two faces back to back cancel, unless their whole part is double-sided: then one side is kept.
     """
     mesh = mesh.compact()
-    # A percentage would be one of a hundredth of the diagonal: that is the largest threshold of this filter.
-    weld = {"threshold": lab.PureValue(WELD * mesh.diagonal)} if (lab := meshlab()) else {}
-    mesh = apply(mesh, ("meshing_merge_close_vertices", weld))
+    # An absolute value, since this filter takes percentages of a hundredth of the diagonal.
+    options = {"threshold": lab.PureValue(MERGE_DISTANCE * mesh.diagonal)} if (lab := meshlab()) else {}
+    mesh = apply(mesh, ("meshing_merge_close_vertices", options))
     faces = mesh.faces
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     rolled = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     side = np.where(rolled[:, 1] < rolled[:, 2], 1, -1)
-    _, first, same = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
-    net = np.bincount(same.ravel(), weights=side).astype(int)
+    _, first, face_ids = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
+    net = np.bincount(face_ids.ravel(), weights=side).astype(int)
     keep = first[net != 0]
     parts = replace(mesh, faces=faces).parts
     double_sided = first[~np.isin(parts[first], parts[keep])]
     kept = np.sort(np.concatenate([keep, double_sided]))
     tidy = replace(mesh, faces=faces[kept])
-    copies, of_copies = _copies(replace(mesh, faces=faces[first]), np.abs(net) - 1)
+    copies, copied_faces = _copies(replace(mesh, faces=faces[first]), np.abs(net) - 1)
     if copies:
         tidy = with_note(tidy, f"{_count(copies, 'part')} with the same faces as another dropped")
-    left = len(faces) - len(kept) - of_copies
-    return with_note(tidy, f"{_count(left, 'doubled face')} dropped") if left else tidy
+    doubled = len(faces) - len(kept) - copied_faces
+    return with_note(tidy, f"{_count(doubled, 'doubled face')} dropped") if doubled else tidy
 
 
-def _copies(mesh: Mesh, again: Int[np.ndarray, " f"]) -> tuple[int, int]:
-    """How many closed parts are there once more, and the faces of these; `again` is how often each face is."""
-    if not (again > 0).any():
+def _copies(mesh: Mesh, counts: Int[np.ndarray, " f"]) -> tuple[int, int]:
+    """The number of duplicate closed parts, and of their faces. `counts` is how often each face is repeated."""
+    if not (counts > 0).any():
         return 0, 0
-    twice, again = replace(mesh, faces=mesh.faces[again > 0]), again[again > 0]
-    closed = np.setdiff1d(twice.parts, twice.parts[twice.open_faces])
-    members = [again[twice.parts == part] for part in closed]  # a part is there as often as its rarest face
-    return int(sum(part.min() for part in members)), int(sum(part.min() * len(part) for part in members))
+    repeated, counts = replace(mesh, faces=mesh.faces[counts > 0]), counts[counts > 0]
+    closed = np.setdiff1d(repeated.parts, repeated.parts[repeated.open_faces])
+    by_part = [counts[repeated.parts == label] for label in closed]  # a part is repeated as often as its rarest face
+    return int(sum(faces.min() for faces in by_part)), int(sum(faces.min() * len(faces) for faces in by_part))
 
 
 def _close(mesh: Mesh) -> Mesh:
-    """Closes open parts, by winding them consistently or else by closing their holes."""
+    """Closes open parts: orients their faces consistently; if that is not enough, fills their holes."""
     parts = mesh.parts
-    opened = np.isin(parts, parts[mesh.open_faces])
-    if not opened.any():
+    is_open = np.isin(parts, parts[mesh.open_faces])
+    if not is_open.any():
         return mesh
-    shells = replace(mesh, faces=mesh.faces[opened])
+    shells = replace(mesh, faces=mesh.faces[is_open])
     wind = ("meshing_re_orient_faces_coherently", {})
     closed = apply(shells, wind)
     if closed.watertight:
@@ -112,19 +113,19 @@ def _close(mesh: Mesh) -> Mesh:
         closed = apply(shells, fill, wind)
         if (count := shells.holes - closed.holes) > 0:
             closed = with_note(closed, f"{_count(count, 'hole')} closed")
-    faces = np.concatenate([mesh.faces[~opened], closed.faces + len(mesh.vertices)])
+    faces = np.concatenate([mesh.faces[~is_open], closed.faces + len(mesh.vertices)])
     return replace(closed, vertices=np.concatenate([mesh.vertices, closed.vertices]), faces=faces).compact()
 
 
 def _drop_flat_parts(mesh: Mesh) -> Mesh | None:
     """Drops the parts that enclose nothing; None if no part is left."""
     parts = mesh.parts
-    areas = np.bincount(parts, weights=np.linalg.norm(mesh.crosses, axis=1) / 2)
-    flat = 2 * np.abs(mesh.part_volumes) <= THIN * mesh.diagonal * areas
-    if flat.all() or not flat.any():
-        return None if flat.all() else mesh
-    kept = replace(mesh, faces=mesh.faces[~flat[parts]])
-    return with_note(kept.compact(), f"{_count(int(flat.sum()), 'part')} without thickness dropped")
+    areas = np.bincount(parts, weights=np.linalg.norm(mesh.area_normals, axis=1) / 2)
+    is_flat = 2 * np.abs(mesh.part_volumes) <= MIN_THICKNESS * mesh.diagonal * areas
+    if is_flat.all() or not is_flat.any():
+        return None if is_flat.all() else mesh
+    kept = replace(mesh, faces=mesh.faces[~is_flat[parts]])
+    return with_note(kept.compact(), f"{_count(int(is_flat.sum()), 'part')} without thickness dropped")
 
 
 def _turn_outward(mesh: Mesh) -> Mesh:
@@ -133,10 +134,10 @@ def _turn_outward(mesh: Mesh) -> Mesh:
     volumes = mesh.part_volumes
     sign = 1 if volumes.sum() > 0 else -1  # the whole mesh, with its cavities, may be inside out
     outward = sign * volumes > 0
-    for part in np.flatnonzero(~outward):
-        points = mesh.vertices[mesh.faces[parts == part, 0]][:16]
-        around = mesh.faces[outward[parts]]
-        outward[part] = bool((sign * _winding(points, mesh.vertices, around) > 0.5).all())
+    for label in np.flatnonzero(~outward):
+        points = mesh.vertices[mesh.faces[parts == label, 0]][:16]
+        outer_faces = mesh.faces[outward[parts]]
+        outward[label] = bool((sign * _winding(points, mesh.vertices, outer_faces) > 0.5).all())
     turn = ~outward if sign > 0 else outward
     if not turn.any():
         return mesh
@@ -145,10 +146,10 @@ def _turn_outward(mesh: Mesh) -> Mesh:
 
 
 def _merge(mesh: Mesh) -> Mesh | None:
-    """Merges overlapping parts, so that surfaces inside the solid vanish; None where that fails."""
+    """Merges overlapping parts, so that surfaces inside the solid vanish; None if that fails."""
     lab = meshlab()
     if lab is None:
-        return with_note(_united(mesh), UNSEEN)
+        return with_note(_united(mesh), NOT_CHECKED_NOTE)
     count = mesh.parts.max() + 1
     meshes = mesh_set(mesh)
     meshes.compute_selection_by_self_intersections_per_face()
@@ -164,47 +165,47 @@ def _merge(mesh: Mesh) -> Mesh | None:
     merged = current(meshes, mesh)
     if not (merged.watertight and merged.volume > 0):
         return None
-    left = merged.parts.max() + 1
-    if left < count:
-        return with_note(merged, f"{count} overlapping parts merged into {left}")
+    remaining = merged.parts.max() + 1
+    if remaining < count:
+        return with_note(merged, f"{count} overlapping parts merged into {remaining}")
     return with_note(merged, f"{_count(crossing, 'face')} that cut through others merged") if crossing else mesh
 
 
 def _united(mesh: Mesh) -> Mesh:
-    """What `_merge` does, by manifold3d; parts that do not overlap stay as they are.
+    """Merges overlapping parts with manifold3d; parts that do not overlap stay as they are.
 
     Raises:
-        BadInput: where it is not installed, or cannot merge them.
+        BadInput: manifold3d is not installed, or cannot merge the parts.
     """
     import trimesh
 
-    parts = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).split(only_watertight=False)
-    touching = mesh.parts.max() == 0 and not all(part.is_watertight for part in parts)  # along edges of four faces
-    if len(parts) == 1 or touching:
+    pieces = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).split(only_watertight=False)
+    touching = mesh.parts.max() == 0 and not all(piece.is_watertight for piece in pieces)  # along edges of four faces
+    if len(pieces) == 1 or touching:
         return mesh
-    whole = [part for part in parts if part.volume > 0]  # others are cavities
+    solids = [piece for piece in pieces if piece.volume > 0]  # others are cavities
     try:
-        made = trimesh.boolean.union(whole, engine="manifold")
+        union = trimesh.boolean.union(solids, engine="manifold")
     except (ImportError, ValueError) as error:
         raise BadInput("its parts may overlap, to merge them: pip install manifold3d, or pymeshlab (GPL-3)") from error
-    if made.volume > (1 - WELD) * sum(part.volume for part in whole):
+    if union.volume > (1 - MERGE_DISTANCE) * sum(piece.volume for piece in solids):
         return mesh
-    if len(whole) < len(parts):
-        needed_meshlab("a mesh with cavities and overlapping parts")
-    merged = replace(mesh, vertices=made.vertices, faces=made.faces)
-    return with_note(merged, f"{len(whole)} overlapping parts merged into {merged.parts.max() + 1}")
+    if len(solids) < len(pieces):
+        require_meshlab("a mesh with cavities and overlapping parts")
+    merged = replace(mesh, vertices=union.vertices, faces=union.faces)
+    return with_note(merged, f"{len(solids)} overlapping parts merged into {merged.parts.max() + 1}")
 
 
 def _covers(solid: Mesh, mesh: Mesh) -> bool:
-    """True where at most `OUTSIDE_SHARE` of the mesh's surface lies outside the solid."""
+    """True if at most `MAX_OUTSIDE_FRACTION` of the mesh's surface lies outside the solid."""
     points = sample_surface(mesh, 5000, seed=0).points
-    outside = Truth(solid).signed_distance(points) > OUTSIDE_BY * mesh.diagonal
-    return bool(outside.mean() <= OUTSIDE_SHARE)
+    outside = Truth(solid).signed_distance(points) > OUTSIDE_DISTANCE * mesh.diagonal
+    return bool(outside.mean() <= MAX_OUTSIDE_FRACTION)
 
 
 def _wrap(mesh: Mesh, reason: str) -> Mesh:
     """Shrinks a closed surface around the mesh, as fine as possible without entering its inside."""
-    lab = needed_meshlab(f"the mesh must be wrapped, since {reason}, which")
+    lab = require_meshlab(f"the mesh must be wrapped, since {reason}, which")
     wrapped = None
     for alpha in WRAP_ALPHAS:
         meshes = mesh_set(mesh)
@@ -213,10 +214,10 @@ def _wrap(mesh: Mesh, reason: str) -> Mesh:
         finer = current(meshes, mesh)
         if wrapped is not None:
             lost = wrapped.volume - finer.volume
-            if lost > HOLLOW_SHARE * wrapped.volume and lost > HOLLOW_SIZE * mesh.diagonal**3:
+            if lost > MAX_WRAP_LOSS_FRACTION * wrapped.volume and lost > MAX_WRAP_LOSS * mesh.diagonal**3:
                 break
-        wrapped, used = finer, alpha
-    how = f"a closed surface shrunk around it, {WRAP_OFFSET:g} % of the diagonal outside, over gaps up to {used:g} %"
+        wrapped, gap = finer, alpha
+    how = f"a closed surface shrunk around it, {WRAP_OFFSET:g} % of the diagonal outside, over gaps up to {gap:g} %"
     return with_note(wrapped, f"{WRAPPED}: {how}, since {reason}")
 
 
@@ -224,49 +225,49 @@ def _wrap_flat(mesh: Mesh) -> Mesh:
     """Wraps a mesh whose parts are all flat: walls around a room enclose a volume, sheets do not.
 
     Raises:
-        ValueError: where they have none.
+        ValueError: the wrap is as thin as one around a sheet.
     """
     wrapped = _wrap(mesh, "all its parts are flat")
-    if 2 * wrapped.volume > SHEET * mesh.diagonal * wrapped.area:
+    if 2 * wrapped.volume > MIN_WRAP_THICKNESS * mesh.diagonal * wrapped.area:
         return wrapped
-    found = "a single triangle" if len(mesh.faces) == 1 else f"{_count(len(mesh.faces), 'face')} in flat sheets"
-    done = f" (after {'; '.join(mesh.repairs)})" if mesh.repairs else ""
+    faces = "a single triangle" if len(mesh.faces) == 1 else f"{_count(len(mesh.faces), 'face')} in flat sheets"
+    repairs = f" (after {'; '.join(mesh.repairs)})" if mesh.repairs else ""
     raise ValueError(
-        f"must enclose a volume, found {found}{done}; copy the file again if it is truncated, else export a closed "
+        f"must enclose a volume, found {faces}{repairs}; copy the file again if it is truncated, else export a closed "
         "surface or give the sheet a thickness"
     )
 
 
-def _warned(before: Mesh, after: Mesh, closed: Mesh | None = None) -> Mesh:
-    """The repaired mesh, with a warning where its area or volume changed much.
+def _warned(original: Mesh, repaired: Mesh, closed: Mesh | None = None) -> Mesh:
+    """The repaired mesh, with a warning if its area or volume changed much.
 
     Args:
-        closed: the mesh before overlapping parts were merged, which counts overlaps twice: the smaller change counts.
+        closed: the mesh before overlapping parts were merged. It counts overlaps twice, so the smaller change counts.
     """
-    if after.repairs == before.repairs:
-        return after
-    wound = apply(before, ("meshing_re_orient_faces_coherently", {}))
+    if repaired.repairs == original.repairs:
+        return repaired
+    consistent = apply(original, ("meshing_re_orient_faces_coherently", {}))
     changes = []
-    for name, was, *now in (
-        ("area", before.area, after.area, *([closed.area] if closed else [])),
-        ("volume", _enclosed(wound), after.volume, *([_enclosed(closed)] if closed else [])),
+    for name, old, *new in (
+        ("area", original.area, repaired.area, *([closed.area] if closed else [])),
+        ("volume", _enclosed(consistent), repaired.volume, *([_enclosed(closed)] if closed else [])),
     ):
-        if was > 0 and min(abs(value - was) for value in now) > CHANGED * was:
-            changes.append(f"{name} from {was:.4g} to {now[0]:.4g} ({now[0] / was - 1:+.0%})")
+        if old > 0 and min(abs(value - old) for value in new) > WARNING_CHANGE_FRACTION * old:
+            changes.append(f"{name} from {old:.4g} to {new[0]:.4g} ({new[0] / old - 1:+.0%})")
     if not changes:
-        return after
-    what = " and ".join(changes)
-    warning = f"warning: repair changed the {what}, in the file's units: check the pictures, or repair the file"
-    return replace(after, repairs=(warning, *after.repairs))
+        return repaired
+    change = " and ".join(changes)
+    warning = f"warning: repair changed the {change}, in the file's units: check the pictures, or repair the file"
+    return replace(repaired, repairs=(warning, *repaired.repairs))
 
 
 def _enclosed(mesh: Mesh) -> float:
-    """The volume of all parts; of an open part, that between its faces and their centroid."""
+    """The volume of all parts; for an open part, the volume between its faces and their centroid."""
     parts = mesh.parts
     faces = np.bincount(parts)
     corners = mesh.vertices[mesh.faces]
     middles = np.stack([np.bincount(parts, weights=axis) / faces for axis in corners.mean(axis=1).T], axis=1)
-    heights = ((corners[:, 0] - middles[parts]) * mesh.crosses).sum(axis=1)
+    heights = ((corners[:, 0] - middles[parts]) * mesh.area_normals).sum(axis=1)
     return float(np.abs(np.bincount(parts, weights=heights / 6)).sum())
 
 
@@ -280,7 +281,7 @@ def _winding(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.
 
 
 def meshlab() -> ModuleType | None:
-    """PyMeshLab; None where it is not installed, as where its licence, GPL-3, is not wanted."""
+    """PyMeshLab; None if it is not installed, for example because its licence, GPL-3, is not wanted."""
     try:
         import pymeshlab
     except ImportError:
@@ -288,11 +289,11 @@ def meshlab() -> ModuleType | None:
     return pymeshlab
 
 
-def needed_meshlab(by: str) -> ModuleType:
-    """PyMeshLab; raises BadInput where it is not installed."""
-    if (found := meshlab()) is None:
-        raise BadInput(f"{by} needs PyMeshLab (GPL-3), which is not installed: pip install pymeshlab")
-    return found
+def require_meshlab(operation: str) -> ModuleType:
+    """PyMeshLab; raises BadInput if it is not installed."""
+    if (lab := meshlab()) is None:
+        raise BadInput(f"{operation} needs PyMeshLab (GPL-3), which is not installed: pip install pymeshlab")
+    return lab
 
 
 def mesh_set(mesh: Mesh):
@@ -304,14 +305,14 @@ def mesh_set(mesh: Mesh):
     return meshes
 
 
-def current(meshes, before: Mesh) -> Mesh:
-    """What filters made of a mesh, with its notes."""
-    current = meshes.current_mesh()
-    return replace(before, vertices=current.vertex_matrix(), faces=current.face_matrix())
+def current(meshes, original: Mesh) -> Mesh:
+    """The current mesh of a mesh set, with the notes of the original."""
+    filtered = meshes.current_mesh()
+    return replace(original, vertices=filtered.vertex_matrix(), faces=filtered.face_matrix())
 
 
 def apply(mesh: Mesh, *filters: tuple[str, dict]) -> Mesh:
-    """Runs filters of pymeshlab; one that fails leaves the mesh unchanged, which the caller checks."""
+    """Runs filters of PyMeshLab. A filter that fails leaves the mesh unchanged; the caller checks the outcome."""
     lab = meshlab()
     if lab is None:
         for name, _ in filters:
@@ -325,25 +326,25 @@ def apply(mesh: Mesh, *filters: tuple[str, dict]) -> Mesh:
 
 
 def _by_open3d(mesh: Mesh, name: str) -> Mesh:
-    """What a filter of pymeshlab does; the mesh itself where Open3D has no such filter."""
+    """Applies Open3D's version of a PyMeshLab filter; returns the mesh unchanged if Open3D has none."""
     import open3d
 
     vectors = open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces)
-    made = open3d.geometry.TriangleMesh(*vectors)
+    converted = open3d.geometry.TriangleMesh(*vectors)
     if name == "meshing_merge_close_vertices":
-        made.merge_close_vertices(WELD * mesh.diagonal)
+        converted.merge_close_vertices(MERGE_DISTANCE * mesh.diagonal)
     elif name == "meshing_re_orient_faces_coherently":
-        made.orient_triangles()
+        converted.orient_triangles()
     elif name == "meshing_repair_non_manifold_edges":
-        made.remove_non_manifold_edges()
+        converted.remove_non_manifold_edges()
     elif name == "meshing_close_holes":
-        there = open3d.t.geometry.TriangleMesh.from_legacy(made, vertex_dtype=open3d.core.float64)
-        made = there.fill_holes(WIDEST * mesh.diagonal).to_legacy()
-    return replace(mesh, vertices=np.array(made.vertices), faces=np.array(made.triangles))
+        tensor_mesh = open3d.t.geometry.TriangleMesh.from_legacy(converted, vertex_dtype=open3d.core.float64)
+        converted = tensor_mesh.fill_holes(MAX_HOLE_SIZE * mesh.diagonal).to_legacy()
+    return replace(mesh, vertices=np.array(converted.vertices), faces=np.array(converted.triangles))
 
 
 def with_note(mesh: Mesh, repair: str) -> Mesh:
-    """The mesh with another note of what was repaired."""
+    """The mesh with one more note in `repairs`."""
     return replace(mesh, repairs=(*mesh.repairs, repair))
 
 

@@ -1,4 +1,4 @@
-"""Datasets of shapes, the exact truth of a shape, and a scene: one shape, one camera, and the camera's view of it."""
+"""Datasets of shapes, the ground truth of a shape, and a scene: one shape, one camera, and its true view."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -18,8 +18,8 @@ from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.checks import BadInput
 
-SPLIT_STRIDE = 1_000_000  # distance between the seeds of two splits, more than a split has shapes
-Corners = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]  # of a point on a face: their weights, and vertices
+SPLIT_STRIDE = 1_000_000  # difference between the first seeds of two splits; a split has fewer shapes
+Corners = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]  # barycentric weights and vertex indices of points
 
 
 class Split(StrEnum):
@@ -41,16 +41,16 @@ class Dataset(Protocol):
         ...
 
     def identity(self) -> dict[str, Any]:
-        """Plain data that determines the shapes: datasets of equal identity hold the same ones."""
+        """Plain data that determines the shapes: datasets with equal identity have the same shapes."""
         ...
 
 
 @runtime_checkable
 class Textured(Protocol):
-    """A dataset whose shapes have colours of their own."""
+    """A dataset whose shapes have colours."""
 
     def texture(self, split: Split, index: int) -> Texture:
-        """The colours of shape number `index` of a split; raises ValueError where it has none."""
+        """The colours of shape number `index` of a split; raises ValueError if it has none."""
         ...
 
 
@@ -63,9 +63,9 @@ def seed_of(split: Split, index: int) -> int:
 
 @dataclass(frozen=True)
 class Hits:
-    """First hits of rays: distances along the unit rays (inf where nothing is hit), outward unit normals, and faces.
+    """First hits of rays: distances along the unit rays (inf for a miss), outward unit normals, and faces.
 
-    `face` is the number of the face that is hit, without meaning where none is.
+    `face` is the index of the face that is hit, without meaning for a miss.
     """
 
     distance: Float[np.ndarray, " n"]
@@ -76,17 +76,17 @@ class Hits:
 
 @dataclass(frozen=True)
 class Surface:
-    """Points sampled on a surface, each with its normal, of which only the direction counts."""
+    """Points sampled on a surface with their normals; only the direction of a normal counts."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
 
     @cached_property
     def tree(self) -> cKDTree:
-        """The points, ready to be asked for the nearest ones."""
+        """Search tree for the nearest points."""
         return cKDTree(self.points)
 
-    def some(self, kept: Bool[np.ndarray, " n"]) -> "Surface":
+    def select(self, kept: Bool[np.ndarray, " n"]) -> "Surface":
         """The samples that are kept."""
         return Surface(self.points[kept], self.normals[kept])
 
@@ -99,7 +99,7 @@ class Truth:
 
         Args:
             mesh: wound outward and free of overlaps, as `load_mesh` returns it.
-            closed: False takes an open mesh as well, of which first hits have a meaning and signed distances have not.
+            closed: False also accepts an open mesh, whose first hits have a meaning but whose signed distances do not.
 
         Raises:
             ValueError: the mesh is not watertight, so that inside and outside have no meaning.
@@ -117,46 +117,46 @@ class Truth:
         self._scene.add_triangles(vertices, self._tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
 
     def cast(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Hits:
-        """Gives the first hit of each ray.
+        """Returns the first hit of each ray.
 
         Args:
-            directions: of any length but zero; distances are along the unit ray.
+            directions: of any positive length; distances are along the unit ray.
         """
         directions = np.asarray(directions, dtype=np.float64)
         lengths = np.linalg.norm(directions, axis=-1, keepdims=True)
         if not (np.isfinite(lengths).all() and (lengths > 0).all()):
             raise ValueError("directions: must be finite and not zero, found some that are not; drop these rays")
         rays = np.concatenate([origins, directions / lengths], axis=-1, dtype=np.float32)
-        answer = self._scene.cast_rays(self._tensor(rays))
-        distance = answer["t_hit"].numpy()
-        normals = answer["primitive_normals"].numpy()
-        face = answer["primitive_ids"].numpy().astype(np.int64)
+        hits = self._scene.cast_rays(self._tensor(rays))
+        distance = hits["t_hit"].numpy()
+        normals = hits["primitive_normals"].numpy()
+        face = hits["primitive_ids"].numpy().astype(np.int64)
         return Hits(distance=distance, normals=normals, hit=np.isfinite(distance), face=face)
 
     def corners(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Corners:
-        """Gives the first hit of each ray by the corners of its face: their weights, 0 without a hit, and vertices."""
+        """Returns the first hit of each ray as weights of the corners of its face, 0 for a miss, and their indices."""
         rays = np.concatenate([origins, directions], axis=-1, dtype=np.float32)
-        answer = self._scene.cast_rays(self._tensor(rays))
-        return self._corners(answer, np.isfinite(answer["t_hit"].numpy()))
+        hits = self._scene.cast_rays(self._tensor(rays))
+        return self._face_corners(hits, np.isfinite(hits["t_hit"].numpy()))
 
     def nearest(self, points: Float[np.ndarray, "n 3"]) -> Corners:
-        """Gives the nearest point of the surface by the corners of its face: their weights, and vertices."""
-        found = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, dtype=np.float32)))
-        return self._corners(found, np.ones(len(points), dtype=bool))
+        """Returns the nearest surface point of each point as weights of the corners of its face, and their indices."""
+        closest = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, dtype=np.float32)))
+        return self._face_corners(closest, np.ones(len(points), dtype=bool))
 
-    def _corners(self, found: Any, hit: Bool[np.ndarray, " n"]) -> Corners:
-        along = found["primitive_uvs"].numpy().astype(np.float64)
-        weights = np.stack([1 - along.sum(axis=1), along[:, 0], along[:, 1]], axis=1) * hit[:, None]
-        return weights, self._faces[np.where(hit, found["primitive_ids"].numpy().astype(np.int64), 0)]
+    def _face_corners(self, answer: Any, hit: Bool[np.ndarray, " n"]) -> Corners:
+        coordinates = answer["primitive_uvs"].numpy().astype(np.float64)
+        weights = np.stack([1 - coordinates.sum(axis=1), coordinates[:, 0], coordinates[:, 1]], axis=1) * hit[:, None]
+        return weights, self._faces[np.where(hit, answer["primitive_ids"].numpy().astype(np.int64), 0)]
 
     def signed_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        """Gives the distance to the surface, negative inside, with the sign by majority over five rays per point."""
+        """Returns the distance to the surface, negative inside; the sign is the majority of five rays per point."""
         points = np.asarray(points, dtype=np.float32)
         flat = self._tensor(np.ascontiguousarray(points.reshape(-1, 3)))
         return self._scene.compute_signed_distance(flat, nsamples=5).numpy().reshape(points.shape[:-1])
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Gives the distance to the nearest point of the surface, which may be open."""
+        """Returns the distance to the nearest point of the surface, which may be open."""
         flat = self._tensor(np.ascontiguousarray(points, dtype=np.float32))
         return self._scene.compute_distance(flat).numpy()
 
@@ -167,16 +167,16 @@ class Truth:
 
 
 def sample_surface(mesh: Mesh, count: int, seed: int) -> Surface:
-    """Draws points evenly by area, and the unit normals of their faces."""
+    """Draws points uniformly by area, with the unit normals of their faces."""
     if count < 0:
         raise ValueError(f"count: must be 0 or more, found {count}; ask for a positive number of points")
     generator = np.random.default_rng(seed)
-    corners, crosses = mesh.vertices[mesh.faces], mesh.crosses
-    areas = np.linalg.norm(crosses, axis=1)
+    corners, area_normals = mesh.vertices[mesh.faces], mesh.area_normals
+    areas = np.linalg.norm(area_normals, axis=1)
     chosen = generator.choice(len(areas), size=count, p=areas / areas.sum())
     root, along = np.sqrt(generator.random(count)), generator.random(count)
-    weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)  # even over the triangle
-    return Surface(np.einsum("nk,nkd->nd", weights, corners[chosen]), crosses[chosen] / areas[chosen, None])
+    weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)  # uniform over the triangle
+    return Surface(np.einsum("nk,nkd->nd", weights, corners[chosen]), area_normals[chosen] / areas[chosen, None])
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class View:
     """A camera and its true images.
 
     Args:
-        camera: its resolution is that of the images.
+        camera: has the resolution of the images.
         depth: camera z, in scene units; 0 on the background.
         normals: unit, in world coordinates; 0 on the background.
         mask: true on the foreground.
@@ -204,10 +204,10 @@ class Scene:
         name: of the dataset and the shape.
         mesh: the true shape.
         view: its true images.
-        measured: camera z that a scanner measured at the view's pixels, 0 where it measured none; None without one.
-        to_world: the similarity from the scene's world into that of a file; None of a scene that is its own.
-        part: whether `mesh` is only what the view shows of an unknown shape, an open surface.
-        texture: the colours of the shape; None where it has none.
+        measured: camera z measured by a scanner at the view's pixels, 0 without a measurement; None without a scanner.
+        to_world: the similarity from the scene's world to the world of a file; None if no file defines one.
+        is_partial: whether `mesh` is an open surface: the part of an unknown shape that the view shows.
+        texture: the colours of the shape; None without colours.
     """
 
     name: str
@@ -215,41 +215,41 @@ class Scene:
     view: View
     measured: Float[Tensor, "height width"] | None = None
     to_world: Float[np.ndarray, "4 4"] | None = None
-    part: bool = False
+    is_partial: bool = False
     texture: Texture | None = None
 
     @cached_property
-    def cast_on(self) -> Truth:
+    def raycaster(self) -> Truth:
         """The true shape, for ray casting and signed distances."""
-        return Truth(self.mesh, closed=not self.part)
+        return Truth(self.mesh, closed=not self.is_partial)
 
-    def given(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
-        """The view whose depths may be given to a task, and the pixels that have one.
+    def observed_view(self, *, exact: bool = False) -> tuple[View, Bool[Tensor, "height width"]]:
+        """The view whose depths a task may observe, and the pixels with a depth.
 
         Args:
-            exact: True for the mesh's depths also where a scanner measured others, at the same pixels.
+            exact: True for the mesh's depths in place of a scanner's, at the same pixels.
         """
         if self.measured is None:
             return self.view, self.view.mask
-        known = self.view.mask & (self.measured > 0)
-        return self.view if exact else replace(self.view, depth=self.measured), known
+        observed = self.view.mask & (self.measured > 0)
+        return self.view if exact else replace(self.view, depth=self.measured), observed
 
     @property
-    def on_depths(self) -> list[str]:
-        """How many depths a scanner measured, and how good they are, in words; empty without one."""
-        if self.measured is None or self.part:
+    def measured_depth_notes(self) -> list[str]:
+        """Notes on the number and the errors of a scanner's depths; empty without a scanner."""
+        if self.measured is None or self.is_partial:
             return []
-        both = self.view.mask & (self.measured > 0)
-        off = (self.measured - self.view.depth)[both].abs()
-        beside = int((self.measured > 0).sum()) - len(off)
-        note = f"measured: {len(off)} of the shape's {int(self.view.mask.sum())} pixels"
-        if len(off):
-            half, most = off.quantile(torch.tensor([0.5, 0.95])).tolist()
-            note += f"; half of their depths are within {half:.2g} scene units of the mesh, 95 % within {most:.2g}"
-        return [f"{note}; {beside} beside its outline are left out"]
+        compared = self.view.mask & (self.measured > 0)
+        errors = (self.measured - self.view.depth)[compared].abs()
+        outside_mask = int((self.measured > 0).sum()) - len(errors)
+        note = f"measured: {len(errors)} of the shape's {int(self.view.mask.sum())} pixels"
+        if len(errors):
+            median, upper = errors.quantile(torch.tensor([0.5, 0.95])).tolist()
+            note += f"; half of their depths are within {median:.2g} scene units of the mesh, 95 % within {upper:.2g}"
+        return [f"{note}; {outside_mask} beside its outline are left out"]
 
     def seed(self, seed: int) -> int:
-        """A run's seed combined with the scene's name, so that draws for different scenes are independent."""
+        """Combines a run's seed with the scene's name, so that draws for different scenes are independent."""
         return crc32(self.name.encode()) ^ seed
 
 
@@ -262,25 +262,25 @@ class Scanned(Protocol):
         ...
 
     def seen(self, index: int) -> Mesh:
-        """The surface that scan number `index` measured, which is open."""
+        """The open surface measured by scan number `index`."""
         ...
 
 
 @runtime_checkable
 class OneView(Protocol):
-    """A dataset of one object that is known from one view, and perhaps from a mesh; its place is not known."""
+    """A dataset of one object, observed in one view, perhaps with a mesh; its position in the world is unknown."""
 
     def placed(self, resolution: int) -> Scene:
-        """The scene, y up, with what is seen within the unit sphere.
+        """The scene, y up, with the visible surface within the unit sphere.
 
         Args:
-            resolution: most pixels of the view's longer side.
+            resolution: largest number of pixels of the view's longer side.
         """
         ...
 
 
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
-    """The scene of shape number `index` of a split, with the camera of that number."""
+    """The scene of shape number `index` of a split, with the camera of the same number."""
     if isinstance(dataset, OneView):
         return dataset.placed(views.resolution)
     mesh = dataset.mesh(split, index)
@@ -289,8 +289,8 @@ def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int
     view = see(Truth(mesh), camera)
     if not bool(view.mask.any()):
         repaired = f" (repaired: {'; '.join(mesh.repairs)})" if mesh.repairs else ""
-        what = f"the camera sees nothing of {dataset.name} {index}{repaired}"
-        raise BadInput(f"{what}: widen view.field_of_view or distance")
+        problem = f"the camera sees nothing of {dataset.name} {index}{repaired}"
+        raise BadInput(f"{problem}: widen view.field_of_view or distance")
     measured = see(Truth(scanned.seen(index), closed=False), camera).depth if scanned else None
     return Scene(scene_name(dataset, split, index), mesh, view, measured)
 
@@ -311,8 +311,8 @@ def see(truth: Truth, camera: Camera) -> View:
     return View(camera, camera.depth(distance), normals.view(*rays.shape, 3), mask)
 
 
-def painted(view: View, texture: Texture) -> Float[Tensor, "height width 3"]:
-    """The colours of what a view shows, without light; 0 on the background."""
+def unshaded_image(view: View, texture: Texture) -> Float[Tensor, "height width 3"]:
+    """The image of a view's surface colours without light; 0 on the background."""
     rays = view.camera.rays()
     points = rays.at(view.camera.distance(view.depth))[view.mask].numpy().astype(np.float64)
     colours = texture(points, view.normals[view.mask].numpy().astype(np.float64))

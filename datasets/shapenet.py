@@ -13,7 +13,7 @@ import numpy as np
 from datasets.captures.formats import find_layout
 from datasets.captures.take import read_shot
 from datasets.colours import FileColours
-from datasets.local import VERSION, deal, repaired
+from datasets.local import VERSION, load_repaired, split_files
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.meshes import read_mesh
 from datasets.repair import WRAPPED
@@ -87,7 +87,7 @@ class ShapeNet:
     def texture(self, split: Split, index: int) -> Texture:
         """The colours of a shape from its file; see `Textured`."""
         file = self._file(split, index)
-        return FileColours(file, repaired(file), self.mesh(split, index))
+        return FileColours(file, load_repaired(file), self.mesh(split, index))
 
     def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
         """See `Pictured`."""
@@ -122,7 +122,7 @@ class ShapeNet:
                 "them there, or give the split of the shapes that are"
             )
         rest = {*by_id.values()}.difference(*listed.values())
-        files = deal(listed.get(Split.TRAIN, sorted(rest))) | listed
+        files = split_files(listed.get(Split.TRAIN, sorted(rest))) | listed
         if Split.TRAIN in listed:
             held_out = {*files[Split.VALIDATION], *files[Split.TEST]}
             files[Split.TRAIN] = [file for file in files[Split.TRAIN] if file not in held_out]
@@ -196,10 +196,10 @@ def _read_ids(file: Path, synset: str) -> list[str]:
 @lru_cache(maxsize=64)
 def _load(path: Path, normalised: str) -> Mesh:
     """The repaired mesh of a file, normalised by the vertices of the unrepaired mesh."""
-    points = read_mesh(path).used
+    points = read_mesh(path).used_vertices
     centre, factor = fit_in_sphere(points, 1 / DEEPSDF_BUFFER)
     if normalised == "onet":
         factor = 1 / float((points.max(axis=0) - points.min(axis=0)).max())
-    mesh = repaired(path)
+    mesh = load_repaired(path)
     sign = (UNKNOWN_INSIDE_WARNING,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
     return replace(mesh, vertices=(mesh.vertices - centre) * factor, repairs=(*sign, *mesh.repairs))

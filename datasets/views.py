@@ -1,4 +1,4 @@
-"""Positions of cameras, and the pixels of a view whose depth is given."""
+"""Positions of cameras, and the choice of pixels whose depth is observed."""
 
 from dataclasses import dataclass
 from math import asin, atan2, degrees, inf, nan, radians, tan
@@ -11,11 +11,11 @@ from torch import Tensor
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_at_least, check_positive
 
-STEEPEST = 89.0  # degrees
+MAX_ELEVATION_DEGREES = 89.0
 
 
 def check_elevation(name: str, degrees: tuple[float, float]) -> None:
-    """Refuses a range that does not rise between the poles."""
+    """Raises ValueError for a range that does not rise between the poles."""
     if not -90 < degrees[0] <= degrees[1] < 90:
         raise ValueError(f"{name} must rise within -90 to 90 degrees, not {list(degrees)}")
 
@@ -48,18 +48,19 @@ class ViewSampler:
 
     @property
     def focal_length(self) -> float:
-        """In pixels: f R / S in DIST, Eq. 10."""
+        """The focal length in pixels: f R / S in DIST, Eq. 10."""
         return self.resolution / 2 / tan(radians(self.field_of_view) / 2)
 
     def draw(self, seed: int) -> Camera:
-        """Camera number `seed`; its random draws are independent of the shape of the same number."""
+        """The random camera of a seed; its draws are independent of the shape with the same seed."""
         generator = np.random.default_rng([seed, 1])
         return self.camera(generator.uniform(*self.azimuth), generator.uniform(*self.elevation))
 
     def towards(self, direction: Float[Tensor, "3"]) -> Camera:
-        """The camera in a direction from the origin; straight above or below it stands a degree beside."""
+        """The camera in a direction from the origin, with an elevation of at most `MAX_ELEVATION_DEGREES`."""
         x, y, z = torch.nn.functional.normalize(direction, dim=0).tolist()
-        return self.camera(degrees(atan2(x, z)), min(max(degrees(asin(y)), -STEEPEST), STEEPEST))
+        elevation = min(max(degrees(asin(y)), -MAX_ELEVATION_DEGREES), MAX_ELEVATION_DEGREES)
+        return self.camera(degrees(atan2(x, z)), elevation)
 
     def camera(self, azimuth: float, elevation: float) -> Camera:
         """The camera at these angles, in degrees."""
@@ -76,7 +77,7 @@ def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor
     """The world_to_camera of a camera at `eye` with `target` in the middle of its image and world y up.
 
     Raises:
-        ValueError: where the camera looks straight up or down, or is at its target.
+        ValueError: the camera looks straight up or down, or is at its target.
     """
     up = torch.tensor([0.0, 1.0, 0.0])
     forward = torch.nn.functional.normalize(target - eye, dim=0)
@@ -91,22 +92,22 @@ def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor
 
 
 def observed_pixels(mask: Bool[Tensor, "height width"], points: str | int, seed: int) -> Bool[Tensor, "height width"]:
-    """True on the foreground pixels whose depth is given.
+    """Mask of the foreground pixels whose depth is observed.
 
     Args:
-        points: "dense" for all, "10%" for a share, 100 for a number.
+        points: "dense" for all, "10%" for a fraction, 100 for a number.
         seed: of the draw, without replacement.
 
     Raises:
-        ValueError: for anything else, or for more points than the foreground has.
+        ValueError: another text, or more points than the foreground has.
     """
     foreground = mask.flatten().nonzero().squeeze(-1)
     available = foreground.numel()
     amount, is_share = parse_amount(points)
     count = max(1, round(available * amount)) if is_share else round(amount)
     if count > available:
-        most = f"points must be at most the {available} pixels of the shape, not {points}"
-        raise BadInput(f"{most}: give fewer, or raise view.resolution")
+        message = f"points must be at most the {available} pixels of the shape, not {points}"
+        raise BadInput(f"{message}: give fewer, or raise view.resolution")
     order = torch.randperm(available, generator=torch.Generator().manual_seed(seed))
     observed = torch.zeros(mask.numel(), dtype=torch.bool)
     observed[foreground[order[:count]]] = True
@@ -114,10 +115,10 @@ def observed_pixels(mask: Bool[Tensor, "height width"], points: str | int, seed:
 
 
 def parse_amount(points: str | int) -> tuple[float, bool]:
-    """An amount such as "dense", "10%" or 100, and whether it is a share of what there is.
+    """Parses an amount such as "dense", "10%" or 100; also returns whether it is a fraction.
 
     Raises:
-        ValueError: for anything else.
+        ValueError: another text.
     """
     text = "100%" if points == "dense" else str(points).strip()
     is_share = text.endswith("%")

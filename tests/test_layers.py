@@ -156,7 +156,7 @@ WRONG = (
     ("bench.runner.run", "from bench.merge import merge"),
     ("bench.report.write.html", "from torch import Tensor"),
     ("bench.report.write.html", "from bench import solve"),
-    ("bench.report.write.html", "from ...solve.solve import COSTS"),
+    ("bench.report.write.html", "from ...solve.solve import COST_DEFINITIONS"),
     ("bench.report", "import renderers"),
     ("bench", "import torch"),
     ("conf", "from bench import config"),

@@ -18,7 +18,7 @@ import yaml
 from bench.__main__ import console
 from bench.records.read import RESULTS
 from bench.runner.executors import EXTRA_BY_EXECUTOR
-from datasets.extras import install, version
+from datasets.extras import install_command, version
 from tests.test_layers import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,10 +59,10 @@ def test_there_is_one_version_everywhere():
 
 def test_an_extra_is_installed_into_the_checkout_or_beside_the_installed_package(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
-    assert install("ray") == "pip install -e '.[ray]'"
+    assert install_command("ray") == "pip install -e '.[ray]'"
     monkeypatch.chdir(tmp_path)
-    assert install("ray") == f"pip install -e '{ROOT}[ray]'"
-    assert install("ray", tmp_path) == "pip install 'implicit-bench[ray]'"
+    assert install_command("ray") == f"pip install -e '{ROOT}[ray]'"
+    assert install_command("ray", tmp_path) == "pip install 'implicit-bench[ray]'"
 
 
 def test_a_library_that_is_not_installed_has_no_version():
@@ -71,7 +71,7 @@ def test_a_library_that_is_not_installed_has_no_version():
 
 def test_every_extra_that_a_message_names_is_there():
     sources = [(ROOT / path).read_text(encoding="utf-8") for path in of_packages(tracked()) if path.endswith(".py")]
-    named = [found for source in sources for found in re.findall(r"""\binstall\(["'](\w+)["']\)""", source)]
+    named = [found for source in sources for found in re.findall(r"""\binstall_command\(["'](\w+)["']\)""", source)]
     assert len(named) >= 4
     assert {*named, *EXTRA_BY_EXECUTOR.values()} <= set(PROJECT["project"]["optional-dependencies"])
 

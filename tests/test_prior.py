@@ -15,7 +15,7 @@ from bench.shape_prior import (
     NetworkSettings,
     PriorSettings,
     distance_samples,
-    find,
+    find_prior,
     fit_error,
     make_prior,
     prior_for,
@@ -174,7 +174,7 @@ def test_a_prior_of_colours_learns_them_and_is_kept(tmp_path):
         points, other = samples.surface[0], prior.decoder.at(half)
         assert torch.equal(other(points), prior.decoder.at(prior.codes[0])(points))
         assert (other.paint(points) - shapes.paint(samples.surface)[0]).abs().max() > 0.01
-    assert find(Boxes(), replace(settings, colour=replace(colour, size=0.5)), tmp_path) is None
+    assert find_prior(Boxes(), replace(settings, colour=replace(colour, size=0.5)), tmp_path) is None
 
 
 def test_another_dataset_or_setting_has_another_key(kept, monkeypatch):
@@ -185,14 +185,14 @@ def test_another_dataset_or_setting_has_another_key(kept, monkeypatch):
         (Boxes(), replace(SETTINGS, seed=1)),
         (Boxes(), replace(SETTINGS, network=replace(SETTINGS.network, width=47))),
     ]
-    assert all(find(dataset, settings, folder) is None for dataset, settings in others)
-    assert find(Boxes(), SETTINGS, folder) is not None
+    assert all(find_prior(dataset, settings, folder) is None for dataset, settings in others)
+    assert find_prior(Boxes(), SETTINGS, folder) is not None
     monkeypatch.setattr(prior_store, "VERSION", prior_store.VERSION + 1)
-    assert find(Boxes(), SETTINGS, folder) is None
+    assert find_prior(Boxes(), SETTINGS, folder) is None
 
 
 def test_a_damaged_prior_is_an_error_with_a_remedy(kept, tmp_path):
-    path = find(Boxes(), SETTINGS, kept[0])
+    path = find_prior(Boxes(), SETTINGS, kept[0])
     (tmp_path / path.name).write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=rf"the prior .*{path.name} cannot be read .*: delete it, and it is trained"):
         prior_for(Boxes(), SETTINGS, tmp_path, CPU, silent)
@@ -213,7 +213,7 @@ def test_the_shipped_priors_are_those_of_the_configuration(family, truncation, c
     assert probe(dataset) == pytest.approx(record["probe"], rel=1e-4)  # the family is as it was
     error = record["surface_error"]
     assert max(error["validation"], error["training"]) < 0.003 and error["mean_shape"] > 5 * error["validation"]
-    path = find(dataset, settings, tmp_path)
+    path = find_prior(dataset, settings, tmp_path)
     assert path == SHIPPED / f"{dataset.name}-{record['key']}.safetensors"
     assert path.stat().st_size < 1_000_000
 

@@ -1,6 +1,7 @@
 """A run's metrics are computed again from the field that it left."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 import bench
 from bench.records.folder import Identity
 from bench.verify import main
-from datasets.field_files import FIELD
+from datasets.field_files import FIELD_FILE
 from tests.composing import composed
 from tests.runner.driving import command
 from tests.tiny import cell_from
@@ -36,7 +37,9 @@ def runs(tmp_path_factory) -> dict[str, Path]:
     for name, chosen in RUNS.items():
         done = command(*chosen, *SMALL, f"results_dir={folder}")
         found[name] = Path(done.out.splitlines()[-1])
-        assert (found[name] / FIELD).is_file(), done.err + str(json.loads((found[name] / "record.json").read_text()))
+        assert (found[name] / FIELD_FILE).is_file(), done.err + str(
+            json.loads((found[name] / "record.json").read_text())
+        )
     return found
 
 
@@ -79,8 +82,8 @@ F = "f" * 40  # a code that is not today's
     (lambda run: edit(run, metrics={"chamfer_l1": "nan"}), ("differs: copy", "chamfer_l1 is nan in", "edited?")),
     (lambda run: edit(run, metrics={"fscore": GONE}), ("fscore is not there in the record, now", "edited?")),
     (lambda run: edit(run, metrics={"fscore": 0.5}, environment={}), [f"{cause} differs: None" for cause in CAUSES]),
-    (lambda run: (run / FIELD).unlink(), (f"left out: copy, from its field: it has no {FIELD}",)),
-    (lambda run: (run / FIELD).write_bytes((run / FIELD).read_bytes()[:999]), ("not compared: copy", "be cut short")),
+    (lambda run: (run / FIELD_FILE).unlink(), (f"left out: copy, from its field: it has no {FIELD_FILE}",)),
+    (lambda run: os.truncate(run / FIELD_FILE, 999), ("not compared: copy", "be cut short")),
     (lambda run: (run / "record.json").write_text("{"), ("not compared: copy", "record.json is not JSON")),
 ])  # fmt: skip
 def test_an_edited_metric_is_found_and_the_cause_told(copied, capsys, spoil, words):
@@ -94,7 +97,7 @@ def test_of_a_run_whose_field_is_read_the_field_alone_decides_what_is_run_again(
     first = Identity({}, config).code
     edit(copied, asked="later")
     assert Identity({}, config).code == first
-    (copied / FIELD).write_bytes(b"other")
+    (copied / FIELD_FILE).write_bytes(b"other")
     assert Identity({}, config).code != first
 
 

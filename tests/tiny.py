@@ -13,11 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import EvaluationSettings
 from bench.records.record import Record
 from bench.setup.fields import FieldChoice
-from bench.setup.inputs import Cell, RunContext, RunInputs, cell_of
+from bench.setup.inputs import Cell, RunContext, RunInputs, build_cell
 from bench.setup.priors import PriorChoice
 from bench.shape_prior import Prior
 from datasets.mesh import Mesh
-from datasets.network_files import Known
+from datasets.network_files import SceneNetwork
 from datasets.scene import Scene, Truth, View, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera
@@ -71,7 +71,7 @@ def plain(config: DictConfig) -> Any:
 
 def cell_from(config: DictConfig) -> Cell:
     """The cell of a composed configuration."""
-    return cell_of(plain(config))
+    return build_cell(plain(config))
 
 
 def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:
@@ -146,7 +146,7 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
         device=CPU,
         cache=folder / "cache",
         field=FieldChoice("prior", None),
-        prior_choice=PriorChoice(Known(prior.decoder, prior.codes, FACTS, ()), scene_code=0),
+        prior_choice=PriorChoice(SceneNetwork(prior.decoder, prior.codes, FACTS, ()), scene_code=0),
     )
     record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
     record.environment = {"gemm_peak_flops": PEAK}

@@ -214,7 +214,7 @@ def _surface_scores(state: State) -> dict[str, float]:
     inputs, mesh = state.inputs, state.mesh
     found = None if mesh is None else sample_surface(mesh, inputs.evaluation.points, inputs.seed + 1)
     scores = surface_metrics(found, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
-    return {name: scores[name] for name in OF_PART} if inputs.scene.part else scores
+    return {name: scores[name] for name in OF_PART} if inputs.scene.is_partial else scores
 
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:

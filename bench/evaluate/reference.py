@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.progress import notice
 from bench.records.record import digest
-from bench.shape_prior import Prior, kept
+from bench.shape_prior import Prior, load_or_make
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals, estimate_lipschitz
 from renderers.reference import trace
@@ -44,7 +44,7 @@ def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
         exact = in_float64(prior)
         return vars(make_reference(exact.decoder.at(exact.codes[0]), camera))
 
-    return Reference(**kept(folder, f"reference-{_key(prior, camera)}", make))
+    return Reference(**load_or_make(folder, f"reference-{_key(prior, camera)}", make))
 
 
 def make_reference(field: Field, camera: Camera) -> Reference:

@@ -1,4 +1,4 @@
-"""The field of an unknown shape without a prior: the candidate that early growth ends on, or a named one."""
+"""Fits an unknown shape without a prior: by the candidate chosen by early growth, or by a named candidate."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,14 +14,14 @@ from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import Given, draw_run
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext
-from bench.solve.solve import COSTS, draw, note_costs, note_result
+from bench.solve.solve import COST_DEFINITIONS, draw, note_costs, note_result
 
 SIZES = (
     "the numbers of its field that the optimiser may change; those that a file must hold so that it can be evaluated, "
     "of a grid all its samples; the size of that file in float32"
 )
-NOT_RENDERED = ("part", "phase", "candidate", "eikonal", "rays_share")  # keys that curves of other runs lack
-ENDED = {
+FIT_ONLY_KEYS = ("part", "phase", "candidate", "eikonal", "rays_share")  # curves of other runs lack these keys
+FIELD_DEFINITIONS = {
     "field": "the candidate that field=auto ended on, or the one that was requested",
     "field_free, field_stored, field_bytes": SIZES,
     "field_error, field_standard_error": "of the held-out observations: as NAME.error of task=capacity, in "
@@ -34,19 +34,19 @@ ENDED = {
 }
 
 
-def solve_by_growth(observations: RayObservations, given: Given, run: RunContext, *, iterations: int) -> None:
-    """Fits the shape of a run by early growth, or with the one field that was requested.
+def solve_by_growth(observations: RayObservations, pictured: Given, run: RunContext, *, iterations: int) -> None:
+    """Fits the shape of a run by early growth, or with the requested field.
 
     Args:
-        observations: that a field is fitted to, some of them held out.
-        given: what pictures show of them.
-        iterations: of a whole fit.
+        observations: for the fit, some of them held out.
+        pictured: the observations for pictures.
+        iterations: of a complete fit.
 
     Raises:
-        Unsupported: where the renderer cannot do what the field needs.
+        Unsupported: the renderer lacks what the field needs.
     """
     inputs, record, choice = run.inputs, run.record, run.inputs.field
-    record.definitions = DEFINITIONS | COSTS | ENDED
+    record.definitions = DEFINITIONS | COST_DEFINITIONS | FIELD_DEFINITIONS
     lines: list[dict[str, Any]] = []
     with curve_file(run.folder) as write_line:
 
@@ -62,29 +62,30 @@ def solve_by_growth(observations: RayObservations, given: Given, run: RunContext
     with run.off_clock():
         first, last = State(growth.first, inputs), State(growth.fitted.model.frozen(), inputs)
         record.metrics_start, after = evaluate(first).metrics, evaluate(last)
-        metrics, notes = after.metrics | ended(growth), (*growth.summary(choice.name), *fitter.notes[:1], *after.notes)
+        notes = (*growth.summary(choice.name), *fitter.notes[:1], *after.notes)
+        metrics = after.metrics | final_field_metrics(growth)
         note_result(run, replace(after, metrics=metrics, failure=failure_of(growth, after), notes=notes))
-        curve = rendered(lines, growth.fitted.evidence.candidate)
+        curve = rendered_curve(lines, growth.fitted.evidence.candidate)
         filmstrip = Filmstrip(inputs, "by candidate")
         for name, field in growth.fields.items():
             filmstrip.add(name, State(field, inputs))
-        draw(run, lambda title: draw_run(run.folder, (first, last), given, curve, title), filmstrip)
+        draw(run, lambda title: draw_run(run.folder, (first, last), pictured, curve, title), filmstrip)
 
 
-def rendered(lines: list[dict[str, Any]], candidate: str) -> list[dict[str, Any]]:
-    """The curve of a candidate's fit through the renderer, its trial and the rest joined, with one clock."""
+def rendered_curve(lines: list[dict[str, Any]], candidate: str) -> list[dict[str, Any]]:
+    """The curve of a candidate's fit with the renderer: its trial and the rest, with seconds of both together."""
     fit = [line for line in lines if line["phase"] == FitProblem.phase and line["candidate"] == candidate]
     clock, curve = 0.0, []
-    for place, line in enumerate(fit):
-        step = line["seconds"] - (fit[place - 1]["seconds"] if place else 0.0)
+    for index, line in enumerate(fit):
+        step = line["seconds"] - (fit[index - 1]["seconds"] if index else 0.0)
         clock += step if step > 0 else line["seconds"]
-        numbers = {name: value for name, value in line.items() if name not in NOT_RENDERED}
-        curve.append({**numbers, "iteration": place, "seconds": clock})
+        numbers = {name: value for name, value in line.items() if name not in FIT_ONLY_KEYS}
+        curve.append({**numbers, "iteration": index, "seconds": clock})
     return curve
 
 
-def ended(growth: Growth) -> dict[str, Any]:
-    """The field that growth ended on, as metrics."""
+def final_field_metrics(growth: Growth) -> dict[str, Any]:
+    """The final field of growth, as metrics."""
     evidence = growth.fitted.evidence
     error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
     return {
@@ -97,7 +98,7 @@ def ended(growth: Growth) -> dict[str, Any]:
 
 
 def failure_of(growth: Growth, after: Evaluation) -> tuple[RunStatus, str] | None:
-    """Why the run failed, or None: a fit that does not improve on its warm start has not, one that gets worse has."""
+    """Status and reason of a failed run, else None. A fit worse than its warm start fails; an equal one does not."""
     evidence, initial = growth.fitted.evidence, growth.initial_error
     if evidence.error is None:
         return RunStatus(evidence.status), evidence.reason
@@ -112,7 +113,7 @@ def failure_of(growth: Growth, after: Evaluation) -> tuple[RunStatus, str] | Non
 
 
 def note_fits(record: Record, fits: list[Evidence], fitter: Fitter) -> None:
-    """Notes the costs of fits in the record."""
+    """Writes the costs of fits into the record."""
     observations = fitter.observations
     iterations, values = sum(fit.iterations for fit in fits), sum(fit.evaluations for fit in fits)
     evaluations = {
@@ -120,7 +121,7 @@ def note_fits(record: Record, fits: list[Evidence], fitter: Fitter) -> None:
         "gradient": sum(fit.gradients for fit in fits),
         "per_ray": values / max(iterations * observations.rays, 1),
         "rays_per_iteration": observations.rays,
-        "observed": int(observations.given.observed.sum() + observations.held_out.observed.sum()),
+        "observed": int(observations.fitted.observed.sum() + observations.held_out.observed.sum()),
         "iterations": iterations,
     }
     seconds = {"forward": 0.0, "backward": 0.0} | fitter.spent

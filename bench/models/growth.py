@@ -1,4 +1,4 @@
-"""Early growth: tries candidates from the smallest on, and keeps one where the held-out error falls significantly."""
+"""Early growth: tries candidates by size, and keeps a candidate that lowers the held-out error significantly."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -12,39 +12,38 @@ from bench.setup.fields import GrowthSettings
 from renderers.field import Field
 from renderers.rendering import final_notes
 
-MIN_TRIAL = 8  # iterations, where a quarter of the fit is more than that
-# Constants of the model `cost`, in milliseconds of a core, fitted to nine candidates at 256, 1,024 and 4,096 rays;
-# it is within a third of the measured times
-START, WARM, FIT = 30.0, 1.0, 11.0  # of a start, and of an iteration of a warm start and of a fit without its values
-FLOP = 2e-8
-OVERHEAD = 12_000  # FLOPs per value beyond the field's own
-PER_RAY, PER_POINT, PER_WARM_POINT = 6.6, 6, 2  # field values, with their backward passes counted as values
+MIN_TRIAL_ITERATIONS = 8  # unless a quarter of the fit is less
+# The model `cost`, in milliseconds of a core, was fitted to nine candidates at 256, 1,024 and 4,096 rays. It is within
+# a third of the measured times. Steps are without field evaluations; a backward pass counts as further evaluations.
+START_MS, WARM_STEP_MS, FIT_STEP_MS = 30.0, 1.0, 11.0
+MS_PER_FLOP, EXTRA_FLOPS_PER_EVALUATION = 2e-8, 12_000
+EVALUATIONS_PER_RAY, EVALUATIONS_PER_POINT, EVALUATIONS_PER_WARM_POINT = 6.6, 6, 2
 
 T = TypeVar("T")
 
 
 @dataclass
 class Trials:
-    """The trials of candidates, in order: all of them, and those of the ones that were kept, the last one best."""
+    """The trials of candidates, in order: all of them, and those of kept candidates, the best last."""
 
     tried: list[Evidence] = field(default_factory=list)
     kept: list[Evidence] = field(default_factory=list)
-    without_gain: int = 0  # successive trials since the last one that was kept
+    without_gain: int = 0  # trials since the last kept one
 
 
 def climb(
     candidates: Iterable[T], trial: Callable[[T, Trials], Evidence | None], *, patience: int, footprint: float = 0.0
 ) -> Trials:
-    """Tries candidates from the smallest on, and keeps each that is better than the last one kept.
+    """Tries candidates in order of size, and keeps each candidate that is better than the last kept one.
 
-    Better is a held-out error that is lower by more than the standard error of the difference over the same groups of
-    rays or pixels. That is the noise of what is held out alone: another start may end with another error.
+    A candidate is better if its held-out error is lower by more than the standard error of the difference over the
+    same groups of rays or pixels. This covers the noise of the held-out data, not of the start.
 
     Args:
         candidates: the smallest first.
-        trial: the result of a candidate's trial, given those before; None skips the candidate.
+        trial: returns the result of a candidate's trial, from the earlier trials; None skips the candidate.
         patience: successive candidates that may be tried without gain.
-        footprint: error under which no larger one is tried.
+        footprint: no larger candidate is tried below this error.
     """
     trials = Trials()
     for candidate in candidates:
@@ -67,10 +66,10 @@ class Growth:
 
     Args:
         first, initial_error: the field of the first candidate after its warm start, and its held-out error.
-        tried: every candidate, in order, as far as it was fitted.
-        footprint: half a pixel, in scene units, under which growth ends.
-        end: why no larger candidate was tried, where the error is above the footprint.
-        fields: of the candidates that were kept, by name, in order; the last one after its whole fit.
+        tried: the results of all candidates, in order.
+        footprint: half a pixel, in scene units; growth ends below this error.
+        end: the reason why no larger candidate was tried, if the error is above the footprint.
+        fields: of the kept candidates, by name, in order; the last one after its complete fit.
     """
 
     fitted: Fitted
@@ -85,11 +84,11 @@ class Growth:
         """The result, in words."""
         error = self.fitted.evidence.mean
         path, size = " -> ".join(self.fields), self.fitted.model.size
-        found = f"field={requested}: {path}, {size}, held-out error {error:.3g}"
+        summary = f"field={requested}: {path}, {size}, held-out error {error:.3g}"
         if error <= self.footprint:
-            return [found, *final_notes(self.fitted.renderer)]
+            return [summary, *final_notes(self.fitted.renderer)]
         above = f"above half a pixel ({self.footprint:.3g}): {self.end}; more iterations may help"
-        return [f"{found}, {above}", *final_notes(self.fitted.renderer)]
+        return [f"{summary}, {above}", *final_notes(self.fitted.renderer)]
 
     @property
     def overhead(self) -> float:
@@ -102,14 +101,14 @@ class Growth:
 
 
 def grow(fitter: Fitter, candidates: list[Candidate], settings: GrowthSettings) -> Growth:
-    """Tries candidates from the smallest on, each beginning from the last one kept, and fits that one completely.
+    """Tries candidates in order of size, each from the last kept one, and fits the last kept one completely.
 
-    Growth ends where the error is below the footprint or patience ends; candidates whose trial would exceed the budget
-    are skipped.
+    Growth ends if the error is below the footprint or patience ends. Candidates whose trial would exceed the budget are
+    skipped.
     """
-    whole, footprint = fitter.settings.iterations, fitter.observations.footprint
-    short = min(max(ceil(settings.trial * whole), MIN_TRIAL), ceil(whole / 4))
-    _load()
+    iterations, footprint = fitter.settings.iterations, fitter.observations.footprint
+    trial_steps = min(max(ceil(settings.trial * iterations), MIN_TRIAL_ITERATIONS), ceil(iterations / 4))
+    _import_slow_modules()
     smallest, end = fitter.begin(candidates[0], None), "there is no larger candidate"
     first, initial_error = smallest.model.frozen(), smallest.evidence.error
     fits = {candidates[0].name: smallest}
@@ -117,37 +116,40 @@ def grow(fitter: Fitter, candidates: list[Candidate], settings: GrowthSettings) 
     def trial(candidate: Candidate, trials: Trials) -> Evidence | None:
         nonlocal end
         if trials.kept:
-            now = fits[trials.kept[-1].candidate]
-            others = sum(cost(fits[one.candidate].candidate, short, fitter) for one in trials.tried)
-            others -= cost(now.candidate, short, fitter)
-            kept, gone = (cost(one, whole, fitter) * (settings.budget - 1) for one in (now.candidate, candidate))
-            if others + cost(candidate, short, fitter) > kept or others + cost(now.candidate, short, fitter) > gone:
+            kept = fits[trials.kept[-1].candidate]
+            pair = (kept.candidate, candidate)
+            old_cost, new_cost = (cost(c, trial_steps, fitter) for c in pair)
+            old_limit, new_limit = ((settings.budget - 1) * cost(c, iterations, fitter) for c in pair)
+            spent = sum(cost(fits[fit.candidate].candidate, trial_steps, fitter) for fit in trials.tried) - old_cost
+            if spent + new_cost > old_limit or spent + old_cost > new_limit:
                 end = "larger ones would exceed models.growth.budget"
                 return None
-            fits[candidate.name] = fitter.begin(candidate, now.model, evaluate=False)
-        fitter.fit(fits[candidate.name], short, checkpoints=False)
+            fits[candidate.name] = fitter.begin(candidate, kept.model, evaluate=False)
+        fitter.fit(fits[candidate.name], trial_steps, checkpoints=False)
         return fits[candidate.name].evidence
 
     trials = climb(candidates, trial, patience=settings.patience, footprint=footprint)
     last = fits[trials.kept[-1].candidate]
     if trials.without_gain == settings.patience:
         end = f"{trials.without_gain} larger ones were no better"
-    fitter.fit(last, whole - short, checkpoints=False)
-    fields = {one.candidate: fits[one.candidate].model.frozen() for one in trials.kept}
+    fitter.fit(last, iterations - trial_steps, checkpoints=False)
+    fields = {evidence.candidate: fits[evidence.candidate].model.frozen() for evidence in trials.kept}
     return Growth(last, first, initial_error, trials.tried, fields, footprint, end)
 
 
 def cost(candidate: Candidate, iterations: int, fitter: Fitter) -> float:
-    """An estimate of the cost of a warm start and `iterations` iterations, in milliseconds; not measured by a clock."""
-    settings, whole = fitter.settings, 1 + (candidate.tries / SCREENING if candidate.tries > 1 else 0)
-    values = PER_RAY * fitter.observations.rays + PER_POINT * EIKONAL_POINTS
-    warm = WARM + PER_WARM_POINT * settings.warm_points * candidate.flops * FLOP
-    start = candidate.tries * START + settings.warm_iterations * whole * warm
-    return start + iterations * (FIT + values * (candidate.flops + OVERHEAD) * FLOP)
+    """The estimated cost of a warm start and `iterations` iterations, in milliseconds; nothing is measured."""
+    settings, warm_starts = fitter.settings, 1 + (candidate.tries / SCREENING if candidate.tries > 1 else 0)
+    evaluations = EVALUATIONS_PER_RAY * fitter.observations.rays + EVALUATIONS_PER_POINT * EIKONAL_POINTS
+    warm_step = WARM_STEP_MS + EVALUATIONS_PER_WARM_POINT * settings.warm_points * candidate.flops * MS_PER_FLOP
+    start = candidate.tries * START_MS + settings.warm_iterations * warm_starts * warm_step
+    return start + iterations * (
+        FIT_STEP_MS + evaluations * (candidate.flops + EXTRA_FLOPS_PER_EVALUATION) * MS_PER_FLOP
+    )
 
 
-def _load() -> None:
-    """Imports slow modules beforehand, so that their seconds do not count for the first candidate."""
+def _import_slow_modules() -> None:
+    """Imports slow modules before the fits, so that the first candidate is not charged for them."""
     import scipy.cluster.vq  # noqa: F401
     import trimesh  # noqa: F401
 

@@ -1,4 +1,4 @@
-"""The error of a field on held-out rays; it never uses the true geometry."""
+"""The error of a field on held-out rays, without the ground truth."""
 
 from dataclasses import dataclass
 from math import inf
@@ -13,19 +13,19 @@ from renderers.camera import Rays
 from renderers.field import Field, autograd_normals
 from renderers.rendering import Renderer
 
-MISSED = 10.0  # footprints: the error of a ray on which only field or observation hits, and the largest error
+MISSED_FOOTPRINTS = 10.0  # largest error, and the error of a ray on which only the field or the observation hits
 
 
 @dataclass(frozen=True)
 class HeldOutError:
     """The error over held-out rays, and its standard error.
 
-    Where field and observation both hit, the error of a ray is the distance between the two points along the field's
-    normal, at most `MISSED` footprints. Where only one of them hits, it is `MISSED` footprints. The mean is over all
-    rays on which at least one hits.
+    If field and observation both hit, the error of a ray is the distance between the two points along the field's
+    normal, at most `MISSED_FOOTPRINTS` footprints. If only one of them hits, it is `MISSED_FOOTPRINTS` footprints. The
+    mean is over all rays on which at least one hits.
 
     Args:
-        sums: of each group of rays: errors of hits; counts of hits with a known distance, of rays on which only one
+        sums: per group of rays: errors of hits; counts of hits with an observed distance, of rays on which only one
             hits, and of rays on which at least one hits.
         missed: error of a ray on which only one hits, in scene units.
     """
@@ -42,7 +42,7 @@ class HeldOutError:
     def standard_error(self) -> float:
         """The standard error of the mean, by the jackknife over groups (Efron and Tibshirani 1993).
 
-        Rays of a group are not independent. A whole view counts as one group, as do the rays held out of a fitted one.
+        Rays of a group are not independent. A held-out view is one group, as are the held-out rays of a fitted view.
         """
         return _jackknife(self._without_each())
 
@@ -50,8 +50,8 @@ class HeldOutError:
         """The standard error of the difference of the two means, over the same groups."""
         return _jackknife(self._without_each() - other._without_each())
 
-    def some(self, groups: Int[np.ndarray, " n"]) -> "HeldOutError":
-        """The error of some of the groups."""
+    def select(self, groups: Int[np.ndarray, " n"]) -> "HeldOutError":
+        """The error over the groups with these indices."""
         return HeldOutError(self.sums[groups], self.missed)
 
     def _without_each(self) -> Float[np.ndarray, " groups"]:
@@ -64,10 +64,10 @@ class HeldOut:
 
     Args:
         rays: in one row.
-        distance: along the ray, where `observed`.
-        observed: whether the distance is known.
+        distance: along the ray, if `observed`.
+        observed: whether the distance is observed.
         mask: whether the ray hits.
-        group: which group a ray belongs to, from 0: a view, or a part of one.
+        group: index of the ray's group, from 0: a view, or a part of a view.
         footprint: half a pixel, in scene units.
     """
 
@@ -81,25 +81,25 @@ class HeldOut:
     @torch.no_grad()
     def error(self, field: Field, renderer: Renderer) -> HeldOutError:
         """The error of a field, rendered by a renderer."""
-        missed = MISSED * self.footprint
+        missed = MISSED_FOOTPRINTS * self.footprint
         rendering = render_checked(renderer, field, self.rays)
         compared = rendering.hit & self.observed
-        apart = torch.zeros_like(self.distance)
+        errors = torch.zeros_like(self.distance)
         normals = autograd_normals(field, rendering.points[compared])
-        flat = torch.linalg.vector_norm(normals, dim=-1) < 0.5  # no normal: the distance along the ray counts
-        cosine = torch.where(flat, 1.0, (normals * self.rays.directions[compared]).sum(-1).abs())
-        apart[compared] = ((rendering.distance - self.distance)[compared].abs() * cosine).clamp_max(missed)
-        parts = [apart, compared, rendering.hit ^ self.mask, rendering.hit | self.mask]
-        sums = [torch.bincount(self.group, part.double()) for part in parts]
+        has_no_normal = torch.linalg.vector_norm(normals, dim=-1) < 0.5  # then the distance along the ray counts
+        cosine = torch.where(has_no_normal, 1.0, (normals * self.rays.directions[compared]).sum(-1).abs())
+        errors[compared] = ((rendering.distance - self.distance)[compared].abs() * cosine).clamp_max(missed)
+        columns = [errors, compared, rendering.hit ^ self.mask, rendering.hit | self.mask]
+        sums = [torch.bincount(self.group, column.double()) for column in columns]
         return HeldOutError(torch.stack(sums, dim=1).cpu().numpy(), missed)
 
 
 def _means(sums: Float[np.ndarray, "n 4"], missed: float) -> Float[np.ndarray, " n"]:
-    """The mean errors of hits and of misses, weighted by their shares of the rays on which at least one hits."""
-    errors, hits, disagree, either = sums.T
-    share = disagree / np.maximum(either, 1)
-    of_hits = np.where(hits > 0, errors / np.maximum(hits, 1), missed)  # no known distance is hit: the largest error
-    return (1 - share) * of_hits + share * missed
+    """The mean errors of hits and of misses, weighted by their fractions of the rays on which at least one hits."""
+    errors, hits, disagreeing, rays = sums.T
+    fraction = disagreeing / np.maximum(rays, 1)
+    hit_error = np.where(hits > 0, errors / np.maximum(hits, 1), missed)  # without hits the largest error
+    return (1 - fraction) * hit_error + fraction * missed
 
 
 def _jackknife(values: Float[np.ndarray, " groups"]) -> float:

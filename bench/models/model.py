@@ -13,7 +13,7 @@ from bench.records.record import RunStatus
 from bench.setup.fields import SIZE_WORDS
 from renderers.field import Counts, Field, Meter
 
-FLOAT = 4  # bytes of a float32
+FLOAT_BYTES = 4  # float32
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class Size:
 
     Args:
         free: numbers that the optimiser may change.
-        stored: numbers that a file must hold so that the field can be evaluated, the free ones among them: of a grid,
-            all its samples.
-        sparse_bytes: of a file with the free numbers only, from which the same field can be computed; None where it
-            would be the same file.
+        stored: numbers that a file must contain to evaluate the field, including the free ones; for a grid, all
+            samples.
+        sparse_bytes: size of a file from which the field can be computed with only the free numbers; None if it would
+            be the same file.
     """
 
     free: int
@@ -35,7 +35,7 @@ class Size:
     @property
     def bytes(self) -> int:
         """The size of a file with all stored numbers."""
-        return FLOAT * self.stored
+        return FLOAT_BYTES * self.stored
 
     def by(self, measure: str) -> int:
         """The size by a measure of `models.size`."""
@@ -51,11 +51,11 @@ class Model:
     """A field and its parameters.
 
     Args:
-        candidate: its name.
-        make: gives the field of parameters.
+        candidate: name of its candidate.
+        make: returns the field of parameters.
         learning_rate: of Adam, for these parameters.
-        metric: whether the values are distances or bounds by construction; else an eikonal term keeps them so.
-        held: number of stored values in addition to the parameters.
+        metric: whether the values are distances or bounds by construction; otherwise an eikonal term is added.
+        fixed_count: number of stored values that are not parameters.
         sparse_bytes: see `Size`.
     """
 
@@ -64,16 +64,16 @@ class Model:
     make: Callable[[list[Tensor]], Field]
     learning_rate: float
     metric: bool
-    held: int = 0
+    fixed_count: int = 0
     sparse_bytes: int | None = None
 
     @property
     def size(self) -> Size:
         free = sum(parameter.numel() for parameter in self.parameters)
-        return Size(free, free + self.held, self.sparse_bytes)
+        return Size(free, free + self.fixed_count, self.sparse_bytes)
 
     def field(self) -> Field:
-        """The field of the current parameters, with gradients towards them."""
+        """The field of the current parameters, differentiable in them."""
         return self.make(self.parameters)
 
     def frozen(self) -> Field:
@@ -82,12 +82,12 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a candidate's start may use.
+class StartInputs:
+    """The inputs of a candidate's start.
 
     Args:
         points: observed points of the surface.
-        previous: the best model so far, if there is one.
+        previous: the best model so far, or None.
         seed: of random draws.
         device: of the parameters.
     """
@@ -107,21 +107,21 @@ class Seen:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A kind of field, of a certain size.
+    """A kind of field of a certain size.
 
     Args:
-        name: of it.
-        stored: numbers, see `Size`, which are known before its start; the free ones of a grid are not.
-        flops: floating-point operations per value; an estimate for parts, where a power counts as 20.
-        starts: gives models to start from; the one with the least loss after a short warm start is fitted.
+        name: of the candidate.
+        stored: numbers, see `Size`; the number of free ones of a grid is not known in advance.
+        flops: floating-point operations per evaluation; an estimate for primitives, where a power counts as 20.
+        starts: returns models to start from; the model with the smallest loss after a short warm start is fitted.
         tries: the largest number of starts.
-        follows: whether it begins with the previous field, not with the observed points.
+        follows: whether it starts from the previous field, not from the observed points.
     """
 
     name: str
     stored: int
     flops: int
-    starts: Callable[[Seen], list[Model]]
+    starts: Callable[[StartInputs], list[Model]]
     tries: int = 1
     follows: bool = False
 
@@ -131,13 +131,13 @@ class Evidence:
     """The result of a candidate's fit, and its cost.
 
     Args:
-        candidate: its name.
-        flops_per_query: floating-point operations per value.
-        error: on held-out rays; None where the fit failed.
-        status, reason: how the fit ended.
+        candidate: name of the candidate.
+        flops_per_query: floating-point operations per evaluation.
+        error: on held-out rays; None if the fit failed.
+        status, reason: of the end of the fit.
         seconds, evaluations, gradients, flops: of the fit with its warm start, without checkpoints.
-        iterations: of the fit, without its warm start and a round that was taken back; see `Fitter.finish`.
-        falling: whether the last of several rounds still lowered the error.
+        iterations: of the fit, without its warm start and without an undone round; see `Fitter.finish`.
+        falling: whether the last of several rounds lowered the error.
         checkpoints: seconds, evaluations, gradients, flops and error at each checkpoint.
     """
 
@@ -157,10 +157,10 @@ class Evidence:
 
     @property
     def mean(self) -> float:
-        """The mean error on held-out rays; infinite where the fit failed."""
+        """The mean error on held-out rays; infinite if the fit failed."""
         return inf if self.error is None else self.error.mean
 
     def field(self) -> dict[str, str | int | float]:
-        """The field and its error, as metrics of the run that ended on it."""
+        """The field and its error, as metrics of a run that chose this field."""
         size = {f"field_{measure}": self.size.by(measure) for measure in ("free", "stored", "bytes")}
         return {"field": self.candidate, **size, "field_error": self.mean}

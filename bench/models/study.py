@@ -1,4 +1,4 @@
-"""Fits all candidates to one shape, chooses the one that it needs, and checks that choice."""
+"""Fits all candidates to one shape, chooses the smallest sufficient candidate, and checks that choice."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,11 +15,11 @@ from renderers.rendering import Renderer
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """How a choice is checked on further views.
+    """Settings of the check of a choice on further views.
 
     Args:
         views: number of further views.
-        seeds: number of random draws of `drawn` of them.
+        seeds: number of random draws of `drawn` views.
     """
 
     views: int
@@ -34,18 +34,18 @@ class CheckSettings:
 
 @dataclass(frozen=True)
 class Choice:
-    """The recommended candidate, the best one, and which rules the recommended one fulfils."""
+    """The chosen candidate, the best candidate, and the rules that the chosen one fulfils."""
 
     chosen: Evidence
     best: Evidence
-    measure: str  # of size, by which it is the smallest
-    within: bool  # its error is within one standard error of the best one's
-    enough: bool  # its error is under the footprint
+    measure: str  # the measure of size
+    within: bool  # the error is within one standard error of the best
+    enough: bool  # the error is below the footprint
 
 
 def fit_all(fitter: Fitter, candidates: list[Candidate], rounds: int = 1) -> Iterator[Fitted]:
-    """Fits every candidate, by so many rounds at most; each may begin from the best one before it."""
-    fitter, best = replace(fitter, part="fit_all"), None
+    """Fits every candidate in at most `rounds` rounds; each may start from the best candidate before it."""
+    fitter, best = replace(fitter, stage="fit_all"), None
     for candidate in candidates:
         fitted = fitter.begin(candidate, None if best is None else best.model)
         fitter.finish(fitted, rounds)
@@ -55,7 +55,7 @@ def fit_all(fitter: Fitter, candidates: list[Candidate], rounds: int = 1) -> Ite
 
 
 def check(chosen: Fitted, fits: list[Fitted], views: Views, settings: CheckSettings, *, seed: int) -> dict[str, float]:
-    """The share of random draws of further views on which the choice holds; see `shares`."""
+    """The fraction of random draws of further views on which the choice holds; see `shares`."""
     further = views.further(settings.views, seed)
     errors = {fit: further.error(fit.model.frozen(), views.renderer) for fit in fits if not fit.failed}
     return shares(errors[chosen], list(errors.values()), settings, footprint=views.footprint, seed=seed)
@@ -64,13 +64,11 @@ def check(chosen: Fitted, fits: list[Fitted], views: Views, settings: CheckSetti
 def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: float) -> Evidence:
     """Fits a candidate again from the same start, at pixel precision, with a number of rays that follows the loss.
 
-    The renderer is at pixel precision; the fit begins with a share of the rays, and has as many rounds and is evaluated
-    as the one before.
+    The fit starts with a fraction of the rays. It has as many rounds as the first fit, and the same evaluation.
     """
     settings = replace(fitter.settings, fewest_rays=fewest_rays)
-    frugal = replace(
-        fitter, settings=settings, observations=fitter.observations.through(renderer), part="frugal", spent={}
-    )
+    observations = fitter.observations.with_renderer(renderer)
+    frugal = replace(fitter, settings=settings, observations=observations, stage="frugal", spent={})
     fitted = frugal.begin(chosen.candidate, chosen.previous, evaluate=False)
     for _ in range(chosen.evidence.iterations // settings.iterations):
         frugal.fit(fitted, settings.iterations, checkpoints=False)
@@ -82,38 +80,38 @@ def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: fl
 def shares(
     chosen: HeldOutError, candidates: list[HeldOutError], settings: CheckSettings, *, footprint: float, seed: int
 ) -> dict[str, float]:
-    """The shares of random draws of views on which a choice is as good as the draw's best candidate, and holds.
+    """The fractions of random draws of views on which a choice is as good as the draw's best candidate, and holds.
 
     Args:
-        footprint: half a pixel, in scene units: a choice with an error below it holds as well.
+        footprint: half a pixel, in scene units; a choice with an error below it also holds.
     """
-    draw, within, held = np.random.default_rng([seed, 4]), 0, 0
+    draw, within, holding = np.random.default_rng([seed, 4]), 0, 0
     for _ in range(settings.seeds):
         drawn = draw.choice(settings.views, settings.drawn, replace=False)
-        best = min((error.some(drawn) for error in candidates), key=lambda error: error.mean)
-        as_good = is_as_good(chosen.some(drawn), best)
+        best = min((error.select(drawn) for error in candidates), key=lambda error: error.mean)
+        as_good = is_as_good(chosen.select(drawn), best)
         within += as_good
-        held += as_good or chosen.some(drawn).mean <= footprint
-    found = {"held_out_seeds_within": within / settings.seeds, "held_out_seeds_held": held / settings.seeds}
-    return {"held_out_seeds": settings.seeds, **found}
+        holding += as_good or chosen.select(drawn).mean <= footprint
+    fractions = {"held_out_seeds_within": within / settings.seeds, "held_out_seeds_held": holding / settings.seeds}
+    return {"held_out_seeds": settings.seeds, **fractions}
 
 
 def choose(evidence: list[Evidence], footprint: float, measure: str) -> Choice:
-    """The smallest candidate within one standard error of the best (Breiman et al. 1984), or under the footprint.
+    """The smallest candidate within one standard error of the best (Breiman et al. 1984), or below the footprint.
 
-    The footprint is half a pixel (DIST, Eq. 10), in scene units; size is by a measure of `models.size`.
+    The footprint is half a pixel (DIST, Eq. 10), in scene units; `measure` is a measure of `models.size`.
 
     Raises:
-        ValueError: where all fits failed.
+        ValueError: all fits failed.
     """
-    known = [candidate for candidate in evidence if candidate.error is not None]
-    if not known:
+    successful = [candidate for candidate in evidence if candidate.error is not None]
+    if not successful:
         raise ValueError(
             f"all fits failed; the last: {evidence[-1].reason}; try other models.candidates or another renderer"
         )
-    best = min(known, key=lambda candidate: candidate.mean)
-    fit = [candidate for candidate in known if is_as_good(candidate.error, best.error) or candidate.mean <= footprint]
-    chosen = min(fit, key=lambda candidate: (candidate.size.by(measure), candidate.mean))
+    best = min(successful, key=lambda candidate: candidate.mean)
+    sufficient = [fit for fit in successful if is_as_good(fit.error, best.error) or fit.mean <= footprint]
+    chosen = min(sufficient, key=lambda candidate: (candidate.size.by(measure), candidate.mean))
     return Choice(chosen, best, measure, is_as_good(chosen.error, best.error), chosen.mean <= footprint)
 
 

@@ -16,7 +16,7 @@ from bench.pictures.run_figures import at_size, picture_normals, save_arrays
 from bench.pictures.style import SCREEN, bare, save
 from bench.setup.inputs import RunContext
 from datasets.photographs import turned
-from datasets.scene import Scene, View, painted, see
+from datasets.scene import Scene, View, see, unshaded_image
 from renderers.camera import Camera
 
 Seen = Callable[[Camera], tuple[View, Float[Tensor, "height width 3"]]]  # a camera's view of a shape, and its colours
@@ -63,8 +63,8 @@ def note_colours(run: RunContext, state: State) -> None:
 
 
 def _of_mesh(scene: Scene, camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
-    view = see(scene.cast_on, camera)
-    return view, painted(view, scene.texture)
+    view = see(scene.raycaster, camera)
+    return view, unshaded_image(view, scene.texture)
 
 
 def rendered_again(seen: Seen, camera: Camera, largest: int) -> dict[str, Tensor]:

@@ -91,7 +91,7 @@ class Filmstrip:
         if not self.frames:
             return
         truth = self._truth()
-        name = "measured" if self.true is None and self.inputs.scene.part else "truth"
+        name = "measured" if self.true is None and self.inputs.scene.is_partial else "truth"
         strip = _strip(self._shown(chosen), {name: truth}, f"{title}; {self.over}", chosen)
         save(strip, folder / "strip.png")
         if self.inputs.evaluation.film is not None:

@@ -87,9 +87,9 @@ def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: lis
             for name, state in zip(("before", "after"), states, strict=True)
         ),
         ViewPair(
-            "measured" if scene.part else "truth",
+            "measured" if scene.is_partial else "truth",
             true_view(scene, front),
-            None if scene.part else see(scene.cast_on, back),
+            None if scene.is_partial else see(scene.raycaster, back),
             scene.view.mask,
         ),
     )
@@ -196,7 +196,7 @@ def save_gallery(
         meshes: by name; None shows nothing.
     """
     cameras = _cameras(inputs, inputs.evaluation.gallery)
-    arrays = {"given": torch.where(observed.cpu(), inputs.scene.given()[0].depth, torch.nan)}
+    arrays = {"given": torch.where(observed.cpu(), inputs.scene.observed_view()[0].depth, torch.nan)}
     for name, mesh in {**meshes, "true": inputs.scene.mesh}.items():
         truth = None if mesh is None else Truth(mesh, closed=False)
         views = [unseen(camera) if truth is None else see(truth, camera) for camera in cameras]
@@ -216,9 +216,9 @@ def true_view(scene: Scene, camera: Camera) -> View:
 
     Depths are NaN at pixels of the silhouette that have none.
     """
-    if not scene.part:
-        return see(scene.cast_on, camera)
-    view, measured = scene.given()
+    if not scene.is_partial:
+        return see(scene.raycaster, camera)
+    view, measured = scene.observed_view()
     return enlarged(replace(view, depth=view.depth.where(measured, torch.nan), normals=0 * view.normals), camera)
 
 

@@ -13,14 +13,14 @@ from bench.evaluate.state import REACH
 from bench.models.growth import Trials, climb
 from bench.models.held_out import HeldOutError
 from bench.models.model import Evidence, Size
-from bench.models.observations import TILES, tiles
+from bench.models.observations import TILES_PER_SIDE, tiles
 from bench.reconstruct.pixels import Stack
 from bench.reconstruct.problem import Learnt, ReconstructionProblem
 from bench.reconstruct.subject import Subject
 from bench.records.format import plural
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
-from bench.setup.fields import PRIOR, parsed
+from bench.setup.fields import PRIOR, parse_field_name
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from datasets.shot import Shot
@@ -64,7 +64,7 @@ class Appearance:
         Raises:
             BadInput: for the name of a field without colours.
         """
-        kind, sizes = (name, ()) if name in (PRIOR, AUTO) else parsed(name)
+        kind, sizes = (name, ()) if name in (PRIOR, AUTO) else parse_field_name(name)
         if kind == "network":
             layers, width = sizes
             shape = {"layers": layers, "width": width, "octaves": self.octaves}
@@ -176,7 +176,9 @@ class Choice:
 
 def tiled(errors: Float[Tensor, " pixels"], shots: Sequence[Shot]) -> HeldOutError:
     """The mean over tiles of each tile's mean error; `errors` has the pixels of all photographs in a row."""
-    tile_numbers = [tiles(shot.camera.height, shot.camera.width) + k * TILES**2 for k, shot in enumerate(shots)]
+    tile_numbers = [
+        tiles(shot.camera.height, shot.camera.width) + k * TILES_PER_SIDE**2 for k, shot in enumerate(shots)
+    ]
     groups = torch.cat(tile_numbers)
     means = (torch.bincount(groups, errors.double()) / torch.bincount(groups)).numpy()
     ones = np.ones_like(means)

@@ -103,8 +103,8 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
     seen_sample = sampled_and_seen = None
     if mesh is not None and sampled is not None:
         sampled_seen = subject.visible_points(mesh, sampled)
-        seen_sample, sampled_and_seen = sampled.some(sampled_seen), (sampled, sampled_seen)
-    seen_scores = surface_metrics(seen_sample, true.some(true_seen), threshold=threshold)
+        seen_sample, sampled_and_seen = sampled.select(sampled_seen), (sampled, sampled_seen)
+    seen_scores = surface_metrics(seen_sample, true.select(true_seen), threshold=threshold)
     roughness = roughness_scores(sampled_and_seen, (true, true_seen))
     return scores | {SEEN_PREFIX + name: value for name, value in seen_scores.items()} | roughness
 

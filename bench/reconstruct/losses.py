@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.reconstruct.pixels import Pixels
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error, slopes_at
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, normal_error
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice
@@ -67,7 +67,7 @@ class Losses:
         rendering = render_checked(renderer, metered, pixels.rays)
         inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
         points, rays = rendering.points[inside], len(inside)
-        gradients = slopes_at(metered, points)
+        gradients = gradients_at(metered, points)
         normals = torch.nn.functional.normalize(gradients, dim=-1)
         terms: Terms = {}
         if self.colour or self.colour_gradient:
@@ -95,13 +95,13 @@ class Losses:
             terms["silhouette"] = self.silhouette_weight * loss
         if self.smoothness:
             nearby_points = points + NEIGHBOUR_CUBE_SIDE * (torch.rand_like(points) - 0.5)
-            neighbours = torch.nn.functional.normalize(slopes_at(metered, nearby_points), dim=-1)
+            neighbours = torch.nn.functional.normalize(gradients_at(metered, nearby_points), dim=-1)
             terms["smoothness"] = self.smoothness * torch.linalg.vector_norm(normals - neighbours, dim=-1).sum() / rays
         if self.normals and pixels.normals is not None:
             terms["normals"] = self.normals * normal_error(normals, pixels.normals[inside])
         if self.eikonal and shape.kind is not Kind.LEVEL:
             random_points = 2 * torch.rand(EIKONAL_POINTS, 3, device=points.device) - 1
-            slopes = [torch.linalg.vector_norm(g, dim=-1) for g in (gradients, slopes_at(metered, random_points))]
+            slopes = [torch.linalg.vector_norm(g, dim=-1) for g in (gradients, gradients_at(metered, random_points))]
             terms["eikonal"] = self.eikonal * sum((slope - 1).square().sum() / max(len(slope), 1) for slope in slopes)
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
@@ -113,7 +113,7 @@ def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -
     sample_rays = rays[volume.ray]
     points = sample_rays.at(volume.distance)
     return volume.weighted_sum(
-        shape.colours(points, slopes_at(field, points), sample_rays.directions), len(rays.origins)
+        shape.colours(points, gradients_at(field, points), sample_rays.directions), len(rays.origins)
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from datasets.extras import install
+from datasets.extras import install_command
 from datasets.shot import Shot
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_at_least, check_positive
@@ -55,7 +55,7 @@ def stereo_clouds(shots: Sequence[Shot], matching: Matching) -> list[Cloud]:
     try:
         import cv2  # noqa: F401
     except ImportError:
-        raise BadInput(f"task=stereo needs OpenCV: type {install('stereo')}") from None
+        raise BadInput(f"task=stereo needs OpenCV: type {install_command('stereo')}") from None
     clouds = [_match(shot, other) for shot in shots for other in _neighbours(shot, shots, matching)]
     return [Cloud(cloud.points[_inside_masks(shots, cloud.points)], cloud.camera) for cloud in clouds]
 

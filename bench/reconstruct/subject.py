@@ -129,7 +129,7 @@ def upright(subject: Subject) -> Subject:
     up = up if (axes[:, 1] @ up).sum() < 0 else -up
     to_old, radius = np.eye(4), 1.0
     if (hull := _hull(subject.input_shots)) is not None:
-        to_old[:3, 3], scale = fit_in_sphere(hull.used, HULL_RADIUS)
+        to_old[:3, 3], scale = fit_in_sphere(hull.used_vertices, HULL_RADIUS)
         radius = 1 / scale
     to_old[:3, :3] = radius * Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()
     return replace(

@@ -13,7 +13,7 @@ from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import Subject, points_in_sphere, visible
 from datasets.mesh import Mesh
 from datasets.meshes import read_points
-from datasets.repair import needed_meshlab
+from datasets.repair import require_meshlab
 from datasets.scene import Surface, Truth, View, see
 from datasets.shot import Shot
 from renderers.camera import Camera
@@ -106,7 +106,7 @@ def poisson(
         depth: of the octree.
         trim: minimum depth of the octree leaf that supports a vertex; 0 keeps all. DVR's Table 2 has 0, 5 and 7.
     """
-    lab = needed_meshlab("screened Poisson reconstruction")
+    lab = require_meshlab("screened Poisson reconstruction")
     if len(points) < NORMAL_NEIGHBOURS:
         return None
     meshes = lab.MeshSet()
@@ -123,7 +123,7 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
     """The mesh with the mean colours of the photographs that see a vertex, weighted towards frontal views."""
     scene = Truth(mesh, closed=False)
     normals = np.zeros_like(mesh.vertices)
-    np.add.at(normals, mesh.faces.ravel(), np.repeat(mesh.crosses, 3, axis=0))
+    np.add.at(normals, mesh.faces.ravel(), np.repeat(mesh.area_normals, 3, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     total, weights = np.zeros_like(mesh.vertices), np.zeros((len(mesh.vertices), 1))
     for shot in shots:

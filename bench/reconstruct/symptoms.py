@@ -38,8 +38,8 @@ def roughness_scores(
     """
     scores = {}
     for name, is_seen in zip(ROUGHNESS, (True, False), strict=True):
-        true_roughness = roughness(truth[0].some(truth[1] == is_seen))
-        rough = None if predicted is None else roughness(predicted[0].some(predicted[1] == is_seen))
+        true_roughness = roughness(truth[0].select(truth[1] == is_seen))
+        rough = None if predicted is None else roughness(predicted[0].select(predicted[1] == is_seen))
         if rough is None:
             scores[name] = 0.0 if true_roughness is None and predicted is not None else np.inf
         else:

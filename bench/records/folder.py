@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import OUR_PACKAGES, Rerun, check, check_draw
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.tables import without_row_keys
-from datasets.extras import named_files, version
+from datasets.extras import referenced_files, version
 
 ROOT = Path(__file__).resolve().parents[2]
 # Files and folders whose code cannot change the result of a run.
@@ -254,7 +254,7 @@ def _file_hash(path: Path) -> str:
             files = [child for pattern in HASHED_PATTERNS for child in sorted(path.glob(pattern)) if child.is_file()]
             return digest([_file_hash(child) for child in files if child.suffix not in ARCHIVE_SUFFIXES])
         name_and_hash = [path.name, hashlib.sha256(path.read_bytes()).hexdigest()]
-        return digest([*name_and_hash, *map(_file_hash, named_files(path))])
+        return digest([*name_and_hash, *map(_file_hash, referenced_files(path))])
     except OSError:
         return ""
 

@@ -17,7 +17,7 @@ from bench.machine import environment
 from bench.progress import Report, notices_to
 from bench.records.record import Record, RunStatus, now
 from bench.runner.job import FinalRecordSent, Job, Notice, Started, Step, reason_of
-from bench.setup.inputs import RunContext, cell_of
+from bench.setup.inputs import RunContext, build_cell
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 
@@ -60,7 +60,7 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
     schedule_before = environment.scheduled()
     try:
         try:
-            cell = cell_of(record.config, progress=progress)
+            cell = build_cell(record.config, progress=progress)
         except (ValueError, OSError) as error:  # the configuration is invalid
             raise BadInput(reason_of(error)) from error
         cell.start()

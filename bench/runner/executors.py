@@ -18,7 +18,7 @@ from bench.progress import notice
 from bench.records.folder import Identity
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
 from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed, stopped_by
-from datasets.extras import install
+from datasets.extras import install_command
 
 Make = Callable[[Identity], list[str]]  # runs a cell; returns messages if it leaves no record
 EXTRA_BY_EXECUTOR = {"slurm": "submitit", "ray": "ray"}  # each extra has the name of its package
@@ -63,7 +63,7 @@ class Launcher:
             try:
                 import_module(extra)
             except ImportError as error:
-                raise ValueError(f"this launcher needs a package: {install(extra)}") from error
+                raise ValueError(f"this launcher needs a package: {install_command(extra)}") from error
         return launcher
 
     @property

@@ -1,6 +1,6 @@
 """Checks all runs of a sweep before the first one starts; `plan=true` lists them with an estimate of their duration.
 
-A check builds the configuration with the same code as the run, `bench.setup.inputs.cell_of`.
+A check builds the configuration with the same code as the run, `bench.setup.inputs.build_cell`.
 """
 
 import io
@@ -52,11 +52,11 @@ def is_reused(plan: Plan, cell: PlannedCell) -> bool:
 
 def refusal_reason(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
     """Why the run of a configuration would be refused; empty if it would start, or fail in another way."""
-    from bench.setup.inputs import cell_of  # it imports torch
+    from bench.setup.inputs import build_cell  # it imports torch
 
     try:
         with redirect_stdout(io.StringIO()):  # classes of the user may print
-            cell_of(config, built)
+            build_cell(config, built)
     except (ValueError, OSError) as error:
         return reason_of(error)
     except (Exception, SystemExit):  # noqa: BLE001 - a class of the user; the run will record the error

@@ -1,4 +1,4 @@
-"""The field that an unknown shape is made of: the names to choose from, and the settings of fits."""
+"""The field of an unknown shape: the names to choose from, and the settings of fits."""
 
 import re
 from dataclasses import dataclass
@@ -8,50 +8,48 @@ from bench.tables import nearest
 from renderers.checks import check_at_least, check_choice, check_fraction
 
 PRIOR = "prior"
-PARTS = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
-SIZED = {
-    "union": "[0-9]+",
-    "network": "[0-9]+x[0-9]+",
-    "grid": "[0-9]+",
-    "occupancy": "[0-9]+",
-}  # and what follows the underscore
+PRIMITIVES = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
+# The text after the underscore.
+SIZE_PATTERNS = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+", "occupancy": "[0-9]+"}
 EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
-FORMS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
-MOST_SAMPLES = 256  # of a grid along an axis: 64 MiB of values
+NAME_FORMS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
+MAX_GRID_SAMPLES = 256  # per axis: 64 MiB of values
 STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.models.model.Size`
 SIZE_WORDS = {STORED: "stored numbers", FREE: "free numbers", BYTES: "bytes"}
 
 
-def parsed(name: str) -> tuple[str, tuple[int, ...]]:
-    """The kind and the sizes of a candidate's name, such as ("network", (4, 64)); a part has no size.
+def parse_field_name(name: str) -> tuple[str, tuple[int, ...]]:
+    """The kind and the sizes of a candidate's name, such as ("network", (4, 64)); a primitive has no size.
 
     Raises:
-        ValueError: where no candidate has this name.
+        ValueError: no candidate has this name.
     """
-    if name in PARTS:
+    if name in PRIMITIVES:
         return name, ()
     kind, _, size = name.partition("_")
-    if kind not in SIZED or re.fullmatch(SIZED[kind], size, re.ASCII) is None:
-        raise ValueError(f"unknown field {name!r}{nearest(name, [*PARTS, *EXAMPLES])}; or {FORMS}, in numbers")
+    if kind not in SIZE_PATTERNS or re.fullmatch(SIZE_PATTERNS[kind], size, re.ASCII) is None:
+        raise ValueError(
+            f"unknown field {name!r}{nearest(name, [*PRIMITIVES, *EXAMPLES])}; or {NAME_FORMS}, in numbers"
+        )
     sizes = tuple(map(int, size.split("x")))
     if kind == "union":
         check_at_least("K of union_K", sizes[0], 2, "union_2 is the smallest")
     if kind == "network":
         check_at_least("network layers", sizes[0], 1, "network_1x16 is small")
         check_at_least("network width", sizes[1], 4, "network_1x16 is small")
-    if kind == "grid" and not 8 <= sizes[0] <= MOST_SAMPLES:
-        raise ValueError(f"N of grid_N must lie between 8 and {MOST_SAMPLES}, not {sizes[0]}: grid_32")
+    if kind == "grid" and not 8 <= sizes[0] <= MAX_GRID_SAMPLES:
+        raise ValueError(f"N of grid_N must lie between 8 and {MAX_GRID_SAMPLES}, not {sizes[0]}: grid_32")
     return kind, sizes
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How each candidate is fitted.
+    """Settings of a candidate's fit.
 
     Args:
         iterations: of the fit with the renderer's loss; with task=capacity, of a round.
-        fewest_rays: least share of the rays in an iteration where their number follows the loss; 1 always takes all.
-            See `bench.setup.auto.rays_share`.
+        fewest_rays: smallest fraction of the rays in an iteration if their number follows the loss; 1 always takes
+            all. See `bench.setup.auto.rays_share`.
         warm_iterations, warm_points: iterations and points per iteration of the warm start, which fits the observed
             points or the previous field without a renderer.
         eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are not distances by
@@ -74,13 +72,13 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class GrowthSettings:
-    """How `field=auto` tries candidates.
+    """Settings of the search of `field=auto`.
 
     Args:
-        trial: share of a whole fit's iterations that a candidate's trial takes.
+        trial: fraction of a complete fit's iterations in a candidate's trial.
         patience: successive candidates that may be tried without improvement.
-        budget: most cost of all candidates together, as a multiple of the final candidate's whole fit; by the cost
-            model of `bench.models.growth.cost`, not by a clock, so that a run ends the same on every machine.
+        budget: largest cost of all candidates together, as a multiple of the final candidate's complete fit. It is
+            estimated by `bench.models.growth.cost`, not measured, so that a run ends the same on every machine.
     """
 
     trial: float
@@ -96,14 +94,14 @@ class GrowthSettings:
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """The views that candidates are fitted to and evaluated on.
+    """Settings of the views that candidates are fitted to and evaluated on.
 
     Args:
-        fitted: number of views whose depth and silhouette are given.
-        held_out: number of views that are held out.
-        share: of the fitted views' rays that are held out as well.
+        fitted: number of views whose depth and silhouette are observed.
+        held_out: number of held-out views.
+        share: fraction of the fitted views' rays that is also held out.
         elevation: largest absolute elevation of the cameras, in degrees.
-        rays: of the fitted views, drawn in each iteration.
+        rays: number of rays of the fitted views drawn in each iteration.
     """
 
     fitted: int
@@ -128,11 +126,11 @@ class ModelSettings:
 
     Args:
         candidates: their names, the smallest first by free numbers; see `bench.models.candidates.candidate`.
-        size: the measure by which one is the smallest: "stored", "free" or "bytes"; see `bench.models.model.Size`.
-            They are tried in its order, see `bench.models.candidates.by_size`.
+        size: the measure of size: "stored", "free" or "bytes"; see `bench.models.model.Size`. Candidates are tried in
+            its order, see `bench.models.candidates.by_size`.
         fit: settings of each fit.
         growth: settings of `field=auto`.
-        views: of a known shape, where candidates are fitted to one.
+        views: of a true shape, if candidates are fitted to one.
     """
 
     candidates: tuple[str, ...]
@@ -146,20 +144,20 @@ class ModelSettings:
         if len(set(self.candidates)) < len(self.candidates):
             raise ValueError(f"models.candidates must name each candidate once, not {', '.join(self.candidates)}")
         for name in self.candidates:
-            parsed(name)
+            parse_field_name(name)
         check_choice("models.size", self.size, tuple(SIZE_WORDS))
 
 
 @dataclass(frozen=True)
 class FieldChoice:
-    """The field that a run asks for.
+    """The field that a run's configuration selects.
 
     Args:
         name: "prior"; "auto", the smallest sufficient candidate, found by early growth; or a candidate's name.
         models: the fields to choose from, and the settings of their fits; not read for "prior".
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: the name is unknown.
     """
 
     name: str
@@ -167,11 +165,11 @@ class FieldChoice:
 
     def __post_init__(self) -> None:
         if self.name not in (PRIOR, AUTO):
-            parsed(self.name)
+            parse_field_name(self.name)
 
     @property
     def of_prior(self) -> bool:
-        """Whether it is a code of the dataset's prior."""
+        """Whether the field is a code of the dataset's prior."""
         return self.name == PRIOR
 
     @property

@@ -1,6 +1,6 @@
-"""What a run is made of: its task, what the task works with, and the run under way.
+"""The objects of a run: its task, the task's inputs, and the run in progress.
 
-`cell_of` is the one place where a configuration becomes objects: for the check of a sweep, and for each run.
+Only `build_cell` turns a configuration into objects: for the check of a sweep, and for each run.
 """
 
 import time
@@ -17,11 +17,11 @@ from bench.config import PRIOR_DATASET_KEY, EvaluationSettings, build_once
 from bench.machine.environment import pick_device
 from bench.progress import Report
 from bench.records.record import Record
-from bench.setup.auto import Node, at_pixel_precision, resolved
+from bench.setup.auto import Node, at_pixel_precision, resolve_auto_settings
 from bench.setup.fields import FieldChoice
-from bench.setup.priors import PriorChoice, learnt_dataset, naming_prior_keys
+from bench.setup.priors import PriorChoice, prior_keys_in_errors, training_dataset
 from bench.shape_prior import Prior, PriorSettings
-from datasets.network_files import Networked
+from datasets.network_files import HasNetwork
 from datasets.own_photographs import Photographed
 from datasets.scene import SPLIT_STRIDE, Dataset, OneView, Scene, Split, Surface, make_scene, sample_surface, scene_name
 from datasets.views import ViewSampler
@@ -29,38 +29,38 @@ from renderers.checks import BadInput
 from renderers.field import Field
 from renderers.rendering import Renderer, final_notes
 
-WIDE = 256  # neurons per layer: a narrower network is evaluated by one thread
-ALL_THREADS = torch.get_num_threads()  # that PyTorch takes by itself
-Noted = tuple[Renderer, list[str]]  # a renderer, and notes on its settings with the value `auto`
+MIN_MULTITHREADED_WIDTH = 256  # neurons per layer: a narrower network is evaluated by one thread
+DEFAULT_THREADS = torch.get_num_threads()  # PyTorch's choice
+RendererWithNotes = tuple[Renderer, list[str]]  # notes on the settings with the value `auto`
 
 
 @dataclass(frozen=True)
 class RunInputs:
-    """What a run works with."""
+    """The inputs of a run."""
 
     renderer: Renderer
     views: ViewSampler
     scene_name: str
     make_scene: Callable[[], Scene]
     make_prior: Callable[[], Prior]
-    make_pixel_precise: Callable[[], Noted]  # the renderer at pixel precision, with no more steps than that takes
+    make_pixel_precise: Callable[[], RendererWithNotes]  # the renderer at pixel precision, with the steps it needs
     evaluation: EvaluationSettings
     seed: int
     device: torch.device
     cache: Path  # folder of priors and references
-    field: FieldChoice  # what an unknown shape is made of
+    field: FieldChoice  # the field of an unknown shape
     prior_choice: PriorChoice
     dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`, and on the network of a scene or prior
 
     @property
     def photographed(self) -> Photographed | None:
-        """The dataset, where it has photographs and no true shape."""
+        """The dataset, if it has photographs and no true shape; else None."""
         return self.dataset if isinstance(self.dataset, Photographed) else None
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene, made at its first use: not every task needs one."""
+        """The scene, made at its first use, since some tasks need none."""
         return self.make_scene()
 
     @cached_property
@@ -76,26 +76,26 @@ class RunInputs:
 
     @cached_property
     def prior(self) -> Prior:
-        """The prior of the dataset, loaded or trained at its first use: not every task needs one."""
+        """The prior of the dataset, loaded or trained at its first use, since some tasks need none."""
         with torch.random.fork_rng():  # training a prior must not change later random draws
             return self.make_prior()
 
     def check_prior(self) -> None:
-        """Raises BadInput for an object of one's own, which has no prior, where none is named."""
+        """Raises BadInput for an object of the user without a prior, if the configuration names no other prior."""
         if not self.prior_choice.exists:
-            without = "field=auto completes a depth image without one"
+            remedy = "field=auto completes a depth image without one"
             if self.photographed is not None:
-                without = "photographs take one with task=multiview, and none with task=reconstruction"
+                remedy = "photographs take one with task=multiview, and none with task=reconstruction"
             raise BadInput(
                 f"{self.scene_name} has no prior of its own: set prior.of=sofa, plane, table or car, or prior=deepsdf "
-                f"prior.path=FOLDER; {without}"
+                f"prior.path=FOLDER; {remedy}"
             )
 
     def check_fitted(self) -> int:
-        """The number of the scene's shape among the codes of the prior.
+        """The index of the scene's shape among the codes of the prior.
 
         Raises:
-            BadInput: where the prior was not trained on that shape.
+            BadInput: the prior was not trained on the scene's shape.
         """
         if self.prior_choice.scene_code is None:
             raise BadInput(
@@ -121,14 +121,14 @@ class RunContext:
 
     @contextmanager
     def on_clock(self) -> Iterator[None]:
-        """Within it, the work of a method without a loop: its seconds count as forward ones."""
+        """Context for a method without a loop: its seconds count as forward seconds."""
         clock = time.perf_counter()
         yield
         self.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
 
     @contextmanager
     def off_clock(self) -> Iterator[None]:
-        """Within it, what is not part of the loop's time: its seconds count as the evaluation's."""
+        """Context for work outside of the loop: its seconds count as evaluation seconds."""
         clock = time.perf_counter()
         yield
         seconds = self.record.seconds
@@ -139,7 +139,7 @@ class RunContext:
 class Task(Protocol):
     """A benchmark problem for a renderer and a scene. It names no renderer.
 
-    One with `takes_field = True` works with any field, as set by `field=`, in place of a prior's code; one with
+    A task with `takes_field = True` accepts any field set by `field=`, not only a prior's code. A task with
     `takes_one_view = True` needs no true shape.
     """
 
@@ -147,14 +147,14 @@ class Task(Protocol):
         """Executes the task, and fills the run's record and folder.
 
         Raises:
-            Unsupported: where the renderer cannot do what the task or its field needs.
+            Unsupported: the renderer lacks what the task or its field needs.
         """
         ...
 
 
 @runtime_checkable
-class Checks(Protocol):
-    """A task that not all inputs will do for, which is told before anything slow, and by `plan=true`."""
+class ValidatesInputs(Protocol):
+    """A task that validates its inputs, before any slow step and with `plan=true`."""
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput for inputs that the task cannot use."""
@@ -162,17 +162,17 @@ class Checks(Protocol):
 
 
 @runtime_checkable
-class Judges(Protocol):
-    """A task that judges a final field otherwise than `bench.evaluate.evaluate.evaluate` does."""
+class EvaluatesField(Protocol):
+    """A task with its own evaluation of a final field, in place of `bench.evaluate.evaluate.evaluate`."""
 
-    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a field that a run of the task ended on."""
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
+        """The metrics of the final field of a run of the task."""
         ...
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A task and what it works with, built and checked; nothing slow was done.
+    """A task and its inputs, built and checked without any slow step.
 
     Args:
         threads: of the CPU; None: see `start`.
@@ -183,26 +183,27 @@ class Cell:
     threads: int | None
 
     def start(self) -> None:
-        """Gives this process the run's threads and seed.
+        """Sets the threads and the seed of this process.
 
-        A run that names no threads takes one for a narrow network, else all that PyTorch takes. A rendering evaluates a
-        narrow network so briefly that threads mostly wait for each other: at 64 x 64 pixels and 4 layers of 128, the
-        loop of a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
+        Without `threads`, a narrow network takes one thread, and others take PyTorch's default. Evaluations of a narrow
+        network are so short that threads mostly wait for each other: at 64 x 64 pixels and 4 layers of 128, the loop of
+        a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
         """
-        torch.set_num_threads(self.threads or (1 if self.inputs.prior_choice.width < WIDE else ALL_THREADS))
+        is_narrow = self.inputs.prior_choice.width < MIN_MULTITHREADED_WIDTH
+        torch.set_num_threads(self.threads or (1 if is_narrow else DEFAULT_THREADS))
         torch.manual_seed(self.inputs.seed)
 
 
-def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None) -> Cell:
-    """Builds everything that a configuration names, and checks all of it before the first slow step.
+def build_cell(config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None) -> Cell:
+    """Builds and checks everything that a configuration names, before the first slow step.
 
     Args:
         config: of a run, resolved, as plain data; `bench.config.check_top_level` has checked it.
-        built: objects and errors by the text of their nodes, which cells of a sweep share while they are checked.
-        progress: receives that of a training of the prior.
+        built: objects and errors by the text of their nodes, shared by the cells of a sweep while they are checked.
+        progress: receives the progress of a training of the prior.
 
     Raises:
-        ValueError, OSError: for anything invalid in it.
+        ValueError, OSError: the configuration is invalid.
     """
     builder = _Builder(config, {} if built is None else built)
     renderer, notes = builder.renderer(config["renderer"])
@@ -214,8 +215,8 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
         renderer=renderer,
         views=view,
         scene_name=dataset.name if isinstance(dataset, Photographed | OneView) else scene_name(dataset, split, index),
-        make_scene=partial(_scene, dataset, view, split, index, prior),
-        make_prior=partial(prior.load, cache, device, threads or ALL_THREADS, progress),  # training pays with more
+        make_scene=partial(_make_scene, dataset, view, split, index, prior),
+        make_prior=partial(prior.load, cache, device, threads or DEFAULT_THREADS, progress),
         make_pixel_precise=partial(builder.renderer, at_pixel_precision(config["renderer"])),
         evaluation=evaluation,
         seed=config["seed"],
@@ -232,7 +233,7 @@ def cell_of(config: Node, built: dict[str, Any] | None = None, *, progress: Repo
 
 @dataclass(frozen=True)
 class _Builder:
-    """Builds the parts of a configuration; equal nodes are built once, see `bench.config.build_once`."""
+    """Builds the objects of a configuration; equal nodes are built once, see `bench.config.build_once`."""
 
     config: Node
     built: dict[str, Any]
@@ -242,38 +243,36 @@ class _Builder:
         nodes = {name: self.config[name] for name in names} | nodes
         return build_once(nodes, list(self.config["packages"]), self.built)
 
-    def renderer(self, requested: Node) -> Noted:
-        """A renderer from its node, with a number for each `auto`, and notes on these."""
-        node, notes = resolved(requested, *self.parts("view", "auto"))
+    def renderer(self, requested: Node) -> RendererWithNotes:
+        """A renderer from its node with a number for each `auto`, and notes on these numbers."""
+        node, notes = resolve_auto_settings(requested, *self.parts("view", "auto"))
         (renderer,) = self.parts(renderer=node)
         if not isinstance(renderer, Renderer):
-            name = type(renderer).__name__
-            raise ValueError(
-                f"renderer {name} lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
-            )
+            lacking = f"renderer {type(renderer).__name__} lacks capabilities, render or silhouette_loss"
+            raise ValueError(f"{lacking}: see renderers/rendering.py")
         return renderer, notes
 
     def prior(self, dataset: Dataset, split: Split, index: int) -> PriorChoice:
         """The prior for shape number `index` of a dataset."""
-        node, shown = self.config["prior"], dataset.network(index) if isinstance(dataset, Networked) else None
-        with naming_prior_keys(node):
+        node, scene_network = self.config["prior"], dataset.network(index) if isinstance(dataset, HasNetwork) else None
+        with prior_keys_in_errors(node):
             (settings,) = self.parts("prior")
-            learnt = learnt_dataset(node.get(PRIOR_DATASET_KEY))
-            network = shown if isinstance(settings, PriorSettings) else settings.network(0)
-        if network is not None:
-            return PriorChoice(network, scene_code=index if network is shown else None)
-        fitted = learnt is None and split is Split.TRAIN and index < settings.shapes
-        exists = learnt is not None or not isinstance(dataset, Photographed | OneView)
-        return PriorChoice(settings, learnt or dataset, index if fitted else None, exists)
+            prior_dataset = training_dataset(node.get(PRIOR_DATASET_KEY))
+            prior_network = scene_network if isinstance(settings, PriorSettings) else settings.network(0)
+        if prior_network is not None:
+            return PriorChoice(prior_network, scene_code=index if prior_network is scene_network else None)
+        fitted = prior_dataset is None and split is Split.TRAIN and index < settings.shapes
+        exists = prior_dataset is not None or not isinstance(dataset, Photographed | OneView)
+        return PriorChoice(settings, prior_dataset or dataset, index if fitted else None, exists)
 
 
-def _scene(dataset: Dataset, view: ViewSampler, split: Split, index: int, prior: PriorChoice) -> Scene:
-    """The scene of a run, in colours where its prior has some."""
+def _make_scene(dataset: Dataset, view: ViewSampler, split: Split, index: int, prior: PriorChoice) -> Scene:
+    """The scene of a run, with colours if its prior has some."""
     return replace(make_scene(dataset, view, split=split, index=index), texture=prior.texture(dataset, split, index))
 
 
 def _shape_number(split: str, index: int) -> tuple[Split, int]:
-    """The split and number of a shape; raises ValueError where no dataset has it."""
+    """The split and index of a shape; raises ValueError if no dataset has it."""
     if split not in list(Split):
         raise ValueError(f"split must be one of {', '.join(Split)}, not {split!r}")
     if index >= SPLIT_STRIDE:
@@ -282,7 +281,7 @@ def _shape_number(split: str, index: int) -> tuple[Split, int]:
 
 
 def _check(task: Task, inputs: RunInputs, index: int) -> None:
-    """Raises ValueError where parts do not fit together."""
+    """Raises ValueError if dataset, task and field do not fit together."""
     name = type(task).__name__
     if isinstance(inputs.dataset, Photographed | OneView) and index:
         raise ValueError(f"{inputs.dataset.name} is one object, with index=0, not {index}: give another dataset.path")
@@ -290,5 +289,5 @@ def _check(task: Task, inputs: RunInputs, index: int) -> None:
         raise ValueError(f"the task {name} needs a true shape, and one view has none: set task=completion")
     if not inputs.field.of_prior and not getattr(task, "takes_field", False):
         raise ValueError(f"the task {name} does not take field={inputs.field.name}: remove it")
-    if isinstance(task, Checks):
+    if isinstance(task, ValidatesInputs):
         task.check(inputs)

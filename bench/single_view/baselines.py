@@ -1,4 +1,4 @@
-"""Shapes that need no network: of the training shapes the mean, the most alike and the best; and a prior's code."""
+"""Baselines without a single-view network: the mean, most similar and best training shape, and a prior's code."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ from bench.evaluate.state import REACH
 from bench.progress import Report
 from bench.records.record import digest
 from bench.setup.inputs import RunInputs
-from bench.shape_prior import kept
-from bench.single_view.images import ImagesOf
+from bench.shape_prior import load_or_make
+from bench.single_view.images import ShapeImages
 from bench.solve.latent_code import CodePenalty, CodeProblem
-from bench.solve.observed_view import DEPTH, GivenView
+from bench.solve.observed_view import DEPTH, ObservedView
 from bench.solve.optimise import OptimiserSettings
 from datasets.mesh import Mesh, extract
 from datasets.scene import Dataset, Split, Truth, sample_surface
@@ -30,48 +30,48 @@ from renderers.fields.grid import Grid
 from renderers.silhouette import SilhouetteLoss
 
 VERSION = 1  # raise it when the mean changes
-SAMPLES = 64  # of the mean distance, per axis
-COMPARED = 2000  # points of a surface in the search for the best shape
+GRID_SAMPLES = 64  # per axis, of the mean distance
+COMPARED_POINTS = 2000  # per surface, in the search for the best shape
 
 
 def mean_shape(dataset: Dataset, count: int, cache: Path, progress: Report) -> Mesh | None:
-    """The zero set of the mean signed distance of the first `count` training shapes, kept in `cache`."""
-    settings = {"dataset": dataset.identity(), "count": count, "samples": SAMPLES, "reach": REACH, "version": VERSION}
-    name = f"mean-{dataset.name}-{digest(settings)}"
+    """The zero set of the mean signed distance of the first `count` training shapes, stored in `cache`."""
+    grid = {"samples": GRID_SAMPLES, "reach": REACH}
+    name = f"mean-{dataset.name}-{digest({'dataset': dataset.identity(), 'count': count, **grid, 'version': VERSION})}"
 
     def make() -> dict[str, Tensor]:
-        total = np.zeros((SAMPLES,) * 3)
+        total = np.zeros((GRID_SAMPLES,) * 3)
         for index in range(count):
             progress("averaging shapes", index, count)
-            total += Truth(dataset.mesh(Split.TRAIN, index)).distance_grid(SAMPLES, REACH)
+            total += Truth(dataset.mesh(Split.TRAIN, index)).distance_grid(GRID_SAMPLES, REACH)
         return {"values": torch.from_numpy(total / count).float()}
 
-    return extract(Grid(kept(cache, name, make)["values"], REACH), grid=2 * SAMPLES, reach=REACH)
+    return extract(Grid(load_or_make(cache, name, make)["values"], REACH), grid=2 * GRID_SAMPLES, reach=REACH)
 
 
-def most_alike(image: Float[Tensor, "4 height width"], images: Sequence[ImagesOf]) -> int:
-    """The shape one of whose images has the least mean squared difference from an image, mask included."""
-    return int(torch.stack([(one.images() - image).square().mean(dim=(1, 2, 3)).min() for one in images]).argmin())
+def most_similar_shape(image: Float[Tensor, "4 height width"], images: Sequence[ShapeImages]) -> int:
+    """The index of the shape with the image most similar to `image`: smallest mean squared difference, with mask."""
+    return int(torch.stack([(shape.images() - image).square().mean(dim=(1, 2, 3)).min() for shape in images]).argmin())
 
 
 def best_shape(mesh: Mesh, dataset: Dataset, count: int) -> int:
-    """The training shape with the least Chamfer-L1 from a true one: what no retrieval can do better than."""
-    true = sample_surface(mesh, COMPARED, 0)
-    others = (dataset.mesh(Split.TRAIN, index) for index in range(count))
-    scores = [surface_metrics(sample_surface(m, COMPARED, 1), true, threshold=1.0) for m in others]
+    """The index of the training shape with the smallest Chamfer-L1 to a true shape: the best possible retrieval."""
+    true = sample_surface(mesh, COMPARED_POINTS, 0)
+    shapes = (dataset.mesh(Split.TRAIN, index) for index in range(count))
+    scores = [surface_metrics(sample_surface(m, COMPARED_POINTS, 1), true, threshold=1.0) for m in shapes]
     return int(np.argmin([score["chamfer_l1"] for score in scores]))
 
 
 @dataclass(frozen=True)
 class MaskSearch:
-    """How a renderer finds the prior's code whose silhouette is that of an image, in place of an encoder.
+    """Finds the prior's code for the silhouette of an image with a renderer, in place of an encoder.
 
-    The camera is known, and depths are not (DIST, Eq. 5, without its first term).
+    The camera is known, depths are unknown (DIST, Eq. 5, without its first term).
 
     Args:
-        silhouette: loss of the mask.
-        silhouette_weight: of it.
-        code: penalty of the code.
+        silhouette: loss between silhouette and mask.
+        silhouette_weight: of this loss.
+        code: penalty on the code.
         optimiser: iterations and learning rate.
     """
 
@@ -82,7 +82,7 @@ class MaskSearch:
 
     depth_loss: ClassVar[str] = DEPTH
     depth_weight: ClassVar[float] = 0.0
-    least_reference: ClassVar[float] = 0.01  # see `optimise`: a start that covers the mask has next to no loss
+    least_reference: ClassVar[float] = 0.01  # see `optimise`: a start that covers the mask has almost no loss
 
     def __post_init__(self) -> None:
         check_at_least("task.search.silhouette_weight", self.silhouette_weight, 0, "10 works")
@@ -90,17 +90,17 @@ class MaskSearch:
     def problem(self, shot: Shot, inputs: RunInputs) -> CodeProblem:
         """The problem of an image with a mask; it starts from code zero, the mean shape.
 
-        The share of pixels whose hit differs from the mask must fall, not the loss: DIST's is a mean over wrong pixels,
-        of which a hit beside the mask weighs no more than the march's epsilon. So it is next to nothing for a mean
-        shape that covers the mask, and rises where these pixels are mended first.
+        The fraction of wrong pixels must fall, not the loss. DIST's loss is a mean over wrong pixels, where a spurious
+        pixel weighs at most the march's epsilon. It is almost zero for a mean shape that covers the mask, and rises
+        when the spurious pixels disappear first.
         """
         size = (shot.camera.height, shot.camera.width)
-        none = torch.zeros(size, dtype=torch.bool, device="cpu")
-        given = GivenView(self, inputs.renderer, shot.camera.rays(), none.float(), (~none).float(), none, shot.mask).to(
-            inputs.device
-        )
+        none, rays = torch.zeros(size, dtype=torch.bool, device="cpu"), shot.camera.rays()
+        view = ObservedView(self, inputs.renderer, rays, none.float(), (~none).float(), none, shot.mask)
+        view = view.to(inputs.device)
 
         def wrong(field: Field) -> float:
-            return float((render_checked(inputs.renderer, field, given.rays).hit != given.mask).float().mean())
+            return float((render_checked(inputs.renderer, field, view.rays).hit != view.mask).float().mean())
 
-        return CodeProblem(inputs.prior, self.code, given.compare, none, none.numel(), inputs.device, judged=wrong)
+        arguments = (inputs.prior, self.code, view.compare, none, none.numel(), inputs.device)
+        return CodeProblem(*arguments, progress_measure=wrong)

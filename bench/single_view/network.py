@@ -1,4 +1,4 @@
-"""From an image to a code, and from a code to a shape with colours (DVR, Secs. 3.1, 3.5)."""
+"""A network from an image to a code, and from a code to a shape with colours (DVR, Secs. 3.1, 3.5)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ from renderers.fields.coloured import OccupancyOf, ScaledOccupancyOf, begin_as_s
 from renderers.fields.occupancy import OccupancyNetwork
 
 OCCUPANCY, DISTANCE = "occupancy", "distance"
-READINGS = {OCCUPANCY: OccupancyOf, DISTANCE: ScaledOccupancyOf}
-PLACES = 4  # rows and columns to which the encoder's last features are averaged
-CODE_SIZE = 0.3  # standard deviation of the numbers of a code
-GROUPS = 8  # of channels that are normalised together
+FIELD_CLASSES = {OCCUPANCY: OccupancyOf, DISTANCE: ScaledOccupancyOf}
+FEATURE_GRID_SIDE = 4  # the encoder's last features are averaged to so many rows and columns
+CODE_STD = 0.3  # standard deviation within a code
+NORM_GROUPS = 8  # the channels of a group are normalised together
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class SingleViewNetwork:
         blocks: residual blocks in each stage.
         code_length: numbers in a code.
         width: of the decoder.
-        reads: its values as "occupancy", for DVR, or as "distance", for every renderer.
-        radius: of the sphere that all shapes begin as, in scene units.
+        reads: the decoder's values as "occupancy", for DVR, or as "distance", for every renderer.
+        radius: of the initial sphere of all shapes, in scene units.
     """
 
     channels: tuple[int, ...]
@@ -40,11 +40,11 @@ class SingleViewNetwork:
 
     def __post_init__(self) -> None:
         check_at_least("the length of task.network.channels", len(self.channels), 1, "[16, 32, 64, 128]")
-        if any(count < GROUPS or count % GROUPS for count in self.channels):
-            raise ValueError(f"task.network.channels must be multiples of {GROUPS}, not {list(self.channels)}")
+        if any(count < NORM_GROUPS or count % NORM_GROUPS for count in self.channels):
+            raise ValueError(f"task.network.channels must be multiples of {NORM_GROUPS}, not {list(self.channels)}")
         for name in ("blocks", "code_length", "width"):
             check_at_least(f"task.network.{name}", getattr(self, name), 1, "conf/scale has values that work")
-        check_choice("task.network.reads", self.reads, tuple(READINGS))
+        check_choice("task.network.reads", self.reads, tuple(FIELD_CLASSES))
         check_positive("task.network.radius", self.radius, "0.5 lies within most objects")
 
 
@@ -53,10 +53,10 @@ class SingleView(nn.Module):
 
     Source: DVR (Niemeyer et al. 2020), Sec. 3.5: a ResNet-18 whose last layer gives a code of 256, and the network of
         `OccupancyNetwork`.
-    Deviates: the ResNet is not trained before; it is given the mask as well; groups of channels are normalised, not
-        batches, since a step has few images, and before each convolution; nothing is pooled after the first one; its
-        last features keep 4 x 4 places, and a code is normalised; at desk it has one block in each of four narrow
-        stages; the shape begins as a sphere.
+    Deviates: the ResNet is not pre-trained; the mask is an input too; groups of channels are normalised, not batches,
+        since a step has few images, and before each convolution; nothing is pooled after the first convolution; the
+        last features keep 4 x 4 positions, and a code is normalised; at desk scale it has one block in each of four
+        narrow stages; the initial shape is a sphere.
     """
 
     def __init__(self, settings: SingleViewNetwork) -> None:
@@ -69,35 +69,35 @@ class SingleView(nn.Module):
     def forward(self, images: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch code_length"]:
         """The codes of images; see `bench.single_view.images.as_input`."""
         code = self.code(self.stages(2 * images - 1))
-        return CODE_SIZE * torch.nn.functional.layer_norm(code, code.shape[-1:])
+        return CODE_STD * torch.nn.functional.layer_norm(code, code.shape[-1:])
 
     def at(self, code: Float[Tensor, " code_length"]) -> OccupancyOf:
         """The shape of a code, with colours."""
-        return READINGS[self.settings.reads](self.decoder.at(code))
+        return FIELD_CLASSES[self.settings.reads](self.decoder.at(code))
 
 
 def encoder(inputs: int, channels: Sequence[int], blocks: int, code_length: int) -> tuple[nn.Sequential, nn.Linear]:
-    """A residual network from images [batch, inputs, height, width] to features, and its last layer, to codes."""
+    """A residual network from images [batch, inputs, height, width] to features, and a last layer to codes."""
     stages: list[nn.Module] = [nn.Conv2d(inputs, channels[0], 7, stride=2, padding=3, bias=False)]
-    previous = channels[0]
-    for place, count in enumerate(channels):
+    in_channels = channels[0]
+    for stage, width in enumerate(channels):
         for block in range(blocks):
-            stages.append(_Residual(previous, count, 2 if place and not block else 1))
-            previous = count
-    whole = nn.Sequential(*stages, nn.ReLU(), nn.AdaptiveAvgPool2d(PLACES), nn.Flatten())
-    return whole, nn.Linear(previous * PLACES**2, code_length)
+            stages.append(_Residual(in_channels, width, 2 if stage and not block else 1))
+            in_channels = width
+    features = nn.Sequential(*stages, nn.ReLU(), nn.AdaptiveAvgPool2d(FEATURE_GRID_SIDE), nn.Flatten())
+    return features, nn.Linear(in_channels * FEATURE_GRID_SIDE**2, code_length)
 
 
 class _Residual(nn.Module):
-    """Two convolutions with a skip connection around them, normalised before (He et al. 2016)."""
+    """Two convolutions, each after a normalisation, with a skip connection (He et al. 2016)."""
 
-    def __init__(self, before: int, channels: int, stride: int) -> None:
+    def __init__(self, in_channels: int, channels: int, stride: int) -> None:
         super().__init__()
-        self.first_norm, self.second_norm = nn.GroupNorm(GROUPS, before), nn.GroupNorm(GROUPS, channels)
-        self.first = nn.Conv2d(before, channels, 3, stride=stride, padding=1, bias=False)
+        self.first_norm, self.second_norm = nn.GroupNorm(NORM_GROUPS, in_channels), nn.GroupNorm(NORM_GROUPS, channels)
+        self.first = nn.Conv2d(in_channels, channels, 3, stride=stride, padding=1, bias=False)
         self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        same = before == channels and stride == 1
-        self.skip = nn.Identity() if same else nn.Conv2d(before, channels, 1, stride=stride, bias=False)
+        is_same_shape = in_channels == channels and stride == 1
+        self.skip = nn.Identity() if is_same_shape else nn.Conv2d(in_channels, channels, 1, stride=stride, bias=False)
 
     def forward(self, features: Tensor) -> Tensor:
         active = torch.relu(self.first_norm(features))

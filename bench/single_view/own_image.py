@@ -1,4 +1,4 @@
-"""A picture of one's own, framed as the images of a training are; and the view from which a shape is most like it."""
+"""A picture of the user, framed like the training images, and the view in which a shape matches it best."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,29 +16,30 @@ from datasets.shot import mask_iou
 from renderers.camera import Camera
 from renderers.checks import BadInput
 
-LONGEST = 1024  # pixels of a picture that are read
-SMALLEST = 16  # pixels along an object's longer side
+MAX_PICTURE_PIXELS = 1024  # longer side; larger pictures are reduced
+MIN_OBJECT_PIXELS = 16  # longer side of the object
 
 
 def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> tuple[Float[Tensor, "4 _ _"], list[str]]:
-    """A picture as encoders take it, cut so that the object fills a share of it; and what is doubtful about it.
+    """A picture as encoder input, cut so that the object fills a fraction of it; and warnings about it.
 
     Args:
-        mask: of its mask; None for the picture's alpha channel.
-        pixels: height and width of what is given back.
-        filled: see `filled_share`.
+        mask: path of the mask; None for the picture's alpha channel.
+        pixels: height and width of the result.
+        filled: see `filled_fraction`.
 
     Raises:
-        BadInput: where a file cannot be read, there is no mask, or it fits neither the picture nor an object.
+        BadInput: a file cannot be read, the mask is missing, or it does not fit the picture or an object.
     """
-    colours, opaque = read_image(path, mask, LONGEST)
+    colours, opaque = read_image(path, mask, MAX_PICTURE_PIXELS)
     if opaque is None:
         raise BadInput(f"{path} has no mask: give task.mask_path=FILE, white on the object, or an alpha channel")
     inside = torch.from_numpy(opaque[..., 0] > 0.5)
     if bool(inside.all()):
         raise BadInput(f"the mask {mask or path} is white everywhere: make it black beside the object")
-    if not bool(inside.any()) or _box(inside)[2] < SMALLEST:
-        raise BadInput(f"the mask {mask or path} shows no object of {SMALLEST} pixels: make it white on the object")
+    if not bool(inside.any()) or _box(inside)[2] < MIN_OBJECT_PIXELS:
+        size = f"{MIN_OBJECT_PIXELS} pixels"
+        raise BadInput(f"the mask {mask or path} shows no object of {size}: make it white on the object")
     sides = {"top": inside[0], "bottom": inside[-1], "left": inside[:, 0], "right": inside[:, -1]}
     if all(bool(side.float().mean() > 0.5) for side in sides.values()):
         raise BadInput(f"the mask {mask or path} is white along the border, as an inverted one: make the object white")
@@ -49,35 +50,35 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> t
     return as_input(cut[:3].permute(1, 2, 0), cut[3] > 0.5), notes
 
 
-def filled_share(masks: Bool[Tensor, "images height width"]) -> float:
-    """The longer side of an object's box over the image's, the median over images."""
+def filled_fraction(masks: Bool[Tensor, "images height width"]) -> float:
+    """The longer side of an object's box as a fraction of the image's side, the median over images."""
     return float(np.median([_box(mask)[2] / len(mask) for mask in masks]))
 
 
 def best_view(
     mesh: Mesh, cameras: Sequence[Camera], mask: Bool[Tensor, "pixels pixels"], filled: float
 ) -> tuple[Camera, float]:
-    """The camera whose silhouette of a mesh, framed alike, overlaps most with a mask; and that overlap, an IoU."""
+    """The camera with the best overlap between a mesh's silhouette, framed like the mask, and a mask; and its IoU."""
     truth, overlaps = Truth(mesh, closed=False), []
     for camera in cameras:
-        seen = see(truth, camera).mask
-        framed = _framed(seen[None].float(), seen, len(mask), filled)[0] > 0.5 if bool(seen.any()) else ~mask
+        hits = see(truth, camera).mask
+        framed = _framed(hits[None].float(), hits, len(mask), filled)[0] > 0.5 if bool(hits.any()) else ~mask
         overlaps.append(mask_iou(framed.numpy(), mask.numpy()))
-    place = int(np.argmax(overlaps))
-    return cameras[place], overlaps[place]
+    best = int(np.argmax(overlaps))
+    return cameras[best], overlaps[best]
 
 
 def _box(mask: Bool[Tensor, "height width"]) -> tuple[float, float, int]:
-    """The centre of the rows and of the columns in which a mask has a pixel, and the longer side of that box."""
+    """The centre, as row and column, and the longer side of a mask's bounding box."""
     rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
-    (top, bottom), (left, right) = (map(int, (found.min(), found.max() + 1)) for found in (rows, columns))
+    (top, bottom), (left, right) = (map(int, (indices.min(), indices.max() + 1)) for indices in (rows, columns))
     return (top + bottom) / 2, (left + right) / 2, max(bottom - top, right - left)
 
 
 def _framed(
     channels: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"], pixels: int, filled: float
 ) -> Float[Tensor, "channels _ _"]:
-    """The square about a mask's box that the box fills a share of, made smaller; 0 beyond the image."""
+    """The square in which a mask's box fills the fraction `filled`, resized to `pixels`; 0 beyond the image."""
     row, column, longer = _box(mask)
     side = max(round(longer / filled), 1)
     top, left = round(row + side / 2), round(column + side / 2)  # in the image with a margin of `side`

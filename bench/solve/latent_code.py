@@ -1,4 +1,4 @@
-"""An inverse problem whose unknown is a prior's code, with any loss."""
+"""The inverse problem of finding a prior's code, with any loss."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,17 +15,17 @@ from bench.evaluate.evaluate import CHAMFER, Evaluation, chamfer_only, evaluate
 from bench.evaluate.state import State
 from bench.pictures.run_figures import Given, draw_run
 from bench.shape_prior import Prior
-from bench.solve.optimise import NotReached, Starts, StartSettings
+from bench.solve.optimise import CannotContinue, Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
 from renderers.field import Counts, Field, Meter, Moved
 
 Terms = dict[str, Tensor]
-BEGUN = 0.8  # size of a prior's shape against its own, where its size is looked for: it may grow, and move aside
+INITIAL_SCALE = 0.8  # if the size is unknown too: below 1, so that the shape can grow and move
 
 
 @dataclass(frozen=True)
 class CodePenalty:
-    """The penalty of a code (DeepSDF, Eq. 10; DIST, B.4).
+    """The penalty on a code (DeepSDF, Eq. 10; DIST, B.4).
 
     Args:
         weight: of the squared entries.
@@ -45,32 +45,32 @@ class CodePenalty:
         return self.weight * (squares.sum() if self.average == "sum" else squares.mean())
 
 
-def turned(count: int) -> Float[Tensor, "count 7"]:
-    """Similarities, see `renderers.field.Moved`: evenly spaced rotations about the vertical axis, of size `BEGUN`."""
-    found = torch.zeros(count, 7)
-    found[:, 4] = (torch.arange(count) / count + 0.5) % 1 * 2 * pi - pi
-    found[:, 6] = log(BEGUN)
-    return found
+def initial_rotations(count: int) -> Float[Tensor, "count 7"]:
+    """Similarities, see `renderers.field.Moved`: equally spaced rotations about the y axis, of size `INITIAL_SCALE`."""
+    similarities = torch.zeros(count, 7)
+    similarities[:, 4] = (torch.arange(count) / count + 0.5) % 1 * 2 * pi - pi
+    similarities[:, 6] = log(INITIAL_SCALE)
+    return similarities
 
 
 @dataclass
 class CodeProblem:
-    """The problem of finding a prior's code, and a similarity where one is given.
+    """The problem of finding a prior's code, and optionally a similarity.
 
     Args:
-        prior: whose code is sought.
-        penalty: of the code.
-        compare: gives the weighted terms of the loss, at a counted field and an iteration.
-        observed: pixels of the scene's view whose depth is given.
-        rays_per_iteration: their number.
+        prior: has the unknown code.
+        penalty: on the code.
+        compare: returns the weighted terms of the loss of a counted field at an iteration.
+        observed: pixels of the scene's view whose depth is observed.
+        rays_per_iteration: number of rays.
         device: of all tensors.
         initial: codes, one per start; None is code zero, the mean shape.
-        misplaced: initial similarities, one per start, see `renderers.field.Moved`; None keeps the shape.
+        initial_similarities: one per start, see `renderers.field.Moved`; None does not move the shape.
         trial: see `bench.solve.optimise.StartSettings`.
-        photographs: the given ones, for pictures.
-        compared_at: iteration at which the first and the last loss are evaluated; None: each at its own.
-        judged: gives of a field what must fall in place of the loss; None: the loss.
-        mask, coloured: whether a mask is given, and colours, for pictures.
+        photographs: the observed photographs, for pictures.
+        comparison_iteration: iteration whose settings the first and last loss use; None: each its own settings.
+        progress_measure: returns the number of a field that must decrease; None: the loss must.
+        mask, coloured: whether a mask and colours are observed, for pictures.
     """
 
     prior: Prior
@@ -80,11 +80,11 @@ class CodeProblem:
     rays_per_iteration: int
     device: torch.device
     initial: Float[Tensor, "starts code_length"] | None = None
-    misplaced: Float[Tensor, "starts 7"] | None = None
+    initial_similarities: Float[Tensor, "starts 7"] | None = None
     trial: int = 1
     photographs: Float[np.ndarray, "views height width 3"] | None = None
-    compared_at: int | None = None
-    judged: Callable[[Field], float] | None = None
+    comparison_iteration: int | None = None
+    progress_measure: Callable[[Field], float] | None = None
     mask: bool = True
     coloured: bool = False
     counts: Counts = field(default_factory=Counts)
@@ -95,11 +95,11 @@ class CodeProblem:
     def __post_init__(self) -> None:
         self.decoder = self.prior.decoder.to(self.device).requires_grad_(False)
         self.observed = self.observed.to(self.device)
-        first = torch.zeros(1, self.decoder.code_length) if self.initial is None else self.initial
-        self.codes = self._free(first)
-        self.similarities = [] if self.misplaced is None else self._free(self.misplaced)
+        initial = torch.zeros(1, self.decoder.code_length) if self.initial is None else self.initial
+        self.codes = self._free(initial)
+        self.similarities = [] if self.initial_similarities is None else self._free(self.initial_similarities)
         self.parameters = [*self.codes, *self.similarities]
-        self.starts = Starts(StartSettings(len(first), self.trial))
+        self.starts = Starts(StartSettings(len(initial), self.trial))
 
     @property
     def code(self) -> Float[Tensor, " code_length"]:
@@ -108,7 +108,7 @@ class CodeProblem:
 
     @property
     def similarity(self) -> Float[Tensor, "7"] | None:
-        """The current similarity, where it is optimised."""
+        """The current similarity; None if it is not optimised."""
         return self.similarities[self.starts.best()].detach().clone() if self.similarities else None
 
     def field(self) -> Field:
@@ -117,10 +117,10 @@ class CodeProblem:
         return shape if self.similarity is None else Moved(shape, self.similarity)
 
     def camera(self) -> None:
-        """None: the scene's camera sees the shape."""
+        """Returns None: the scene's camera is used."""
 
     def evaluate(self, state: State) -> Evaluation:
-        """The current shape against the truth."""
+        """The errors of the current shape against the ground truth."""
         return evaluate(state)
 
     def checkpoint(self, state: State) -> dict[str, float]:
@@ -129,17 +129,17 @@ class CodeProblem:
 
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
-        view, observed = states[0].inputs.scene.given()[0], self.observed.cpu().numpy()
-        given = Given(view, observed, self.photographs, self.mask, self.coloured)
-        draw_run(folder, states, given, curve, title)
+        view, observed = states[0].inputs.scene.observed_view()[0], self.observed.cpu().numpy()
+        observations = Given(view, observed, self.photographs, self.mask, self.coloured)
+        draw_run(folder, states, observations, curve, title)
 
     def loss(self, iteration: int) -> Terms:
         """The terms and their sum."""
-        start, step = self.starts.turn(iteration)
+        start, step = self.starts.assignment(iteration)
         penalty = {"code": self.penalty(self.codes[start])}
         try:
             terms = self.compare(Meter(self._shape(start), self.counts), step) | penalty
-        except NotReached:
+        except CannotContinue:
             if not self.starts.give_up(start, step):
                 raise
             return {"total": penalty["code"], **penalty}
@@ -149,13 +149,13 @@ class CodeProblem:
 
     @torch.no_grad()
     def objective(self) -> float | None:
-        """What `judged` gives, or the current loss at iteration `compared_at`, not counted; None without either."""
+        """`progress_measure`, or the loss at `comparison_iteration`; None without either. It is not counted as cost."""
         best = self.starts.best()
-        if self.judged is not None:
-            return self.judged(self._shape(best))
-        if self.compared_at is None:
+        if self.progress_measure is not None:
+            return self.progress_measure(self._shape(best))
+        if self.comparison_iteration is None:
             return None
-        terms = self.compare(self._shape(best), self.compared_at)
+        terms = self.compare(self._shape(best), self.comparison_iteration)
         return float(torch.stack(list(terms.values())).sum() + self.penalty(self.codes[best]))
 
     def _shape(self, start: int) -> Field:

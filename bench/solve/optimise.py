@@ -1,4 +1,4 @@
-"""The optimisation loop, whose clock runs around a step's forward and backward pass only; several starts within it.
+"""The optimisation loop, timed over the forward and backward passes only, and several starts in one loop.
 
 Several starts share one budget of iterations: successive halving keeps the better ones, and the last gets the rest.
 """
@@ -19,16 +19,16 @@ from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
 from renderers.hits import Hits, collect_hits, missing_distance_message
 
-DIVERGED = 100.0  # a loss above this many times its first value, or `least_reference`, has diverged
-KEPT = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
-LAST = 3  # a start is scored by its mean loss over the last 3 iterations of a round: views change between them
+DIVERGENCE_FACTOR = 100.0  # times the first loss, or `least_reference` if larger: a loss above it has diverged
+HALVING_FACTOR = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
+SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of a round, since each sees other views
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
-MARKS = (0.6, 0.8)  # shares of the iterations after which the rate of "steps" is a fifth (DVR: 750 and 1,000 epochs)
-RAMP = 0.1  # share of the iterations over which the rate of "ramped" rises
+RATE_DROP_FRACTIONS = (0.6, 0.8)  # the rate of "steps" falls to a fifth there (DVR: 750 and 1,000 epochs)
+WARMUP_FRACTION = 0.1  # the rate of "ramped" rises over this fraction of the iterations
 
 
-class NotReached(Exception):
-    """An optimisation cannot continue, without an error of the program; the message says why."""
+class CannotContinue(Exception):
+    """An optimisation cannot continue, although the program has no error; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class OptimiserSettings:
     """Adam, for a fixed number of iterations.
 
     Args:
-        iterations: their number.
+        iterations: number of steps.
         learning_rate: of Adam, at the start.
-        schedule: "constant", or "cosine": the rate falls to zero along half a cosine; "ramped": a cosine that rises
-            from zero over the first tenth, for a start that is nearly right; "steps": a fifth after each of two marks.
-        budget: of the field, see `renderers.field.Counts.cost`; the step that reaches it is the last.
+        schedule: "constant"; "cosine": the rate falls to zero along half a cosine; "ramped": a cosine that rises from
+            zero over the first tenth, for a start that is almost correct; "steps": falls to a fifth twice.
+        budget: largest cost, see `renderers.field.Counts.cost`; the step that reaches it is the last.
     """
 
     iterations: int
@@ -57,35 +57,35 @@ class OptimiserSettings:
 
     def rate(self, iteration: int) -> float:
         """The learning rate of an iteration, counted from 0."""
-        done = iteration / self.iterations
+        elapsed = iteration / self.iterations
         if self.schedule in ("constant", "steps"):
-            passed = sum(done >= mark for mark in MARKS) if self.schedule == "steps" else 0
-            return self.learning_rate / 5**passed
-        rise = min((iteration + 1) / (RAMP * self.iterations), 1.0) if self.schedule == "ramped" else 1.0
-        return self.learning_rate * 0.5 * (1 + cos(pi * done)) * rise
+            drops = sum(elapsed >= fraction for fraction in RATE_DROP_FRACTIONS) if self.schedule == "steps" else 0
+            return self.learning_rate / 5**drops
+        warmup = min((iteration + 1) / (WARMUP_FRACTION * self.iterations), 1.0) if self.schedule == "ramped" else 1.0
+        return self.learning_rate * 0.5 * (1 + cos(pi * elapsed)) * warmup
 
 
 @runtime_checkable
 class Objective(Protocol):
-    """What the optimisation loop minimises. Every evaluation that `loss` makes is counted in `counts`."""
+    """The function that the optimisation loop minimises. `counts` counts every field evaluation of `loss`."""
 
     parameters: list[Tensor]
     counts: Counts
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
-        """The loss of an iteration, counted from 0, as "total", and its weighted terms."""
+        """The loss of an iteration, counted from 0, under "total", and its weighted terms."""
         ...
 
 
 @dataclass
 class FirstChecked:
-    """An objective whose first loss, the warm-up of `optimise`, checks the hits of its renderings.
+    """An objective that checks the hits of its renderings at the first loss, the warm-up of `optimise`.
 
-    The check evaluates the field once, which is neither counted nor on the clock.
+    The check evaluates the field once. This is neither counted nor timed.
 
     Args:
         problem: the objective.
-        notes: gets a note where hits lie off the surface; a run goes on with them.
+        notes: receives a note if hits lie off the surface; the run continues.
     """
 
     problem: Objective
@@ -106,23 +106,23 @@ class FirstChecked:
         """The objective's loss.
 
         Raises:
-            BrokenContract: where the first loss is a number, but some hit has no finite distance or a negative one.
+            BrokenContract: the first loss is a number, but the distance of a hit is not finite or is negative.
         """
         if self.checked:
             return self.problem.loss(iteration)
         self.checked = True
-        with collect_hits() as kept:
+        with collect_hits() as all_hits:
             terms = self.problem.loss(iteration)
-        if not bool(terms["total"].isnan()):  # else `optimise` ends before the step, and says why
-            for hits in kept:
+        if not bool(terms["total"].isnan()):  # else `optimise` ends before the step, with the reason
+            for hits in all_hits:
                 hits.check()
-            self.notes += [f"at the first iteration, {note}" for hits in kept if (note := hits.off_surface())][:1]
+            self.notes += [f"at the first iteration, {note}" for hits in all_hits if (note := hits.off_surface())][:1]
         return terms
 
 
 @dataclass
 class History:
-    """The course and the costs of an optimisation."""
+    """The curve and the costs of an optimisation."""
 
     status: RunStatus = RunStatus.OK
     reason: str = ""
@@ -130,7 +130,7 @@ class History:
     seconds: dict[str, float] = field(default_factory=lambda: {"warmup": 0.0, "forward": 0.0, "backward": 0.0})
     counts: Counts = field(default_factory=Counts)
     peak_memory_bytes: int | None = None
-    objectives: list[float] = field(default_factory=list)  # the problem's objective before and after, where it has one
+    objectives: list[float] = field(default_factory=list)  # before and after, if the problem has an objective
 
 
 def optimise(
@@ -145,12 +145,12 @@ def optimise(
     """Runs Adam on the problem's parameters.
 
     Args:
-        problem: gives the loss; its parameters are changed in place.
-        device: that is synchronised when the clock is read.
+        problem: returns the loss; its parameters are changed in place.
+        device: synchronised when the clock is read.
         history: an empty one, filled during the loop, so that it is complete if the loop is stopped. A loss that
-            becomes NaN or diverges ends the loop and sets its status. A step is not taken where the loss is NaN.
-        least_reference: for divergence, a smaller first loss counts as this; for starts that are nearly right.
-        on_step: called with each line of the curve, to which it may add; off the clock, and its memory is not counted.
+            becomes NaN or diverges ends the loop and sets the status. No step is taken if the loss is NaN.
+        least_reference: lower bound of the first loss in the divergence test, for starts that are almost correct.
+        on_step: receives each line of the curve and may extend it. Its time and memory are not counted.
     """
     optimiser = _Adam(problem.parameters)
     history.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())
@@ -159,11 +159,11 @@ def optimise(
     for iteration in range(settings.iterations):
         optimiser.forget_gradients()
         rate, terms = settings.rate(iteration), dict[str, Tensor]()
-        with collect_hits() as kept:
+        with collect_hits() as all_hits:
             history.seconds["forward"] += _timed(device, lambda i=iteration, t=terms: t.update(problem.loss(i)))
-        numbers = dict(zip(terms, _read([*terms.values()]), strict=True))
+        numbers = dict(zip(terms, _to_floats([*terms.values()]), strict=True))
         if isnan(numbers["total"]):
-            history.status, history.reason = RunStatus.NAN, _not_a_number(numbers, iteration, kept)
+            history.status, history.reason = RunStatus.NAN, _not_a_number(numbers, iteration, all_hits)
         else:
             history.seconds["backward"] += _timed(
                 device, lambda rate=rate, loss=terms["total"]: (loss.backward(), optimiser.step(rate))
@@ -179,19 +179,19 @@ def optimise(
         }
         history.curve.append(line)
         history.peak_memory_bytes = memory.repeatable()
-        over = _failed(history, problem.parameters, least_reference) or line["cost"] >= (settings.budget or inf)
+        failed = _update_status(history, problem.parameters, least_reference)
         with memory.pause():
             on_step(line)
-        if over:
+        if failed or line["cost"] >= (settings.budget or inf):
             break
 
 
 class _Adam:
-    """`torch.optim.Adam` by its function alone: the class imports torch's compiler, for a second of every process."""
+    """Adam by torch's function: the class `torch.optim.Adam` imports torch's compiler, which takes a second."""
 
     def __init__(self, parameters: list[Tensor]) -> None:
         self.parameters = parameters
-        self.averages, self.squares = ([torch.zeros_like(one) for one in parameters] for _ in range(2))
+        self.averages, self.squares = ([torch.zeros_like(parameter) for parameter in parameters] for _ in range(2))
         self.steps = [torch.tensor(0.0, device="cpu") for _ in parameters]
 
     def forget_gradients(self) -> None:
@@ -200,44 +200,44 @@ class _Adam:
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
-        """Moves the parameters that have a gradient, at a learning rate."""
+        """Updates the parameters that have a gradient."""
         states = zip(self.parameters, self.averages, self.squares, self.steps, strict=True)
-        moved = [(one, gradient, *state) for one, *state in states if (gradient := one.grad) is not None]
-        if moved:
-            ones, gradients, averages, squares, steps = map(list, zip(*moved, strict=True))
+        updates = [(value, gradient, *state) for value, *state in states if (gradient := value.grad) is not None]
+        if updates:
+            values, gradients, averages, squares, steps = map(list, zip(*updates, strict=True))
             settings = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0}
-            adam(ones, gradients, averages, squares, [], steps, lr=rate, **settings, amsgrad=False, maximize=False)
+            adam(values, gradients, averages, squares, [], steps, lr=rate, **settings, amsgrad=False, maximize=False)
 
 
 def _largest(parameters: list[Tensor]) -> Tensor:
-    """The largest magnitude of any parameter: not finite where one is not."""
-    return get_total_norm([one.detach() for one in parameters], norm_type=inf)
+    """The largest magnitude of any parameter; not finite if a parameter is not."""
+    return get_total_norm([parameter.detach() for parameter in parameters], norm_type=inf)
 
 
-def _read(numbers: list[Tensor]) -> list[float]:
-    """Numbers of a device, in one wait for it."""
+def _to_floats(numbers: list[Tensor]) -> list[float]:
+    """Copies numbers from a device, waiting for it only once."""
     return torch.stack([number.detach().double() for number in numbers]).tolist()
 
 
-def _not_a_number(numbers: dict[str, float], iteration: int, kept: Sequence[Hits]) -> str:
-    """Why the loss of an iteration is not a number: its terms that are not, and the hits without a distance."""
-    wrong = [name for name, number in numbers.items() if isnan(number) and name != "total"]
-    what = f"the {' and the '.join(wrong)} term{'s are' if len(wrong) > 1 else ' is'}" if wrong else "the loss is"
-    endless = missing_distance_message(kept)
-    return f"{what} not a number at iteration {iteration}{f': {endless}' if endless else ''}"
+def _not_a_number(numbers: dict[str, float], iteration: int, all_hits: Sequence[Hits]) -> str:
+    """The reason for a loss that is not a number: its terms that are not, and hits without a distance."""
+    terms = [name for name, number in numbers.items() if isnan(number) and name != "total"]
+    subject = f"the {' and the '.join(terms)} term{'s are' if len(terms) > 1 else ' is'}" if terms else "the loss is"
+    misses = missing_distance_message(all_hits)
+    return f"{subject} not a number at iteration {iteration}{f': {misses}' if misses else ''}"
 
 
-def _failed(history: History, parameters: list[Tensor], least_reference: float) -> bool:
-    """Whether the loop must end; notes the reason in the history."""
+def _update_status(history: History, parameters: list[Tensor], least_reference: float) -> bool:
+    """Sets status and reason in the history if the loop must end; returns whether it must."""
     loss, first = history.curve[-1]["total"], max(history.curve[0]["total"], least_reference)
     iteration = history.curve[-1]["iteration"]
-    (largest,) = _read([_largest(parameters)])
+    (largest,) = _to_floats([_largest(parameters)])
     if history.status is RunStatus.OK and not isfinite(largest):
         history.status, history.reason = RunStatus.NAN, f"a parameter is not a number at iteration {iteration}"
-    elif loss > DIVERGED * first:
+    elif loss > DIVERGENCE_FACTOR * first:
         history.status = RunStatus.DIVERGED
-        begun = history.curve[0]["total"]
-        history.reason = f"the loss rose from {begun:.3g} to {loss:.3g} by iteration {iteration}"
+        initial = history.curve[0]["total"]
+        history.reason = f"the loss rose from {initial:.3g} to {loss:.3g} by iteration {iteration}"
     return history.status is not RunStatus.OK
 
 
@@ -263,7 +263,7 @@ class StartSettings:
         """The number of starts in each round; empty for a single start."""
         counts = [self.count]
         while counts[-1] > 1:
-            counts.append(-(-counts[-1] // KEPT))
+            counts.append(-(-counts[-1] // HALVING_FACTOR))
         return counts[:-1]
 
     @property
@@ -272,11 +272,11 @@ class StartSettings:
         return self.trial * sum(self.rounds)
 
     def iterations_of_last(self, iterations: int) -> int:
-        """The iterations that the last start gets, of a budget."""
+        """The iterations of the last start, from a budget."""
         return iterations - self.trials + self.trial * len(self.rounds)
 
     def check(self, iterations: int) -> None:
-        """Raises ValueError where the rounds would use up the budget."""
+        """Raises ValueError if the rounds would use up the budget."""
         if self.trials >= iterations:
             raise ValueError(
                 f"task.optimiser.iterations must be more than {self.trials}, not {iterations}: {self.count} starts "
@@ -286,44 +286,44 @@ class StartSettings:
 
 @dataclass
 class Starts:
-    """Assigns iterations to starts, and keeps those with the least losses; the truth is not used."""
+    """Assigns iterations to starts, and keeps the starts with the smallest losses; ground truth is not used."""
 
     settings: StartSettings
     losses: list[dict[int, Tensor]] = field(init=False)  # by start and step
-    alive: list[int] = field(init=False)  # the kept ones, the best first after a round
-    begun: int = 0  # first iteration of this round
-    done: int = 0  # steps of each kept start before this round
+    remaining: list[int] = field(init=False)  # the best first after a round
+    round_start: int = 0  # first iteration of this round
+    steps_before: int = 0  # steps of each remaining start before this round
 
     def __post_init__(self) -> None:
         self.losses = [{} for _ in range(self.settings.count)]
-        self.alive = list(range(self.settings.count))
+        self.remaining = list(range(self.settings.count))
 
-    def turn(self, iteration: int) -> tuple[int, int]:
-        """The start that an iteration belongs to, and the start's step, counted from 0."""
-        left = iteration - self.begun
-        return self.alive[left % len(self.alive)], self.done + left // len(self.alive)
+    def assignment(self, iteration: int) -> tuple[int, int]:
+        """The start of an iteration, and the index of the start's step, from 0."""
+        offset = iteration - self.round_start
+        return self.remaining[offset % len(self.remaining)], self.steps_before + offset // len(self.remaining)
 
     def note(self, start: int, step: int, loss: Tensor) -> None:
-        """Notes the loss of a start's step; the last one of a round ends it."""
+        """Records the loss of a start's step; the last loss of a round ends the round."""
         self.losses[start][step] = loss.detach()
-        end = self.done + self.settings.trial
-        if len(self.alive) > 1 and all(end - 1 in self.losses[other] for other in self.alive):
-            self.begun, self.done = self.begun + len(self.alive) * self.settings.trial, end
-            self.alive = sorted(self.alive, key=self._end)[: -(-len(self.alive) // KEPT)]
+        end = self.steps_before + self.settings.trial
+        if len(self.remaining) > 1 and all(end - 1 in self.losses[index] for index in self.remaining):
+            self.round_start, self.steps_before = self.round_start + len(self.remaining) * self.settings.trial, end
+            self.remaining = sorted(self.remaining, key=self._score)[: -(-len(self.remaining) // HALVING_FACTOR)]
 
     def best(self) -> int:
-        """The last start; before all rounds are over, the best one of the last completed round."""
-        return self.alive[0]
+        """The last start; during the rounds, the best start of the last completed round."""
+        return self.remaining[0]
 
     def give_up(self, start: int, step: int) -> bool:
-        """Notes that a start cannot continue, so that it is not kept; False where there is no other."""
-        if len(self.alive) == 1:
+        """Gives an infinite loss to a start that cannot continue; returns False if no other start remains."""
+        if len(self.remaining) == 1:
             return False
         self.note(start, step, torch.tensor(inf))
         return True
 
-    def _end(self, start: int) -> float:
-        """The mean loss of a start at the end of a round; infinite where it is NaN."""
-        last = [self.losses[start][step] for step in range(max(self.done - LAST, 0), self.done)]
+    def _score(self, start: int) -> float:
+        """The mean loss of a start at the end of a round; infinite if it is NaN."""
+        last = [self.losses[start][step] for step in range(max(self.steps_before - SCORED_STEPS, 0), self.steps_before)]
         mean = float(torch.stack(last).mean())
         return inf if isnan(mean) else mean

@@ -1,4 +1,4 @@
-"""An inverse problem, and how it is solved: evaluated, optimised, evaluated again, and drawn."""
+"""Solves an inverse problem: evaluates it, optimises it, evaluates it again, and draws it."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,8 +19,8 @@ from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.optimise import FirstChecked, History, NotReached, Objective, OptimiserSettings, optimise
-from datasets.field_files import FIELD, save_field
+from bench.solve.optimise import CannotContinue, FirstChecked, History, Objective, OptimiserSettings, optimise
+from datasets.field_files import FIELD_FILE, save_field
 from datasets.mesh import Mesh
 from datasets.meshes import read_mesh
 from datasets.scene import Scene
@@ -28,7 +28,7 @@ from renderers.camera import Camera
 from renderers.field import Counts, Field
 from renderers.rendering import Renderer, Unsupported, check_kind
 
-COSTS = {
+COST_DEFINITIONS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
     "evaluations.coarse": "points whose value was computed more cheaply, in bfloat16, where it decides nothing; absent "
     "without any, and not among those of value",
@@ -54,35 +54,35 @@ COSTS = {
 
 @runtime_checkable
 class Problem(Objective, Protocol):
-    """An inverse problem: its unknown, how a state of it is evaluated, and how it is drawn."""
+    """An inverse problem: its unknown, and the evaluation and drawing of its state."""
 
     tracked: tuple[str, ...]  # metrics that each checkpoint writes into the curve
     rays_per_iteration: int
-    observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is given
+    observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is observed
 
     @property
     def shown(self) -> Shown | None:
-        """What the filmstrip's frames are compared with; None for the scene's shape in its view."""
+        """The reference of the filmstrip's frames; None for the scene's shape in its view."""
         ...
 
     def objective(self) -> float | None:
-        """What must fall, not counted, where losses of different iterations are not comparable; else None."""
+        """A measure that must decrease, not counted as cost; None if losses of different iterations are comparable."""
         ...
 
     def field(self) -> Field:
-        """The field of the current parameters, which does not change with them; its evaluations are not counted."""
+        """The field of a copy of the current parameters; its evaluations are not counted."""
         ...
 
     def camera(self) -> Camera | None:
-        """The camera of the filmstrip's frame of the current state; None for the scene's."""
+        """The camera of the filmstrip's frame of the current state; None for the scene's camera."""
         ...
 
     def evaluate(self, state: State) -> Evaluation:
-        """The current state against the truth."""
+        """The errors of the current state against the ground truth."""
         ...
 
     def checkpoint(self, state: State) -> dict[str, float]:
-        """The `tracked` metrics of the current state alone."""
+        """Only the `tracked` metrics of the current state."""
         ...
 
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
@@ -104,13 +104,13 @@ class InverseTask(Protocol):
         """The inverse problem of a scene.
 
         Raises:
-            Unsupported: where the renderer has no gradient that the task needs.
+            Unsupported: the renderer lacks a gradient that the task needs.
         """
         ...
 
 
 def check_field_gradient(renderer: Renderer) -> None:
-    """Raises Unsupported where a renderer has no gradient towards the field's parameters."""
+    """Raises Unsupported if a renderer has no gradient towards the field's parameters."""
     if not renderer.capabilities.field_gradient:
         raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
 
@@ -123,18 +123,18 @@ def solve(
     *,
     gallery: bool = False,
 ) -> State:
-    """Makes a problem, solves it, fills the run's record and folder, and gives the final state.
+    """Makes a problem, solves it, fills the run's record and folder, and returns the final state.
 
     Args:
-        run: its record has the definitions of its numbers also where it ends before it has a problem.
+        run: its record receives the definitions first, so that it has them even if making the problem fails.
         definitions: of the metrics of the problem's `evaluate`.
-        gallery: whether pictures for galleries are written, where the configuration asks for them.
+        gallery: whether pictures for galleries are written, if the configuration has a size for them.
 
     Raises:
-        Unsupported: where the renderer cannot do what the problem's field needs.
+        Unsupported: the renderer lacks what the problem's field needs.
     """
     inputs, record = run.inputs, run.record
-    record.definitions = definitions | COSTS
+    record.definitions = definitions | COST_DEFINITIONS
     problem = make_problem()
     first = State(problem.field(), inputs)
     check_kind(inputs.renderer, first.field)
@@ -145,7 +145,7 @@ def solve(
 
     def state() -> State:
         field = problem.field()
-        return first if field is first.field else State(field, inputs)  # a shape that is known is extracted once
+        return first if field is first.field else State(field, inputs)  # extracts an unchanged shape only once
 
     def errors_at(iteration: int) -> dict[str, float]:
         current = state() if iteration else first
@@ -154,7 +154,7 @@ def solve(
             return problem.checkpoint(current)
         return {name: before.metrics[name] for name in problem.tracked if name in before.metrics}
 
-    history = descend(problem, settings, run, errors_at)
+    history = run_optimisation(problem, settings, run, errors_at)
     with run.off_clock():
         last = state()
         after = problem.evaluate(last)
@@ -167,25 +167,25 @@ def solve(
 
 
 def solve_task(task: InverseTask, run: RunContext) -> State:
-    """Solves a task's inverse problem of a code, and gives the final state."""
+    """Solves a task's inverse problem of a code, and returns the final state."""
     inputs = run.inputs
 
     def problem() -> Problem:
         return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
 
-    return solve(problem, task.optimiser, run, defined(inputs), gallery=True)
+    return solve(problem, task.optimiser, run, metric_definitions(inputs), gallery=True)
 
 
-def defined(inputs: RunInputs) -> dict[str, str]:
-    """The definitions of what a solved code is judged by."""
+def metric_definitions(inputs: RunInputs) -> dict[str, str]:
+    """The definitions of the metrics of a solved code."""
     return DEFINITIONS | COLOUR if inputs.prior_choice.coloured else DEFINITIONS
 
 
 def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | None:
-    """Writes `to_world.txt` into a run's folder, and its mesh, which it gives, as `mesh_world.ply`; all digits of both.
+    """Writes `to_world.txt` and `mesh_world.ply`, the transformed mesh, into a run's folder; returns the run's mesh.
 
     Args:
-        to_world: the similarity from the scene's world into that of a file.
+        to_world: the similarity from the scene's world to the world of a file.
     """
     np.savetxt(folder / "to_world.txt", to_world, fmt="%.17g")
     if not (folder / "mesh.ply").is_file():
@@ -196,22 +196,22 @@ def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | No
 
 
 def note_result(run: RunContext, after: Evaluation) -> None:
-    """Notes the result in the record, and writes its mesh and its field."""
+    """Writes the result into the record, and its mesh and its field into the run's folder."""
     record = run.record
     record.metrics = after.metrics
     record.status, record.reason = after.failure or (RunStatus.OK, "")
-    lost = None if after.field is None else save_field(after.field, run.folder / FIELD)
-    record.notes = [*record.notes, *([lost] if lost else []), *after.notes, *depth_gap_note(after.metrics)]
+    unsaved = None if after.field is None else save_field(after.field, run.folder / FIELD_FILE)
+    record.notes = [*record.notes, *([unsaved] if unsaved else []), *after.notes, *depth_gap_note(after.metrics)]
     if after.mesh is not None:
         record.notes += after.mesh.repairs
         after.mesh.save(run.folder / "mesh.ply")
 
 
 def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Filmstrip) -> None:
-    """Writes pictures and filmstrip of a run whose result is noted.
+    """Writes pictures and filmstrip of a run, after its result is in the record.
 
     Args:
-        draw_pictures: writes the pictures under a title; not called where pictures are off.
+        draw_pictures: writes the pictures with a title; not called if pictures are off.
     """
     record = run.record
     if run.inputs.evaluation.picture is not None:
@@ -219,7 +219,7 @@ def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Films
     filmstrip.save(run.folder, record.outcome)
 
 
-def descend(
+def run_optimisation(
     problem: Problem,
     settings: OptimiserSettings,
     run: RunContext,
@@ -227,21 +227,21 @@ def descend(
     *,
     least_reference: float = 0.0,
 ) -> History:
-    """Runs the optimisation loop; writes its curve line by line, and its costs to the record, also if it is stopped.
+    """Runs the optimisation loop; writes its curve line by line, and its costs to the record, even if it is stopped.
 
     Args:
-        errors_at: gives the errors of the current state before an iteration, outside the timed part. A line has the
-            loss before its step; its errors are of the same parameters.
+        errors_at: returns the errors of the current state before an iteration, outside the timed part. Loss and errors
+            of a line belong to the parameters before its step.
         least_reference: see `bench.solve.optimise.optimise`.
     """
     history = History()
     checkpoints = checkpoints_of(run.inputs.evaluation.every, settings.iterations)
-    known: dict[int, dict[str, float]] = {}
+    checkpoint_errors: dict[int, dict[str, float]] = {}
     notes: list[str] = []
 
     def check(iteration: int) -> None:
         with run.off_clock():
-            known[iteration] = errors_at(iteration)
+            checkpoint_errors[iteration] = errors_at(iteration)
 
     def note_objective() -> None:
         if (value := problem.objective()) is not None:
@@ -250,7 +250,7 @@ def descend(
     with curve_file(run.folder) as write_line:
 
         def on_step(line: dict[str, Any]) -> None:
-            line |= known.get(line["iteration"], {})
+            line |= checkpoint_errors.get(line["iteration"], {})
             write_line(line)
             if history.status is RunStatus.OK and line["iteration"] + 1 in checkpoints:
                 check(line["iteration"] + 1)
@@ -265,7 +265,7 @@ def descend(
                 checked, settings, run.inputs.device, history=history, on_step=on_step, least_reference=least_reference
             )
             note_objective()
-        except NotReached as error:
+        except CannotContinue as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
         finally:
             run.record.notes = [*run.record.notes, *notes]
@@ -273,14 +273,14 @@ def descend(
     return history
 
 
-def checkpoints_of(every: int | str | None, iterations: int) -> set[int]:
-    """The iterations, counted from 0, before which the current state is evaluated: with the first also the last."""
-    if every is None:
+def checkpoints_of(interval: int | str | None, iterations: int) -> set[int]:
+    """The iterations, counted from 0, before which the current state is evaluated, with the first and the last."""
+    if interval is None:
         return set()
     last = iterations - 1
-    if every == DOUBLING:
+    if interval == DOUBLING:
         return {0, last} | {2**power for power in range(last.bit_length()) if 2**power < last}
-    return {*range(0, last, int(every)), last}
+    return {*range(0, last, int(interval)), last}
 
 
 def note_costs(
@@ -291,7 +291,7 @@ def note_costs(
     evaluations: dict[str, float],
     coarse_flops: int = 0,
 ) -> None:
-    """Notes a loop's costs in the record; `seconds` has "forward" and "backward", `flops` are without coarse ones."""
+    """Writes a loop's costs into the record; `seconds` has "forward" and "backward", `flops` excludes coarse ones."""
     record.seconds |= seconds
     record.evaluations = evaluations
     loop = seconds["forward"] + seconds["backward"]
@@ -301,8 +301,8 @@ def note_costs(
         record.gemm_fraction = seconds_at_peak(record.environment, flops, coarse_flops) / loop
 
 
-def counted(counts: Counts, field: Field) -> dict[str, float]:
-    """Evaluations of a field as they stand in a record; without hits no work is known to be needed."""
+def evaluation_counts(counts: Counts, field: Field) -> dict[str, float]:
+    """The evaluation counts of a field for the record; "work_over_bound" only with hits."""
     numbers: dict[str, float] = {"value": counts.value, "gradient": counts.gradient}
     numbers |= {name: number for name in ("coarse", "masked") if (number := getattr(counts, name))}
     if (over_bound := counts.over_bound(field)) is not None:
@@ -311,10 +311,10 @@ def counted(counts: Counts, field: Field) -> dict[str, float]:
 
 
 def _note_history(record: Record, problem: Problem, history: History) -> None:
-    """Notes the costs of a loop, also of one that was stopped."""
+    """Writes the costs of a loop into the record, even if the loop was stopped."""
     iterations = max(len(history.curve), 1)
     evaluations = {
-        **counted(history.counts, problem.field()),
+        **evaluation_counts(history.counts, problem.field()),
         "per_ray": history.counts.value / problem.rays_per_iteration / iterations,
         "rays_per_iteration": problem.rays_per_iteration,
         "observed": int(problem.observed.sum()),
@@ -326,13 +326,13 @@ def _note_history(record: Record, problem: Problem, history: History) -> None:
 
 
 def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | None:
-    """Why a run failed, or None: decided by its loss or a field without a surface, never by the truth."""
+    """Status and reason of a failed run, else None. They follow from loss and surface, never from the ground truth."""
     if history.status is not RunStatus.OK:
         return history.status, history.reason
     if after.failure is not None:
         return after.failure
     first, last = history.objectives or (history.curve[0]["total"], history.curve[-1]["total"])
     if last >= first and last > 0 and len(history.curve) > 1:
-        what = "objective" if history.objectives else "loss"
-        return RunStatus.NOT_REACHED, f"the {what} did not fall: {first:.4g} at the start, {last:.4g} at the end"
+        measure = "objective" if history.objectives else "loss"
+        return RunStatus.NOT_REACHED, f"the {measure} did not fall: {first:.4g} at the start, {last:.4g} at the end"
     return None

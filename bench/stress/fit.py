@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
-from bench.solve.observed_view import GivenView
+from bench.solve.observed_view import ObservedView
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import check_field_gradient
 from bench.stress.trial import Conditions, Failure, Outcome
@@ -118,7 +118,7 @@ def judge_fit(
         observation = DISTURBANCES[name](observation, severity, draw)
     depth, mask, device = observation.depth, observation.mask, conditions.device
     view = View(observation.camera, depth, torch.zeros(*depth.shape, 3), mask)
-    observed_view = GivenView.of(view, fit, renderer, observed=observation.observed, mask=mask, device=device)
+    observed_view = ObservedView.of(view, fit, renderer, observed=observation.observed, mask=mask, device=device)
     problem = SphereProblem(initial.to(device).requires_grad_(), observed_view, conditions.limits)
     history = History()
     settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
@@ -136,7 +136,7 @@ class SphereProblem:
     """The problem of finding a sphere's four parameters; see `bench.solve.solve.Objective`."""
 
     sphere: Float[Tensor, "4"]
-    view: GivenView
+    view: ObservedView
     limits: Limits
     counts: Counts = field(default_factory=Counts)
 

@@ -23,8 +23,8 @@ from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.observed_view import slopes_over
-from bench.solve.solve import check_field_gradient, counted
+from bench.solve.observed_view import central_differences
+from bench.solve.solve import check_field_gradient, evaluation_counts
 from datasets.scene import View
 from renderers.boundary import render_checked, silhouette_loss
 from renderers.camera import Camera, Rays
@@ -204,7 +204,7 @@ class Ablation:
         record.metrics = {"size": bench.camera.height, **numbers[BASE], "cost": bench.forward.counts.cost}
         record.metrics_start = {"pixel_errors": record.metrics["hits"]}
         record.seconds |= {name: record.metrics[f"{name}_seconds"] for name in ("forward", "backward")}
-        record.evaluations = counted(bench.step.counts, bench.decoder.at(bench.code))
+        record.evaluations = evaluation_counts(bench.step.counts, bench.decoder.at(bench.code))
         record.evaluations["per_ray"] = bench.forward.counts.value / bench.rays.shape.numel()
         record.peak_memory_bytes = bench.step.memory
         if self.beside:
@@ -379,7 +379,7 @@ class Workbench:
         if normal_width is None:
             normals[hit] = autograd_normals(field, points)
         else:
-            normals[hit] = torch.nn.functional.normalize(slopes_over(field, points, normal_width), dim=-1)
+            normals[hit] = torch.nn.functional.normalize(central_differences(field, points, normal_width), dim=-1)
         hit, distance = hit.cpu(), self.rendering.distance.cpu().double()
         return (
             View(self.camera, distance * cosine * hit, normals.cpu(), hit),

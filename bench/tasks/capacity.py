@@ -5,7 +5,7 @@ from typing import Any
 
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
 from bench.evaluate.state import State
-from bench.models.candidates import PAPERS, by_size, candidate
+from bench.models.candidates import PAPER_NETWORK, by_size, candidate
 from bench.models.field import SIZES, note_fits
 from bench.models.fit import Fitted, Fitter
 from bench.models.growth import Growth, grow
@@ -18,7 +18,7 @@ from bench.records.record import curve_file
 from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
-from bench.solve.solve import COSTS, check_field_gradient, note_result
+from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result
 from renderers.checks import check_at_least, check_choice, check_fraction, check_positive
 from renderers.rendering import final_notes
 from renderers.silhouette import SilhouetteLoss
@@ -88,9 +88,9 @@ class Capacity:
         """Fits all candidates, chooses one, checks the choice, and compares the chosen field with the truth."""
         inputs, record = run.inputs, run.record
         check_field_gradient(inputs.renderer)
-        record.definitions = DEFINITIONS | COSTS | CHOICE_DEFINITIONS
+        record.definitions = DEFINITIONS | COST_DEFINITIONS | CHOICE_DEFINITIONS
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
-        views = Views(inputs.scene.cast_on, inputs.views, models.views, self, inputs.renderer, inputs.device)
+        views = Views(inputs.scene.raycaster, inputs.views, models.views, self, inputs.renderer, inputs.device)
         max_iterations = self.rounds * models.fit.iterations
         with curve_file(run.folder) as write_line:
 
@@ -168,8 +168,8 @@ def choice_metrics(choice: Choice, evidence: list[Evidence], growth: Growth) -> 
 
 def savings(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
     """Costs of the papers' network over the chosen candidate's; runtime only if it was fitted in this run."""
-    fitted = next((fit for fit in evidence if fit.candidate == PAPERS and fit.error is not None), None)
-    papers = candidate(PAPERS)
+    fitted = next((fit for fit in evidence if fit.candidate == PAPER_NETWORK and fit.error is not None), None)
+    papers = candidate(PAPER_NETWORK)
     size = Size(papers.stored, papers.stored)
     ratios = {measure: size.by(measure) / chosen.size.by(measure) for measure in SIZE_WORDS}
     ratios["flops_per_query"] = papers.flops / chosen.flops_per_query

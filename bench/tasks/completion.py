@@ -7,17 +7,17 @@ from typing import ClassVar
 import torch
 
 from bench.models.field import solve_by_growth
-from bench.models.observations import RayObservations, hold_out, tiles, together
+from bench.models.observations import RayObservations, concatenate_views, hold_out, tiles
 from bench.pictures.colours import note_colours
 from bench.pictures.run_figures import Given
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, turned
-from bench.solve.observed_view import DEPTH_LOSSES, GivenView
+from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
+from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
-from datasets.scene import OneView, Scene, painted
+from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.rendering import Renderer
@@ -41,7 +41,7 @@ class Completion:
         normal_weight: weight of 1 minus the cosine between the normals of the rendered surface and the true ones, the
             mean over the same pixels (DIST, B.3). Above 0, the normals of these pixels are given too.
         normal_width: width of the finite differences for the rendered surface's normals, in scene units; see
-            `bench.solve.observed_view.slopes_over`.
+            `bench.solve.observed_view.central_differences`.
         colour_weight: weight of the mean absolute error of colours over pixels on the shape that hit (DIST, B.3).
             Above 0, the colours of these pixels are given, and the prior must have colours.
         silhouette: the silhouette loss.
@@ -94,7 +94,7 @@ class Completion:
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, or the requested field, and evaluates the shape before and after."""
-        run.record.notes = [*run.record.notes, *run.inputs.scene.on_depths]
+        run.record.notes = [*run.record.notes, *run.inputs.scene.measured_depth_notes]
         inputs = run.inputs
         if inputs.field.of_prior:
             state = solve_task(self, run)
@@ -120,7 +120,7 @@ class Completion:
         if not self.similarity:
             return problem()
         codes = torch.zeros(self.rotations, prior.decoder.code_length)
-        return problem(initial=codes, misplaced=turned(self.rotations), trial=self.trial)
+        return problem(initial=codes, initial_similarities=initial_rotations(self.rotations), trial=self.trial)
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
@@ -130,19 +130,23 @@ class Completion:
         observed, camera = view.observed.cpu(), scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         tile_ids = tiles(*observed.shape)
-        rays = hold_out(together([view]), tile_ids, share=HELD_OUT_FRACTION, whole=(), footprint=half_pixel, seed=seed)
-        return rays, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
+        rays = hold_out(
+            concatenate_views([view]), tile_ids, share=HELD_OUT_FRACTION, entire=(), footprint=half_pixel, seed=seed
+        )
+        return rays, Given(
+            scene.observed_view(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None
+        )
 
-    def _observed_view(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> GivenView:
+    def _observed_view(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:
         """The observed part of a scene's view."""
-        view, measured = scene.given(exact=self.depths == EXACT)
+        view, measured = scene.observed_view(exact=self.depths == EXACT)
         observed = observed_pixels(measured, self.points, seed)
         mask = view.mask if self.mask or self.points == "dense" else None
-        observed_view = GivenView.of(view, self, renderer, observed=observed, mask=mask, device=device)
+        observed_view = ObservedView.of(view, self, renderer, observed=observed, mask=mask, device=device)
         if self.normal_weight:
             normal_settings = {"normal_weight": self.normal_weight, "normal_width": self.normal_width}
             observed_view = replace(observed_view, normals=view.normals.to(device), **normal_settings)
         if self.colour_weight:
-            image = painted(view, scene.texture).where(view.mask[..., None], torch.nan)
+            image = unshaded_image(view, scene.texture).where(view.mask[..., None], torch.nan)
             observed_view = replace(observed_view, colours=image.to(device), colour_weight=self.colour_weight)
         return observed_view

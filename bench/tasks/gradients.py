@@ -12,7 +12,7 @@ from bench.evaluate.finite_differences import Paint, differences, image_differen
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.observed_view import slopes_at
+from bench.solve.observed_view import gradients_at
 from bench.solve.solve import check_field_gradient
 from renderers.boundary import check_gradients, render_checked
 from renderers.camera import Camera, Rays, sphere_span
@@ -215,7 +215,7 @@ class Subject:
         outputs = rendering.distance[rows, None]
         if paint is not None:
             points = rendering.points[rows]
-            outputs = Paint(*weights)(points, slopes_at(field, points)) if len(rows) else outputs.expand(-1, 3)
+            outputs = Paint(*weights)(points, gradients_at(field, points)) if len(rows) else outputs.expand(-1, 3)
         parameters = (code, twist, *weights)
         tables = [torch.zeros(len(pixels), outputs.shape[1], len(values), dtype=torch.float64) for values in parameters]
         for index, row in enumerate(rows.tolist()):

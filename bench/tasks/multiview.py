@@ -17,9 +17,9 @@ from bench.reconstruct.subject import NONE, Depths, PhotographTask, Subject, upr
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.single_view.encoder import EncoderSettings
-from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, turned
-from bench.solve.optimise import NotReached, OptimiserSettings, StartSettings
-from bench.solve.solve import COSTS, check_field_gradient, defined, descend, solve
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
+from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings
+from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, metric_definitions, run_optimisation, solve
 from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot
@@ -147,13 +147,13 @@ class Multiview(PhotographTask):
                     code.data += mean_code.to(code)
             return built
 
-        solve(problem, self.optimiser, run, defined(inputs), gallery=True)
+        solve(problem, self.optimiser, run, metric_definitions(inputs), gallery=True)
 
     def _execute_on_photographs(self, run: RunContext) -> None:
         """Optimises the code for the user's photographs, and evaluates the shape on the held-out ones."""
         inputs, record = run.inputs, run.record
         check_field_gradient(inputs.renderer)
-        record.definitions = COLOURED_DEFINITIONS | COSTS
+        record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
         subject = self.subject(inputs)
         record.notes = [*record.notes, subject.summary]
         photometric_loss = PhotometricLoss(self, inputs.renderer, subject.input_shots, inputs.device, from_user=True)
@@ -169,7 +169,7 @@ class Multiview(PhotographTask):
 
         with run.off_clock():
             record.metrics_start = judge_mesh(mesh(), subject, inputs).metrics
-        history = descend(problem, self.optimiser, run, scores)
+        history = run_optimisation(problem, self.optimiser, run, scores)
         with run.off_clock():
             note_surface(run, mesh(), subject, {}, history, problem.field())
             draw_curve(run.folder / "curve.png", history.curve)
@@ -181,7 +181,7 @@ class Multiview(PhotographTask):
         return upright(subject) if self.similarity else subject
 
     def judged(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a run's final field; see `bench.setup.inputs.Judges`."""
+        """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
         if run.inputs.photographed is None:
             return evaluate(State(field, run.inputs)).metrics
         subject = self.subject(run.inputs)
@@ -195,7 +195,7 @@ class Multiview(PhotographTask):
         check_field_gradient(renderer)
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
-        photographs = self.images.take(scene.cast_on, scene.view.camera.zoomed(self.focal), seed=scene_seed)
+        photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
         return self._problem(prior, PhotometricLoss(self, renderer, photographs, device), generator)
 
     def _problem(self, prior: Prior, photometric_loss: "PhotometricLoss", generator: torch.Generator) -> CodeProblem:
@@ -213,10 +213,12 @@ class Multiview(PhotographTask):
             2 * photometric_loss.per_step * observed.numel(),
             photometric_loss.colours.device,
             initial=codes,
-            misplaced=turned(self.starts) if photometric_loss.from_user and self.similarity else misplaced,
+            initial_similarities=initial_rotations(self.starts)
+            if photometric_loss.from_user and self.similarity
+            else misplaced,
             trial=self.trial,
             photographs=photometric_loss.colours.cpu().numpy(),
-            compared_at=self.optimiser.iterations,  # images are no longer blurred
+            comparison_iteration=self.optimiser.iterations,  # images are no longer blurred
         )
 
     def _initial_similarity(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
@@ -269,7 +271,7 @@ class PhotometricLoss:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
 
         Raises:
-            NotReached: if no pixel is visible in both views.
+            CannotContinue: if no pixel is visible in both views.
         """
         renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration)
         colours = self.images_at(iteration)
@@ -288,7 +290,7 @@ class PhotometricLoss:
             differences.append((warped - colours[view][visible]).abs().mean(-1))
         errors = torch.cat(differences)
         if not len(errors):
-            raise NotReached(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
+            raise CannotContinue(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
         terms = {"photometric": self.settings.photometric_weight * errors.mean()}
         if self.masks is not None:
             observation = RayObservation(self.masks[views], torch.full_like(rendering.distance, torch.nan))

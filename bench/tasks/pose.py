@@ -92,7 +92,7 @@ class PoseTask(ABC):
             scene: the known mesh and the observed view.
             rendering: the view of the renderer under test from the estimated camera, if any.
         """
-        mesh_view, true = see(scene.cast_on, estimate), scene.view
+        mesh_view, true = see(scene.raycaster, estimate), scene.view
         images = view_metrics(mesh_view, true) | ({} if rendering is None else view_metrics(rendering, true, OWN))
         metrics = self.metrics(estimate, true.camera)
         rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
@@ -166,7 +166,7 @@ def build_shape_field(settings: Pose, inputs: RunInputs) -> Field:
     if settings.shape == "prior":
         fitted = inputs.fitted()
         return fitted.decoder.to(inputs.device).requires_grad_(False).at(fitted.codes[0].to(inputs.device))
-    values = inputs.scene.cast_on.distance_grid(settings.grid, REACH)
+    values = inputs.scene.raycaster.distance_grid(settings.grid, REACH)
     return Grid(torch.from_numpy(values).to(inputs.device), REACH)
 
 
@@ -222,7 +222,7 @@ class PoseProblem:
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
-        start, step = self.starts.turn(iteration)
+        start, step = self.starts.assignment(iteration)
         camera = self.cameras[start].with_object_moved(self.parameters[start])
         renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.shape_field, self.counts)
         rendering = render_checked(renderer, metered, rays)

@@ -87,7 +87,7 @@ class Reconstruction(PhotographTask):
         seconds["trials"] = choice.seconds
 
     def judged(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a run's final field; see `bench.setup.inputs.Judges`."""
+        """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
         subject = self.subject(run.inputs)
         evaluation = judge(State(field, run.inputs), subject)
         return evaluation.metrics | subject.point_metrics(evaluation.mesh, run.inputs)

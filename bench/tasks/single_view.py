@@ -18,13 +18,13 @@ from bench.reconstruct.surfaces import with_colours
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext, RunInputs
-from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
-from bench.single_view.images import ImagesOf, Imaging
+from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_similar_shape
+from bench.single_view.images import Imaging, ShapeImages
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.own_image import best_view, read_picture
 from bench.single_view.store import Recipe, overlap
 from bench.single_view.training import Supervision, TrainingSettings
-from bench.solve.solve import COSTS, check_field_gradient, descend, note_result
+from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result, run_optimisation
 from datasets.photographs import Photography
 from datasets.scene import Split, Truth
 from datasets.views import check_elevation
@@ -148,7 +148,7 @@ class OneImage:
         if self.image_path is not None:
             self._infer_picture(run, recipe, Path(self.image_path))
             return
-        record.definitions = DEFINITIONS | COSTS | TRAINING_DEFINITIONS
+        record.definitions = DEFINITIONS | COST_DEFINITIONS | TRAINING_DEFINITIONS
         images, subject = self._images(run, recipe)
         if self.method == NETWORK:
             self._infer_shape(run, recipe, images, subject)
@@ -167,15 +167,15 @@ class OneImage:
         mesh = coloured(field, subject, run.inputs)
         return judge_mesh(mesh, subject, run.inputs).metrics | {"iou": overlap(field, images, run.inputs.device)}
 
-    def _images(self, run: RunContext, recipe: Recipe) -> tuple[ImagesOf, Subject]:
+    def _images(self, run: RunContext, recipe: Recipe) -> tuple[ShapeImages, Subject]:
         """The images of the scene's shape, and the subject: the input image, with all others held out."""
         config = run.record.config
-        images = recipe.imaging.of_shape(recipe.dataset, Split(config["split"]), config["index"])
+        images = recipe.imaging.shape_images(recipe.dataset, Split(config["split"]), config["index"])
         shots = images.shots()
         others = tuple(shot for index, shot in enumerate(shots) if index != self.given)
         return images, Subject((shots[self.given],), others or shots, run.inputs.scene.mesh, "")
 
-    def _infer_shape(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
+    def _infer_shape(self, run: RunContext, recipe: Recipe, images: ShapeImages, subject: Subject) -> None:
         """Infers the shape by the network; the initial metrics are the mean code's."""
         inputs, record = run.inputs, run.record
         model, trained = self._network(run, recipe)
@@ -214,7 +214,7 @@ class OneImage:
     def _infer_picture(self, run: RunContext, recipe: Recipe, path: Path) -> None:
         """Infers the shape of the user's picture, and finds the view that matches the picture best."""
         inputs, record = run.inputs, run.record
-        record.scene, record.definitions = path.name, PICTURE_DEFINITIONS | COSTS | TRAINING_DEFINITIONS
+        record.scene, record.definitions = path.name, PICTURE_DEFINITIONS | COST_DEFINITIONS | TRAINING_DEFINITIONS
         model, trained = self._network(run, recipe)
         mask = None if self.mask_path is None else Path(self.mask_path)
         picture, warnings = read_picture(path, mask, self.image_pixels, trained["filled"])
@@ -234,26 +234,26 @@ class OneImage:
             if inputs.evaluation.picture is not None:
                 draw_picture(run.folder, mesh, picture, camera, inputs.evaluation.picture, record.outcome)
 
-    def _evaluate(self, state: State, images: ImagesOf, subject: Subject) -> Evaluation:
+    def _evaluate(self, state: State, images: ShapeImages, subject: Subject) -> Evaluation:
         """The scores of a network's shape; scores of colours only if its training used colours."""
         evaluation = judge(state, subject)
         excluded = () if self.knows_colours else COLOUR_SCORES
         scores = {name: x for name, x in evaluation.metrics.items() if name.removeprefix(OWN) not in excluded}
         return replace(evaluation, metrics=scores | {"iou": overlap(state.field, images, state.inputs.device)})
 
-    def _search(self, run: RunContext, images: ImagesOf, subject: Subject) -> None:
+    def _search(self, run: RunContext, images: ShapeImages, subject: Subject) -> None:
         """Searches the prior's code; the shape gets the colours of the input image."""
         inputs = run.inputs
         problem = self.search.problem(subject.input_shots[0], inputs)
         check_kind(inputs.renderer, problem.field())
         settings, least = self.search.optimiser, self.search.least_reference
-        history = descend(problem, settings, run, lambda iteration: {}, least_reference=least)
+        history = run_optimisation(problem, settings, run, lambda iteration: {}, least_reference=least)
         with run.off_clock():
             field = problem.field()
             scores = {"iou": overlap(field, images, inputs.device)}
             note_surface(run, coloured(field, subject, inputs), subject, scores, history, field)
 
-    def _look_up(self, run: RunContext, recipe: Recipe, images: ImagesOf, subject: Subject) -> None:
+    def _look_up(self, run: RunContext, recipe: Recipe, images: ShapeImages, subject: Subject) -> None:
         """Takes a training shape or the mean shape, with the colours of its images."""
         inputs, record, count = run.inputs, run.record, self.shapes
         record.notes = [*record.notes, "no network and no renderer took part"]
@@ -263,7 +263,7 @@ class OneImage:
             others = recipe.imaging.images(recipe.dataset, Split.TRAIN, count, inputs.cache, run.progress)
             with run.on_clock():
                 if self.method == NEAREST:
-                    index = most_alike(images.image(self.given), others)
+                    index = most_similar_shape(images.image(self.given), others)
                 else:
                     index = best_shape(inputs.scene.mesh, recipe.dataset, count)
             mesh, shots = recipe.dataset.mesh(Split.TRAIN, index), others[index].shots()

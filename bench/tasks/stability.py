@@ -14,7 +14,7 @@ from bench.stress import fit, judge
 from bench.stress.axes import Stress
 from bench.stress.search import Bisection, Search, SearchSettings
 from bench.stress.trial import Conditions, Criteria, Failure, FitSettings, Trial
-from datasets.network_files import Networked
+from datasets.network_files import HasNetwork
 from datasets.stress.distortions import NETWORK_DISTORTIONS
 from renderers.checks import BadInput, check_at_least
 from renderers.rendering import Renderer, Unsupported
@@ -64,7 +64,7 @@ class Stability:
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput for a user's network under a stress that does not use it."""
-        if not isinstance(inputs.dataset, Networked):
+        if not isinstance(inputs.dataset, HasNetwork):
             return
         scene, stresses = self.stress.scene, ", ".join(NETWORK_DISTORTIONS)
         if scene not in NETWORK_DISTORTIONS:

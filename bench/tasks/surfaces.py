@@ -11,7 +11,7 @@ from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
 from bench.reconstruct.subject import NO_HULL, PhotographTask, Subject
 from bench.reconstruct.surfaces import fuse_clouds, given_clouds, measured_clouds, poisson, with_colours
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.solve import COSTS
+from bench.solve.solve import COST_DEFINITIONS
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh
 from renderers.checks import BadInput, check_at_least
@@ -28,7 +28,7 @@ class _Surface(PhotographTask):
     def execute(self, run: RunContext) -> None:
         """Computes the surface of the input photographs with their colours, and evaluates it on the held-out ones."""
         record = run.record
-        record.definitions = COLOURED_DEFINITIONS | COSTS
+        record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
         subject = self.subject(run.inputs)
         record.notes = [*record.notes, subject.summary, "no renderer took part"]
         with run.on_clock():

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from datasets.captures.frames import Frame, Layout, rigid_matrix
 from datasets.captures.lenses import colmap_lens
 from datasets.captures.pairing import find_images, find_masks, images_in, unpaired_note
-from datasets.extras import install
+from datasets.extras import install_command
 from renderers.checks import BadInput
 
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "image", ".")
@@ -30,7 +30,7 @@ def read_colmap(folder: Path, files: Sequence[Path], masked: bool, images: str |
     try:
         import pycolmap
     except ImportError as error:
-        raise BadInput(f"{folders[0]} is read by pycolmap: {install('colmap')}") from error
+        raise BadInput(f"{folders[0]} is read by pycolmap: {install_command('colmap')}") from error
     models = {model_folder: pycolmap.Reconstruction(str(model_folder)) for model_folder in folders}
     model_folder = max(folders, key=lambda candidate: len(models[candidate].images))  # the first of equal ones
     cameras = _cameras(models[model_folder], model_folder)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from datasets.extras import install
+from datasets.extras import install_command
 from renderers.checks import BadInput
 
 
@@ -31,7 +31,7 @@ def read_depth_file(path: Path, remedy: str) -> Float[np.ndarray, "height width"
     try:
         import cv2
     except ImportError as error:
-        raise BadInput(f"{path} is read by OpenCV: {install('stereo')}, or {remedy}") from error
+        raise BadInput(f"{path} is read by OpenCV: {install_command('stereo')}, or {remedy}") from error
     try:
         channels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from datasets.deform import STRETCH, TAPER, TWIST, Deformation
+from datasets.deform import MAX_LOG_SCALE, MAX_TAPER, MAX_TWIST_RADIANS, Deformation
 from tests.looped import each
 from tests.tiny import icosphere
 
@@ -29,9 +29,9 @@ def test_strength_zero_is_the_identity_and_strength_scales_the_same_kind():
 def test_the_parameters_fill_their_ranges():
     drawn = [Deformation.draw(seed) for seed in range(200)]
     for values, limit in [
-        ([one.stretch for one in drawn], STRETCH),
-        ([one.taper for one in drawn], TAPER),
-        ([one.twist for one in drawn], TWIST),
+        ([one.stretch for one in drawn], MAX_LOG_SCALE),
+        ([one.taper for one in drawn], MAX_TAPER),
+        ([one.twist for one in drawn], MAX_TWIST_RADIANS),
     ]:
         assert 0.95 * limit < np.max(values) <= limit
         assert -limit <= np.min(values) < -0.95 * limit

@@ -61,7 +61,7 @@ def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, suffix, pi
         cv2.imwrite(str(folder / "depth.exr"), np.array(Image.open(folder / "depth.png"), np.float32))
     changed = {"camera_to_world": None} if unknown else {"mask_path": str(folder / "mask.png")}
     scene = depth_image(made, path=str(folder / f"depth{suffix}"), **changed).placed(pixels)
-    view, known = scene.given()
+    view, known = scene.observed_view()
     points = view.camera.rays().at(view.camera.distance(view.depth))[known].double().numpy()
     assert OBJECT_RADIUS < np.linalg.norm(points, axis=1).max() < 1 and known.sum() > pixels
     assert scene.part and max(known.shape) <= pixels and torch.equal(known, view.mask)
@@ -148,7 +148,7 @@ def test_a_number_that_is_no_depth_is_none_also_on_the_object(made, tmp_path, od
     depths[::2] = odd
     np.save(tmp_path / "odd.npy", depths)
     scene = depth_image(made, path=str(tmp_path / "odd.npy"), mask_path=str(folder / "mask.png")).placed(200)
-    assert (scene.measured >= 0).all() and scene.given()[1].sum() == mask[1::2].sum()
+    assert (scene.measured >= 0).all() and scene.observed_view()[1].sum() == mask[1::2].sum()
 
 
 def test_a_pixel_that_flies_behind_the_outline_does_not_shrink_the_object(made, tmp_path):

@@ -23,7 +23,7 @@ def test_a_sphere_has_its_radius_its_place_and_faces_that_wind_outward():
     assert radii.max() < 0.501
     assert mesh.watertight
     assert mesh.volume == pytest.approx(4 / 3 * torch.pi * 0.5**3, rel=0.01)
-    assert ((out[mesh.faces[:, 0]] * mesh.crosses).sum(1) > 0).all()
+    assert ((out[mesh.faces[:, 0]] * mesh.area_normals).sum(1) > 0).all()
 
 
 def test_each_axis_keeps_its_own_size():

@@ -10,7 +10,7 @@ import torch
 from bench.config import load
 from bench.records.record import digest
 from bench.tables import CONF, choices_of
-from datasets.families import BUILDERS, HALF_GRID, Family
+from datasets.families import BUILDERS, CUBE_HALF_SIDE, Family
 from datasets.scene import SPLIT_STRIDE, Split, seed_of
 from renderers.field import Kind, autograd_gradients
 from tests.looped import each
@@ -70,9 +70,9 @@ def test_each_parameter_changes_the_shape(family):
 
 @by_family
 def test_shapes_stay_clear_of_the_sampled_cube(family):
-    faces = torch.empty(20_000, 3).uniform_(-HALF_GRID, HALF_GRID, generator=torch.Generator().manual_seed(0))
+    faces = torch.empty(20_000, 3).uniform_(-CUBE_HALF_SIDE, CUBE_HALF_SIDE, generator=torch.Generator().manual_seed(0))
     rows = torch.arange(len(faces))
-    faces[rows, rows % 3] = HALF_GRID * faces[rows, rows % 3].sign()
+    faces[rows, rows % 3] = CUBE_HALF_SIDE * faces[rows, rows % 3].sign()
     widest = {name: high for name, (_, high) in family.ranges.items()}
     for parameters in (widest, *(family.draw(Split.TRAIN, index) for index in range(10))):
         assert not inside(family, parameters, faces).any()

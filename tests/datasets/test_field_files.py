@@ -10,10 +10,10 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 import bench
-from bench.models.candidates import PARTS
+from bench.models.candidates import PRIMITIVES
 from bench.records.read import RESULTS
 from datasets import field_files
-from datasets.field_files import FIELD, load_field, load_network, save_field
+from datasets.field_files import FIELD_FILE, load_field, load_network, save_field
 from renderers.checks import BadInput
 from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields.analytic import sphere
@@ -60,7 +60,11 @@ FIELDS = {
     "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
     "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,
     "occupancy_at_code": lambda: ScaledOccupancyOf(OccupancyNetwork(width=8, code_length=3).at(numbers(3))),
-    **{name: lambda n=name: formula(n, numbers(PARTS[n].size), Flops(1, 2)) for name in FORMULAS if name != "union"},
+    **{
+        name: lambda n=name: formula(n, numbers(PRIMITIVES[n].size), Flops(1, 2))
+        for name in FORMULAS
+        if name != "union"
+    },
     "union": lambda: formula("union", numbers(3, 10), Flops(3, 6)),
 }
 
@@ -68,7 +72,7 @@ FIELDS = {
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_field_that_is_read_has_the_same_values_and_says_the_same_of_itself(name, tmp_path):
     field = FIELDS[name]()
-    assert save_field(field, tmp_path / FIELD) is None
+    assert save_field(field, tmp_path / FIELD_FILE) is None
     found = bench.load_field(tmp_path)
     assert type(found) is type(field)
     torch.testing.assert_close(found(POINTS), field(POINTS).detach(), rtol=0, atol=1e-6)
@@ -81,7 +85,7 @@ def test_a_field_that_is_read_has_the_same_values_and_says_the_same_of_itself(na
 @pytest.mark.parametrize("name", ["decoder", "coloured", "union"])
 def test_it_is_a_network_whose_code_is_its_place(name, tmp_path):
     field = FIELDS[name]()
-    save_field(field, tmp_path / FIELD)
+    save_field(field, tmp_path / FIELD_FILE)
     network = load_network(tmp_path)
     place = torch.tensor([0.1, 0.0, -0.1])
     torch.testing.assert_close(network.at(place)(POINTS), field(POINTS - place).detach(), rtol=0, atol=1e-5)
@@ -100,8 +104,8 @@ class Own(nn.Module):
     (FIELDS["coloured"](), "0 MB are the most"),
 ])  # fmt: skip
 def test_a_class_of_the_users_or_a_large_field_is_told_and_left_out(field, words, tmp_path, monkeypatch):
-    monkeypatch.setattr(field_files, "MOST", 1000)
-    assert words in (save_field(field, tmp_path / FIELD) or "")
+    monkeypatch.setattr(field_files, "MAX_FIELD_BYTES", 1000)
+    assert words in (save_field(field, tmp_path / FIELD_FILE) or "")
     assert not [*tmp_path.iterdir()]
 
 
@@ -116,14 +120,14 @@ def test_the_name_of_a_run_is_enough_where_runs_are_by_default(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     folder = Path(RESULTS, "runs", "one")
     folder.mkdir(parents=True)
-    save_field(FIELDS["decoder"](), folder / FIELD)
+    save_field(FIELDS["decoder"](), folder / FIELD_FILE)
     assert torch.equal(load_field("one")(POINTS), load_field(folder)(POINTS))
 
 
 @pytest.mark.parametrize("spoil, words", [
     (lambda path: path.write_bytes(path.read_bytes()[:-100]), "may be cut short"),
     (lambda path: path.write_bytes(b""), "may be cut short"),
-    (Path.unlink, f"has no {FIELD}: a task that looks for no field, such as ablation"),
+    (Path.unlink, f"has no {FIELD_FILE}: a task that looks for no field, such as ablation"),
     (lambda path: shutil.rmtree(path.parent), "there is nothing at .*: give the folder of a run"),
     (lambda path: save_file(load_file(path), path), "version None of fields"),
     (lambda path: changed(path, "Linear", "Popen"), "'Popen', which is none of ours"),
@@ -133,7 +137,7 @@ def test_the_name_of_a_run_is_enough_where_runs_are_by_default(tmp_path, monkeyp
     (lambda path: changed(path, '"t0"', '"t99"'), "its parts do not fit"),
 ])  # fmt: skip
 def test_a_file_that_will_not_do_is_refused_with_the_cause(spoil, words, tmp_path):
-    save_field(FIELDS["coloured"](), tmp_path / FIELD)
-    spoil(tmp_path / FIELD)
+    save_field(FIELDS["coloured"](), tmp_path / FIELD_FILE)
+    spoil(tmp_path / FIELD_FILE)
     with pytest.raises(BadInput, match=words):
         load_field(tmp_path)

@@ -145,17 +145,17 @@ def test_a_mesh_that_took_long_to_repair_is_kept_until_its_file_changes(tmp_path
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(module, "load_mesh", lambda path: asked.append(path) or load_mesh(path))
     path = write_box(tmp_path / "box.ply")
-    module.repaired(path)
+    module.load_repaired(path)
     assert not (tmp_path / "cache").exists()  # as that was quick
-    monkeypatch.setattr(module, "SLOW", -1.0)
+    monkeypatch.setattr(module, "MIN_CACHED_SECONDS", -1.0)
     half = trimesh.creation.box((1.0, 0.6, 0.4))
     half.update_faces(range(10))
     half.export(path)
-    first, again = module.repaired(path), module.repaired(path)
+    first, again = module.load_repaired(path), module.load_repaired(path)
     assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
     assert first.repairs == again.repairs != () and len(asked) == 2
     (kept,) = (tmp_path / "cache").rglob("*.npz")
     kept.write_bytes(kept.read_bytes()[:200])
-    assert np.array_equal(module.repaired(path).faces, first.faces) and len(asked) == 3
+    assert np.array_equal(module.load_repaired(path).faces, first.faces) and len(asked) == 3
     write_box(path)
-    assert module.repaired(path).repairs == () and len(asked) == 4
+    assert module.load_repaired(path).repairs == () and len(asked) == 4

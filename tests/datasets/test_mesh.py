@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets.mesh import Mesh, joined, normalise
+from datasets.mesh import Mesh, concatenate_meshes, normalise
 from tests.looped import each
 from tests.tiny import mesh_of
 
@@ -28,7 +28,7 @@ def test_volume_is_negative_inside_out_and_does_not_move_with_the_mesh():
 
 def test_two_boxes_are_two_parts():
     mesh = box((1, 1, 1))
-    both = joined([mesh, Mesh(2 * mesh.vertices + 9, mesh.faces)])
+    both = concatenate_meshes([mesh, Mesh(2 * mesh.vertices + 9, mesh.faces)])
     assert both.parts.tolist() == [0] * 12 + [1] * 12
     assert both.part_volumes == pytest.approx([1, 8])
 

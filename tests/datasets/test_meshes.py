@@ -12,9 +12,9 @@ import trimesh
 
 from bench.reconstruct.surfaces import poisson
 from datasets.mesh import Mesh
-from datasets.mesh import joined as as_one
+from datasets.mesh import concatenate_meshes as as_one
 from datasets.meshes import find_meshes, load_mesh, read_mesh, read_pieces, read_points, repair
-from datasets.repair import UNSEEN
+from datasets.repair import NOT_CHECKED_NOTE
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.looped import each
@@ -200,7 +200,7 @@ def test_corners_less_than_a_millionth_of_the_diagonal_apart_are_one(scale, back
     repaired = repair(Mesh(scale * (corners + shifts), np.arange(36).reshape(-1, 3)))
     assert (len(repaired.vertices), repaired.watertight) == (8, True)
     assert repaired.volume == pytest.approx(scale**3, rel=1e-5)
-    assert repaired.repairs == (() if backend else (UNSEEN,))
+    assert repaired.repairs == (() if backend else (NOT_CHECKED_NOTE,))
 
 
 @each("name", REPAIRED)

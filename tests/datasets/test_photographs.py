@@ -10,7 +10,7 @@ import torch
 from bench.tasks.multiview import sample
 from datasets.photographs import MAX_ELEVATION_DEGREES, Photography, around, turned
 from datasets.scene import Truth
-from datasets.textures import ONE_COLOUR, PHOTOGRAPHS, TEXTURES, make_texture
+from datasets.textures import ONE_COLOUR, SKIMAGE_PHOTOGRAPHS, TEXTURES, make_texture
 from tests.looped import each
 from tests.tiny import camera_of, icosphere
 
@@ -51,7 +51,7 @@ def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
 
 
 def test_each_axis_sees_its_own_projection():
-    texture = make_texture(PHOTOGRAPHS[0], 1.0, seed=0)
+    texture = make_texture(SKIMAGE_PHOTOGRAPHS[0], 1.0, seed=0)
     along = np.array([[0.9, 0.2, 0.3], [0.1, 0.2, 0.3]])  # the same place but for x, seen along x
     same = texture(along, np.array([[1.0, 0, 0], [1, 0, 0]]))
     assert same[0] == pytest.approx(same[1])

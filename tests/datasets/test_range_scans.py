@@ -43,8 +43,8 @@ def test_the_camera_stands_where_the_scanner_did(folder, index, turn):
 @each("index", range(len(TURNS)))
 def test_depths_are_those_of_the_surface_that_was_scanned(folder, index):
     scene = make_scene(scans(folder), FAR, split=Split.TEST, index=index)
-    view, known = scene.given()
-    exact, both = scene.given(exact=True)
+    view, known = scene.observed_view()
+    exact, both = scene.observed_view(exact=True)
     assert torch.equal(known, both) and not (known & ~scene.view.mask).any()
     assert torch.equal(exact.depth, scene.view.depth) and torch.equal(view.mask, scene.view.mask)
     assert 0.9 * scene.view.mask.sum() < known.sum() <= scene.view.mask.sum()
@@ -57,10 +57,10 @@ def test_depths_are_those_of_the_surface_that_was_scanned(folder, index):
 
 def test_noise_stays_in_the_depths_and_is_told(tmp_path):
     scene = make_scene(scans(write_scans(tmp_path, noise=0.002)), FAR, split=Split.TEST, index=0)
-    _, both = scene.given(exact=True)
+    _, both = scene.observed_view(exact=True)
     off = (scene.measured - scene.view.depth)[both].abs()
     assert 0.4 < float(off.median()) / (0.6745 * 0.002 * 0.97 / RADIUS) < 1.3  # half of a Gaussian is within .6745 s.d.
-    (note,) = scene.on_depths
+    (note,) = scene.measured_depth_notes
     assert note.startswith(f"measured: {int(both.sum())} of the shape's {int(scene.view.mask.sum())} pixels")
     half, most = off.quantile(torch.tensor([0.5, 0.95])).tolist()
     assert f"within {half:.2g} scene units of the mesh, 95 % within {most:.2g};" in note and most > 2 * half

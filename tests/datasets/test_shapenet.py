@@ -237,4 +237,4 @@ def test_images_of_others_take_the_place_of_rendered_ones(v2, renders, tmp_path)
 def test_images_that_do_not_fit_are_refused(v2, renders, changes, imaging, told):
     dataset = shapenet(v2, **{"normalised": "onet", "renders": str(renders)} | changes)
     with pytest.raises(BadInput, match=told):
-        imaging.of_shape(dataset, Split.TRAIN, 0)
+        imaging.shape_images(dataset, Split.TRAIN, 0)

@@ -65,7 +65,7 @@ def test_the_true_mesh_has_the_distance_of_two_independent_samplings(inputs):
 def test_a_part_of_the_truth_only_judges_whether_it_is_in_the_prediction(inputs):
     whole = inputs.scene.mesh
     half = replace(whole, faces=whole.faces[(whole.vertices[whole.faces][..., 2] > 0).all(axis=1)])
-    scene = replace(inputs.scene, mesh=half, part=True)
+    scene = replace(inputs.scene, mesh=half, is_partial=True)
     state = State(sphere(RADIUS), replace(inputs, make_scene=lambda: scene))
     metrics = evaluate(state).metrics
     assert metrics.keys() & WORST_SURFACE.keys() == {"completeness", "chamfer_gt_to_pred"} and chamfer_only(state) == {}

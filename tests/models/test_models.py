@@ -9,18 +9,18 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.models.candidates import PAPERS, REACH, by_size, candidate
-from bench.models.field import rendered
-from bench.models.fit import SCREENING, FitProblem, Fitter, scattered
+from bench.models.candidates import PAPER_NETWORK, REACH, by_size, candidate
+from bench.models.field import rendered_curve
+from bench.models.fit import SCREENING, FitProblem, Fitter, scatter_points
 from bench.models.growth import _is_better, cost, grow
-from bench.models.held_out import MISSED, HeldOutError
-from bench.models.model import Evidence, Model, Seen, Size
-from bench.models.observations import FREE, Views, hold_out, together
+from bench.models.held_out import MISSED_FOOTPRINTS, HeldOutError
+from bench.models.model import Evidence, Model, Size, StartInputs
+from bench.models.observations import FREE_POINTS_PER_RAY, Views, concatenate_views, hold_out
 from bench.models.study import choose, fit_all, refit
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
-from bench.solve.observed_view import GivenView
+from bench.solve.observed_view import ObservedView
 from datasets.mesh import extract
 from datasets.scene import Truth, see
 from datasets.views import ViewSampler
@@ -88,7 +88,7 @@ def evidence_of(name: str, size: int | Size, error: HeldOutError | None) -> Evid
 @each("name", SIZES)
 def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
     ball = Model("sphere", [torch.zeros(1, requires_grad=True)], lambda free: sphere(0.5), 0.1, metric=True)
-    seen = Seen(points(500).float(), ball, 0, CPU)
+    seen = StartInputs(points(500).float(), ball, 0, CPU)
     for model in candidate(name).starts(seen):
         assert model.size == Size(SIZES[name], SIZES[name])
         assert model.size.bytes == 4 * SIZES[name]
@@ -146,7 +146,7 @@ def test_a_superquadric_is_a_bound(powers):
 
 def test_a_grids_free_samples_lie_near_the_surface_and_the_rest_stays():
     ball = Model("sphere", [torch.zeros(1)], lambda free: sphere(0.5), 0.1, metric=True)
-    (model,) = candidate("grid_24").starts(Seen(torch.tensor([[0.9, 0.9, 0.9]]), ball, 0, CPU))
+    (model,) = candidate("grid_24").starts(StartInputs(torch.tensor([[0.9, 0.9, 0.9]]), ball, 0, CPU))
     cell = 2 * REACH / 23
     shell = 4 * np.pi * 0.5**2 * 4 * cell / cell**3  # two cells to both sides
     assert model.size.free == pytest.approx(shell + 4**3, rel=0.15)
@@ -163,9 +163,12 @@ def test_a_grids_free_samples_lie_near_the_surface_and_the_rest_stays():
 def test_a_union_keeps_the_parts_of_a_smaller_one():
     old = torch.tensor([[0.0] * 6 + [-1.0] * 3 + [0.0], [0.5] + [0.0] * 5 + [-2.0] * 3 + [0.0]], requires_grad=True)
     smaller = Model("union_2", [old], lambda free: FORMULAS["union"](free[0]), 0.1, metric=True)
-    *_, kept = candidate("union_3").starts(Seen(points(400).float(), smaller, 0, CPU))
+    *_, kept = candidate("union_3").starts(StartInputs(points(400).float(), smaller, 0, CPU))
     assert torch.equal(kept.parameters[0][:2], old)
-    assert len(candidate("union_3").starts(Seen(points(400).float(), None, 0, CPU))) == candidate("union_3").tries - 1
+    assert (
+        len(candidate("union_3").starts(StartInputs(points(400).float(), None, 0, CPU)))
+        == candidate("union_3").tries - 1
+    )
 
 
 def test_the_error_is_the_surface_offset_along_its_normal():
@@ -179,7 +182,7 @@ def test_the_error_is_the_surface_offset_along_its_normal():
     smaller = observations.error(sphere(0.6 - 0.3 * footprint, (0.1, 0.0, -0.1))).sums.sum(0)
     assert smaller[2] / smaller[3] == pytest.approx(alone / either, rel=0.5)
     nothing = observations.error(sphere(0.01, (0.0, 0.0, 0.9)))
-    assert nothing.mean == pytest.approx(MISSED * footprint, rel=1e-3)
+    assert nothing.mean == pytest.approx(MISSED_FOOTPRINTS * footprint, rel=1e-3)
 
 
 def test_groups_give_the_standard_error_of_a_mean():
@@ -191,24 +194,24 @@ def test_groups_give_the_standard_error_of_a_mean():
     assert shifted.noise_of_difference(found) == pytest.approx(0, abs=1e-12)
     lost = HeldOutError(np.array([[0.0, 0, 5, 10], [0.05, 5, 5, 10]]), 0.1)
     assert lost.mean == pytest.approx(0.5 * 0.01 + 0.5 * 0.1)
-    assert lost.some(np.array([1])).mean == pytest.approx(0.5 * 0.01 + 0.5 * 0.1)
+    assert lost.select(np.array([1])).mean == pytest.approx(0.5 * 0.01 + 0.5 * 0.1)
 
 
 def test_held_out_rays_are_not_given():
     views = [see(shape_of("box"), SAMPLER.camera(angle, 20.0)) for angle in (0.0, 90.0, 180.0)]
-    given = [GivenView.of(v, WEIGHTS, DIST, observed=v.mask, mask=v.mask, device=CPU) for v in views]
+    given = [ObservedView.of(v, WEIGHTS, DIST, observed=v.mask, mask=v.mask, device=CPU) for v in views]
     group = torch.arange(3).repeat_interleave(24 * 24)
-    found = hold_out(together(given), group, share=0.25, whole=(2,), footprint=0.02, seed=0)
+    found = hold_out(concatenate_views(given), group, share=0.25, entire=(2,), footprint=0.02, seed=0)
     pixels = 24 * 24
     assert len(found.held_out.distance) == pytest.approx(pixels + 0.25 * 2 * pixels, abs=2)
-    everything = torch.cat([found.given.rays.directions, found.held_out.rays.directions])
+    everything = torch.cat([found.fitted.rays.directions, found.held_out.rays.directions])
     assert len(everything) == 3 * pixels == len(everything.unique(dim=0))
     assert found.held_out.group.bincount().tolist()[2] == pixels
     observed = torch.cat([v.mask.flatten() for v in views[:2]])
-    assert found.given.observed.sum() == pytest.approx(0.75 * observed.sum(), abs=1)
+    assert found.fitted.observed.sum() == pytest.approx(0.75 * observed.sum(), abs=1)
     assert box((0.5, 0.3, 0.4))(found.points).abs().max() < 0.01
     assert (box((0.5, 0.3, 0.4))(found.free) > -0.01).all()
-    assert len(found.free) > 1.5 * FREE * found.given.observed.sum()  # on background rays too
+    assert len(found.free) > 1.5 * FREE_POINTS_PER_RAY * found.fitted.observed.sum()  # on background rays too
     first, again, other = (found.terms(sphere(0.4), iteration, 1.0) for iteration in (0, 0, 1))
     assert first == again != other
 
@@ -364,14 +367,14 @@ def test_a_renderers_random_draws_are_the_same_for_every_fit():
 def test_too_few_depths_to_hold_some_out_are_an_error():
     view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
     few = view.mask & (view.mask.flatten().cumsum(0).view_as(view.mask) <= 2)
-    given = GivenView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
+    given = ObservedView.of(view, WEIGHTS, DIST, observed=few, mask=None, device=CPU)
     with pytest.raises(ValueError, match="2 depths are too few to hold some out: give more"):
-        hold_out(together([given]), torch.arange(24 * 24) // 96, share=0.2, whole=(), footprint=0.02, seed=0)
+        hold_out(concatenate_views([given]), torch.arange(24 * 24) // 96, share=0.2, entire=(), footprint=0.02, seed=0)
 
 
 def test_half_of_the_points_of_a_warm_start_lie_near_the_surface():
     far = torch.tensor([[0.0, 0.0, 9.0]])  # outside of the sphere that holds the others
-    found = scattered(far, 100, torch.Generator().manual_seed(0))
+    found = scatter_points(far, 100, torch.Generator().manual_seed(0))
     assert int(((found - far).norm(dim=1) < 0.5).sum()) == 50
     assert int((found.norm(dim=1) <= 1.1).sum()) == 50
 
@@ -389,7 +392,7 @@ def test_a_warm_start_counts_evaluations_of_the_previous_field():
 
 def test_a_union_has_a_part_about_each_cluster_however_small():
     two = torch.cat([torch.randn(30, 3) * 0.02 + 0.6, torch.tensor([[-0.7] * 3, [-0.72] * 3])])
-    for start in candidate("union_2").starts(Seen(two, None, 0, CPU)):
+    for start in candidate("union_2").starts(StartInputs(two, None, 0, CPU)):
         middles = start.parameters[0][:, :3].mean(1).sort().values
         assert middles.tolist() == pytest.approx([-0.71, 0.6], abs=0.05)
 
@@ -408,7 +411,7 @@ def test_free_and_stored_numbers_disagree_and_the_measure_decides(measure, chose
 def test_sizes_in_words():
     assert str(GRID) == "32,768 numbers, 4,427 of them free"
     assert str(NETWORK) == "12,801 numbers"
-    assert (GRID.bytes, NETWORK.bytes) == (131_072, 51_204) and candidate(PAPERS).stored == 1_839_614
+    assert (GRID.bytes, NETWORK.bytes) == (131_072, 51_204) and candidate(PAPER_NETWORK).stored == 1_839_614
 
 
 def test_candidates_are_tried_in_the_order_of_the_measure():
@@ -453,6 +456,6 @@ def test_the_clock_of_a_fit_goes_on_where_its_trial_ended():
 
     trial = [line("box", "warm", 9.0), line("box", "fit", 1.0), line("box", "fit", 2.5)]
     rest = [line("sphere", "fit", 7.0), line("box", "fit", 0.5), line("box", "fit", 2.0)]  # its own clock
-    curve = rendered([*trial, *rest], "box")
+    curve = rendered_curve([*trial, *rest], "box")
     assert [one["seconds"] for one in curve] == [1.0, 2.5, 3.0, 4.5]
     assert [one["iteration"] for one in curve] == [0, 1, 2, 3] and [one["total"] for one in curve] == [1, 2.5, 0.5, 2]

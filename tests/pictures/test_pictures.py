@@ -88,7 +88,7 @@ def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, drawn
 
 
 def test_a_part_of_the_surface_is_called_measured(inputs, tmp_path, drawn):
-    filmstrip = Filmstrip(replace(inputs, make_scene=lambda: replace(inputs.scene, part=True)))
+    filmstrip = Filmstrip(replace(inputs, make_scene=lambda: replace(inputs.scene, is_partial=True)))
     filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
     filmstrip.save(tmp_path, "a ball")
     assert [tick.label2.get_text() for tick in drawn[-1].axes[0].xaxis.get_major_ticks()] == ["0", "measured"]
@@ -199,7 +199,7 @@ def test_a_picture_and_the_metric_compare_silhouettes_alike_where_the_mesh_is_wh
     """The mesh of a depth image joins the centres of pixels: it is half a pixel smaller than the mask all around."""
     scene = inputs.scene
     unmeasured = torch.arange(256).view(16, 16) == 8 * 16 + 8
-    part = replace(scene, mesh=half_ball(0.5), part=True, measured=scene.view.depth.where(~unmeasured, 0.0))
+    part = replace(scene, mesh=half_ball(0.5), is_partial=True, measured=scene.view.depth.where(~unmeasured, 0.0))
     inputs = replace(inputs, make_scene=lambda: part)
     states = State(sphere(0.3), inputs), State(sphere(0.65), inputs)
     draw_run(tmp_path, states, Given(scene.view, scene.view.mask.numpy()), [], "a depth image")

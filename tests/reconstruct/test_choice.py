@@ -9,7 +9,7 @@ import torch
 
 from bench.models.growth import _is_better
 from bench.models.model import Evidence, Size
-from bench.models.observations import TILES
+from bench.models.observations import TILES_PER_SIDE
 from bench.reconstruct.choice import AutoField, Choice, tiled
 from bench.reconstruct.subject import Subject
 from bench.solve.optimise import OptimiserSettings
@@ -103,7 +103,9 @@ def test_one_that_fails_is_worse_than_any(tmp_path):
 
 def of_tiles(errors: np.ndarray) -> Evidence:
     """A trial on one photograph whose tiles, of 4 x 4 pixels, have these errors; pixels of a tile differ."""
-    pixels = np.kron(errors.reshape(TILES, TILES), np.ones((4, 4))) + np.tile([[0.05, -0.05]], (16, 8))
+    pixels = np.kron(errors.reshape(TILES_PER_SIDE, TILES_PER_SIDE), np.ones((4, 4))) + np.tile(
+        [[0.05, -0.05]], (16, 8)
+    )
     return Evidence("one", Size(1, 1), error=tiled(torch.from_numpy(pixels.flatten()), [shot("0")]))
 
 

@@ -10,7 +10,7 @@ import torch
 
 from bench.reconstruct import stereo
 from bench.reconstruct.stereo import Cloud, Matching, stereo_clouds
-from datasets.extras import install
+from datasets.extras import install_command
 from datasets.scene import Truth
 from datasets.shot import Shot
 from renderers.checks import BadInput
@@ -118,5 +118,5 @@ def test_points_outside_of_the_unit_sphere_are_left_out(sphere):
 def test_without_opencv_the_remedy_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     shots = [shot_of(ball(), camera_of(8, angles=(turn, 0.0))) for turn in (0.0, 10.0)]
-    with pytest.raises(BadInput, match=re.escape(f"task=stereo needs OpenCV: type {install('stereo')}")):
+    with pytest.raises(BadInput, match=re.escape(f"task=stereo needs OpenCV: type {install_command('stereo')}")):
         stereo_clouds(shots, ALL)

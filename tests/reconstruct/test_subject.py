@@ -17,7 +17,7 @@ from bench.reconstruct.subject import (
     hull_distances,
 )
 from bench.tasks.surfaces import Hull
-from datasets.mesh import Mesh, joined
+from datasets.mesh import Mesh, concatenate_meshes
 from datasets.photographs import around
 from datasets.scene import Surface, sample_surface
 from renderers.checks import BadInput
@@ -96,7 +96,7 @@ def seen_by(*cameras, surface: Mesh, points: np.ndarray) -> np.ndarray:
 
 def test_what_lies_behind_another_part_or_beside_the_image_is_not_seen():
     front, back = icosphere(0.3, (0.0, 0.0, 0.6)), icosphere(0.25, (0.0, 0.0, -0.5))
-    both = joined([front, back])
+    both = concatenate_meshes([front, back])
     towards = np.array([[0.0, 0.0, 0.9], [0.05, 0.0, -0.5 + np.sqrt(0.25**2 - 0.05**2)]])  # one on each, at z = 2.5
     camera, aside = camera_of(16), camera_of(16, angles=(60.0, 0.0))
     assert seen_by(camera, surface=both, points=towards).tolist() == [True, False]

@@ -29,7 +29,7 @@ from bench.report.write import html
 from bench.report.write.html import safe_json, to_script, write_index
 from bench.tables import choice
 from bench.tables import names as choices
-from datasets.field_files import FIELD, save_field
+from datasets.field_files import FIELD_FILE, save_field
 from renderers.fields.grid import Grid
 from tests.browser import made
 from tests.looped import each
@@ -142,7 +142,7 @@ def test_a_planned_cell_has_the_command_that_its_sweep_planned():
 
 def test_the_lines_for_python_open_the_run(tmp_path):
     results = tmp_path / "it's mine"
-    save_field(Grid(torch.ones(3, 3, 3), 1.05), made.write(results, 0) / FIELD)
+    save_field(Grid(torch.ones(3, 3, 3), 1.05), made.write(results, 0) / FIELD_FILE)
     made.write(results, 1)
     write_index(results)
     found: dict = {}

@@ -7,7 +7,7 @@ import torch
 
 from bench import config as config_module
 from bench.machine.environment import using_threads
-from bench.setup.inputs import cell_of
+from bench.setup.inputs import build_cell
 from renderers.checks import BadInput
 from tests.tiny import cell_from, plain
 
@@ -33,7 +33,7 @@ def built(monkeypatch) -> Counter[str]:
 
 
 def test_a_run_builds_each_part_once(compose_config, built):
-    cell_of(plain(compose_config("scale=smoke")))
+    build_cell(plain(compose_config("scale=smoke")))
     assert set(built.values()) == {1}
     assert {"task", "renderer", "view", "dataset", "evaluation", "prior", "models"} <= set(built)
 
@@ -44,7 +44,7 @@ def test_a_part_that_cells_share_is_built_once_also_one_that_cannot_be(compose_c
     wrong = one | {"renderer": one["renderer"] | {"steps": 0}}
     for config in (one, wrong, one | {"index": 3}, wrong):
         try:
-            cell_of(config, shared)
+            build_cell(config, shared)
         except ValueError as error:
             reasons.append(str(error))
     assert reasons == ["steps must be at least 1, not 0: the paper uses 50 to 100"] * 2
@@ -60,7 +60,7 @@ def test_a_shape_has_a_code_of_the_prior_where_its_training_had_the_shape(compos
 
 
 def test_a_narrow_network_takes_one_thread_and_a_wide_one_all(compose_config, monkeypatch):
-    monkeypatch.setattr("bench.setup.inputs.ALL_THREADS", 3)
+    monkeypatch.setattr("bench.setup.inputs.DEFAULT_THREADS", 3)
     for width, threads in ((128, 1), (512, 3)):
         cell_from(compose_config("scale=smoke", f"scale.network.width={width}")).start()
         assert torch.get_num_threads() == threads

@@ -225,7 +225,7 @@ def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, 
         meanwhile.extend(json.loads(path.read_text()) for path in (tmp_path / "r").glob("runs/*/record.json"))
         raise error
 
-    monkeypatch.setattr(execute, "cell_of", fail)
+    monkeypatch.setattr(execute, "build_cell", fail)
     found, out, err, folder = bench()
     record = json.loads((folder / "record.json").read_text())
     assert found == code
@@ -273,7 +273,7 @@ def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(cloc
     record = Record("id", "task", "renderer", "dataset", 0, {}, seconds={"evaluation": 1.0})
     record.environment = {"gemm_peak_flops": 1e10}
     settings = OptimiserSettings(iterations, 0.05, "constant")
-    history = solve.descend(toy, settings, RunContext(stage, tmp_path, record, lambda *_: None), see)
+    history = solve.run_optimisation(toy, settings, RunContext(stage, tmp_path, record, lambda *_: None), see)
     curve = curve_of(tmp_path)
     assert [line["iteration"] for line in curve] == list(range(iterations))
     assert [line["iteration"] for line in curve if "chamfer_l2" in line] == looks

@@ -68,7 +68,7 @@ def test_a_class_of_a_package_that_is_named_must_be_what_its_place_asks_for(comp
             find_class(f"{stranger}.{wrong}", "renderer", [stranger], None)
     with pytest.raises(ValueError, match=r"no ViewSampler: name a class that extends datasets\.views"):
         build({"_target_": f"{stranger}.Other"}, "view", [stranger], PARTS["view"])
-    with pytest.raises(ValueError, match=r"no Networked: it lacks network"):
+    with pytest.raises(ValueError, match=r"no HasNetwork: it lacks network"):
         build({"_target_": f"{stranger}.Other"}, "prior", [stranger], PARTS["prior"])
 
 

@@ -9,7 +9,7 @@ import pytest
 from bench import trackers
 from bench.records.record import read_record
 from bench.trackers import MLflow, TensorBoard, curve, settings, values
-from datasets.extras import install
+from datasets.extras import install_command
 from tests.runner.driving import FAILING, record_of
 
 
@@ -75,7 +75,7 @@ def test_tensorboard_has_the_run(finished, tmp_path):
 
 def test_a_tracker_that_is_not_installed_is_an_error_before_the_run(monkeypatch):
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=re.escape(f": {install('mlflow')}")):
+    with pytest.raises(ValueError, match=re.escape(f": {install_command('mlflow')}")):
         MLflow("sqlite:///x.db", "e", "a")
 
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.setup.auto import AutoSettings, epsilon, footprint, resolved, steps
-from datasets.families import BUILDERS, HALF_GRID, Family
+from bench.setup.auto import AutoSettings, epsilon, footprint, resolve_auto_settings, steps
+from datasets.families import BUILDERS, CUBE_HALF_SIDE, Family
 from datasets.mesh import extract, fit_in_sphere
 from datasets.scene import Split
 from datasets.views import ViewSampler
@@ -29,7 +29,9 @@ def formula(family: Family) -> Shape:
     """The formula of the first validation shape where its mesh is, divided by its slope to be a bound."""
     raw = BUILDERS[family.name](SimpleNamespace(**family.draw(Split.VALIDATION, 0)))
     steepest = max(raw.lipschitz, 1.0)
-    centre, factor = fit_in_sphere(extract(raw, grid=family.resolution, reach=HALF_GRID).used, family.radius)
+    centre, factor = fit_in_sphere(
+        extract(raw, grid=family.resolution, reach=CUBE_HALF_SIDE).used_vertices, family.radius
+    )
     return Shape(lambda p: raw(p) / steepest, Kind.BOUND).translate(tuple(-centre)).scale(factor)
 
 
@@ -63,7 +65,7 @@ def test_steps_that_cannot_be_computed_are_errors():
 
 
 def test_epsilon_and_steps_are_resolved_in_order_with_notes():
-    node, notes = resolved({"epsilon": "auto", "steps": "auto", "alpha": 1.5}, VIEW, TEN)
+    node, notes = resolve_auto_settings({"epsilon": "auto", "steps": "auto", "alpha": 1.5}, VIEW, TEN)
     assert node["epsilon"] == pytest.approx(7e-4)
     assert node["steps"] == steps(VIEW, node, TEN) < 33
     seen = "for 128 pixels from 2.5 away (view)"
@@ -78,7 +80,7 @@ def test_epsilon_and_steps_are_resolved_in_order_with_notes():
 
 def test_auto_without_an_equation_is_an_error():
     with pytest.raises(ValueError, match=r"renderer\.alpha=auto has no equation: only epsilon, steps have one"):
-        resolved({"alpha": "auto"}, VIEW, TEN)
+        resolve_auto_settings({"alpha": "auto"}, VIEW, TEN)
     with pytest.raises(ValueError, match=r"view\.distance - 1 must be positive.*outside of the unit sphere"):
         epsilon(ViewSampler(0.9, 50.0, (0.0, 0.0), (0.0, 0.0), 64), {}, TEN)
     with pytest.raises(ValueError, match=r"auto\.grazing must be positive"):

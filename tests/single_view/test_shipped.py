@@ -31,7 +31,7 @@ def test_it_is_that_of_the_default_configuration_and_knows_unseen_shapes(path, c
     assert record["status"] == "ok" and record["key"] == recipe.key and record["filled"] > 0.2
     assert record["validation"]["iou_network"] > record["validation"]["iou_mean_code"] + 0.03
     imaging = replace(recipe.imaging, photography=replace(recipe.imaging.photography, views=2))
-    unseen = [imaging.of_shape(recipe.dataset, Split.VALIDATION, index) for index in range(3)]
+    unseen = [imaging.shape_images(recipe.dataset, Split.VALIDATION, index) for index in range(3)]
     found = [overlap(model.at(model(one.image(0)[None])[0]), one, CPU) for one in unseen]
     mean = [overlap(model.at(torch.tensor(record["mean_code"])), one, CPU) for one in unseen]
     assert np.mean(found) > max(np.mean(mean), LEAST_IOU[family])

@@ -9,10 +9,10 @@ import torch
 
 from bench.config import load
 from bench.reconstruct.losses import Losses
-from bench.single_view.images import NEAR, POINTS, Imaging
+from bench.single_view.images import NEAR_SURFACE_STD, OCCUPANCY_POINTS, Imaging
 from bench.single_view.network import SingleView, SingleViewNetwork
 from bench.single_view.store import Recipe, overlap
-from bench.single_view.training import Failed, Lessons, Supervision, TrainingSettings
+from bench.single_view.training import Supervision, Training, TrainingFailed, TrainingSettings
 from datasets.scene import Split
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
@@ -60,7 +60,7 @@ def renderer():
 
 
 def trained(images, renderer, state, supervision=RGB, progress=silent, network=NETWORK, **changed):
-    return Lessons(images, supervision, renderer, replace(SETTINGS, **changed), CPU).train(network, state, progress)
+    return Training(images, supervision, renderer, replace(SETTINGS, **changed), CPU).train(network, state, progress)
 
 
 def weights(model: SingleView) -> torch.Tensor:
@@ -80,9 +80,9 @@ def test_images_are_of_the_shape_from_other_cameras_and_points_know_where_they_a
         length = one.points.norm(dim=1)
         clear = (length - radius).abs() > 0.02  # of the faces of the ball, which lie a little inside of it
         assert torch.equal(one.inside[clear], (length < radius)[clear])
-        near = (length[POINTS // 2 :] - radius).abs()
-        assert float(near.median()) == pytest.approx(0.6745 * NEAR, rel=0.15)
-        assert float(one.points[: POINTS // 2].abs().max()) <= 1
+        near = (length[OCCUPANCY_POINTS // 2 :] - radius).abs()
+        assert float(near.median()) == pytest.approx(0.6745 * NEAR_SURFACE_STD, rel=0.15)
+        assert float(one.points[: OCCUPANCY_POINTS // 2].abs().max()) <= 1
     cameras = torch.stack([torch.stack([camera.center for camera in one.cameras]) for one in images])
     assert not torch.allclose(cameras[0], cameras[1])
 
@@ -97,7 +97,7 @@ def test_an_encoder_is_given_colours_on_the_shape_and_the_mask(images):
 
 def test_images_are_made_once(tmp_path, images, monkeypatch):
     first = IMAGING.images(Balls(), Split.TRAIN, 2, tmp_path, silent)
-    monkeypatch.setattr(Imaging, "of_shape", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(Imaging, "shape_images", lambda *_: pytest.fail("made again"))
     again = IMAGING.images(Balls(), Split.TRAIN, 2, tmp_path, silent)
     for one, other, whole in zip(first, again, images, strict=False):
         assert torch.equal(one.colours, other.colours) and torch.equal(one.colours, whole.colours)
@@ -129,7 +129,11 @@ def test_pixels_are_those_of_the_image(images):
 def test_the_visual_hull_takes_the_place_of_a_depth_that_is_not_known():
     masks = Occupancy(width=0.02, weight=1.0, sphere_radius=1.0, occupied_at="depth")
     own = replace(RGB, losses=replace(LOSSES, silhouette=masks))
-    assert own.to_hull and not RGB.to_hull and not replace(own, losses=replace(own.losses, depth=1.0)).to_hull
+    assert (
+        own.needs_hull_depth
+        and not RGB.needs_hull_depth
+        and not replace(own, losses=replace(own.losses, depth=1.0)).needs_hull_depth
+    )
 
 
 def test_it_learns_which_ball_an_image_shows(images, renderer, tmp_path):
@@ -146,10 +150,10 @@ def test_a_step_over_more_shapes_has_no_larger_loss_and_gradient(images, rendere
     given = []
     for count in (1, 3):
         settings = replace(SETTINGS, shapes_per_step=count)
-        lessons = Lessons([images[2]] * 3, replace(VOLUME, points=4096), renderer, settings, CPU)
+        training = Training([images[2]] * 3, replace(VOLUME, points=4096), renderer, settings, CPU)
         torch.manual_seed(0)
         model = SingleView(NETWORK)
-        loss = lessons.give(model, 0, Counts())
+        loss = training.accumulate_gradients(model, 0, Counts())
         slopes = [one.grad for one in model.parameters() if one.grad is not None]
         given.append((loss, torch.cat([g.flatten() for g in slopes])))
     (once, slope), (thrice, other) = given
@@ -161,7 +165,7 @@ def test_it_learns_from_the_visual_hull_which_ball_an_image_shows(images, render
     assert not masks.renders
     model, course = trained(images, renderer, tmp_path / "s", masks, steps=150, shapes_per_step=3, keep_every=1000)
     assert course.counts.value == 0
-    codes, hulls = [model(one.image(0)[None])[0] for one in images], [one.in_hull(1) for one in images]
+    codes, hulls = [model(one.image(0)[None])[0] for one in images], [one.hull_samples(1) for one in images]
 
     def right(code: torch.Tensor, hull: tuple[torch.Tensor, torch.Tensor]) -> float:
         return float(((model.at(code)(hull[0]) < 0) == hull[1]).float().mean())
@@ -172,8 +176,8 @@ def test_it_learns_from_the_visual_hull_which_ball_an_image_shows(images, render
 
 def test_the_hull_comes_first_and_the_renderer_after_it(images, renderer, tmp_path, monkeypatch):
     seen = []
-    known = Lessons._known
-    monkeypatch.setattr(Lessons, "_known", lambda self, *given: seen.append("hull") or known(self, *given))
+    known = Training._occupancy_loss
+    monkeypatch.setattr(Training, "_occupancy_loss", lambda self, *given: seen.append("hull") or known(self, *given))
     _, course = trained(
         images, renderer, tmp_path / "s", replace(RGB, hull=0.5), progress=lambda *told: seen.append(told[1])
     )
@@ -235,15 +239,17 @@ def test_a_training_goes_on_without_the_gpu_that_it_began_on(images, renderer, t
 
 
 def test_a_step_that_is_no_number_keeps_the_last_state_and_has_a_record(renderer, tmp_path, monkeypatch):
-    give = Lessons.give
+    give = Training.accumulate_gradients
 
     def spoilt(self, model, step, counts):
         loss = give(self, model, step, counts)
         return float("nan") if step == 3 else loss
 
-    monkeypatch.setattr(Lessons, "give", spoilt)
+    monkeypatch.setattr(Training, "accumulate_gradients", spoilt)
     made = recipe(renderer)
-    with pytest.raises(Failed, match=r"number at step 3; the state after 2 steps is in .*: lower task\.training"):
+    with pytest.raises(
+        TrainingFailed, match=r"number at step 3; the state after 2 steps is in .*: lower task\.training"
+    ):
         made.make(tmp_path, CPU, silent)
     assert list(tmp_path.glob("single_view-*.state")) and made.find(tmp_path) is None
     (path,) = tmp_path.glob("single_view-*.json")
@@ -263,7 +269,7 @@ def test_a_network_is_stored_with_its_record_and_found_again(renderer, tmp_path,
     model, _ = made.load(path)
     image = torch.rand(1, 4, 16, 16)
     assert torch.equal(model(image), made.load(path)[0](image))
-    monkeypatch.setattr("bench.single_view.store.Lessons.train", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr("bench.single_view.store.Training.train", lambda *_: pytest.fail("trained again"))
     assert made.make(tmp_path, CPU, silent) == path
     assert not list(tmp_path.glob("*.state"))
 
@@ -274,9 +280,9 @@ def test_a_training_that_is_stopped_after_its_last_step_is_not_lost(renderer, tm
 
     made = recipe(renderer)
     with monkeypatch.context() as patched, pytest.raises(Stopped):
-        patched.setattr("bench.single_view.store._found", stop)
+        patched.setattr("bench.single_view.store._training_results", stop)
         made.make(tmp_path, CPU, silent)
-    monkeypatch.setattr(Lessons, "give", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(Training, "accumulate_gradients", lambda *_: pytest.fail("trained again"))
     assert made.make(tmp_path, CPU, silent).exists()
 
 
@@ -309,7 +315,7 @@ def test_a_damaged_network_is_told(renderer, tmp_path):
 def test_the_overlap_is_that_of_volumes(images):
     torch.manual_seed(0)
     model = SingleView(replace(NETWORK, width=128))
-    volume = 8 * float((model.at(torch.zeros(6))(images[2].points[: POINTS // 2]) < 0).float().mean())
+    volume = 8 * float((model.at(torch.zeros(6))(images[2].points[: OCCUPANCY_POINTS // 2]) < 0).float().mean())
     radius = (volume * 3 / (4 * np.pi)) ** (1 / 3)
     for one, true in zip(images, (0.35, 0.55, 0.8), strict=True):
         expected = (min(radius, true) / max(radius, true)) ** 3

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.models.observations import together
-from bench.solve.observed_view import GivenView, normal_error, slopes_at, slopes_over
+from bench.models.observations import concatenate_views
+from bench.solve.observed_view import ObservedView, central_differences, gradients_at, normal_error
 from datasets.scene import View
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
@@ -43,10 +43,10 @@ def hits(factors: Tensor, offset: Tensor) -> Tensor:
     return rays.at((-b - (b * b - a * c).sqrt()) / a)
 
 
-def given(normals: Tensor, observed: Tensor, renderer: str = "idr", weight: float = 2.0) -> GivenView:
+def given(normals: Tensor, observed: Tensor, renderer: str = "idr", weight: float = 2.0) -> ObservedView:
     blank = torch.zeros(6, 6, dtype=torch.float64)
     view = View(CAMERA, blank, blank[..., None].expand(-1, -1, 3), torch.ones(6, 6, dtype=torch.bool))
-    seen = GivenView.of(view, WEIGHTS, RENDERERS[renderer], observed=observed, mask=None, device=CPU)
+    seen = ObservedView.of(view, WEIGHTS, RENDERERS[renderer], observed=observed, mask=None, device=CPU)
     return replace(seen, normals=normals, normal_weight=weight, normal_width=WIDTH)
 
 
@@ -65,7 +65,7 @@ def test_the_term_is_one_less_the_cosine_over_observed_pixels(observed):
     exact = given(found, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
     assert abs(exact["normals"].item()) < 1e-9
     shape, points = ellipsoid(FACTORS, OFFSET), hits(FACTORS, OFFSET).view(-1, 3)
-    at_points = torch.nn.functional.normalize(slopes_at(shape, points).detach(), dim=-1)  # as reconstruction has it
+    at_points = torch.nn.functional.normalize(gradients_at(shape, points).detach(), dim=-1)  # as reconstruction has it
     same = normal_error(at_points, OTHER.view(-1, 3))
     torch.testing.assert_close(same, (1 - (found * OTHER).sum(-1)).mean(), rtol=1e-9, atol=0)
 
@@ -113,20 +113,20 @@ def test_slopes_over_a_width_move_a_code_that_those_at_a_point_do_not():
     def error(slopes: Tensor) -> Tensor:
         return normal_error(torch.nn.functional.normalize(slopes, dim=-1), given_normals.double())
 
-    (at_a_point,) = torch.autograd.grad(error(slopes_at(decoder.at(code), points)), code)
-    (over_a_width,) = torch.autograd.grad(error(slopes_over(decoder.at(code), points, 0.05)), code)
+    (at_a_point,) = torch.autograd.grad(error(gradients_at(decoder.at(code), points)), code)
+    (over_a_width,) = torch.autograd.grad(error(central_differences(decoder.at(code), points, 0.05)), code)
     assert not at_a_point.any() and over_a_width.norm() > 1e-4
 
 
 def test_views_without_normals_have_no_such_term_and_parts_keep_theirs():
     view = given(OTHER, ALL)
-    flat = together([view])
-    some = flat.some(torch.tensor([0, 7]))
+    flat = concatenate_views([view])
+    some = flat.select(torch.tensor([0, 7]))
     assert torch.equal(some.normals, OTHER.flatten(0, 1)[[0, 7]])
     assert set(some.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth", "normals"}
-    plain = GivenView(WEIGHTS, RENDERERS["idr"], CAMERA.rays(), view.depth, view.depth_of_distance, ALL, None)
+    plain = ObservedView(WEIGHTS, RENDERERS["idr"], CAMERA.rays(), view.depth, view.depth_per_distance, ALL, None)
     assert set(plain.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth"}
-    assert together([plain]).normals is None
+    assert concatenate_views([plain]).normals is None
 
 
 def test_normals_that_are_not_given_have_no_part():

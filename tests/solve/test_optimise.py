@@ -10,7 +10,15 @@ import torch
 from bench.config import load
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import RunStatus
-from bench.solve.optimise import DIVERGED, FirstChecked, History, OptimiserSettings, Starts, StartSettings, optimise
+from bench.solve.optimise import (
+    DIVERGENCE_FACTOR,
+    FirstChecked,
+    History,
+    OptimiserSettings,
+    Starts,
+    StartSettings,
+    optimise,
+)
 from renderers.boundary import render_checked
 from renderers.checks import BrokenContract
 from renderers.field import Counts, Meter
@@ -271,7 +279,7 @@ def test_a_parameter_that_is_no_number_ends_the_loop():
     assert len(history.curve) == 1
 
 
-@each("factor, diverges", [(0.99 * DIVERGED, False), (1.2 * DIVERGED, True), (1e20, True)])
+@each("factor, diverges", [(0.99 * DIVERGENCE_FACTOR, False), (1.2 * DIVERGENCE_FACTOR, True), (1e20, True)])
 def test_a_loss_far_above_its_first_value_has_diverged(factor, diverges):
     history = go(Toy(spoil={3: factor}), 5, rate=1e-4)
     assert history.status is (RunStatus.DIVERGED if diverges else RunStatus.OK)
@@ -315,7 +323,7 @@ def play(count: int, trial: int, iterations: int, loss) -> list[tuple[int, int]]
     starts = Starts(StartSettings(count, trial))
     turns = []
     for iteration in range(iterations):
-        start, own = starts.turn(iteration)
+        start, own = starts.assignment(iteration)
         starts.note(start, own, torch.tensor(float(loss(start, own))))
         turns.append((start, own))
     return turns

@@ -9,7 +9,7 @@ import torch
 from bench.config import build, load
 from bench.reconstruct.subject import Depths
 from bench.setup.fields import FieldChoice
-from bench.single_view.training import Lessons
+from bench.single_view.training import Training
 from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
 from bench.tasks.pose import Pose, PoseProblem
 from datasets.scene import Scene
@@ -64,8 +64,8 @@ def test_a_training_from_images_stays_on_its_device(images, tmp_path, renderer, 
     settings, network = replace(SETTINGS, steps=4), replace(NETWORK, reads=reads)
     torch.set_default_device("meta")
     try:
-        lessons = Lessons(images, supervision, load("renderer", renderer), settings, CPU)
-        model, course = lessons.train(network, tmp_path / "state", silent)
+        training = Training(images, supervision, load("renderer", renderer), settings, CPU)
+        model, course = training.train(network, tmp_path / "state", silent)
     finally:
         torch.set_default_device(None)
     assert len(course.losses) == 4 and np.isfinite(course.losses).all()

@@ -12,7 +12,7 @@ from bench.reconstruct.subject import HULL_RADIUS
 from bench.shape_prior import Prior
 from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty
-from bench.solve.optimise import History, NotReached, OptimiserSettings, optimise
+from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
 from bench.tasks.multiview import Multiview, PhotometricLoss, blur, sample
 from datasets.mesh import extract
 from datasets.meshes import read_mesh
@@ -148,10 +148,10 @@ def test_blurring_keeps_what_is_constant_and_the_mean():
 
 
 def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
-    with pytest.raises(NotReached, match="no point of the shape is seen by two neighbouring views"):
+    with pytest.raises(CannotContinue, match="no point of the shape is seen by two neighbouring views"):
         level = replace(PLAINLY, views=2).take(Truth(scene.mesh), camera_of(32), seed=0)  # from opposite sides
         PhotometricLoss(SETTINGS, RENDERER, level, CPU).compare(sphere(0.5), 0)
-    with pytest.raises(NotReached):
+    with pytest.raises(CannotContinue):
         given(scene).compare(sphere(1e-3, (0.0, 0.0, 0.9)), 0)
 
 

@@ -14,11 +14,11 @@ from bench.config import load
 from bench.evaluate.state import State
 from bench.records.read import read_records
 from bench.single_view import baselines, store
-from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_alike
-from bench.single_view.own_image import best_view, filled_share, read_picture
+from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_similar_shape
+from bench.single_view.own_image import best_view, filled_fraction, read_picture
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import OptimiserSettings
-from bench.solve.solve import descend, failure_of
+from bench.solve.solve import failure_of, run_optimisation
 from bench.tasks import single_view
 from bench.tasks.single_view import DEFINITIONS
 from bench.train import main
@@ -120,7 +120,9 @@ def test_a_search_has_succeeded_where_its_silhouette_is_nearer_to_the_mask_thoug
     search = MaskSearch(Own(), 10.0, CodePenalty(1.0, "sum"), OptimiserSettings(30, 0.02, "constant"))
     shot = shot_of(Ball(torch.tensor(factor * 0.5), torch.zeros(3), PAINT), camera)
     problem = search.problem(shot, run.inputs)
-    history = descend(problem, search.optimiser, run, lambda iteration: {}, least_reference=search.least_reference)
+    history = run_optimisation(
+        problem, search.optimiser, run, lambda iteration: {}, least_reference=search.least_reference
+    )
     assert failure_of(history, problem.evaluate(State(problem.field(), run.inputs))) is None
     first, last = history.objectives
     assert first == pytest.approx(abs(covered(radius) - covered(0.5)), abs=0.02) and last < 0.3 * first
@@ -188,7 +190,7 @@ def test_a_picture_that_cannot_be_is_told(picture, image, mask, says):
 
 
 def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
-    filled = filled_share(torch.cat([one.masks for one in images]))
+    filled = filled_fraction(torch.cat([one.masks for one in images]))
     sides = [max(np.ptp(np.flatnonzero(m.any(0))), np.ptp(np.flatnonzero(m.any(1)))) + 1 for m in images[1].masks]
     assert filled == pytest.approx(np.median(sides) / 16, abs=1 / 16)
     framed, doubts = read_picture(picture, None, 32, 0.5)
@@ -208,7 +210,7 @@ def test_the_view_that_is_most_alike_is_that_of_the_mask():
     mesh = Mesh(Balls().mesh(Split.TEST, 1).vertices * [1.5, 0.5, 0.8], Balls().mesh(Split.TEST, 1).faces)
     cameras = [SAMPLER.draw(place) for place in range(6)]
     mask = see(Truth(mesh), cameras[4]).mask
-    filled = filled_share(mask[None])
+    filled = filled_fraction(mask[None])
     camera, overlapping = best_view(mesh, cameras, mask, filled)
     assert torch.equal(camera.world_to_camera, cameras[4].world_to_camera) and overlapping > 0.9
 
@@ -229,8 +231,8 @@ def test_rows_without_a_network_are_judged_alike(folder, method):
 
 def test_the_nearest_image_and_the_best_shape_are_those_of_the_same_shape(images):  # noqa: F811
     for place, one in enumerate(images):
-        assert most_alike(one.image(1), images) == place
-        assert most_alike((one.image(2) + 0.01).clamp(0, 1), images) == place
+        assert most_similar_shape(one.image(1), images) == place
+        assert most_similar_shape((one.image(2) + 0.01).clamp(0, 1), images) == place
         assert best_shape(Balls().mesh(Split.TEST, place), Balls(), 3) == place
 
 
@@ -242,7 +244,7 @@ def test_the_nearest_image_is_one_image_and_no_mean_over_a_shape(images):  # noq
     very = replace(same, colours=torch.cat([colours, torch.zeros_like(colours), torch.zeros_like(colours)]))
     near = (colours.int() + 20).clamp(0, 255).to(torch.uint8)
     all_near = replace(same, colours=near.repeat(3, 1, 1, 1))
-    assert most_alike(given, [all_near, very]) == 1
+    assert most_similar_shape(given, [all_near, very]) == 1
 
 
 def test_the_mean_shape_has_the_mean_distance(tmp_path):

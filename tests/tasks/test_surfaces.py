@@ -10,7 +10,7 @@ from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN_PREFIX
 from bench.reconstruct.stereo import Matching
 from bench.reconstruct.subject import Depths
 from bench.reconstruct.surfaces import fuse_clouds, measured_clouds, with_colours
-from bench.solve.solve import COSTS
+from bench.solve.solve import COST_DEFINITIONS
 from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
 from datasets.scene import Truth, sample_surface
@@ -47,7 +47,7 @@ def test_a_surface_has_colours_metrics_and_pictures_and_no_evaluations(scene, tm
     task.execute(run)
     record, metrics = run.record, run.record.metrics
     assert (record.status, record.reason) == ("ok", "")
-    assert set(metrics) == SCORES and record.definitions == COLOURED_DEFINITIONS | COSTS
+    assert set(metrics) == SCORES and record.definitions == COLOURED_DEFINITIONS | COST_DEFINITIONS
     assert record.evaluations == {"value": 0, "gradient": 0}
     assert record.seconds["forward"] > 0 and record.seconds["backward"] == 0 and record.seconds["evaluation"] > 0
     chamfer, overlap, psnr = WORST[name]
