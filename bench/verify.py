@@ -119,7 +119,7 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.dev
     if not (folder / FIELD_FILE).is_file():
         notes = [note for note in record.notes if FIELD_FILE in note]
         status = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
-        raise NothingToCompare(notes[0] if notes else f"it has no {FIELD_FILE}: no field was found or looked for{status}")
+        raise NothingToCompare(notes[0] if notes else f"it has no {FIELD_FILE}, since it optimised no field{status}")
     cell = build_cell(record.config)
     cell.start()
     field = load_field(folder, cell.inputs.device)

@@ -177,8 +177,8 @@ def _scan(conf: Path, number: int, words: list[str]) -> Scan:
 def smooth(mesh: Mesh) -> Mesh | None:
     """The screened Poisson reconstruction of a mesh (Kazhdan and Hoppe 2013), for scans with holes and tangled faces.
 
-    None without PyMeshLab, or if more than `MAX_OUTSIDE_FRACTION` of one surface is farther than `OUTSIDE_DISTANCE` from
-    the other. This happens if faces are oriented inconsistently or a hole is wide.
+    None without PyMeshLab, or if more than `MAX_OUTSIDE_FRACTION` of one surface is farther than
+    `OUTSIDE_DISTANCE` from the other. This happens if faces are oriented inconsistently or a hole is wide.
     """
     if meshlab() is None:
         return None

@@ -180,7 +180,7 @@ class Multiview(PhotographTask):
         subject = super().subject(inputs)
         return upright(subject) if self.similarity else subject
 
-    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
         """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
         if run.inputs.photographed is None:
             return evaluate(State(field, run.inputs)).metrics

@@ -86,7 +86,7 @@ class Reconstruction(PhotographTask):
         run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
         seconds["trials"] = choice.seconds
 
-    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
         """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
         subject = self.subject(run.inputs)
         evaluation = judge(State(field, run.inputs), subject)

@@ -157,7 +157,7 @@ class OneImage:
         else:
             self._look_up(run, recipe, images, subject)
 
-    def judged(self, field: Field, run: RunContext) -> dict[str, float]:
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
         """The metrics of a run's final field; empty for the user's picture, whose camera is not known."""
         if self.image_path is not None:
             return {}
