@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -64,22 +64,6 @@ class Capture:
             f"{self.format}: {len(self.shots)} photographs of {pixels} pixels, {masks}; the unit sphere has its centre "
             f"at ({centre}) and radius {self.sphere.radius}, {self.sphere_source}"
         )
-
-
-@runtime_checkable
-class Photographed(Protocol):
-    """A dataset of one object with photographs, and perhaps a file of its surface, `truth`; see `OwnPhotographs`."""
-
-    truth: str | None
-
-    @property
-    def dtu_scan(self) -> int | None:
-        """The number of DTU's scan; see `OwnPhotographs`."""
-        ...
-
-    def capture(self, longest: int, held_out: int) -> Capture:
-        """Reads the photographs, at most `longest` pixels a side; every `held_out`-th is not used for the sphere."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -279,6 +279,27 @@ class OneView(Protocol):
         ...
 
 
+@runtime_checkable
+class Photographed(Protocol):
+    """A dataset of one object with photographs, and perhaps a file of its surface, `truth`; see `OwnPhotographs`."""
+
+    truth: str | None
+
+    @property
+    def dtu_scan(self) -> int | None:
+        """The number of DTU's scan; see `OwnPhotographs`."""
+        ...
+
+    def capture(self, longest: int, held_out: int) -> Any:
+        """Reads a `datasets.own_photographs.Capture`.
+
+        Args:
+            longest: largest number of pixels per side.
+            held_out: every photograph of such a number is not used for the sphere.
+        """
+        ...
+
+
 def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int) -> Scene:
     """The scene of shape number `index` of a split, with the camera of the same number."""
     if isinstance(dataset, OneView):

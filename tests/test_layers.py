@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
 
-from bench.records.folder import NOT_IN_CODE_HASH
 from tests.conftest import checked, forgetting_modules
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -35,7 +34,6 @@ COMMANDS = (
     "bench.turntable", "bench.verify",
 )  # fmt: skip
 # No run imports these, which decide what is run.
-DRIVING = ("__main__", "records/folder", "runner/command", "runner/process", "runner/run")
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.runner.library",)  # reads where this process finds modules, for the process that it starts
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
@@ -190,28 +188,6 @@ def test_the_checker_finds_what_is_wrong():
 def test_the_checker_lets_pass_what_is_right():
     for module, source in RIGHT:
         assert wrongs(source, module, is_package=module == "bench") == [], (module, source)
-
-
-def imported_from(*beginnings: str) -> set[str]:
-    """The modules of ours that those of some packages import, and these, and so on."""
-    files = {name: (path, package) for path in modules() for name, package in [named(path)]}
-    left, seen = [name for name in files if within(name, *beginnings)], set[str]()
-    while left:
-        name = left.pop()
-        if within(name, *OURS) and name not in seen:
-            seen.add(name)
-            left.append(name.rpartition(".")[0])  # its module, where it is a class; its package, where it is a module
-            if name in files:
-                path, package = files[name]
-                left += imported(ast.parse(path.read_text()), name, package)
-    return seen
-
-
-def test_an_edit_of_a_module_that_no_run_imports_repeats_no_finished_run():
-    running = imported_from("bench.runner.execute", "bench.tasks", "datasets", "renderers")
-    others = [path for path in modules() if path.is_relative_to(ROOT / "bench") and named(path)[0] not in running]
-    acting = {path for other in others if not (path := other.relative_to(ROOT).as_posix()).startswith(NOT_IN_CODE_HASH)}
-    assert acting == {f"bench/{name}.py" for name in DRIVING}
 
 
 @jaxtyped(typechecker=checked)

@@ -18,9 +18,8 @@ from bench.solve.solve import save_in_world
 from datasets.captures.hull import hull_mesh
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.meshes import read_pieces, read_points
-from datasets.own_photographs import Photographed
 from datasets.photographs import Photography
-from datasets.scene import Surface, Truth, sample_surface, see
+from datasets.scene import Photographed, Surface, Truth, sample_surface, see
 from datasets.shot import Shot
 from datasets.views import observed_pixels
 from renderers.checks import BadInput, check_at_least

@@ -15,23 +15,16 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import OUR_PACKAGES, Rerun, check, check_draw
+from bench.records.imports import ROOT, imported_files
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.tables import without_row_keys
 from datasets.extras import referenced_files, version
 
-ROOT = Path(__file__).resolve().parents[2]
-# Files and folders whose code cannot change the result of a run.
-NOT_IN_CODE_HASH = (
-    *("bench/report", "bench/studies"),
-    *(f"bench/{name}.py" for name in ("judge", "merge", "photos", "prior", "progress", "suite", "trackers", "train")),
-    *(f"bench/{name}.py" for name in ("tune", "turntable", "verify")),
-    *(f"bench/runner/{name}.py" for name in ("compose", "executors", "jobs", "library", "plan", "summary", "sweep")),
-    *(f"bench/records/{name}.py" for name in ("format", "metrics", "names", "read")),
-    *("bench/pictures/style.py", "bench/pictures/size_chart.py"),
-)
 NO_STRESS = "none"
 INPUT_FILE_KEYS = ("path", "image_path", "mask_path", "truth", "codes", "cloud")  # keys whose values are files
 HASHED_PATTERNS = ("*", "ModelParameters/*", "LatentCodes/*")  # the hashed files of an input folder, also of DeepSDF's
+# Settings that name choices, which a run loads itself, with the modules of all such choices.
+LOADED_BY_NAME = {("task", "beside"): "renderers", ("prior", "of"): "datasets.families"}
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz")  # not hashed: gigabytes that no run reads
 FIELD_FILE = "field.safetensors"  # the only file of a run folder that another run reads; see `datasets.field_files`
 HASHED_LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
@@ -87,7 +80,11 @@ class Identity:
             paths += sorted(map(str, split.parent.glob(f"*{split.suffix or split.name}")))
         files = [_file_hash(Path(path)) for path in paths]
         files += [_class_counts_hash(str(dataset["path"]))] if "synset" in dataset else []
-        return digest([_our_code_hash(), *(_package_hash(name) for name in packages), *files])
+        hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
+        targets = {*_values_of_key(hashed, "_target_")}
+        targets |= {module for (part, key), module in LOADED_BY_NAME.items() if (hashed.get(part) or {}).get(key)}
+        code = _our_code_hash(frozenset(targets), bool(packages))
+        return digest([code, *(_package_hash(name) for name in packages), *files])
 
 
 def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, Any]:
@@ -221,12 +218,13 @@ def _reserve_bytes(folder: Path) -> None:
         os.fsync(file.fileno())
 
 
-@lru_cache(maxsize=1)
-def _our_code_hash() -> str:
-    files = [path for package in OUR_PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    hashed = [path for path in files if not path.relative_to(ROOT).as_posix().startswith(NOT_IN_CODE_HASH)]
-    priors = sorted((ROOT / "datasets" / "priors").glob("*.safetensors"))
-    return digest([*map(_file_hash, [*hashed, *priors]), *(version(library) for library in HASHED_LIBRARIES)])
+@lru_cache
+def _our_code_hash(targets: frozenset[str], has_user_code: bool) -> str:
+    """Hash of the code that a run imports, of shipped priors and library versions; user code may import any of ours."""
+    every_file = sorted(path for package in OUR_PACKAGES for path in (ROOT / package).rglob("*.py"))
+    files = every_file if has_user_code else imported_files(targets)
+    shipped = sorted((ROOT / "datasets" / "priors").glob("*.safetensors"))
+    return digest([*map(_file_hash, [*files, *shipped]), *(version(library) for library in HASHED_LIBRARIES)])
 
 
 @lru_cache

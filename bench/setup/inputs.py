@@ -22,8 +22,18 @@ from bench.setup.fields import FieldChoice
 from bench.setup.priors import PriorChoice, prior_keys_in_errors, training_dataset
 from bench.shape_prior import Prior, PriorSettings
 from datasets.network_files import HasNetwork
-from datasets.own_photographs import Photographed
-from datasets.scene import SPLIT_STRIDE, Dataset, OneView, Scene, Split, Surface, make_scene, sample_surface, scene_name
+from datasets.scene import (
+    SPLIT_STRIDE,
+    Dataset,
+    OneView,
+    Photographed,
+    Scene,
+    Split,
+    Surface,
+    make_scene,
+    sample_surface,
+    scene_name,
+)
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.field import Field

@@ -1,0 +1,49 @@
+"""The files whose edit makes a finished run stale: the modules that the run imports, and no others."""
+
+import subprocess
+import sys
+
+import pytest
+
+from bench.records.folder import Identity
+from bench.records.imports import ROOT, imported_files
+
+COMPLETION = ("bench.tasks.completion.Completion", "renderers.DIST", "datasets.families.Family")
+MAX_FILES = 90  # of the completion of a procedural shape
+LOADED = """
+import sys, bench.runner.execute, bench.tasks.completion, renderers.dist, datasets.families
+print(*(module.__file__ for name, module in list(sys.modules.items()) if name.split(".")[0] in ("bench", "datasets")))
+"""
+
+
+def files_of(*targets: str) -> set[str]:
+    return {path.relative_to(ROOT).as_posix() for path in imported_files(targets)}
+
+
+def test_a_run_depends_on_its_renderer_and_dataset_and_on_no_other():
+    files = files_of(*COMPLETION)
+    assert {"renderers/dist.py", "renderers/march.py", "datasets/families.py", "bench/solve/optimise.py"} <= files
+    assert len(files) <= MAX_FILES
+    others = {"renderers/dvr.py", "renderers/volumes/neus.py", "datasets/captures/lenses.py", "bench/runner/command.py"}
+    assert not files & others and not any(file.startswith(("bench/report", "bench/studies")) for file in files)
+    assert files_of("renderers.DVR") - files >= {"renderers/dvr.py"}
+    assert "datasets/captures/lenses.py" in files_of("datasets.own_photographs.OwnPhotographs")
+
+
+def test_every_module_that_python_loads_is_among_the_files():
+    loaded = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    modules = {path for path in loaded.split() if not path.endswith("__init__.py")}
+    assert len(modules) > 30 and modules <= {str(path) for path in imported_files(COMPLETION)}
+
+
+@pytest.mark.parametrize("target", ["mypkg.Mine", "torch.nn.Linear", "bench.no_such_module.Thing"])
+def test_a_target_outside_of_this_project_adds_no_file(target):
+    assert files_of(target) - files_of() <= {"bench/__init__.py"}
+
+
+def test_a_run_that_loads_choices_by_name_depends_on_all_of_them():
+    config = {"task": {"_target_": "bench.tasks.ablation.Ablation"}, "prior": {}}
+    alone, beside_others = (
+        Identity({}, config | {"task": config["task"] | {"beside": names}}) for names in ([], ["dvr"])
+    )
+    assert alone.code != beside_others.code
