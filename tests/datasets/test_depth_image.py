@@ -64,7 +64,7 @@ def test_what_is_seen_lies_on_the_object_and_in_the_unit_sphere(made, suffix, pi
     view, known = scene.observed_view()
     points = view.camera.rays().at(view.camera.distance(view.depth))[known].double().numpy()
     assert OBJECT_RADIUS < np.linalg.norm(points, axis=1).max() < 1 and known.sum() > pixels
-    assert scene.part and max(known.shape) <= pixels and torch.equal(known, view.mask)
+    assert scene.is_partial and max(known.shape) <= pixels and torch.equal(known, view.mask)
     world = points @ scene.to_world[:3, :3].T + scene.to_world[:3, 3]
     if unknown:
         motion = camera.camera_to_world.double().numpy()

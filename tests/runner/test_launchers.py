@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -171,14 +170,6 @@ def test_workers_that_are_stopped_write_the_records_of_their_runs(tmp_path):
     assert "3 planned: 2 killed, 1 not_run" in out
     killed = [record["reason"] for record in read_records(tmp_path)[0] if record["status"] == "killed"]
     assert killed == ["stopped by SIGTERM; the same command starts it anew"] * 2
-
-
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Ctrl-C takes effect also where these tests are a shell's background job, which ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("interruptible")

@@ -101,6 +101,7 @@ def test_the_server_has_what_runs_need_and_no_more():
     assert found >= {"torch", "open3d", "matplotlib"} and not found & {"hydra", "pandas"}
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_while_the_server_loads_what_runs_need_is_told_in_one_line(tmp_path):
     command = [sys.executable, "-m", "bench", f"results_dir={tmp_path}", "scale=smoke"]
     with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True) as running:
