@@ -16,7 +16,7 @@ import torch
 
 from bench.records.record import BESIDE, WAITED, Record
 from datasets.extras import version
-from renderers.fields.mlp import multiplies_faster
+from renderers.fields.mlp import bfloat16_is_faster
 from renderers.kernels.library import kernels
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,11 +56,11 @@ def describe(device: torch.device) -> dict[str, Any]:
         "runs_at_once": int(os.environ.get(BESIDE, "1")),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
         "denormals_flushed": _denormals_flushed(),
-        "kernels": kernels().said_of(device.type, torch.get_num_threads()),
+        "kernels": kernels().description_for(device.type, torch.get_num_threads()),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),
-        "bfloat16_peak_flops": gemm_peak(device, torch.bfloat16) if multiplies_faster(device) else None,
+        "bfloat16_peak_flops": gemm_peak(device, torch.bfloat16) if bfloat16_is_faster(device) else None,
     }
 
 
