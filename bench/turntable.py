@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from PIL import Image
 from torch import Tensor
 
-from bench.evaluate.state import painted
+from bench.evaluate.state import render_vertex_colours
 from bench.pictures.run_figures import normals_image, shaded
 from bench.records.record import leads_out, read_record
 from datasets.mesh import Mesh, normalise
@@ -67,7 +67,8 @@ def turntable(mesh: Mesh, frames: int, size: int) -> list[UInt8[np.ndarray, "hei
     truth = Truth(mesh, closed=False)
     parts, depths = [], []
     for view in turned(truth, frames, size):
-        shown = np.repeat(shaded(view)[..., None], 3, -1) if mesh.colours is None else painted(mesh, truth, view.camera)
+        grey = np.repeat(shaded(view)[..., None], 3, -1)
+        shown = grey if mesh.colours is None else render_vertex_colours(mesh, truth, view.camera)
         parts.append([_written(np.where(view.mask[..., None], shown, 1.0)), _written(normals_image(view))])
         depths.append(torch.where(view.mask, view.depth, torch.nan))
     if not any(bool(depth.isfinite().any()) for depth in depths):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from bench.evaluate.state import State
-from bench.pictures.colours import Seen, seen_arrays
+from bench.pictures.colours import RenderColours, view_arrays
 from bench.pictures.run_figures import at_size, draw_curve, normals_image, save_arrays
 from bench.pictures.style import SCREEN, bare, save
 from bench.reconstruct.judge import judge_mesh, judged_pixels
@@ -39,7 +39,7 @@ def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: lis
         draw_curve(folder / "curve.png", curve)
 
     def seen(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
-        view = state.pictured(camera)
+        view = state.refined_view(camera)
         return view, state.colours(view)
 
     _save(folder, seen, state.inputs, subject, title)
@@ -89,23 +89,23 @@ def draw_picture(
         save(figure, folder / "summary.png")
 
 
-def _save(folder: Path, seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> None:
+def _save(folder: Path, seen: RenderColours, inputs: RunInputs, subject: Subject, title: str) -> None:
     with rc_context(SCREEN):
         figures = {"summary": _summary(seen, inputs, subject, title), "input": _input(subject)}
         for name, figure in figures.items():
             save(figure, folder / f"{name}.png")
     shot = subject.held_out[len(subject.held_out) // 2]
-    arrays = {"photograph": shot.colours} | seen_arrays(seen, at_size(shot.camera, inputs.evaluation.picture))
+    arrays = {"photograph": shot.colours} | view_arrays(seen, at_size(shot.camera, inputs.evaluation.picture))
     if len(subject.given) == 1:
         arrays["given"] = subject.given[0].colours
     if subject.truth is not None:
         behind = turned(at_size(shot.camera, inputs.evaluation.picture), np.pi)
         true = normals_image(see(Truth(subject.truth, closed=False), behind))
-        arrays |= seen_arrays(seen, behind, "back_") | {"back_truth": torch.from_numpy(true)}
+        arrays |= view_arrays(seen, behind, "back_") | {"back_truth": torch.from_numpy(true)}
     save_arrays(folder, arrays)
 
 
-def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Figure:
+def _summary(seen: RenderColours, inputs: RunInputs, subject: Subject, title: str) -> Figure:
     """A row per held-out photograph: it, the rendering at the pictures' size, the error at its own, the normals."""
     shots = spread(subject.held_out, MOST_HELD_OUT)
     tall = shots[0].camera.height / shots[0].camera.width
@@ -129,7 +129,7 @@ def _summary(seen: Seen, inputs: RunInputs, subject: Subject, title: str) -> Fig
     return figure
 
 
-def _error(seen: Seen, shot: Shot) -> Float[np.ndarray, "height width"]:
+def _error(seen: RenderColours, shot: Shot) -> Float[np.ndarray, "height width"]:
     """The mean difference of colours at the photograph's own size, as `judge.IMAGES` has it; NaN elsewhere."""
     image = seen(shot.camera)[1]
     judged, known = judged_pixels(shot)

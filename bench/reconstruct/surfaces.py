@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 
-from bench.evaluate.state import GREY, painted
+from bench.evaluate.state import DEFAULT_VERTEX_COLOUR, render_vertex_colours
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import Subject, visible, within
 from datasets.mesh import Mesh
@@ -133,10 +133,10 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
         image = shot.colours.numpy()
         seen = [map_coordinates(image[..., band], places, order=1, mode="nearest") for band in range(3)]
         total, weights = total + weight * np.stack(seen, axis=1), weights + weight
-    return replace(mesh, colours=np.where(weights > 0, total / np.maximum(weights, 1e-12), GREY))
+    return replace(mesh, colours=np.where(weights > 0, total / np.maximum(weights, 1e-12), DEFAULT_VERTEX_COLOUR))
 
 
 def painter(mesh: Mesh) -> Callable[[Camera], tuple[View, Float[torch.Tensor, "height width 3"]]]:
-    """Gives a camera's view of a mesh, and its colours as `bench.evaluate.state.painted` has them."""
+    """Gives a camera's view of a mesh, and its colours as `bench.evaluate.state.render_vertex_colours` has them."""
     scene = Truth(mesh, closed=False)
-    return lambda camera: (see(scene, camera), torch.from_numpy(painted(mesh, scene, camera)).float())
+    return lambda camera: (see(scene, camera), torch.from_numpy(render_vertex_colours(mesh, scene, camera)).float())

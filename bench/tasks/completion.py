@@ -9,7 +9,7 @@ import torch
 from bench.models.field import solve_by_growth
 from bench.models.observations import RayObservations, hold_out, tiles, together
 from bench.pictures.colours import note_colours
-from bench.pictures.run_figures import Given
+from bench.pictures.run_figures import InputView
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
@@ -124,14 +124,14 @@ class Completion:
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[RayObservations, Given]:
+    ) -> tuple[RayObservations, InputView]:
         """The observations for a field without a prior; a fifth of them, by tiles of the view, is held out."""
         view = self._given(scene, renderer, seed=seed, device=device)
         observed, camera = view.observed.cpu(), scene.view.camera
         half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
         group = tiles(*observed.shape)
         held = hold_out(together([view]), group, share=HELD_OUT, whole=(), footprint=half_pixel, seed=seed)
-        return held, Given(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
+        return held, InputView(scene.given(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None)
 
     def _given(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> GivenView:
         """The given part of a scene's view."""

@@ -10,7 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
+from bench.evaluate.evaluate import (
+    IMAGE_DEFINITIONS,
+    OWN_PREFIX,
+    RENDERER_DEFINITIONS,
+    Evaluation,
+    render_view,
+    view_metrics,
+)
 from bench.evaluate.state import REACH, State
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
@@ -34,7 +41,7 @@ DEFINITIONS = {
 }
 TRACKED = tuple(DEFINITIONS)
 SEEN = "By exact first hits of the known mesh, the same for every method."
-SEEN_DEFINITIONS = DEFINITIONS | {name: f"{text} {SEEN}" for name, text in IMAGE.items()}
+SEEN_DEFINITIONS = DEFINITIONS | {name: f"{text} {SEEN}" for name, text in IMAGE_DEFINITIONS.items()}
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,7 @@ class PoseTask(ABC):
             own: what the renderer under test sees from the found camera, where there is one.
         """
         seen, true = see(scene.cast_on, found), scene.view
-        images = view_metrics(seen, true) | ({} if own is None else view_metrics(own, true, OWN))
+        images = view_metrics(seen, true) | ({} if own is None else view_metrics(own, true, OWN_PREFIX))
         metrics = self.metrics(found, true.camera)
         rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
         note = f"the pose was not found: it is {rotation:.1f} degrees and {distance:.3f} scene units off"
@@ -158,7 +165,7 @@ class Pose(PoseTask):
         def problem() -> PoseProblem:
             return PoseProblem(self, inputs.renderer, known, view, cameras, inputs.device)
 
-        solve(problem, self.optimiser, run, SEEN_DEFINITIONS | OWN_DEFINITIONS)
+        solve(problem, self.optimiser, run, SEEN_DEFINITIONS | RENDERER_DEFINITIONS)
 
 
 def known_shape(settings: Pose, inputs: RunInputs) -> Field:

@@ -73,7 +73,7 @@ class PriorFit:
         }
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
-        found, true = state.pictured(camera), see(inputs.scene.cast_on, camera)
+        found, true = state.refined_view(camera), see(inputs.scene.cast_on, camera)
         save_images(run.folder, found, true)
 
     def problem(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import OWN, Evaluation
+from bench.evaluate.evaluate import OWN_PREFIX, Evaluation
 from bench.evaluate.state import State, vertex_colours
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, coloured, judge, judge_mesh
 from bench.reconstruct.pictures import draw_picture, draw_reconstruction, note_surface
@@ -240,7 +240,7 @@ class OneImage:
         """The scores of a network's shape; of its colours only where its training knew some."""
         found = judge(state, subject)
         scores = {
-            name: x for name, x in found.metrics.items() if self.knows_colours or name.removeprefix(OWN) not in COLOURS
+            k: x for k, x in found.metrics.items() if self.knows_colours or k.removeprefix(OWN_PREFIX) not in COLOURS
         }
         return replace(found, metrics=scores | {"iou": overlap(state.field, images, state.inputs.device)})
 

@@ -303,7 +303,7 @@ def coarse_values(hidden: tuple[Layer, ...], last: Layer, skip: int, exact: Valu
     if width < MIN_COARSE_WIDTH or last[0].dtype != torch.float32 or not bfloat16_is_faster(last[0].device):
         return None
     network = _Bfloat16Decoder.of(hidden, last, skip)
-    version, error = _errors.get(last[0], (None, 0.0))
+    version, error = _errors.get(last[0]) or (None, 0.0)
     if version != last[0]._version:
         error = COARSE_ERROR_FACTOR * _largest_error(network, exact, last[0])
         _errors[last[0]] = last[0]._version, error
