@@ -85,13 +85,14 @@ def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: flo
         return dict(WORST_SURFACE)
     to_truth, cosine_to_truth = _nearest(predicted, truth)
     to_predicted, cosine_to_predicted = _nearest(truth, predicted)
+    precision, recall = float(np.mean(to_truth < threshold)), float(np.mean(to_predicted < threshold))
     return {
         "chamfer_l2": float(np.mean(to_truth**2) + np.mean(to_predicted**2)),
         "chamfer_l1": float(np.mean(to_truth) + np.mean(to_predicted)) / 2,
         "chamfer_gt_to_pred": float(np.mean(to_predicted**2)),
         "accuracy": float(np.mean(to_truth)),
         "completeness": float(np.mean(to_predicted)),
-        "fscore": _harmonic_mean(float(np.mean(to_truth < threshold)), float(np.mean(to_predicted < threshold))),
+        "fscore": 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
         "normal_consistency": float(np.mean(cosine_to_truth) + np.mean(cosine_to_predicted)) / 2,
     }
 
@@ -257,7 +258,3 @@ def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     vectors = vectors.astype(np.float64)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-
-
-def _harmonic_mean(first: float, second: float) -> float:
-    return 2 * first * second / (first + second) if first + second > 0 else 0.0

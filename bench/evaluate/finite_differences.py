@@ -56,9 +56,9 @@ class Differences:
     They are valid where visibility does not change and, for colours, where normals do not jump.
     """
 
-    code: Float[Tensor, "m channels directions"]
-    camera: Float[Tensor, "m channels 6"]
-    texture: Float[Tensor, "m channels weights"] | None
+    code: Float[Tensor, "m c directions"]
+    camera: Float[Tensor, "m c 6"]
+    texture: Float[Tensor, "m c weights"] | None
     valid: Bool[Tensor, " m"]
 
 
@@ -85,14 +85,10 @@ def differences(
     rays, base = camera.rays().flat()[pixels], _FieldBatch((decoder.at(code),))
     shifted = _FieldBatch(tuple(map(decoder.at, code + STEP * torch.cat([directions.T, -directions.T]))))
 
-    def observe(
-        field: _FieldBatch, rays: Rays, distance: Float[Tensor, "codes m"]
-    ) -> Float[Tensor, "codes m channels"]:
+    def observe(field: _FieldBatch, rays: Rays, distance: Float[Tensor, "codes m"]) -> Float[Tensor, "codes m c"]:
         return distance[..., None] if paint is None else paint(*_hits(field, rays, distance))
 
-    def is_smooth(
-        ahead: Float[Tensor, "codes m channels"], behind: Float[Tensor, "codes m channels"]
-    ) -> Bool[Tensor, " m"]:
+    def is_smooth(ahead: Float[Tensor, "codes m c"], behind: Float[Tensor, "codes m c"]) -> Bool[Tensor, " m"]:
         """Whether normals do not jump within the step; those of a ReLU network jump at its kinks."""
         return ((ahead + behind - 2 * base_values).abs() < MAX_SECOND_DIFFERENCE).all(-1).all(0) | (paint is None)
 

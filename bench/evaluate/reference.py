@@ -44,7 +44,10 @@ def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
         exact = in_float64(prior)
         return vars(make_reference(exact.decoder.at(exact.codes[0]), camera))
 
-    return Reference(**kept(folder, f"reference-{_key(prior, camera)}", render))
+    camera_settings = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
+    weights = fingerprint(Prior(prior.decoder, prior.codes[:1]))
+    key = digest({"version": VERSION, "weights": weights, "camera": camera_settings})
+    return Reference(**kept(folder, f"reference-{key}", render))
 
 
 def make_reference(field: Field, camera: Camera) -> Reference:
@@ -63,9 +66,3 @@ def fingerprint(prior: Prior) -> str:
     for tensor in (*prior.decoder.state_dict().values(), prior.codes):
         weights.update(tensor.cpu().contiguous().numpy().tobytes())
     return weights.hexdigest()
-
-
-def _key(prior: Prior, camera: Camera) -> str:
-    camera_settings = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
-    weights = fingerprint(Prior(prior.decoder, prior.codes[:1]))
-    return digest({"version": VERSION, "weights": weights, "camera": camera_settings})

@@ -25,7 +25,7 @@ PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit
 CODE_ONLY = ("--", ".", ":(exclude)results")  # arguments of git: results are written by reports
 DENORMAL_BITS = 713_623  # 1e-39, below float32's full precision, as bits, since the number itself may become 0
 NUMBERS_PER_THREAD = 2**15  # PyTorch computes an operation on fewer numbers in one thread
-MAX_GEMM_FRACTION = 1.2  # of a GPU's matrix product rate: above it, the clock did not wait for the device
+MAX_GEMM_FRACTION = 1.2  # a GPU that exceeds its matrix product rate by more was not synchronised with the clock
 
 
 def pick_device(wanted: str) -> torch.device:
@@ -157,9 +157,9 @@ class Stopwatch:
 class MemoryPeak:
     """Measures the largest growth of memory since its creation.
 
-    On a GPU it is memory allocated by PyTorch. On a CPU it is the process's resident set, whose high-water mark a
-    process can reset on Linux, without pages of files, since a forked process loads those of its libraries only when
-    it uses them. `growth` is None if neither is available.
+    On a GPU it is memory allocated by PyTorch; on a CPU the resident set, whose high-water mark Linux can reset. Pages
+    of files are left out, since a forked process loads those of its libraries when it first uses them. `growth` is
+    None if neither is available.
     """
 
     def __init__(self, device: torch.device) -> None:

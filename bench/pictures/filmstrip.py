@@ -126,7 +126,8 @@ def _strip(frames: dict[int | str, Shown], last_column: dict[str, Shown], title:
     square = window([frame.view.mask.numpy() for frame in shown.values()])
     columns = [frame.pictures(truth) for frame in shown.values()]
     rows = list(columns[0])
-    framed = [[_framed(column[row][square]) for row in rows] for column in columns]
+    border = {"pad_width": ((1, 1), (1, 1), (0, 0)), "constant_values": BORDER_GREY}
+    framed = [[np.pad(column[row][square], **border) for row in rows] for column in columns]
     montage = np.concatenate([np.concatenate(column, axis=0) for column in framed], axis=1)
     size = montage.shape[0] / len(rows)
     figure = Figure(figsize=(1.25 * len(shown) + 0.4, 0.5 + 1.3 * len(rows)), layout="constrained")
@@ -139,10 +140,6 @@ def _strip(frames: dict[int | str, Shown], last_column: dict[str, Shown], title:
         axis.xaxis.get_major_ticks()[list(frames).index(chosen)].label2.set_fontweight("bold")
     figure.suptitle(f"{title}{' (red missed, blue spurious)' if SILHOUETTE_ROW in rows else ''}")
     return figure
-
-
-def _framed(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "framed_height framed_width 3"]:
-    return np.pad(picture, ((1, 1), (1, 1), (0, 0)), constant_values=BORDER_GREY)
 
 
 def _animate(path: Path, frames: list[Shown], truth: Shown) -> None:

@@ -29,7 +29,7 @@ from renderers.camera import Camera
 LIGHT = np.array([-0.35, 0.6, 0.72])  # from the camera's upper left; axes point right, up, to the camera
 BACK_AZIMUTH_DEGREES = 160.0  # about the vertical axis, from the scene's camera to the one behind
 BACK_ELEVATION_DEGREES = 25.0
-MAX_PHOTOGRAPHS = 4  # in two rows
+MAX_PHOTOGRAPHS = 4  # shown in two rows
 INPUT_AXES_INCHES = 2.0
 
 
@@ -78,7 +78,7 @@ class InputView:
 
 @rc_context(SCREEN)
 def draw_run(
-    folder: Path, states: tuple[State, State], shown: InputView, curve: list[dict[str, Any]], title: str
+    folder: Path, states: tuple[State, State], view: InputView, curve: list[dict[str, Any]], title: str
 ) -> None:
     """Writes summary.png and curve.png from a run's states before and after, in the size of pictures."""
     inputs = states[0].inputs
@@ -95,7 +95,7 @@ def draw_run(
             scene.view.mask,
         ),
     )
-    save(_summary(pairs, shown, title), folder / "summary.png")
+    save(_summary(pairs, view, title), folder / "summary.png")
     draw_curve(folder / "curve.png", curve)
 
 
@@ -189,8 +189,7 @@ def save_gallery(
 ) -> None:
     """Writes `folder/images.npz` for galleries: given depths, and meshes from the scene's camera and from behind.
 
-    `given` is NaN at pixels without a given depth. Each mesh, and the truth as "true", has NAME_normals [2, h, w, 3]
-    and NAME_hit [2, h, w].
+    `given` is NaN without a depth. Meshes and the truth, "true", have NAME_normals [2, h, w, 3], NAME_hit [2, h, w].
 
     Args:
         observed: pixels of the scene's view whose depth is given.
@@ -328,15 +327,14 @@ def _show_input(axis: Any, shown: InputView) -> None:
         chosen = shown.photographs[indices]
         bare(axis).imshow(np.concatenate([np.concatenate(chosen[:2], 1), np.concatenate(chosen[2:], 1)], 0))
         return
-    mask = shown.view.mask.numpy()
+    mask, depths = shown.view.mask.numpy(), shown.view.depth.numpy()
     rows, columns = window([mask])
     bare(axis).imshow(np.where(mask, 0.85, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     axis.set_xlim(columns.start - 0.5, columns.stop - 0.5)
     axis.set_ylim(rows.stop - 0.5, rows.start - 0.5)
     pixels = np.nonzero(shown.observed)
     size = (72 * INPUT_AXES_INCHES / (rows.stop - rows.start)) ** 2  # of a marker, in square points of 1/72 inch
-    depths = shown.view.depth.numpy()[pixels]
-    axis.scatter(pixels[1], pixels[0], c=depths, s=size, cmap="viridis_r", marker="s", linewidths=0)
+    axis.scatter(pixels[1], pixels[0], c=depths[pixels], s=size, cmap="viridis_r", marker="s", linewidths=0)
 
 
 def window(masks: Sequence[Bool[np.ndarray, "height width"]]) -> tuple[slice, slice]:

@@ -154,8 +154,8 @@ def window(masks: Sequence[np.ndarray], margin: float = 0.08) -> tuple[float, fl
         margin: as a fraction of the masks' extent.
 
     Returns:
-        Its upper edge, left edge and side, in units of the larger side of a picture. Without a pixel in any mask it is
-        a square of the smaller side.
+        Its upper edge, left edge and side, in units of a picture's larger side. If all masks are empty, the side is the
+        smaller side.
     """
     sizes = [max(mask.shape) for mask in masks]
     max_side = min((min(mask.shape) / size for mask, size in zip(masks, sizes, strict=True)), default=1.0)

@@ -6,8 +6,7 @@ from torch import Tensor
 
 # Assumed rounding errors, in units of the precision: of each number of a layer in these bounds, which are computed in
 # float64, and of the network's own values, in the precision of the points.
-ROUNDING_FACTOR = 8.0
-EVALUATION_ROUNDING_FACTOR = 64.0
+ROUNDING_FACTOR, EVALUATION_ROUNDING_FACTOR = 8.0, 64.0
 SEGMENTS_PER_BATCH = 512  # keeps the activations in cache
 
 Layer = tuple[Tensor, Tensor]

@@ -1,7 +1,6 @@
 """Analytic shapes and their combinations; each states its kind. A shape is a few lines: `sphere(0.5) | box((1, 1, 1))`.
 
-Formulas for the exact distances are standard (Hart 1996; Quilez, "distance functions"). Parameters may be tensors, so
-that gradients flow to them.
+Formulas for distances are standard (Hart 1996; Quilez, "distance functions"). Tensors as parameters get gradients.
 """
 
 from collections.abc import Callable, Sequence
@@ -93,12 +92,7 @@ def plane(normal: Numbers = (0.0, 1.0, 0.0), offset: Numbers = 0.0) -> Shape:
 
 def box(half_sizes: Numbers) -> Shape:
     """An axis-aligned box about the origin, with half side lengths `half_sizes` [3]; exact distance."""
-
-    def distance(points: Tensor) -> Tensor:
-        beyond = points.abs() - _like(half_sizes, points)
-        return _box_distance(beyond)
-
-    return Shape(distance)
+    return Shape(lambda p: _box_distance(p.abs() - _like(half_sizes, p)))
 
 
 def rounded_box(half_sizes: Numbers, radius: Numbers) -> Shape:
@@ -110,13 +104,11 @@ def superquadric(half_sizes: Numbers, exponents: Numbers) -> Shape:
     """A superquadric (Barr 1981) of half sizes `half_sizes` [3] about the origin; a bound.
 
     On its surface the norm ((|x|^p + |y|^p)^(q/p) + |z|^q)^(1/q) of the coordinates over the half sizes is 1. The
-    Lipschitz constant of this norm is at most 1 for exponents of 2 and more, and 2^(1/p - 1/2) per exponent p below.
-    Values are divided by it.
+    Lipschitz constant of this norm, by which values are divided, has a factor 2^(1/p - 1/2) per exponent p below 2.
 
     Args:
         half_sizes: along x, y and z, in scene units, positive.
-        exponents: p across x and y, q towards z, each at least 1: 1 gives an octahedron, 2 an ellipsoid, and large
-            exponents nearly a box.
+        exponents: p across x and y, q towards z, at least 1: 1 gives an octahedron, 2 an ellipsoid, 20 nearly a box.
     """
 
     def bound(points: Tensor) -> Tensor:

@@ -1,8 +1,7 @@
 """The DeepSDF decoder: a network of points and a shape code, bound to one code before rendering.
 
-Coarse values are computed with hidden layers in bfloat16, if the processor multiplies bfloat16 matrices faster. The
-points and the last layer stay in float32: coordinates need more than the 8 bits of bfloat16, and so does a sum that
-cancels near the surface.
+Coarse values have hidden layers in bfloat16, if the processor multiplies such matrices faster. The points and the last
+layer stay in float32: coordinates, and sums that cancel near the surface, need more than the 8 bits of bfloat16.
 """
 
 import time
@@ -29,10 +28,8 @@ ONEDNN_PACKING_POINTS = 1024  # the batch size for which oneDNN packs weights
 MIN_COARSE_WIDTH = 256  # neurons per layer: below it, converting features takes the time that the products save
 # The coarse error is measured at points of the unit sphere with a small coarse value, since elsewhere it has no effect;
 # with too few of them, at all points. The factor allows for larger errors between the points, and at other codes.
-ERROR_SAMPLE_POINTS = 2**14
-NEAR_SURFACE_VALUE = 0.05
-MIN_NEAR_SURFACE_POINTS = 100
-COARSE_ERROR_FACTOR = 2.0
+ERROR_SAMPLE_POINTS, MIN_NEAR_SURFACE_POINTS = 2**14, 100
+NEAR_SURFACE_VALUE, COARSE_ERROR_FACTOR = 0.05, 2.0
 
 Layer = tuple[Tensor, Tensor]  # weight [out, in] and bias [out]
 _errors = WeakTensorKeyDictionary()  # from a network's last weight, shared by all codes, to its version and the error
@@ -49,8 +46,7 @@ class Decoder(nn.Module):
         width: neurons per hidden layer.
         code_length: numbers in a shape's code; 0 for a network of one shape.
         skip: index of the hidden layer whose input also takes the code and the point; 0 for no skip.
-        narrow: whether the layer before the skip is narrower, as in DeepSDF, so that its output and the input together
-            have `width` numbers.
+        narrow: whether the layer before the skip is narrower, as in DeepSDF: with the input it has `width` numbers.
         outputs: numbers per point; `BoundDecoder.outputs` returns more than one.
     """
 

@@ -25,13 +25,11 @@ from renderers.field import (
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder, flops_of, split_into_passes
 
-SAMPLE_POINTS = 2**14  # points in the unit sphere, for values and slopes
+SAMPLES = 2**14  # points in the unit sphere, for values and slopes
 SPHERE_POINTS, OTHER_CODE_POINTS = 4096, 512  # points on the unit sphere, for the field and for each other code
 # Values are distances if two limits hold, as for our trained priors. Near the surface, at this fraction of the points,
 # the middle 80 % of the slopes are 1 up to this deviation. Of all slopes, 99 % are at most MAX_SLOPE.
-NEAR_SURFACE_FRACTION = 0.1
-MAX_SLOPE_DEVIATION = 0.25
-MAX_SLOPE = 1.5
+NEAR_SURFACE_FRACTION, MAX_SLOPE_DEVIATION, MAX_SLOPE = 0.1, 0.25, 1.5
 
 
 @dataclass(frozen=True)
@@ -69,12 +67,12 @@ class FieldStatistics:
     def summary(self) -> str:
         """The statistics in one line."""
         low, middle, high = self.near_slopes
-        crosses = f"{self.sphere_fraction_inside:.1%} of the unit sphere's surface is inside"
+        where = f"{self.sphere_fraction_inside:.1%} of the unit sphere's surface is inside"
+        where = where if self.sphere_fraction_inside else "it lies in the unit sphere"
         return (
             f"slopes from {self.min_slope:.3g} to {self.max_slope:.3g}, near the surface {middle:.3g} "
             f"({low:.3g} to {high:.3g}); {self.fraction_inside:.1%} of the sphere is inside, "
-            f"{' x '.join(f'{side:.2f}' for side in self.extent)} in extent; "
-            f"{crosses if self.sphere_fraction_inside else 'it lies in the unit sphere'}"
+            f"{' x '.join(f'{side:.2f}' for side in self.extent)} in extent; {where}"
         )
 
 
@@ -125,15 +123,14 @@ def measure_field(
     Raises:
         BadInput: if values are not finite.
     """
-    points = points_in_sphere(SAMPLE_POINTS, like)
+    points = points_in_sphere(SAMPLES, like)
     surface = nn.functional.normalize(points[:SPHERE_POINTS], dim=-1)
     with torch.no_grad():
         values = torch.cat([field(chunk) for chunk in points.split(SPHERE_POINTS)]).double() - level
         sphere_values = [field(surface).double() - level]
         sphere_values += [other(surface[:OTHER_CODE_POINTS]) - level for other in others]
     if count := int((~values.isfinite()).sum()):
-        message = f"its value is not finite at {count} of {SAMPLE_POINTS} points of the unit sphere: check its weights"
-        raise BadInput(message)
+        raise BadInput(f"its value is not finite at {count} of {SAMPLES} points of the unit sphere: check its weights")
     slopes = scale * torch.cat([_slopes(field, chunk) for chunk in points.split(SPHERE_POINTS)])
     if sign is None:
         votes = sum(float((field_values > 0).double().mean()) >= 0.5 for field_values in sphere_values)
@@ -302,8 +299,7 @@ class Published(nn.Module):
     def __init__(self, inner: Decoder | Coded, squash: int = 0) -> None:
         super().__init__()
         self.inner, self.squash, self.kind, self.lipschitz = inner, squash, Kind.LEVEL, None
-        self.code_length, self.width = inner.code_length, inner.width
-        self.code_is_position = inner.code_is_position
+        self.code_length, self.width, self.code_is_position = inner.code_length, inner.width, inner.code_is_position
         self.register_buffer("factor", torch.ones(()))
         self.register_buffer("level", torch.zeros(()))
 

@@ -1,9 +1,8 @@
 """Compiled code that replaces PyTorch, with equal values up to rounding; built once per machine, if possible.
 
-It computes values of float32 ReLU networks without a gradient, on one thread of a CPU. PyTorch computes everything
-else: values with a gradient, coarse values, softplus networks, grids and formulas. Renderers need these in different
-proportions, so ratios of runtimes depend on the engine; a record names it under `kernels`.
-`IMPLICIT_BENCH_KERNELS=torch` uses PyTorch for everything.
+It computes values of float32 ReLU networks without a gradient, on one thread of a CPU; PyTorch computes all else, such
+as values with a gradient and coarse values. Renderers need these in different proportions, so ratios of runtimes depend
+on the engine; a record names it under `kernels`. `IMPLICIT_BENCH_KERNELS=torch` uses PyTorch for everything.
 """
 
 import ctypes

@@ -110,8 +110,7 @@ def render_volume(
     queried = meets.nonzero().squeeze(-1)
     blocks = queried.split(BLOCK // 256)  # bounds the memory of a search; one block, even of no rays
     results = [_BatchResult.of(field, flat, index, (entry, leave), search, log_transmittance) for index in blocks]
-    columns = zip(*(vars(batch).values() for batch in results), strict=True)
-    result = _BatchResult(*(torch.cat(column) for column in columns))
+    result = _BatchResult(*map(torch.cat, zip(*(vars(batch).values() for batch in results), strict=True)))
     inside = result.starts_inside
     hit = (result.opacity.detach() > HIT_OPACITY) & ~inside
     hit_index = hit.nonzero().squeeze(-1)
@@ -129,9 +128,8 @@ def render_volume(
         residual=torch.zeros_like(entry).index_put((queried,), torch.where(hit, result.residual, result.closest_value)),
         closest=(queried, closest_value),
     )
-    deferred_rays = torch.zeros_like(meets).index_put((queried,), ~hit)
-    deferred_distance = leave.index_put((queried,), closest_distance)
-    deferred = Deferred(deferred_distance.view(rays.shape), deferred_rays.view(rays.shape))
+    is_deferred = torch.zeros_like(meets).index_put((queried,), ~hit)
+    deferred = Deferred(leave.index_put((queried,), closest_distance).view(rays.shape), is_deferred.view(rays.shape))
     volume = Volume(result.ray, result.distance, result.weight)
     return replace(rendering, deferred=deferred, volume=volume)
 

@@ -25,8 +25,8 @@ class UNISURF(VolumeRenderer):
         its slope. A level set has no unit of length and is refused.
     Deviates from the paper: see Needs; samples are equally spaced and not random; the background is empty; the
         smoothness of normals is a loss of the task, and off. Without space in front of the interval, free samples get
-        the value of free space. `distance` is the weighted mean. While the interval is wide it lies in front of the
-        surface, since samples of low occupancy have absorbed light there.
+        the value of free space. `distance` is the weighted mean: while the interval is wide, it lies in front of the
+        surface, where samples of low occupancy absorb light.
 
     Args:
         search_samples: equally spaced samples, for the search of the first change from free to occupied.

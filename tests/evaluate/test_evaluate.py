@@ -208,7 +208,7 @@ def dipped(place: tuple[float, float, float], width: float) -> Shape:
 def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inputs):
     fine = replace(inputs, renderer=load("renderer", "newton"), evaluation=replace(inputs.evaluation, grid=96))
     camera = camera_of(128)
-    scene = replace(inputs.scene, view=State(sphere(RADIUS), fine).seen(camera))
+    scene = replace(inputs.scene, view=State(sphere(RADIUS), fine).view_from(camera))
     fine = replace(fine, make_scene=lambda: scene)
     state = State(dipped((0.8, 0.3, 0.1), 0.03), fine)
     found = evaluate(state)
