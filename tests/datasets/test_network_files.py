@@ -19,7 +19,7 @@ from datasets.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
 from renderers.field import STEEPEST_MARGIN, Field, Kind, autograd_gradients, points_in_sphere
-from renderers.fields.network import from_module, measured
+from renderers.fields.network import from_module, measure_field
 from tests.composing import composed
 from tests.documentation import code_of
 from tests.looped import each
@@ -139,13 +139,13 @@ def test_a_deepsdf_folder_has_a_shape_for_each_code(tmp_path_factory, codes, dty
 def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
     codes = torch.tensor([[0.1], [-0.2], [-0.45]])  # the last reaches through most of the unit sphere
     near(field_of(deepsdf_folder(tmp_path, codes), 2)(POINTS), octahedron(POINTS) - 0.45)
-    bound = measured(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
-    assert bound.divisor == pytest.approx(3 * measured(octahedron, POINTS, kind=Kind.BOUND).divisor)
+    bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
+    assert bound.divisor == pytest.approx(3 * measure_field(octahedron, POINTS, kind=Kind.BOUND).divisor)
 
 
 def test_a_bound_that_is_scaled_has_no_slope_above_1_at_the_steepest_code():
     steep = lambda points: 3 * octahedron(points)  # noqa: E731
-    bound = measured(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
+    bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
     slopes = autograd_gradients(lambda points: bound.factor * steep(points), POINTS).norm(dim=-1)
     assert bound.lipschitz == 1.0 and slopes.max() == pytest.approx(1 / STEEPEST_MARGIN, rel=1e-3)
 
