@@ -69,7 +69,7 @@ class Stability:
         own, some = self.stress.scene, ", ".join(OF_NETWORKS)
         if own not in OF_NETWORKS:
             raise BadInput(f"the stress {own} renders no network: remove field=file, or set stress={some}")
-        if own == "far_code" and inputs.prior.decoder.placed:
+        if own == "far_code" and inputs.prior.decoder.code_is_position:
             raise BadInput("the network has no code that the stress far_code could change: set stress=noisy_weights")
 
     def execute(self, run: RunContext) -> None:
