@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bench.evaluate import dtu
-from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, drawn, surface_metrics
+from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, subsample, surface_metrics
 from bench.records.read import check_links
 from bench.records.record import Record, RunStatus, digest, is_plain_name, now, read_record
 from bench.report.write.html import write_index
@@ -106,12 +106,13 @@ class Judge:
         if isinstance(item.truth, Path):
             return self._by_surface(item.name, mesh, item.truth)
         scan = dtu.read_scan(self.folder or Path(), item.truth)
-        notes = [*_mismatch_warnings(mesh, scan.above(), *SCAN_LIMITS), *dtu.published(item.truth)]
+        notes = [*_mismatch_warnings(mesh, scan.points_above_plane(), *SCAN_LIMITS), *dtu.published_results(item.truth)]
         metrics = dtu.dtu_metrics(mesh, scan, seed=self.seed)
         if metrics["dtu_accuracy"] == inf:
             raise BadInput(
-                f"'{item.mesh}': nothing of the mesh lies within {dtu.CUT:g} mm of scan {item.truth} where it was "
-                "observed: it must be in DTU's world, in mm; --to-world PHOTOS moves it there from their unit sphere"
+                f"'{item.mesh}': nothing of the mesh lies within {dtu.MAX_DISTANCE_MM:g} mm of scan {item.truth} "
+                "where it was observed: it must be in DTU's world, in mm; --to-world PHOTOS moves it there from their "
+                "unit sphere"
             )
         return Verdict(item.name, metrics, notes, mesh=mesh)
 
@@ -143,7 +144,9 @@ class Judge:
         notes.append(f"{self.points} points of each; F at {threshold_text}")
         predicted_samples = sample_surface(mesh, self.points, self.seed + 1)
         if surface is None:
-            metrics = cloud_metrics(predicted_samples, drawn(truth_points, self.points, self.seed), threshold=threshold)
+            metrics = cloud_metrics(
+                predicted_samples, subsample(truth_points, self.points, self.seed), threshold=threshold
+            )
             return Verdict(name, metrics, notes, mesh=mesh)
         true_samples, repeated_samples = (sample_surface(surface, self.points, self.seed + offset) for offset in (0, 2))
         sampling_error = surface_metrics(repeated_samples, true_samples, threshold=threshold)
@@ -202,7 +205,7 @@ def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
 def metric_units(judge: Judge) -> dict[str, str]:
     """The unit of each metric."""
     if judge.folder is not None:
-        return dict.fromkeys(dtu.NAMES, "mm")
+        return dict.fromkeys(dtu.METRIC_NAMES, "mm")
     unit = "scene unit" if judge.unit_sphere else "unit"
     powers = {name: UNIT_SUFFIXES.get(name, "") for name in WORST_SURFACE}
     return {name: "" if power is None else unit + power for name, power in powers.items()}

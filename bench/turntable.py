@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from PIL import Image
 from torch import Tensor
 
-from bench.evaluate.state import painted
+from bench.evaluate.state import render_vertex_colours
 from bench.pictures.run_figures import normals_image, shaded
 from bench.records.record import is_outside, read_record
 from datasets.mesh import Mesh, normalise
@@ -68,7 +68,11 @@ def turntable(mesh: Mesh, frames: int, size: int) -> list[UInt8[np.ndarray, "hei
     truth = Truth(mesh, closed=False)
     parts, depths = [], []
     for view in turntable_views(truth, frames, size):
-        shown = np.repeat(shaded(view)[..., None], 3, -1) if mesh.colours is None else painted(mesh, truth, view.camera)
+        shown = (
+            np.repeat(shaded(view)[..., None], 3, -1)
+            if mesh.colours is None
+            else render_vertex_colours(mesh, truth, view.camera)
+        )
         parts.append([_downsample(np.where(view.mask[..., None], shown, 1.0)), _downsample(normals_image(view))])
         depths.append(torch.where(view.mask, view.depth, torch.nan))
     if not any(bool(depth.isfinite().any()) for depth in depths):

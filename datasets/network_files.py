@@ -30,14 +30,22 @@ from renderers.checks import BadInput, check_at_least, check_choice, check_posit
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
-from renderers.fields.network import Coded, Facts, Published, enlarged, measured, settled
-from renderers.fields.published import LAYERS, SIGNED, Residual, deepsdf, implicit, occupancy, plain
+from renderers.fields.network import Coded, FieldStatistics, Published, interpret, measure_field, scale_shapes
+from renderers.fields.published import (
+    LAYERS,
+    SIGNED,
+    Residual,
+    load_deepsdf,
+    load_mlp,
+    load_occupancy_network,
+    load_sdf_network,
+)
 
 VERSION = 1  # raise it when reading or measuring changes the fields
 CUBE_HALF_SIDE = 1.05  # scene units: the surface within the unit sphere is extracted in this cube
 AUTO = "auto"
 MEASURED_CODES = 16  # the sign and the Lipschitz constant are measured at about so many codes
-INSIDE_SIGNS = {AUTO: None, "negative": 1.0, "positive": -1.0}  # see `Meaning`
+INSIDE_SIGNS = {AUTO: None, "negative": 1.0, "positive": -1.0}  # see `FieldInterpretation`
 OWN_CLASS = "field._target_=PACKAGE.CLASS"
 DEEPSDF_FILES = ("ModelParameters/latest.pth", "LatentCodes/latest.pth")
 SUPPORTED_CHECKPOINTS = (
@@ -65,7 +73,7 @@ class SceneNetwork:
 
     decoder: Decoder | Published
     codes: Float[Tensor, "shapes code_length"]
-    facts: Facts
+    facts: FieldStatistics
     notes: tuple[str, ...]
 
 
@@ -210,7 +218,7 @@ def _load_network(file: NetworkFile, index: int, content: str) -> SceneNetwork:
     """The network, measured at one code; read again when a file has changed."""
     try:
         network, codes = _read(file)
-        enlarged(network.inner, file.scale)
+        scale_shapes(network.inner, file.scale)
         if index >= len(codes):
             message = f"{len(codes)} codes, and index={index} is none of them: set index=0 to {len(codes) - 1}"
             raise BadInput(f"it has {message if len(codes) > 1 else 'one code: set index=0'}")
@@ -222,7 +230,7 @@ def _load_network(file: NetworkFile, index: int, content: str) -> SceneNetwork:
 def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> SceneNetwork:
     """The network, converted to a field that is negative inside and of the measured kind."""
     others = [network.at(code) for code in codes[:: max(len(codes) // MEASURED_CODES, 1)]] if len(codes) > 1 else []
-    meaning = measured(
+    meaning = measure_field(
         network.at(codes[index]),
         codes,
         kind=None if file.kind == AUTO else Kind(file.kind),
@@ -231,21 +239,23 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
         scale=file.scale,
         others=others,
     )
-    facts, kind = meaning.facts, meaning.kind
-    if not facts.least < 0 < facts.most:
-        ends = sorted(file.level + value / (meaning.factor * meaning.divisor) for value in (facts.least, facts.most))
+    facts, kind = meaning.statistics, meaning.kind
+    if not facts.min_value < 0 < facts.max_value:
+        ends = sorted(
+            file.level + value / (meaning.factor * meaning.divisor) for value in (facts.min_value, facts.max_value)
+        )
         raise BadInput(
             f"its values in the unit sphere lie between {ends[0]:.3g} and {ends[1]:.3g}, and the surface at the level "
             f"{file.level:g} is not among them: set dataset.level (0.5 where they are probabilities), or dataset.scale"
         )
     network.register_buffer("content", torch.frombuffer(bytearray.fromhex(content), dtype=torch.uint8))
-    decoder = settled(network, meaning, level=file.level).requires_grad_(False)
+    decoder = interpret(network, meaning, level=file.level).requires_grad_(False)
     side = f"values are {'negative' if meaning.factor > 0 else 'positive'} inside, at the level {file.level:g}"
     if isinstance(network.inner, Coded) and isinstance(network.inner.body, Residual):
         side += f" of the logits, a probability of {torch.tensor(file.level).sigmoid():.2g} (occupancy networks' own "
         side += "meshes are at 0.2, dataset.level=-1.386)"
     divided = f", by values divided by {meaning.divisor:.3g}" if kind is Kind.BOUND else ""
-    note = f"{file.name}: {side}; {facts.in_words}; taken as a {kind.value}{divided}"
+    note = f"{file.name}: {side}; {facts.summary}; taken as a {kind.value}{divided}"
     return SceneNetwork(decoder, codes, facts, (note,))
 
 
@@ -259,14 +269,14 @@ def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     elif path.is_dir():
         network, codes = _read_folder(path, file.tanh)
     elif path.suffix == ".npz":
-        network, codes = plain(_arrays(path)), None
+        network, codes = load_mlp(_arrays(path)), None
     else:
         network, codes = _by_tensor_names(_tensors(path)), None
     if file.codes is not None:
         codes = _codes(Path(file.codes))
     length = network.code_length
     if codes is None:
-        if not network.placed:
+        if not network.code_is_position:
             raise BadInput(
                 f"its values depend on a code of {length} numbers, which it does not hold: set dataset.codes=FILE, an "
                 f".npy or .pth of [shapes, {length}], such as an encoder's output"
@@ -288,16 +298,16 @@ def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | No
     weights, latent = (path / name for name in DEEPSDF_FILES)
     if not weights.is_file():
         raise BadInput(f"the folder has no {DEEPSDF_FILES[0]}")
-    network = deepsdf(_tensors(weights), specs, squash=squash)
+    network = load_deepsdf(_tensors(weights), specs, squash=squash)
     return network, _codes(latent) if latent.is_file() and not network.placed else None
 
 
 def _by_tensor_names(tensors: dict[str, Tensor]) -> Published:
     """The network of a checkpoint; its tensors' names determine its format."""
     if any(re.search(rf"(?:^|\.){SIGNED}\.{LAYERS}", name) for name in tensors):
-        return implicit(tensors)
+        return load_sdf_network(tensors)
     if any(f".{first}_p." in f".{name}" for name in tensors for first in ("fc", "conv")):
-        return occupancy(tensors)
+        return load_occupancy_network(tensors)
     names = ", ".join([*tensors][:6]) or "no tensors"
     formats = f"{SUPPORTED_CHECKPOINTS}; .npz; a class of yours, by {OWN_CLASS}"
     raise BadInput(f"it is of no format that is read, which are {formats}: it has {names}")

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 import bench
-from bench.evaluate.dtu import NAMES, dtu_metrics, read_scan
+from bench.evaluate.dtu import METRIC_NAMES, dtu_metrics, read_scan
 from bench.evaluate.evaluate import DEFINITIONS, surface_metrics
 from bench.judge import Judge, main, metric_units
 from bench.merge import merge
@@ -193,7 +193,7 @@ def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path,
     expected = dtu_metrics(there, read_scan(tmp_path / "dtu", 65), seed=0)
     where = ("--dtu", tmp_path / "dtu")
     first = judged(capsys, tmp_path / "there65.ply", *where)
-    assert first["there65"] == pytest.approx(expected, rel=1e-3) and tuple(first["there65"]) == NAMES
+    assert first["there65"] == pytest.approx(expected, rel=1e-3) and tuple(first["there65"]) == METRIC_NAMES
     assert any("DVR (RGB): 0.907" in note for note in first["notes"])
     moved = judged(capsys, tmp_path / "scan65.ply", *where, "--to-world", tmp_path / "photos")
     assert moved["scan65"] == pytest.approx(expected, rel=1e-3)

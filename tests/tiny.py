@@ -23,11 +23,11 @@ from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
-from renderers.fields.network import Facts
+from renderers.fields.network import FieldStatistics
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
-FACTS = Facts(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, near=(1.0, 1.0, 1.0), nearly_all=1.0)  # of a distance
+FACTS = FieldStatistics(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, (1.0, 1.0, 1.0), slope_p99=1.0)  # of a distance
 TRIANGLE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
 PEAK = 1e10  # operations a second that the machine of a run is said to do
 

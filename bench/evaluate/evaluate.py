@@ -24,18 +24,18 @@ from renderers.field import Field, autograd_normals
 from renderers.fields.coloured import Coloured
 from renderers.rendering import Rendering
 
-OWN = "own_"  # prefix of the metrics of what the renderer under test sees
-TIMES, LEAST_GAP = 3.0, 0.02  # how far apart two depth errors are noted: as a ratio, and in scene units
-BEHIND = 2.0  # spacings of the samples that give the mesh: a hit so far behind a part of it is of another part
-OF_MESH = "By exact first hits of the mesh that evaluation.grid gives within the unit sphere, for every renderer."
-IMAGE = {
+OWN_PREFIX = "own_"  # begins names of metrics of the image by the renderer under test
+MIN_GAP_RATIO, MIN_GAP = 3.0, 0.02  # ratio, and difference in scene units, at which two depth errors give a note
+MAX_SPACINGS_BEHIND = 2.0  # grid spacings: a hit farther behind a part of the mesh belongs to another part
+FROM_MESH = "By exact first hits of the mesh that evaluation.grid gives within the unit sphere, for every renderer."
+IMAGE_DEFINITIONS = {
     "depth_mae": "Mean absolute difference of camera-z depth over the pixels that are foreground in both the"
     " predicted and the true mask, in scene units; infinite if there is no such pixel.",
     "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground"
     " in at least one, from 0 to 1; two empty masks give 1.",
 }
-OWN_DEFINITIONS = {
-    OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE.items()
+RENDERER_DEFINITIONS = {
+    OWN_PREFIX + k: f"{v} Of the image that the renderer under test renders." for k, v in IMAGE_DEFINITIONS.items()
 }
 DEFINITIONS: dict[str, str] = {
     "chamfer_l2": "Sum of the mean squared distance from each point sampled on the prediction to the nearest"
@@ -54,18 +54,18 @@ DEFINITIONS: dict[str, str] = {
     "normal_consistency": "Mean absolute cosine between the normal at each sampled point and the normal at"
     " the nearest point sampled on the other surface, averaged over both directions (Occupancy Networks),"
     " from 0 to 1.",
-    **{name: f"{text} {OF_MESH}" for name, text in IMAGE.items()},
-    **OWN_DEFINITIONS,
+    **{name: f"{text} {FROM_MESH}" for name, text in IMAGE_DEFINITIONS.items()},
+    **RENDERER_DEFINITIONS,
 }
 
-OF_PART = ("completeness", "chamfer_gt_to_pred")  # what a part of the truth can judge: is it in the prediction?
-COLOUR = {
+PARTIAL_TRUTH_METRICS = ("completeness", "chamfer_gt_to_pred")  # valid if the truth shows only a part of the shape
+COLOUR_DEFINITIONS = {
     "colour_error": "Mean absolute difference between the field's colours and the true ones, from 0 to 1, at points"
     " sampled on the whole true surface, seen or not.",
 }
-CHAMFER = ("chamfer_l1", "chamfer_l2")  # what checkpoints judge by
+CHECKPOINT_METRICS = ("chamfer_l1", "chamfer_l2")
 
-# The score of a run without a surface: the worst.
+# The scores of a run without a surface.
 WORST_SURFACE = dict.fromkeys(("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness"), np.inf)
 WORST_SURFACE |= {"fscore": 0.0, "normal_consistency": 0.0}
 
@@ -74,8 +74,8 @@ def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: flo
     """The seven surface metrics of `DEFINITIONS`, unscaled.
 
     Args:
-        predicted: None or empty means that there is no surface, which scores worst: infinite distances, zero
-            `fscore` and `normal_consistency`. A zero normal is consistent with none.
+        predicted: None or empty means no surface, with infinite distances and a `fscore` and `normal_consistency` of 0.
+            A zero normal is consistent with no normal.
         truth: must not be empty.
         threshold: of `fscore`, in scene units, positive.
     """
@@ -85,26 +85,27 @@ def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: flo
         return dict(WORST_SURFACE)
     to_truth, cosine_to_truth = _nearest(predicted, truth)
     to_predicted, cosine_to_predicted = _nearest(truth, predicted)
+    precision, recall = float(np.mean(to_truth < threshold)), float(np.mean(to_predicted < threshold))
     return {
         "chamfer_l2": float(np.mean(to_truth**2) + np.mean(to_predicted**2)),
         "chamfer_l1": float(np.mean(to_truth) + np.mean(to_predicted)) / 2,
         "chamfer_gt_to_pred": float(np.mean(to_predicted**2)),
         "accuracy": float(np.mean(to_truth)),
         "completeness": float(np.mean(to_predicted)),
-        "fscore": _harmonic_mean(float(np.mean(to_truth < threshold)), float(np.mean(to_predicted < threshold))),
+        "fscore": 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
         "normal_consistency": float(np.mean(cosine_to_truth) + np.mean(cosine_to_predicted)) / 2,
     }
 
 
 def cloud_metrics(predicted: Surface | None, points: Float[np.ndarray, "n 3"], *, threshold: float) -> dict[str, float]:
-    """Those of `surface_metrics` that need no normals, where the truth is a cloud of points."""
-    found = surface_metrics(predicted, Surface(points, np.zeros_like(points)), threshold=threshold)
-    del found["normal_consistency"]
-    return found
+    """The metrics of `surface_metrics` that need no normals, for a truth that is a point cloud."""
+    metrics = surface_metrics(predicted, Surface(points, np.zeros_like(points)), threshold=threshold)
+    del metrics["normal_consistency"]
+    return metrics
 
 
-def drawn(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
-    """At most so many points of a cloud, drawn at random."""
+def subsample(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
+    """At most `count` random points of a cloud."""
     return points if len(points) <= count else np.random.default_rng(seed).choice(points, count, replace=False)
 
 
@@ -114,10 +115,10 @@ class Evaluation:
 
     Args:
         metrics: by the names in the record's definitions.
-        mesh: of the field; None where it has no surface, or none was extracted.
-        failure: status and reason, where the state is not a valid result; else None.
+        mesh: of the field; None if it has no surface, or if no mesh was extracted.
+        failure: status and reason, if the state is not a valid result; else None.
         notes: for the user.
-        field: that was judged; None of what has no field of its own.
+        field: the evaluated field; None if the result has no field.
     """
 
     metrics: dict[str, Any]
@@ -130,91 +131,93 @@ class Evaluation:
 def evaluate(state: State) -> Evaluation:
     """Compares a state with a scene's truth: surface samples of both, and the images in the scene's view.
 
-    Images are those of the extracted mesh, so that no renderer judges itself, and those of the run's renderer beside
-    them.
+    Images are rendered from the extracted mesh, so that no renderer evaluates itself, and also by the run's renderer.
     """
     truth = state.inputs.scene.view
-    own = render_view(state.field, truth.camera, state.inputs)
-    metrics = _surface_scores(state) | view_metrics(state.seen(truth.camera), truth) | view_metrics(own, truth, OWN)
+    renderer_view = render_view(state.field, truth.camera, state.inputs)
+    metrics = _surface_scores(state) | view_metrics(state.view_from(truth.camera), truth)
+    metrics |= view_metrics(renderer_view, truth, OWN_PREFIX)
     failure = (RunStatus.EMPTY, "the field has no surface in the unit sphere") if state.mesh is None else None
     mesh, texture, device = state.mesh, state.inputs.scene.texture, state.inputs.device
     if texture is not None and isinstance(state.field, Coloured):
         surface = state.inputs.true_surface
-        found = colours_at(state.field, torch.from_numpy(surface.points).float(), None, device).numpy()
-        metrics["colour_error"] = float(np.abs(found - texture(surface.points, surface.normals)).mean())
+        colours = colours_at(state.field, torch.from_numpy(surface.points).float(), None, device).numpy()
+        metrics["colour_error"] = float(np.abs(colours - texture(surface.points, surface.normals)).mean())
         mesh = mesh and replace(mesh, colours=vertex_colours(state.field, mesh, device))
-    return Evaluation(metrics, mesh, failure, unrendered(state, [own]), state.field)
+    return Evaluation(metrics, mesh, failure, missed_parts_note(state, [renderer_view]), state.field)
 
 
-def unrendered(state: State, own: Sequence[View]) -> tuple[str, ...]:
-    """A note on parts of the mesh that the renderer under test does not see; none where it sees all that it should.
+def missed_parts_note(state: State, renderer_views: Sequence[View]) -> tuple[str, ...]:
+    """A note if the renderer under test misses connected parts of the mesh completely, else an empty tuple.
 
-    A ray that first meets a part of the mesh, and ends without a hit or far behind, has missed it. A part is noted
-    where all rays that should hit it have. A distance field with a local dip has such a part: a march steps over it.
+    A ray misses the first part of the mesh on its way if it ends without a hit, or far behind the part. The note counts
+    parts that all rays miss. Such a part is, for example, a local dip of a distance field: marching steps over it.
 
     Args:
-        own: what the renderer sees from the cameras that judge it.
+        renderer_views: by the renderer, from the cameras of the evaluation.
     """
-    if state.mesh is None or state.cast_on is None:
+    if state.mesh is None or state.raycaster is None:
         return ()
     parts = state.mesh.parts
-    meant, missed = np.zeros((2, parts.max() + 1), dtype=np.int64)
-    for view in own:
+    expected, missed = np.zeros((2, parts.max() + 1), dtype=np.int64)
+    for view in renderer_views:
         rays = view.camera.rays().flat()
-        hits = state.cast_on.cast(rays.origins.double().numpy(), rays.directions.double().numpy())
-        found = torch.where(view.mask, view.camera.distance(view.depth), torch.inf).flatten().numpy()
-        past = found[hits.hit] > hits.distance[hits.hit] + BEHIND * state.spacing
-        met = parts[hits.face[hits.hit]]
-        meant += np.bincount(met, minlength=len(meant))
-        missed += np.bincount(met[past], minlength=len(meant))
-    lost = np.flatnonzero((meant > 0) & (missed == meant))
+        hits = state.raycaster.cast(rays.origins.double().numpy(), rays.directions.double().numpy())
+        distance = torch.where(view.mask, view.camera.distance(view.depth), torch.inf).flatten().numpy()
+        overshoots = distance[hits.hit] > hits.distance[hits.hit] + MAX_SPACINGS_BEHIND * state.spacing
+        index = parts[hits.face[hits.hit]]
+        expected += np.bincount(index, minlength=len(expected))
+        missed += np.bincount(index[overshoots], minlength=len(expected))
+    lost = np.flatnonzero((expected > 0) & (missed == expected))
     if not len(lost):
         return ()
-    sizes = [replace(state.mesh, faces=state.mesh.faces[parts == part]).diagonal for part in lost]
+    sizes = [replace(state.mesh, faces=state.mesh.faces[parts == index]).diagonal for index in lost]
     what = f"{len(lost)} part{'s' * (len(lost) > 1)} of the mesh, at most {max(sizes):.2g} scene units across,"
-    return (f"the renderer misses {what} which {meant[lost].sum()} of its rays should hit; the pictures show the mesh",)
+    return (
+        f"the renderer misses {what} which {expected[lost].sum()} of its rays should hit; the pictures show the mesh",
+    )
 
 
 def depth_gap_note(metrics: dict[str, Any]) -> tuple[str, ...]:
-    """A note where the depth error of the renderer's own image is `TIMES` that of the field's mesh; else none.
+    """A note if the depth error of the renderer's image is `MIN_GAP_RATIO` times that of the field's mesh.
 
-    Errors that differ by less than `LEAST_GAP` are not noted: a pixel at an outline may decide them.
+    A difference below `MIN_GAP` gives no note, as a single pixel at an outline may cause it.
     """
-    error, of_renderer = metrics.get("depth_mae", np.inf), metrics.get(f"{OWN}depth_mae", 0.0)
-    if not of_renderer >= max(TIMES * error, error + LEAST_GAP) or np.isinf(error):
+    error, own_error = metrics.get("depth_mae", np.inf), metrics.get(f"{OWN_PREFIX}depth_mae", 0.0)
+    if not own_error >= max(MIN_GAP_RATIO * error, error + MIN_GAP) or np.isinf(error):
         return ()
     return (
-        f"the depth error of the renderer's own image is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene "
+        f"the depth error of the renderer's own image is {own_error:.3g}, and that of the mesh is {error:.3g} scene "
         "units. The renderer does not show the surface of the field; the contract test of CONTRIBUTING.md checks its "
         "hits",
     )
 
 
-def view_metrics(seen: View, true: View, prefix: str = "") -> dict[str, float]:
-    """The metrics of `IMAGE` of a view against the true one, with a prefix to their names.
+def view_metrics(view: View, true: View, prefix: str = "") -> dict[str, float]:
+    """The metrics of `IMAGE_DEFINITIONS` of a view against the true one, with a prefix to their names.
 
-    Depths are compared where both masks are true and the true depth is known, which 0 is not. One there that is not a
-    number counts as infinitely wrong.
+    Depths are compared where both masks are true and the true depth is not 0, which means unknown. There, a depth of
+    NaN counts as an infinite error.
     """
-    depth, mask, true_mask = true.depth.numpy(), seen.mask.numpy(), true.mask.numpy()
+    depth, mask, true_mask = true.depth.numpy(), view.mask.numpy(), true.mask.numpy()
     common = mask & true_mask & (depth > 0)
-    error = np.abs(seen.depth.numpy()[common].astype(np.float64) - depth[common])
+    error = np.abs(view.depth.numpy()[common].astype(np.float64) - depth[common])
     error[np.isnan(error)] = np.inf
     mean = float(error.mean()) if common.any() else np.inf
     return {f"{prefix}depth_mae": mean, f"{prefix}mask_iou": mask_iou(mask, true_mask)}
 
 
 def chamfer_only(state: State) -> dict[str, float]:
-    """The state's Chamfer distances only, as in `evaluate`: for checkpoints. None where a part is the truth."""
+    """The state's Chamfer distances only, as in `evaluate`, for checkpoints; empty for a partial truth."""
     scores = _surface_scores(state)
-    return {name: scores[name] for name in CHAMFER if name in scores}
+    return {name: scores[name] for name in CHECKPOINT_METRICS if name in scores}
 
 
 def _surface_scores(state: State) -> dict[str, float]:
     inputs, mesh = state.inputs, state.mesh
-    found = None if mesh is None else sample_surface(mesh, inputs.evaluation.points, inputs.seed + 1)
-    scores = surface_metrics(found, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
-    return {name: scores[name] for name in OF_PART} if inputs.scene.is_partial else scores
+    predicted = None if mesh is None else sample_surface(mesh, inputs.evaluation.points, inputs.seed + 1)
+    scores = surface_metrics(predicted, inputs.true_surface, threshold=inputs.evaluation.fscore_threshold)
+    return {name: scores[name] for name in PARTIAL_TRUTH_METRICS} if inputs.scene.is_partial else scores
 
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
@@ -233,19 +236,19 @@ def _rendered(field: Field, camera: Camera, inputs: RunInputs) -> tuple[Renderin
 
 
 def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[View, Float[Tensor, "height width 3"]]:
-    """What the run's renderer shows from a camera: its hits, and their colours or a volume's weighted sums."""
+    """The hits of the run's renderer from a camera, and their colours or a volume's weighted sums."""
     rendering, view = _rendered(field, camera, inputs)
     volume = rendering.volume
     if volume is None:
         return view, coloured_image(field, view, inputs.device)
     rays = camera.rays().flat().to(inputs.device)
-    some = rays[volume.ray]
-    colours = colours_at(field, some.at(volume.distance), some.directions, inputs.device).to(inputs.device)
+    ray = rays[volume.ray]
+    colours = colours_at(field, ray.at(volume.distance), ray.directions, inputs.device).to(inputs.device)
     return view, volume.weighted_sum(colours, len(rays.origins)).view(*view.mask.shape, 3).cpu()
 
 
 def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:
-    """From each source point to the nearest target point: distance, and absolute cosine of the normals."""
+    """Per source point: distance to the nearest target point, and absolute cosine of the two normals."""
     distance, index = target.tree.query(source.points)
     return distance, np.abs((_unit(source.normals) * _unit(target.normals)[index]).sum(axis=1))
 
@@ -255,7 +258,3 @@ def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     vectors = vectors.astype(np.float64)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-
-
-def _harmonic_mean(first: float, second: float) -> float:
-    return 2 * first * second / (first + second) if first + second > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Float64 renderings of a network in a view, made once and cached by a hash of weights and camera."""
+"""Float64 renderings of a network in a view, cached by a hash of weights and camera."""
 
 import hashlib
 from copy import deepcopy
@@ -17,13 +17,13 @@ from renderers.field import Field, autograd_normals, estimate_lipschitz
 from renderers.reference import trace
 
 VERSION = 1  # raise it when the reference changes
-LEAST_STEP = 2e-4  # scene units: what is thinner along a ray may be missed; a pixel at 512 x 512 is 4.6e-3 wide
-RADIUS = 1.0  # scene units, of the sphere that rays start on
+MIN_STEP = 2e-4  # scene units: thinner parts along a ray may be missed; a pixel at 512 x 512 is 4.6e-3 wide
+RADIUS = 1.0  # scene units; rays start on this sphere
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A rendering of a field in float64, on the CPU; distance and normals are 0 where nothing is hit."""
+    """A rendering of a field in float64, on the CPU; distance and normals are 0 without a hit."""
 
     distance: Float[Tensor, "height width"]
     normals: Float[Tensor, "height width 3"]
@@ -36,22 +36,25 @@ def in_float64(prior: Prior) -> Prior:
 
 
 def reference_for(prior: Prior, camera: Camera, folder: Path) -> Reference:
-    """The reference of a prior's first shape in a view, from `folder`, or made and stored there."""
+    """The reference of a prior's first shape in a view: read from `folder`, or rendered and stored there."""
 
-    def make() -> dict[str, Tensor]:
+    def render() -> dict[str, Tensor]:
         size = f"{camera.height} x {camera.width}"
         notice(f"rendering the {size} pixels of the reference in float64, once; it is stored in {folder}")
         exact = in_float64(prior)
         return vars(make_reference(exact.decoder.at(exact.codes[0]), camera))
 
-    return Reference(**load_or_make(folder, f"reference-{_key(prior, camera)}", make))
+    camera_settings = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
+    weights = fingerprint(Prior(prior.decoder, prior.codes[:1]))
+    key = digest({"version": VERSION, "weights": weights, "camera": camera_settings})
+    return Reference(**load_or_make(folder, f"reference-{key}", render))
 
 
 def make_reference(field: Field, camera: Camera) -> Reference:
-    """Traces a float64 field through every pixel's centre."""
+    """Traces a float64 field along the rays through all pixel centres."""
     rays = camera.double().rays()
     lipschitz = estimate_lipschitz(field, radius=RADIUS)
-    rendering = trace(field, rays, lipschitz=lipschitz, least_step=LEAST_STEP, radius=RADIUS)
+    rendering = trace(field, rays, lipschitz=lipschitz, least_step=MIN_STEP, radius=RADIUS)
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     return Reference(rendering.distance * rendering.hit, normals, rendering.hit)
@@ -63,9 +66,3 @@ def fingerprint(prior: Prior) -> str:
     for tensor in (*prior.decoder.state_dict().values(), prior.codes):
         weights.update(tensor.cpu().contiguous().numpy().tobytes())
     return weights.hexdigest()
-
-
-def _key(prior: Prior, camera: Camera) -> str:
-    numbers = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
-    weights = fingerprint(Prior(prior.decoder, prior.codes[:1]))
-    return digest({"version": VERSION, "weights": weights, "camera": numbers})

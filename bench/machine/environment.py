@@ -1,4 +1,4 @@
-"""The environment of a run: versions, hardware, the machine's peak rate, memory, and what disturbs the times."""
+"""The environment of a run: versions, hardware, the machine's peak rate, memory, and disturbances of runtimes."""
 
 import ctypes
 import hashlib
@@ -16,23 +16,23 @@ import torch
 
 from bench.records.record import CONCURRENT_RUNS_VARIABLE, MAX_WAIT_FRACTION, Record
 from datasets.extras import version
-from renderers.fields.mlp import multiplies_faster
+from renderers.fields.mlp import bfloat16_is_faster
 from renderers.kernels.library import kernels
 
 ROOT = Path(__file__).resolve().parents[2]
-GEMM_SIZE, GEMM_TIMES = 1024, 6  # of the square matrices whose product is timed; how often, a warm-up first
+GEMM_SIDE, GEMM_REPEATS = 1024, 6  # square matrices; the first product is a warm-up
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
-CODE = ("--", ".", ":(exclude)results")  # for git: what a report writes is no code
-DENORMAL = 713_623  # the bits of 1e-39, a number too small for float32's full precision: as a number it may become 0
-PER_THREAD = 2**15  # numbers of an operation that PyTorch leaves to one thread
-IMPOSSIBLE = 1.2  # times a GPU's matrix product rate: above it, the clock did not wait for the device
+CODE_ONLY = ("--", ".", ":(exclude)results")  # arguments of git: results are written by reports
+DENORMAL_BITS = 713_623  # 1e-39, below float32's full precision, as bits, since the number itself may become 0
+NUMBERS_PER_THREAD = 2**15  # PyTorch computes an operation on fewer numbers in one thread
+MAX_GEMM_FRACTION = 1.2  # a GPU that exceeds its matrix product rate by more was not synchronised with the clock
 
 
 def pick_device(wanted: str) -> torch.device:
     """The device of `device=auto|cpu|cuda`.
 
     Raises:
-        ValueError: where cuda is requested and there is none.
+        ValueError: if cuda is requested but PyTorch sees no GPU.
     """
     if wanted == "cuda" and not torch.cuda.is_available():
         raise ValueError("device=cuda, but PyTorch sees no GPU: set device=cpu, or install a CUDA build of torch")
@@ -43,12 +43,12 @@ def describe(device: torch.device) -> dict[str, Any]:
     """The environment as plain data for the record."""
     return {
         "commit": _git("rev-parse", "HEAD"),
-        "dirty": bool(_git("status", "--porcelain", "--untracked-files=no", *CODE)),
-        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD", *CODE)) else "",
+        "dirty": bool(_git("status", "--porcelain", "--untracked-files=no", *CODE_ONLY)),
+        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD", *CODE_ONLY)) else "",
         "implicit_bench": version("implicit-bench") or "",
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
-        "torch": str(torch.__version__),  # with its build; as its own class, it would load torch in the driver
+        "torch": str(torch.__version__),  # includes the build; a plain str, as its class would load torch in the driver
         "platform": platform.platform(),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
@@ -56,11 +56,11 @@ def describe(device: torch.device) -> dict[str, Any]:
         "runs_at_once": int(os.environ.get(CONCURRENT_RUNS_VARIABLE, "1")),
         "threads_wait": os.environ.get("OMP_WAIT_POLICY", "").lower() or None,
         "denormals_flushed": _denormals_flushed(),
-        "kernels": kernels().said_of(device.type, torch.get_num_threads()),
+        "kernels": kernels().description_for(device.type, torch.get_num_threads()),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "load_at_start": os.getloadavg()[0],
         "gemm_peak_flops": gemm_peak(device),
-        "bfloat16_peak_flops": gemm_peak(device, torch.bfloat16) if multiplies_faster(device) else None,
+        "bfloat16_peak_flops": gemm_peak(device, torch.bfloat16) if bfloat16_is_faster(device) else None,
     }
 
 
@@ -75,7 +75,7 @@ def cpu_name() -> str:
 
 @contextmanager
 def using_threads(count: int) -> Iterator[None]:
-    """Within it, PyTorch uses so many threads of the CPU."""
+    """A context in which PyTorch uses `count` threads of the CPU."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -86,10 +86,10 @@ def using_threads(count: int) -> Iterator[None]:
 
 @contextmanager
 def flushing_denormals() -> Iterator[None]:
-    """Within it, this thread takes numbers too small for full precision as 0: processors are many times slower at them.
+    """A context in which this thread replaces denormal numbers by 0, since processors are many times slower with them.
 
-    Threads that it starts meanwhile do the same, those of PyTorch's operations among them. So does the backward pass,
-    which on a CPU runs in the thread that asks for it. Where the processor cannot, nothing changes.
+    Threads that it starts do the same, such as those of PyTorch's operations. So does the backward pass, which on a CPU
+    runs in the calling thread. If the processor does not support it, nothing changes.
     """
     before = sys.float_info.min / 2 == 0.0
     torch.set_flush_denormal(True)
@@ -100,35 +100,35 @@ def flushing_denormals() -> Iterator[None]:
 
 
 def _denormals_flushed() -> bool:
-    """Whether all threads of PyTorch's operations take numbers too small for full precision as 0."""
-    bits = torch.full((PER_THREAD * torch.get_num_threads(),), DENORMAL, dtype=torch.int32, device="cpu")
+    """Whether all threads of PyTorch's operations replace denormal numbers by 0."""
+    bits = torch.full((NUMBERS_PER_THREAD * torch.get_num_threads(),), DENORMAL_BITS, dtype=torch.int32, device="cpu")
     return not bool((bits.view(torch.float32) * 0.5).view(torch.int32).any())  # compared as bits, for the same reason
 
 
 def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32) -> float:
     """Best rate of a matrix product on this device with the current threads, in operations per second."""
-    matrix = torch.rand(GEMM_SIZE, GEMM_SIZE, device=device).to(dtype)
-    best = float("inf")
-    for _ in range(GEMM_TIMES):
+    matrix = torch.rand(GEMM_SIDE, GEMM_SIDE, device=device).to(dtype)
+    least_seconds = float("inf")
+    for _ in range(GEMM_REPEATS):
         stopwatch = Stopwatch(device)
         matrix @ matrix
-        best = min(best, stopwatch.seconds())
-    return 2 * GEMM_SIZE**3 / best
+        least_seconds = min(least_seconds, stopwatch.seconds())
+    return 2 * GEMM_SIDE**3 / least_seconds
 
 
 def seconds_at_peak(environment: dict[str, Any], flops: int, coarse_flops: int) -> float:
     """The seconds that operations take at the machine's peak rates; `coarse_flops` are those in bfloat16.
 
-    A field of one's own may offer coarse values where bfloat16 pays nothing: they are then at float32's rate.
+    A user's field may have coarse values although bfloat16 is not faster: they then count at the rate of float32.
     """
     peak = environment["gemm_peak_flops"]
     return flops / peak + coarse_flops / (environment.get("bfloat16_peak_flops") or peak)
 
 
 class Stopwatch:
-    """Seconds that a device's work takes from here on: by a GPU's own events, else by the wall clock.
+    """Measures the seconds of a device's work from its creation: by events of a GPU, else by the wall clock.
 
-    It waits until the device has finished what came before, and what is measured.
+    It waits until the device has finished all earlier work, and the measured work.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -146,7 +146,7 @@ class Stopwatch:
         return self.start.elapsed_time(end) / 1000  # milliseconds
 
     def _mark(self) -> Any:
-        """The time, or an event behind all that the GPU was given to do."""
+        """The time, or on a GPU an event after all work submitted so far."""
         if self.device is None:
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)
@@ -155,35 +155,35 @@ class Stopwatch:
 
 
 class MemoryPeak:
-    """Measures the largest rise of memory since the measurement began.
+    """Measures the largest growth of memory since its creation.
 
-    On a GPU, it is memory allocated by PyTorch; else the process's resident set, whose high-water mark Linux lets a
-    process reset, without pages of files: a process that was forked has those of its libraries when it first uses
-    them. `growth` is None where neither is available.
+    On a GPU it is memory allocated by PyTorch; on a CPU the resident set, whose high-water mark Linux can reset. Pages
+    of files are left out, since a forked process loads those of its libraries when it first uses them. `growth` is
+    None if neither is available.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.earlier = 0  # growth before the last pause
-        able = self._reset()
+        was_reset = self._reset()
         if device.type == "cuda":
             self.start: int | None = torch.cuda.memory_allocated(device)
         else:
-            self.start = _resident().get("RssAnon") if able else None
+            self.start = _resident_bytes().get("RssAnon") if was_reset else None
 
     def growth(self) -> int | None:
-        """The largest rise above the start so far, in bytes."""
+        """The largest growth so far, in bytes."""
         if self.start is None:
             return None
         if self.device.type == "cuda":
             peak: int = torch.cuda.max_memory_allocated(self.device)
         else:
-            now = _resident()
-            peak = max(now["VmHWM"] - now["RssFile"] - now["RssShmem"], now["RssAnon"])
+            resident = _resident_bytes()
+            peak = max(resident["VmHWM"] - resident["RssFile"] - resident["RssShmem"], resident["RssAnon"])
         return max(peak - self.start, self.earlier)
 
     def repeatable(self) -> int | None:
-        """`growth` on a GPU; None on a CPU, where that of five runs of one command differed by 15 %."""
+        """`growth` on a GPU; None on a CPU, where five runs of one command differed by 15 %."""
         return self.growth() if self.device.type == "cuda" else None
 
     @contextmanager
@@ -197,11 +197,11 @@ class MemoryPeak:
             self._reset()
 
     def _reset(self) -> bool:
-        """Resets the high-water mark; False where that is not possible."""
+        """Resets the high-water mark; False if that is not possible."""
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
             return True
-        with suppress(OSError, AttributeError):  # glibc only: freed memory goes back, so that later allocations show
+        with suppress(OSError, AttributeError):  # glibc only: returns freed memory, so that later allocations count
             ctypes.CDLL(None).malloc_trim(0)
         try:
             Path("/proc/self/clear_refs").write_text("5")
@@ -211,7 +211,7 @@ class MemoryPeak:
 
 
 def scheduled() -> tuple[int, int] | None:
-    """Nanoseconds that this process's living threads ran, and that they waited; None where that is unknown."""
+    """Nanoseconds that this process's living threads ran, and that they waited for a processor; None if unknown."""
     ran = waited = 0
     try:
         for task in Path("/proc/self/task").iterdir():
@@ -224,15 +224,15 @@ def scheduled() -> tuple[int, int] | None:
 
 
 def waited_share(before: tuple[int, int] | None) -> float | None:
-    """The time that this process's threads were ready but waited for a processor, over the time they ran or waited.
+    """The fraction of time that this process's threads waited for a processor, of the time that they ran or waited.
 
-    It is counted from `before`, an earlier `scheduled`; None if unknown.
+    It is measured since `before`, the result of an earlier `scheduled`; None if unknown.
     """
-    now = scheduled()
-    if before is None or now is None:
+    counts = scheduled()
+    if before is None or counts is None:
         return None
-    ran, waited = now[0] - before[0], now[1] - before[1]
-    return waited / (ran + waited) if ran > 0 and waited >= 0 else None  # a thread that ended takes its counts along
+    ran, waited = counts[0] - before[0], counts[1] - before[1]
+    return waited / (ran + waited) if ran > 0 and waited >= 0 else None  # counts of ended threads are lost
 
 
 def doubts(record: Record) -> list[str]:
@@ -244,10 +244,10 @@ def doubts(record: Record) -> list[str]:
     elif share is None and load is not None and load > (os.cpu_count() or 1):
         lines.append(f"loaded machine: load {load:.1f} at the start; times may be too long")
     on_device = record.environment.get("device") != "cpu"
-    if on_device and (beside := record.environment.get("runs_at_once", 1)) > 1:
-        lines.append(f"shared device: {beside} runs at a time on it; times are too long")
+    if on_device and (runs := record.environment.get("runs_at_once", 1)) > 1:
+        lines.append(f"shared device: {runs} runs at a time on it; times are too long")
     # A CPU's clock always waits, and its compiled code can be faster than PyTorch's matrix product.
-    if on_device and record.gemm_fraction is not None and record.gemm_fraction > IMPOSSIBLE:
+    if on_device and record.gemm_fraction is not None and record.gemm_fraction > MAX_GEMM_FRACTION:
         lines.append(
             f"missing synchronisation: {record.gemm_fraction:.1f} times the machine's matrix product rate is more "
             f"than it can do; the clock did not wait for the device"
@@ -255,14 +255,14 @@ def doubts(record: Record) -> list[str]:
     return lines
 
 
-def _resident() -> dict[str, int]:
-    """The bytes of this process's resident set: now, by kind, and at most since the last reset (`VmHWM`)."""
+def _resident_bytes() -> dict[str, int]:
+    """The bytes of this process's resident set: now, by kind, and the maximum since the last reset (`VmHWM`)."""
     lines = (line.split() for line in Path("/proc/self/status").read_text().splitlines())
     return {words[0].rstrip(":"): int(words[1]) * 1024 for words in lines if words[0].startswith(("Rss", "VmHWM"))}
 
 
 def _git(*arguments: str) -> str:
-    """What git says of our repository; empty where the package is installed, perhaps within one of somebody else's."""
+    """The output of git for our repository; empty for an installed package, which may lie in another repository."""
     if not (ROOT / ".git").exists():
         return ""
     try:

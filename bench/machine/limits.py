@@ -1,4 +1,4 @@
-"""Limits of work and memory of a rendering, checked at each evaluation of the field."""
+"""Limits of the work and the memory of a rendering, checked at each evaluation of the field."""
 
 import time
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from bench.records.record import RunStatus
 from renderers.checks import check_positive
 from renderers.field import Bounds, Coarse, Field, Wrapper, coarse_version, counted_bounds
 
-MEMORY_INTERVAL = 0.05  # seconds between two checks of the memory
-LEAST = 32  # values that a call counts as at least: calls for fewer points take about as long
+MEMORY_CHECK_SECONDS = 0.05  # interval
+MIN_VALUES_PER_CALL = 32  # a call with fewer points counts as this many, as it takes about as long
 
 
 class LimitReached(Exception):
@@ -28,12 +28,12 @@ class LimitReached(Exception):
 class Limits:
     """The limits of one rendering, or of one step of an optimisation.
 
-    Work is limited, and not time, so that a busy or a slow machine reaches no other limit than a quiet one.
+    Work is limited instead of time, so that the limit is the same on a busy, a slow and an idle machine.
 
     Args:
-        values: of the field, most of them that are evaluated, coarse ones included. A call counts as `LEAST` or more,
-            and as much again where a gradient is propagated back through it.
-        memory: rise above the process's memory before, in GiB.
+        values: maximum number of field evaluations, coarse ones included. A call counts as at least
+            `MIN_VALUES_PER_CALL`, and a gradient propagated back through it counts the same again.
+        memory: maximum growth of the process's memory, in GiB.
     """
 
     values: float
@@ -47,8 +47,8 @@ class Limits:
         """A field that evaluates `inner` until a limit is reached, counted from now.
 
         Args:
-            device: whose memory is watched.
-            work: what is limited, named in the reason: "a step"; may be empty.
+            device: with the memory to check.
+            work: name of the limited work in the reason, such as "a step"; may be empty.
         """
         return Watched(inner, self, MemoryPeak(device), f" in {work}" if work else "")
 
@@ -58,8 +58,8 @@ class Watched(Wrapper):
     """A Field that raises LimitReached when it is evaluated, or differentiated, beyond the limits.
 
     Args:
-        where: the end of the reason: " in a step".
-        spent: values evaluated so far, as `Limits` counts them.
+        where: the end of the reason, such as " in a step".
+        spent: field evaluations so far, as counted by `Limits`.
     """
 
     inner: Field
@@ -79,26 +79,26 @@ class Watched(Wrapper):
     @property
     def coarse(self) -> Coarse | None:
         """The coarse values of the field, until a limit is reached."""
-        offered = coarse_version(self.inner)
-        return offered and offered.with_counter(self._spend)
+        coarse = coarse_version(self.inner)
+        return coarse and coarse.with_counter(self._spend)
 
     @property
     def bounds(self) -> Bounds | None:
-        """The bounds that the field offers, until a limit is reached."""
+        """The bounds of the field, until a limit is reached."""
         return counted_bounds(self.inner, self._spend)
 
     def _spend(self, values: int) -> None:
-        """Counts values before they are evaluated.
+        """Counts field evaluations before they are made.
 
         Raises:
-            LimitReached: where they are too many, or the memory has grown too much.
+            LimitReached: if they exceed the limit, or if the memory does.
         """
-        self.spent += max(values, LEAST)
+        self.spent += max(values, MIN_VALUES_PER_CALL)
         if self.spent > self.limits.values:
             reason = f"more than {self.limits.values:,.0f} field values{self.where}"
             raise LimitReached(RunStatus.TIMEOUT, reason)
         now = time.perf_counter()
-        if now - self.memory_checked > MEMORY_INTERVAL:
+        if now - self.memory_checked > MEMORY_CHECK_SECONDS:
             self.memory_checked = now
             growth = self.memory.growth()
             if growth is not None and growth > self.limits.memory * 2**30:

@@ -11,7 +11,7 @@ from bench.models.growth import Growth, grow
 from bench.models.model import Evidence
 from bench.models.observations import RayObservations
 from bench.pictures.filmstrip import Filmstrip
-from bench.pictures.run_figures import Given, draw_run
+from bench.pictures.run_figures import InputView, draw_run
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext
 from bench.solve.solve import COST_DEFINITIONS, draw, note_costs, note_result
@@ -34,7 +34,7 @@ FIELD_DEFINITIONS = {
 }
 
 
-def solve_by_growth(observations: RayObservations, pictured: Given, run: RunContext, *, iterations: int) -> None:
+def solve_by_growth(observations: RayObservations, pictured: InputView, run: RunContext, *, iterations: int) -> None:
     """Fits the shape of a run by early growth, or with the requested field.
 
     Args:

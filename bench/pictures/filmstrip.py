@@ -18,59 +18,59 @@ from bench.setup.inputs import RunInputs
 from datasets.scene import View
 from renderers.camera import Camera
 
-MOST = 9  # columns of a strip
-SILHOUETTE = "silhouette error"  # a row of a strip
-FRAME = 0.73  # grey between the pictures of a strip
+MAX_STRIP_COLUMNS = 9
+SILHOUETTE_ROW = "silhouette error"
+BORDER_GREY = 0.73
 FRAME_SECONDS = 0.25
-LAST_SECONDS = 1.5  # of the last frame
+LAST_FRAME_SECONDS = 1.5
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture of a shape: its view, and its colours where it has some.
+    """A picture of a shape: its view, and its colours if it has any.
 
     Args:
-        view: with the mask that silhouettes are compared with.
+        view: with the mask for the comparison of silhouettes.
         colours: of all pixels.
         masked: False where the mask is not known.
     """
 
     view: View
     colours: Float[Tensor, "height width 3"] | None = None
-    masked: bool = True
+    has_mask: bool = True
 
-    def cells(self, truth: "Shown") -> dict[str, Float[np.ndarray, "height width 3"]]:
-        """Pictures of it by the names of their rows: its colours and the error of its mask where the truth has them."""
+    def pictures(self, truth: "Shown") -> dict[str, Float[np.ndarray, "height width 3"]]:
+        """Pictures by the names of their rows. Colours and the silhouette error are included if the truth has them."""
         image = normals_image(self.view)
-        cells = {"normals": image if bool(self.view.normals.any()) else np.ones_like(image)}
+        pictures = {"normals": image if bool(self.view.normals.any()) else np.ones_like(image)}
         if truth.colours is not None and self.colours is not None:
             on_white = torch.where(self.view.mask[..., None], self.colours, 1.0)
-            cells = {"colours": (self.colours if self is truth else on_white).clamp(0, 1).numpy()} | cells
-        if truth.masked:
-            cells[SILHOUETTE] = silhouette_image(self.view.mask.numpy(), truth.view.mask.numpy())
-        return cells
+            pictures = {"colours": (self.colours if self is truth else on_white).clamp(0, 1).numpy()} | pictures
+        if truth.has_mask:
+            pictures[SILHOUETTE_ROW] = silhouette_image(self.view.mask.numpy(), truth.view.mask.numpy())
+        return pictures
 
     def enlarged(self, camera: Camera) -> "Shown":
-        """The same pixels in another size, that of a camera."""
+        """The same pixels in the size of a camera."""
         colours = None if self.colours is None else in_size(self.colours, camera)
-        return Shown(enlarged(self.view, camera), colours, self.masked)
+        return Shown(enlarged(self.view, camera), colours, self.has_mask)
 
 
 class Filmstrip:
-    """Collects frames of a run; none where pictures are off."""
+    """Collects frames of a run, unless pictures are off."""
 
-    def __init__(self, inputs: RunInputs, over: str = "after iterations", true: Shown | None = None):
-        """Begins without frames.
+    def __init__(self, inputs: RunInputs, over: str = "after iterations", truth: Shown | None = None):
+        """Starts without frames.
 
         Args:
-            over: what the frames' names mean, for the title.
-            true: what frames are compared with; None for the scene's shape in its view.
+            over: meaning of the frames' names, for the title.
+            truth: the picture for comparison; None for the scene's shape in its view.
         """
-        self.inputs, self.over, self.true = inputs, over, true
+        self.inputs, self.over, self.truth = inputs, over, truth
         self.frames: dict[int | str, Shown] = {}
 
     def add(self, name: int | str, state: State, camera: Camera | None = None) -> None:
-        """Adds a frame, which shows the mesh of a state at the resolution of pictures.
+        """Adds a frame that shows the mesh of a state at the resolution of pictures.
 
         Args:
             name: its label, such as an iteration.
@@ -78,75 +78,72 @@ class Filmstrip:
         """
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
-            view = state.pictured(at_size(camera, self.inputs.evaluation.picture))
+            view = state.refined_view(at_size(camera, self.inputs.evaluation.picture))
             self.frames[name] = Shown(view, state.colours(view))
 
     @rc_context(SCREEN)
     def save(self, folder: Path, title: str, chosen: str | None = None) -> None:
-        """Writes strip.png into a run folder, and film.gif or film.webp where one is requested.
+        """Writes strip.png into a run folder, and film.gif or film.webp if requested.
 
         Args:
-            chosen: the frame of the run's result, where that is not the last one: it is shown, with its name in bold.
+            chosen: name of the frame of the run's result, if it is not the last: it is shown, with its name in bold.
         """
         if not self.frames:
             return
         truth = self._truth()
-        name = "measured" if self.true is None and self.inputs.scene.is_partial else "truth"
-        strip = _strip(self._shown(chosen), {name: truth}, f"{title}; {self.over}", chosen)
+        name = "measured" if self.truth is None and self.inputs.scene.is_partial else "truth"
+        strip = _strip(self._selected_frames(chosen), {name: truth}, f"{title}; {self.over}", chosen)
         save(strip, folder / "strip.png")
         if self.inputs.evaluation.film is not None:
             _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
 
     def _truth(self) -> Shown:
         size = self.inputs.evaluation.picture
-        if self.true is None:
+        if self.truth is None:
             return Shown(true_view(self.inputs.scene, at_size(self.inputs.scene.view.camera, size)))
-        return self.true.enlarged(at_size(self.true.view.camera, size))
+        return self.truth.enlarged(at_size(self.truth.view.camera, size))
 
-    def _shown(self, chosen: str | None) -> dict[int | str, Shown]:
-        """Evenly spaced frames, with the chosen one; without a checkpoint one iteration before the last."""
+    def _selected_frames(self, chosen: str | None) -> dict[int | str, Shown]:
+        """Evenly spaced frames and the chosen one. A checkpoint one iteration before the last is left out."""
         names = list(self.frames)
         last = names[-2:]
         if len(names) > 2 and all(isinstance(name, int) for name in last) and int(last[1]) - int(last[0]) == 1:
             del names[-2]
-        places = np.unique(np.linspace(0, len(names) - 1, min(MOST, len(names))).round().astype(int))
-        if chosen is not None and names.index(chosen) not in places:
-            inner = places[1:-1]
-            inner[np.abs(inner - names.index(chosen)).argmin()] = names.index(chosen)
-        return {names[place]: self.frames[names[place]] for place in places}
+        indices = np.unique(np.linspace(0, len(names) - 1, min(MAX_STRIP_COLUMNS, len(names))).round().astype(int))
+        if chosen is not None and names.index(chosen) not in indices:
+            inner_indices = indices[1:-1]
+            inner_indices[np.abs(inner_indices - names.index(chosen)).argmin()] = names.index(chosen)
+        return {names[index]: self.frames[names[index]] for index in indices}
 
 
-def _strip(frames: dict[int | str, Shown], true: dict[str, Shown], title: str, chosen: str | None) -> Figure:
-    """A figure with a column per frame and one for the truth, with its name: colours, normals, outlines, where known.
+def _strip(frames: dict[int | str, Shown], last_column: dict[str, Shown], title: str, chosen: str | None) -> Figure:
+    """A figure with a column per frame and a named one for the truth; rows are colours, normals and silhouette errors.
 
-    It is one image on one axis, since a figure of twenty axes takes a second to draw.
+    It is one image on one axis, since a figure with twenty axes takes a second to draw.
     """
-    shown = {str(name).replace("_", " "): frame for name, frame in frames.items()} | true
-    (truth,) = true.values()
-    part = window([frame.view.mask.numpy() for frame in shown.values()])
-    columns = [frame.cells(truth) for frame in shown.values()]
+    shown = {str(name).replace("_", " "): frame for name, frame in frames.items()} | last_column
+    (truth,) = last_column.values()
+    square = window([frame.view.mask.numpy() for frame in shown.values()])
+    columns = [frame.pictures(truth) for frame in shown.values()]
     rows = list(columns[0])
-    parts = [[_framed(column[row][part]) for row in rows] for column in columns]
-    montage = np.concatenate([np.concatenate(column, axis=0) for column in parts], axis=1)
+    border = {"pad_width": ((1, 1), (1, 1), (0, 0)), "constant_values": BORDER_GREY}
+    framed = [[np.pad(column[row][square], **border) for row in rows] for column in columns]
+    montage = np.concatenate([np.concatenate(column, axis=0) for column in framed], axis=1)
     size = montage.shape[0] / len(rows)
     figure = Figure(figsize=(1.25 * len(shown) + 0.4, 0.5 + 1.3 * len(rows)), layout="constrained")
     axis = bare(figure.subplots())
     axis.imshow(montage, interpolation="nearest")
-    axis.set_xticks([size * (place + 0.5) for place in range(len(shown))], list(shown))
-    axis.set_yticks([size * (place + 0.5) for place in range(len(rows))], rows, rotation=90, va="center")
+    axis.set_xticks([size * (index + 0.5) for index in range(len(shown))], list(shown))
+    axis.set_yticks([size * (index + 0.5) for index in range(len(rows))], rows, rotation=90, va="center")
     axis.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
     if chosen is not None:
         axis.xaxis.get_major_ticks()[list(frames).index(chosen)].label2.set_fontweight("bold")
-    figure.suptitle(f"{title}{' (red missed, blue spurious)' if SILHOUETTE in rows else ''}")
+    figure.suptitle(f"{title}{' (red missed, blue spurious)' if SILHOUETTE_ROW in rows else ''}")
     return figure
 
 
-def _framed(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "framed_height framed_width 3"]:
-    return np.pad(picture, ((1, 1), (1, 1), (0, 0)), constant_values=FRAME)
-
-
 def _animate(path: Path, frames: list[Shown], truth: Shown) -> None:
-    pictures = [np.concatenate(list(frame.cells(truth).values()), axis=1) for frame in frames]
+    pictures = [np.concatenate(list(frame.pictures(truth).values()), axis=1) for frame in frames]
     images = [Image.fromarray((255 * picture).astype(np.uint8)) for picture in pictures]
-    lasting = [round(1000 * FRAME_SECONDS)] * (len(images) - 1) + [round(1000 * LAST_SECONDS)]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=lasting, loop=0)
+    durations = [round(1000 * FRAME_SECONDS)] * (len(images) - 1) + [round(1000 * LAST_FRAME_SECONDS)]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)

@@ -1,4 +1,4 @@
-"""Pictures of a run: its input, the shape before and after, and the truth. Not part of any timing."""
+"""Pictures of a run: its input, the shape before and after, and the truth. Never drawn within a timed phase."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from bench.evaluate.state import State, unseen
+from bench.evaluate.state import State, empty_view
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, save, silhouette_image
@@ -26,11 +26,11 @@ from datasets.mesh import Mesh
 from datasets.scene import Scene, Truth, View, see
 from renderers.camera import Camera
 
-LIGHT = np.array([-0.35, 0.6, 0.72])  # from the camera's upper left; axes to the right, up, towards the camera
-BEHIND = 160.0  # degrees about the vertical axis from the given camera to the one behind
-BEHIND_ELEVATION = 25.0  # degrees
-MOST_PHOTOGRAPHS = 4  # shown, in two rows
-GIVEN_INCHES = 2.0  # width of the axes with what is given
+LIGHT = np.array([-0.35, 0.6, 0.72])  # from the camera's upper left; axes point right, up, to the camera
+BACK_AZIMUTH_DEGREES = 160.0  # about the vertical axis, from the scene's camera to the one behind
+BACK_ELEVATION_DEGREES = 25.0
+MAX_PHOTOGRAPHS = 4  # shown in two rows
+INPUT_AXES_INCHES = 2.0
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class ViewPair:
     """Views of one shape.
 
     Args:
-        front: by the given camera, in the size of pictures.
-        back: by a camera behind; None of a shape of which only the front is known, without its normals.
-        mask: the silhouette for the given camera, in the size in which metrics compare silhouettes.
+        front: by the scene's camera, in the size of pictures.
+        back: by a camera behind; None if only the front of the shape is known. The front then has no normals.
+        mask: the silhouette for the scene's camera, in the size in which metrics compare silhouettes.
     """
 
     title: str
@@ -50,15 +50,15 @@ class ViewPair:
 
 
 @dataclass(frozen=True)
-class Given:
+class InputView:
     """The input of a run: depths of a view, or photographs.
 
     Args:
         view: of the scene.
-        observed: its pixels whose depth was given.
-        photographs: all of them, or None.
-        mask: whether the silhouette was given as well.
-        coloured: whether its colours were.
+        observed: pixels of the view with a given depth.
+        photographs: all photographs, or None.
+        mask: whether the silhouette was given too.
+        coloured: whether colours were given too.
     """
 
     view: View
@@ -69,21 +69,23 @@ class Given:
 
     @property
     def summary(self) -> str:
-        """The input in words."""
+        """The input in a few words."""
         if self.photographs is not None:
             return f"{len(self.photographs)} photographs"
-        parts = {"mask": self.mask, "colours": self.coloured, f"{int(self.observed.sum())} depths": self.observed.any()}
-        return " and ".join(name for name, there in parts.items() if there) or "distances"
+        names = {"mask": self.mask, "colours": self.coloured, f"{int(self.observed.sum())} depths": self.observed.any()}
+        return " and ".join(name for name, is_given in names.items() if is_given) or "distances"
 
 
 @rc_context(SCREEN)
-def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: list[dict[str, Any]], title: str) -> None:
-    """Writes summary.png and curve.png of a run's states before and after, at a higher resolution than in the run."""
+def draw_run(
+    folder: Path, states: tuple[State, State], view: InputView, curve: list[dict[str, Any]], title: str
+) -> None:
+    """Writes summary.png and curve.png from a run's states before and after, in the size of pictures."""
     inputs = states[0].inputs
     scene, (front, back) = inputs.scene, _cameras(inputs, inputs.evaluation.picture)
     pairs = (
         *(
-            ViewPair(name, state.pictured(front), state.pictured(back), state.seen(scene.view.camera).mask)
+            ViewPair(name, state.refined_view(front), state.refined_view(back), state.view_from(scene.view.camera).mask)
             for name, state in zip(("before", "after"), states, strict=True)
         ),
         ViewPair(
@@ -93,7 +95,7 @@ def draw_run(folder: Path, states: tuple[State, State], given: Given, curve: lis
             scene.view.mask,
         ),
     )
-    save(_summary(pairs, given, title), folder / "summary.png")
+    save(_summary(pairs, view, title), folder / "summary.png")
     draw_curve(folder / "curve.png", curve)
 
 
@@ -103,11 +105,12 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
-        excluded = (*NOT_LOSS_TERMS, *CHECKPOINT_METRICS)
-        for name in dict.fromkeys(name for line in curve for name in line if name not in excluded):
-            known = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
-            if known:
-                axis.plot(*zip(*known, strict=True), label=name, lw=1.4)
+        for name in dict.fromkeys(
+            name for line in curve for name in line if name not in (*NOT_LOSS_TERMS, *CHECKPOINT_METRICS)
+        ):
+            points = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
+            if points:
+                axis.plot(*zip(*points, strict=True), label=name, lw=1.4)
         axis.set_xlabel(label)
     style.log_axis(axes[0], "y", [value for line in axes[0].lines for value in line.get_ydata()])
     axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -118,15 +121,15 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
 
 
 @rc_context(SCREEN)
-def draw_against(path: Path, found: View, true: View, *, title: str) -> None:
+def draw_against(path: Path, view: View, reference: View, *, title: str) -> None:
     """Writes a picture that compares a view with the true one: normals of both, missed and spurious pixels."""
-    both = ViewPair("rendered", found, None, found.mask), ViewPair("reference", true, None, true.mask)
+    pairs = ViewPair("rendered", view, None, view.mask), ViewPair("reference", reference, None, reference.mask)
     figure = Figure(figsize=(9.2, 3.5), layout="constrained")
     axes = figure.subplots(1, 3)
-    for axis, pair in zip(axes, both, strict=False):
-        _show_normals(axis, pair, both)
+    for axis, pair in zip(axes, pairs, strict=False):
+        _show_normals(axis, pair, pairs)
         axis.set_title(f"normals, {pair.title}")
-    _show_silhouette(axes[2], both[0], both)
+    _show_silhouette(axes[2], pairs[0], pairs)
     axes[2].set_title("silhouette error")
     figure.suptitle(title)
     save(figure, path)
@@ -137,26 +140,26 @@ def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, t
     """Writes images.npz and failure.png: rendered and true distances, and the kind of error of each pixel.
 
     Args:
-        images: "distance", "true_distance" and "kinds", a place in `PIXELS` for each pixel; all [height, width].
+        images: "distance", "true_distance" and "kinds", an index into `PIXELS` for each pixel; all [height, width].
     """
     np.savez_compressed(folder / "images.npz", severity=severity, **images)  # type: ignore[arg-type]
     figure = Figure(figsize=(9.2, 3.6), layout="constrained")
-    found, true, kinds = figure.subplots(1, 3)
+    rendered_axis, true_axis, kinds_axis = figure.subplots(1, 3)
     true_distance = images["true_distance"]
-    known = true_distance[np.isfinite(true_distance)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    for axis, name, heading in ((found, "distance", "found"), (true, "true_distance", "truth")):
+    finite = true_distance[np.isfinite(true_distance)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    for axis, name, heading in ((rendered_axis, "distance", "found"), (true_axis, "true_distance", "truth")):
         shown = axis.imshow(images[name], cmap="viridis", vmin=low, vmax=max(high, low + 1e-6))
         axis.set_title(f"distance along the ray, {heading}")
         bare(axis)
-    figure.colorbar(shown, ax=[found, true], shrink=0.7, label="scene units")
-    kinds.imshow(images["kinds"], cmap=ListedColormap(list(PIXELS.values())), vmin=-0.5, vmax=len(PIXELS) - 0.5)
-    kinds.set_title("kind of error")
-    bare(kinds)
-    there = [name for number, name in enumerate(PIXELS) if (images["kinds"] == number).any()]
-    named = {PIXEL_NAMES.get(name, name): PIXELS[name] for name in there}
-    patches = [Patch(facecolor=colour, edgecolor="#888888", label=name) for name, colour in named.items()]
-    kinds.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
+    figure.colorbar(shown, ax=[rendered_axis, true_axis], shrink=0.7, label="scene units")
+    kinds_axis.imshow(images["kinds"], cmap=ListedColormap(list(PIXELS.values())), vmin=-0.5, vmax=len(PIXELS) - 0.5)
+    kinds_axis.set_title("kind of error")
+    bare(kinds_axis)
+    names = [name for index, name in enumerate(PIXELS) if (images["kinds"] == index).any()]
+    colours = {PIXEL_NAMES.get(name, name): PIXELS[name] for name in names}
+    patches = [Patch(facecolor=colour, edgecolor="#888888", label=name) for name, colour in colours.items()]
+    kinds_axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
     figure.suptitle(title)
     save(figure, folder / "failure.png")
 
@@ -170,26 +173,25 @@ def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
     save(figure, folder / "ladder.png")
 
 
-def save_images(folder: Path, found: View, true: View) -> None:
+def save_images(folder: Path, view: View, true: View) -> None:
     """Writes `folder/images.npz`: normals of both [h, w, 3], hits of both and the depth error [h, w]."""
     arrays = {
-        "normals": picture_normals(found).half(),
+        "normals": picture_normals(view).half(),
         "reference_normals": picture_normals(true).half(),
-        "hit": found.mask,
+        "hit": view.mask,
         "reference_hit": true.mask,
-        "depth_error": torch.where(found.mask & true.mask, (found.depth - true.depth).abs(), torch.nan),
+        "depth_error": torch.where(view.mask & true.mask, (view.depth - true.depth).abs(), torch.nan),
     }
-    plain = {name: array.numpy() for name, array in arrays.items()}
-    np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
+    stored = {name: array.numpy() for name, array in arrays.items()}
+    np.savez_compressed(folder / "images.npz", **stored)  # type: ignore[arg-type]
 
 
 def save_gallery(
     folder: Path, inputs: RunInputs, observed: Bool[Tensor, "height width"], meshes: dict[str, Mesh | None]
 ) -> None:
-    """Writes `folder/images.npz` for galleries: given depths, and meshes seen by the scene's camera and from behind.
+    """Writes `folder/images.npz` for galleries: given depths, and meshes from the scene's camera and from behind.
 
-    `given` is NaN where no depth is given. NAME_normals [2, h, w, 3] and NAME_hit [2, h, w] are those of each mesh, by
-    its name, and of the truth, "true".
+    `given` is NaN without a depth. Meshes and the truth, "true", have NAME_normals [2, h, w, 3], NAME_hit [2, h, w].
 
     Args:
         observed: pixels of the scene's view whose depth is given.
@@ -199,7 +201,7 @@ def save_gallery(
     arrays = {"given": torch.where(observed.cpu(), inputs.scene.observed_view()[0].depth, torch.nan)}
     for name, mesh in {**meshes, "true": inputs.scene.mesh}.items():
         truth = None if mesh is None else Truth(mesh, closed=False)
-        views = [unseen(camera) if truth is None else see(truth, camera) for camera in cameras]
+        views = [empty_view(camera) if truth is None else see(truth, camera) for camera in cameras]
         arrays[f"{name}_normals"] = torch.stack([picture_normals(view) for view in views])
         arrays[f"{name}_hit"] = torch.stack([view.mask for view in views])
     save_arrays(folder, arrays)
@@ -207,14 +209,14 @@ def save_gallery(
 
 def save_arrays(folder: Path, arrays: dict[str, Tensor]) -> None:
     """Writes images.npz, with numbers in half precision."""
-    plain = {name: (array if array.dtype == torch.bool else array.half()).numpy() for name, array in arrays.items()}
-    np.savez_compressed(folder / "images.npz", **plain)  # type: ignore[arg-type]
+    stored = {name: (array if array.dtype == torch.bool else array.half()).numpy() for name, array in arrays.items()}
+    np.savez_compressed(folder / "images.npz", **stored)  # type: ignore[arg-type]
 
 
 def true_view(scene: Scene, camera: Camera) -> View:
-    """The true shape in a size of the scene's image; the given pixels, without normals, where they are all of it.
+    """The true shape in a camera's size; for a partial truth the given pixels, without normals.
 
-    Depths are NaN at pixels of the silhouette that have none.
+    Depths are NaN at pixels of the silhouette without a measured depth.
     """
     if not scene.is_partial:
         return see(scene.raycaster, camera)
@@ -223,9 +225,9 @@ def true_view(scene: Scene, camera: Camera) -> View:
 
 
 def enlarged(view: View, camera: Camera) -> View:
-    """The same pixels in another size, that of a camera."""
-    parts = [in_size(part, camera) for part in (view.depth, view.normals, view.mask)]
-    return View(camera, *parts)
+    """The same pixels in the size of a camera."""
+    images = [in_size(image, camera) for image in (view.depth, view.normals, view.mask)]
+    return View(camera, *images)
 
 
 def in_size(image: Tensor, camera: Camera) -> Tensor:
@@ -236,32 +238,32 @@ def in_size(image: Tensor, camera: Camera) -> Tensor:
 
 
 def picture_normals(view: View) -> Float[Tensor, "height width 3"]:
-    """Normals with axes to the right, up and towards the camera, as pictures show them."""
+    """Normals for pictures, with axes that point right, up and to the camera."""
     rotation = view.camera.world_to_camera[:3, :3].to(view.normals.dtype)
     return (view.normals @ rotation.T) * torch.tensor([1, -1, -1])
 
 
 def shaded(view: View) -> Float[np.ndarray, "height width"]:
-    """The brightness of a grey surface under `LIGHT`, from 0 to 1; without meaning beside it."""
+    """The brightness of a grey surface under `LIGHT`, from 0 to 1; meaningless outside the mask."""
     return 0.25 + 0.75 * (picture_normals(view).numpy() @ (LIGHT / np.linalg.norm(LIGHT))).clip(0, 1)
 
 
 def _cameras(inputs: RunInputs, size: int) -> tuple[Camera, Camera]:
-    """The scene's camera at so many pixels per side, and one behind the shape."""
+    """The scene's camera with `size` pixels per side, and one behind the shape."""
     camera = inputs.scene.view.camera
     x, _, z = camera.center.tolist()
     views = replace(inputs.views, resolution=size)
-    behind = views.camera(degrees(atan2(x, z)) + BEHIND, BEHIND_ELEVATION)
+    behind = views.camera(degrees(atan2(x, z)) + BACK_AZIMUTH_DEGREES, BACK_ELEVATION_DEGREES)
     return camera.resized(size, size), behind
 
 
-def at_size(camera: Camera, longest: int) -> Camera:
-    """The camera with so many pixels on the longer side."""
-    larger = longest / max(camera.height, camera.width)
-    return camera.resized(round(larger * camera.height), round(larger * camera.width))
+def at_size(camera: Camera, longer_side: int) -> Camera:
+    """The camera with `longer_side` pixels on the longer side."""
+    factor = longer_side / max(camera.height, camera.width)
+    return camera.resized(round(factor * camera.height), round(factor * camera.width))
 
 
-def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
+def _summary(pairs: tuple[ViewPair, ...], shown: InputView, title: str) -> Figure:
     columns = {
         "depth": _show_depth,
         "normals": _show_normals,
@@ -273,8 +275,8 @@ def _summary(pairs: tuple[ViewPair, ...], given: Given, title: str) -> Figure:
     for row, pair in zip(axes, pairs, strict=True):
         for axis, (name, show) in zip(row, columns.items(), strict=True):
             if pair is pairs[2] and name == "silhouette error":
-                _show_given(axis, given)
-                axis.set_xlabel(f"given: {given.summary}")
+                _show_input(axis, shown)
+                axis.set_xlabel(f"given: {shown.summary}")
             elif pair.back is None and name in ("normals", "from behind"):
                 axis.set_axis_off()
             else:
@@ -293,56 +295,56 @@ def _show_depth(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
     depths = np.concatenate([other.front.depth.numpy()[other.front.mask.numpy()] for other in pairs])
     low, high = (np.nanmin(depths), np.nanmax(depths)) if depths.size else (0.0, 1.0)
     shown = np.where(pair.front.mask.numpy(), pair.front.depth.numpy(), np.nan)
-    part = window([other.front.mask.numpy() for other in pairs])
-    return bare(axis).imshow(shown[part], cmap="viridis_r", vmin=low, vmax=high, interpolation="nearest")
+    square = window([other.front.mask.numpy() for other in pairs])
+    return bare(axis).imshow(shown[square], cmap="viridis_r", vmin=low, vmax=high, interpolation="nearest")
 
 
 def _show_normals(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
-    part = window([other.front.mask.numpy() for other in pairs])
-    return bare(axis).imshow(normals_image(pair.front)[part])
+    square = window([other.front.mask.numpy() for other in pairs])
+    return bare(axis).imshow(normals_image(pair.front)[square])
 
 
 def _show_shaded(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> Any:
     views = {other.title: other.back for other in pairs if other.back is not None}
     shown = np.where(views[pair.title].mask.numpy(), shaded(views[pair.title]), 1.0)
-    part = window([view.mask.numpy() for view in views.values()])
-    return bare(axis).imshow(shown[part], cmap="gray", vmin=0, vmax=1)
+    square = window([view.mask.numpy() for view in views.values()])
+    return bare(axis).imshow(shown[square], cmap="gray", vmin=0, vmax=1)
 
 
 def _show_silhouette(axis: Any, pair: ViewPair, pairs: tuple[ViewPair, ...]) -> None:
-    """Compares a silhouette with that of the truth, the last of the pairs."""
-    found, true = pair.mask.numpy(), pairs[-1].mask.numpy()
-    missed, spurious = (100 * part.sum() / max(true.sum(), 1) for part in (true & ~found, found & ~true))
-    part = window([other.mask.numpy() for other in pairs])
-    bare(axis).imshow(silhouette_image(found, true)[part], interpolation="nearest")
+    """Compares a silhouette with the true one, that of the last pair."""
+    rendered, true = pair.mask.numpy(), pairs[-1].mask.numpy()
+    missed, spurious = (100 * pixels.sum() / max(true.sum(), 1) for pixels in (true & ~rendered, rendered & ~true))
+    square = window([other.mask.numpy() for other in pairs])
+    bare(axis).imshow(silhouette_image(rendered, true)[square], interpolation="nearest")
     label = {"transform": axis.transAxes, "fontsize": 8, "bbox": {"facecolor": "white", "lw": 0, "pad": 1.5}}
     axis.text(0.02, 0.10, f"missed {missed:.1f} %", color=MISSED, **label)
     axis.text(0.02, 0.02, f"spurious {spurious:.1f} %", color=SPURIOUS, **label)
 
 
-def _show_given(axis: Any, given: Given) -> None:
-    """Shows some photographs; or the mask, and a square as large as a pixel for each depth."""
-    if given.photographs is not None:
-        places = np.linspace(0, len(given.photographs), MOST_PHOTOGRAPHS, endpoint=False).astype(int)
-        chosen = given.photographs[places]
+def _show_input(axis: Any, shown: InputView) -> None:
+    """Shows photographs, or else the mask with a square of a pixel's size per depth."""
+    if shown.photographs is not None:
+        indices = np.linspace(0, len(shown.photographs), MAX_PHOTOGRAPHS, endpoint=False).astype(int)
+        chosen = shown.photographs[indices]
         bare(axis).imshow(np.concatenate([np.concatenate(chosen[:2], 1), np.concatenate(chosen[2:], 1)], 0))
         return
-    mask = given.view.mask.numpy()
+    mask, depths = shown.view.mask.numpy(), shown.view.depth.numpy()
     rows, columns = window([mask])
     bare(axis).imshow(np.where(mask, 0.85, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     axis.set_xlim(columns.start - 0.5, columns.stop - 0.5)
     axis.set_ylim(rows.stop - 0.5, rows.start - 0.5)
-    at = np.nonzero(given.observed)
-    size = (72 * GIVEN_INCHES / (rows.stop - rows.start)) ** 2  # of a marker, in square points of 1/72 inch
-    axis.scatter(at[1], at[0], c=given.view.depth.numpy()[at], s=size, cmap="viridis_r", marker="s", linewidths=0)
+    pixels = np.nonzero(shown.observed)
+    size = (72 * INPUT_AXES_INCHES / (rows.stop - rows.start)) ** 2  # of a marker, in square points of 1/72 inch
+    axis.scatter(pixels[1], pixels[0], c=depths[pixels], s=size, cmap="viridis_r", marker="s", linewidths=0)
 
 
 def window(masks: Sequence[Bool[np.ndarray, "height width"]]) -> tuple[slice, slice]:
     """The smallest square part of an image that holds all masks, with a margin, as slices of its pixels."""
-    top, left, side = (round(max(masks[0].shape) * length) for length in style.window(masks, margin=0.12))
+    top, left, side = (round(max(masks[0].shape) * edge) for edge in style.window(masks, margin=0.12))
     return slice(top, top + side), slice(left, left + side)
 
 
 def normals_image(view: View) -> Float[np.ndarray, "height width 3"]:
-    """The normals of `picture_normals` as red, green, blue; white where there is no surface."""
+    """The normals of `picture_normals` as red, green, blue; white where the view has no surface."""
     return torch.where(view.mask[..., None], picture_normals(view) / 2 + 0.5, 1.0).clamp(0, 1).numpy()

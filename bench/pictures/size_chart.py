@@ -7,7 +7,7 @@ import numpy as np
 
 from bench.pictures import style
 
-KINDS = {  # kinds of candidates by the beginning of their names: label, colour, marker
+KINDS = {  # from the beginning of a candidate's name to label, colour and marker
     "network": ("networks", "#0072b2", "s"),
     "grid": ("narrow-band grid", "#9a6a1f", "v"),
     "union": ("unions of boxes", "#009e73", "P"),
@@ -19,7 +19,7 @@ AXES = {"stored": "stored numbers", "free": "free numbers", "bytes": "bytes", FL
 
 @dataclass(frozen=True)
 class CandidateResult:
-    """The result of a candidate; `error` is None where its fit failed."""
+    """The result of a candidate; `error` is None if its fit failed."""
 
     name: str
     numbers: dict[str, Any]
@@ -46,10 +46,10 @@ class Candidates:
 
     Args:
         results: of all of them.
-        chosen: the recommended one; None where there is none.
-        best: the one with the least error; likewise.
-        measure: the measure of size by which the choice is made.
-        footprint: half a pixel, in scene units; None where it is not known.
+        chosen: the recommended candidate, or None.
+        best: the candidate with the smallest error, or None.
+        measure: the measure of size for the choice.
+        footprint: half a pixel, in scene units; None if unknown.
     """
 
     results: list[CandidateResult]
@@ -61,27 +61,27 @@ class Candidates:
     @staticmethod
     def of(metrics: dict[str, Any]) -> "Candidates":
         """The candidates of a record's metrics."""
-        fits = [name.removesuffix(".stored") for name in metrics if name.endswith(".stored")]
-        names = [name for name in fits if name not in ("auto", "frugal")]  # further fits of candidates
-        found = {
+        fit_names = [name.removesuffix(".stored") for name in metrics if name.endswith(".stored")]
+        names = [name for name in fit_names if name not in ("auto", "frugal")]  # further fits of candidates
+        results = {
             name: CandidateResult(
                 name, {key.removeprefix(f"{name}."): x for key, x in metrics.items() if key.startswith(f"{name}.")}
             )
             for name in names
         }
-        chosen, best = (found.get(metrics.get(f"{which}_field", "")) for which in ("recommended", "best"))
+        chosen, best = (results.get(metrics.get(f"{which}_field", "")) for which in ("recommended", "best"))
         measure, footprint = metrics.get("recommended_by", "stored"), metrics.get("footprint")
-        return Candidates(list(found.values()), chosen, best, measure, footprint)
+        return Candidates(list(results.values()), chosen, best, measure, footprint)
 
 
 def panels(axes: np.ndarray, candidates: Candidates) -> None:
-    """Draws the error over the size and over FLOPs per query: standard errors, half a pixel, the recommended one."""
+    """Draws errors over size and over FLOPs per query, with standard errors, half a pixel and the recommendation."""
     fitted = [result for result in candidates.results if result.error is not None]
     for axis, key in zip(axes, (candidates.measure, FLOPS), strict=True):
         for kind, (label, colour, marker) in KINDS.items():
-            numbers = [result.numbers for result in fitted if result.kind == kind]
-            if numbers:
-                x, y, spread = ([own[name] for own in numbers] for name in (key, "error", "standard_error"))
+            fits = [result.numbers for result in fitted if result.kind == kind]
+            if fits:
+                x, y, spread = ([fit[name] for fit in fits] for name in (key, "error", "standard_error"))
                 axis.errorbar(x, y, yerr=spread, fmt=marker, color=colour, ms=4, lw=0.8, label=label)
         axis.axhline(candidates.footprint, color="#888888", lw=0.9, ls="--", label="half a pixel")
         if candidates.best is not None:
@@ -89,9 +89,9 @@ def panels(axes: np.ndarray, candidates: Candidates) -> None:
             label = "one standard error of the best"
             axis.axhspan(low, low + spread, color="#cccccc", alpha=0.6, lw=0, label=label)
         if candidates.chosen is not None:
-            at = candidates.chosen.numbers[key], candidates.chosen.error
-            axis.plot(*at, "o", ms=9, mfc="none", mec="#111111", mew=1.2, label="recommended")
-            axis.annotate(candidates.chosen.label, at, (0, 9), textcoords="offset points", ha="center", fontsize=7)
+            point = candidates.chosen.numbers[key], candidates.chosen.error
+            axis.plot(*point, "o", ms=9, mfc="none", mec="#111111", mew=1.2, label="recommended")
+            axis.annotate(candidates.chosen.label, point, (0, 9), textcoords="offset points", ha="center", fontsize=7)
         axis.set(xscale="log", yscale="log", xlabel=AXES[key])
         style.log_axis(axis, "y", [result.error for result in fitted])
     axes[0].set_ylabel("held-out error (scene units)")

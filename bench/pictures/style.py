@@ -27,7 +27,7 @@ RC = {
     "legend.fontsize": 7,
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
-    "xtick.minor.pad": 5.0,  # in line with labels of major ticks, whose marks are longer
+    "xtick.minor.pad": 5.0,  # aligns labels with those of major ticks, whose marks are longer
     "ytick.minor.pad": 5.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -42,13 +42,12 @@ RC = {
     "savefig.dpi": 300,
     "pdf.fonttype": 42,
 }
-# For the pictures in run folders, which are seen on a screen: larger type, no grid.
+# For pictures in run folders, which are viewed on a screen: larger type, no grid.
 SCREEN = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
 SCREEN_DPI = 110  # pixels per inch
-# Pixels of a rendered silhouette compared with the true one: in the true one only, in the rendered one only, in both,
-# in none; and pixels that show a wrong surface.
+# Pixels in the true silhouette only, in the rendered silhouette only, in both, in neither; pixels with a wrong surface.
 MISSED, SPURIOUS, BOTH, PAPER, WRONG = "#d6262b", "#1f77b4", "#d1d1d1", "#ffffff", "#f2a600"
-# Kinds of pixels in a stress test's images.npz, in the order of their numbers, with their colours; names for readers.
+# Colours of kinds of pixels; a stress test's images.npz stores the index of the kind. Names for readers, if different.
 PIXELS = {"background": PAPER, "right": BOTH, "lost": MISSED, "false": SPURIOUS, "wrong surface": WRONG}
 PIXEL_NAMES = {"lost": "missed", "false": "spurious"}
 
@@ -62,21 +61,21 @@ class Look:
     line: str = "-"
 
 
-_COLOURS = (  # of presets that conf does not know; of no renderer there
+FALLBACK_COLOURS = (  # for presets that are not in conf; no renderer there has these
     *("#7570b3", "#556b2f", "#b5179e", "#3a86ff", "#8d6e63", "#607d3b", "#c1121f", "#4a4e69", "#9a8c00", "#00788a"),
 )
-_MARKERS = ("<", ">", "p", "h", "*", "d", "8")
-_LINES = ("-", "--", "-.", ":")
+FALLBACK_MARKERS = ("<", ">", "p", "h", "*", "d", "8")
+FALLBACK_LINES = ("-", "--", "-.", ":")
 
 
 @cache
 def look(preset: str) -> Look:
-    """The look of a row by its preset, the same in every figure: `_look_` of its renderer, its method, or drawn."""
-    drawn = crc32(preset.encode("utf-8", "backslashreplace"))
-    choices = {"colour": (_COLOURS, 0), "marker": (_MARKERS, 8), "line": (_LINES, 16)}
-    picks = {key: names[(drawn >> shift) % len(names)] for key, (names, shift) in choices.items()}
-    known = look_of(preset)
-    return Look(**picks | ({"line": "-"} if known else {}) | known)
+    """The look of a preset in every figure: `_look_` of its renderer or method in conf, else from a hash."""
+    checksum = crc32(preset.encode("utf-8", "backslashreplace"))
+    choices = {"colour": (FALLBACK_COLOURS, 0), "marker": (FALLBACK_MARKERS, 8), "line": (FALLBACK_LINES, 16)}
+    picks = {key: options[(checksum >> shift) % len(options)] for key, (options, shift) in choices.items()}
+    settings = look_of(preset)
+    return Look(**picks | ({"line": "-"} if settings else {}) | settings)
 
 
 def styled(function: Callable[..., Figure]) -> Callable[..., Figure]:
@@ -85,21 +84,21 @@ def styled(function: Callable[..., Figure]) -> Callable[..., Figure]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes a picture of a run for a screen, quickly: drawn once (`savefig` draws twice), with little compression."""
+    """Writes a picture of a run for a screen, quickly: draws once (`savefig` draws twice), compresses little."""
     figure.set_dpi(SCREEN_DPI)
     FigureCanvasAgg(figure).print_png(path, pil_kwargs={"compress_level": 1})
 
 
 def log_axis(axes: Axes, letter: str, values: Any) -> None:
-    """Makes the axis "x" or "y" logarithmic, with plain numbers as ticks; values that are not positive are not drawn.
+    """Makes the axis "x" or "y" logarithmic, with plain numbers as ticks; only positive values are drawn.
 
-    Without positive values, or where they lie within a factor of 2, the axis stays linear.
+    Without positive values, or if they lie within a factor of 2, the axis stays linear.
     """
     positive = [x for x in finite(values) if x > 0]
     if not positive or 1 < max(positive) / min(positive) < 2:
         return
     getattr(axes, f"set_{letter}scale")("log", nonpositive="mask")
-    ratio = max(positive) / min(positive)  # where it is small, ticks at decades alone would be too few
+    ratio = max(positive) / min(positive)  # if it is small, ticks only at powers of ten would be too few
     digits = {2, 3, 4, 5, 6, 7, 8} if ratio < 5 else {2, 5} if ratio < 100 else set()
     axis = getattr(axes, f"{letter}axis")
     axis.set_major_formatter(FuncFormatter(lambda x, _: short(x)))
@@ -113,33 +112,33 @@ def short(x: float) -> str:
 
 
 def error_colours() -> Colormap:
-    """The colour map of errors, from light grey to black, in which `MISSED` and `SPURIOUS` can be seen."""
+    """The colour map of errors, from light grey to black, on which `MISSED` and `SPURIOUS` are visible."""
     colours = ListedColormap(colormaps["Greys"](np.linspace(0.12, 1.0, 256)))
     return colours.with_extremes(bad=PAPER)
 
 
 def rounded_up(x: float) -> float:
-    """The smallest of 1, 2, 5, 10, 20, 30, 45, 60, 90, 180 that is not below x: the end of a scale of degrees."""
+    """The end of a scale of degrees: the smallest of 1, 2, 5, 10, 20, 30, 45, 60, 90, 180 that is at least x."""
     return next((end for end in (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0) if end >= x), 180.0)
 
 
 def finite(values: Any) -> list[float]:
-    """The values as floats, with nan, which is not drawn, for those that are missing or not finite."""
+    """The values as floats; missing and non-finite values become NaN, which is not drawn."""
     return [float(x) if isinstance(x, Real) and math.isfinite(x) else math.nan for x in values]
 
 
 def legend_below(figure: Figure, *axes: Axes, columns: int = 4) -> None:
-    """Draws one legend of some axes below them, in so many columns, or in fewer where it is wider than the figure."""
-    named = {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
+    """Draws one legend of several axes below them, with at most `columns` columns, so that it fits the figure."""
+    handles = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     for ncols in range(columns, 0, -1):
-        legend = figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=ncols)
+        legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=ncols)
         if ncols == 1 or legend.get_window_extent().width <= figure.bbox.width:
             break
         legend.remove()
 
 
 def bare(axis: Any) -> Any:
-    """Prepares axes for a picture: a thin frame, no ticks, no grid; gives the axes."""
+    """Prepares axes for a picture (a thin frame, no ticks, no grid) and returns them."""
     axis.set(xticks=[], yticks=[])
     axis.grid(False)
     for spine in axis.spines.values():
@@ -151,29 +150,30 @@ def window(masks: Sequence[np.ndarray], margin: float = 0.08) -> tuple[float, fl
     """The square part of pictures that contains all masks, with a margin.
 
     Args:
-        masks: [height, width], of the same aspect ratio; their sizes may differ.
-        margin: as a share of the masks' extent.
+        masks: [height, width], with the same aspect ratio; their sizes may differ.
+        margin: as a fraction of the masks' extent.
 
     Returns:
-        Its upper edge, left edge and side, in units of the larger side of a picture; a square of the smaller side
-        where no mask has a pixel.
+        Its upper edge, left edge and side, in units of a picture's larger side. If all masks are empty, the side is the
+        smaller side.
     """
-    largest = [max(mask.shape) for mask in masks]
-    smallest = min((min(mask.shape) / of for mask, of in zip(masks, largest, strict=True)), default=1.0)
+    sizes = [max(mask.shape) for mask in masks]
+    max_side = min((min(mask.shape) / size for mask, size in zip(masks, sizes, strict=True)), default=1.0)
     low, high = np.ones(2), np.zeros(2)
-    for mask, of in zip(masks, largest, strict=True):
+    for mask, size in zip(masks, sizes, strict=True):
         for axis in (0, 1) if mask.any() else ():
-            places = np.nonzero(mask.any(1 - axis))[0]
-            low[axis], high[axis] = min(low[axis], places[0] / of), max(high[axis], (places[-1] + 1) / of)
+            indices = np.nonzero(mask.any(1 - axis))[0]
+            low[axis] = min(low[axis], indices[0] / size)
+            high[axis] = max(high[axis], (indices[-1] + 1) / size)
     if (low > high).any():
-        return 0.0, 0.0, smallest
-    side = min(smallest, float((high - low).max()) * (1 + margin))
-    spans = np.array(masks[0].shape) / largest[0]
+        return 0.0, 0.0, max_side
+    side = min(max_side, float((high - low).max()) * (1 + margin))
+    spans = np.array(masks[0].shape) / sizes[0]
     top, left = np.clip((low + high - side) / 2, 0, spans - side)
     return float(top), float(left), side
 
 
-def silhouette_image(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+def silhouette_image(rendered: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Compares two masks [height, width] as a picture [height, width, 3]: `BOTH`, `MISSED`, `SPURIOUS` on `PAPER`."""
-    cases = [(found & true)[..., None], (true & ~found)[..., None], (found & ~true)[..., None]]
+    cases = [(rendered & true)[..., None], (true & ~rendered)[..., None], (rendered & ~true)[..., None]]
     return np.select(cases, [np.array(to_rgb(colour)) for colour in (BOTH, MISSED, SPURIOUS)], np.array(to_rgb(PAPER)))

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from bench.evaluate.evaluate import (
     DEFINITIONS,
-    OWN,
+    OWN_PREFIX,
     WORST_SURFACE,
     Evaluation,
+    missed_parts_note,
     render_image,
     surface_metrics,
-    unrendered,
 )
-from bench.evaluate.state import State, coloured_image, unseen, vertex_colours
+from bench.evaluate.state import State, coloured_image, empty_view, vertex_colours
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.surfaces import painter, with_colours
 from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness_scores
@@ -54,7 +54,10 @@ COLOURED_DEFINITIONS = {
     },
     **ROUGHNESS,
     **{name: text + MESH_IMAGE_NOTE for name, text in IMAGE_SCORES.items()},
-    **{OWN + name: f"{text} Of the image that the renderer under test renders." for name, text in IMAGE_SCORES.items()},
+    **{
+        OWN_PREFIX + name: f"{text} Of the image that the renderer under test renders."
+        for name, text in IMAGE_SCORES.items()
+    },
     **WEIGHT,
 }
 
@@ -63,23 +66,23 @@ def judge(state: State, subject: Subject) -> Evaluation:
     """Compares a state whose field has colours with held-out photographs and, if it is known, the true surface."""
     field, inputs, shots = state.field, state.inputs, subject.held_out
     metrics = surface_scores(state.mesh, subject, inputs) | field_scores(state, shots)
-    metrics |= early_weight(field, [state.seen(shot.camera) for shot in shots], inputs)
+    metrics |= early_weight(field, [state.view_from(shot.camera) for shot in shots], inputs)
     renderings = [render_image(field, shot.camera, inputs) for shot in shots]
     views = [view for view, _ in renderings]
     scores = image_scores(views, [image for _, image in renderings], shots)
-    metrics |= {OWN + name: value for name, value in scores.items()}
+    metrics |= {OWN_PREFIX + name: value for name, value in scores.items()}
     if state.mesh is None:
         failure = RunStatus.EMPTY, "the field has no surface in the unit sphere"
         return Evaluation(metrics, None, failure, field=field)
     mesh = replace(state.mesh, colours=vertex_colours(field, state.mesh, inputs.device))
-    return Evaluation(metrics, mesh, notes=unrendered(state, views), field=field)
+    return Evaluation(metrics, mesh, notes=missed_parts_note(state, views), field=field)
 
 
 def judge_mesh(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> Evaluation:
     """Compares a mesh with coloured vertices in the same way, without a renderer."""
     metrics = surface_scores(mesh, subject, inputs)
     cameras = [shot.camera for shot in subject.held_out]
-    blank = [(unseen(camera), torch.zeros(camera.height, camera.width, 3)) for camera in cameras]
+    blank = [(empty_view(camera), torch.zeros(camera.height, camera.width, 3)) for camera in cameras]
     renderings = blank if mesh is None else [*map(painter(mesh), cameras)]
     metrics |= image_scores([view for view, _ in renderings], [image for _, image in renderings], subject.held_out)
     failure = (RunStatus.EMPTY, "no surface was found") if mesh is None else None
@@ -111,7 +114,7 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
 
 def field_scores(state: State, shots: Sequence[Shot]) -> dict[str, float]:
     """The metrics of `IMAGE_SCORES` of a field's colours on its mesh's visible surface."""
-    views = [state.seen(shot.camera) for shot in shots]
+    views = [state.view_from(shot.camera) for shot in shots]
     return image_scores(views, [coloured_image(state.field, view, state.inputs.device) for view in views], shots)
 
 

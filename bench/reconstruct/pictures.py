@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from bench.evaluate.state import State
-from bench.pictures.colours import Seen, seen_arrays
+from bench.pictures.colours import RenderColours, view_arrays
 from bench.pictures.run_figures import at_size, draw_curve, normals_image, save_arrays
 from bench.pictures.style import SCREEN, bare, save
 from bench.reconstruct.judge import judge_mesh, judged_pixels
@@ -39,7 +39,7 @@ def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: lis
         draw_curve(folder / "curve.png", curve)
 
     def render(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
-        view = state.pictured(camera)
+        view = state.refined_view(camera)
         return view, state.colours(view)
 
     _save(folder, render, state.inputs, subject, title)
@@ -89,23 +89,23 @@ def draw_picture(
         save(figure, folder / "summary.png")
 
 
-def _save(folder: Path, render: Seen, inputs: RunInputs, subject: Subject, title: str) -> None:
+def _save(folder: Path, render: RenderColours, inputs: RunInputs, subject: Subject, title: str) -> None:
     with rc_context(SCREEN):
         figures = {"summary": _summary(render, inputs, subject, title), "input": _input(subject)}
         for name, figure in figures.items():
             save(figure, folder / f"{name}.png")
     shot = subject.held_out[len(subject.held_out) // 2]
-    arrays = {"photograph": shot.colours} | seen_arrays(render, at_size(shot.camera, inputs.evaluation.picture))
+    arrays = {"photograph": shot.colours} | view_arrays(render, at_size(shot.camera, inputs.evaluation.picture))
     if len(subject.input_shots) == 1:
         arrays["given"] = subject.input_shots[0].colours
     if subject.truth is not None:
         behind = turned(at_size(shot.camera, inputs.evaluation.picture), np.pi)
         true = normals_image(see(Truth(subject.truth, closed=False), behind))
-        arrays |= seen_arrays(render, behind, "back_") | {"back_truth": torch.from_numpy(true)}
+        arrays |= view_arrays(render, behind, "back_") | {"back_truth": torch.from_numpy(true)}
     save_arrays(folder, arrays)
 
 
-def _summary(render: Seen, inputs: RunInputs, subject: Subject, title: str) -> Figure:
+def _summary(render: RenderColours, inputs: RunInputs, subject: Subject, title: str) -> Figure:
     """A row per held-out photograph: photograph, rendering, error at the photograph's size, normals."""
     shots = evenly_spaced(subject.held_out, MAX_HELD_OUT_SHOWN)
     aspect = shots[0].camera.height / shots[0].camera.width
@@ -129,7 +129,7 @@ def _summary(render: Seen, inputs: RunInputs, subject: Subject, title: str) -> F
     return figure
 
 
-def _error(render: Seen, shot: Shot) -> Float[np.ndarray, "height width"]:
+def _error(render: RenderColours, shot: Shot) -> Float[np.ndarray, "height width"]:
     """The mean difference of colours at the photograph's size, as in `judge.IMAGE_SCORES`; NaN at other pixels."""
     image = render(shot.camera)[1]
     judged, photographed = judged_pixels(shot)

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from bench.evaluate.dtu import DEFINITIONS as DTU_DEFINITIONS
-from bench.evaluate.dtu import DtuScan, dtu_metrics, published, read_scan
-from bench.evaluate.evaluate import cloud_metrics, drawn
+from bench.evaluate.dtu import DtuScan, dtu_metrics, published_results, read_scan
+from bench.evaluate.evaluate import cloud_metrics, subsample
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import save_in_world
 from datasets.captures.hull import hull_mesh
@@ -101,7 +101,7 @@ class Subject:
             return dtu_metrics(mesh and mesh.moved(self.to_world), self.points, seed=inputs.seed)
         count, threshold = inputs.evaluation.points, inputs.evaluation.fscore_threshold
         predicted = None if mesh is None else sample_surface(mesh, count, inputs.seed + 1)
-        return cloud_metrics(predicted, drawn(self.points, count, inputs.seed), threshold=threshold)
+        return cloud_metrics(predicted, subsample(self.points, count, inputs.seed), threshold=threshold)
 
     def true_surface(self, count: int, seed: int) -> tuple[Surface, Bool[np.ndarray, " n"]]:
         """Samples of the true surface, and a mask of those visible in an input photograph; drawn once."""
@@ -225,7 +225,7 @@ def load_truth(
     if dataset.truth is None:
         return None, None, []
     if (number := dataset.dtu_scan) is not None:
-        return None, read_scan(Path(dataset.truth), number), published(number)
+        return None, read_scan(Path(dataset.truth), number), published_results(number)
     mesh, points = None, None if Path(dataset.truth).is_dir() else read_points(dataset.truth)
     if points is None:
         full_mesh = read_pieces(dataset.truth).moved(np.linalg.inv(to_world))

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 
-from bench.evaluate.state import GREY, painted
+from bench.evaluate.state import DEFAULT_VERTEX_COLOUR, render_vertex_colours
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.subject import Subject, points_in_sphere, visible
 from datasets.mesh import Mesh
@@ -135,10 +135,10 @@ def with_colours(mesh: Mesh, shots: Sequence[Shot]) -> Mesh:
         image = shot.colours.numpy()
         bands = [map_coordinates(image[..., band], coordinates, order=1, mode="nearest") for band in range(3)]
         total, weights = total + weight * np.stack(bands, axis=1), weights + weight
-    return replace(mesh, colours=np.where(weights > 0, total / np.maximum(weights, 1e-12), GREY))
+    return replace(mesh, colours=np.where(weights > 0, total / np.maximum(weights, 1e-12), DEFAULT_VERTEX_COLOUR))
 
 
 def painter(mesh: Mesh) -> Callable[[Camera], tuple[View, Float[torch.Tensor, "height width 3"]]]:
     """A function that renders a mesh for a camera: the view, and colours by `bench.evaluate.state.painted`."""
     scene = Truth(mesh, closed=False)
-    return lambda camera: (see(scene, camera), torch.from_numpy(painted(mesh, scene, camera)).float())
+    return lambda camera: (see(scene, camera), torch.from_numpy(render_vertex_colours(mesh, scene, camera)).float())

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from bench.evaluate.evaluate import OWN
+from bench.evaluate.evaluate import OWN_PREFIX
 from bench.setup.inputs import RunInputs
 from datasets.scene import Surface, View
 from renderers.boundary import render_checked
@@ -23,7 +23,8 @@ ROUGHNESS = {
     for name, others in (("seen", "some"), ("unseen", "no"))
 }
 WEIGHT = {
-    OWN + "early_weight": "Share of the weight of a ray that lies more than 0.05 scene units in front of the first hit "
+    OWN_PREFIX
+    + "early_weight": "Share of the weight of a ray that lies more than 0.05 scene units in front of the first hit "
     "of the mesh, mean over the rays of held-out photographs that hit it and have weight; of renderers that sum along "
     "rays (NeuS, Sec. 3.1: an unbiased rendering has its greatest weight at the surface)."
 }

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.fields.coloured import OccupancyOf, ScaledOccupancyOf, begin_as_sphere
+from renderers.fields.coloured import OccupancyOf, ScaledOccupancyOf, initialise_to_sphere
 from renderers.fields.occupancy import OccupancyNetwork
 
 OCCUPANCY, DISTANCE = "occupancy", "distance"
@@ -64,7 +64,7 @@ class SingleView(nn.Module):
         self.settings = settings
         self.stages, self.code = encoder(4, settings.channels, settings.blocks, settings.code_length)
         self.decoder = OccupancyNetwork(width=settings.width, code_length=settings.code_length)
-        begin_as_sphere(self.decoder, settings.radius)
+        initialise_to_sphere(self.decoder, settings.radius)
 
     def forward(self, images: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch code_length"]:
         """The codes of images; see `bench.single_view.images.as_input`."""

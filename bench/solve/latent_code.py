@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import CHAMFER, Evaluation, chamfer_only, evaluate
+from bench.evaluate.evaluate import CHECKPOINT_METRICS, Evaluation, chamfer_only, evaluate
 from bench.evaluate.state import State
-from bench.pictures.run_figures import Given, draw_run
+from bench.pictures.run_figures import InputView, draw_run
 from bench.shape_prior import Prior
 from bench.solve.optimise import CannotContinue, Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
@@ -89,7 +89,7 @@ class CodeProblem:
     coloured: bool = False
     counts: Counts = field(default_factory=Counts)
 
-    tracked: ClassVar[tuple[str, ...]] = CHAMFER
+    tracked: ClassVar[tuple[str, ...]] = CHECKPOINT_METRICS
     shown: ClassVar[None] = None
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ class CodeProblem:
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
         """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
         view, observed = states[0].inputs.scene.observed_view()[0], self.observed.cpu().numpy()
-        observations = Given(view, observed, self.photographs, self.mask, self.coloured)
+        observations = InputView(view, observed, self.photographs, self.mask, self.coloured)
         draw_run(folder, states, observations, curve, title)
 
     def loss(self, iteration: int) -> Terms:

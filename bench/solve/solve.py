@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.config import DOUBLING
-from bench.evaluate.evaluate import COLOUR, DEFINITIONS, Evaluation, depth_gap_note
+from bench.evaluate.evaluate import COLOUR_DEFINITIONS, DEFINITIONS, Evaluation, depth_gap_note
 from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Filmstrip, Shown
@@ -141,7 +141,7 @@ def solve(
     with run.off_clock():
         before = problem.evaluate(first)
     record.metrics_start = before.metrics
-    filmstrip = Filmstrip(inputs, true=problem.shown)
+    filmstrip = Filmstrip(inputs, truth=problem.shown)
 
     def state() -> State:
         field = problem.field()
@@ -178,7 +178,7 @@ def solve_task(task: InverseTask, run: RunContext) -> State:
 
 def metric_definitions(inputs: RunInputs) -> dict[str, str]:
     """The definitions of the metrics of a solved code."""
-    return DEFINITIONS | COLOUR if inputs.prior_choice.coloured else DEFINITIONS
+    return DEFINITIONS | COLOUR_DEFINITIONS if inputs.prior_choice.coloured else DEFINITIONS
 
 
 def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | None:

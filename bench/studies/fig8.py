@@ -6,7 +6,7 @@ from bench.report.study import Result, Runs, Selection, format, gallery, records
 
 PLACE = 47
 READS = (Selection("fig8", conditions=("split",), setup=("machine",)),)
-SIDES = {  # prefixes in images.npz, see `bench.pictures.colours.rendered_again`; turns are about the vertical axis
+SIDES = {  # prefixes in images.npz, see `bench.pictures.colours.picture_arrays`; turns are about the vertical axis
     "coarse": "size_0_",
     "finer": "size_1_",
     "full size": "size_2_",

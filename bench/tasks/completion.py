@@ -9,7 +9,7 @@ import torch
 from bench.models.field import solve_by_growth
 from bench.models.observations import RayObservations, concatenate_views, hold_out, tiles
 from bench.pictures.colours import note_colours
-from bench.pictures.run_figures import Given
+from bench.pictures.run_figures import InputView
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
@@ -124,7 +124,7 @@ class Completion:
 
     def observations(
         self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[RayObservations, Given]:
+    ) -> tuple[RayObservations, InputView]:
         """The observations for a field without a prior, of which a fifth is held out, and the view for pictures."""
         view = self._observed_view(scene, renderer, seed=seed, device=device)
         observed, camera = view.observed.cpu(), scene.view.camera
@@ -133,7 +133,7 @@ class Completion:
         rays = hold_out(
             concatenate_views([view]), tile_ids, share=HELD_OUT_FRACTION, entire=(), footprint=half_pixel, seed=seed
         )
-        return rays, Given(
+        return rays, InputView(
             scene.observed_view(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None
         )
 

@@ -116,7 +116,7 @@ class Gradients:
         metrics |= self._evaluate_outline(subject, outline, directions[:, : self.outline_directions])
         run.progress("comparing gradients", len(BANDS) + 1, len(BANDS) + 2)
         visible = _draw(torch.cat([bands["frontal"], bands["oblique"]]), self.pixels, generator)
-        paint = Paint.drawn(generator)
+        paint = Paint.random(generator)
         numbers = self._evaluate(subject, visible, reference.distance.flatten()[visible], directions, paint)
         record.metrics = metrics | {f"colour.{name}": value for name, value in numbers.items()}
         record.evaluations = {"value": subject.counts.value, "gradient": subject.counts.gradient}

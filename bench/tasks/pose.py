@@ -10,7 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import IMAGE, OWN, OWN_DEFINITIONS, Evaluation, render_view, view_metrics
+from bench.evaluate.evaluate import (
+    IMAGE_DEFINITIONS,
+    OWN_PREFIX,
+    RENDERER_DEFINITIONS,
+    Evaluation,
+    render_view,
+    view_metrics,
+)
 from bench.evaluate.state import REACH, State
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
@@ -34,7 +41,7 @@ DEFINITIONS = {
 }
 TRACKED = tuple(DEFINITIONS)
 MESH_VIEW_NOTE = "By exact first hits of the known mesh, the same for every method."
-MESH_VIEW_DEFINITIONS = DEFINITIONS | {name: f"{text} {MESH_VIEW_NOTE}" for name, text in IMAGE.items()}
+MESH_VIEW_DEFINITIONS = DEFINITIONS | {name: f"{text} {MESH_VIEW_NOTE}" for name, text in IMAGE_DEFINITIONS.items()}
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,9 @@ class PoseTask(ABC):
             rendering: the view of the renderer under test from the estimated camera, if any.
         """
         mesh_view, true = see(scene.raycaster, estimate), scene.view
-        images = view_metrics(mesh_view, true) | ({} if rendering is None else view_metrics(rendering, true, OWN))
+        images = view_metrics(mesh_view, true) | (
+            {} if rendering is None else view_metrics(rendering, true, OWN_PREFIX)
+        )
         metrics = self.metrics(estimate, true.camera)
         rotation, distance = metrics["rotation_error_deg"], metrics["translation_error"]
         note = f"the pose was not found: it is {rotation:.1f} degrees and {distance:.3f} scene units off"
@@ -158,7 +167,7 @@ class Pose(PoseTask):
         def problem() -> PoseProblem:
             return PoseProblem(self, inputs.renderer, shape_field, view, cameras, inputs.device)
 
-        solve(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | OWN_DEFINITIONS)
+        solve(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | RENDERER_DEFINITIONS)
 
 
 def build_shape_field(settings: Pose, inputs: RunInputs) -> Field:

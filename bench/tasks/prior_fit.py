@@ -73,7 +73,7 @@ class PriorFit:
         }
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
-        predicted, true = state.pictured(camera), see(inputs.scene.raycaster, camera)
+        predicted, true = state.refined_view(camera), see(inputs.scene.raycaster, camera)
         save_images(run.folder, predicted, true)
 
     def problem(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import OWN, Evaluation
+from bench.evaluate.evaluate import OWN_PREFIX, Evaluation
 from bench.evaluate.state import State, vertex_colours
 from bench.reconstruct.judge import COLOURED_DEFINITIONS, coloured, judge, judge_mesh
 from bench.reconstruct.pictures import draw_picture, draw_reconstruction, note_surface
@@ -238,7 +238,7 @@ class OneImage:
         """The scores of a network's shape; scores of colours only if its training used colours."""
         evaluation = judge(state, subject)
         excluded = () if self.knows_colours else COLOUR_SCORES
-        scores = {name: x for name, x in evaluation.metrics.items() if name.removeprefix(OWN) not in excluded}
+        scores = {name: x for name, x in evaluation.metrics.items() if name.removeprefix(OWN_PREFIX) not in excluded}
         return replace(evaluation, metrics=scores | {"iou": overlap(state.field, images, state.inputs.device)})
 
     def _search(self, run: RunContext, images: ShapeImages, subject: Subject) -> None:

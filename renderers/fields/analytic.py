@@ -1,7 +1,6 @@
 """Analytic shapes and their combinations; each states its kind. A shape is a few lines: `sphere(0.5) | box((1, 1, 1))`.
 
-Formulas for the exact distances are standard (Hart 1996; Quilez, "distance functions"). Parameters may be tensors, so
-that gradients flow to them.
+Formulas for distances are standard (Hart 1996; Quilez, "distance functions"). Tensors as parameters get gradients.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ from torch import Tensor
 from renderers.field import Flops, Kind
 
 Numbers = float | Sequence[float] | Tensor
-LEAST_SHARE = 1e-6  # smaller parts of a norm are raised to this share of the largest: an error of 1e-6 at most
+MIN_NORM_FRACTION = 1e-6  # parts of a norm below this fraction of the largest are raised to it: an error below 1e-6
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,13 @@ class Shape:
         return self._replace(lambda p: self(p @ _like(rotation, p)))
 
     def scale(self, factor: Numbers) -> "Shape":
-        """The shape made `factor` times as large; its kind is kept. `factor` is one positive number."""
+        """The shape made `factor` times as large, `factor` a positive number; its kind is kept."""
         return self._replace(lambda p: self(p / _like(factor, p)) * _like(factor, p))
 
     def stretch(self, factors: Numbers) -> "Shape":
         """The shape stretched along the axes by `factors` [3].
 
-        Multiplied by the least factor it stays a bound, but no longer a distance.
+        The value times the smallest factor is a bound, but no longer a distance.
         """
 
         def stretched(points: Tensor) -> Tensor:
@@ -70,7 +69,7 @@ class Shape:
 def smooth_union(first: Shape, second: Shape, *, radius: Numbers) -> Shape:
     """Union with a fillet of about `radius` (quadratic smooth minimum).
 
-    Its gradient is a convex mix of the two gradients, so that of two bounds it is a bound.
+    Its gradient is a convex combination of the two gradients, so the union of two bounds is a bound.
     """
 
     def blend(a: Tensor, b: Tensor) -> Tensor:
@@ -92,31 +91,24 @@ def plane(normal: Numbers = (0.0, 1.0, 0.0), offset: Numbers = 0.0) -> Shape:
 
 
 def box(half_sizes: Numbers) -> Shape:
-    """An axis-aligned box of half the side lengths `half_sizes` [3] about the origin; exact distance."""
-
-    def distance(points: Tensor) -> Tensor:
-        beyond = points.abs() - _like(half_sizes, points)
-        return _around(beyond)
-
-    return Shape(distance)
+    """An axis-aligned box about the origin, with half side lengths `half_sizes` [3]; exact distance."""
+    return Shape(lambda p: _box_distance(p.abs() - _like(half_sizes, p)))
 
 
 def rounded_box(half_sizes: Numbers, radius: Numbers) -> Shape:
-    """A box of half sizes `half_sizes` [3], over all, whose edges are rounded by `radius`; exact distance."""
+    """A box whose edges are rounded by `radius`; `half_sizes` [3] include the rounding; exact distance."""
     return Shape(lambda p: box(_like(half_sizes, p) - _like(radius, p))(p) - _like(radius, p))
 
 
 def superquadric(half_sizes: Numbers, exponents: Numbers) -> Shape:
     """A superquadric (Barr 1981) of half sizes `half_sizes` [3] about the origin; a bound.
 
-    Its surface is where a norm is 1: ((|x|^p + |y|^p)^(q/p) + |z|^q)^(1/q) of the coordinates over the half sizes.
-    That norm is at most as steep as the Euclidean one for exponents of 2 and more, and 2^(1/p - 1/2) times as steep
-    below, by which its values are divided.
+    On its surface the norm ((|x|^p + |y|^p)^(q/p) + |z|^q)^(1/q) of the coordinates over the half sizes is 1. The
+    Lipschitz constant of this norm, by which values are divided, has a factor 2^(1/p - 1/2) per exponent p below 2.
 
     Args:
         half_sizes: along x, y and z, in scene units, positive.
-        exponents: p across x and y, q towards z, each 1 or more: 1 gives an octahedron, 2 an ellipsoid, large ones
-            nearly a box.
+        exponents: p across x and y, q towards z, at least 1: 1 gives an octahedron, 2 an ellipsoid, 20 nearly a box.
     """
 
     def bound(points: Tensor) -> Tensor:
@@ -124,7 +116,7 @@ def superquadric(half_sizes: Numbers, exponents: Numbers) -> Shape:
         p, q = _like(exponents, points).unbind()
         x, y, z = (points / sizes).abs().unbind(-1)
         slope = 2 ** ((1 / p - 0.5).clamp_min(0) + (1 / q - 0.5).clamp_min(0))
-        return sizes.min() / slope * (_length(torch.stack([_length(torch.stack([x, y], -1), p), z], -1), q) - 1)
+        return sizes.min() / slope * (_power_norm(torch.stack([_power_norm(torch.stack([x, y], -1), p), z], -1), q) - 1)
 
     return Shape(bound, Kind.BOUND)
 
@@ -161,16 +153,16 @@ def cylinder(radius: Numbers, half_height: Numbers) -> Shape:
             ],
             -1,
         )
-        return _around(beyond)
+        return _box_distance(beyond)
 
     return Shape(distance)
 
 
 def _combine(function: Callable[[Tensor, Tensor], Tensor], first: Shape, second: Shape) -> Shape:
-    """A function of two fields that is 1-Lipschitz in their values; of bounds it gives a bound."""
+    """Applies a function that is 1-Lipschitz in the two fields' values, so that two bounds give a bound."""
     kind = Kind.LEVEL if Kind.LEVEL in (first.kind, second.kind) else Kind.BOUND
-    known = first.lipschitz is not None and second.lipschitz is not None
-    lipschitz = max(first.lipschitz, second.lipschitz) if known else None  # pyright: ignore[reportArgumentType]
+    a, b = first.lipschitz, second.lipschitz
+    lipschitz = None if a is None or b is None else max(a, b)
     return Shape(lambda p: function(first(p), second(p)), kind, lipschitz)
 
 
@@ -178,19 +170,18 @@ def _like(value: Numbers, points: Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=points.dtype, device=points.device)
 
 
-def _length(parts: Float[Tensor, "*batch 2"], power: Tensor) -> Float[Tensor, "*batch"]:
-    """The norm of that power of parts that are not negative; scaled by the largest, so that no power overflows."""
+def _power_norm(parts: Float[Tensor, "*batch 2"], power: Tensor) -> Float[Tensor, "*batch"]:
+    """The p-norm for p = `power` of non-negative parts; scaled by the largest part, so that no power overflows."""
     largest = parts.amax(-1, keepdim=True).clamp_min(torch.finfo(parts.dtype).tiny)
-    shares = (parts / largest).clamp_min(LEAST_SHARE)  # a power of 0 has no gradient towards its exponent
-    return largest.squeeze(-1) * (shares**power).sum(-1) ** (1 / power)
+    fractions = (parts / largest).clamp_min(MIN_NORM_FRACTION)  # 0 ** power has no gradient towards power
+    return largest.squeeze(-1) * (fractions**power).sum(-1) ** (1 / power)
 
 
-def _around(beyond: Tensor) -> Tensor:
-    """The distance of a box from how far points lie beyond its sides; on a side it has the inside's gradient."""
-    nearest = beyond.amax(-1)
-    return _norm(beyond.clamp_min(0)) + (
-        nearest - nearest.relu()
-    )  # at 0 clamp_max has no gradient from PyTorch 2.14 on
+def _box_distance(beyond: Tensor) -> Tensor:
+    """The distance of a box, from signed distances to its sides; on a side the gradient is that of the inside."""
+    largest = beyond.amax(-1)
+    inside = largest - largest.relu()  # not clamp_max: at 0 it has no gradient from PyTorch 2.14 on
+    return _norm(beyond.clamp_min(0)) + inside
 
 
 def _norm(vectors: Tensor) -> Tensor:

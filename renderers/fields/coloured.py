@@ -1,4 +1,4 @@
-"""Fields with colours: of one shape, learnt from images and beginning as a sphere; or of a code."""
+"""Fields with colours: networks and grids of one shape, initialised to a sphere, and a decoder of a code."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,15 +13,15 @@ from torch.nn.functional import softplus
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Bounds, Field, Flops, Kind, OccupancyField, Wrapper, field_bounds
 from renderers.fields.grid import FLOPS, Grid
-from renderers.fields.mlp import BoundDecoder, Decoder, flops_of, passes
+from renderers.fields.mlp import BoundDecoder, Decoder, flops_of, split_into_passes
 from renderers.fields.occupancy import BoundOccupancy, OccupancyNetwork
 
-SHARPNESS = 100.0  # of softplus, as IDR has it: nearly a ReLU, with a second derivative
-AROUND = 256  # points on the sphere that it begins as, where its mean value is made 0
-DIRECTION_OCTAVES = 2  # of the encoding of view directions
-LOGIT_WIDTH = 0.1  # scene units over which a logit of occupancy changes by 1 at its start
-THRESHOLD = 0.5  # of occupancy: DVR's tau
-COLOUR_SCALE = 20.0  # of a grid's logits of colours: Adam's steps have the size of those of distances
+SOFTPLUS_BETA = 100.0  # as in IDR: nearly a ReLU, with a second derivative
+INIT_SPHERE_POINTS = 256  # points of the initial sphere; the bias is set so that the mean value there is 0
+DIRECTION_OCTAVES = 2  # see `positional_encoding`
+LOGIT_WIDTH = 0.1  # scene units over which the initial occupancy logit changes by 1
+OCCUPANCY_THRESHOLD = 0.5  # tau in DVR
+COLOUR_LOGIT_SCALE = 20.0  # makes one step size of Adam suit the colours and the distances of a grid
 Vectors = Float[Tensor, "*batch 3"]
 
 
@@ -34,27 +34,27 @@ class Coloured(Field, Protocol):
 
         Args:
             points: on the surface.
-            normals: the field's gradients there; their graph leads colours to the shape.
-            directions: of the rays that see the points, unit.
+            normals: the field's gradients at the points; through their graph, colours have a gradient to the shape.
+            directions: unit directions of the rays that hit the points.
         """
         ...
 
 
 class ColouredDistance(nn.Module):
-    """A network of distance, and one of colour that takes its features, the point, and the normal and view direction.
+    """A distance network, and a colour network that takes its features, the point, the normal and the view direction.
 
-    It begins as a sphere about the origin: the encoding has no weight yet, and the other weights are drawn so that
-    values grow by one per unit (Atzmon and Lipman 2020, "SAL", Theorem 1; IDR, Sec. 4).
+    It is initialised to a sphere about the origin. The encoding has zero weights, and the other weights are drawn so
+    that the slope is about 1 (Atzmon and Lipman 2020, "SAL", Theorem 1; IDR, Sec. 4).
 
     Source: IDR (Yariv et al. 2020), Sec. 3.2 and its supplement: softplus, positional encoding; colours of point,
         normal, direction and features.
     Deviates: narrower; no skip; the features are a linear map of the last hidden layer.
 
     Args:
-        layers: hidden layers of the distance, at least 1.
-        width: neurons per hidden layer, and of each of the two hidden layers of the colour.
+        layers: hidden layers of the distance network, at least 1.
+        width: neurons per hidden layer; the colour network has two hidden layers.
         octaves: of the encoding of points: sine and cosine of 1, 2, 4, ... times each coordinate.
-        radius: of the sphere that it begins as, in scene units.
+        radius: of the initial sphere, in scene units.
         directional: whether colours depend on the view direction.
     """
 
@@ -71,13 +71,13 @@ class ColouredDistance(nn.Module):
         inputs = [3 + 6 * octaves] + [width] * (layers - 1)
         self.hidden = nn.ModuleList(nn.Linear(size, width) for size in inputs)
         self.last, self.features = nn.Linear(width, 1), nn.Linear(width, width)
-        seen = 3 + 6 * DIRECTION_OCTAVES if directional else 0
-        sizes = [width + 6 + seen, width, width, 3]
+        direction_inputs = 3 + 6 * DIRECTION_OCTAVES if directional else 0
+        sizes = [width + 6 + direction_inputs, width, width, 3]
         self.colour = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(sizes))
-        self._begin_as_sphere(radius)
+        self._initialise_to_sphere(radius)
 
     @torch.no_grad()
-    def _begin_as_sphere(self, radius: float) -> None:
+    def _initialise_to_sphere(self, radius: float) -> None:
         for index, layer in enumerate(self.hidden):
             assert isinstance(layer, nn.Linear)
             layer.weight.normal_(0.0, sqrt(2 / len(layer.weight)))
@@ -86,60 +86,60 @@ class ColouredDistance(nn.Module):
                 layer.weight[:, 3:] = 0.0
         self.last.weight.normal_(sqrt(pi / self.last.in_features), 1e-4)
         self.last.bias.zero_()
-        around = radius * torch.nn.functional.normalize(torch.randn(AROUND, 3), dim=-1)
-        self.last.bias.fill_(-self(around).mean())  # softplus is a little more than a ReLU
+        sphere_points = radius * torch.nn.functional.normalize(torch.randn(INIT_SPHERE_POINTS, 3), dim=-1)
+        self.last.bias.fill_(-self(sphere_points).mean())  # softplus is slightly above a ReLU
 
     @property
     def field(self) -> "ColouredDistance":
-        """Itself; near enough to a distance where an eikonal term keeps it so."""
+        """Itself; close to a distance if the loss has an eikonal term."""
         return self
 
     @property
     def flops(self) -> Flops:
-        """Of a distance; see `flops_of`."""
+        """Of one distance; see `flops_of`."""
         return flops_of(nn.ModuleList([*self.hidden, self.last]))
 
     def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """The distances."""
         flat = points.reshape(-1, 3)
-        chunks = [flat] if torch.is_grad_enabled() else passes(flat, self.last.in_features)
+        chunks = [flat] if torch.is_grad_enabled() else split_into_passes(flat, self.last.in_features)
         return torch.cat([self.last(self._hidden(chunk)) for chunk in chunks]).view(points.shape[:-1])
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`; directions are unused unless `directional`."""
-        seen = [encoded(directions, DIRECTION_OCTAVES)] if self.directional else []
-        features = torch.cat([self.features(self._hidden(points)), points, normals, *seen], dim=-1)
+        direction_encoding = [positional_encoding(directions, DIRECTION_OCTAVES)] if self.directional else []
+        features = torch.cat([self.features(self._hidden(points)), points, normals, *direction_encoding], dim=-1)
         *layers, last = self.colour
         for layer in layers:
             features = layer(features).relu_()
         return torch.sigmoid(last(features))
 
     def _hidden(self, points: Tensor) -> Tensor:
-        features = encoded(points, self.octaves)
+        features = positional_encoding(points, self.octaves)
         for layer in self.hidden:
-            features = softplus(layer(features), beta=SHARPNESS)
+            features = softplus(layer(features), beta=SOFTPLUS_BETA)
         return features
 
 
 class ColouredOccupancy(nn.Module):
-    """DVR's network of one shape. Its colours are those of points alone, whatever normals and directions.
+    """DVR's network of one shape. Its colours depend on points alone, not on normals or directions.
 
-    It begins as a sphere: its blocks add nothing yet, and a sum of many ReLUs of random directions grows with the
+    It is initialised to a sphere. Its blocks add 0, and a sum of many ReLUs of random directions grows with the
     distance from the origin (Atzmon and Lipman 2020, "SAL", Theorem 1).
 
     Source: DVR (Niemeyer et al. 2020), Secs. 3.1 and 3.5.
-    Deviates: see `OccupancyNetwork`; the paper does not say how it begins.
+    Deviates: see `OccupancyNetwork`; the paper does not describe the initialisation.
 
     Args:
         width: neurons per layer.
-        radius: of the sphere that it begins as, in scene units.
+        radius: of the initial sphere, in scene units.
     """
 
     def __init__(self, *, width: int, radius: float) -> None:
         super().__init__()
         check_positive("radius", radius, "0.5 lies within most objects")
         self.network = OccupancyNetwork(width=width, code_length=0)
-        begin_as_sphere(self.network, radius)
+        initialise_to_sphere(self.network, radius)
 
     @property
     def field(self) -> "OccupancyOf":
@@ -148,21 +148,21 @@ class ColouredOccupancy(nn.Module):
 
 
 @torch.no_grad()
-def begin_as_sphere(network: OccupancyNetwork, radius: float) -> None:
-    """Sets the weights so that the shape is a sphere whatever the code; see `ColouredOccupancy`."""
+def initialise_to_sphere(network: OccupancyNetwork, radius: float) -> None:
+    """Sets the weights so that the shape is a sphere for every code; see `ColouredOccupancy`."""
     width = network.width
     half = torch.randn(width - width // 2, 3)
     network.first.weight.copy_(torch.cat([half, -half])[:width])
     network.first.bias.zero_()
-    for added in (*network.shifts, *(block.outer for block in network.blocks)):
-        for weights in added.parameters():  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+    for layer in (*network.shifts, *(block.outer for block in network.blocks)):
+        for weights in layer.parameters():  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
             weights.zero_()
     head = network.occupancy_head
     head.weight.fill_(-1.0)
     head.bias.zero_()
-    around = radius * torch.nn.functional.normalize(torch.randn(AROUND, 3), dim=-1)
+    sphere_points = radius * torch.nn.functional.normalize(torch.randn(INIT_SPHERE_POINTS, 3), dim=-1)
     shape = OccupancyOf(network.at(head.weight.new_zeros(network.code_length)))
-    head.weight.mul_(radius / LOGIT_WIDTH / shape(around).mean())
+    head.weight.mul_(radius / LOGIT_WIDTH / shape(sphere_points).mean())
     head.bias.fill_(radius / LOGIT_WIDTH)
 
 
@@ -181,7 +181,7 @@ class OccupancyOf:
         return self.bound.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return OccupancyField(self.bound.logits, THRESHOLD)(points)
+        return OccupancyField(self.bound.logits, OCCUPANCY_THRESHOLD)(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         return self.bound.colours(points)
@@ -189,7 +189,7 @@ class OccupancyOf:
 
 @dataclass(frozen=True)
 class ScaledOccupancyOf(OccupancyOf):
-    """The same network read as a distance, for renderers of distances: an eikonal term makes it one."""
+    """The scaled logits as a distance, for renderers that need one; training with an eikonal term makes it one."""
 
     kind: ClassVar[Kind] = Kind.DISTANCE
 
@@ -198,11 +198,11 @@ class ScaledOccupancyOf(OccupancyOf):
 
 
 class ColouredGrid(nn.Module):
-    """Distances and colours on a grid, interpolated linearly; it begins as a sphere.
+    """Distances and colours on a grid, interpolated linearly; initialised to a sphere.
 
     Args:
         samples: per axis.
-        radius: of the sphere, in scene units.
+        radius: of the initial sphere, in scene units.
         reach: half the cube's side, in scene units.
     """
 
@@ -215,8 +215,8 @@ class ColouredGrid(nn.Module):
         check_at_least("samples", samples, 2, "48 suit one shape")
         check_positive("radius", radius, "0.5 lies within most objects")
         axis = torch.linspace(-reach, reach, samples)
-        places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
-        self.distances = nn.Parameter(torch.linalg.vector_norm(places, dim=-1) - radius)
+        grid_points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+        self.distances = nn.Parameter(torch.linalg.vector_norm(grid_points, dim=-1) - radius)
         self.logits = nn.Parameter(torch.zeros(3, samples, samples, samples))
         self.reach = reach
 
@@ -230,22 +230,22 @@ class ColouredGrid(nn.Module):
         return Grid(self.distances, self.reach)(points)
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
-        places = (points.flip(-1) / self.reach).reshape(1, -1, 1, 1, 3)  # it takes z, y and x
-        sampled = torch.nn.functional.grid_sample(self.logits[None], places, padding_mode="border", align_corners=True)
-        return torch.sigmoid(COLOUR_SCALE * sampled.reshape(3, -1).T.reshape(points.shape))
+        zyx = (points.flip(-1) / self.reach).reshape(1, -1, 1, 1, 3)  # the order of `grid_sample`
+        sampled = torch.nn.functional.grid_sample(self.logits[None], zyx, padding_mode="border", align_corners=True)
+        return torch.sigmoid(COLOUR_LOGIT_SCALE * sampled.reshape(3, -1).T.reshape(points.shape))
 
 
 class TexturedDecoder(nn.Module):
-    """A decoder of distance, of the first half of a code, and one of colour, of the whole code.
+    """A distance decoder of the first half of a code, and a colour decoder of the whole code.
 
     Source: DIST, B.1: a shape code and a texture code of 256 each; the texture network takes both.
-    Deviates: colours are a sigmoid of its outputs; it has no narrowed layer before the skip, which needs a width above
-        the code's length.
+    Deviates: colours are a sigmoid of the outputs. The colour decoder has no narrowed layer before the skip, which
+        needs a width above the code's length.
 
     Args:
-        layers, width, skip: of both; see `Decoder`.
+        layers, width, skip: of both decoders; see `Decoder`.
         code_length: of both codes together, even.
-        narrow: of the decoder of distance.
+        narrow: of the distance decoder.
     """
 
     def __init__(self, *, layers: int, width: int, code_length: int, skip: int, narrow: bool) -> None:
@@ -264,7 +264,7 @@ class TexturedDecoder(nn.Module):
 
 @dataclass(frozen=True)
 class TexturedShape(Wrapper):
-    """The field of a `TexturedDecoder` at one code, whose colours are those of points alone, and not counted."""
+    """The field of a `TexturedDecoder` at one code. Colours depend on points alone and are not counted as cost."""
 
     inner: Field
     texture: BoundDecoder
@@ -285,7 +285,7 @@ class TexturedShape(Wrapper):
         return self.paint(points)
 
 
-def encoded(vectors: Float[Tensor, "*batch 3"], octaves: int) -> Float[Tensor, "*batch encoding"]:
+def positional_encoding(vectors: Float[Tensor, "*batch 3"], octaves: int) -> Float[Tensor, "*batch encoding"]:
     """The vectors, and sine and cosine of 1, 2, 4, ... times each coordinate (NeRF, Eq. 4, without pi)."""
     scaled = [2.0**octave * vectors for octave in range(octaves)]
-    return torch.cat([vectors, *(wave(each) for each in scaled for wave in (torch.sin, torch.cos))], dim=-1)
+    return torch.cat([vectors, *(wave(x) for x in scaled for wave in (torch.sin, torch.cos))], dim=-1)

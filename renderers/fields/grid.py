@@ -1,4 +1,4 @@
-"""A field interpolated between samples on a grid: for any shape whose distances can be computed."""
+"""A field interpolated between distances sampled on a grid."""
 
 from dataclasses import dataclass
 
@@ -15,12 +15,12 @@ FLOPS = Flops(value=40, gradient=60)  # eight products and sums, and their indic
 class Grid:
     """Trilinear interpolation of signed distances in the cube from -reach to reach.
 
-    Inside it is a distance, up to the square of the spacing where that is smooth and up to half of it at edges. Outside
-    it is the hypotenuse of the value at the nearest point of the cube and the distance to that point: a bound, since
-    the cube is convex and holds the shape.
+    Inside the cube it is a distance; its error is of the order of the squared spacing where the distance is smooth, and
+    up to half the spacing at edges. Outside, the value is the hypotenuse of the value at the nearest point of the cube
+    and the distance to that point. It is a bound, since the cube is convex and contains the shape.
 
     Args:
-        values: [n, n, n] at evenly spaced points, in scene units; the indices are those of x, y and z.
+        values: [n, n, n] at evenly spaced points, in scene units; the axes are x, y and z.
         reach: half the cube's side, in scene units.
     """
 
@@ -39,9 +39,9 @@ class Grid:
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         nearest = points.clamp(-self.reach, self.reach)
         count = self.values.shape[0]
-        place = (nearest + self.reach) * ((count - 1) / (2 * self.reach))
-        low = place.detach().floor().clamp(0, count - 2)
-        x, y, z = (place - low).unbind(-1)
+        cell_coordinates = (nearest + self.reach) * ((count - 1) / (2 * self.reach))
+        low = cell_coordinates.detach().floor().clamp(0, count - 2)
+        x, y, z = (cell_coordinates - low).unbind(-1)
         column, row, layer = low.long().unbind(-1)
         corner = (column * count + row) * count + layer
         flat = self.values.reshape(-1)
@@ -56,6 +56,6 @@ class Grid:
 
         near = along_y(corner)
         inside = near + x * (along_y(corner + count * count) - near)
-        away = (points - nearest).square().sum(-1)
-        outside = away > 0
-        return torch.where(outside, torch.where(outside, inside.square() + away, 1.0).sqrt(), inside)
+        squared_distance = (points - nearest).square().sum(-1)
+        outside = squared_distance > 0
+        return torch.where(outside, torch.where(outside, inside.square() + squared_distance, 1.0).sqrt(), inside)

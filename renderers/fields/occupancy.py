@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from renderers.checks import check_at_least
 from renderers.field import Flops
-from renderers.fields.mlp import flops_of, passes
+from renderers.fields.mlp import flops_of, split_into_passes
 
 BLOCKS = 5  # DVR, Sec. 3.5
 
@@ -18,9 +18,9 @@ class OccupancyNetwork(nn.Module):
 
     Source: DVR (Niemeyer et al. 2020), Secs. 3.1 and 3.5: 5 blocks; one output for occupancy, three for texture; codes
         of length 256 for single views.
-    Deviates: no image encoder; a code is given. The two sections leave open where the code enters, what a block looks
-        like, the width and the first weights. Here a linear map of the code is added before every block; a block is
-        x + B relu(A relu(x)); the width is an argument; the weights start as torch draws them.
+    Deviates: no image encoder; the code is an input. The two sections do not specify where the code enters, the form of
+        a block, the width and the initial weights. Here a linear map of the code is added before every block; a block
+        is x + B relu(A relu(x)); the width is an argument; the initial weights are torch's.
 
     Args:
         width: neurons per layer.
@@ -48,14 +48,14 @@ class OccupancyNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class BoundOccupancy:
-    """An occupancy network at one code. It is no Field: `field.OccupancyField` makes one of its logits."""
+    """An occupancy network at one code. It is not a Field: `field.OccupancyField` makes one from its logits."""
 
     network: OccupancyNetwork
     shifts: tuple[Tensor, ...]
 
     @property
     def flops(self) -> Flops:
-        """Of a logit; see `flops_of`."""
+        """Of one logit; see `flops_of`."""
         return flops_of(nn.ModuleList([self.network.first, self.network.blocks, self.network.occupancy_head]))
 
     def logits(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -69,7 +69,7 @@ class BoundOccupancy:
     def _outputs(self, points: Tensor, head: nn.Module) -> Tensor:
         if self.shifts and self.shifts[0].dim() > 1:
             return head(self._features(points))
-        chunks = [head(self._features(chunk)) for chunk in passes(points.reshape(-1, 3), self.network.width)]
+        chunks = [head(self._features(chunk)) for chunk in split_into_passes(points.reshape(-1, 3), self.network.width)]
         outputs = torch.cat(chunks)
         return outputs.view(*points.shape[:-1], outputs.shape[-1])
 

@@ -1,4 +1,4 @@
-"""Parts with a formula, and unions of them, by their numbers: each begins with its pose; sizes are logarithms."""
+"""Parametric parts, and unions of them. Parameters begin with the pose; sizes are given as logarithms."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,19 +13,19 @@ from renderers.field import Flops, Kind
 from renderers.fields.analytic import Shape, sphere, superquadric
 from renderers.fields.analytic import box as exact_box
 
-EXPONENTS = (1.0, 20.0)  # of a superquadric: 1 is an octahedron, 20 nearly a box
+EXPONENT_RANGE = (1.0, 20.0)  # from an octahedron to nearly a box
 
 
 @dataclass(frozen=True)
 class Formula:
-    """The values of a part or a union, from the name of its formula, one of `FORMULAS`, and its numbers."""
+    """The values of a part or a union: `FORMULAS[name]` at its parameters."""
 
     name: str
     parameters: Tensor
 
     @cached_property
     def shape(self) -> Shape:
-        """The formula at these numbers."""
+        """The formula at these parameters."""
         return FORMULAS[self.name](self.parameters)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -33,51 +33,51 @@ class Formula:
 
 
 def formula(name: str, parameters: Tensor, flops: Flops) -> Shape:
-    """The field of a formula, which keeps its name and its numbers."""
-    found = Formula(name, parameters)
-    return replace(found.shape, function=found, flops=flops)
+    """The field of a formula; its function keeps the name and the parameters."""
+    values = Formula(name, parameters)
+    return replace(values.shape, function=values, flops=flops)
 
 
 def union(parameters: Float[Tensor, "parts 10"]) -> Shape:
-    """A union of rounded boxes, computed as one batch: a loop over them takes as many times as long.
+    """A union of rounded boxes, computed as one batch, since a loop over n boxes takes n times as long.
 
-    Each has its pose, see `_placed`, the logarithms of its half sizes, and the logit of its edges' radius over the
-    least of these; at 1 it is a capsule.
+    The parameters of a box are its pose (see `_apply_pose`), the logarithms of its half sizes, and a logit: that of
+    the radius of its edges over the smallest half size. At a ratio of 1 the box is a capsule.
     """
     sizes = parameters[:, 6:9].exp()
     radii = torch.sigmoid(parameters[:, 9]) * sizes.amin(-1)
-    turns = _turn(parameters)
+    rotations = _rotations(parameters)
     cores = exact_box(sizes - radii[:, None])
 
     def bound(points: Tensor) -> Tensor:
-        local = torch.einsum("...pi,pij->...pj", points[..., None, :] - parameters[:, :3], turns)
+        local = torch.einsum("...pi,pij->...pj", points[..., None, :] - parameters[:, :3], rotations)
         return (cores(local) - radii).amin(-1)
 
     return Shape(bound, Kind.DISTANCE if len(parameters) == 1 else Kind.BOUND)
 
 
 def quadric(parameters: Float[Tensor, "11"]) -> Shape:
-    """A superquadric: as an ellipsoid, then the logits of two exponents between `EXPONENTS`, on a logarithmic scale."""
-    low, high = EXPONENTS
+    """A superquadric: pose, half sizes, and logits of two exponents in `EXPONENT_RANGE`, on a logarithmic scale."""
+    low, high = EXPONENT_RANGE
     powers = low * (high / low) ** torch.sigmoid(parameters[9:11])
-    return _placed(superquadric(parameters[6:9].exp(), powers), parameters)
+    return _apply_pose(superquadric(parameters[6:9].exp(), powers), parameters)
 
 
-def _placed(shape: Shape, parameters: Float[Tensor, " n"]) -> Shape:
-    """The shape turned by the rotation vector, parameters 3 to 5, and moved by the translation, the first three."""
-    return shape.rotate(_turn(parameters)).translate(parameters[:3])
+def _apply_pose(shape: Shape, parameters: Float[Tensor, " n"]) -> Shape:
+    """Rotates a shape by the rotation vector, parameters 3 to 5, then translates it by parameters 0 to 2."""
+    return shape.rotate(_rotations(parameters)).translate(parameters[:3])
 
 
-def _turn(parameters: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
+def _rotations(parameters: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3 3"]:
     """Rotation matrices of the rotation vectors, parameters 3 to 5."""
     vector = parameters[..., 3:6]
     return rigid(torch.cat([torch.zeros_like(vector), vector], dim=-1))[..., :3, :3]
 
 
-FORMULAS: dict[str, Callable[[Tensor], Shape]] = {  # all but a sphere begin with pose, and logarithms of half sizes
+FORMULAS: dict[str, Callable[[Tensor], Shape]] = {  # all except the sphere begin with pose and log half sizes
     "sphere": lambda p: sphere(p[3].exp(), p[:3]),  # centre, logarithm of the radius
-    "ellipsoid": lambda p: _placed(sphere(1.0).stretch(p[6:9].exp()), p),
-    "box": lambda p: _placed(exact_box(p[6:9].exp()), p),
+    "ellipsoid": lambda p: _apply_pose(sphere(1.0).stretch(p[6:9].exp()), p),
+    "box": lambda p: _apply_pose(exact_box(p[6:9].exp()), p),
     "rounded_box": lambda p: union(p[None]),
     "superquadric": quadric,
     "union": union,

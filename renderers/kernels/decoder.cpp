@@ -1,5 +1,5 @@
-// Values of a ReLU network at points, without a graph: the layers of a tile of points stay in the first caches.
-// Its plain twin is `BoundDecoder._forward` in renderers/fields/mlp.py.
+// Values of a ReLU network at points, without a graph: the features of a tile of points stay in the first caches.
+// The same in PyTorch is `BoundDecoder._forward` in renderers/fields/mlp.py.
 #include <cstdint>
 #include <cstring>
 #include <memory>
@@ -9,17 +9,17 @@ constexpr int LANES = 16, VECTORS = 4;  // 24 of 32 registers hold sums
 #else
 constexpr int LANES = 8, VECTORS = 2;  // 12 of 16
 #endif
-constexpr int BLOCK = LANES * VECTORS;  // neurons whose weights lie together: [outputs / BLOCK][inputs][BLOCK]
-constexpr int ROWS = 6;                 // points whose sums are in registers
-constexpr int TILE = 8 * ROWS;          // points between two layers
+constexpr int BLOCK = LANES * VECTORS;  // neurons whose weights are contiguous: [outputs / BLOCK][inputs][BLOCK]
+constexpr int ROWS = 6;                 // points whose sums are kept in registers
+constexpr int TILE = 8 * ROWS;          // points that pass through all layers together
 
 typedef float Vector __attribute__((vector_size(4 * LANES), aligned(4)));
 
 struct Decoder {
-  int layers, skip;              // hidden layers, and the one whose input also has the point; 0 for none
-  const int *inputs, *outputs;   // of each hidden layer; its outputs are a multiple of BLOCK
+  int layers, skip;              // hidden layers; index of the one that also takes the point, 0 for none
+  const int *inputs, *outputs;   // of each hidden layer; outputs are a multiple of BLOCK
   const float *const *weights, *const *biases;
-  const float *last;             // as long as the last hidden layer's outputs
+  const float *last;             // weights, as many as the outputs of the last hidden layer
   float last_bias;
 };
 
@@ -43,14 +43,14 @@ static inline void block(Rows from, int inputs, const float *weight, const float
       for (int j = 0; j < VECTORS; j++) sum[r][j] += from.at(r)[k] * column[j];
   }
   for (int r = 0; r < R; r++)
-    for (int j = 0; j < VECTORS; j++)  // not a number stays so, as in PyTorch
+    for (int j = 0; j < VECTORS; j++)  // NaN stays NaN, as in PyTorch
       *(Vector *)(to.at(r) + LANES * j) = sum[r][j] < 0 ? Vector{} : sum[r][j];
 }
 
 template <int R>
-static void some(int rows, Rows from, int inputs, const float *weight, const float *bias, Rows to) {
+static void partial_block(int rows, Rows from, int inputs, const float *weight, const float *bias, Rows to) {
   if (rows == R) return block<R>(from, inputs, weight, bias, to);
-  if constexpr (R > 1) some<R - 1>(rows, from, inputs, weight, bias, to);
+  if constexpr (R > 1) partial_block<R - 1>(rows, from, inputs, weight, bias, to);
 }
 
 static void layer(const Decoder *net, int index, Rows from, int points, Rows to) {
@@ -58,8 +58,8 @@ static void layer(const Decoder *net, int index, Rows from, int points, Rows to)
   const float *weight = net->weights[index];
   for (int o = 0; o < net->outputs[index]; o += BLOCK, weight += (size_t)BLOCK * inputs)
     for (int r = 0; r < points; r += ROWS)
-      some<ROWS>(points - r < ROWS ? points - r : ROWS, {from.at(r), from.stride}, inputs, weight,
-                 net->biases[index] + o, {to.at(r) + o, to.stride});
+      partial_block<ROWS>(points - r < ROWS ? points - r : ROWS, {from.at(r), from.stride}, inputs, weight,
+                          net->biases[index] + o, {to.at(r) + o, to.stride});
 }
 
 static float sum_last(const Decoder *net, const float *features) {
@@ -76,19 +76,19 @@ extern "C" int decoder_block() { return BLOCK; }
 extern "C" void decoder_values(const Decoder *net, float *points, int64_t count, float *values) {
   int stride = 0;
   for (int l = 0; l < net->layers; l++) stride = net->outputs[l] > stride ? net->outputs[l] : stride;
-  stride += LANES;  // the point stands behind the features
-  std::unique_ptr<float[]> room(new float[2 * (size_t)TILE * stride]);
+  stride += LANES;  // the point follows the features
+  std::unique_ptr<float[]> buffer(new float[2 * (size_t)TILE * stride]);
   for (int64_t first = 0; first < count; first += TILE) {
-    int some = count - first < TILE ? (int)(count - first) : TILE;
-    Rows given = {points + 3 * first, 3}, from = {room.get(), stride}, to = {from.at(TILE), stride};
-    layer(net, 0, given, some, from);
+    int rows = count - first < TILE ? (int)(count - first) : TILE;
+    Rows tile = {points + 3 * first, 3}, from = {buffer.get(), stride}, to = {from.at(TILE), stride};
+    layer(net, 0, tile, rows, from);
     for (int l = 1; l < net->layers; l++) {
       if (l == net->skip)
-        for (int r = 0; r < some; r++) memcpy(from.at(r) + net->inputs[l] - 3, given.at(r), 3 * sizeof(float));
-      layer(net, l, from, some, to);
+        for (int r = 0; r < rows; r++) memcpy(from.at(r) + net->inputs[l] - 3, tile.at(r), 3 * sizeof(float));
+      layer(net, l, from, rows, to);
       Rows swapped = from;
       from = to, to = swapped;
     }
-    for (int r = 0; r < some; r++) values[first + r] = sum_last(net, from.at(r));
+    for (int r = 0; r < rows; r++) values[first + r] = sum_last(net, from.at(r));
   }
 }

@@ -1,1 +1,1 @@
-"""Renderers that see through a volume: a field's values become opacity, and what a ray sees is a weighted sum."""
+"""Volume renderers: field values become opacities, and a rendered quantity is a weighted sum over a ray's samples."""

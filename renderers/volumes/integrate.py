@@ -1,4 +1,4 @@
-"""Volume rendering along rays: weights from the share of light that passes, and the rendering that they give."""
+"""Volume rendering along rays: weights of samples from their transmittance, and the rendering from the weights."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -17,20 +17,20 @@ from renderers.field import Field, carries_gradient
 from renderers.gradients import reevaluate_with_graph
 from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Deferred, Rendering, Status, Volume, assemble
 
-FAINT = 1e-5  # share of a ray's light below which a sample has no part: neither a weight nor a gradient
-SEEN = 0.5  # opacity above which a ray has hit
-RISE = 1e-5  # of the field between two samples, scene units: less is rounding
-LEAST_IMPORTANCE = 1e-12  # of a whole ray, spread evenly: where nothing is important all of it is
-LEAST_OPACITY = 1e-3  # in the mask loss, which has no gradient beyond it; as in the official code of NeuS
+MIN_LIGHT = 1e-5  # samples that absorb less of a ray's light have neither a weight nor a gradient
+HIT_OPACITY = 0.5  # a ray with a larger opacity is a hit
+MIN_FIELD_CHANGE = 1e-5  # scene units: smaller changes between two samples are rounding
+MIN_IMPORTANCE = 1e-12  # spread evenly over a ray, so that a ray without importance is sampled evenly
+MIN_LOSS_OPACITY = 1e-3  # clamp of the silhouette loss, as in the official code of NeuS; no gradient outside it
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples along n rays, found without a graph.
+    """Samples along n rays, without a graph.
 
     Args:
-        distance: along the rays, rising.
-        value: of the field there; what is not finite counts as free space.
+        distance: along the rays, increasing.
+        value: of the field at the samples; non-finite values become free space.
     """
 
     distance: Float[Tensor, "n samples"]
@@ -41,105 +41,109 @@ class Samples:
         """The field's values at distances along n rays."""
         return Samples(distance, _finite(field(rays.at_each(distance))))
 
-    def of_rays(self, index: Tensor) -> "Samples":
-        """Those of some of the rays, by their places."""
+    def select(self, index: Tensor) -> "Samples":
+        """The samples of the rays at `index`."""
         return Samples(self.distance[index], self.value[index])
 
-    def joined(self, other: "Samples") -> "Samples":
-        """The samples of both, in rising order."""
+    def merge(self, other: "Samples") -> "Samples":
+        """The samples of both, by increasing distance."""
         distance, order = torch.cat([self.distance, other.distance], dim=1).sort(dim=1)
         return Samples(distance, torch.cat([self.value, other.value], dim=1).gather(1, order))
 
 
-# From values and distances [n, samples] to the logarithm of the share of light that passes each sample [n, samples], or
-# each interval between two [n, samples - 1]; at most 0.
-Passing = Callable[[Tensor, Tensor], Tensor]
-Search = Callable[[Field, Rays, Tensor, Tensor], Samples]  # field, rays, where they enter and leave the sphere
+# From values and distances [n, samples] to the logarithm of the fraction of light that passes each sample [n, samples],
+# or each interval between two samples [n, samples - 1]; at most 0.
+LogTransmittance = Callable[[Tensor, Tensor], Tensor]
+Search = Callable[[Field, Rays, Tensor, Tensor], Samples]  # field, rays, entry and exit distances
 
 
-def scheduled(first: float, last: float, over: int, iteration: int) -> float:
-    """A setting at an iteration, counted from 0: from `first` to `last` in `over` iterations, by equal factors."""
+def schedule(first: float, last: float, over: int, iteration: int) -> float:
+    """A setting at an iteration from 0: from `first` to `last` in `over` iterations, by a constant factor."""
     return last * (first / last) ** max(1 - iteration / over, 0) if over else last
 
 
-def weights(passing: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """The share of a ray's light that stays in each sample: what has passed all before, and does not pass this one."""
-    return _before(passing).exp() * -torch.expm1(passing)
+def weights(log_transmittance: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """The fraction of a ray's light that each sample absorbs: it passes all samples before, but not this one."""
+    return _log_light_before(log_transmittance).exp() * -torch.expm1(log_transmittance)
 
 
-def by_importance(
+def resample(
     distance: Float[Tensor, "n samples"], importance: Float[Tensor, "n intervals"], count: int
 ) -> Float[Tensor, "n count"]:
-    """Distances drawn from a piecewise constant density, at the middles of `count` equal shares of it.
+    """Distances at the midpoints of `count` equal fractions of a piecewise constant density.
 
     Args:
-        distance: the ends of the intervals, rising.
-        importance: of each interval, at least 0; where all are 0 the density is even.
+        distance: the ends of the intervals, increasing.
+        importance: of each interval, at least 0; if all are 0, the density is uniform.
     """
     lengths = distance[:, 1:] - distance[:, :-1]
-    least = FAINT * importance.sum(dim=1, keepdim=True) + LEAST_IMPORTANCE
-    density = importance + least * lengths / lengths.sum(dim=1, keepdim=True)
+    density_offset = MIN_LIGHT * importance.sum(dim=1, keepdim=True) + MIN_IMPORTANCE
+    density = importance + density_offset * lengths / lengths.sum(dim=1, keepdim=True)
     total = torch.nn.functional.pad(density.cumsum(dim=1), (1, 0))
     total = total / total[:, -1:]
-    shares = (torch.arange(count, dtype=distance.dtype, device=distance.device) + 0.5) / count
-    shares = shares.expand(len(distance), count).contiguous()
-    after = torch.searchsorted(total, shares, right=True).clamp(1, distance.shape[1] - 1)
+    fractions = (torch.arange(count, dtype=distance.dtype, device=distance.device) + 0.5) / count
+    fractions = fractions.expand(len(distance), count).contiguous()
+    after = torch.searchsorted(total, fractions, right=True).clamp(1, distance.shape[1] - 1)
     low, high = total.gather(1, after - 1), total.gather(1, after)
-    part = ((shares - low) / (high - low).clamp_min(torch.finfo(low.dtype).tiny)).clamp(0, 1)
+    position = ((fractions - low) / (high - low).clamp_min(torch.finfo(low.dtype).tiny)).clamp(0, 1)
     start = distance.gather(1, after - 1)
-    return start + part * (distance.gather(1, after) - start)
+    return start + position * (distance.gather(1, after) - start)
 
 
-def render_volume(field: Field, rays: Rays, search: Search, passing: Passing, *, radius: float) -> Rendering:
-    """The rendering of a volume: samples are searched without a graph, then summed with one.
+def render_volume(
+    field: Field, rays: Rays, search: Search, log_transmittance: LogTransmittance, *, radius: float
+) -> Rendering:
+    """Renders a volume: searches samples without a graph, then sums them with a graph.
 
-    `distance` of a hit is a mean of its samples' distances by weight, whose gradient is that of the weights: over the
-    samples of the surface in which the middle of the ray's light stays, so that one that it passes and one behind that
-    are not averaged. `residual` is the field's value there, between those of the samples beside it.
+    `distance` of a hit is the weighted mean of its samples' distances; its gradient is that of the weights. It covers
+    only samples of the surface that absorbs the median of the ray's light, so that two surfaces are not averaged.
+    `residual` is the field's value at that distance, interpolated between the two nearest samples.
 
     Args:
         rays: of any leading shape.
-        search: of the samples.
-        passing: of light, by the samples' values.
-        radius: of the sphere about the origin that holds the shape.
+        search: returns the samples.
+        log_transmittance: from the samples' values and distances.
+        radius: of the sphere about the origin that contains the shape.
     """
     flat = rays.flat()
-    entry, leave, meets = (part.detach() for part in sphere_span(flat, radius))
+    entry, leave, meets = (column.detach() for column in sphere_span(flat, radius))
     queried = meets.nonzero().squeeze(-1)
     blocks = queried.split(SAMPLES_PER_BATCH // 256)  # bounds the memory of a search; one block, even of no rays
-    parts = [_Part.of(field, flat, some, (entry, leave), search, passing) for some in blocks]
-    whole = _Part(*(torch.cat(part) for part in zip(*(vars(part).values() for part in parts), strict=True)))
-    inside = whole.begun_inside
-    hit = (whole.opacity.detach() > SEEN) & ~inside
-    seen = hit.nonzero().squeeze(-1)
+    results = [_BatchResult.of(field, flat, index, (entry, leave), search, log_transmittance) for index in blocks]
+    result = _BatchResult(*map(torch.cat, zip(*(vars(batch).values() for batch in results), strict=True)))
+    inside = result.starts_inside
+    hit = (result.opacity.detach() > HIT_OPACITY) & ~inside
+    hit_index = hit.nonzero().squeeze(-1)
     status = torch.full_like(inside, Status.MISS, dtype=torch.int8)
     status = status.masked_fill(inside, Status.STARTED_INSIDE).masked_fill(hit, Status.HIT)
-    ended = torch.where(hit, whole.mean, torch.where(inside, entry[queried], leave[queried]))
-    least = whole.least.index_put(
-        (seen,), reevaluate_with_graph(field, flat[queried[seen]], whole.least_distance[seen], whole.least[seen])
+    end = torch.where(hit, result.mean, torch.where(inside, entry[queried], leave[queried]))
+    closest_distance, closest_value = result.closest_distance, result.closest_value
+    values = reevaluate_with_graph(
+        field, flat[queried[hit_index]], closest_distance[hit_index], closest_value[hit_index]
     )
+    closest_value = closest_value.index_put((hit_index,), values)
     rendering = assemble(
         rays,
         radius,
-        distance=torch.where(meets, entry, leave).index_put((queried,), ended),
+        distance=torch.where(meets, entry, leave).index_put((queried,), end),
         status=torch.full_like(meets, Status.MISS, dtype=torch.int8).index_put((queried,), status),
-        residual=torch.zeros_like(entry).index_put((queried,), torch.where(hit, whole.residual, whole.least)),
-        closest=(queried, least),
+        residual=torch.zeros_like(entry).index_put((queried,), torch.where(hit, result.residual, result.closest_value)),
+        closest=(queried, closest_value),
     )
-    left_out = torch.zeros_like(meets).index_put((queried,), ~hit)
-    deferred = Deferred(leave.index_put((queried,), whole.least_distance).view(rays.shape), left_out.view(rays.shape))
-    volume = Volume(whole.ray, whole.distance, whole.weight)
+    is_deferred = torch.zeros_like(meets).index_put((queried,), ~hit)
+    deferred = Deferred(leave.index_put((queried,), closest_distance).view(rays.shape), is_deferred.view(rays.shape))
+    volume = Volume(result.ray, result.distance, result.weight)
     return replace(rendering, deferred=deferred, volume=volume)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeRenderer(ABC):
-    """What renderers share that see through a volume.
+    """The common part of all volume renderers.
 
     Args:
-        sharpening: iterations in which the first blur becomes the last one, by equal factors.
-        mask_weight: of the mask loss.
-        sphere_radius: of the sphere about the origin that holds the shape.
+        sharpening: iterations from the first to the last blur, by a constant factor.
+        mask_weight: of the silhouette loss.
+        sphere_radius: of the sphere about the origin that contains the shape.
     """
 
     sharpening: int
@@ -160,25 +164,25 @@ class VolumeRenderer(ABC):
     def silhouette_loss(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """The mean cross entropy of opacities and a mask (NeuS, Sec. 3.2); the other papers have no masks."""
-        opacity = rendering.opacity.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
+        """The mean cross entropy of opacities and a mask (NeuS, Sec. 3.2); the other papers do not use masks."""
+        opacity = rendering.opacity.clamp(MIN_LOSS_OPACITY, 1 - MIN_LOSS_OPACITY)
         entropy = -torch.where(mask, opacity, 1 - opacity).log().sum() / max(mask.numel(), 1)
         return self.mask_weight * entropy
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Of n rays, one number each: opacity, mean distance, the field there, the sample of least magnitude.
+class _BatchResult:
+    """For n rays: opacity, mean distance, the field's value there, and the sample with the smallest magnitude.
 
-    `ray`, `distance`, `weight` are those of the samples that have a part, of all the rays in one row.
+    `ray`, `distance` and `weight` describe the samples with a weight, of all rays in one row.
     """
 
     opacity: Float[Tensor, " n"]
     mean: Float[Tensor, " n"]
     residual: Float[Tensor, " n"]
-    least: Float[Tensor, " n"]
-    least_distance: Float[Tensor, " n"]
-    begun_inside: Bool[Tensor, " n"]
+    closest_value: Float[Tensor, " n"]
+    closest_distance: Float[Tensor, " n"]
+    starts_inside: Bool[Tensor, " n"]
     ray: Int[Tensor, " samples"]
     distance: Float[Tensor, " samples"]
     weight: Float[Tensor, " samples"]
@@ -190,81 +194,83 @@ class _Part:
         index: Int[Tensor, " n"],
         span: tuple[Tensor, Tensor],
         search: Search,
-        passing: Passing,
-    ) -> "_Part":
-        """Searches, and sums, along the rays at `index`."""
-        some, (entry, leave) = rays[index], (part[index] for part in span)
+        log_transmittance: LogTransmittance,
+    ) -> "_BatchResult":
+        """Searches and sums samples along the rays at `index`."""
+        batch, (entry, leave) = rays[index], (bound[index] for bound in span)
         with torch.no_grad():
-            samples = search(field, some, entry, leave)
+            samples = search(field, batch, entry, leave)
             value, distance = samples.value, samples.distance
-            place = value.abs().argmin(dim=1, keepdim=True)
-        found = weights(passing(_with_graph(field, some, samples, passing), distance))
-        if found.shape[1] < distance.shape[1]:
+            closest = value.abs().argmin(dim=1, keepdim=True)
+        weight = weights(log_transmittance(_values_with_graph(field, batch, samples, log_transmittance), distance))
+        if weight.shape[1] < distance.shape[1]:
             distance = (distance[:, 1:] + distance[:, :-1]) / 2
-        opacity = found.sum(dim=1)
-        main = found * _around_middle(found.detach(), value)
-        mean = (main * distance).sum(dim=1) / main.sum(dim=1).clamp_min(FAINT)
-        row, column = (found.detach() > FAINT).nonzero(as_tuple=True)
-        return _Part(
+        opacity = weight.sum(dim=1)
+        surface_weight = weight * _median_surface_mask(weight.detach(), value)
+        mean = (surface_weight * distance).sum(dim=1) / surface_weight.sum(dim=1).clamp_min(MIN_LIGHT)
+        row, column = (weight.detach() > MIN_LIGHT).nonzero(as_tuple=True)
+        return _BatchResult(
             opacity,
             mean,
-            _between(samples, mean.detach()),
-            value.gather(1, place).squeeze(1),
-            samples.distance.gather(1, place).squeeze(1),
+            _interpolate(samples, mean.detach()),
+            value.gather(1, closest).squeeze(1),
+            samples.distance.gather(1, closest).squeeze(1),
             value[:, 0] < 0,
             index[row],
             distance[row, column],
-            found[row, column],
+            weight[row, column],
         )
 
 
-def _with_graph(field: Field, rays: Rays, samples: Samples, passing: Passing) -> Float[Tensor, "n samples"]:
-    """The samples' values, with a graph where the weights depend on them by more than `FAINT`."""
-    wanted = rays.origins.requires_grad or rays.directions.requires_grad or carries_gradient(field, rays.origins)
-    if not (torch.is_grad_enabled() and wanted):
+def _values_with_graph(
+    field: Field, rays: Rays, samples: Samples, log_transmittance: LogTransmittance
+) -> Float[Tensor, "n samples"]:
+    """The samples' values, with a graph where weights depend on them by more than `MIN_LIGHT`."""
+    is_required = rays.origins.requires_grad or rays.directions.requires_grad or carries_gradient(field, rays.origins)
+    if not (torch.is_grad_enabled() and is_required):
         return samples.value
     with torch.no_grad():
-        logs = passing(samples.value, samples.distance)
-        needed = (_before(logs) > log(FAINT)) & (-torch.expm1(logs) > FAINT)
-        if needed.shape[1] < samples.value.shape[1]:  # of an interval both ends
+        log_light = log_transmittance(samples.value, samples.distance)
+        matters = (_log_light_before(log_light) > log(MIN_LIGHT)) & (-torch.expm1(log_light) > MIN_LIGHT)
+        if matters.shape[1] < samples.value.shape[1]:  # both ends of an interval
             pad = torch.nn.functional.pad
-            needed = pad(needed, (0, 1)) | pad(needed, (1, 0))
-    row, column = needed.nonzero(as_tuple=True)
+            matters = pad(matters, (0, 1)) | pad(matters, (1, 0))
+    row, column = matters.nonzero(as_tuple=True)
     values = _finite(field(rays[row].at(samples.distance[row, column])))
     return samples.value.index_put((row, column), values)
 
 
-def _around_middle(weight: Float[Tensor, "n k"], value: Float[Tensor, "n samples"]) -> Bool[Tensor, "n k"]:
-    """The samples of the surface at which half of the light has stayed.
+def _median_surface_mask(weight: Float[Tensor, "n k"], value: Float[Tensor, "n samples"]) -> Bool[Tensor, "n k"]:
+    """A mask of the samples of the surface that absorbs the median of the ray's absorbed light.
 
-    Between two surfaces the field, still positive, turns from rising to falling.
+    A surface begins where the field, still positive, changes from increasing to decreasing.
     """
-    passed = weight.cumsum(dim=1)
-    middle = (passed < passed[:, -1:] / 2).sum(dim=1, keepdim=True).clamp_max(weight.shape[1] - 1)
+    absorbed = weight.cumsum(dim=1)
+    middle = (absorbed < absorbed[:, -1:] / 2).sum(dim=1, keepdim=True).clamp_max(weight.shape[1] - 1)
     step = value[:, 1:] - value[:, :-1]
-    moves = step.abs() > RISE
-    last = torch.where(moves, torch.arange(step.shape[1], device=step.device), 0).cummax(dim=1)[0]  # that moved
-    rising = (step.gather(1, last) > RISE)[:, :-1]
-    turns = rising & (step[:, 1:] < -RISE) & (value[:, 1:-1] > 0)
-    group = torch.nn.functional.pad(turns, (1, 1)).cumsum(dim=1)[:, : weight.shape[1]]
-    return group == group.gather(1, middle)
+    changes = step.abs() > MIN_FIELD_CHANGE
+    last_change = torch.where(changes, torch.arange(step.shape[1], device=step.device), 0).cummax(dim=1)[0]
+    rising = (step.gather(1, last_change) > MIN_FIELD_CHANGE)[:, :-1]
+    starts_surface = rising & (step[:, 1:] < -MIN_FIELD_CHANGE) & (value[:, 1:-1] > 0)
+    surface_number = torch.nn.functional.pad(starts_surface, (1, 1)).cumsum(dim=1)[:, : weight.shape[1]]
+    return surface_number == surface_number.gather(1, middle)
 
 
 def _finite(values: Tensor) -> Tensor:
     return torch.where(values.isfinite(), values, 1.0)
 
 
-def _before(passing: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """The logarithm of the share of light that has passed all before each sample."""
-    return passing.cumsum(dim=1) - passing
+def _log_light_before(log_transmittance: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """The logarithm of the fraction of light that passes all samples before each one."""
+    return log_transmittance.cumsum(dim=1) - log_transmittance
 
 
-def _between(samples: Samples, distance: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """The field at a distance along each ray, on the line between the samples beside it."""
+def _interpolate(samples: Samples, distance: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """The field at a distance along each ray, interpolated linearly between the nearest samples."""
     last = samples.distance.shape[1] - 1
     after = torch.searchsorted(samples.distance, distance[:, None]).clamp(1, last)
     near, far, low, high = (
-        table.gather(1, place).squeeze(1) for table in (samples.distance, samples.value) for place in (after - 1, after)
+        table.gather(1, index).squeeze(1) for table in (samples.distance, samples.value) for index in (after - 1, after)
     )
-    part = (distance - near) / (far - near).clamp_min(torch.finfo(near.dtype).tiny)
-    return low + part.clamp(0, 1) * (high - low)
+    fraction = (distance - near) / (far - near).clamp_min(torch.finfo(near.dtype).tiny)
+    return low + fraction.clamp(0, 1) * (high - low)

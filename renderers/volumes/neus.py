@@ -1,4 +1,4 @@
-"""NeuS: volume rendering whose weights are greatest at the surface (Wang et al., NeurIPS 2021)."""
+"""NeuS: volume rendering whose weights are largest at the surface (Wang et al., NeurIPS 2021)."""
 
 from dataclasses import dataclass, replace
 
@@ -11,28 +11,28 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
 from renderers.rendering import Rendering, check_kind
-from renderers.volumes.integrate import Samples, VolumeRenderer, by_importance, render_volume, scheduled, weights
+from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, resample, schedule, weights
 
 
 @dataclass(frozen=True)
 class NeuS(VolumeRenderer):
-    """Opacity from how a sigmoid of the distance falls from one sample to the next.
+    """Opacity of an interval from the decrease of a sigmoid of the distance.
 
     Source: NeuS (Wang et al. 2021, arXiv 2106.10689), Eq. 13 (opacity of an interval), Sec. 3.2 and supplement
         (samples by importance, each round with a sigmoid twice as sharp; the mask's cross entropy).
-    Differentiable in: field parameters and rays, by the samples' weights, also of rays that pass close by: what comes
-        into view or leaves it has a part, as wide as the sigmoid.
+    Differentiable in: field parameters and rays, through the samples' weights. Rays that pass close to the surface have
+        a gradient too, so a visibility gradient exists, as wide as the sigmoid.
     Needs: a distance or a bound inside the sphere.
-    Deviates from the paper: the sharpness follows a schedule, and is not learnt; samples lie at the middles of equal
-        shares, and are not drawn; importance follows Eq. 13, not an estimate from slopes; the background is empty;
-        the cosine is not annealed, as the official code does over its first sixth where it has no masks.
+    Deviates from the paper: the sharpness follows a schedule and is not learnt; samples lie at midpoints of equal
+        fractions and are not random; importance follows Eq. 13, not an estimate from slopes; the background is empty;
+        the cosine is not annealed, as in the first sixth of the official code's iterations without masks.
 
     Args:
-        samples: equally spaced between where a ray enters and leaves the sphere, its ends among them.
-        rounds: of more samples by importance.
-        round_samples: in each of them.
-        round_sharpness: of the sigmoid in the first round, for a length of one scene unit; it doubles with each.
-        sharpness: s, of the sigmoid; the blur of the surface is some times its inverse.
+        samples: equally spaced from the ray's entry into the sphere to its exit, both included.
+        rounds: of further samples by importance.
+        round_samples: in each round.
+        round_sharpness: of the sigmoid in the first round, per scene unit; it doubles with each round.
+        sharpness: s, of the sigmoid; the blur of the surface is a few times its inverse.
         first_sharpness: at the first iteration of an optimisation.
         sharpening, mask_weight, sphere_radius: see `integrate.VolumeRenderer`.
     """
@@ -62,28 +62,28 @@ class NeuS(VolumeRenderer):
         return replace(self, sharpness=1 / blur, sharpening=0)
 
     def at_iteration(self, iteration: int) -> "NeuS":
-        """The renderer of an iteration, on the way from `first_sharpness` to `sharpness`."""
-        return replace(self, sharpness=scheduled(self.first_sharpness, self.sharpness, self.sharpening, iteration))
+        """The renderer at an iteration, with a sharpness between `first_sharpness` and `sharpness`."""
+        return replace(self, sharpness=schedule(self.first_sharpness, self.sharpness, self.sharpening, iteration))
 
     def render(self, field: Field, rays: Rays) -> Rendering:
-        """Samples where the sigmoid falls, then sums with a graph."""
+        """Samples where the sigmoid decreases, then sums with a graph."""
         check_kind(self, field)
-        return render_volume(field, rays, self._search, self._passing, radius=self.sphere_radius)
+        return render_volume(field, rays, self._search, self._log_transmittance, radius=self.sphere_radius)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
-        """Equally spaced samples, then rounds of more, where the last found most weight."""
-        found = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
-        for number in range(self.rounds):
-            importance = weights(_falling(found.value, self.round_sharpness * 2**number))
-            more = by_importance(found.distance, importance, self.round_samples)
-            found = found.joined(Samples.of(field, rays, more))
-        return found
+        """Equally spaced samples, then rounds of further ones where the weight is largest."""
+        samples = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
+        for index in range(self.rounds):
+            importance = weights(_sigmoid_log_transmittance(samples.value, self.round_sharpness * 2**index))
+            distance = resample(samples.distance, importance, self.round_samples)
+            samples = samples.merge(Samples.of(field, rays, distance))
+        return samples
 
-    def _passing(self, value: Tensor, distance: Tensor) -> Tensor:
-        return _falling(value, self.sharpness)
+    def _log_transmittance(self, value: Tensor, distance: Tensor) -> Tensor:
+        return _sigmoid_log_transmittance(value, self.sharpness)
 
 
-def _falling(value: Float[Tensor, "n samples"], sharpness: float) -> Float[Tensor, "n intervals"]:
-    """The logarithm of the share of light that passes each interval: 1 less the opacity of Eq. 13, at most 1."""
-    logs = logsigmoid(sharpness * value)
-    return (logs[:, 1:] - logs[:, :-1]).clamp_max(0.0)
+def _sigmoid_log_transmittance(value: Float[Tensor, "n samples"], sharpness: float) -> Float[Tensor, "n intervals"]:
+    """The logarithm of the fraction of light that passes each interval: 1 minus the opacity of Eq. 13, at most 1."""
+    log_sigmoid = logsigmoid(sharpness * value)
+    return (log_sigmoid[:, 1:] - log_sigmoid[:, :-1]).clamp_max(0.0)

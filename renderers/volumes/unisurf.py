@@ -1,4 +1,4 @@
-"""UNISURF: occupancy as the opacity of samples that draw together about the surface (Oechsle et al., ICCV 2021)."""
+"""UNISURF: occupancy as the opacity of samples in an interval about the surface (Oechsle et al., ICCV 2021)."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, occupancy_logits
 from renderers.rendering import Rendering, check_kind
-from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, scheduled
+from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, schedule
 
 
 @dataclass(frozen=True)
@@ -19,23 +19,23 @@ class UNISURF(VolumeRenderer):
     """DVR's search for the surface, then occupancies as opacities within an interval about it.
 
     Source: UNISURF (Oechsle et al. 2021, arXiv 2104.10078), Eq. 5 (weights), Sec. 3.3 and Eq. 9 (the interval).
-    Differentiable in: field parameters and rays, by the samples' weights, also of rays that pass close by: what comes
-        into view or leaves it has a part, as wide as the occupancy's fall.
-    Needs: a distance or a bound inside the sphere, of which the occupancy is a sigmoid. The paper's occupancy network
-        learns how steep it is; a level set here has no length, and is refused.
-    Deviates from the paper: see Needs; samples are equally spaced, and are not drawn; the background is empty;
-        the smoothness of normals is a task's loss, and off. Free samples that have no room count as free space.
-        `distance` is the mean by weight: while the interval is wide it lies in front of the surface, as many samples of
-        some occupancy have stopped the light there.
+    Differentiable in: field parameters and rays, through the samples' weights. Rays that pass close to the surface have
+        a gradient too, so a visibility gradient exists, as wide as the occupancy's fall.
+    Needs: a distance or a bound inside the sphere; the occupancy is its sigmoid. The paper's occupancy network learns
+        its slope. A level set has no unit of length and is refused.
+    Deviates from the paper: see Needs; samples are equally spaced and not random; the background is empty; the
+        smoothness of normals is a loss of the task, and off. Without space in front of the interval, free samples get
+        the value of free space. `distance` is the weighted mean: while the interval is wide, it lies in front of the
+        surface, where samples of low occupancy absorb light.
 
     Args:
-        search_samples: equally spaced, among which the first change from free to occupied is searched.
-        search_steps: of the secant method, for each that is found.
-        samples: within the interval about a surface; on rays without one, equally spaced.
-        free_samples: from where a ray enters the sphere to the interval.
-        interval: half its length, in scene units.
+        search_samples: equally spaced samples, for the search of the first change from free to occupied.
+        search_steps: of the secant method, for each change.
+        samples: within the interval about the surface; equally spaced on rays without a surface.
+        free_samples: from the ray's entry into the sphere to the interval.
+        interval: half of its length, in scene units.
         first_interval: at the first iteration of an optimisation.
-        occupancy_width: scene units over which a distance turns from occupied to free.
+        occupancy_width: scene units over which the occupancy falls from occupied to free.
         first_occupancy_width: at the first iteration.
         sharpening, mask_weight, sphere_radius: see `integrate.VolumeRenderer`.
     """
@@ -69,37 +69,37 @@ class UNISURF(VolumeRenderer):
         return replace(self, occupancy_width=blur, interval=interval, sharpening=0)
 
     def at_iteration(self, iteration: int) -> "UNISURF":
-        """The renderer of an iteration, on the way from the first interval and width to the last."""
+        """The renderer at an iteration, with an interval and a width between the first and the last ones."""
         names = ("interval", "occupancy_width")
-        now = {
-            name: scheduled(getattr(self, f"first_{name}"), getattr(self, name), self.sharpening, iteration)
+        settings = {
+            name: schedule(getattr(self, f"first_{name}"), getattr(self, name), self.sharpening, iteration)
             for name in names
         }
-        return replace(self, **now)
+        return replace(self, **settings)
 
     def render(self, field: Field, rays: Rays) -> Rendering:
-        """Searches the surface, samples about it, then sums with a graph."""
+        """Searches the surface, samples around it, then sums with a graph."""
         check_kind(self, field)
 
-        def passing(value: Tensor, distance: Tensor) -> Tensor:
+        def log_transmittance(value: Tensor, distance: Tensor) -> Tensor:
             return logsigmoid(-occupancy_logits(field, value, width=self.occupancy_width))
 
-        return render_volume(field, rays, self._search, passing, radius=self.sphere_radius)
+        return render_volume(field, rays, self._search, log_transmittance, radius=self.sphere_radius)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
-        """Equally spaced samples in front of the surface and in the interval; on the whole ray where there is none."""
+        """Equally spaced samples in front of and in the interval; on the whole ray if it has no surface."""
         coarse = Samples.of(field, rays, equally_spaced(entry, leave, self.search_samples))
-        found, bracket = first_crossing(coarse.distance, coarse.value)
-        hit = found.nonzero().squeeze(-1)
+        has_surface, bracket = first_crossing(coarse.distance, coarse.value)
+        hit = has_surface.nonzero().squeeze(-1)
         root, _ = refine(field, rays[hit], bracket.select(hit), method="secant", steps=self.search_steps)
         near = torch.maximum(root - self.interval, entry[hit])
         far = torch.minimum(root + self.interval, leave[hit])
         distance = equally_spaced(entry, leave, self.free_samples + self.samples)
-        about = [
+        near_surface = [
             equally_spaced(entry[hit], near, self.free_samples + 1)[:, :-1],
             equally_spaced(near, far, self.samples),
         ]
-        samples = Samples.of(field, rays, distance.index_put((hit,), torch.cat(about, dim=1)))
-        crowded = torch.zeros_like(found).index_put((hit,), near <= entry[hit])  # all free samples are at one place
-        samples.value[:, : self.free_samples].masked_fill_(crowded[:, None], self.sphere_radius)
+        samples = Samples.of(field, rays, distance.index_put((hit,), torch.cat(near_surface, dim=1)))
+        no_free_space = torch.zeros_like(has_surface).index_put((hit,), near <= entry[hit])  # free samples coincide
+        samples.value[:, : self.free_samples].masked_fill_(no_free_space[:, None], self.sphere_radius)
         return samples

@@ -14,30 +14,30 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind
 from renderers.rendering import Capabilities, Rendering, check_kind
-from renderers.volumes.integrate import Samples, VolumeRenderer, by_importance, render_volume, scheduled, weights
+from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, resample, schedule, weights
 
-HALVINGS = 10  # of the interval in which the least width is searched, as in the paper
-MOST_LOG = 14.0  # of the error's exponential: larger ones are all the same
+BISECTION_STEPS = 10  # for the least width, as in the paper
+MAX_EXPONENT = 14.0  # clamps the error bound: larger bounds need not be distinguished
 
 
 @dataclass(frozen=True)
 class VolSDF(VolumeRenderer):
-    """Density from the Laplace distribution's cumulative function of the distance.
+    """Density from the cumulative distribution function of a Laplace distribution, of the distance.
 
     Source: VolSDF (Yariv et al. 2021, arXiv 2106.12052), Eqs. 2, 3 (density), Theorem 1 and Eq. 14 (bound on the error
         of the opacity), Algorithm 1 (samples).
-    Differentiable in: field parameters and rays, by the samples' weights, also of rays that pass close by: what comes
-        into view or leaves it has a part, as wide as the density's fall.
-    Needs: a distance inside the sphere; Theorem 1 holds for no other.
-    Deviates from the paper: the width follows a schedule, and is not learnt; samples lie at the middles of equal
-        shares, and are not drawn; rays whose bound holds are not sampled again; the background is empty.
+    Differentiable in: field parameters and rays, through the samples' weights. Rays that pass close to the surface have
+        a gradient too, so a visibility gradient exists, as wide as the density's fall.
+    Needs: a distance inside the sphere; Theorem 1 holds for distances only.
+    Deviates from the paper: the width follows a schedule and is not learnt; samples lie at midpoints of equal
+        fractions and are not random; rays whose bound holds are not sampled again; the background is empty.
 
     Args:
-        samples: equally spaced at first, and as many more with each round, where the bound is greatest.
-        rounds: at most, beside the first.
-        error: epsilon, most that the opacity may be off at the samples.
-        fine_samples: by the weights of the opacity that was found.
-        extra_samples: beside these, of the samples that bound the error, every so many, as in the official code.
+        samples: equally spaced in the first round; as many in each further round, where the bound is largest.
+        rounds: maximum number after the first.
+        error: epsilon, the maximum error of the opacity at the samples.
+        fine_samples: by the weights of the opacity.
+        extra_samples: in addition, evenly selected from the samples that bound the error, as in the official code.
         width: beta, in scene units; the density deep inside is its inverse.
         first_width: at the first iteration of an optimisation.
         sharpening, mask_weight, sphere_radius: see `integrate.VolumeRenderer`.
@@ -72,69 +72,69 @@ class VolSDF(VolumeRenderer):
         return replace(self, width=blur, sharpening=0)
 
     def at_iteration(self, iteration: int) -> "VolSDF":
-        """The renderer of an iteration, on the way from `first_width` to `width`."""
-        return replace(self, width=scheduled(self.first_width, self.width, self.sharpening, iteration))
+        """The renderer at an iteration, with a width between `first_width` and `width`."""
+        return replace(self, width=schedule(self.first_width, self.width, self.sharpening, iteration))
 
     def render(self, field: Field, rays: Rays) -> Rendering:
-        """Samples until the opacity's error is bounded, then sums with a graph."""
+        """Adds samples until the opacity's error is bounded, then sums with a graph."""
         check_kind(self, field)
-        return render_volume(field, rays, self._search, self._passing, radius=self.sphere_radius)
+        return render_volume(field, rays, self._search, self._log_transmittance, radius=self.sphere_radius)
 
-    def bounded(
+    def bounded_samples(
         self, field: Field, rays: Rays, entry: Tensor, leave: Tensor
     ) -> Iterator[tuple[Int[Tensor, " k"], Samples, Float[Tensor, "k 1"]]]:
-        """Algorithm 1 up to its last step, in groups of rays that need equally many rounds.
+        """Algorithm 1 except its last step, in groups of rays that need the same number of rounds.
 
-        Gives the places of these rays, their samples, and the width of each ray for which they bound the error.
+        Yields the indices of these rays, their samples, and per ray the width for which the error is bounded.
         """
         index = torch.arange(len(entry), device=entry.device)
-        found = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
-        square = _spacing(found.distance).square().sum(dim=1, keepdim=True)
+        samples = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
+        square = _spacing(samples.distance).square().sum(dim=1, keepdim=True)
         width = (square / (4 * log(1 + self.error))).sqrt().clamp_min(self.width)  # Lemma 2, of any spacing
-        for number in range(self.rounds + 1):
-            bound = Bound.of(found)
+        for round_index in range(self.rounds + 1):
+            bound = OpacityErrorBound.of(samples)
             width = self._least_width(bound, width)
-            ends = (width <= self.width).squeeze(1) | (number == self.rounds)
-            ended, on = _parted(ends)
-            yield index[ended], found.of_rays(ended), width[ended]
-            if not len(on):
+            is_last = (width <= self.width).squeeze(1) | (round_index == self.rounds)
+            ended, active = _split_indices(is_last)
+            yield index[ended], samples.select(ended), width[ended]
+            if not len(active):
                 return
-            index, found, width, bound = index[on], found.of_rays(on), width[on], bound.of_rays(on)
-            more = by_importance(found.distance, bound.errors(width), self.samples)
-            found = found.joined(Samples.of(field, rays[index], more))
+            index, samples, width, bound = index[active], samples.select(active), width[active], bound.select(active)
+            distance = resample(samples.distance, bound.errors(width), self.samples)
+            samples = samples.merge(Samples.of(field, rays[index], distance))
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
-        """Algorithm 1: samples by the weights at the least width whose error is bounded, and some of those before."""
+        """Algorithm 1: samples by the weights at the least width with a bounded error, and some of the earlier ones."""
         distance = entry.new_empty(len(entry), self.fine_samples + self.extra_samples)
-        for index, found, width in self.bounded(field, rays, entry, leave):
-            importance = weights(_passing(found.value, found.distance, width))[:, :-1]
-            fine = by_importance(found.distance, importance, self.fine_samples)
-            every = torch.linspace(0, found.distance.shape[1] - 1, self.extra_samples, device=entry.device).long()
-            distance[index] = torch.cat([fine, found.distance[:, every]], dim=1).sort(dim=1)[0]
+        for index, samples, width in self.bounded_samples(field, rays, entry, leave):
+            importance = weights(_log_transmittance(samples.value, samples.distance, width))[:, :-1]
+            fine = resample(samples.distance, importance, self.fine_samples)
+            columns = torch.linspace(0, samples.distance.shape[1] - 1, self.extra_samples, device=entry.device).long()
+            distance[index] = torch.cat([fine, samples.distance[:, columns]], dim=1).sort(dim=1)[0]
         return Samples.of(field, rays, distance)
 
-    def _passing(self, value: Tensor, distance: Tensor) -> Tensor:
-        return _passing(value, distance, torch.full_like(value[:, :1], self.width))
+    def _log_transmittance(self, value: Tensor, distance: Tensor) -> Tensor:
+        return _log_transmittance(value, distance, torch.full_like(value[:, :1], self.width))
 
-    def _least_width(self, bound: "Bound", width: Float[Tensor, "n 1"]) -> Float[Tensor, "n 1"]:
-        """The least width from `self.width` to `width` whose error is bounded, by halving; `width` where none is."""
+    def _least_width(self, bound: "OpacityErrorBound", width: Float[Tensor, "n 1"]) -> Float[Tensor, "n 1"]:
+        """The least width from `self.width` to `width` with a bounded error, by bisection; else `width`."""
         least = torch.full_like(width, self.width)
-        rest = (bound.greatest(least) > self.error).nonzero().squeeze(-1)
-        bound, low, high = bound.of_rays(rest), least[rest], width[rest]
-        for _ in range(HALVINGS if len(rest) else 0):
+        unbounded = (bound.max_error(least) > self.error).nonzero().squeeze(-1)
+        bound, low, high = bound.select(unbounded), least[unbounded], width[unbounded]
+        for _ in range(BISECTION_STEPS if len(unbounded) else 0):
             middle = (low + high) / 2
-            holds = bound.greatest(middle)[:, None] <= self.error
+            holds = bound.max_error(middle)[:, None] <= self.error
             low, high = torch.where(holds, low, middle), torch.where(holds, middle, high)
-        return least.index_put((rest,), high)
+        return least.index_put((unbounded,), high)
 
 
 @dataclass(frozen=True)
-class Bound:
+class OpacityErrorBound:
     """The bound on the error of the opacity along n rays, for any width (Theorem 1, Eq. 14).
 
-    Of each interval `magnitude` is that of the value with which it begins, `inside` its length where that value is not
-    positive, else 0, `tail` half the length with the value's sign, `square` a quarter of the length's square, and
-    `clearance` how far it is from the surface at least.
+    For each interval, `magnitude` is that of the value at its start. `inside` is its length if that value is not
+    positive, else 0. `tail` is half of its length with the value's sign. `square` is a quarter of its squared length.
+    `clearance` is a lower bound of its distance to the surface.
     """
 
     magnitude: Float[Tensor, "n intervals"]
@@ -144,39 +144,39 @@ class Bound:
     clearance: Float[Tensor, "n intervals"]
 
     @staticmethod
-    def of(found: Samples) -> "Bound":
+    def of(samples: Samples) -> "OpacityErrorBound":
         """The bound of the rays' samples."""
-        value, spacing = found.value[:, :-1], _spacing(found.distance)
+        value, spacing = samples.value[:, :-1], _spacing(samples.distance)
         free = value > 0
         inside = torch.where(free, 0.0, spacing)
-        return Bound(value.abs(), inside, spacing / 2 - inside, spacing.square() / 4, _clearance(found))
+        return OpacityErrorBound(value.abs(), inside, spacing / 2 - inside, spacing.square() / 4, _clearance(samples))
 
-    def of_rays(self, index: Tensor) -> "Bound":
-        """That of some of the rays, by their places."""
-        return Bound(*(part[index] for part in vars(self).values()))
+    def select(self, index: Tensor) -> "OpacityErrorBound":
+        """The bound of the rays at `index`."""
+        return OpacityErrorBound(*(tensor[index] for tensor in vars(self).values()))
 
     def errors(self, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n intervals"]:
-        """Of the opacity at each interval (Theorem 1)."""
+        """Bounds on the error of the opacity at each interval (Theorem 1)."""
         rate = -1 / width
-        stopped = torch.addcmul(self.inside, self.tail, (self.magnitude * rate).exp_())  # `density` by length and width
-        before = (stopped.cumsum(dim=1) - stopped).mul_(rate)
+        absorbed = torch.addcmul(self.inside, self.tail, (self.magnitude * rate).exp_())  # `density` * length * width
+        before = (absorbed.cumsum(dim=1) - absorbed).mul_(rate)
         error = (self.clearance * rate).exp_().mul_(self.square).cumsum(dim=1).mul_(rate.square())
-        return before.exp_().mul_(error.clamp_max_(MOST_LOG).expm1_())
+        return before.exp_().mul_(error.clamp_max_(MAX_EXPONENT).expm1_())
 
-    def greatest(self, width: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-        """The greatest of each ray (Eq. 14)."""
+    def max_error(self, width: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
+        """The largest bound of each ray (Eq. 14)."""
         return self.errors(width).amax(dim=1)
 
 
 def density(value: Float[Tensor, "n samples"], width: Float[Tensor, "n 1"]) -> Float[Tensor, "n samples"]:
-    """Eqs. 2, 3: the share of a Laplace distribution that lies below minus the value, over its width."""
+    """Eqs. 2, 3: the probability below minus the value, of a Laplace distribution, divided by its width."""
     tail = torch.exp(-value.abs() / width) / 2
     return torch.where(value > 0, tail, 1 - tail) / width
 
 
-def _parted(which: Bool[Tensor, " n"]) -> tuple[Int[Tensor, " k"], Int[Tensor, " rest"]]:
-    """The places where it is true, and the others, in one wait for the device."""
-    order, count = (~which).to(torch.uint8).argsort(stable=True), int(which.sum())
+def _split_indices(mask: Bool[Tensor, " n"]) -> tuple[Int[Tensor, " k"], Int[Tensor, " rest"]]:
+    """The indices of True and of False, with only one synchronisation of the device."""
+    order, count = (~mask).to(torch.uint8).argsort(stable=True), int(mask.sum())
     return order[:count], order[count:]
 
 
@@ -184,19 +184,19 @@ def _spacing(distance: Float[Tensor, "n samples"]) -> Float[Tensor, "n intervals
     return distance[:, 1:] - distance[:, :-1]
 
 
-def _passing(value: Tensor, distance: Tensor, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n samples"]:
-    """The logarithm of the share of light that passes each sample: by its density up to the next; all, the last one."""
+def _log_transmittance(value: Tensor, distance: Tensor, width: Float[Tensor, "n 1"]) -> Float[Tensor, "n samples"]:
+    """The logarithm of the fraction of light that passes from each sample to the next; everything passes the last."""
     return torch.nn.functional.pad(-density(value[:, :-1], width) * _spacing(distance), (0, 1))
 
 
-def _clearance(found: Samples) -> Float[Tensor, "n intervals"]:
-    """d*: how far each interval is from the surface at least, by the empty spheres about its ends (Eq. 12)."""
-    side = _spacing(found.distance)
-    first, second = found.value[:, :-1].abs(), found.value[:, 1:].abs()
+def _clearance(samples: Samples) -> Float[Tensor, "n intervals"]:
+    """d*: a lower bound of each interval's distance to the surface, by the empty spheres about its ends (Eq. 12)."""
+    side = _spacing(samples.distance)
+    first, second = samples.value[:, :-1].abs(), samples.value[:, 1:].abs()
     half = (side + first + second) / 2
     area = (half * (half - side) * (half - first) * (half - second)).clamp_min(0).sqrt()
     least = 2 * area / side.clamp_min(torch.finfo(side.dtype).tiny)
     least = torch.where(first.square() >= side.square() + second.square(), second, least)
     least = torch.where(second.square() >= side.square() + first.square(), first, least)
-    crosses = (found.value[:, :-1] > 0) != (found.value[:, 1:] > 0)
+    crosses = (samples.value[:, :-1] > 0) != (samples.value[:, 1:] > 0)
     return torch.where(crosses | (first + second <= side), 0.0, least)

@@ -310,7 +310,7 @@ def test_a_row_that_conf_does_not_know_has_a_colour_of_no_renderer():
     known = {(look(name).colour, cls) for name, cls in classes.items()}
     colours = {colour for colour, _ in known}
     assert len(known) == len(colours) > 20  # a colour is of one class
-    assert not colours & {*style._COLOURS}
+    assert not colours & {*style.FALLBACK_COLOURS}
 
 
 def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers():

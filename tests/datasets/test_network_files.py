@@ -19,7 +19,7 @@ from datasets.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
 from renderers.field import LIPSCHITZ_SAFETY_FACTOR, Field, Kind, autograd_gradients, points_in_sphere
-from renderers.fields.network import from_module, measured
+from renderers.fields.network import from_module, measure_field
 from tests.composing import composed
 from tests.documentation import code_of
 from tests.looped import each
@@ -61,8 +61,8 @@ def test_a_distance_is_found_to_be_one_and_its_values_stay(tmp_path):
     assert (field.kind, field.lipschitz) == (Kind.DISTANCE, None)
     near(field(POINTS), octahedron(POINTS))
     facts = known.facts
-    assert facts.leaves == 0 and 0.99 < facts.flattest <= facts.steepest < 1.01
-    assert facts.inside == pytest.approx(2 * 3**0.5 * RADIUS**3 * 2 / (4 / 3 * np.pi), abs=0.02)
+    assert facts.sphere_fraction_inside == 0 and 0.99 < facts.min_slope <= facts.max_slope < 1.01
+    assert facts.fraction_inside == pytest.approx(2 * 3**0.5 * RADIUS**3 * 2 / (4 / 3 * np.pi), abs=0.02)
     assert list(facts.extent) == pytest.approx([2 * 3**0.5 * RADIUS] * 3, abs=0.3)
     (note,) = known.notes
     for word in ("shape: values are negative inside", "level 0", "slopes from 1 to 1", "taken as a distance"):
@@ -120,7 +120,7 @@ def test_the_surface_is_the_true_mesh_closed_where_it_leaves_the_sphere(tmp_path
     large = replace(file, scale=1.4)
     mesh, known = large.mesh(Split.TRAIN, 0), large.network(0)
     assert mesh.watertight and np.linalg.norm(mesh.vertices, axis=1).max() < 1.01
-    assert 0 < known.facts.leaves < 0.5 and "of the unit sphere's surface is inside" in known.notes[0]
+    assert 0 < known.facts.sphere_fraction_inside < 0.5 and "of the unit sphere's surface is inside" in known.notes[0]
 
 
 @each("codes, dtype, most", [
@@ -139,24 +139,24 @@ def test_a_deepsdf_folder_has_a_shape_for_each_code(tmp_path_factory, codes, dty
 def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
     codes = torch.tensor([[0.1], [-0.2], [-0.45]])  # the last reaches through most of the unit sphere
     near(field_of(deepsdf_folder(tmp_path, codes), 2)(POINTS), octahedron(POINTS) - 0.45)
-    bound = measured(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
-    assert bound.divisor == pytest.approx(3 * measured(octahedron, POINTS, kind=Kind.BOUND).divisor)
+    bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
+    assert bound.divisor == pytest.approx(3 * measure_field(octahedron, POINTS, kind=Kind.BOUND).divisor)
 
 
 def test_a_bound_that_is_scaled_has_no_slope_above_1_at_the_steepest_code():
     steep = lambda points: 3 * octahedron(points)  # noqa: E731
-    bound = measured(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
+    bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
     slopes = autograd_gradients(lambda points: bound.factor * steep(points), POINTS).norm(dim=-1)
     assert bound.lipschitz == 1.0 and slopes.max() == pytest.approx(1 / LIPSCHITZ_SAFETY_FACTOR, rel=1e-3)
 
 
 def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):
     file = npz(tmp_path, arrays())
-    before = file.network(0).facts.steepest, file.identity()
+    before = file.network(0).facts.max_slope, file.identity()
     with pytest.raises(BadInput, match=r"it has one code: set index=0$"):
         file.network(3)
     npz(tmp_path, arrays(3.0))
-    assert file.network(0).facts.steepest == pytest.approx(3 * before[0])
+    assert file.network(0).facts.max_slope == pytest.approx(3 * before[0])
     assert file.identity() != before[1]
 
 

@@ -8,7 +8,17 @@ import torch
 from scipy.io import loadmat, savemat
 from scipy.spatial.distance import cdist
 
-from bench.evaluate.dtu import DILATION, NAMES, WORST, DtuScan, culled, dtu_metrics, published, read_scan, thinned
+from bench.evaluate.dtu import (
+    MASK_DILATION_FRACTION,
+    METRIC_NAMES,
+    WORST,
+    DtuScan,
+    culled,
+    dtu_metrics,
+    published_results,
+    read_scan,
+    thinned,
+)
 from datasets.mesh import Mesh
 from datasets.shot import Shot
 from renderers.camera import Camera
@@ -71,7 +81,7 @@ def test_a_scan_with_all_of_it_equals_a_brute_force(tmp_path):
     cloud = np.concatenate([on_ball(400, 9.0), np.array([[0.0, 0, -15], [0, 0, 60]]) + CENTRE])
     write_dtu(tmp_path, cloud, reach=7.0, plane=(0.0, 0.1, 1.0, -590.0))
     found = dtu_metrics(mesh, read_scan(tmp_path, NUMBER), seed=3)
-    assert [*found.values()] == pytest.approx(brute_force(mesh, tmp_path, 3), abs=1e-9) and tuple(found) == NAMES
+    assert [*found.values()] == pytest.approx(brute_force(mesh, tmp_path, 3), abs=1e-9) and tuple(found) == METRIC_NAMES
 
 
 def test_thinning_keeps_the_first_of_points_that_are_near():
@@ -117,7 +127,7 @@ def test_culling_takes_the_faces_that_a_mask_excludes_but_for_its_dilation():
     kept = culled(mesh, [Shot("half", camera, colours, half), Shot("all", camera, colours, torch.ones_like(half))])
     assert kept is not None
     pixels = camera.project(torch.from_numpy(kept.vertices).float())[0][:, 0].numpy()
-    assert pixels[pixels <= 64].max() == pytest.approx(32 + 64 * DILATION, abs=1) and pixels.min() < 1
+    assert pixels[pixels <= 64].max() == pytest.approx(32 + 64 * MASK_DILATION_FRACTION, abs=1) and pixels.min() < 1
     shown = camera.shows(torch.from_numpy(mesh.vertices).float()).numpy().reshape(-1, 3)
     assert not shown[-1].any() and (kept.vertices @ right).max() == pytest.approx(1.21)  # beyond the image: kept
     assert culled(mesh, [Shot("none", camera, colours, torch.zeros_like(half))]) is not None
@@ -155,4 +165,4 @@ def test_files_may_lie_as_the_archives_have_them_and_broken_ones_are_named(folde
 
 
 def test_published_numbers_are_of_the_scans_that_dvr_has():
-    assert published(24) == [] and "DVR (RGB): 0.907" in published(65)[0]
+    assert published_results(24) == [] and "DVR (RGB): 0.907" in published_results(65)[0]

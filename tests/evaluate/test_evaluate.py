@@ -14,11 +14,19 @@ from bench.evaluate.evaluate import (
     chamfer_only,
     depth_gap_note,
     evaluate,
+    missed_parts_note,
     render_image,
     render_view,
-    unrendered,
 )
-from bench.evaluate.state import GREY, REACH, State, coloured_image, colours_at, newton_step, painted
+from bench.evaluate.state import (
+    DEFAULT_VERTEX_COLOUR,
+    REACH,
+    State,
+    coloured_image,
+    colours_at,
+    newton_step,
+    render_vertex_colours,
+)
 from bench.setup.inputs import RunInputs
 from bench.solve.solve import note_result
 from datasets.scene import Truth, sample_surface
@@ -88,7 +96,7 @@ class Painted(Shape):
 
 
 def test_colours_are_those_seen_along_each_ray_or_from_straight_above(monkeypatch):
-    monkeypatch.setattr(state_module, "CHUNK", 4)
+    monkeypatch.setattr(state_module, "POINTS_PER_BATCH", 4)
     points = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     field, device = Painted(sphere(1.0).function), torch.device("cpu")
     for directions in (points.roll(1, dims=0), None):
@@ -106,10 +114,10 @@ def test_a_volume_shows_the_colours_of_its_surface_where_they_are(inputs):
 
 def test_a_painted_mesh_has_the_colours_of_its_vertices_and_is_grey_without(inputs):
     mesh, view = inputs.scene.mesh, inputs.scene.view
-    image = painted(replace(mesh, colours=mesh.vertices / 2 + 0.5), Truth(mesh), view.camera)
+    image = render_vertex_colours(replace(mesh, colours=mesh.vertices / 2 + 0.5), Truth(mesh), view.camera)
     mask, points = view.mask.numpy(), view.camera.rays().at(view.camera.distance(view.depth)).numpy()
     assert image[mask] == pytest.approx(points[mask] / 2 + 0.5, abs=1e-5) and not image[~mask].any()
-    assert (painted(mesh, Truth(mesh), view.camera)[mask] == GREY).all()
+    assert (render_vertex_colours(mesh, Truth(mesh), view.camera)[mask] == DEFAULT_VERTEX_COLOUR).all()
 
 
 def test_the_colour_error_is_the_mean_absolute_difference_over_the_true_surface(inputs):
@@ -158,7 +166,7 @@ def test_a_state_is_extracted_once_and_its_pictures_ask_for_a_value_per_hit(inpu
     state = State(meter, inputs)
     evaluate(state)
     asked = meter.counts.value
-    view = state.pictured(inputs.scene.view.camera)
+    view = state.refined_view(inputs.scene.view.camera)
     assert meter.counts.value - asked == view.mask.sum() == inputs.scene.view.mask.sum()
 
 
@@ -174,7 +182,7 @@ def test_the_truth_is_sampled_once_in_a_run(inputs, monkeypatch):
 def test_pictures_are_of_the_fields_own_surface_also_where_it_is_no_distance(inputs, scale):
     squares = Shape(lambda p: scale * (p.square().sum(-1) - RADIUS**2), Kind.LEVEL)
     camera = inputs.scene.view.camera
-    view, on_mesh = State(squares, inputs).pictured(camera), State(squares, inputs).seen(camera)
+    view, on_mesh = State(squares, inputs).refined_view(camera), State(squares, inputs).view_from(camera)
     points = camera.rays().at(camera.distance(view.depth))[view.mask]
     off = [
         (camera.rays().at(camera.distance(one.depth))[one.mask].norm(dim=-1) - RADIUS).abs() for one in (view, on_mesh)
@@ -200,16 +208,16 @@ def dipped(place: tuple[float, float, float], width: float) -> Shape:
 def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inputs):
     fine = replace(inputs, renderer=load("renderer", "newton"), evaluation=replace(inputs.evaluation, grid=96))
     camera = camera_of(128)
-    scene = replace(inputs.scene, view=State(sphere(RADIUS), fine).seen(camera))
+    scene = replace(inputs.scene, view=State(sphere(RADIUS), fine).view_from(camera))
     fine = replace(fine, make_scene=lambda: scene)
     state = State(dipped((0.8, 0.3, 0.1), 0.03), fine)
     found = evaluate(state)
     assert state.mesh.parts.max() == 1
-    floating = state.pictured(camera).mask & ~scene.view.mask
+    floating = state.refined_view(camera).mask & ~scene.view.mask
     assert floating.sum() > 8
     assert not (render_view(state.field, camera, fine).mask & floating).any()
     (note,) = found.notes
-    rays = int((state.seen(camera).mask & ~scene.view.mask).sum())
+    rays = int((state.view_from(camera).mask & ~scene.view.mask).sum())
     assert "misses 1 part of the mesh, at most 0.1" in note and f"{rays} of its rays" in note
     assert evaluate(State(sphere(RADIUS) | sphere(0.1, (0.8, 0.3, 0.1)), fine)).notes == ()
 
@@ -237,12 +245,12 @@ def test_a_part_that_lies_just_before_another_is_missed_where_the_renderer_sees_
     camera = inputs.scene.view.camera
     towards = torch.nn.functional.normalize(camera.center, dim=0)
     state = State(sphere(RADIUS) | sphere(0.1, tuple((0.85 * towards).tolist())), inputs)
-    assert unrendered(state, [state.seen(camera)]) == ()
-    (note,) = unrendered(state, [State(sphere(RADIUS), inputs).seen(camera)])  # 0.15 to 0.35 behind
+    assert missed_parts_note(state, [state.view_from(camera)]) == ()
+    (note,) = missed_parts_note(state, [State(sphere(RADIUS), inputs).view_from(camera)])  # 0.15 to 0.35 behind
     assert "misses 1 part of the mesh" in note
-    seen = state.seen(camera)
+    seen = state.view_from(camera)
     odd = seen.mask & (torch.arange(seen.mask.numel()).view_as(seen.mask) % 2 == 1)
-    assert unrendered(state, [replace(seen, mask=odd)]) == ()  # of each part some rays hit
+    assert missed_parts_note(state, [replace(seen, mask=odd)]) == ()  # of each part some rays hit
 
 
 @each("scale", [0.01, 1.0, 100.0])

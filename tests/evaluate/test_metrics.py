@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from bench.evaluate.evaluate import (
     DEFINITIONS,
-    IMAGE,
-    OWN_DEFINITIONS,
+    IMAGE_DEFINITIONS,
+    RENDERER_DEFINITIONS,
     WORST_SURFACE,
-    drawn,
+    subsample,
     surface_metrics,
     view_metrics,
 )
@@ -129,13 +129,13 @@ def test_image_edges():
 
 def test_drawn_points_are_different_ones():
     points = np.arange(300.0).reshape(100, 3)
-    some = drawn(points, 60, seed=0)
+    some = subsample(points, 60, seed=0)
     assert len(np.unique(some, axis=0)) == 60 and np.isin(some, points).all()
-    assert np.array_equal(drawn(points, 100, seed=0), points)
+    assert np.array_equal(subsample(points, 100, seed=0), points)
 
 
 def test_every_metric_has_one_sentence():
-    assert set(DEFINITIONS) == {*WORST_SURFACE, *IMAGE, *OWN_DEFINITIONS}
+    assert set(DEFINITIONS) == {*WORST_SURFACE, *IMAGE_DEFINITIONS, *RENDERER_DEFINITIONS}
     for sentence in DEFINITIONS.values():
         assert re.fullmatch(r"[A-Z][^\n]*\.", sentence)
         assert re.search(r"scene units|from 0 to 1", sentence)

@@ -75,8 +75,8 @@ def test_threads_that_ended_meanwhile_make_it_unknown(monkeypatch):
 
 def products() -> set[float]:
     """Of a denormal number and one, in each thread of an operation."""
-    count = environment.PER_THREAD * torch.get_num_threads()
-    bits = torch.full((count,), environment.DENORMAL, dtype=torch.int32)
+    count = environment.NUMBERS_PER_THREAD * torch.get_num_threads()
+    bits = torch.full((count,), environment.DENORMAL_BITS, dtype=torch.int32)
     return set((bits.view(torch.float32) * 1.0).view(torch.int32).tolist())
 
 

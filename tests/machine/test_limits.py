@@ -9,7 +9,7 @@ import torch
 
 from bench.machine import limits
 from bench.machine.environment import MemoryPeak
-from bench.machine.limits import LEAST, LimitReached, Limits
+from bench.machine.limits import MIN_VALUES_PER_CALL, LimitReached, Limits
 from bench.records.record import RunStatus
 from renderers.field import Flops, Kind
 from renderers.fields.analytic import Shape, sphere
@@ -44,10 +44,10 @@ def test_values_are_limited_from_when_the_watch_begins():
 
 
 def test_a_call_for_few_points_counts_as_one_for_more():
-    watched = Limits(values=10 * LEAST, memory=8).watch(FIELD, CPU)
+    watched = Limits(values=10 * MIN_VALUES_PER_CALL, memory=8).watch(FIELD, CPU)
     for _ in range(10):
         watched(torch.zeros(1, 3))
-    assert watched.spent == 10 * LEAST
+    assert watched.spent == 10 * MIN_VALUES_PER_CALL
     with pytest.raises(LimitReached, match=r"more than 320 field values"):
         watched(torch.zeros(1, 3))
 
@@ -71,7 +71,7 @@ def test_memory_is_limited(clock):
     with pytest.raises(LimitReached, match=r"more than 0\.125 GiB of memory") as caught:
         for _ in range(100):
             held.append(torch.ones(32 * MIB // 4))
-            clock.sleep(1.1 * limits.MEMORY_INTERVAL)
+            clock.sleep(1.1 * limits.MEMORY_CHECK_SECONDS)
             watched(POINTS)
     assert caught.value.status is RunStatus.OOM
     assert 3 <= len(held) <= 6  # of 32 MiB each
@@ -79,7 +79,7 @@ def test_memory_is_limited(clock):
 
 def test_where_memory_cannot_be_measured_work_is_still_limited(monkeypatch):
     monkeypatch.setattr(MemoryPeak, "growth", lambda self: None)
-    watched = Limits(values=LEAST, memory=1e-6).watch(FIELD, CPU)
+    watched = Limits(values=MIN_VALUES_PER_CALL, memory=1e-6).watch(FIELD, CPU)
     watched(POINTS)
     with pytest.raises(LimitReached) as caught:
         watched(POINTS)
@@ -94,7 +94,7 @@ def test_the_memory_is_not_checked_in_every_evaluation(clock, monkeypatch):
         for _ in range(100):
             watched(POINTS)
         assert len(looks) == number
-        clock.sleep(1.1 * limits.MEMORY_INTERVAL)
+        clock.sleep(1.1 * limits.MEMORY_CHECK_SECONDS)
 
 
 def test_invalid_limits_are_errors():

@@ -13,8 +13,8 @@ from PIL import Image
 from bench.config import load
 from bench.evaluate.evaluate import view_metrics
 from bench.evaluate.state import State
-from bench.pictures.filmstrip import MOST, SILHOUETTE, Filmstrip, Shown
-from bench.pictures.run_figures import Given, ViewPair, _show_depth, draw_curve, draw_run, enlarged, save_gallery
+from bench.pictures.filmstrip import MAX_STRIP_COLUMNS, SILHOUETTE_ROW, Filmstrip, Shown
+from bench.pictures.run_figures import InputView, ViewPair, _show_depth, draw_curve, draw_run, enlarged, save_gallery
 from bench.pictures.style import legend_below
 from bench.reconstruct.problem import ReconstructionProblem
 from bench.report.site.files import ALT
@@ -65,24 +65,24 @@ def test_an_animation_has_a_frame_per_checkpoint_and_a_longer_last_one(inputs, t
 
 def test_a_strip_alone_is_the_default(inputs, tmp_path):
     filmstrip = Filmstrip(inputs)
-    for iteration in range(3 * MOST):
+    for iteration in range(3 * MAX_STRIP_COLUMNS):
         filmstrip.add(iteration, State(sphere(0.5), inputs), CAMERA)
     filmstrip.save(tmp_path, "a ball")
     assert [path.name for path in tmp_path.glob("*.*")] == ["strip.png"]
     with Image.open(tmp_path / "strip.png") as strip:
-        assert strip.width < 1.35 * 110 * (MOST + 1)
+        assert strip.width < 1.35 * 110 * (MAX_STRIP_COLUMNS + 1)
 
 
 def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, drawn):
     filmstrip = Filmstrip(inputs, "by rung")
-    for name in range(3 * MOST):
+    for name in range(3 * MAX_STRIP_COLUMNS):
         filmstrip.add(f"rung_{name}", State(sphere(0.5), inputs), CAMERA)
     for own in (0, 1):
         filmstrip.save(tmp_path, "a ball", f"rung_{own}")
         labels = [tick.label2 for tick in drawn[-1].axes[0].xaxis.get_major_ticks()]  # those at the top
         names = [label.get_text() for label in labels]
-        assert len(names) == MOST + 1
-        assert (names[0], names[-2], names[-1]) == ("rung 0", f"rung {3 * MOST - 1}", "truth")
+        assert len(names) == MAX_STRIP_COLUMNS + 1
+        assert (names[0], names[-2], names[-1]) == ("rung 0", f"rung {3 * MAX_STRIP_COLUMNS - 1}", "truth")
         assert [label.get_text() for label in labels if label.get_fontweight() == "bold"] == [f"rung {own}"]
         assert sorted(names[:-1], key=lambda name: int(name.split()[1])) == names[:-1]
 
@@ -111,14 +111,14 @@ def photograph(height: int, width: int, *, masked: bool = True) -> Shown:
 @pytest.mark.parametrize(("size", "masked"), [((10, 20), True), ((24, 15), False)])
 def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path, drawn, size, masked):
     true = photograph(*size, masked=masked)
-    filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=32)), true=true)
+    filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=32)), truth=true)
     for iteration, radius in enumerate((0.3, 0.7)):
         filmstrip.add(iteration, State(cast(ball(radius, (0.0, 0.0, 0.0)), torch.float32), inputs), true.view.camera)
     filmstrip.save(tmp_path, "a ball")
     (figure,) = drawn
     axis = figure.axes[0]
     rows = [label.get_text() for label in axis.get_yticklabels()]
-    assert rows == ["colours", "normals", *([SILHOUETTE] if masked else [])]
+    assert rows == ["colours", "normals", *([SILHOUETTE_ROW] if masked else [])]
     assert ("red missed" in figure.get_suptitle()) == masked
     montage = np.asarray(axis.get_images()[0].get_array())
     height, width = montage.shape[0] / len(rows), montage.shape[1] / 3
@@ -146,16 +146,16 @@ def test_a_photograph_is_enlarged_with_its_parts_in_place():
     assert torch.equal(large.view.normals[2::3, ::3], true.view.normals)
     assert torch.equal(large.view.depth[2::3, ::3], true.view.depth)
     small = true.enlarged(true.view.camera.resized(5, 10))
-    assert small.colours is not None and small.colours.shape == (5, 10, 3) and small.masked
+    assert small.colours is not None and small.colours.shape == (5, 10, 3) and small.has_mask
 
 
 def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, drawn):
     for true in (None, photograph(16, 16)):
-        filmstrip = Filmstrip(inputs, true=true)
+        filmstrip = Filmstrip(inputs, truth=true)
         filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
         filmstrip.save(tmp_path, "a ball")
         labels = [label.get_text() for label in drawn[-1].axes[0].get_yticklabels()]
-        assert labels == ["normals", SILHOUETTE]
+        assert labels == ["normals", SILHOUETTE_ROW]
 
 
 def half_ball(radius: float) -> Mesh:
@@ -202,11 +202,11 @@ def test_a_picture_and_the_metric_compare_silhouettes_alike_where_the_mesh_is_wh
     part = replace(scene, mesh=half_ball(0.5), is_partial=True, measured=scene.view.depth.where(~unmeasured, 0.0))
     inputs = replace(inputs, make_scene=lambda: part)
     states = State(sphere(0.3), inputs), State(sphere(0.65), inputs)
-    draw_run(tmp_path, states, Given(scene.view, scene.view.mask.numpy()), [], "a depth image")
+    draw_run(tmp_path, states, InputView(scene.view, scene.view.mask.numpy()), [], "a depth image")
     summary = drawn[0].axes[:12]
     for state, axis in zip(states, summary[2:8:4], strict=True):
         missed, spurious = (float(text.get_text().split()[1]) / 100 for text in axis.texts)
-        overlap = view_metrics(state.seen(scene.view.camera), part.view)["mask_iou"]
+        overlap = view_metrics(state.view_from(scene.view.camera), part.view)["mask_iou"]
         assert (1 - missed) / (1 + spurious) == pytest.approx(overlap, abs=0.001)
     assert [axis.axison for axis in summary[8:]] == [True, False, True, False]  # no normals, and no view from behind
     (measured,) = summary[8].get_images()

@@ -9,8 +9,8 @@ import torch
 
 from bench.config import load
 from bench.evaluate.evaluate import render_image
-from bench.evaluate.state import State, unseen
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, image_scores, judge, surface_scores
+from bench.evaluate.state import State, empty_view
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN_PREFIX, image_scores, judge, surface_scores
 from bench.reconstruct.subject import Subject
 from bench.reconstruct.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness, roughness_scores
 from bench.records.record import RunStatus
@@ -94,7 +94,7 @@ def test_no_surface_is_empty_and_scores_worst(subject, inputs):
     assert set(metrics) == OF_HITS
     assert all(metrics[name] == inf for name in ROUGHNESS)
     assert metrics["chamfer_l1"] == metrics["seen_chamfer_l1"] == inf and metrics["fscore"] == 0.0
-    assert [metrics[prefix + name] for prefix in ("", OWN) for name in MASK_IOU] == [0.0] * 4
+    assert [metrics[prefix + name] for prefix in ("", OWN_PREFIX) for name in MASK_IOU] == [0.0] * 4
     assert 0 < metrics["psnr"] < 15 and metrics["psnr"] == pytest.approx(metrics["own_psnr"])
 
 
@@ -187,4 +187,4 @@ def test_a_wide_blur_has_weight_before_the_surface(subject: Subject, inputs, sha
 
 def test_a_renderer_of_hits_has_no_weight_before_the_surface(subject: Subject, inputs):
     assert early_weight(painted(), [see(Truth(subject.truth), subject.held_out[0].camera)], inputs) == {}
-    assert early_weight(painted(), [unseen(shot.camera) for shot in subject.held_out], inputs) == {}
+    assert early_weight(painted(), [empty_view(shot.camera) for shot in subject.held_out], inputs) == {}

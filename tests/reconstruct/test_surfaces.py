@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bench.evaluate.state import GREY
+from bench.evaluate.state import DEFAULT_VERTEX_COLOUR
 from bench.reconstruct import surfaces
 from bench.reconstruct.stereo import Cloud
 from bench.reconstruct.surfaces import fuse_clouds, given_clouds, poisson, with_colours
@@ -104,7 +104,7 @@ def test_vertices_have_the_colours_of_photographs_and_are_grey_where_none_sees_t
     assert seen.sum() > 1000 and unseen.sum() > 400
     assert expected[seen].std(axis=0)[1:].min() > 0.1  # so that a wrong place would be a wrong colour
     assert np.abs(found.colours - expected)[seen].max() < 0.02
-    assert (found.colours[unseen] == GREY).all()
+    assert (found.colours[unseen] == DEFAULT_VERTEX_COLOUR).all()
 
 
 def test_a_photograph_that_a_vertex_faces_counts_most():

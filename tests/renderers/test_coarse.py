@@ -187,7 +187,7 @@ def test_coarse_values_are_counted_apart_and_limited():
 @pytest.fixture
 def wide(monkeypatch) -> Decoder:
     """A network that offers coarse values on any machine, slowly where they do not pay."""
-    monkeypatch.setattr(mlp, "multiplies_faster", lambda device: True)
+    monkeypatch.setattr(mlp, "bfloat16_is_faster", lambda device: True)
     torch.manual_seed(0)
     return Decoder(layers=4, width=256, code_length=8, skip=2, narrow=True).requires_grad_(False)
 
@@ -197,7 +197,7 @@ def test_instructions_that_take_more_time_do_not_pay(monkeypatch):
     for seconds in (0.5, 2.0):
         taken = {torch.float32: 1.0, torch.bfloat16: seconds}
         monkeypatch.setattr(mlp, "_product_seconds", taken.get)
-        assert mlp.multiplies_faster.__wrapped__(torch.device("cpu")) is (seconds < 1)
+        assert mlp.bfloat16_is_faster.__wrapped__(torch.device("cpu")) is (seconds < 1)
 
 
 def points(count: int = 3000) -> Tensor:
@@ -217,14 +217,14 @@ def test_the_coarse_values_of_a_network_are_off_by_no_more_than_they_say(wide):
 
 def test_a_network_with_hardly_a_surface_states_the_error_of_all_its_coarse_values(wide):
     """Of no value that is near 0, or of few of them, nothing could be measured."""
-    drawn = points_in_sphere(mlp.DRAWN, torch.zeros(()))
-    for least in (mlp.NEAR + 0.01, mlp.NEAR - 0.01):
+    drawn = points_in_sphere(mlp.ERROR_SAMPLE_POINTS, torch.zeros(()))
+    for least in (mlp.NEAR_SURFACE_VALUE + 0.01, mlp.NEAR_SURFACE_VALUE - 0.01):
         wide.last.weight.mul_(10.0)
         wide.last.bias.sub_(wide.at(torch.zeros(8))(drawn).min() - least)
         field = wide.at(torch.zeros(8))
-        assert (field.coarse.values(drawn).abs() <= mlp.NEAR).sum() < mlp.FEWEST
+        assert (field.coarse.values(drawn).abs() <= mlp.NEAR_SURFACE_VALUE).sum() < mlp.MIN_NEAR_SURFACE_POINTS
         off = (field.coarse.values(drawn) - field(drawn)).abs().max()
-        assert field.coarse.error == pytest.approx(mlp.MARGIN * off.item())
+        assert field.coarse.error == pytest.approx(mlp.COARSE_ERROR_FACTOR * off.item())
 
 
 def test_their_error_is_measured_once_for_each_state_of_the_weights(wide, monkeypatch):
@@ -256,7 +256,7 @@ def test_what_does_not_pay_or_changes_offers_none(wide, monkeypatch):
     wide.last.weight.requires_grad_(True)
     assert wide.at(code).coarse is None
     wide.requires_grad_(False)
-    monkeypatch.setattr(mlp, "multiplies_faster", lambda device: False)
+    monkeypatch.setattr(mlp, "bfloat16_is_faster", lambda device: False)
     assert wide.at(code).coarse is None
 
 

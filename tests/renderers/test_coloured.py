@@ -7,13 +7,13 @@ from torch import Tensor
 from renderers.field import Field, Kind, Meter, autograd_gradients
 from renderers.fields import coloured
 from renderers.fields.coloured import (
-    COLOUR_SCALE,
+    COLOUR_LOGIT_SCALE,
     LOGIT_WIDTH,
     Coloured,
     ColouredDistance,
     ColouredGrid,
     ColouredOccupancy,
-    encoded,
+    positional_encoding,
 )
 from tests.looped import each
 
@@ -43,15 +43,16 @@ def test_it_begins_as_a_sphere(layers, width):
 
 def test_the_encoding_has_sine_and_cosine_of_each_octave():
     point = torch.tensor([0.1, -0.2, 0.3])
-    assert encoded(point, 0).tolist() == point.tolist()
+    assert positional_encoding(point, 0).tolist() == point.tolist()
     torch.testing.assert_close(
-        encoded(point, 2), torch.cat([point, point.sin(), point.cos(), (2 * point).sin(), (2 * point).cos()])
+        positional_encoding(point, 2),
+        torch.cat([point, point.sin(), point.cos(), (2 * point).sin(), (2 * point).cos()]),
     )
 
 
 def test_values_without_a_graph_are_the_same_in_chunks_and_of_any_leading_shape(monkeypatch):
     network, points = make(), draw(3, 20)
-    monkeypatch.setattr(coloured, "passes", lambda some, width: some.split(7))
+    monkeypatch.setattr(coloured, "split_into_passes", lambda some, width: some.split(7))
     with torch.no_grad():
         values = network.field(points)
     torch.testing.assert_close(values, network.field(points).detach(), **EXACT)
@@ -140,7 +141,7 @@ def test_a_grids_colours_are_interpolated_linearly_and_kept_outside():
     axis = torch.linspace(-1, 1, 9)
     x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
     with torch.no_grad():
-        grid.logits.copy_(torch.stack([x, 2 * y - 0.3, 0.5 * z + x * y]) / COLOUR_SCALE)
+        grid.logits.copy_(torch.stack([x, 2 * y - 0.3, 0.5 * z + x * y]) / COLOUR_LOGIT_SCALE)
     points = torch.rand(3, 7, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     colours = grid.field.colours(points, points, points)
     u, v, w = points.unbind(-1)

@@ -29,8 +29,8 @@ def make(name: str) -> Decoder:
 
 
 def in_sevens(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mlp, "FEWEST_AT_ONCE", 7)
-    monkeypatch.setattr(mlp, "CACHED", 0)
+    monkeypatch.setattr(mlp, "MIN_POINTS_PER_PASS", 7)
+    monkeypatch.setattr(mlp, "CACHE_BYTES_PER_THREAD", 0)
 
 
 def plain(decoder: Decoder, code: Tensor, points: Tensor) -> Tensor:
@@ -107,10 +107,10 @@ def test_a_pass_has_as_many_points_as_caches_hold_and_far_more_on_a_gpu():
     with using_threads(1):
         for width, dtype, most in [(128, torch.float32, 2048), (512, torch.float32, 512), (512, torch.bfloat16, 1024)]:
             assert (
-                mlp.points_at_once(width, dtype, torch.device("cpu")) == most == one_mebibyte / width / dtype.itemsize
+                mlp.points_per_pass(width, dtype, torch.device("cpu")) == most == one_mebibyte / width / dtype.itemsize
             )
-        assert mlp.points_at_once(2**16, torch.float64, torch.device("cpu")) == 256  # at least
-    assert mlp.points_at_once(128, torch.float32, gpu) == 2**18
+        assert mlp.points_per_pass(2**16, torch.float64, torch.device("cpu")) == 256  # at least
+    assert mlp.points_per_pass(128, torch.float32, gpu) == 2**18
 
 
 def test_a_pass_back_takes_the_memory_of_one_gradient_however_many_chunks_it_has(monkeypatch):

@@ -34,12 +34,12 @@ NETWORKS = {
 def by_default() -> library.Kernels:
     """What a process finds that asks for nothing."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.delenv(library.VARIABLE, raising=False)
+        patch.delenv(library.KERNELS_VARIABLE, raising=False)
         return kernels.__wrapped__()
 
 
 THERE = by_default()
-with_compiler = pytest.mark.skipif(THERE.library is None, reason=f"nothing is compiled here: {THERE.said}")
+with_compiler = pytest.mark.skipif(THERE.library is None, reason=f"nothing is compiled here: {THERE.description}")
 
 
 @pytest.fixture(autouse=True)
@@ -54,7 +54,7 @@ def make(name: str) -> Decoder:
 
 def fresh(monkeypatch: pytest.MonkeyPatch, cache: Path, **environment: str) -> library.Kernels:
     """What a new process would find."""
-    for name, value in {"XDG_CACHE_HOME": str(cache), library.VARIABLE: "", **environment}.items():
+    for name, value in {"XDG_CACHE_HOME": str(cache), library.KERNELS_VARIABLE: "", **environment}.items():
         monkeypatch.setenv(name, value)
     return kernels.__wrapped__()
 
@@ -66,7 +66,7 @@ def test_values_are_those_of_torch(name, count):
     field = make(name).at(torch.linspace(-1, 1, 4))
     points = 2 * torch.rand(count, 3) - 1
     with using_threads(1):
-        assert field._quickest(points) == field._compiled().values
+        assert field._fastest_forward(points) == field._compiled().values
         torch.testing.assert_close(field(points), field._forward(points), rtol=1e-6, atol=1e-6)
         if count > 5:
             points[2], points[4] = torch.nan, torch.inf
@@ -122,7 +122,7 @@ def rendered(name: str) -> tuple[Tensor, Tensor, Counts]:
 def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, monkeypatch):
     with using_threads(1):
         status, distance, counts = rendered(name)
-        monkeypatch.setattr(mlp, "compiled", lambda *_: None)
+        monkeypatch.setattr(mlp, "compile_decoder", lambda *_: None)
         status_of_torch, distance_of_torch, counts_of_torch = rendered(name)
         monkeypatch.undo()
     alike = status == status_of_torch
@@ -132,31 +132,31 @@ def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, monkeypatch):
 
 
 def test_torch_alone_is_left_to_torch_and_nothing_else_can_be_asked_for(monkeypatch, tmp_path):
-    assert fresh(monkeypatch, tmp_path, **{library.VARIABLE: "torch"}) == library.Kernels(None, "torch")
-    with pytest.raises(ValueError, match=f"{library.VARIABLE} must be torch or compiled, not 'cuda'"):
-        fresh(monkeypatch, tmp_path, **{library.VARIABLE: "cuda"})
+    assert fresh(monkeypatch, tmp_path, **{library.KERNELS_VARIABLE: "torch"}) == library.Kernels(None, "torch")
+    with pytest.raises(ValueError, match=f"{library.KERNELS_VARIABLE} must be torch or compiled, not 'cuda'"):
+        fresh(monkeypatch, tmp_path, **{library.KERNELS_VARIABLE: "cuda"})
     assert not list(tmp_path.iterdir())
 
 
 def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(monkeypatch, tmp_path):
-    monkeypatch.setattr(library, "NEEDED", set())
-    assert fresh(monkeypatch, tmp_path, PATH="").said == "torch: no compiler (g++ or clang++)"
+    monkeypatch.setattr(library, "REQUIRED_CPU_FLAGS", set())
+    assert fresh(monkeypatch, tmp_path, PATH="").description == "torch: no compiler (g++ or clang++)"
     broken = tmp_path / "bin" / "g++"
     broken.parent.mkdir()
     broken.write_text("#!/bin/sh\necho it is broken >&2\nexit 1\n")
     broken.chmod(0o755)
-    assert fresh(monkeypatch, tmp_path, PATH=str(broken.parent)).said == "torch: g++: it is broken"
+    assert fresh(monkeypatch, tmp_path, PATH=str(broken.parent)).description == "torch: g++: it is broken"
     file = tmp_path / "file"
     file.touch()
-    assert fresh(monkeypatch, file, PATH=str(broken.parent)).said.startswith("torch: [Errno")
-    monkeypatch.setattr(library, "NEEDED", {"a-flag-of-none"})
-    assert fresh(monkeypatch, tmp_path).said == "torch: the processor lacks a-flag-of-none"
+    assert fresh(monkeypatch, file, PATH=str(broken.parent)).description.startswith("torch: [Errno")
+    monkeypatch.setattr(library, "REQUIRED_CPU_FLAGS", {"a-flag-of-none"})
+    assert fresh(monkeypatch, tmp_path).description == "torch: the processor lacks a-flag-of-none"
 
 
 @with_compiler
 def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
-    asked = "from renderers.kernels.library import kernels; print(kernels().said)"
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.VARIABLE: ""}
+    asked = "from renderers.kernels.library import kernels; print(kernels().description)"
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.KERNELS_VARIABLE: ""}
     command = [sys.executable, "-c", asked]
     several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     assert [one.communicate()[0].strip() for one in several] == ["compiled"] * 3
@@ -164,4 +164,4 @@ def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_
     whole = built.read_bytes()
     built.unlink()
     built.write_bytes(whole[:100])
-    assert fresh(monkeypatch, tmp_path).said == "compiled" and built.stat().st_size > 1000
+    assert fresh(monkeypatch, tmp_path).description == "compiled" and built.stat().st_size > 1000

@@ -88,7 +88,7 @@ def deepsdf(specs: dict[str, Any], written: Any, prefix: str) -> tuple[State, di
 def test_a_deepsdf_decoder_has_the_values_of_its_own_code(specs, written, prefix, plain):
     torch.manual_seed(0)
     state, settings, values = deepsdf(specs, written, prefix)
-    network = published.deepsdf(state, settings)
+    network = published.load_deepsdf(state, settings)
     torch.testing.assert_close(network.at(CODE)(POINTS), values, rtol=0, atol=1e-6)
     assert isinstance(network.inner.at(CODE), BoundDecoder) or not plain
 
@@ -96,7 +96,7 @@ def test_a_deepsdf_decoder_has_the_values_of_its_own_code(specs, written, prefix
 def test_a_tanh_keeps_what_a_decoder_offers():
     torch.manual_seed(0)
     state, settings, _ = deepsdf(SPECS | {"use_tanh": True}, as_of_2019, "")
-    network = published.deepsdf(state, settings)
+    network = published.load_deepsdf(state, settings)
     network.factor.fill_(-2.0)
     network.level.fill_(0.1)
     field, half = network.at(CODE), 0.1 * POINTS.flip(0)
@@ -152,7 +152,7 @@ def test_a_network_of_idr_neus_or_volsdf_has_the_values_of_its_own_code(prefix, 
     torch.manual_seed(0)
     state, values = implicit(prefix, frequencies, written)
     others = {"rendering_network.lin0.weight": drawn(4, 9), "variance_network_fine.variance": torch.ones(())}
-    network = published.implicit(others | state)
+    network = published.load_sdf_network(others | state)
     torch.testing.assert_close(network.at(torch.zeros(3))(POINTS), values, rtol=0, atol=1e-6)
 
 
@@ -198,7 +198,7 @@ def occupancy(kind: str) -> tuple[State, Tensor]:
 def test_an_occupancy_network_has_the_logits_of_its_own_code(kind):
     torch.manual_seed(0)
     state, logits = occupancy(kind)
-    network = published.occupancy({"encoder.conv1.weight": drawn(4, 4)} | state)
+    network = published.load_occupancy_network({"encoder.conv1.weight": drawn(4, 4)} | state)
     torch.testing.assert_close(network.at(CODE)(POINTS), logits, rtol=0, atol=1e-6)
 
 
@@ -219,7 +219,7 @@ def plain(activation: str) -> tuple[State, Tensor]:
 def test_a_plain_network_has_the_values_of_its_operations(activation):
     torch.manual_seed(0)
     state, values = plain(activation)
-    field = published.plain(state).at(torch.zeros(3))
+    field = published.load_mlp(state).at(torch.zeros(3))
     torch.testing.assert_close(field(POINTS), values, rtol=0, atol=1e-6)
     assert isinstance(field.inner, BoundDecoder) == (activation == "relu")
 
@@ -231,20 +231,20 @@ def without(state: State, key: str) -> State:
 def deepsdf_with(state: Any, **changed: Any) -> Any:
     """Reads a DeepSDF decoder whose state is changed by a function, and its specs."""
     found, settings, _ = deepsdf(SPECS, as_of_2019, "")
-    return published.deepsdf(state(found), settings | {"NetworkSpecs": SPECS | changed})
+    return published.load_deepsdf(state(found), settings | {"NetworkSpecs": SPECS | changed})
 
 
 def implicit_with(changed: State) -> Any:
     state = implicit("sdf_network.", 0, directly)[0]
-    return published.implicit(state | {f"sdf_network.{key}": one for key, one in changed.items()})
+    return published.load_sdf_network(state | {f"sdf_network.{key}": one for key, one in changed.items()})
 
 
 def cbn_with(state: Any) -> Any:
-    return published.occupancy(state(occupancy("cbn")[0]))
+    return published.load_occupancy_network(state(occupancy("cbn")[0]))
 
 
 def plain_with(state: Any) -> Any:
-    return published.plain(state(plain("relu")[0]))
+    return published.load_mlp(state(plain("relu")[0]))
 
 
 @each("read, words", [
@@ -255,13 +255,16 @@ def plain_with(state: Any) -> Any:
     (lambda: deepsdf_with(lambda s: s, dims="16", latent_in=2), ("dims '16', latent_in 2: dims", "of whole numbers")),
     (lambda: deepsdf_with(lambda s: s, norm_layers=[0, "1"]), ("norm_layers [0, '1']",)),
     (lambda: deepsdf_with(lambda s: s, use_tanh="false"), ("use_tanh 'false'", "true or false")),
-    (lambda: published.deepsdf({}, {"NetworkSpecs": SPECS, "CodeLength": "2"}), ("CodeLength '2'",)),
-    (lambda: published.deepsdf({}, {"NetworkSpecs": [3]}), ("must have NetworkSpecs, an object, not [3]",)),
+    (lambda: published.load_deepsdf({}, {"NetworkSpecs": SPECS, "CodeLength": "2"}), ("CodeLength '2'",)),
+    (lambda: published.load_deepsdf({}, {"NetworkSpecs": [3]}), ("must have NetworkSpecs, an object, not [3]",)),
     (lambda: deepsdf_with(lambda _: {"conv.weight": drawn(2, 2)}), ("no layers of this format", "conv.weight")),
     (lambda: implicit_with({"lin0.weight": drawn(40, 2), "lin2.weight": drawn(40, 39)}), ("lin0 takes 2", "be 3")),
     (lambda: implicit_with({"lin0.weight": drawn(40, 81), "lin2.weight": drawn(40, 118)}), ("takes 81", "at most 12")),
     (lambda: implicit_with({"lin2.weight": drawn(40, 39)}), ("lin2 takes 39",)),
-    (lambda: published.implicit(implicit("module.", 0, directly)[0]), ("no layers of this format", "module.lin0")),
+    (
+        lambda: published.load_sdf_network(implicit("module.", 0, directly)[0]),
+        ("no layers of this format", "module.lin0"),
+    ),
     (lambda: cbn_with(lambda s: s | {"decoder.fc_p.weight": drawn(8, 2, 1)}), ("fc_p.weight must be any x 3",)),
     (lambda: cbn_with(lambda s: without(s, "decoder.bn.bn.running_var")), ("lacks decoder.bn.bn.running_var",)),
     (lambda: plain_with(lambda s: s | {"0000.dense.A": drawn(2, 8)}), ("0000.dense.A must be 3 x any", "2 x 8")),

@@ -15,8 +15,8 @@ from renderers.field import Counts, Meter
 from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.relaxed_boundary import _parabola_vertex
 from renderers.rendering import Blurred, Status, Volume, at_iteration
-from renderers.volumes.integrate import Samples, by_importance, weights
-from renderers.volumes.volsdf import Bound, _clearance, _passing
+from renderers.volumes.integrate import Samples, resample, weights
+from renderers.volumes.volsdf import OpacityErrorBound, _clearance, _log_transmittance
 from tests.renderers.analytic_cases import CASES, Case, vector
 
 NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "unisurf"))
@@ -63,10 +63,11 @@ def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
     rays, entry, leave = rays[meets], entry[meets], leave[meets]
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
         sharp, places = 0, []
-        for index, found, reached in renderer.bounded(field, rays, entry, leave):
+        for index, found, reached in renderer.bounded_samples(field, rays, entry, leave):
             dense = Samples.of(field, rays[index], equally_spaced(entry[index], leave[index], 20_000))
             truth, opacity = (
-                1 - _passing(one.value, one.distance, reached)[:, :-1].cumsum(dim=1).exp() for one in (dense, found)
+                1 - _log_transmittance(one.value, one.distance, reached)[:, :-1].cumsum(dim=1).exp()
+                for one in (dense, found)
             )
             place = torch.searchsorted(dense.distance, found.distance[:, 1:].contiguous()).clamp_max(19_999) - 1
             off = (opacity - truth.gather(1, place.clamp_min(0))).abs()
@@ -82,8 +83,8 @@ def test_the_width_at_which_volsdf_begins_bounds_the_error_of_any_field():
     renderer, rays = replace(VOLSDF, samples=3, rounds=0, error=0.1), parallel(6).flat()
     entry, leave, meets = sphere_span(rays)
     field = Shape(lambda p: torch.where((20 * p[..., 2]).round() % 2 == 0, 0.7, -0.001), sphere(0.5).kind)
-    for _, found, width in renderer.bounded(field, rays[meets], entry[meets], leave[meets]):
-        assert (Bound.of(found).greatest(width) <= renderer.error).all()
+    for _, found, width in renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets]):
+        assert (OpacityErrorBound.of(found).max_error(width) <= renderer.error).all()
 
 
 def test_the_least_width_of_volsdf_is_within_ten_halvings_of_that_which_bounds_the_error():
@@ -93,10 +94,10 @@ def test_the_least_width_of_volsdf_is_within_ten_halvings_of_that_which_bounds_t
 
         least: Tensor
 
-        def greatest(self, width: Tensor) -> Tensor:
+        def max_error(self, width: Tensor) -> Tensor:
             return (0.1 * self.least / width).squeeze(1)
 
-        def of_rays(self, index: Tensor) -> "Falling":
+        def select(self, index: Tensor) -> "Falling":
             return Falling(self.least[index])
 
     renderer = replace(VOLSDF, error=0.1).with_blur(0.001)
@@ -133,7 +134,7 @@ def test_the_presets_of_volsdf_bound_the_error_at_their_width_on_so_many_rays(re
     rays = parallel(12).flat()
     entry, leave, meets = sphere_span(rays)
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
-        found = renderer.bounded(field, rays[meets], entry[meets], leave[meets])
+        found = renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets])
         reached = torch.cat([(width == renderer.width).flatten() for _, _, width in found])
         assert len(reached) == int(meets.sum()) and reached.double().mean() >= least
 
@@ -290,7 +291,7 @@ def test_leaving_out_faint_samples_changes_no_gradient(renderer, monkeypatch):
     leaf = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     found = []
     for faint in (1e-5, 1e-12):
-        monkeypatch.setattr("renderers.volumes.integrate.FAINT", faint)
+        monkeypatch.setattr("renderers.volumes.integrate.MIN_LIGHT", faint)
         rendering = renderer.with_blur(0.01).render(sphere(leaf), parallel(20))
         loss = rendering.opacity.sum() + rendering.distance[rendering.hit].sum()
         found.append(torch.autograd.grad(loss, leaf)[0])
@@ -308,9 +309,9 @@ def test_the_residual_is_the_field_where_the_ray_ends(renderer):
 def test_weights_importance_and_sums_worked_out_by_hand():
     passing = vector((0.5, 1.0, 0.25)).log()[None]
     torch.testing.assert_close(weights(passing), vector((0.5, 0.0, 0.375))[None])
-    drawn = by_importance(vector((0, 1, 2, 4))[None], torch.stack([vector((0, 1, 0))]), 4)
+    drawn = resample(vector((0, 1, 2, 4))[None], torch.stack([vector((0, 1, 0))]), 4)
     torch.testing.assert_close(drawn, vector((1.125, 1.375, 1.625, 1.875))[None], rtol=0, atol=1e-4)
-    even = by_importance(vector((0, 1, 2, 4))[None], torch.zeros(1, 3).double(), 4)
+    even = resample(vector((0, 1, 2, 4))[None], torch.zeros(1, 3).double(), 4)
     torch.testing.assert_close(even, vector((0.5, 1.5, 2.5, 3.5))[None])
     volume = Volume(torch.tensor([2, 0, 2]), vector((1, 2, 3)), vector((0.5, 1, 0.25)))
     channels: Tensor = vector((1, 0, 0, 1, 1, 1)).view(3, 2)

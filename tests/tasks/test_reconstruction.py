@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from bench.config import load
-from bench.evaluate.dtu import NAMES, dtu_metrics, read_scan
+from bench.evaluate.dtu import METRIC_NAMES, dtu_metrics, read_scan
 from bench.reconstruct.choice import Appearance, AutoField
 from bench.reconstruct.judge import COLOURED_DEFINITIONS
 from bench.reconstruct.losses import Losses
@@ -200,9 +200,9 @@ def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
     away = np.abs(np.linalg.norm(sample_surface(mesh, 4000, 0).points - CENTRE, axis=1) - RADIUS).mean()
     metrics = record.metrics
     if kind == "dtu":
-        assert {name: metrics[name] for name in NAMES} == dtu_metrics(mesh, read_scan(truth, 65), seed=0)
+        assert {name: metrics[name] for name in METRIC_NAMES} == dtu_metrics(mesh, read_scan(truth, 65), seed=0)
         assert metrics["dtu_accuracy"] == pytest.approx(away, abs=0.02 * RADIUS)
-        assert set(NAMES) < set(record.definitions) and any("DVR (RGB): 0.907" in note for note in record.notes)
+        assert set(METRIC_NAMES) < set(record.definitions) and any("DVR (RGB): 0.907" in note for note in record.notes)
         return
     unit = np.linalg.norm(np.loadtxt(tmp_path / "run" / "to_world.txt")[:3, 0])
     assert metrics["accuracy"] * unit == pytest.approx(away, abs=0.01 * RADIUS)

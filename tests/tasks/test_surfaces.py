@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN, SEEN_PREFIX
+from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN_PREFIX, SEEN_PREFIX
 from bench.reconstruct.stereo import Matching
 from bench.reconstruct.subject import Depths
 from bench.reconstruct.surfaces import fuse_clouds, measured_clouds, with_colours
@@ -36,7 +36,7 @@ TASKS = {"hull": HULL, "poisson": POISSON, "stereo": STEREO}
 SEEN_AS = {"colours": (8, 8, 3), "normals": (8, 8, 3), "hit": (8, 8)}  # at the size of pictures
 ARRAYS = SEEN_AS | {f"back_{name}": shape for name, shape in SEEN_AS.items()} | {"back_truth": (8, 8, 3)}
 WORST = {"hull": (0.055, 0.9, 19), "poisson": (0.035, 0.98, 27), "stereo": (0.06, 0.8, 16)}  # Chamfer-L1, IoU, PSNR
-SCORES = {name for name in COLOURED_DEFINITIONS if not name.startswith(OWN)}
+SCORES = {name for name in COLOURED_DEFINITIONS if not name.startswith(OWN_PREFIX)}
 
 
 @pytest.mark.parametrize("name", TASKS)
