@@ -43,7 +43,7 @@ def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
     assert list(rows["reason"]) == ["64 pixels took over 60 s", "no luck", "", ""]
     names = ("forward_s", "backward_s", "step_s", "step_s_low", "step_s_high", "lost", "false", "wrong")
     assert list(rows.loc[DYNAMIC, [*names, "depth_error_max"]]) == [0.5, 0.25, 0.75, 0.625, 0.875, 12, 8, 3, 0.25]
-    assert page.verdict.startswith("A step at 64 pixels: *500 ms* (of ours)")
+    assert page.verdict.startswith("Step runtime at 64 pixels: *500 ms* (of ours)")
 
 
 def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
