@@ -97,13 +97,13 @@ def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp
     assert list(zip(*(page.data[key] for key in ("size", "threads", "forward_ratio")), strict=True))[:-1] == lines
     assert set(page.data["renderer"][1:6:2]) == {"newton"}
     line = page.table.iloc[1]
-    assert (line["Values"], line["Forward ratio"]) == ("1.00k + 3.00k coarse", "0.75 (0.50–1.00)")
+    assert (line["Evaluations"], line["Forward ratio"]) == ("1.00k + 3.00k coarse", "0.75 (0.50–1.00)")
     assert line["Missed / spurious / wrong depth"] == "1 / 2 / 3"
     assert list(page.table["Forward ratio"].iloc[[0, -1]]) == ["1", "–"]  # of the first renderer, and of a failed run
     assert (
         "medians of 5 rounds" in told(page) and "timeout" in told(page) and "thread" not in page.shown().caption[-40:]
     )
-    said = "A step at 256 × 256 pixels over that of dist: *0.600* (newton, 1 thread) to 0.900 (newton, 2 threads)"
+    said = "Step runtime at 256 × 256 pixels, relative to dist: *0.600* (newton, 1 thread) to 0.900 (newton, 2 threads)"
     assert page.verdict == f"{said}; n = one shape."
 
 

@@ -162,7 +162,7 @@ def test_poses_found_are_counted_at_each_angle(tmp_path):
     assert theirs["30°"] == "4 of 4 (n = 1)"
     assert "fewer than six shapes: points, no interval" in result.caption
     assert theirs["90°"] == ""
-    assert (mine["Loop"], theirs["Loop"]) == ("2.00 s", "250 ms")
+    assert (mine["Runtime"], theirs["Runtime"]) == ("2.00 s", "250 ms")
     assert "1 of 9 runs did not end ok: DIST, 30 degrees, seed 3: nan (" in result.caption
     assert "5 degrees and 0.05 scene units" in result.caption
 
