@@ -10,8 +10,8 @@ from bench.report.study import Result, Runs, Selection, chart, format, records, 
 PLACE = 60
 READS = (Selection("fig6", ("task.degrees",), setup=("scenes", "pixels", "machine")),)
 CAPTION = (
-    "Fraction of runs that end within {success_degrees:g} degrees and {success_distance:g} scene units of the true pose, "
-    "over the initial error in rotation."
+    "Fraction of runs that end within {success_degrees:g} degrees and {success_distance:g} scene units of the true "
+    "pose, over the initial error in rotation."
 )
 NOTES = (
     "The initial camera is also shifted by {shift:g} scene units. All methods share the views and initial cameras.",

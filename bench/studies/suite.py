@@ -247,8 +247,8 @@ def _notes(made: Standing) -> list[str]:
     for name in made.sets if len(made.sets) > 1 else ():
         first, end = (standing.ranking(runs[runs["set"] != name], outcome) for outcome in (AT_1, END))
         notes.append(
-            f"{leaders(first, f'Without {name}, at 1 ×')} The order is: {'; '.join(first.progress)}. At the end, "
-            f"{len(end.better)} pairs differ significantly, and the first 3 are: {'; '.join([*end.progress][:3])}."
+            f"{leaders(first, f'Without {name}, at 1 ×')} The order is: {'; '.join(first.progress)}. Pairs that "
+            f"differ significantly at the end: {len(end.better)}. First there: {'; '.join([*end.progress][:3])}."
         )
     if made.lacking:
         rows = ", ".join(f"{row} ({format.plural(count, 'problem')})" for row, count in made.lacking.items())

@@ -93,7 +93,7 @@ def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
     plain, clamped, both = (lines[kind, 1.5] for kind in kinds.values())
     return (
         f"At alpha = 1.5, *{wrong['plain']}* of the pixels are wrong on distances without clamped steps. With clamped "
-        f"steps, {wrong['clamped']} are wrong on distances, {wrong['both']} on a truncated field. Clamped steps cost "
+        f"steps, {wrong['clamped']} are wrong on distances and {wrong['both']} on a truncated field. These steps cost "
         f"{clamped['cost']:.2f} and {both['cost']:.2f} times the field evaluations of alpha = 1 without clamp; "
         f"n = {plain['shapes']} shapes."
     )
