@@ -43,8 +43,8 @@ def recommendation() -> str:
     lines, presets = _lines("suite"), {line["row"]: line["preset"] for line in _lines("suite")}
     page = json.loads((PAPER / "suite.json").read_text(encoding="utf-8"))
     rows = r"(.*) \(\*.*\*\) and (.*) \(\*.*\*\) make significantly more progress than the \d+ others"
-    rest = "These cannot be distinguished. At the end, none of"
-    leaders = re.search(rf"^At the cost of one run of DIST, {rows}. {rest}", page["verdict"])
+    rest = "These 2 cannot be distinguished. At the end of the runs, none of"
+    leaders = re.search(rf"^At the cost of one DIST run, {rows}. {rest}", page["verdict"])
     _check(leaders, "the leaders at the cost of one run, or the pairs at the end")
     both = leaders.groups() if leaders else ()
     hard = [presets[row] for row in both if row in _hardest()]
@@ -57,7 +57,7 @@ def recommendation() -> str:
     _check(presets[worst["row"]] == other, "the last rank on hard scenes")
     verdict = json.loads((PAPER / "suite_sets.json").read_text(encoding="utf-8"))["verdict"]
     slower = re.search(
-        r"DIST, (.*) \(\*.*\*\) makes the most progress, significantly more than (.*?)\. Seconds", verdict
+        r"run, (.*) \(\*.*\*\) makes the most progress, significantly more than \d+ others?: (.*?)\. Run", verdict
     )
     _check(slower and presets[slower[1]] == hard[0], "the first in the time of one run")
     behind = slower[2].split("; ") if slower else []

@@ -6,11 +6,11 @@ PLACE = 22
 READS = (Selection("as_printed", ("task.points",)),)
 REFERENCE = "as_printed"
 NOTES = (
-    "“Both” is the truncated prior with clamped steps. The clamp and the mean of the squared code are the official "
-    "code's. The mean of the mask loss over all pixels is ours: the text does not give the average of Eq. 11.",
-    "DIST has 100 iterations. DeepSDF's samples have 300, with numbers that were chosen on validation shapes.",
-    "“Neither”, “clamp alone”, “DIST with mask” and “DeepSDF samples” are on the prior of distances.",
-    "DIST, Table 2, dense, has errors of 0.77 (sofas), 0.59 (planes) and 0.42 (tables) times DeepSDF's.",
+    "“Both”: the truncated prior with clamped steps. The clamp and the mean of the squared code are from the official "
+    "code. The paper does not give the average of its silhouette loss (Eq. 11); we take the mean over all pixels.",
+    "DIST has 100 iterations. DeepSDF's samples have 300, and settings that were chosen on validation shapes.",
+    "“Neither”, “clamp alone”, “DIST with mask” and “DeepSDF samples” use the prior that is not truncated.",
+    "In DIST, Table 2, dense, the errors are 0.77 (sofas), 0.59 (planes) and 0.42 (tables) times DeepSDF's errors.",
 )
 
 
@@ -19,7 +19,7 @@ def make(runs: Runs) -> Result:
     compared = compare.Compared(runs, lambda _: REFERENCE)
     return compared.result(
         "The paper's setting of DIST on dense depth, one change at a time.",
-        "To what is the error of the paper's setting due?",
+        "Which part of the paper's setting causes its error?",
         verdict=compared.differing("to the paper's setting"),
         remarks=(compare.ERROR, f"{compare.RATIO} {compare.FAILURE}", *NOTES),
         columns=[column for column in compared.columns("Ratio to the paper's setting") if column.key != "dense"],

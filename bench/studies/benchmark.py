@@ -23,11 +23,10 @@ COSTS = {
     "step_cpu": "Step ratio, CPU",
 }
 NOTES = (
-    "Values are points whose field value one rendering computes; coarse ones are computed in bfloat16, where they "
-    "decide nothing.",
-    "Work over bound: the operations of a step over those of one value and one gradient per hit.",
-    "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
-    "hit.",
+    "Field evaluations are those of one rendering. Coarse evaluations use bfloat16, away from the surface.",
+    "Work over bound: the operations of a step divided by those of one field evaluation and one gradient per hit.",
+    "Pixels and depths are compared with a float64 reference. Depth errors are in scene units, over the pixels that "
+    "are hits in both images.",
 )
 
 
@@ -40,9 +39,9 @@ def make(runs: Runs) -> Result:
     return Result(
         replace(runs, records=records),
         "Renderers timed in turn, in one process.",
-        "Seconds of one rendering and of one step of an optimisation, and their ratios to those of the first renderer "
-        f"of the same round: medians of {' or '.join(map(str, rounds))} rounds, in brackets the least and the largest.",
-        question="Which renderer is fastest, timed in turn in one process?",
+        "Seconds of one rendering and of one optimisation step, and their ratios to the first renderer in the same "
+        f"round; medians of {' or '.join(map(str, rounds))} rounds, in brackets the smallest and the largest.",
+        question="Which renderer is fastest, if all are timed in turn in one process?",
         verdict=_verdict(lines),
         remarks=NOTES,
         columns=COLUMNS,
@@ -60,7 +59,7 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
         if line["size"] == size and not line["first"]
     }
     first = next((line["renderer"] for line in measured_lines if line["first"]), "")
-    return format.ends(f"A step at {size} × {size} pixels over that of {first}", ratios, "one shape")
+    return format.ends(f"Step runtime at {size} × {size} pixels, relative to {first}", ratios, "one shape")
 
 
 def _size_and_threads(record: Record) -> tuple[int, int]:
@@ -102,7 +101,7 @@ COLUMNS = (
     table.text("renderer", "Renderer"),
     *(*map(table.text, ("status", "reason", "folder")), table.Column("rounds")),
     table.Column(
-        "queries", "Values", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))
+        "queries", "Evaluations", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))
     ),
     table.Column("coarse_queries"),
     table.Column("forward_seconds", "Forward", show=format.seconds),

@@ -25,7 +25,7 @@ CLAMPED = {"renderer.step_clamp": 0.1}  # both rows, as in the official code
 PAPER_VIEWS = {"task.images.views": 72, "task.optimiser.iterations": 180}  # as many photographs as in the paper
 FIG10 = {**PAPER_VIEWS, "task.focal": 1.0, "task.start_scale": 1.0}
 FIG12 = {**PAPER_VIEWS, "task.similarity": True, "task.degrees": 0.0, "task.shift": 0.0, "task.scale": 1.0}
-NO_RUNS = "needs runs with the settings of this version, which the command makes"
+NO_RUNS = "needs runs with the settings of this version: use the command"
 
 
 @dataclass(frozen=True)
@@ -75,24 +75,24 @@ def _mean(ratios: list[float]) -> float:
 DENSE = [4.12 / 5.37, 2.18 / 3.71, 5.37 / 12.93]  # DIST with mask over DeepSDF
 TWENTY = [4.94 / 7.63, 3.60 / 5.39, 7.62 / 15.77]
 TWENTY_MASK = [4.94 / 6.95, 3.60 / 5.30, 7.62 / 15.83]  # over DIST without the mask
-AVERAGE = "the mean of the mask loss over all pixels, which the text does not give: see the next line, and `as_printed`"
-ITERATIONS = "DIST has 100 iterations, DeepSDF's samples 300: see `as_printed`"
+AVERAGE = "the paper does not give the average of its silhouette loss; we take the mean over all pixels (`as_printed`)"
+ITERATIONS = "DIST has 100 iterations here, DeepSDF 300 (`as_printed`)"
 CARS = ("car",)  # DVR, Table 1: 0.196 with RGB, 0.179 with depth, 0.181 with 3D supervision
 SEEN_ERROR, COST = "seen_chamfer_l1", "queries"
 CLAIMS = (
     Claim(
-        "DIST, Table 1", "aggressive marching saves field evaluations (both clamped)", 1.43 / 1.99, "table1_large",
+        "DIST, Table 1", "aggressive marching saves field evaluations (both rows clamped)", 1.43 / 1.99, "table1_large",
         "dist_aggressive", "dist_dynamic", COST, top_settings=CLAMPED,
     ),
     Claim(
-        "DIST, Table 1", "coarse to fine saves further evaluations", 887 / 1430, "table1_large", "dist_coarse_to_fine",
-        "dist_aggressive", COST, top_settings=CLAMPED,
+        "DIST, Table 1", "coarse-to-fine marching saves more field evaluations", 887 / 1430, "table1_large",
+        "dist_coarse_to_fine", "dist_aggressive", COST, top_settings=CLAMPED,
     ),
     Claim(
-        "DIST, Table 1", "100 steps cost as many evaluations as 50", 898 / 887, "table1_large",
+        "DIST, Table 1", "100 steps take about as many field evaluations as 50", 898 / 887, "table1_large",
         "dist_coarse_to_fine_100", "dist_coarse_to_fine", COST, NO_LARGER, CLAMPED,
     ),
-    Claim("DIST, B.2", "2048 x 2048 pixels fit on one graphics card", why="needs a GPU"),
+    Claim("DIST, B.2", "an image of 2048 x 2048 pixels fits on one GPU", why="needs a GPU"),
     _table2(
         "dense", DENSE, "dist_mask_paper", "deepsdf_truncated",
         "dense depth: DIST is better than DeepSDF (paper's setting)", AVERAGE,
@@ -119,7 +119,7 @@ CLAIMS = (
     Claim(
         "DIST, Table 3", "from random codes, DIST is better than PMO", _mean([0.919 / 1.187, 1.595 / 6.124]),
         "table3", "multiview_paper", "multiview_mesh_long", "chamfer_gt_to_pred", top_settings=PAPER_VIEWS,
-        why="needs runs of the method `multiview_mesh_long`, with as many views and iterations",
+        why="needs runs of the method `multiview_mesh_long` with 72 views and 180 iterations",
     ),
     Claim(
         "DIST, Fig. 5", "aggressive marching does not impair the result", None, "fig5", "dist_aggressive",
@@ -134,36 +134,36 @@ CLAIMS = (
         "multiview_paper", "chamfer_gt_to_pred", NO_LARGER, {**FIG10, "task.focal": 0.5}, FIG10, command="fig10_focal",
     ),
     Claim(
-        "DIST, Fig. 10", "not affected by noise in the initial code (our test: twice the noise)", None, "fig10",
+        "DIST, Fig. 10", "robust to noise in the initial code (our test: twice the noise)", None, "fig10",
         "multiview_paper", "multiview_paper", "chamfer_gt_to_pred", NO_LARGER,
         {**FIG10, "task.start_scale": 2.0}, FIG10, command="fig10_start",
     ),
     Claim(
-        "DIST, Fig. 12", "a similarity is optimised with the shape (our test: 20 degrees off)", None, "fig12",
+        "DIST, Fig. 12", "a wrong initial rotation is corrected (our test: 20 degrees)", None, "fig12",
         "multiview_paper", "multiview_paper", "chamfer_gt_to_pred", NO_LARGER, {**FIG12, "task.degrees": 20.0},
         FIG12,
     ),
     Claim(
-        "DIST, Sec. 4.2", "it generalises to images of another data set and to real photographs",
+        "DIST, Sec. 4.2", "DIST generalises to another data set and to real photographs",
         why="needs photographs with cameras of a class that has a prior",
     ),
     Claim("DVR, Eqs. 8 and 11", "the gradient of the depth is exact", test="test_the_implicit_gradient_is_exact"),
     Claim(
-        "DVR, Sec. 1", "memory of the backward pass does not depend on n",
+        "DVR, Sec. 1", "memory of the backward pass does not depend on n (samples per ray)",
         test="test_what_a_step_keeps_does_not_grow_with_n",
     ),
     Claim(
-        "DVR, Table 1", "cars: RGB is about as good as ONet, with 3D supervision", 0.196 / 0.181, "dvr_table1",
+        "DVR, Table 1", "cars: RGB supervision is about as good as ONet's 3D supervision", 0.196 / 0.181, "dvr_table1",
         "single_view_dvr_rgb", "single_view_occupancy", "chamfer_l1", NO_LARGER, families=CARS,
-        why="our training is far shorter: its error is not distinguished from that of the mean shape",
+        why="our training is much shorter; its error cannot be distinguished from the error of the mean shape",
     ),
     Claim(
-        "DVR, Table 1", "cars: depth is better than RGB", 0.179 / 0.196, "dvr_table1", "single_view_dvr_depth",
-        "single_view_dvr_rgb", "chamfer_l1", families=CARS,
+        "DVR, Table 1", "cars: depth is a better supervision than RGB", 0.179 / 0.196, "dvr_table1",
+        "single_view_dvr_depth", "single_view_dvr_rgb", "chamfer_l1", families=CARS,
     ),
     Claim(
         "DVR, Sec. 4.1.2", "one image of each training shape suffices",
-        why="needs a training with one image with depth of each shape",
+        why="needs a training run with one depth image per shape",
     ),
     Claim(
         "DVR, Fig. 7", "RGB alone has a smaller error than the visual hull", None, "dvr_table2", "dvr_paper", "hull",
@@ -177,7 +177,7 @@ CLAIMS = (
         "DVR, Table 2", "depth improves on RGB", 0.782 / 0.907, "dvr_table2", "dvr_paper_depth", "dvr_paper", SEEN_ERROR
     ),
     Claim(
-        "DVR, Table 2", "on DTU's photographs, in mm",
+        "DVR, Table 2", "errors in mm on DTU's photographs",
         why="needs DTU's data: `+experiment=photos dataset.truth=DTU`",
     ),
 )  # fmt: skip
@@ -185,20 +185,20 @@ COLUMNS = (
     *(table.text("source", "Paper"), table.text("claim", "Claim"), table.Column("published", "Published ratio")),
     *(*table.estimate("ratio", "Measured ratio"), table.Column("shapes", "Shapes"), table.text("families", "Families")),
     table.text("verdict", "Verdict"),
-    *(table.text("why", "Cause, or what it needs"), table.text("command", "Command, or test")),
+    *(table.text("why", "Possible cause, or what is missing"), table.text("command", "Command, or test")),
 )
 NOTES = (
-    "A ratio is the median over shapes of the two rows' errors or, in Table 1, field evaluations. Its interval is that "
-    "of the sign test at 95 %; below six shapes there is none. A shape on which both rows fail is left out. The "
-    "published ratio is of the medians that the paper prints, as a geometric mean over families.",
-    "A claim of a smaller error “holds” where the interval lies below 1, and “does not hold” where it lies above. "
-    "Where the interval lies above half of the published effect, in the logarithm, the claim is “weaker” below 1, and "
-    "“less than half the effect” around it.",
-    f"A claim of no larger an error allows ratios up to {MAX_SAME_RATIO}; that margin is ours. It “holds” where the "
-    "interval lies below, and is “larger (size not decided)” where the interval lies above 1 and includes the margin.",
-    "Below six shapes the verdict says whether the median is as claimed. Counts of evaluations in Table 1 follow "
-    "nearly from the algorithm: one shape shows their size. All else is “not decided”.",
-    "No correction for the number of claims is made: each is a question of its own.",
+    "A ratio compares the errors of two rows, or in DIST, Table 1, their field evaluations. It is a median over shapes "
+    "without those where both rows failed. The 95 % interval of the sign test needs six shapes. The published ratio is "
+    "of the paper's numbers, as a geometric mean over families.",
+    "A claim of a smaller error “holds” if the interval is below 1, and “does not hold” if it is above 1. If the "
+    "interval shows less than half of the published effect, on a log scale, the verdict is “weaker” if it is below 1, "
+    "and “less than half the effect” if it contains 1.",
+    f"A claim of no larger error allows ratios up to {MAX_SAME_RATIO}. This margin is ours. The claim “holds” if the "
+    "interval is below it. “Larger (size not decided)”: the interval is above 1 and contains the margin.",
+    "With fewer than six shapes, the verdict only states whether the median is as claimed. The algorithm nearly "
+    "determines the counts of DIST, Table 1: one shape shows their size. All other cases are “not decided”.",
+    "Each claim is a separate question, so there is no correction for the number of claims.",
 )
 CHECKED, UNTESTED = "checked by a test", "not tested"
 
@@ -211,10 +211,10 @@ def make(*sources: Runs | None) -> Result:
     return Result(
         first,
         "Claims of DIST and DVR.",
-        "Ratios of two rows' errors or costs, and the paper's. A failed run counts as infinite.",
-        question="Which claims of the two papers hold here?",
+        "Measured and published ratios of the errors or costs of two rows. A failed run has an infinite error.",
+        question="Which claims of the DIST and DVR papers hold in our measurements?",
         verdict=_verdict([line["verdict"] for line in lines]),
-        n=f"{sum(line['shapes'] is not None for line in lines)} measured claims, each with its number of shapes",
+        n=f"{sum(line['shapes'] is not None for line in lines)} measured claims; the table has the shapes of each",
         interval=compare.INTERVAL,
         remarks=NOTES,
         columns=COLUMNS,
@@ -226,8 +226,8 @@ def _verdict(verdicts: list[str]) -> str:
     kinds = [verdict.split(",")[0] for verdict in verdicts]
     tested = {kind: kinds.count(kind) for kind in dict.fromkeys(kinds) if kind not in (CHECKED, UNTESTED)}
     counts = "; ".join(f"{kind} *{count}*" for kind, count in tested.items())
-    rest = f"{kinds.count(CHECKED)} are checked by tests of this project, {kinds.count(UNTESTED)} are not tested"
-    return f"Of {len(kinds)} claims, {sum(tested.values())} are measured: {counts}. Of the others, {rest}."
+    rest = f"Tests of this project check {kinds.count(CHECKED)} claims, and {kinds.count(UNTESTED)} are not tested."
+    return f"{sum(tested.values())} of {len(kinds)} claims are measured: {counts}. {rest}"
 
 
 def _line(claim: Claim, runs: Runs | None) -> dict[str, Any]:

@@ -20,17 +20,17 @@ PUBLISHED = {
     "plane": {"DVR, RGB": 0.190, "DVR, depth": 0.143, "ONet (3D)": 0.151},
 }
 NOTES = (
-    "Each shape is one that no training has seen, from one image; its other images judge the mask and the colours.",
-    "Trainings from images spend their first steps on the visual hull of the masks, without a renderer, and “Masks, "
-    "hull” does nothing else.",
-    "“DVR's own”: occupancy, DVR's renderer and losses from the first step; from RGB the hull is the depth of Eq. 15. "
-    "At desk a step has 4 images of 128 rays, at a rate of 1e-3; gradients are shortened to 1. A seed is a training.",
-    "Without a training: the code of the prior that DIST finds by the mask, knowing the camera; the mean shape; the "
-    "training shape with the nearest image; the one with the least Chamfer-L1, which no retrieval can beat.",
-    "“Over ...”: the median over shapes of the ratio of Chamfer-L1 to that row's; below 1 is better. “Trained in” is "
-    "once for the family, “Inference” the network with its mesh, or the search without one.",
-    "“Published” is DVR, Table 1: ShapeNet, in tenths of the largest edge of a shape's bounding box, which cannot be "
-    "compared directly with the measured rows.",
+    "Each shape is unseen in training, and has one input image. Its other images evaluate the mask and the colours.",
+    "Training from images begins with the visual hull of the masks, without a renderer. “Masks, hull” has only that.",
+    "“DVR's own”: occupancy, DVR's renderer and losses from the first step. With RGB, the hull gives the depth of Eq. "
+    "15. At scale=desk, a step has 4 images of 128 rays; the learning rate is 1e-3; gradients are clipped to a norm of "
+    "1. A seed is one training run.",
+    "Without training: the latent code that DIST fits to the mask, with the known camera; the mean shape; the training "
+    "shape with the nearest image; the training shape with the smallest Chamfer-L1, the limit of any retrieval.",
+    "“Over ...”: the median over shapes of the ratio of Chamfer-L1 to that row; below 1 is better. “Trained in” is the "
+    "training time of a family. “Inference” is the time of the network and its mesh, or of the search.",
+    "“Published” is DVR, Table 1: ShapeNet, in tenths of the largest edge of a shape's bounding box. These numbers "
+    "cannot be compared directly with the measured rows.",
 )
 COLUMNS = (
     *(table.text("family", "Family"), table.text("method", "Training"), table.Column("iou", "IoU")),
@@ -59,9 +59,9 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Shape from one image.",
-        "Medians over shapes, of costs over those that ended ok, by what the training of the network may know; "
-        "Chamfer-L1 in scene units, times 1000.",
-        question="How much must a training know, so that one image gives a shape?",
+        "Medians over shapes for each kind of training, of costs over runs that ended ok; Chamfer-L1 in scene units, "
+        "times 1000.",
+        question="Which observations must a training use, so that a network reconstructs a shape from one image?",
         verdict=" ".join(filter(None, (_verdict(name, rows) for name, rows in family_lines.items()))),
         interval=compare.INTERVAL,
         estimates=[line["interval"] for line in lines if "interval" in line],
@@ -116,11 +116,11 @@ def figures(runs: Runs) -> Result:
     return Result(
         runs,
         "Shapes from one image in pictures.",
-        "Of each family the shapes with the least and the largest Chamfer-L1 of the first row: images, and the normals "
-        "that each row found.",
+        "For each family, the shapes with the smallest and the largest Chamfer-L1 of the first row: images, and the "
+        "normals of each row.",
         remarks=(
-            "The given image is all that the encoder sees; normals (right, up, towards the camera as red, green, blue) "
-            "are seen by the camera of another image, which no row was given.",
+            "The encoder sees only the given image. Normals (right, up, towards the camera as red, green, blue) are "
+            "seen by the camera of another image, which is no input of any row.",
             *gallery.missing(scenes.values()),
         ),
         run_columns=PICTURE_COLUMNS,

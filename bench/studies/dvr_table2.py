@@ -15,15 +15,14 @@ READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
 SEEN_ERROR, SEEN_LABEL = "seen_chamfer_l1", "Chamfer-L1, seen × 1000"
 NAMES = ("seen_accuracy", "seen_completeness", SEEN_ERROR, "chamfer_l1", "psnr", "ssim", "mask_iou")
 NOTES = (
-    "“Seen” is what a given photograph sees of either surface, as none sees the underside; distances are in scene "
-    "units, times 1000, and two samplings of one surface by 30,000 points have a Chamfer-L1 of 5.7 to 7.1.",
-    "Colours are compared at hits on held-out photographs; with volumes and the relaxed boundary on all rays of the "
-    "foreground, in front of black.",
-    "Volumes have the cross entropy of their opacity for the masks and a budget of samples a ray.",
-    "“Error over the iterations on photographs” shows whether a row is at its end.",
-    "A row without field evaluations has no point where the figure shows them.",
-    "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm, which cannot be compared directly with the "
-    "measured rows.",
+    "“Seen”: the parts of both surfaces that a photograph of the input shows; none shows the underside. Distances are "
+    "in scene units, times 1000. Two samples of 30,000 points of one surface have a Chamfer-L1 of 5.7 to 7.1.",
+    "Colours are compared at hits in held-out photographs. For volume renderers and the relaxed boundary, they are "
+    "compared at all pixels of the mask, on black.",
+    "Volume renderers use the cross entropy between opacity and mask, and a limited number of samples per ray.",
+    "The page “Error over the iterations on photographs” shows whether a row has converged.",
+    "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm. These numbers cannot be compared directly "
+    "with the measured rows.",
 )
 NOTED_SETTINGS = {  # names in the note on optimised rows, and configuration keys
     "field": ("field",),
@@ -54,10 +53,10 @@ PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN_ERROR, "ps
 CURVE_COLUMNS = (
     table.text("method", "Method"),
     table.Column("iterations", "Iterations", show=table.whole),
-    table.Column("at", "Nearest to half", show=table.whole),
-    table.Column("half", "Error there", show=table.thousandfold),
-    table.Column("end", "At the end", show=table.thousandfold),
-    table.Column("fell", "Fell by", show=table.percent),
+    table.Column("at", "Checkpoint nearest to half", show=table.whole),
+    table.Column("half", "Error at this checkpoint", show=table.thousandfold),
+    table.Column("end", "Error at the end", show=table.thousandfold),
+    table.Column("fell", "Decrease", show=table.percent),
 )
 MAX_SCENES = 2
 LOOKALIKES = {  # presets not shown in figures, because they look like another row
@@ -83,11 +82,11 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Shape and colour from photographs.",
-        f"Medians over {scenes} of errors on what the photographs see; in the figure a point per scene, and the "
-        f"median.{_photograph_settings(runs)}",
-        question="Which method finds shape and colour from photographs?",
+        f"Median errors over {scenes} on the surface that the photographs show; the figure has a point per scene and "
+        f"the median.{_photograph_settings(runs)}",
+        question="Which method best reconstructs shape and colour from photographs?",
         verdict=format.ends(
-            "From photographs alone, the median Chamfer-L1 × 1000 of what they see",
+            "Median Chamfer-L1 × 1000 of the seen surface, for methods that use no depth",
             medians.whole([line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR),
             scenes,
             show=table.thousandfold,
@@ -142,18 +141,18 @@ def convergence(runs: Runs) -> Result:
     return Result(
         runs,
         "Error over the iterations on photographs.",
-        f"Median over {_scenes(runs)} of the Chamfer-L1 of what the photographs see, at the checkpoint nearest to half "
-        "of the iterations and at the end; in the figure, at all checkpoints.",
-        question="Would more iterations help on photographs?",
+        f"Median Chamfer-L1 of the seen surface over {_scenes(runs)}, at the checkpoint nearest to half of the "
+        "iterations and at the end; the figure has all checkpoints.",
+        question="Would more iterations reduce the error on photographs?",
         verdict=format.ends(
-            "Fall of the error from the checkpoint nearest to half of the iterations to the end",
+            "Decrease of the error from half of the iterations (nearest checkpoint) to the end",
             {line["method"]: line["fell"] for line in lines},
             _scenes(runs),
             show=table.percent,
         ),
         remarks=(
-            "The error of a low rate falls slowly, far from its end too.",
-            "In the figure, of rows that look alike one is shown, and a row without iterations is a level.",
+            "With a low learning rate, the error decreases slowly even far from convergence.",
+            "The figure shows one of several rows with similar results. A row without iterations is a horizontal line.",
         ),
         data=pd.concat(
             curve.rename(SEEN_ERROR).rename_axis("iteration").reset_index().assign(row=row.name)
@@ -203,8 +202,8 @@ def figures(runs: Runs) -> Result:
         f"Colours, and normals (right, up, towards the camera as red, green, blue), of {len(shown)} of "
         f"{format.plural(len(by_scene), 'scene')}, seen by the camera of a held-out photograph.",
         remarks=(
-            "A mesh row has the colours of the photographs that see a vertex, another row those of its field.",
-            "Of rows that look alike one is shown; summary.png in a run's folder is its own picture.",
+            "Mesh rows have the colours of the photographs that show a vertex. Other rows have the colours of a field.",
+            "The figure shows one of several rows with similar results. The run folder of each run has summary.png.",
             *gallery.missing(scenes.values()),
         ),
         run_columns=PICTURE_COLUMNS,

@@ -14,11 +14,11 @@ CONDITIONS = (
 )
 READS = (Selection("fig10", tuple(f"task.{condition.key}" for condition in CONDITIONS)),)
 NOTES = (
-    "One condition varies, the other is at 1; the noise is in standard deviations of the prior's training codes, so "
-    "that 0 is the mean shape or, of a row with an encoder, that of the encoder's code.",
-    "A mesh row moves the vertices of the prior's mesh by the photometric error, as PMO does, the paper's other curve.",
-    "A run that did not end ok counts as infinite, drawn at the upper edge.",
-    "The paper (Fig. 10, a chart without numbers) finds its method robust to both.",
+    "One condition varies, and the other is at 1. The noise is in standard deviations of the prior's training codes. "
+    "At 0, a run starts from the mean shape or, with an encoder, from the encoder's code.",
+    "Mesh rows have gradients through the vertices of the prior's mesh, like PMO, the paper's other curve.",
+    "A failed run counts as infinite and is drawn at the upper edge.",
+    "The paper (Fig. 10, a chart without numbers) reports that its method is robust to both.",
 )
 
 
@@ -27,10 +27,10 @@ def make(runs: Runs) -> Result:
     lines = conditions.lines_of(runs.made.records, CONDITIONS)
     return Result(
         runs,
-        "Shape from many views under other focal lengths and starts.",
-        f"{conditions.BELOW[0].upper()}{conditions.BELOW[1:]}; in the figure, the median ratio to the error at 1 of "
-        "the same shape.",
-        question="Does another focal length or start change the shape that is found?",
+        "Shape from many views under other focal lengths and initial codes.",
+        f"{conditions.BELOW[0].upper()}{conditions.BELOW[1:]}; in the figure, the median ratio to the error of "
+        "the same shape at 1.",
+        question="Does another focal length or initial code change the reconstructed shape?",
         verdict=_verdict(runs.made),
         interval=conditions.INTERVALS,
         estimates=[line["error"] for line in lines],
@@ -69,7 +69,7 @@ def _verdict(runs: Runs) -> str:
     errors = runs.error(records.ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
     factors = {", ".join(names): ratio for names, ratio in (errors.max() / errors.min()).items()}
     shapes = format.plural(len(runs.frame[["family", "solid"]].drop_duplicates()), "shape")
-    return format.ends("Largest over least median error of all conditions", factors, shapes)
+    return format.ends("Largest median error of all conditions, relative to the smallest", factors, shapes)
 
 
 PAGES = {"fig10": make}

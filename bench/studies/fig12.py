@@ -15,12 +15,12 @@ CONDITIONS = (
 READS = (Selection("fig12", (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity")),)
 MAX_ERROR = 1.0  # squared scene units x 1000: about the errors of DIST, Table 3; a success has less
 NOTES = (
-    f"A success ended ok with an error below {MAX_ERROR:g}; its interval is Clopper and Pearson's, over shapes.",
-    "One condition varies, the others are neutral; a shift's direction, a rotation's axis and the initial code are "
-    "random, the same for every method.",
-    "At zero displacement a similarity is optimised as well; “place known” is without one, and has no point.",
-    "A run that did not end ok counts as infinite, drawn at the upper edge.",
-    "The paper (Fig. 12) shows pictures of real chairs and no numbers; here shapes and photographs are synthetic.",
+    f"A success ended ok with an error below {MAX_ERROR:g}. Its interval is over shapes (Clopper and Pearson).",
+    "One condition varies, and the others are neutral. The direction of a shift, the axis of a rotation and the "
+    "initial code are random, and the same for all methods.",
+    "A run also optimises a similarity transform (position, rotation and size), even at zero displacement. Only “place "
+    "known” does not; it is not in the figure. A failed run counts as infinite and is drawn at the upper edge.",
+    "The paper (Fig. 12) shows pictures of real chairs and no numbers. Here shapes and photographs are synthetic.",
 )
 RUNS = conditions.run_columns(CONDITIONS, "similarity")
 PLACE_KNOWN = "place known"
@@ -43,8 +43,8 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Shape from many views, misplaced at the start.",
-        f"Runs that succeeded, and {conditions.BELOW}, over the displacement.",
-        question="Is a shape found from a wrong similarity?",
+        f"Successful runs, and {conditions.BELOW}, over the initial displacement.",
+        question="Is a shape reconstructed if its initial position, rotation or size is wrong?",
         verdict=_verdict(runs),
         interval=conditions.INTERVALS,
         estimates=[line["error"] for line in lines],
@@ -83,12 +83,11 @@ def pictures(runs: Runs) -> Result:
     return Result(
         first,
         "Shapes from many views, misplaced at the start, in pictures.",
-        "The shape with the least number of each family: where it began, and what each row found, over the "
-        "displacement.",
+        "The first shape of each family: its initial shape and the result of each row, over the initial displacement.",
         remarks=(
-            f"{gallery.JUDGED}, seen from the first photograph's side.",
-            "Start: the shape of the random code, misplaced; at “known place” no similarity is optimised.",
-            "DIST, Fig. 24, shows photographs of real chairs, and what PMO makes of them; these shapes are synthetic.",
+            f"{gallery.JUDGED}, seen from the side of the first photograph.",
+            "Start: the misplaced shape of the random code. At “known place”, no similarity transform is optimised.",
+            "DIST, Fig. 24, shows photographs of real chairs with the results of PMO. These shapes are synthetic.",
             *gallery.missing(scenes.values()),
         ),
         run_columns=RUNS,

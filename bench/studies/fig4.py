@@ -6,7 +6,7 @@ PLACE = 210
 READS = (Selection("fig4", alike=("dataset", "view", "prior", "task")),)
 NOTES = (
     "Pictures are cropped to the part with hits.",
-    "A row that did not finish at the requested size is shown at the largest size at which it did.",
+    "A row that did not finish at the requested size is shown at its largest finished size.",
 )
 MAX_COLUMNS = 5
 COLUMNS = (  # a line is a record and the counts of its picture
@@ -25,8 +25,8 @@ def make(runs: Runs) -> Result:
     return Result(
         chosen,
         "Errors of each strategy in the image.",
-        "Above, normals (right, up, towards the camera as red, green, blue); below, the angle to the reference's "
-        "normals.",
+        "Above, normals (right, up, towards the camera as red, green, blue); below, their angle to the normals of the "
+        "reference.",
         question="Which pixels does each strategy get wrong?",
         verdict=format.ends("Missed and spurious pixels", wrong, "one shape", show=table.whole),
         remarks=(*comparison.missing, *NOTES),

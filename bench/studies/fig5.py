@@ -20,17 +20,16 @@ COLUMNS = (
     *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.whole)),
     *(
         table.Column(key, heading, show=table.thousandfold)
-        for key, heading in (("end", "End"), ("low", "least"), ("high", "most"))
+        for key, heading in (("end", "End"), ("low", "Smallest"), ("high", "Largest"))
     ),
-    *(table.Column("seconds", "Loop", show=format.seconds), table.Column("spearman", "ρ")),
+    *(table.Column("seconds", "Runtime", show=format.seconds), table.Column("spearman", "ρ")),
 )
 HIGH_RHO = 0.7  # a larger correlation is called high
 NOTES = (
-    "Chamfer distance is chamfer_l2, in squared scene units, times 1000; it is measured during the optimisation, but "
-    "not used by it.",
-    "A line is the median over a row's runs; after its end a failed run counts as infinite.",
-    "ρ is Spearman's rank correlation of loss and Chamfer over the iterations of a run that have both, in the median "
-    "of a row's runs: points of one run are not independent, so it is no test.",
+    "Chamfer distance is chamfer_l2, in squared scene units, times 1000. The optimisation does not use it.",
+    "A curve is the median over the runs of a row. A failed run is infinite after its end.",
+    "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over the iterations. "
+    "Iterations of a run are not independent, so ρ is not a significance test.",
 )
 Medians = dict[str, pd.DataFrame]  # a row's median curve by quantity
 
@@ -55,7 +54,7 @@ def make(runs: Runs) -> Result:
         runs,
         "Loss and Chamfer distance as shapes are completed.",
         f"Loss and Chamfer distance over iterations{' and seconds' if runs.timed else ''}.",
-        question="Does the error fall with the loss?",
+        question="Does the error decrease when the loss decreases?",
         verdict=f"{_verdict(lines)} {_ends(lines)}".strip(),
         remarks=(*unread, _loss(runs), *NOTES),
         data=_data(runs, {folder: history for folder, (history, _) in histories.items()}, medians, lines),
@@ -81,7 +80,7 @@ def _ends(lines: list[dict[str, Any]]) -> str:
     return format.ends(
         "Median error at the end (Chamfer × 1000)",
         {line["row"]: line.get("end") for line in lines},
-        f"{format.plural(min(line['runs'] for line in lines), 'run')} a row",
+        f"{format.plural(min(line['runs'] for line in lines), 'run')} per row",
         show=table.thousandfold,
     )
 
@@ -100,12 +99,10 @@ def _end_errors(histories: list[pd.DataFrame], failed: list[bool]) -> dict[str, 
 def _loss(runs: Runs) -> str:
     """The terms of the loss, and whether those of different rows can be compared."""
     weight, width = (setting(runs.requested(), "task", f"normal_{name}") for name in ("weight", "width"))
-    normals = (
-        f"depths, normals over {width} scene units (weight {weight or 0:g}) and the silhouette, as the paper's Fig. 5"
-    )
-    terms = normals if weight else "depths and the silhouette; the paper's Fig. 5 has normals as well"
-    differing = "each row has the silhouette loss of its renderer, so that losses of different rows do not compare"
-    return f"The loss has {terms}; {'it is the same for every row' if shared_loss(runs.records) else differing}."
+    normals = f"depths, normals over {width} scene units (weight {weight or 0:g}) and silhouette, as in DIST, Fig. 5"
+    terms = normals if weight else "depths and the silhouette; DIST, Fig. 5, also has normals"
+    differing = "each row has the silhouette loss of its renderer, so losses of different rows cannot be compared"
+    return f"The loss has terms for {terms}; {'all rows share it' if shared_loss(runs.records) else differing}."
 
 
 def draw(medians: dict[Row, Medians], axes: list[str]) -> Figure:

@@ -10,14 +10,14 @@ from bench.report.study import Result, Runs, Selection, chart, format, records, 
 PLACE = 60
 READS = (Selection("fig6", ("task.degrees",), setup=("scenes", "pixels", "machine")),)
 CAPTION = (
-    "Share of runs that end within {success_degrees:g} degrees and {success_distance:g} scene units of the true pose, "
-    "over the initial error in rotation."
+    "Fraction of runs that end within {success_degrees:g} degrees and {success_distance:g} scene units of the true "
+    "pose, over the initial error in rotation."
 )
 NOTES = (
-    "The initial camera is also shifted by {shift:g}; all methods have the same views and starts.",
-    "An interval counts the views of one shape as one trial; a run that did not end ok is a failure.",
-    "Times include the trials of all starts; iterative closest points run every start to its end.",
-    "Times and evaluations are those of the loop, over runs that ended ok.",
+    "The initial camera is also shifted by {shift:g} scene units. All methods share the views and initial cameras.",
+    "An interval counts the views of one shape as one trial. A failed run has not found the pose.",
+    "Runtimes include the trials of all starts. Iterative closest points (ICP) run every start to its end.",
+    "Runtimes and field evaluations are medians over runs that ended ok.",
 )
 RUNS = (
     table.FAMILY,
@@ -38,14 +38,14 @@ def make(runs: Runs) -> Result:
     columns = [
         table.text("method", "Method"),
         *(table.Column(str(angle), f"{angle:g}°", show=_share) for angle in angles),
-        table.Column("seconds", "Loop", show=format.seconds),
-        table.Column("evaluations", "Evaluations", show=format.count),
+        table.Column("seconds", "Runtime", show=format.seconds),
+        table.Column("evaluations", "Field evaluations", show=format.count),
     ]
     return Result(
         runs,
         "Camera pose from a depth image and a silhouette of a known shape.",
         CAPTION.format(**settings),
-        question="From how far off is the camera of a known shape found?",
+        question="How wrong can the initial camera be, if the shape is known?",
         verdict=_verdict(poses),
         interval="95 % intervals over shapes (Clopper and Pearson)",
         estimates=[_rate(row_poses) for _, row_poses in poses.groupby(["row", "preset", "degrees"])],

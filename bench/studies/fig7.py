@@ -9,8 +9,8 @@ from bench.report.study import Result, Runs, Selection, gallery, records, table
 PLACE = 230
 READS = (Selection("fig7", alike=("dataset", "view", "prior", "task")),)
 NOTES = (
-    "Missed and spurious pixels, the paper's erosion and dilation, are shares of the number of the reference's hits.",
-    "The depth error is over pixels that both hit; epsilon is in scene units.",
+    "Missed and spurious pixels are the paper's erosion and dilation, as percentages of the hits of the reference.",
+    "The depth error is over the pixels that are hits in both images. Epsilon is in scene units.",
 )
 MAX_COLUMNS = 7
 COUNTED = ("size", "hits", "lost", "false")  # from the record, or if missing from its picture
@@ -25,9 +25,9 @@ def make(runs: Runs) -> Result:
     return Result(
         chosen,
         "Missed and spurious pixels by the convergence threshold.",
-        "Pictures from the largest epsilon to the smallest, normals (right, up, towards the camera as red, green, "
-        "blue) above the angle to the reference's.",
-        question="Which threshold of convergence shows the true outline?",
+        "Pictures from the largest to the smallest epsilon: normals (right, up, towards the camera as red, green, "
+        "blue), and below their angle to the normals of the reference.",
+        question="Which convergence threshold gives the fewest wrong pixels?",
         verdict=_verdict(
             [counts | {"epsilon": _epsilon(record)} for record, counts in lines if record["status"] == "ok"]
         ),

@@ -44,15 +44,15 @@ def make(runs: Runs) -> Result:
     scenes = {_name(record): gallery.Scene(runs, [record], _arrays(record)) for record in runs.records}
     return Result(
         runs,
-        "Shapes with colours as codes, rendered in sizes, from sides and under lights.",
-        "Renderings of the mesh, and of codes of shape and colour; a test shape has no code of training.",
-        question="What does a code of shape and colour show?",
-        verdict=f"Error of colour {texts}; a code has {code:.0f} bytes, the network that all codes of a family share "
-        f"{network / 1000:.0f} kB, mesh and texture as they come {sum(mesh_and_texture) / 1000:.0f} kB (medians, "
+        "Shapes and colours of latent codes, rendered at several sizes, from several sides and lights.",
+        "Renderings of the mesh and of its latent codes of shape and colour; a test shape has no code of training.",
+        question="How accurate are the colours of a latent code, and how large is the code?",
+        verdict=f"Error of colour {texts}; a code has {code:.0f} bytes, the network of all codes of a family "
+        f"{network / 1000:.0f} kB, the original mesh and texture {sum(mesh_and_texture) / 1000:.0f} kB (medians, "
         f"n = {format.plural(len(runs.records), 'shape')}).",
         remarks=(
-            "Meshes are as finely cut as they come: one with the error of its code has far fewer triangles.",
-            "A code of the image is found from the one that is given, its colours and mask, without depth.",
+            "Meshes have their original triangles: a mesh with the error of its code has far fewer.",
+            "A “code of the image” is optimised from the colours and the mask of the given image, without depth.",
             f"Lights: colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
             *records.definitions(runs.records, DEFINED),
             *gallery.missing(scenes.values()),

@@ -18,28 +18,28 @@ IMAGE_METRICS = ("image_cosine", "image_scale")
 NUMBERS = (*COUNTS, *(f"{to}_{error}" for to in ("code", "camera", "texture") for error in ERRORS), *IMAGE_METRICS)
 VISIBILITY_HEADINGS = {  # headings of the metrics of the image at the outline
     **dict(zip(IMAGE_METRICS, ("Cosine", "Scale"), strict=True)),
-    **{"image_error": "Error", "image_spread": "Noise of a ray", "values_per_ray": "Values per ray"},
+    **{"image_error": "Error", "image_spread": "Noise of a ray", "values_per_ray": "Evaluations per ray"},
 }
 NOTES = (
-    "A pooled number compares the gradients of all pixels of a band as one long vector: a factor that differs between "
-    "pixels lowers the pooled cosine, and not a pixel's own.",
-    "An error is the length of the difference over that of the true gradient; hits are frontal, oblique or grazing by "
-    "the angle of ray and normal, and the silhouette is one image.",
-    "Excluded are pixels where visibility changes, the root is not found again, or the renderer hits nothing or "
-    "another surface.",
-    "Colour is the gradient of a smooth paint of point and normal towards shape (code), camera and paint (texture).",
+    "A pooled number compares the gradients of all pixels of a band as one long vector. A factor that differs between "
+    "pixels lowers the pooled cosine, but not the cosine of a single pixel.",
+    "An error is the length of the difference divided by the length of the true gradient. Hits are frontal, oblique or "
+    "grazing, by the angle between ray and normal. The silhouette is one image.",
+    "Excluded: pixels where visibility changes, the root is not found again, or the renderer misses or hits another "
+    "surface.",
+    "Colour: the gradient of a smooth colour of point and normal, for shape (code), camera and colours (texture).",
 )
 VISIBLE_NOTES = (
-    "A pixel at the outline is the mean over many rays of the distance that each sees, with the far side of the unit "
-    "sphere behind, and the truth are central differences of that image, in which visibility changes.",
-    "Error is the length of the difference over that of the true gradient, so that zeros have 1; noise is the error of "
-    "one ray per pixel, and falls with the square root of their number.",
-    "Blur is the length over which a renderer spreads the gradient of visibility (NeuS 1/s, VolSDF beta, the width of "
-    "UNISURF's occupancy, the band of the relaxed boundary); a pixel at the outline is about 0.01 scene units wide.",
-    "A blur of a pixel or more moves the gradient to the pixels beside, which lowers a pixel's cosine and scale, and "
-    "not the sum over the image.",
-    "Of a disc, at the defaults, the truth has an error of 0.07 of its length and a cosine of 0.997, since few of a "
-    "pixel's rays change sides.",
+    "A pixel at the outline is the mean distance of many rays; a miss has the distance of the far side of the unit "
+    "sphere. The true gradient is a central difference of this image, so changes of visibility are included.",
+    "Error: the length of the difference divided by the length of the true gradient, so zeros have an error of 1. "
+    "Noise: the error with one ray per pixel; it falls with the square root of the number of rays.",
+    "Blur: the length over which a renderer spreads the visibility gradient (NeuS: 1/s, VolSDF: beta, UNISURF: width "
+    "of the occupancy, relaxed boundary: the band). A pixel at the outline is about 0.01 scene units wide.",
+    "A blur of a pixel or more moves the gradient to neighbouring pixels. This lowers the cosine and the scale of a "
+    "pixel, but not the sum over the image.",
+    "For a disc, with default settings, the central difference has an error of 0.07 and a cosine of 0.997, because few "
+    "rays of a pixel change sides.",
 )
 
 
@@ -50,12 +50,12 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Errors of the gradients.",
-        "Cosine and scale of a renderer's gradient against the true one, pooled over the pixels of a band and per "
-        "pixel (1 where it is exact), and the relative error; in the figure the median error and, at the silhouette, "
-        "cosine and scale.",
-        question="Are the gradients true?",
+        "Cosine and scale of a renderer's gradient relative to the true gradient (1 if exact), pooled over a band of "
+        "pixels and per pixel, and the relative error; the figure has the median error and, for the silhouette, cosine "
+        "and scale.",
+        question="How accurate are the gradients?",
         verdict=_verdict(data),
-        remarks=(*NOTES, f"{unseen} errors of exactly zero lie below the figure's logarithmic axes." if unseen else ""),
+        remarks=(*NOTES, f"The figure's logarithmic axes leave out {unseen} errors of exactly zero." if unseen else ""),
         columns=COLUMNS,
         lines=data.to_dict("records"),
         data=data.drop(columns=["name", "preset"]),
@@ -68,10 +68,10 @@ def make_visibility(runs: Runs) -> Result:
     data = _blur_lines(runs)
     return Result(
         runs,
-        "Gradients of what comes into view.",
-        "At the outline, the gradient of the image of distances towards the code against the true one: cosine and "
-        "scale are 1 and the error is 0 where it is exact.",
-        question="Does what comes into view have a gradient?",
+        "Visibility gradients.",
+        "At the outline, the gradient of the image of distances for the code, relative to the true gradient (if exact, "
+        "cosine and scale are 1 and the error is 0).",
+        question="Do the gradients include surface that enters or leaves the view?",
         verdict=_visibility_verdict(data),
         remarks=VISIBLE_NOTES,
         columns=VISIBILITY_COLUMNS,
@@ -104,7 +104,7 @@ def _verdict(data: pd.DataFrame) -> str:
     hits = data[data["band"].isin(ANGLES)]
     cosines = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False)
     least = cosines.min(min_count=len(ANGLES))  # NaN if a band is missing
-    title = f"Least pooled cosine in any band of hits, {(least >= 0.99).sum()} of {len(least)} of 0.99 or more"
+    title = f"{(least >= 0.99).sum()} of {len(least)} reach a pooled cosine of 0.99 in all bands of hits. Smallest"
     return format.ends(title, least.to_dict(), "one shape", show=_cosine, most=True)
 
 
@@ -121,7 +121,7 @@ def _visibility_verdict(data: pd.DataFrame) -> str:
         )
     if len(sharp):
         most = sharp[[*IMAGE_METRICS]].max()
-        parts.append(f"renderers that differentiate hits alone have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
+        parts.append(f"renderers that differentiate only hits have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
     return f"{'; '.join(parts)} (n = one shape)." if parts else ""
 
 

@@ -11,17 +11,17 @@ PLACE = 160
 READS = (Selection("parsimony", setup=("scenes", "pixels", "machine"), alike=("models", "task")),)
 COSTS = ("seconds", "flops", "evaluations")
 NOTES = (
-    "All candidates are fitted to depth and silhouettes of the same views with the same rays, in rounds, until one "
-    "lowers the held-out error by no more than its noise; costs are of all rounds. It is the mean distance along the "
+    "All candidates are fitted to depth and silhouettes of the same views with the same rays. Rounds end when the "
+    "error decreases by no more than its noise; costs are of all rounds. The error is the mean distance along the "
     "normal over held-out rays, most of them of other views.",
-    "Recommended is the smallest candidate by {size} whose error is within one standard error (s.e.) of the best "
-    "candidate's, or under half a pixel at the nearest distance: those are filled in the figure.",
-    "Seeds held: the share of draws of further views on which the recommended candidate is within one standard error "
-    "of the draw's best, or under half a pixel.",
-    "Saved: the papers' network (8 layers of 512, without a code) over the recommended candidate. Overhead: the "
-    "seconds of all candidates that field=auto tried over those of its final fit.",
+    "Recommended: the smallest candidate by {size} whose error is within one standard error (s.e.) of the best "
+    "candidate's error, or under half a pixel at the nearest distance. The figure shows such candidates filled.",
+    "Seeds held: the percentage of draws of further views for which the recommended candidate is within one standard "
+    "error of the best candidate, or under half a pixel.",
+    "Saved: the papers' network (8 layers of 512, without a code) relative to the recommended candidate. Overhead: the "
+    "seconds of all candidates that field=auto tried, relative to its final fit.",
     "Pixel precision: the recommended candidate fitted again with renderer.epsilon=auto, renderer.steps=auto and rays "
-    "that follow the loss, over its plain fit.",
+    "that follow the loss, relative to its plain fit.",
 )
 Line = dict[str, Any]  # a run
 
@@ -32,8 +32,8 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         f"The smallest sufficient field for each scene, by {AXES[size]}.",
-        f"{AXES[size].capitalize()} of each candidate, by which the choice is made; filled is one that suffices.",
-        question="How little model does a shape need?",
+        f"{AXES[size].capitalize()} of each candidate, by which one is recommended; filled candidates suffice.",
+        question="How small can the model of a shape be?",
         verdict=_verdict([line for line in lines if line["ok"]]),
         interval="± is one standard error, by the jackknife over views",
         remarks=[*(note.format(size=AXES[size]) for note in NOTES), _falling(lines)],
@@ -82,7 +82,7 @@ def _falling(lines: list[Line]) -> str:
     """A sentence on the fits that still improved at their end, with their scenes."""
     fits = [(candidate, line["scene"]) for line in lines for candidate in line["candidates"].results]
     names = [f"{candidate.label} ({scene})" for candidate, scene in fits if candidate.numbers.get("falling")]
-    return f"Not at their end, as the last round still lowered their error: {', '.join(names)}." if names else ""
+    return f"Not converged (the last round still reduced the error): {', '.join(names)}." if names else ""
 
 
 def _verdict(lines: list[Line]) -> str:
@@ -92,8 +92,8 @@ def _verdict(lines: list[Line]) -> str:
     most = max(lines, key=lambda line: line["chosen.stored"])
     single = sum(line["candidates"].chosen.kind == "" for line in lines)
     return (
-        f"A single part suffices for *{single} of {len(lines)}* scenes; the most is {most['chosen.name']} "
-        f"of {most['chosen.stored']:,.0f} stored numbers, for {most['scene']}."
+        f"A single part suffices for *{single} of {len(lines)}* scenes. The largest field needed is "
+        f"{most['chosen.name']} with {most['chosen.stored']:,.0f} stored numbers, for {most['scene']}."
     )
 
 

@@ -33,8 +33,8 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Shape and colour from real photographs.",
-        "Held-out photographs: how well the shape and its colours match them, medians over folders; in the figure a "
-        "point per folder, and the median.",
+        "Agreement of shape and colours with held-out photographs, medians over folders; the figure has a point per "
+        "folder and the median.",
         question="Which method is best on real photographs?",
         verdict=format.ends("PSNR of held-out photographs (dB)", medians.whole(lines, "psnr"), folders, most=True),
         remarks=records.definitions(runs.records, DEFINED),

@@ -15,8 +15,8 @@ DEFINED = {
     "slope_p99": "|gradient|, 99 %",
 }
 NOTES = (
-    "A code of each prior is fitted to the signed distances of an unseen shape (DeepSDF, Eq. 10); the floor is the "
-    "Chamfer distance between two samplings of the true surface, and a run that did not end ok counts as infinite.",
+    "A latent code of each prior is fitted to the signed distances of an unseen shape (DeepSDF, Eq. 10). The floor is "
+    "the Chamfer distance between two samples of the true surface. A failed run counts as infinite.",
 )
 
 
@@ -50,10 +50,10 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "The best fit of each prior to unseen shapes.",
-        "Chamfer distance times 1000 (squared scene units) of each prior's best fit, and its floor; medians over "
-        "shapes. Pictures: normals of the truth and of the fit.",
-        question="How well can a prior show an unseen shape?",
-        verdict=f"The best fit has *{median}* times the least error that can be measured (median), at most {largest} "
+        "Chamfer distance times 1000 (squared scene units) of each prior's best fit, and its smallest measurable value "
+        "(floor), medians over shapes. Pictures: normals of ground truth and fit.",
+        question="How well can a prior represent an unseen shape?",
+        verdict=f"The best fit has *{median}* times the smallest measurable error (median), at most {largest} "
         f"times; n = {format.plural(len(values), 'shape')}.",
         remarks=(*NOTES, *records.definitions(runs.records, DEFINED)),
         columns=COLUMNS,

@@ -24,11 +24,11 @@ RUNS = (
     *(*table.metrics(*METRICS), *table.LOOP),
 )
 NOTES = (
-    "Scans of one object depend on each other, so there is no interval: a ratio is the median over scans of the "
-    "error with measured depths to that with exact ones, 1 where both failed.",
-    "The depth error is that of the given view; Chamfer is that of the whole shape.",
-    "Exact depths are those of the mesh at the pixels that the scanner measured; the mask is that of the mesh in both.",
-    "A run that did not end ok counts as infinite; one that was refused does not count.",
+    "Scans of one object depend on each other, so there is no interval. A ratio is the median over scans of the error "
+    "with measured depths divided by the error with exact depths; it is 1 if both failed.",
+    "The depth error is for the observed view, and Chamfer for the whole shape.",
+    "Exact depths are depths of the mesh at the pixels that the scanner measured. Both use the mask of the mesh.",
+    "A failed run counts as infinite. A refused run is left out.",
 )
 Line = dict[str, Any]
 
@@ -42,11 +42,11 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Shape from depths that a scanner measured.",
-        "Median errors over scans (times 1000; depths in scene units, distances between surfaces in their squares) "
-        "with exact and with measured depths, and the ratio of both.",
-        question="Do depths that a scanner measured complete a shape as exact ones do?",
+        "Median errors over scans with exact and with measured depths, and their ratio (times 1000; depths in scene "
+        "units, distances between surfaces in squared scene units).",
+        question="Does shape completion work as well with depths from a scanner as with exact depths?",
         verdict=format.ends(
-            "Error of the shape (Chamfer) with measured depths over that with exact ones",
+            "Chamfer distance with measured depths, relative to exact depths",
             {line["row"]: line.get(f"chamfer_l2_{RATIO}") for line in lines},
             f"{format.plural(scans, 'scan')} of {format.plural(len(runs.families()), 'object')}, without an interval",
         ),

@@ -11,17 +11,17 @@ from bench.report.study import Result, Runs, Selection, chart, curves, format, s
 PLACE = 90
 READS = (Selection("speed_completion"),)
 TARGET_ERROR = 1e-3  # Chamfer distance in squared scene units
-COST_AXES = {"seconds": "time (seconds)", "value_evaluations": "field values"}
+COST_AXES = {"seconds": "time (seconds)", "value_evaluations": "field evaluations"}
 ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
-    "The figure has a line per run of each renderer's first setting, as far as the run came.",
-    f"The table has all settings, how many of their runs reached {SCALE * TARGET_ERROR:g} × 10⁻³, and the median time "
-    "to it over all runs, infinite for a run that did not end ok or never was at it.",
+    "The figure has a curve per run of the first setting of each renderer, up to the end of the run.",
+    f"The table has all settings, the number of runs that reached {SCALE * TARGET_ERROR:g} × 10⁻³, and the median time "
+    "to this error. A run that failed or never reached it counts as infinite.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (
     *(table.text("setting", "Setting"), table.text("runs", "Runs"), table.text("reached", "Reached")),
-    *(table.Column("time", "Median time to it", show=format.seconds), table.Column("rank", "ρ of loss and error")),
+    *(table.Column("time", "Median time to error", show=format.seconds), table.Column("rank", "ρ of loss and error")),
 )
 Line = dict[str, Any]  # a setting of a renderer, with its records and histories
 
@@ -38,16 +38,16 @@ def make(runs: Runs) -> Result:
     panels = [_panel(lines, axis) for axis in COST_AXES if axis != "seconds" or runs.timed]
     return Result(
         runs,
-        "Error over time and over field values.",
-        f"Chamfer distance over {'seconds and over ' if runs.timed else ''}field values.",
-        question="How fast does the error fall?",
+        "Error over time and over field evaluations.",
+        f"Chamfer distance over {'seconds and over ' if runs.timed else ''}field evaluations.",
+        question="How fast does the error decrease?",
         verdict=_verdict(lines),
         remarks=NOTES,
         data=pd.concat(data)[[*(column.key for column in identity_columns), *curves.HISTORY]],
         columns=COLUMNS,
         lines=lines,
         figure=chart.draw(panels, 2.9, legend=5, sharey=True),
-        chart={"panels": panels, "note": "A line is a run, which a click opens."},
+        chart={"panels": panels, "note": "A curve is a run. Click on it to open the run."},
     )
 
 
@@ -72,7 +72,7 @@ def _verdict(lines: list[Line]) -> str:
     reached = {line["setting"]: line["time"] for line in lines if math.isfinite(line["time"])}
     title = f"Median time to an error of {SCALE * TARGET_ERROR:g} (Chamfer × 1000)"
     n = min(line["runs"] for line in lines)
-    runs = f"{n} runs each, and {len(reached)} of {len(lines)} settings reach it in most"
+    runs = f"{n} runs per setting; {len(reached)} of {len(lines)} settings reach it in most runs"
     return format.ends(title, reached, runs, show=format.seconds)
 
 

@@ -17,15 +17,15 @@ READS = (Selection("speed_completion"), Selection("speed_rendering", alike=("vie
 QUANTITIES = ("seconds", "error", "evaluations")
 MIN_PLOTTED_ERROR = 1e-9  # smaller errors are raised to this, so that their logarithms are bounded
 NOTES = (
-    "Left: final error of a completion over the seconds of its loop; right: depth error of one rendering (95th "
-    "percentile over pixels, missed and spurious ones infinite) over its seconds.",
-    "A run that did not end ok is infinite in both, and so is one that others have and a setting lacks; a setting with "
-    "an infinite median is in the table alone.",
-    "Filled points are on the front, numbered from the fastest; hollow ones are dominated.",
-    "In brackets is the probability of being on the front, over 2,000 bootstrap draws of {shapes and seeds}; settings "
+    "Left: the final error of a completion over its runtime. Right: the depth error of one rendering (95th percentile "
+    "over pixels; missed and spurious pixels are infinite) over its time.",
+    "Error and time are infinite for a failed run, and for a run that a setting lacks and others have. A setting with "
+    "an infinite median is only in the table.",
+    "Filled points are on the front, numbered from the fastest. Hollow points are dominated.",
+    "In brackets: the probability of being on the front, over 2,000 bootstrap draws of {shapes and seeds}. Settings "
     "that compute the same share their times.",
 )
-POINT = "Filled points are on the front, hollow ones are dominated. A point opens the runs of its setting."
+POINT = "Filled points are on the front, and hollow points are dominated. Click on a point for the runs of its setting."
 RUNS_PAGE = "#/runs?task=all&view=runs&"  # the page's list of runs
 Line = dict[str, Any]  # a setting
 
@@ -58,8 +58,8 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
     return Result(
         together(completion, rendering),
         "Error over time.",
-        "Median error of each setting over its median time, over {shapes and seeds}.",
-        question="What does accuracy cost in time?",
+        "Median error of each setting over its median time; medians over {shapes and seeds}.",
+        question="How much time does accuracy cost?",
         verdict=_verdict(panels),
         interval="in the CSV, 95 % bootstrap intervals of interquartile means over {shapes and seeds}",
         estimates=[line["middle"] for line in lines],
@@ -138,7 +138,7 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
                 for p in (front[0], *front[1:][-1:])
             ]
             return (
-                f"On the front of {trial.title}: {len(front)} of {len(panel)} settings, {' to '.join(ends)}; n = "
+                f"{len(front)} of {len(panel)} settings are on the front of {trial.title}: {' to '.join(ends)}; n = "
                 f"{format.plural(panel[0]['shapes'], 'shape')}."
             )
     return ""
@@ -194,7 +194,7 @@ def _failed(line: Line) -> str:
 COLUMNS = (
     *(table.text("trial", "Trial"), table.text("setting", "Setting"), table.text("renderer")),
     table.Column("seconds", "Time", show=format.seconds),
-    table.Column("evaluations", "Evaluations", show=format.count),
+    table.Column("evaluations", "Field evaluations", show=format.count),
     *(table.Column("error", "Error × 1000"), table.Column("error_iqm", value=lambda line: line["middle"].value)),
     *table.ends("error", lambda line: line["middle"]),
     *map(table.Column, ("failed", "runs", "missing")),

@@ -14,31 +14,31 @@ PLACE = 120
 READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
 FAILED = "failed_"  # prefix of the metrics that count failed trials by kind
 ENDS = ("mild", "severe")
-COST_AXES = ("field values per ray at the mild end, median over axes", "mean rank over axes (1 is best)")
+COST_AXES = ("field evaluations per ray at the mildest severity, median", "mean rank over axes (1 is best)")
 NOTES = (
-    "The adaptive search makes {share:.0f} % of a full grid's trials, and every renderer gets the same trials at a "
-    "severity; renderings have {resolution}×{resolution} pixels.",
-    "“At once”: breaks at the mildest severity; “none”: does not break at the severest; both with the failed trials "
-    "there and the interval of their share (Clopper and Pearson); – is a renderer without that setting.",
-    "“Rises”: more trials succeed at the severest than at the mildest severity, so that none is a breakdown; “one "
-    "trial”: repeats could not differ, and the breakdown lies between two neighbouring severities.",
-    "Where a disturbance moves the surface, renderers are judged by the moved surface; the CSV has how far, and the "
+    "The adaptive search makes {share:.0f} % of the trials of a full grid. Every renderer gets the same trials at a "
+    "severity. Renderings have {resolution}×{resolution} pixels.",
+    "“At once”: breaks at the mildest severity. “None”: does not break at the severest. Both have the failed trials "
+    "and the interval of their fraction (Clopper and Pearson). “–”: the renderer lacks that setting.",
+    "“Rises”: more trials succeed at the severest than at the mildest severity, so there is no breakdown. “One trial”: "
+    "repeats cannot differ, and the breakdown is between two neighbouring severities.",
+    "If a disturbance moves the surface, the moved surface is the ground truth. The CSV has the distance, and the "
     "kinds of failed trials.",
-    "Success: {hits:g} of the true hits within the pixel's footprint and false hits of at most {false_hits:g} of them; "
-    "a gradient whose cosine is at least {cosine:g} and whose relative length is within {scale:g} of 1; a fit within "
-    "{surface_error:g} scene units of the surface.",
+    "Success: {hits:g} of the true hits lie within the footprint of a pixel, and spurious hits are at most "
+    "{false_hits:g} of them. A gradient has a cosine of at least {cosine:g} and a relative length within {scale:g} of "
+    "1. A fit is within {surface_error:g} scene units of the surface.",
 )
 COST_NOTES = (
-    "Axes are those that evaluate renderings and that every renderer supports; rank 1 is the best, and equal "
-    "breakdowns share their mean rank.",
-    "A run that did not end ok, or is missing, has the worst rank; 95 % bootstrap intervals over axes.",
-    "A renderer has one row, that of its own preset or else its first one; “stability” has its variants.",
-    "At once: axes on which it breaks at the mildest severity; none: on which it does not break at the severest.",
+    "An axis is a kind of stress. The axes are those of renderings that every renderer supports. Rank 1 is the best, "
+    "and equal breakdowns share their mean rank. A failed or missing run has the worst rank.",
+    "Intervals are 95 % bootstrap intervals over axes. Two renderers cannot be distinguished if the interval of the "
+    "difference of their ranks contains 0. Each renderer has one preset; the page “stability” has all presets.",
+    "At once: axes on which it breaks at the mildest severity. None: axes on which it does not break at the severest.",
 )
 CURVE_NOTES = (
-    "The CSV has the number of trials and successes at each severity, and the interval of their share (Clopper and "
-    "Pearson), where repeats could differ.",
-    "A cell of the page's atlas opens the curves of its axis.",
+    "The CSV has the trials and successes at each severity. If repeats can differ, it also has the interval of the "
+    "success rate (Clopper and Pearson).",
+    "On the interactive page, a cell of the atlas opens the curves of its axis.",
 )
 TARGET = ("renderer", "_target_")
 CRITERIA = ("hits", "false_hits", "cosine", "scale", "surface_error")
@@ -51,7 +51,7 @@ COST_COLUMNS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
     table.text("at_once", "At once"),
     table.text("never", "None"),
-    table.Column("cost", "Field values per ray"),
+    table.Column("cost", "Field evaluations per ray"),
     table.text("preset"),
 )
 
@@ -71,10 +71,10 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "The severity at which each renderer breaks.",
-        "The severity at which half of the trials succeed.",
-        question="Where does each renderer break?",
+        "The severity at which half of the trials succeed, on each axis (kind of stress).",
+        question="At which severity of stress does each renderer break?",
         verdict=format.ends(
-            "Axes on which a renderer does not break",
+            "Axes (kinds of stress) on which a renderer does not break",
             cells.groupby("row", sort=False)["never"].sum().to_dict(),
             f"{trials:.0f} trials on {len(axes)} axes",
             show=table.whole,
@@ -110,15 +110,15 @@ def make_cost(runs: Runs) -> Result:
         chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
         for line in lines[lines["cost"].notna() & means.notna()].itertuples()
     ]
-    costs = [f"{line.row}, {format.number(line.cost)} field values per ray" for line in lines.itertuples()]
-    ends = format.ends("Mean rank", dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
+    costs = [f"{line.row}, {format.number(line.cost)} field evaluations per ray" for line in lines.itertuples()]
+    ends = format.ends("Mean rank, 1 is best", dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
     panel = chart.panel_data("", *COST_AXES, points, height=420)
     panel["y"] = {"title": COST_AXES[1], "log": False, "reversed": True}
     return Result(
         runs,
         "Robustness over cost.",
-        "Mean rank of the breakdowns over the median, over axes, of the field values per ray at the mild end.",
-        question="Is a robust renderer an expensive one?",
+        "Mean rank of a renderer's breakdowns, over its median of field evaluations per ray at the mildest severity.",
+        question="Do robust renderers cost more field evaluations?",
         verdict=f"{ends} {_alike(ranks)}".strip(),
         n=f"{len(shades)} axes and {len(lines)} renderers",
         remarks=COST_NOTES,
@@ -148,7 +148,7 @@ def make_curves(runs: Runs) -> Result:
     return Result(
         runs,
         "Probability of success over severity.",
-        "In the CSV and on the page, the share of successful trials at each severity.",
+        "The fraction of successful trials at each severity, in the CSV and on the interactive page.",
         n=f"{cells['axis'].nunique()} axes and {cells['row'].nunique()} renderers",
         interval="95 % intervals (Clopper and Pearson)",
         remarks=CURVE_NOTES,
@@ -305,9 +305,9 @@ def _alike(ranks: dict[str, statistics.Interval]) -> str:
         return ""
     similar = statistics.as_good(ranks, best)
     if not similar:
-        return f"All others differ from {best} by the interval of the difference of ranks."
+        return f"All others can be distinguished from {best}."
     listed = f"*{len(similar)}* of the {len(ranks) - 1} others ({'; '.join(similar)})"
-    return f"By the interval of the difference of ranks, {listed} cannot be distinguished from {best}."
+    return f"{listed} cannot be distinguished from {best}."
 
 
 def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:

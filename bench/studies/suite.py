@@ -22,23 +22,23 @@ HEADINGS = {
     AT_10: "At 10 ×",
     END: "At the end",
     AREA: "Mean, 0.3 × to 30 ×",
-    AT_SECONDS: "In DIST's time",
+    AT_SECONDS: "In DIST's runtime",
 }
-COST = "field evaluations, DIST's run = 1"
+COST = "field evaluations, DIST run = 1"
 PROGRESS = (
-    "Progress: 1 - log(error / best possible) / log(initial error / best possible), cut at 0 and 100 %. Each set "
-    "weighs the same. A failed run has made none.",
-    "Costs are field evaluations over those of DIST's whole run at the same problem; a gradient counts as two. "
-    "Progress at a cost is interpolated between the checkpoints of a run that may be longer, or is that of its end. A "
-    "run ends after its set's iterations, or at its set's cap of costs.",
-    "The best possible error is that of the prior's fit to the truth (complete, multiview), 0.1 degrees (pose), or the "
-    "best result of the shipped renderers themselves (reconstruct).",
-    f"Significant: signs of scenes' differences are flipped, with Holm's correction over all pairs at {ALPHA:g}. "
-    "There, 3 to 5 % of simulated draws of equal renderers have a false pair at these costs, and 12 % at the end.",
+    "Progress is 1 - log(error / best possible error) / log(initial error / best possible error), limited to 0 to "
+    "100 %. All problem sets have the same weight. A failed run has a progress of 0 %.",
+    "Cost: field evaluations relative to the whole DIST run of the same problem; a gradient counts as two. Progress at "
+    "a cost is interpolated between the checkpoints of a run that may be longer; a shorter run has its final progress. "
+    "Runs end after the iterations, or at the cost limit, of their problem set.",
+    "The best possible error is the error of the prior's fit to the ground truth (complete, multiview), 0.1 degrees "
+    "(pose), or the best result of the shipped renderers (reconstruct).",
+    f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs at {ALPHA:g}. In simulated "
+    "draws of equal renderers, 3 to 5 % have a false significant pair at these costs, and 12 % at the end.",
 )
 WRONG_PIXELS = (
-    "Wrong pixels are missed, spurious, or more than 0.02 scene units off in depth, over the object's pixels, of the "
-    "prior's networks. They are no part of progress. All runs are on a CPU, with small networks and images."
+    "Wrong pixels are missed, spurious, or more than 0.02 scene units off in depth, relative to the object's pixels, "
+    "on the prior's networks. Progress does not include them. All runs are on a CPU, with small networks and images."
 )
 
 
@@ -55,12 +55,12 @@ def make(*several: Runs | None) -> Result:
     return Result(
         replace(runs, records=[], left_out=0),  # kept attempts count even if their run folders are gone
         "The suite.",
-        "Progress of each renderer from the initial to the best possible error over its cost, with the ranks that it "
-        "can have (in brackets). A cross: all runs failed.",
+        "Progress of each renderer from the initial to the best possible error, over its cost; in brackets, its "
+        "possible ranks. A cross: all runs failed.",
         question="Which renderer makes the most progress, and at what cost?",
         verdict=verdict(made),
         n=_sample(made),
-        interval="ranks simultaneous at 95 % (flipped signs of scenes' differences, Holm's correction over all pairs)",
+        interval="simultaneous 95 % ranks (sign-flip test over scenes, Holm's correction over all pairs)",
         remarks=[*PROGRESS, WRONG_PIXELS, *_notes(made), *(f"Not read: {problem}" for problem in gathered.problems)],
         columns=[
             table.text("row", "Renderer"),
@@ -96,27 +96,27 @@ def make_sets(*several: Runs | None) -> Result:
     return Result(
         replace(runs, records=[], left_out=0),
         "The suite, set by set.",
-        "Progress of each renderer in each set, and what a whole run costs over DIST's at the same problem.",
-        question="What does a run of each renderer cost, and what progress does the time of one run of DIST give?",
+        "Progress of each renderer in each problem set, and costs of a whole run relative to DIST on the same problem.",
+        question="What does a run of each renderer cost, and how much progress fits in the runtime of one DIST run?",
         verdict=sets
-        and f"{leaders(ranked, f'In {sets}, in the time of one run of DIST')} "
-        + format.ends("Seconds of a run over DIST's", seconds, scenes),
+        and f"{leaders(ranked, f'In {sets}, in the runtime of one DIST run')} "
+        + format.ends("Runtime of a run relative to DIST", seconds, scenes),
         n=_sample(made),
-        interval="medians over scenes with intervals of the sign test, 95 %",
+        interval="medians over scenes with 95 % intervals (of the sign test)",
         estimates=[*lines["evaluations"].dropna()],
         remarks=[
             *PROGRESS,
-            f"All renderers were timed on a machine that was not loaded only in {sets or 'no set'}; field evaluations "
-            f"and seconds there are of the same runs. Their engine: {', '.join(pairs['kernels'].unique()) or 'none'}.",
-            f"In the time of one run of DIST {len(ranked.better)} of {ranked.pairs} pairs differ significantly.",
-            "Tuned: with the setting of conf/tuned.yaml, chosen on validation shapes, and its silhouette loss, which "
-            "may be another one. The two effects are not separated.",
+            f"Only in {sets or 'no set'}, all renderers were timed on a machine without other load. Field evaluations "
+            f"and runtimes there are from the same runs. Engine: {', '.join(pairs['kernels'].unique()) or 'none'}.",
+            f"In the runtime of one DIST run, {len(ranked.better)} of {ranked.pairs} pairs differ significantly.",
+            "Tuned: the settings of conf/tuned.yaml, chosen on validation shapes. They may have another silhouette "
+            "loss. The effects of settings and loss are not separated.",
         ],
         columns=[
             *(table.text("set", "Set"), table.text("row", "Renderer")),
             *(table.Column(name, HEADINGS[name], show=percent) for name in (*BUDGETS, AT_SECONDS)),
             *table.estimate("evaluations", "Field evaluations of a run, DIST = 1", ends="evaluations_"),
-            *table.estimate("seconds", "Seconds of a run, DIST = 1", ends="seconds_"),
+            *table.estimate("seconds", "Runtime of a run, DIST = 1", ends="seconds_"),
             *(table.Column("scenes", "Scenes", show=table.whole), table.PRESET),
         ],
         lines=lines.to_dict("records"),
@@ -183,21 +183,22 @@ def verdict(made: Standing) -> str:
     return " ".join([leaders(made.rankings[AT_1]), at_end(made), failures(made)])
 
 
-def leaders(ranked: Ranking, when: str = "At the cost of one run of DIST") -> str:
+def leaders(ranked: Ranking, when: str = "At the cost of one DIST run") -> str:
     """The rows that no row significantly beats, if they beat all others; else the first row."""
     if not ranked.decidable:
-        return f"{when}: {format.plural(ranked.scenes, 'scene')} cannot decide."
+        return f"{when}, no decision is possible with {format.plural(ranked.scenes, 'scene')}."
     beaten = {second for _, second in ranked.better}
     first = [row for row in ranked.progress if row not in beaten]
-    names = [f"{row} (*{percent(ranked.progress[row])}*)" for row in first]
+    rows = [f"{row} (*{percent(ranked.progress[row])}*)" for row in first]
     if beaten and all((row, other) in ranked.better for row in first for other in beaten):
         more = f"significantly more progress than the {format.plural(len(beaten), 'other')}"
         if len(first) == 1:
-            return f"{when}, {names[0]} makes {more}."
-        return f"{when}, {', '.join(names[:-1])} and {names[-1]} make {more}. These cannot be distinguished."
-    behind = "; ".join(row for row in ranked.progress if (first[0], row) in ranked.better)
-    than = f"significantly more than {behind}" if behind else "and cannot be distinguished from any other"
-    return f"{when}, {names[0]} makes the most progress, {than}."
+            return f"{when}, {rows[0]} makes {more}."
+        return f"{when}, {', '.join(rows[:-1])} and {rows[-1]} make {more}. These {len(rows)} cannot be distinguished."
+    behind = [row for row in ranked.progress if (first[0], row) in ranked.better]
+    less = f"{format.plural(len(behind), 'other')}: {'; '.join(behind)}"
+    than = f"significantly more than {less}" if behind else "and cannot be distinguished from any other"
+    return f"{when}, {rows[0]} makes the most progress, {than}."
 
 
 def at_end(made: Standing) -> str:
@@ -205,7 +206,7 @@ def at_end(made: Standing) -> str:
     rows = min(made.costs, key=made.costs.__getitem__), max(made.costs, key=made.costs.__getitem__)
     pairs = f"{len(made.rankings[END].better) or 'none'} of {made.rankings[END].pairs} pairs"
     costs = " to ".join(f"*{made.costs[row]:.2g}* ({row})" for row in rows)
-    return f"At the end, {pairs} can be distinguished. A run costs {costs} runs of DIST."
+    return f"At the end of the runs, {pairs} differ significantly. A run costs {costs} times a DIST run."
 
 
 def failures(made: Standing) -> str:
@@ -228,33 +229,33 @@ def _notes(made: Standing) -> list[str]:
         later = runs.assign(**{AT_1: runs[AT_1].where(~runs["row"].isin(rows), runs[f"{AT_1}_next"])})
         ranked = standing.ranking(later, AT_1)
         notes.append(
-            f"A dash: fewer than {standing.FEWEST_CHECKPOINTS} checkpoints lie within that cost in some set, so the "
-            "ranks rest on interpolated progress. With the progress of the next checkpoint, "
-            f"{len(ranked.better)} pairs differ at 1 ×, not {len(made.rankings[AT_1].better)}. "
+            f"A dash: in some set, fewer than {standing.FEWEST_CHECKPOINTS} checkpoints lie within that cost, and the "
+            "ranks use interpolated progress. With the progress of the next checkpoint, "
+            f"{len(ranked.better)} pairs differ significantly at 1 ×, instead of {len(made.rankings[AT_1].better)}. "
             f"{leaders(ranked, 'Then')}"
         )
     counts = ", ".join(f"{len(ranked.better)} ({HEADINGS[name].lower()})" for name, ranked in made.rankings.items())
     end = made.rankings[END]
-    least = f"{end.least_p:.2g}, and {ALPHA / max(end.pairs, 1):.2g} is the first step of the correction"
-    notes.append(f"Significantly different pairs, of {end.pairs}: {counts}. The least p at the end is {least}.")
+    least = f"The smallest p at the end is {end.least_p:.2g}; significance needs {ALPHA / max(end.pairs, 1):.2g}."
+    notes.append(f"Significantly different pairs, of {end.pairs}: {counts}. {least}")
     for name in made.sets:
         if ends := standing.bounds(runs, name):
             notes.append(
-                f"In {name}, every renderer's mean final error is {ends[0]:.2f} to {ends[1]:.2f} times that of DIST "
-                "(geometric means over scenes, simultaneous 95 % intervals by flipped signs)."
+                f"In {name}, every renderer's mean final error is {ends[0]:.2f} to {ends[1]:.2f} times DIST's "
+                "error (geometric means over scenes, simultaneous 95 % intervals of the sign-flip test)."
             )
     for name in made.sets if len(made.sets) > 1 else ():
         first, end = (standing.ranking(runs[runs["set"] != name], outcome) for outcome in (AT_1, END))
         notes.append(
-            f"{leaders(first, f'Without {name}, at 1 ×')} The order is {'; '.join(first.progress)}. At the end it "
-            f"begins with {'; '.join([*end.progress][:3])}; pairs that differ there: {len(end.better)}."
+            f"{leaders(first, f'Without {name}, at 1 ×')} The order is: {'; '.join(first.progress)}. Pairs that "
+            f"differ significantly at the end: {len(end.better)}. First there: {'; '.join([*end.progress][:3])}."
         )
     if made.lacking:
         rows = ", ".join(f"{row} ({format.plural(count, 'problem')})" for row, count in made.lacking.items())
         notes.append(f"Not compared, because runs are missing: {rows}.")
     machines, loaded = runs.loc[runs["cpu"] != "", "machine"].nunique(), (~runs["timed"]).sum()
-    code = f"Runs of {format.plural(runs['code'].nunique(), 'version')} of the code, on {machines} machines or engines"
-    notes.append(f"{code}; {loaded} of {len(runs)} were not timed, since the machine was loaded.")
+    code = f"{format.plural(runs['code'].nunique(), 'version')} of the code, {machines} machines or engines"
+    notes.append(f"Runs: {code}; {loaded} of {len(runs)} have no runtime, because the machine had other load.")
     return [note.replace("*", "") for note in notes]  # without the marks of numbers in verdicts
 
 

@@ -19,15 +19,14 @@ PUBLISHED = {
     "dist_coarse_to_fine_100": (512, 100, "898K", "1.24s"),
 }
 NOTES = (
-    "Forward is one rendering without gradient. A step renders with a graph, computes the loss and goes backward, so "
-    "it takes longer than forward and backward together. In brackets are the least and the largest of several repeats.",
-    "“+ dynamic” also clamps values to 0.1, as all rows after it but “no clamp” do: naive tracing has no clamp.",
-    "Queries are points whose field value one rendering computes; coarse ones are computed in bfloat16, where they "
-    "decide nothing.",
-    "Pixels and depths are compared with the float64 reference; depth errors, in scene units, are of pixels that both "
-    "hit.",
-    "Behind the surface is the share of field values, coarse ones too, that are negative (DIST, Fig. 14).",
-    "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene: compare ratios, not numbers.",
+    "Forward is one rendering without gradients. A step is a rendering with gradients, the loss and the backward pass. "
+    "It takes longer than forward and backward together. In brackets: the smallest and the largest of several repeats.",
+    "“+ dynamic” also clamps field values to 0.1, like all rows below except “no clamp”. Naive tracing has no clamp.",
+    "Field evaluations are those of one rendering. Coarse evaluations use bfloat16, away from the surface.",
+    "Pixels and depths are compared with a float64 reference. Depth errors are in scene units, over the pixels that "
+    "are hits in both images.",
+    "Behind the surface: the percentage of field evaluations, coarse ones included, that are negative (DIST, Fig. 14).",
+    "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene. Compare ratios, not numbers.",
 )
 _TIME_METRICS = ("forward_seconds", "backward_seconds", "step_seconds")
 # Metrics of the CSV at the requested size; empty if only a smaller size was finished.
@@ -54,9 +53,9 @@ def make(small: Runs | None, large: Runs | None) -> Result:
     return Result(
         runs,
         "The cost of each strategy of sphere tracing.",
-        "Computed field values (queries), times and errors of one rendering and its gradient"
-        + (f", times as medians of {times} repeats." if times else "."),
-        question="What does one rendering and its gradient cost, and what does each strategy save?",
+        "Field evaluations, times and errors of one rendering and its gradient"
+        + (f"; times are medians of {times} repeats." if times else "."),
+        question="What does one rendering with its gradient cost, and how much does each strategy save?",
         verdict=_verdict(runs),
         remarks=NOTES,
         columns=COLUMNS,
@@ -76,8 +75,8 @@ def _verdict(runs: Runs) -> str:
     chain = [steps.get(preset, ("", None)) for preset in list(PUBLISHED)[:-1]]
     factors = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
     if not factors:
-        return format.ends(f"A step at {least} pixels", dict(steps.values()), "one shape", show=format.seconds)
-    title = f"A step at {least} pixels is faster than with the strategy before, by factors"
+        return format.ends(f"Step runtime at {least} pixels", dict(steps.values()), "one shape", show=format.seconds)
+    title = f"Speedup of a step at {least} pixels over the previous strategy"
     return f"{title}: {', '.join(factors)}; n = one shape."
 
 
@@ -137,12 +136,13 @@ COLUMNS = (  # shown columns of a record; metrics are those of the largest finis
     table.shown("Size", _size),
     table.configured("", "renderer", "steps", heading="Marching steps"),
     table.shown(
-        "Queries", lambda r: format.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries"))
+        "Field evaluations",
+        lambda r: format.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries")),
     ),
     table.metric("forward_seconds", "Forward", format.seconds),
     table.metric("backward_seconds", "Backward", format.seconds),
     table.shown("Time of a step", _step),
-    table.metric("hits", "Hits of the reference", table.whole),
+    table.metric("hits", "Reference hits", table.whole),
     table.shown(
         "Missed / spurious / wrong depth", table.together(records.measured, table.whole, "lost", "false", "wrong")
     ),
@@ -151,7 +151,7 @@ COLUMNS = (  # shown columns of a record; metrics are those of the largest finis
         table.together(records.measured, format.number, "depth_error_median", "depth_error_max"),
     ),
     table.metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
-    table.shown("Published queries", lambda record: _shown(record, 2)),
+    table.shown("Published evaluations", lambda record: _shown(record, 2)),
     table.shown("Published time of a step", lambda record: _shown(record, 3)),
 )
 

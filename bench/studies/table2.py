@@ -28,11 +28,10 @@ PUBLISHED = {
 }
 NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
-    "Dense depth implies the mask; “paper's setting” is that of DIST, B.4; the mean of the squared code is the "
-    "official code's, the mean of the mask loss over all pixels is ours. The figure leaves out rows with "
-    "the settings of papers.",
-    f"{compare.FITTED} “Published” is DIST, Table 2: 200 shapes of ShapeNet with another prior and camera, and another "
-    "number of points per share, so these numbers do not compare with the measured ones.",
+    "Dense depth includes the mask. “Paper's setting” is DIST, B.4, with the mean of the squared code of the official "
+    "code and our mean of the silhouette loss over all pixels. The figure leaves out the papers' settings.",
+    f"{compare.FITTED} “Published” is DIST, Table 2: 200 shapes of ShapeNet, with another prior and camera, and other "
+    "numbers of points per percentage. These numbers do not compare with the measured ones.",
 )
 RUNS = (
     table.FAMILY,
@@ -55,10 +54,10 @@ def make(runs: Runs) -> Result:
     }
     columns = compared.columns("Ratio to DIST with mask")
     return compared.result(
-        "Shape completion from one depth image, over its sparsity.",
+        "Shape completion from one depth image, by its number of points.",
         "Which method completes a shape best from sparse depth?",
-        plotted="Median error over {shapes and seeds} at each number of given depth points, and over all.",
-        verdict=compared.best("errors × 1000 over all numbers of points"),
+        plotted="Median error over {shapes and seeds} for each number of depth points, and for all numbers together.",
+        verdict=compared.best("errors × 1000 over all numbers of depth points"),
         remarks=(compare.ERROR, f"{_shapes(compared)} {_iterations(runs)}", *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
         lines=compared.beside({compare.ORACLE: oracle}, published),
@@ -79,15 +78,15 @@ def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
                 lines.append(chart.curve(row.name, row.preset, positions, style.finite(medians)))
         if family in oracle:
             lines.append(chart.level(compare.ORACLE, positions, oracle[family]))
-            lines.append(chart.level("1.5 times that", positions, 1.5 * oracle[family], dash=":"))
-        panels.append(chart.panel_data(family, "given depth points", compare.LABEL, lines, ticks=conditions))
+            lines.append(chart.level("1.5 times the oracle", positions, 1.5 * oracle[family], dash=":"))
+        panels.append(chart.panel_data(family, "observed depth points", compare.LABEL, lines, ticks=conditions))
     height = -(-len(panels) // 4)
     return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
 
 
 def _shapes(compared: compare.Compared) -> str:
     counts = compared.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
-    return f"Shapes per cell: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
+    return f"Shapes per family and row: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
 
 
 def _iterations(runs: Runs) -> str:
@@ -106,13 +105,11 @@ def pictures(runs: Runs) -> Result:
     return Result(
         shown,
         "Completed shapes in pictures.",
-        "The shape with the least number of each family at each number of given depth points, from the given camera "
-        "and from behind.",
+        "The first shape of each family for each number of depth points, seen by the given camera and from behind.",
         remarks=(
-            f"{gallery.JUDGED}; given depths are yellow where they are near.",
-            "Dense depth implies the mask, “DIST with mask” sees it at all numbers of points, and DeepSDF is given the "
-            "true normals.",
-            "DIST, Figs. 20 to 22, shows shapes of ShapeNet; these are of other families and another prior.",
+            f"{gallery.JUDGED}; observed depths are yellow near the camera.",
+            "Dense depth includes the mask, and “DIST with mask” always has the mask. DeepSDF has the true normals.",
+            "DIST, Figs. 20 to 22, shows shapes of ShapeNet. These are shapes of other families, from another prior.",
             *gallery.missing(scenes.values()),
         ),
         run_columns=(*RUNS[:2], *table.COMPLETION),

@@ -11,23 +11,23 @@ PUBLISHED = {
     "plane": {"PMO": 1.129, "PMO, random start": 6.124, "DIST, random start": 1.595},
 }
 NOTES = (
-    "Error: mean squared distance from points of the true surface to the nearest of the found one, in that direction "
-    "only, in squared scene units, times 1000; that of a run that did not end ok is infinite.",
+    "Error: mean squared distance from points of the true surface to the nearest points of the reconstruction, not the "
+    "reverse, in squared scene units, times 1000. A failed run has an infinite error.",
     f"{compare.RATIO} {compare.FAILURE}",
-    "Runs start from random codes, one per shape, the same for each method, but where a row starts from an encoder's "
-    f"code. {compare.FITTED}",
+    "Runs start from one random code per shape, the same for all methods. Rows with an encoder start from its code. "
+    f"{compare.FITTED}",
     "“Published” is DIST, Table 3, which does not say whether it has means or medians: 50 shapes of PMO's renderings "
-    "of ShapeNet, with another prior and metric scale, which cannot be compared directly with the measured rows.",
+    "of ShapeNet. Prior and scale differ, so these numbers cannot be compared directly with the measured rows.",
 )
 ENCODER_KEY = "task.encoder.batch"  # set if a row starts from an encoder's code
 PMO = {"multiview_mesh": "PMO, random start", "multiview_mesh_encoder": "PMO"}  # comparable published row of a preset
 ON_MESH = (
-    "“{row}” has its gradients through vertices of the prior's mesh, as PMO (Lin et al. 2019), but changes the code "
-    "alone: read it beside “published: {published}”."
+    "“{row}” has gradients through the vertices of the prior's mesh, like PMO (Lin et al. 2019), but changes only the "
+    "code. Its published counterpart is “published: {published}”."
 )
 ENCODER = (
-    "The encoder learns from photographs of decoded training codes by the same kind of cameras; a run starts from its "
-    "mean over all photographs (PMO: one). Its training is in no column."
+    "The encoder is trained on photographs of decoded training codes. A run starts from the mean of its codes over all "
+    "photographs (PMO: one photograph). No column includes its training."
 )
 ERROR_COLUMNS = table.metrics(records.ONE_WAY, "chamfer_l2")
 RUNS = (
@@ -43,7 +43,7 @@ def make(runs: Runs) -> Result:
     compared = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, conditions.LABEL)
     starts = records.SCALE * runs.number(f"start_{records.ONE_WAY}")
     encoded = runs.setting(ENCODER_KEY) != ""
-    starts_by_kind = {"start: random codes": starts[~encoded], "start: encoder's codes": starts[encoded]}
+    starts_by_kind = {"initial error, random": starts[~encoded], "initial error, encoder": starts[encoded]}
     above = {
         **{
             name: errors.groupby(runs.frame.family, sort=False).median().dropna().to_dict()
@@ -55,10 +55,10 @@ def make(runs: Runs) -> Result:
     on_mesh = [ON_MESH.format(row=row.name, published=PMO[row.preset]) for row in runs.rows() if row.preset in PMO]
     return compared.result(
         "Shape from many views, without a mask.",
-        "Which method finds a shape by photographs from many views, without a mask?",
-        plotted="Median error over {shapes and seeds}, over shapes alone, its ratio, and the median cost of runs that "
-        "ended ok.",
-        verdict=compared.best("errors × 1000, from truth to prediction"),
+        "Which method best reconstructs a shape from photographs of many views, without a mask?",
+        plotted="Median error over {shapes and seeds}; median over shapes alone, with its ratio to DIST; median cost of "
+        "runs that ended ok.",
+        verdict=compared.best("errors × 1000 from ground truth to prediction"),
         remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
         columns=compared.columns("Ratio to DIST"),
         lines=compared.beside(above, published),
@@ -75,13 +75,11 @@ def pictures(runs: Runs) -> Result:
     return Result(
         shown,
         "Shapes from many views in pictures.",
-        f"The truth, the start, and the shape that each row found, of the {MAX_SHAPES} shapes of each family with the "
-        "least numbers.",
+        f"Ground truth, initial shape and result of each row, for the first {MAX_SHAPES} shapes of each family.",
         remarks=(
-            f"{gallery.JUDGED}, seen from the first photograph's side.",
-            "Start: the shape of the random code that rows begin with, but those with an encoder; a mesh row is "
-            "no run of PMO's code.",
-            "DIST, Figs. 11 and 23, shows shapes of ShapeNet beside PMO; these are of other families.",
+            f"{gallery.JUDGED}, seen from the side of the first photograph.",
+            "Start: the shape of the random initial code, of rows without an encoder. Mesh rows do not run PMO's code.",
+            "DIST, Figs. 11 and 23, compares with PMO on shapes of ShapeNet. These are shapes of other families.",
             *gallery.missing(scenes.values()),
         ),
         run_columns=(table.FAMILY, *table.IDENTITY, *ERROR_COLUMNS),

@@ -27,10 +27,10 @@ COLUMNS = (
     *(table.Column("cost", "Field evaluations, ratio"), *table.ends("cost", lambda line: line["ratio"])),
 )
 NOTES = (
-    "Wrong pixels are missed, spurious, or off in depth by more than 0.02 scene units, over the float64 reference's "
-    "hits. The ratio is over plain sphere tracing of the distances: alpha = 1, no clamp.",
-    "A truncated field is a prior trained on distances clamped at 0.1 scene units, as DeepSDF's networks are: beyond, "
-    "its values are not constrained. Clamped steps clamp values at 0.1 before alpha, as DIST's official code does.",
+    "Wrong pixels are missed, spurious, or more than 0.02 scene units off in depth, relative to the hits of a float64 "
+    "reference. The ratio of evaluations is relative to plain sphere tracing of distances: alpha = 1, no clamp.",
+    "A truncated field is a prior trained on distances clamped at 0.1 scene units, like DeepSDF's networks. Beyond, "
+    "its values are not constrained. Clamped steps clamp field values at 0.1 before alpha, like DIST's official code.",
 )
 Kind = tuple[bool, bool]  # whether the prior is truncated, and whether steps are clamped
 Line = dict[str, Any]
@@ -52,7 +52,7 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Aggressive marching on distances and on truncated distances.",
-        "Medians over shapes of the share of wrong pixels, and of the field evaluations of a rendering, over alpha.",
+        "Wrong pixels and field evaluations of a rendering over alpha, as medians over shapes.",
         question="Does aggressive marching need a truncated field, or clamped steps?",
         verdict=_verdict({(line["kind"], line["alpha"]): line for line in lines}),
         interval=compare.INTERVAL,
@@ -92,9 +92,9 @@ def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
     wrong = {name: table.small_percent(lines[kind, 1.5]["wrong"]) for name, kind in kinds.items()}
     plain, clamped, both = (lines[kind, 1.5] for kind in kinds.values())
     return (
-        f"At alpha = 1.5, *{wrong['plain']}* of the pixels are wrong on distances without clamped steps. With them, "
-        f"{wrong['clamped']} are wrong on distances and {wrong['both']} on a truncated field. Clamped steps cost "
-        f"{clamped['cost']:.2f} and {both['cost']:.2f} times the evaluations of alpha = 1 without them; "
+        f"At alpha = 1.5, *{wrong['plain']}* of the pixels are wrong on distances without clamped steps. With clamped "
+        f"steps, {wrong['clamped']} are wrong on distances and {wrong['both']} on a truncated field. These steps cost "
+        f"{clamped['cost']:.2f} and {both['cost']:.2f} times the field evaluations of alpha = 1 without clamp; "
         f"n = {plain['shapes']} shapes."
     )
 

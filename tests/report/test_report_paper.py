@@ -191,15 +191,15 @@ def test_table_1_says_what_a_strategy_saves_and_has_the_published_numbers_at_the
             about = {"metrics": costs(size=size, step_seconds=seconds), "settings": settings, "minute": 10 * number}
             write_run(tmp_path, experiment, label, **about)
     page = page_of(tmp_path, "table1")
-    assert page.verdict.startswith("A step at 64 pixels") and f"{DYNAMIC} *2.0*" in page.verdict
-    published = next(column for column in page.columns if column.heading == "Published queries")
+    assert page.verdict.startswith("Speedup of a step at 64 pixels") and f"{DYNAMIC} *2.0*" in page.verdict
+    published = next(column for column in page.columns if column.heading == "Published evaluations")
     assert [published.words(line) for line in page.lines] == ["", "", "6.06M", "1.99M"]
 
 
 def test_a_strategy_whose_forerunner_is_missing_is_not_credited_with_what_both_save(tmp_path):
     for label, seconds in ((NAIVE, 9.0), (DYNAMIC, 1.5)):
         write_run(tmp_path, "table1", label, metrics=costs(step_seconds=seconds))
-    assert "factors" not in page_of(tmp_path, "table1").verdict
+    assert "Speedup" not in page_of(tmp_path, "table1").verdict
 
 
 def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
@@ -245,9 +245,9 @@ def test_latex_has_one_sentence_powers_of_ten_dashes_and_rules_between_groups():
 def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_path, capsys):
     copy = shutil.copytree(reported, tmp_path / "results")
     before = {path.name: path.read_bytes() for path in (copy / "paper").iterdir()}
-    assert main([f"results_dir={copy}", 'columns.table1="Queries", Strategy']) == 0
+    assert main([f"results_dir={copy}", 'columns.table1="Field evaluations", Strategy']) == 0
     text = (copy / "paper" / "table1.tex").read_text()
-    assert "Queries & Strategy \\\\\n\\midrule\n1.00k & + dynamic \\\\\n\\bottomrule" in text
+    assert "ions\\end{tabular} & Strategy \\\\\n\\midrule\n1.00k & + dynamic \\\\\n\\bottomrule" in text
     changed = {path.name for path in (copy / "paper").iterdir() if path.read_bytes() != before[path.name]}
     assert changed == {"table1.tex"}
     for argument, named in (
@@ -309,14 +309,14 @@ def completions(tmp_path: Path) -> Path:
 
 
 def test_fig5_says_which_terms_its_loss_has_and_whether_losses_can_be_compared(tmp_path):
-    alone = "The loss has depths and the silhouette; the paper's Fig. 5"
+    alone = "The loss has terms for depths and the silhouette; DIST, Fig. 5"
     for task, label, words in (
         (
             {"normal_weight": 1.0, "normal_width": 0.02},
             "hinge",
-            ["normals over 0.02 scene units (weight 1)", "is the same"],
+            ["normals over 0.02 scene units (weight 1)", "all rows share it"],
         ),
-        ({"normal_weight": 0.0, "normal_width": 0.02}, "", [alone, "losses of different rows do not compare"]),
+        ({"normal_weight": 0.0, "normal_width": 0.02}, "", [alone, "losses of different rows cannot be compared"]),
         ({}, "", [alone]),  # of older runs
     ):
         settings = {"task": task, "silhouette": {"_label_": label} if label else {}}
@@ -376,7 +376,7 @@ def test_in_fig5_a_row_of_which_every_run_failed_is_not_the_best(tmp_path):
         write_curve(write_run(tmp_path, "fig5", DYNAMIC, **lost), [4, 3], {0: 0.2, 1: 0.1})
     made = page_of(tmp_path, "fig5")
     assert made.table.set_index("Method")["End"].to_dict() == {PARALLEL: "300", DYNAMIC: "∞"}
-    assert f": *300* ({PARALLEL}) to ∞ ({DYNAMIC}); n = 1 run a row." in made.verdict
+    assert f": *300* ({PARALLEL}) to ∞ ({DYNAMIC}); n = 1 run per row." in made.verdict
     runs = chosen(tmp_path, "fig5")
     assert fig5.make(runs.where(runs.frame.row == DYNAMIC)).verdict == ""
 

@@ -64,8 +64,8 @@ def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
     lost = page.data[page.data["scene"] == "torus 0"]
     assert (lost["status"].item(), lost["reason"].item()) == ("crashed", "why")
     assert "1 of 4 runs did not end ok: dist, torus: crashed (why)." in told(page)
-    most = "the most is grid 24 of 13,824 stored numbers, for car 0."
-    assert page.verdict == f"A single part suffices for *2 of 3* scenes; {most}"
+    most = "The largest field needed is grid 24 with 13,824 stored numbers, for car 0."
+    assert page.verdict == f"A single part suffices for *2 of 3* scenes. {most}"
 
 
 def test_a_row_tells_the_need_and_what_it_saves(page):

@@ -43,7 +43,7 @@ def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
     assert list(rows["reason"]) == ["64 pixels took over 60 s", "no luck", "", ""]
     names = ("forward_s", "backward_s", "step_s", "step_s_low", "step_s_high", "lost", "false", "wrong")
     assert list(rows.loc[DYNAMIC, [*names, "depth_error_max"]]) == [0.5, 0.25, 0.75, 0.625, 0.875, 12, 8, 3, 0.25]
-    assert page.verdict.startswith("A step at 64 pixels: *500 ms* (of ours)")
+    assert page.verdict.startswith("Step runtime at 64 pixels: *500 ms* (of ours)")
 
 
 def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
@@ -97,13 +97,13 @@ def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp
     assert list(zip(*(page.data[key] for key in ("size", "threads", "forward_ratio")), strict=True))[:-1] == lines
     assert set(page.data["renderer"][1:6:2]) == {"newton"}
     line = page.table.iloc[1]
-    assert (line["Values"], line["Forward ratio"]) == ("1.00k + 3.00k coarse", "0.75 (0.50–1.00)")
+    assert (line["Evaluations"], line["Forward ratio"]) == ("1.00k + 3.00k coarse", "0.75 (0.50–1.00)")
     assert line["Missed / spurious / wrong depth"] == "1 / 2 / 3"
     assert list(page.table["Forward ratio"].iloc[[0, -1]]) == ["1", "–"]  # of the first renderer, and of a failed run
     assert (
         "medians of 5 rounds" in told(page) and "timeout" in told(page) and "thread" not in page.shown().caption[-40:]
     )
-    said = "A step at 256 × 256 pixels over that of dist: *0.600* (newton, 1 thread) to 0.900 (newton, 2 threads)"
+    said = "Step runtime at 256 × 256 pixels, relative to dist: *0.600* (newton, 1 thread) to 0.900 (newton, 2 threads)"
     assert page.verdict == f"{said}; n = one shape."
 
 
@@ -120,13 +120,13 @@ def test_gradients_have_a_row_for_each_renderer_and_band(tmp_path):
     assert (rows.loc["naive", "status"] == "oom").all() and rows.loc["naive", "code_scale"].isna().all()
     assert page.table.loc[0, ["Code pooled cosine", "Code scale", "Pixels"]].tolist() == ["0.99000", "1.00", "100"]
     assert "A pooled number compares the gradients of all pixels of a band" in told(page)
-    assert page.verdict.startswith("Least pooled cosine in any band of hits, 0 of 3 of 0.99 or more: *0.97000* (dist)")
+    assert "0 of 3 reach a pooled cosine of 0.99 in all bands of hits. Smallest: *0.97000* (dist)" in page.verdict
 
 
 def test_a_renderer_without_a_number_in_a_band_has_no_least_one():
     known = [("a", band, "ok", 0.995) for band in gradients.ANGLES] + [("b", "frontal", "ok", 0.999)]
-    data = pd.DataFrame(known, columns=["name", "band", "status", "code_pooled_cosine"])
-    assert ", 1 of 2 of 0.99 or more: *0.99500* (a); " in gradients._verdict(data)
+    said = gradients._verdict(pd.DataFrame(known, columns=["name", "band", "status", "code_pooled_cosine"]))
+    assert "1 of 2 reach a pooled cosine of 0.99 in all bands of hits. Smallest: *0.99500* (a); " in said
 
 
 def test_gradients_figure_plots_the_numbers_of_its_csv(tmp_path):

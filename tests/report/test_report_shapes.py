@@ -154,7 +154,7 @@ def test_published_chamfer_is_the_mean_of_both_directions(name):
     assert chamfer == pytest.approx((accuracy + completeness) / 2, abs=1.01e-3)
 
 
-@pytest.mark.parametrize(("scenes", "words"), [(["sofa"], "over 1 scene of"), (["sofa", "car"], "over 2 scenes of")])
+@pytest.mark.parametrize(("scenes", "words"), [(["sofa"], "over 1 scene on"), (["sofa", "car"], "over 2 scenes on")])
 def test_the_figure_has_a_line_per_row_with_a_point_per_scene_and_their_median(tmp_path, scenes, words):
     for place, scene in enumerate(scenes):
         made(tmp_path, NEWTON, scored(0.02 + 0.02 * place), dataset=scene, seconds=3.0)

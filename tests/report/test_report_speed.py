@@ -60,7 +60,7 @@ def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
     assert data.loc["good", ["seconds", "error"]].tolist() == pytest.approx([3.0, 0.6])
     assert data.loc["broken", ["failed", "runs"]].tolist() == [2, 3] and math.isinf(data.loc["broken", "error"])
     ends = "fast (*1.00 s*, error × 1000 7.00) to good (*3.00 s*, error × 1000 0.600)"
-    assert page.verdict == f"On the front of completing a shape: 2 of 4 settings, {ends}; n = 3 shapes."
+    assert page.verdict == f"2 of 4 settings are on the front of completing a shape: {ends}; n = 3 shapes."
 
 
 def test_dominated_points_are_hollow_and_the_front_is_numbered(three):
@@ -121,7 +121,7 @@ def test_the_time_to_the_target_is_infinite_for_what_did_not_reach_it(three):
     assert table.loc["good"].tolist() == ["3", "3", "3.00 s", "1.00"]
     assert table.loc["bad"].tolist() == ["3", "0", "∞", "0.775"]  # the last is the rank correlation of loss and error
     assert table.loc["broken"].tolist() == ["3", "1", "∞", "–"]  # failed runs did not, whatever they scored
-    assert page.verdict.endswith("*3.00 s* (good); n = 3 runs each, and 1 of 4 settings reach it in most.")
+    assert page.verdict.endswith("*3.00 s* (good); n = 3 runs per setting; 1 of 4 settings reach it in most runs.")
 
 
 def test_the_time_to_the_target_is_that_of_the_first_checkpoint_there():
@@ -143,7 +143,7 @@ def test_a_missing_run_is_told_and_counts_as_infinite(tmp_path):
     completed(tmp_path, "idr", [9, 1], renderer="idr")
     row = page_of(tmp_path, "speed_front").table.set_index("Setting").loc["idr"]
     assert row["Failed"] == "0 of 1, 1 missing"
-    assert (row["Time"], row["Error × 1000"], row["Evaluations"]) == ("∞", "∞", "∞")
+    assert (row["Time"], row["Error × 1000"], row["Field evaluations"]) == ("∞", "∞", "∞")
 
 
 def test_a_cost_that_is_not_a_number_is_infinite(tmp_path):
@@ -184,7 +184,7 @@ def test_a_run_that_left_no_curve_is_a_row_all_the_same(tmp_path):
         assert "idr" in page_of(tmp_path, name).table.to_string()
 
 
-@pytest.mark.parametrize(("loaded", "axes"), [(5, ["time (seconds)", "field values"]), (6, ["field values"])])
+@pytest.mark.parametrize(("loaded", "axes"), [(5, ["time (seconds)", "field evaluations"]), (6, ["field evaluations"])])
 def test_where_half_of_the_times_are_doubtful_a_chart_shows_field_values_alone(three, loaded, axes):
     for folder in sorted((three / "runs").iterdir())[:loaded]:  # of twelve
         record = json.loads((folder / "record.json").read_text())

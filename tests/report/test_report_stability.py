@@ -50,7 +50,7 @@ def test_a_breakdown_stands_with_its_interval(tmp_path):
     assert page.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"
     assert page.data["failures"].tolist() == ["1 false; 3 lost"] * 2
     assert page.verdict.endswith("does not break: *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes.")
-    assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of a full grid's" in told(page)
+    assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of the trials" in told(page)
     dist, dvr = page.atlas["cells"][0]
     assert dist["shade"] == 0.5 and (dvr["shade"], dvr["short"]) == (1.0, "none")
 
@@ -124,8 +124,8 @@ def test_the_ranking_has_one_row_a_renderer(tmp_path):
             broke(tmp_path, axis, label, level, renderer="custom", target="mypkg.Mine")
     page = page_of(tmp_path, "stability_cost")
     assert set(page.data["row"]) == {"DIST, our default", "VolSDF, 136 samples", "Mine", "Mine, slow"}
-    assert "4 renderers" in page.caption and "(Mine, slow, 4.00 field values per ray)" in page.verdict
-    assert "All others differ from Mine, slow by the interval of the difference of ranks" in page.verdict
+    assert "4 renderers" in page.caption and "(Mine, slow, 4.00 field evaluations per ray)" in page.verdict
+    assert "All others can be distinguished from Mine, slow." in page.verdict
     assert "+ capped" in page_of(tmp_path, "stability").table
 
 

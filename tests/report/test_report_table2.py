@@ -125,15 +125,15 @@ def test_captions_name_what_varies_and_a_try_at_smoke(tmp_path):
                   settings=settings, index=index, seed=seed)  # fmt: skip
 
     write(0, 0)
-    assert "Median error over one shape at each" in caption()
+    assert "Median error over one shape for each" in caption()
     write(0, 1)
-    assert "Median error over seeds of one shape at each" in caption()
+    assert "Median error over seeds of one shape for each" in caption()
     write(1, 0)
-    assert "Median error over shapes and seeds at each" in caption()
+    assert "Median error over shapes and seeds for each" in caption()
     assert "nothing follows" not in caption()
     write(0, 0, scale={"name": "smoke"})
     assert caption().startswith("Made at scale=smoke, to try things out: nothing follows from these numbers.")
-    assert "Median error over one shape at each" in caption()
+    assert "Median error over one shape for each" in caption()
 
 
 def test_the_oracle_is_of_all_of_the_tables_shapes(tmp_path):
@@ -163,7 +163,7 @@ def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):
     lines = {line.get_label(): line.get_ydata() for line in axis.lines}
     assert list(lines[REFERENCE]) == [1.0, 1.0]
     assert all(math.isnan(y) for y in lines[OTHER])
-    assert lines["1.5 times that"][0] == pytest.approx(0.3)
+    assert lines["1.5 times the oracle"][0] == pytest.approx(0.3)
     assert axis.get_title() == "sofa"
 
 

@@ -61,7 +61,7 @@ def test_table_3_has_medians_ratios_and_published_numbers(tmp_path):
     assert (ours["Median"], ours["Median over shapes"], ours["Failed"]) == ("2.00", "2.00 (n = 3)", "0 of 3")
     assert (ours["Ratio to DIST"], idr["Ratio to DIST"]) == ("", "2.00 (n = 3); 0 of 3")
     assert (ours["Loop"], ours["Values"]) == ("3.00 s", "5.00k")
-    assert row(result, "start: random codes")["Median"] == "8.00"
+    assert row(result, "initial error, random")["Median"] == "8.00"
     assert row(result, "published: DIST, random start")["Median"] == "0.919"
     assert row(result, "published: PMO, random start")["Median"] == "1.187"  # as the paper prints it
     assert "does not say whether it has means or medians" in told(result)
@@ -75,20 +75,20 @@ def test_published_numbers_of_pmo_stand_beside_the_mesh_row(tmp_path):
     result = page_of(tmp_path, "table3")
     ends = dict(zip(result.table["Method"], result.table["Median"], strict=True))
     assert list(ends.items()) == [
-        *(("start: random codes", "8.00"), ("DIST", "1.00"), ("Mesh, 48³", "2.00")),
+        *(("initial error, random", "8.00"), ("DIST", "1.00"), ("Mesh, 48³", "2.00")),
         *(("published: PMO", "0.661"), ("published: PMO, random start", "1.187")),
         ("published: DIST, random start", "0.919"),
     ]
     assert list(result.data["row"]) == ["DIST", "Mesh, 48³"]  # the CSV has measured rows alone
-    assert "“Mesh, 48³” has its gradients" in told(result) and "read it beside “published: PMO, random" in told(result)
+    assert "“Mesh, 48³” has gradients" in told(result) and "counterpart is “published: PMO, random" in told(result)
 
 
 def test_an_encoders_start_is_a_line_of_its_own(tmp_path):
     found(tmp_path, "table3", "DIST", 1.0, start=8.0)
     found(tmp_path, "table3", "DIST, encoder's start", 0.5, start=2.0, encoder={"batch": 16})
     result = page_of(tmp_path, "table3")
-    assert row(result, "start: random codes")["Median"] == "8.00"
-    assert row(result, "start: encoder's codes")["Median"] == "2.00"
+    assert row(result, "initial error, random")["Median"] == "8.00"
+    assert row(result, "initial error, encoder")["Median"] == "2.00"
 
 
 def test_rows_may_have_images_of_their_own_size(tmp_path):
@@ -162,7 +162,7 @@ def test_poses_found_are_counted_at_each_angle(tmp_path):
     assert theirs["30°"] == "4 of 4 (n = 1)"
     assert "fewer than six shapes: points, no interval" in result.caption
     assert theirs["90°"] == ""
-    assert (mine["Loop"], theirs["Loop"]) == ("2.00 s", "250 ms")
+    assert (mine["Runtime"], theirs["Runtime"]) == ("2.00 s", "250 ms")
     assert "1 of 9 runs did not end ok: DIST, 30 degrees, seed 3: nan (" in result.caption
     assert "5 degrees and 0.05 scene units" in result.caption
 

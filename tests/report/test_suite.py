@@ -337,32 +337,32 @@ def test_seconds_are_compared_on_one_machine_and_field_evaluations_of_the_same_r
     [
         (
             "AC AD BC BD",
-            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others. These cannot be",
+            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others. These 2 cannot be",
         ),
         ("AB AC AD", "A (*90 %*) makes significantly more progress than the 3 others."),
-        ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than C; D."),
+        ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than 2 others: C; D."),
         ("", "A (*90 %*) makes the most progress, and cannot be distinguished from any other."),
     ],
 )
 def test_the_answer_names_who_leads_by_a_rule(better, said):
     pairs = {tuple(pair) for pair in better.split()}
     ranked = Ranking(dict(zip("ABCD", (0.9, 0.8, 0.7, 0.6), strict=True)), pairs, 6, 0.01, 16)
-    assert study.leaders(ranked).removeprefix("At the cost of one run of DIST, ").startswith(said)
+    assert study.leaders(ranked).removeprefix("At the cost of one DIST run, ").startswith(said)
 
 
 def test_the_answer_says_what_differs_at_the_end_what_failed_and_what_scenes_cannot_decide(tmp_path, monkeypatch):
     rows = [("Dist", 0.0101, 100.0), ("B", 0.01, 300.0)]
     lost = [attempt("Lost", scene, {0: 1.0, 50: 1.0}, status="diverged", final=inf) for scene in TEN]
     answer = study.verdict(page([*made(rows, TEN), *lost], tmp_path / "three", monkeypatch))
-    assert "At the end, 3 of 3 pairs can be distinguished" in answer and "lie within" not in answer
+    assert "At the end of the runs, 3 of 3 pairs differ significantly" in answer and "lie within" not in answer
     assert "Lost failed in 10 of 10 problems of complete; none of the other 20 runs failed." in answer
     mixed = [
         replace(one, curve=[*one.curve[:2], [2e2, 0.2, 0.0099]], final=0.0099, started="2027")
         for one in made(rows[:1], TEN)[:3]
     ]
     shown = page([*made(rows, TEN), *mixed], tmp_path / "two", monkeypatch)
-    assert "In complete, every renderer's mean final error is 0.99 to 1.01 times that" in " ".join(study._notes(shown))
-    assert "none of 1 pairs can be distinguished. A run costs *1* (Dist) to *3* (B)" in study.verdict(shown)
+    assert "In complete, every renderer's mean final error is 0.99 to 1.01 times D" in " ".join(study._notes(shown))
+    assert "none of 1 pairs differ significantly. A run costs *1* (Dist) to *3* (B) times" in study.verdict(shown)
     assert study.verdict(shown).endswith("None of 20 runs failed.")
     few = [one for one in made(rows, TEN) if one.scene in TEN[:3]]
     assert study.verdict(page(few, tmp_path / "few", monkeypatch)).startswith("3 scenes cannot decide between 2 ")
