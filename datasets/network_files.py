@@ -299,7 +299,7 @@ def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | No
     if not weights.is_file():
         raise BadInput(f"the folder has no {DEEPSDF_FILES[0]}")
     network = load_deepsdf(_tensors(weights), specs, squash=squash)
-    return network, _codes(latent) if latent.is_file() and not network.placed else None
+    return network, _codes(latent) if latent.is_file() and not network.code_is_position else None
 
 
 def _by_tensor_names(tensors: dict[str, Tensor]) -> Published:

@@ -69,7 +69,7 @@ class Stability:
         scene, stresses = self.stress.scene, ", ".join(NETWORK_DISTORTIONS)
         if scene not in NETWORK_DISTORTIONS:
             raise BadInput(f"the stress {scene} renders no network: remove field=file, or set stress={stresses}")
-        if scene == "far_code" and inputs.prior.decoder.placed:
+        if scene == "far_code" and inputs.prior.decoder.code_is_position:
             raise BadInput("the network has no code that the stress far_code could change: set stress=noisy_weights")
 
     def execute(self, run: RunContext) -> None:

@@ -44,7 +44,7 @@ def fewer():
     """Fewer validation shapes, samples of a mean shape, and views in the search for that of a picture."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store, "VALIDATION_SHAPES", 1)
-        patch.setattr(baselines, "SAMPLES", 32)
+        patch.setattr(baselines, "GRID_SAMPLES", 32)
         patch.setattr(single_view, "SEARCHED_VIEWS", 20)
         yield
 
