@@ -24,8 +24,8 @@ COST = (
 def scene_of(record: Record) -> str:
     """The name of a run's scene, for titles: with its number, unless it is a file's or a folder's own object."""
     dataset = record["config"].get("dataset", {})
-    own = dataset.get("path") and not dataset.get("strength") and not index(record)
-    return family(record) if own else f"{family(record)} {index(record)}"
+    is_own_object = dataset.get("path") and not dataset.get("strength") and not index(record)
+    return family(record) if is_own_object else f"{family(record)} {index(record)}"
 
 
 def scored(runs: Runs, name: str) -> pd.Series:
@@ -39,7 +39,7 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
 
     A metric that a run lacks though it ended ok is None.
     """
-    runs = runs.made
+    runs = runs.executed
     frame = runs.frame[["row", "preset"]].assign(
         **{name: scored(runs, name) for name in names},
         ok=(runs.frame.status == "ok").to_numpy(bool),
@@ -47,12 +47,13 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
         evaluations=runs.frame["values"],
     )
     lines = []
-    for (row, preset), own in frame.groupby(["row", "preset"], sort=False):
-        found = {name: None if own[name].isna().any() else float(median(own[name].to_numpy())) for name in names}
-        spent = own[own.ok][["seconds", "evaluations"]].median()
-        costs = {name: None if np.isnan(value) else float(value) for name, value in spent.items()}
-        failed = f"{(~own.ok).sum()} of {len(own)}"
-        lines.append({"method": row, "preset": preset, "runs": len(own), **found, "failed": failed, **costs})
+    for (row, preset), group in frame.groupby(["row", "preset"], sort=False):
+        values = {name: group[name] for name in names}
+        values = {name: None if x.isna().any() else float(median(x.to_numpy())) for name, x in values.items()}
+        median_costs = group[group.ok][["seconds", "evaluations"]].median()
+        costs = {name: None if np.isnan(value) else float(value) for name, value in median_costs.items()}
+        failed = f"{(~group.ok).sum()} of {len(group)}"
+        lines.append({"method": row, "preset": preset, "runs": len(group), **values, "failed": failed, **costs})
     return lines
 
 
@@ -75,10 +76,10 @@ def cost(runs: Runs) -> dict[str, pd.Series]:
     return {"seconds in the loop": runs.frame.loop} if runs.timed else {"field evaluations of the run": evaluations}
 
 
-def whole(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
+def comparable_medians(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
     """A median of the rows with as many runs as any, by row: those of fewer are not of the same shapes."""
-    most = max((line["runs"] for line in lines), default=0)
-    return {line["method"]: line[name] for line in lines if line["runs"] == most}
+    max_runs = max((line["runs"] for line in lines), default=0)
+    return {line["method"]: line[name] for line in lines if line["runs"] == max_runs}
 
 
 def draw_runs(
@@ -91,16 +92,17 @@ def draw_runs(
         rows: from above, all of them; by default in the order of the runs.
         log: whether an axis whose values differ by a factor is logarithmic.
     """
-    rows, made = list(rows or runs.rows()), []
+    rows, chart_panels = list(rows or runs.rows()), []
     for label, values in panels.items():
         drawn = []
-        for place, row in enumerate(rows):
-            mine = values[(runs.frame.row == row.name) & (runs.frame.preset == row.preset)].dropna().to_numpy(float)
-            spread = np.linspace(-0.25, 0.25, len(mine)) if len(mine) > 1 else np.zeros(len(mine))
-            drawn.append(chart.series(row.name, row.preset, mine, place + spread))
-            if len(mine) > 1 and np.isfinite(middle := float(median(mine))):
-                drawn.append(chart.level("median", [middle] * 2, 0) | {"y": [place - 0.38, place + 0.38]})
+        for position, row in enumerate(rows):
+            in_row = (runs.frame.row == row.name) & (runs.frame.preset == row.preset)
+            row_values = values[in_row].dropna().to_numpy(float)
+            spread = np.linspace(-0.25, 0.25, len(row_values)) if len(row_values) > 1 else np.zeros(len(row_values))
+            drawn.append(chart.series(row.name, row.preset, row_values, position + spread))
+            if len(row_values) > 1 and np.isfinite(row_median := float(median(row_values))):
+                drawn.append(chart.level("median", [row_median] * 2, 0) | {"y": [position - 0.38, position + 0.38]})
         panel = chart.panel_data("", label, "", drawn, rows=[row.name for row in rows])
         panel["x"]["log"] &= log
-        made.append(panel)
-    return chart.draw(made, 0.19 * len(rows) + 0.9, legend=0, sharey=True)
+        chart_panels.append(panel)
+    return chart.draw(chart_panels, 0.19 * len(rows) + 0.9, legend=0, sharey=True)

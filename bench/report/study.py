@@ -9,6 +9,6 @@ from bench.pictures import style
 from bench.records import format
 from bench.report import compare, conditions, gallery, medians
 from bench.report.data import curves, records, statistics
-from bench.report.data.runs import Runs, Selection, together
+from bench.report.data.runs import Runs, Selection, merge_runs
 from bench.report.write import chart, table
 from bench.report.write.result import Result

@@ -12,16 +12,28 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import NEUTRAL_KEYS
 from bench.report.data.kept import UNFINISHED
-from bench.report.data.records import SCALE, Record, RunKey, error, grouped, run_key
+from bench.report.data.records import CHAMFER_SCALE, Record, RunKey, error, grouped, run_key
 from bench.report.data.runs import Runs, Selection
 
 TUNING = Selection("tuning", ("split",))
 PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")  # validation shapes alone
 CHAMFER = "chamfer_l2"
-ERRORS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # that draws are chosen by, where it is not the usual one
-SPACE, TUNED = "space/", "tuned/"  # before the names of methods whose settings are drawn; of those written for them
+SELECTION_METRICS = {
+    PHOTOGRAPHS.experiment: "seen_chamfer_l1"
+}  # that draws are chosen by, where it is not the usual one
+SPACE_PREFIX, TUNED_PREFIX = (
+    "space/",
+    "tuned/",
+)  # before the names of methods whose settings are drawn; of those written for them
 VALIDATION = "validation"
-OTHER = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are no drawn settings
+NOT_DRAWN = (
+    "label",
+    "draw",
+    "dataset",
+    "index",
+    "seed",
+    "split",
+)  # keys of the configuration that are no drawn settings
 
 
 @dataclass(frozen=True)
@@ -67,7 +79,7 @@ def unfinished(runs: Runs) -> int:
 
 def metric_of(runs: Runs) -> str:
     """The error that the draws of an experiment are chosen by."""
-    return ERRORS.get(runs.selection.experiment, CHAMFER)
+    return SELECTION_METRICS.get(runs.selection.experiment, CHAMFER)
 
 
 def tunings(runs: Runs) -> list[Tuning]:
@@ -104,28 +116,27 @@ def _cell(record: Record, keys: list[RunKey], metric: str) -> dict[str, Any]:
     return {
         **{"method": record["method"], "split": config["split"], "draw": config["draw"]},
         **{"run": keys.index(run_key(record)), "failed": not ok, "record": record},
-        "error": SCALE * error(record, metric),
+        "error": CHAMFER_SCALE * error(record, metric),
     }
 
 
-def _tuning(own: pd.DataFrame, records: list[Record]) -> Tuning:
-    own = own[own.split == VALIDATION]
-    first = own.groupby("draw").record.first()
-    method, config = own.method.iloc[0].removeprefix(SPACE), first.iloc[0]["config"]
+def _tuning(runs: pd.DataFrame, records: list[Record]) -> Tuning:
+    runs = runs[runs.split == VALIDATION]
+    first = runs.groupby("draw").record.first()
+    method, config = runs.method.iloc[0].removeprefix(SPACE_PREFIX), first.iloc[0]["config"]
     return Tuning(
         method=method,
         label=str(config.get("label") or method),
         draws=first.index.tolist(),
         settings=_settings(first.tolist(), records),
-        validation=own.pivot(index="draw", columns="run", values="error").to_numpy(),
-        failures=own.groupby("draw").failed.sum().to_numpy(),
+        validation=runs.pivot(index="draw", columns="run", values="error").to_numpy(),
+        failures=runs.groupby("draw").failed.sum().to_numpy(),
     )
 
 
 def _settings(records: list[Record], among: list[Record]) -> list[dict[str, Any]]:
     """The values of some of a method's draws, by dotted key, in which the configurations of any of its draws differ."""
-    every = [flat(record["config"]) for record in among]
-    varies = [name for name in every[0] if len({str(each.get(name)) for each in every}) > 1]
-    names = [name for name in varies if name.partition(".")[0] not in {*OTHER, *NEUTRAL_KEYS}]
-    chosen = [flat(record["config"]) for record in records]
-    return [{name: each[name] for name in names} for each in chosen]
+    configs = [flat(record["config"]) for record in among]
+    varies = [name for name in configs[0] if len({str(config.get(name)) for config in configs}) > 1]
+    names = [name for name in varies if name.partition(".")[0] not in {*NOT_DRAWN, *NEUTRAL_KEYS}]
+    return [{name: config[name] for name in names} for config in (flat(record["config"]) for record in records)]

@@ -8,7 +8,7 @@ PLACE = 20
 READS = (Selection("table2", ("task.points",)),)
 REFERENCE = "dist_mask"
 HIDDEN_SUFFIXES = ("_paper", "_official")  # the figure leaves out these presets, to stay readable
-# DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, in the order of `compare.ORDER`.
+# DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, by `compare.CONDITION_ORDER`.
 PUBLISHED = {
     "sofa": {
         "DeepSDF": (5.37, 5.56, 5.50, 5.93, 6.03, 7.63),
@@ -42,7 +42,10 @@ RUNS = (
     *table.LOOP,
 )
 PICTURED_PRESETS = ("deepsdf", "dist_depth", "dist_mask")
-ARRAYS = ("given", *(kind + array for kind in (gallery.FOUND, gallery.TRUE) for array in ("normals", "hit")))
+ARRAYS = (
+    "given",
+    *(kind + array for kind in (gallery.PREDICTED, gallery.GROUND_TRUTH) for array in ("normals", "hit")),
+)
 BOTH_SIDES = (gallery.FRONT, gallery.BEHIND)
 
 
@@ -50,7 +53,7 @@ def make(runs: Runs) -> Result:
     """A line per family and row, with the oracle and published numbers of each family."""
     compared, oracle = compare.Compared(runs, lambda _: REFERENCE), compare.oracles(runs, compare.METRIC)
     published = {
-        family: {row: dict(zip(compare.ORDER, numbers, strict=True)) for row, numbers in rows.items()}
+        family: {row: dict(zip(compare.CONDITION_ORDER, numbers, strict=True)) for row, numbers in rows.items()}
         for family, rows in PUBLISHED.items()
     }
     columns = compared.columns("Ratio to DIST with mask")
@@ -61,7 +64,7 @@ def make(runs: Runs) -> Result:
         verdict=compared.best("errors × 1000 over all numbers of points"),
         remarks=(compare.ERROR, f"{_shapes(compared)} {_iterations(runs)}", *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
-        lines=compared.beside({compare.ORACLE: oracle}, published),
+        lines=compared.with_reference_lines({compare.ORACLE: oracle}, published),
         run_columns=RUNS,
         figure=draw(compared, oracle),
     )
@@ -86,7 +89,7 @@ def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
 
 
 def _shapes(compared: compare.Compared) -> str:
-    counts = compared.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
+    counts = compared.cells.groupby(["family", "row", "condition"], observed=True).solid.nunique()
     return f"Shapes per cell: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
 
 
@@ -109,11 +112,11 @@ def pictures(runs: Runs) -> Result:
         "The shape with the least number of each family at each number of given depth points, from the given camera "
         "and from behind.",
         remarks=(
-            f"{gallery.JUDGED}; given depths are yellow where they are near.",
+            f"{gallery.NORMALS_PHRASE}; given depths are yellow where they are near.",
             "Dense depth implies the mask, “DIST with mask” sees it at all numbers of points, and DeepSDF is given the "
             "true normals.",
             "DIST, Figs. 20 to 22, shows shapes of ShapeNet; these are of other families and another prior.",
-            *gallery.missing(scenes.values()),
+            *gallery.missing_notes(scenes.values()),
         ),
         run_columns=(*RUNS[:2], *table.COMPLETION),
         figure=gallery.draw([_block(name, group, scenes[name]) for name, group in shown.families().items()], across=2),
@@ -125,10 +128,14 @@ def _block(name: str, family_records: list[records.Record], scene: gallery.Scene
     by_points = records.grouped(family_records, _points)
     points = compare.ordered(by_points)
     given_depths = [scene.shared(by_points[p][:1], gallery.depth) for p in points]
-    rows = {"given depths": [*given_depths, scene.shared(family_records, gallery.normals(gallery.TRUE), BOTH_SIDES)]}
+    rows = {
+        "given depths": [*given_depths, scene.shared(family_records, gallery.normals(gallery.GROUND_TRUTH), BOTH_SIDES)]
+    }
     for row, row_records in records.grouped(family_records, records.row_of).items():
         by_row_points = {_points(record): record for record in row_records}
-        rows[row.name] = [scene.cell(by_row_points.get(p), gallery.normals(gallery.FOUND), BOTH_SIDES) for p in points]
+        rows[row.name] = [
+            scene.cell(by_row_points.get(p), gallery.normals(gallery.PREDICTED), BOTH_SIDES) for p in points
+        ]
     return gallery.Block(name, [*map(compare.heading, points), "truth"], rows)
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.records.read import curve_lines as lines
+from bench.records.read import curve_lines
 from bench.records.record import as_number
-from bench.report.data.records import SCALE, Record, measured
+from bench.report.data.records import CHAMFER_SCALE, Record, measured
 from bench.report.data.runs import Runs
 
 HISTORY = ("iteration", "seconds", "value_evaluations", "error", "loss")
@@ -18,16 +18,16 @@ COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
 
 def read(folder: Path, columns: Sequence[str] = COLUMNS) -> tuple[pd.DataFrame, str]:
     """A row for each line of `curve.jsonl`, with these columns as floats, nan for missing; and a warning, or ""."""
-    found = lines(folder)
-    sound = [line for line in found or [] if as_number(line.get("iteration")) is not None]
-    known = [[as_number(line.get(name)) for name in columns] for line in sound]
-    if found is None:
+    parsed = curve_lines(folder)
+    numbered = [line for line in parsed or [] if as_number(line.get("iteration")) is not None]
+    rows = [[as_number(line.get(name)) for name in columns] for line in numbered]
+    if parsed is None:
         warning = "no curve.jsonl"
-    elif len(known) < len(found):
-        warning = f"{len(found) - len(known)} lines of curve.jsonl cannot be read"
+    elif len(rows) < len(parsed):
+        warning = f"{len(parsed) - len(rows)} lines of curve.jsonl cannot be read"
     else:
-        warning = "" if found else "curve.jsonl is empty"
-    return pd.DataFrame(known, columns=list(columns), dtype=float).drop_duplicates("iteration", keep="last"), warning
+        warning = "" if parsed else "curve.jsonl is empty"
+    return pd.DataFrame(rows, columns=list(columns), dtype=float).drop_duplicates("iteration", keep="last"), warning
 
 
 def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.DataFrame:
@@ -42,10 +42,10 @@ def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.Da
     numbered = [run.set_index("iteration") for run in runs]
     values = pd.concat([run[quantity] for run in numbered], axis=1, keys=range(len(runs))).sort_index()
     times = pd.concat([run["seconds"] for run in numbered], axis=1, keys=range(len(runs))).reindex(values.index)
-    for place, (run, over) in enumerate(zip(numbered, failed, strict=True)):
+    for column, (run, has_failed) in enumerate(zip(numbered, failed, strict=True)):
         end = run.index.max() if len(run) else -math.inf
-        if over:
-            values.loc[values.index > end, place] = math.inf
+        if has_failed:
+            values.loc[values.index > end, column] = math.inf
     values = values.dropna(how="any")
     values = values[np.isfinite(values).any(axis=1)]
     parts = {"seconds": times.loc[values.index].median(axis=1)}
@@ -61,12 +61,12 @@ def history_of(runs: Runs, record: Record) -> pd.DataFrame:
     """
     curve = read(runs.folder(record))[0].sort_values("iteration")
     costs = curve[["seconds", "value_evaluations"]].shift(1, fill_value=0.0)
-    history = costs.assign(iteration=curve["iteration"], error=SCALE * curve["chamfer_l2"], loss=curve["total"])
+    history = costs.assign(iteration=curve["iteration"], error=CHAMFER_SCALE * curve["chamfer_l2"], loss=curve["total"])
     history = history.dropna(subset=["error"])
     if record["status"] == "ok" and len(curve) and (error := measured(record, "chamfer_l2")) is not None:
         last = curve.iloc[-1]
         end = {"seconds": last["seconds"], "value_evaluations": last["value_evaluations"]}
-        end |= {"iteration": last["iteration"] + 1, "error": SCALE * error, "loss": math.nan}
+        end |= {"iteration": last["iteration"] + 1, "error": CHAMFER_SCALE * error, "loss": math.nan}
         history = pd.concat([history, pd.DataFrame([end])], ignore_index=True)
     return history[[*HISTORY]]
 

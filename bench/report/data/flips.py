@@ -7,7 +7,7 @@ import numpy as np
 
 from bench.report.data.statistics import shapes_needed
 
-MOST_EXACT = 16  # units of which all signs are tried; of more, 2**15 random signs
+MAX_EXACT_UNITS = 16  # units of which all signs are tried; of more, 2**15 random signs
 
 
 @cache
@@ -16,11 +16,11 @@ def signs(units: int) -> np.ndarray:
 
     The other half of all flips has the same sums, with the other sign.
     """
-    if units <= MOST_EXACT:
+    if units <= MAX_EXACT_UNITS:
         return np.array([(1.0, *others)[:units] for others in product((1.0, -1.0), repeat=max(units - 1, 0))])
-    drawn = np.random.default_rng(0).choice((1.0, -1.0), (2 ** (MOST_EXACT - 1), units))
-    drawn[0] = 1
-    return drawn
+    random_signs = np.random.default_rng(0).choice((1.0, -1.0), (2 ** (MAX_EXACT_UNITS - 1), units))
+    random_signs[0] = 1
+    return random_signs
 
 
 def p_values(differences: np.ndarray) -> np.ndarray:
@@ -43,13 +43,13 @@ def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
 
 def interval(values: np.ndarray, alpha: float) -> tuple[float, float]:
     """The confidence interval of the mean of values [units] at level 1 - alpha: the means that are not rejected."""
-    drawn, ends = signs(len(values)), []
-    sums, counts = drawn @ values, drawn.sum(axis=1)
+    flips, ends = signs(len(values)), []
+    sums, counts = flips @ values, flips.sum(axis=1)
     for end in (values.min(), values.max()):
-        kept, lost = values.mean(), 2 * end - values.mean()
+        accepted, rejected = values.mean(), 2 * end - values.mean()
         for _ in range(50):
-            mean = (kept + lost) / 2
+            mean = (accepted + rejected) / 2
             p_value = np.mean(np.abs(sums - mean * counts) >= np.abs(sums[0] - mean * counts[0]) - 1e-12)
-            kept, lost = (mean, lost) if p_value > alpha else (kept, mean)
-        ends.append(float(kept))
+            accepted, rejected = (mean, rejected) if p_value > alpha else (accepted, mean)
+        ends.append(float(accepted))
     return ends[0], ends[1]

@@ -13,25 +13,25 @@ from bench.records.read import RESULTS, read_records
 from bench.records.record import row_name, started
 from bench.report.data.records import index
 
-TEXT, CATEGORY, WHOLE, NUMBER, TRUTH, TIME = (
+TEXT, CATEGORY, INTEGER, NUMBER, BOOLEAN, TIME = (
     *("string", "category", "Int64", "Float64", "boolean"),
     "datetime64[ms, UTC]",
 )
-COLUMNS = {  # that every table has, with their types
+FIXED_COLUMNS = {  # that every table has, with their types
     **{name: TEXT for name in ("folder", "name")},
     **{name: CATEGORY for name in ("task", "renderer", "method", "dataset", "scene")},
-    **{name: WHOLE for name in ("index", "seed")},
+    **{name: INTEGER for name in ("index", "seed")},
     "status": CATEGORY,
     "reason": TEXT,
     "started": TIME,
-    "reused": TRUTH,
+    "reused": BOOLEAN,
     **{name: NUMBER for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
     **{name: CATEGORY for name in ("cpu", "device")},
-    "threads": WHOLE,
+    "threads": INTEGER,
     "commit": CATEGORY,
-    "dirty": TRUTH,
+    "dirty": BOOLEAN,
 }
-MACHINE = ("cpu", "device", "threads", "commit", "dirty")  # of the record's environment
+ENVIRONMENT_COLUMNS = ("cpu", "device", "threads", "commit", "dirty")  # of the record's environment
 PREFIXES = {"metrics": "", "metrics_start": "start_", "seconds": "seconds_", "evaluations": "evaluations_"}
 CONFIG = "config."
 
@@ -71,24 +71,24 @@ def to_frame(records: Iterable[dict[str, Any]]) -> pd.DataFrame:
 
 def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
     """The values of each column, None where a run has none."""
-    columns: dict[str, list[Any]] = {name: [None] * len(records) for name in COLUMNS}
-    for place, record in enumerate(records):
+    columns: dict[str, list[Any]] = {name: [None] * len(records) for name in FIXED_COLUMNS}
+    for row, record in enumerate(records):
         for name, value in _row(record).items():
             if name not in columns:
                 columns[name] = [None] * len(records)
-            columns[name][place] = value
-    return {name: columns[name] for name in dict.fromkeys((*COLUMNS, *sorted(columns, key=_place)))}
+            columns[name][row] = value
+    return {name: columns[name] for name in dict.fromkeys((*FIXED_COLUMNS, *sorted(columns, key=_sort_key)))}
 
 
 def _row(record: dict[str, Any]) -> dict[str, Any]:
     """The values of a run by column; a metric that has the name of another column gets `metric_` in front."""
-    row = {name: record.get(name) for name in COLUMNS}
-    row |= {name: None if (value := record["environment"].get(name)) == "" else value for name in MACHINE}
+    row = {name: record.get(name) for name in FIXED_COLUMNS}
+    row |= {name: None if (value := record["environment"].get(name)) == "" else value for name in ENVIRONMENT_COLUMNS}
     row |= {"name": row_name(record["config"], record["renderer"]), "index": index(record)}
     row |= {"started": started(record), "method": record.get("method") or None, "scene": record.get("scene") or None}
-    for part, prefix in PREFIXES.items():
-        named = {f"{prefix}{name}": value for name, value in record[part].items()}
-        row |= {f"metric_{name}" if name in COLUMNS else name: _cell(value) for name, value in named.items()}
+    for section, prefix in PREFIXES.items():
+        named = {f"{prefix}{name}": value for name, value in record[section].items()}
+        row |= {f"metric_{name}" if name in FIXED_COLUMNS else name: _cell(value) for name, value in named.items()}
     return row | {name: _cell(value) for name, value in flat(record["config"], CONFIG).items()}
 
 
@@ -103,8 +103,8 @@ def _series(values: list[Any], kind: str) -> pd.Series:
         except (TypeError, ValueError, OverflowError):
             return pd.Series([None if value is None else str(value) for value in values], dtype=TEXT)
     texts = [None if value is None else str(value) for value in values]
-    known = pd.Index(sorted({text for text in texts if text is not None}), dtype="str")
-    return pd.Series(pd.Categorical(texts, categories=known))
+    categories = pd.Index(sorted({text for text in texts if text is not None}), dtype="str")
+    return pd.Series(pd.Categorical(texts, categories=categories))
 
 
 def _cell(value: Any) -> Any:
@@ -112,19 +112,19 @@ def _cell(value: Any) -> Any:
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
-def _place(name: str) -> tuple[int, str]:
+def _sort_key(name: str) -> tuple[int, str]:
     """Metrics first, then the start's, seconds, evaluations and settings, each by name."""
     prefixes = [*list(PREFIXES.values())[1:], CONFIG]
-    return next((place for place, prefix in enumerate(prefixes, 1) if name.startswith(prefix)), 0), name
+    return next((rank for rank, prefix in enumerate(prefixes, 1) if name.startswith(prefix)), 0), name
 
 
 def _type(name: str, values: list[Any]) -> str:
     """The type of a column: of a measured one number, unless it is text; of a setting by its values."""
-    if name in COLUMNS:
-        return COLUMNS[name]
+    if name in FIXED_COLUMNS:
+        return FIXED_COLUMNS[name]
     kinds = {type(value) for value in values if value is not None}
     if kinds == {bool}:
-        return TRUTH
+        return BOOLEAN
     if kinds == {int} and name.startswith(CONFIG):
-        return WHOLE
+        return INTEGER
     return NUMBER if kinds <= {int, float} and (kinds or not name.startswith(CONFIG)) else TEXT

@@ -18,16 +18,16 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import started, write_bytes
-from bench.report.data.lines import UNREADABLE
+from bench.report.data.lines import READ_ERRORS
 from bench.report.data.records import Record, grouped, setting
 
 SUFFIX = ".runs.csv.gz"
 CONFIG = "config."
-KEPT = "kept"  # marks a record that was read here
+FROM_RUNS_CSV = "kept"  # marks a record that was read here
 UNFINISHED = ("not_run", "killed")  # statuses of runs that say nothing of a row
 NO_ATTEMPTS = (*UNFINISHED, "refused")  # those of runs that did not measure what they were to measure
-HERE = ("log", "overrides", "environment.diff", "environment.platform", KEPT)
-HERE += ("config.results_dir", "config.priors_dir")  # what is of the machine, or can be looked up
+LOCAL_FIELDS = ("log", "overrides", "environment.diff", "environment.platform", FROM_RUNS_CSV)
+LOCAL_FIELDS += ("config.results_dir", "config.priors_dir")  # what is of the machine, or can be looked up
 
 
 def join(records: Iterable[Record], kept: Iterable[Record]) -> list[Record]:
@@ -55,7 +55,7 @@ def read_rows(folder: Path) -> list[Record]:
         try:
             with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
                 records += map(_record, csv.DictReader(file))
-        except (*UNREADABLE, AttributeError, EOFError, zlib.error) as error:
+        except (*READ_ERRORS, AttributeError, EOFError, zlib.error) as error:
             raise ValueError(f"{path} cannot be read, mend it or move it away: {error!r}") from error
     return records
 
@@ -86,7 +86,7 @@ def _cells(value: Any, name: str = "") -> dict[str, str]:
     if isinstance(value, str) and name.startswith(CONFIG) and value.startswith("/"):
         value = "/".join(["", *Path(value).parts[-2:]])  # which name the family of a folder of data
     bare = isinstance(value, str) and value and _value(value) == value
-    return {} if name in HERE else {name: value if bare else json.dumps(value)}
+    return {} if name in LOCAL_FIELDS else {name: value if bare else json.dumps(value)}
 
 
 def _has_columns(value: Any, name: str) -> bool:
@@ -107,7 +107,7 @@ def _record(cells: dict[str, str]) -> Record:
     if lacking := {"id", "status", "config"} - record.keys():
         raise ValueError(f"a line has no {', '.join(sorted(lacking))}")
     started(record)
-    return record | {KEPT: True, "log": []}
+    return record | {FROM_RUNS_CSV: True, "log": []}
 
 
 def _value(cell: str) -> Any:

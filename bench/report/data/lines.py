@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from bench.records.record import from_json_values, to_json_values, write_text
 
 Item = TypeVar("Item")
-UNREADABLE = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)  # of a damaged file
+READ_ERRORS = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)  # of a damaged file
 
 
 def write_lines(path: Path, kind: type, items: Iterable[Any]) -> Path:

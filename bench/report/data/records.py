@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.records.record import as_number, row_name
 
-SCALE = 1000.0  # of Chamfer distances, in tables and figures
+CHAMFER_SCALE = 1000.0  # of Chamfer distances, in tables and figures
 ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
 SHAPENET = "shapenet_"  # beginning of the families of `dataset=shapenet`; the class follows
 DOUBTFUL = ("loaded machine", "shared device", "missing synchronisation")  # beginnings of notes on times
@@ -93,10 +93,10 @@ def value_evaluations(record: Record) -> float | None:
     return None if value is None else value + record["evaluations"].get("coarse", 0)
 
 
-def median_of_known(values: Iterable[float | None]) -> float | None:
+def median_or_none(values: Iterable[float | None]) -> float | None:
     """The median of the values that are known; None where there is none."""
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
+    numbers = [value for value in values if value is not None]
+    return float(np.median(numbers)) if numbers else None
 
 
 def setting(config: dict[str, Any], *path: str) -> Any:
@@ -168,25 +168,25 @@ def by_shape(values: dict[RunKey, float]) -> list[Any]:
     """
     shapes = [grouped(runs, lambda run: run[1]).values() for runs in grouped(values, lambda run: run[0]).values()]
     arrays = [[np.array([values[run] for run in runs]) for runs in views] for views in shapes]
-    return arrays if any(len(views) > 1 for views in arrays) else [of_view for (of_view,) in arrays]
+    return arrays if any(len(views) > 1 for views in arrays) else [views for (views,) in arrays]
 
 
-def definition(known: dict[str, Any], name: str) -> Any:
+def definition(texts_by_names: dict[str, Any], name: str) -> Any:
     """The definition of a metric; empty where there is none.
 
     A key is a list of names, such as "lost, false". It is also that of another band's metric of that name, such as
     "frontal.code_cosine", and of names that begin so: "saved_..." and "depth_error" of depth_error_p99.
     """
-    keys = [(part.strip(), words) for key, words in known.items() for part in key.split(",")]
+    keys = [(alias.strip(), words) for key, words in texts_by_names.items() for alias in key.split(",")]
     last = name.rsplit(".", 1)[-1]
-    for fits in (
-        lambda part: part == name,
-        lambda part: part.endswith("...") and name.startswith(part[:-3]),
-        lambda part: part.rsplit(".", 1)[-1] == last,
-        lambda part: last.startswith(f"{part.rsplit('.', 1)[-1]}_"),
+    for matches in (
+        lambda alias: alias == name,
+        lambda alias: alias.endswith("...") and name.startswith(alias[:-3]),
+        lambda alias: alias.rsplit(".", 1)[-1] == last,
+        lambda alias: last.startswith(f"{alias.rsplit('.', 1)[-1]}_"),
     ):
-        for part, words in keys:
-            if fits(part):
+        for alias, words in keys:
+            if matches(alias):
                 return words
     return ""
 
@@ -195,9 +195,9 @@ def definitions(records: list[Record], names: dict[str, str]) -> list[str]:
     """A line with the headings and the definition of each metric that is shown; `names` has the heading by metric."""
     lines: dict[str, list[str]] = {}
     for name, heading in names.items():
-        told = next(filter(None, (str(definition(record["definitions"], name)) for record in records)), "")
-        lines.setdefault(told, []).append(heading)
-    return [f"{', '.join(dict.fromkeys(headings))}: {told}" for told, headings in lines.items() if told]
+        text = next(filter(None, (str(definition(record["definitions"], name)) for record in records)), "")
+        lines.setdefault(text, []).append(heading)
+    return [f"{', '.join(dict.fromkeys(headings))}: {text}" for text, headings in lines.items() if text]
 
 
 def repeated(records: list[Record]) -> str:

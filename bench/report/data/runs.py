@@ -13,10 +13,22 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import requested, row_name, started
 from bench.report.data.frame import to_frame
-from bench.report.data.kept import KEPT, NO_ATTEMPTS
-from bench.report.data.records import SCALE, Record, Row, doubtful, family, grouped, index, row_of, setting, solid, view
+from bench.report.data.kept import FROM_RUNS_CSV, NO_ATTEMPTS
+from bench.report.data.records import (
+    CHAMFER_SCALE,
+    Record,
+    Row,
+    doubtful,
+    family,
+    grouped,
+    index,
+    row_of,
+    setting,
+    solid,
+    view,
+)
 
-MACHINE = ("cpu", "device", "threads")
+MACHINE_KEYS = ("cpu", "device", "threads")
 # Rows of one table may differ in these: an error against the truth compares them.
 ROW_SETTINGS = ("prior.truncation",)
 
@@ -67,7 +79,7 @@ class Runs:
         rows = [row_of(record) for record in self.records]
         coarse = table.evaluations_coarse.fillna(0) if "evaluations_coarse" in table else 0
         missing = pd.Series(pd.NA, table.index, dtype="Float64")
-        forward, backward, loop = (table.get(f"seconds_{part}", missing) for part in ("forward", "backward", "loop"))
+        forward, backward, loop = (table.get(f"seconds_{phase}", missing) for phase in ("forward", "backward", "loop"))
         return table.assign(
             row=[row.name for row in rows],
             preset=[row.preset for row in rows],
@@ -78,7 +90,7 @@ class Runs:
             values=(table.get("evaluations_value", missing) + coarse).astype(float),
         )
 
-    def error(self, metric: str, scale: float = SCALE) -> pd.Series:
+    def error(self, metric: str, scale: float = CHAMFER_SCALE) -> pd.Series:
         """A metric of each run, times `scale`; infinite where the run did not end ok or lacks it."""
         ok = (self.frame.status == "ok").to_numpy(bool)
         return self.number(metric).where(ok, np.inf).fillna(np.inf) * scale
@@ -103,10 +115,10 @@ class Runs:
         return replace(self, records=[record for record, keep in zip(self.records, kept, strict=True) if keep])
 
     @property
-    def made(self) -> "Runs":
+    def executed(self) -> "Runs":
         """Without cells that were not run, killed or refused, which are no failures; all where no other is there."""
-        made = ~self.frame.status.isin(NO_ATTEMPTS)
-        return self.where(made) if made.any() else self
+        is_executed = ~self.frame.status.isin(NO_ATTEMPTS)
+        return self.where(is_executed) if is_executed.any() else self
 
     def other(self, selection: Selection) -> "Runs | None":
         """The runs of another experiment of the same results folder."""
@@ -118,7 +130,7 @@ class Runs:
         Raises:
             NoFolder: where it is gone, and the record is a row of a shipped table.
         """
-        if KEPT in record:
+        if FROM_RUNS_CSV in record:
             raise NoFolder(record["folder"])
         return self.results_dir / "runs" / record["folder"]
 
@@ -138,20 +150,20 @@ class Runs:
 
     def names(self) -> list[str]:
         """A readable name of each run: its row's, with what else runs differ in: conditions, family, seed, shape."""
-        parts = {"": family, "seed ": itemgetter("seed"), "shape ": index}
-        varied = {word: part for word, part in parts.items() if len({str(part(record)) for record in self.records}) > 1}
+        getters = {"": family, "seed ": itemgetter("seed"), "shape ": index}
+        varying = {word: get for word, get in getters.items() if len({str(get(run)) for run in self.records}) > 1}
         return [
             row_of(record).name
             + "".join(f", {value} {name}" for name, value in self._conditions(record))
-            + "".join(f", {word}{part(record)}" for word, part in varied.items())
+            + "".join(f", {word}{get(record)}" for word, get in varying.items())
             for record in self.records
         ]
 
     def _conditions(self, record: Record) -> list[tuple[str, Any]]:
-        found = {
+        values = {
             key.rpartition(".")[2]: setting(record["config"], *key.split(".")) for key in self.selection.conditions
         }
-        return [(name, value) for name, value in found.items() if isinstance(value, str | int | float)]
+        return [(name, value) for name, value in values.items() if isinstance(value, str | int | float)]
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
         """The names of the runs by what their times depend on: processor, accelerator, threads, compiled kernels.
@@ -160,8 +172,8 @@ class Runs:
         """
 
         def machine_of(record: Record) -> tuple[Any, ...]:
-            said = record["environment"]
-            return (*(said.get(key) for key in MACHINE), said.get("kernels") == "compiled")
+            environment = record["environment"]
+            return (*(environment.get(key) for key in MACHINE_KEYS), environment.get("kernels") == "compiled")
 
         machines = grouped([record for record in self.named() if record["environment"].get("cpu")], machine_of)
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
@@ -169,16 +181,16 @@ class Runs:
     def mixed(self) -> list[str]:
         """The settings of view and evaluation in which an experiment's runs differ, of prior and field in a family."""
         experiments = grouped(self.records, lambda record: record["config"].get("experiment")).values()
-        together = [(records, ("view", "evaluation")) for records in experiments]
-        families = (records for own in experiments for records in grouped(own, family).values())
-        together += [(records, ("prior", "field")) for records in families]
-        found: dict[str, None] = {}
-        for records, parts in together:
-            known = [flat({part: record["config"].get(part) for part in parts}, "") for record in records]
-            ignored = {*self.selection.conditions, *ROW_SETTINGS}
-            keys = dict.fromkeys(key for one in known for key in one if key not in ignored)
-            found |= {key: None for key in keys if len({str(one[key]) for one in known if key in one}) > 1}
-        return list(found)
+        comparisons = [(records, ("view", "evaluation")) for records in experiments]
+        families = (records for group in experiments for records in grouped(group, family).values())
+        comparisons += [(records, ("prior", "field")) for records in families]
+        differing, ignored = dict[str, None](), {*self.selection.conditions, *ROW_SETTINGS}
+        for records, sections in comparisons:
+            configs = [flat({key: record["config"].get(key) for key in sections}, "") for record in records]
+            keys = dict.fromkeys(key for config in configs for key in config if key not in ignored)
+            texts = {key: {str(config[key]) for config in configs if key in config} for key in keys}
+            differing |= {key: None for key in keys if len(texts[key]) > 1}
+        return list(differing)
 
     def of_newest_scene(self) -> "Runs":
         """Those runs alone that have the seed and the shape of the one requested last."""
@@ -195,26 +207,27 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ru
     where nothing is averaged, rows of one name are told apart by their renderers' settings. Rows stand in the order in
     which they started.
     """
-    found = sorted((r for r in records if r["config"].get("experiment") == selection.experiment), key=started)
-    if not found:
+    candidates = sorted((r for r in records if r["config"].get("experiment") == selection.experiment), key=started)
+    if not candidates:
         return None
     shared = [key for key in ("scale.name", "split", *selection.alike) if key not in selection.conditions]
-    newest = max(found, key=requested)
-    same = [r for r in found if all(_part(r, key, selection) == _part(newest, key, selection) for key in shared)]
+    newest = max(candidates, key=requested)
+    wanted = [_without_conditions(newest, key, selection) for key in shared]
+    chosen = [run for run in candidates if [_without_conditions(run, key, selection) for key in shared] == wanted]
     if "dataset" not in selection.alike:
-        last = {_row(record): _setting(record, selection) for record in sorted(same, key=requested)}
-        same = [record for record in same if _setting(record, selection) == last[_row(record)]]
+        newest = {_row_key(run): _row_settings(run, selection) for run in sorted(chosen, key=requested)}
+        chosen = [record for record in chosen if _row_settings(record, selection) == newest[_row_key(record)]]
     cells: dict[Hashable, Record] = {}
-    for record in same:
-        cells[_cell(record, selection)] = record  # keeps the place of the first record, with the content of the newest
-    return Runs(selection, results_dir, named_rows(list(cells.values())), len(found) - len(cells), records)
+    for record in chosen:  # a cell keeps the position of its first record, with the content of the newest
+        cells[_cell_key(record, selection)] = record
+    return Runs(selection, results_dir, named_rows(list(cells.values())), len(candidates) - len(cells), records)
 
 
-def together(*several: Runs | None) -> Runs:
+def merge_runs(*runs_or_none: Runs | None) -> Runs:
     """The runs of several experiments as one, for a common caption."""
-    known = [runs for runs in several if runs is not None]
-    records = sorted((record for runs in known for record in runs.records), key=started)
-    return replace(known[0], records=records, left_out=sum(runs.left_out for runs in known))
+    present = [runs for runs in runs_or_none if runs is not None]
+    records = sorted((record for runs in present for record in runs.records), key=started)
+    return replace(present[0], records=records, left_out=sum(runs.left_out for runs in present))
 
 
 def shared_loss(records: list[Record]) -> str:
@@ -231,17 +244,18 @@ def named_rows(records: list[Record]) -> list[Record]:
     """
     shared = {"silhouette": {}} if shared_loss(records) else {}
     names = [row_name(record["config"] | shared, record["renderer"]) for record in records]
-    alike = grouped(range(len(records)), lambda place: (names[place], row_of(records[place]).preset))
-    for places in alike.values():
-        settings = {place: renderer_settings(records[place]) for place in places}
-        keys = dict.fromkeys(key for one in settings.values() for key in one)
-        differ = [key for key in keys if len({one.get(key) for one in settings.values()}) > 1]
-        for place, own in settings.items():
-            told = [f"{key.strip('_')} {own[key]}" for key in differ if key in own]
-            names[place] += f" ({', '.join(told)})" if told else ""
-    presets = grouped(range(len(records)), lambda place: names[place])
-    several = {name for name, own in presets.items() if len({row_of(records[place]).preset for place in own}) > 1}
-    names = [f"{n}, {row_of(r).preset}" if n in several else n for n, r in zip(names, records, strict=True)]
+    presets = [row_of(record).preset for record in records]
+    positions_by_row = grouped(range(len(records)), lambda position: (names[position], presets[position]))
+    for positions in positions_by_row.values():
+        settings = {position: renderer_settings(records[position]) for position in positions}
+        keys = dict.fromkeys(key for values in settings.values() for key in values)
+        differ = [key for key in keys if len({values.get(key) for values in settings.values()}) > 1]
+        for position, row_settings in settings.items():
+            differences = [f"{key.strip('_')} {row_settings[key]}" for key in differ if key in row_settings]
+            names[position] += f" ({', '.join(differences)})" if differences else ""
+    presets_by_name = grouped(zip(names, presets, strict=True), lambda pair: pair[0])
+    ambiguous = {name for name, pairs in presets_by_name.items() if len({*pairs}) > 1}
+    names = [f"{name}, {preset}" if name in ambiguous else name for name, preset in zip(names, presets, strict=True)]
     return [record | {"row": name} for record, name in zip(records, names, strict=True)]
 
 
@@ -252,28 +266,28 @@ def renderer_settings(record: Record) -> dict[str, str]:
     return {str(key): str(value) for key, value in (record["config"].get("renderer") or {}).items()}
 
 
-def _part(record: Record, key: str, selection: Selection) -> Any:
-    found = setting(record["config"], *key.split("."))
-    if not isinstance(found, dict) or not any(one.startswith(f"{key}.") for one in selection.conditions):
-        return found
-    kept = [name for name in found if f"{key}.{name}" not in selection.conditions]
-    return {name: _part(record, f"{key}.{name}", selection) for name in kept}
+def _without_conditions(record: Record, key: str, selection: Selection) -> Any:
+    node = setting(record["config"], *key.split("."))
+    if not isinstance(node, dict) or not any(condition.startswith(f"{key}.") for condition in selection.conditions):
+        return node
+    names = [name for name in node if f"{key}.{name}" not in selection.conditions]
+    return {name: _without_conditions(record, f"{key}.{name}", selection) for name in names}
 
 
-def _row(record: Record) -> Hashable:
+def _row_key(record: Record) -> Hashable:
     """What has one setting: a row in a task, and of a search space a draw."""
     return row_of(record), record["task"], record["config"].get("draw")
 
 
-def _setting(record: Record, selection: Selection) -> Any:
+def _row_settings(record: Record, selection: Selection) -> Any:
     """The settings of a row: the renderer's, the task's without conditions, the loss of the mask, the resolution."""
-    parts = [_part(record, key, selection) for key in ("renderer", "task", "silhouette")]
-    return [*parts, setting(record["config"], "view", "resolution")]
+    settings = [_without_conditions(record, key, selection) for key in ("renderer", "task", "silhouette")]
+    return [*settings, setting(record["config"], "view", "resolution")]
 
 
-def _cell(record: Record, selection: Selection) -> Hashable:
+def _cell_key(record: Record, selection: Selection) -> Hashable:
     """What has one run. A condition that is a node, such as a stress, is named by the shape's family already."""
-    found = (setting(record["config"], *key.split(".")) for key in (*selection.conditions, "split"))
-    conditions = (str(value) for value in found if not isinstance(value, dict))
+    values = (setting(record["config"], *key.split(".")) for key in (*selection.conditions, "split"))
+    conditions = (str(value) for value in values if not isinstance(value, dict))
     settings = str(sorted(renderer_settings(record).items()))
-    return (*_row(record), settings, *solid(record), view(record), record["seed"], *conditions)
+    return (*_row_key(record), settings, *solid(record), view(record), record["seed"], *conditions)

@@ -4,7 +4,7 @@ Lower is better. A run that failed or is missing has the error +inf. A method's 
 with the errors of its seeds, or a list per shape with an array per view. Where methods are compared, the same place in
 their groups means the same shape, view and seed.
 
-The independent unit is the shape. Below `FEWEST_SHAPES` no interval is given: its ends are nan, and the values of the
+The independent unit is the shape. Below `MIN_SHAPES` no interval is given: its ends are nan, and the values of the
 shapes stand in `Interval.points` to be shown instead. From one run alone no probability and no rank is given.
 """
 
@@ -25,9 +25,9 @@ Values = np.ndarray | Sequence[float]
 Groups = Sequence[Any]  # of each shape an array of its seeds, or a sequence of such arrays, one per view
 Statistic = Callable[[np.ndarray], float | np.ndarray]  # reduces the last axis, as `interquartile_mean` does
 Point = tuple[Groups, Groups]  # the costs and the errors of one setting
-LEVEL = 0.95  # of all intervals
-ALPHA = 1 - LEVEL  # the probability of any false rejection among the tests of a page
-FEWEST_SHAPES = 6  # with an interval: the extremes of five enclose a median with a probability of 94 %, of four 88 %
+CONFIDENCE_LEVEL = 0.95  # of all intervals
+ALPHA = 1 - CONFIDENCE_LEVEL  # the probability of any false rejection among the tests of a page
+MIN_SHAPES = 6  # with an interval: the extremes of five enclose a median with a probability of 94 %, of four 88 %
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Interval:
     points: tuple[float, ...] = field(default=(), compare=False, repr=False)
 
     @property
-    def known(self) -> bool:
+    def has_ends(self) -> bool:
         """Whether there is an interval."""
         return not math.isnan(self.low)
 
@@ -54,7 +54,7 @@ class Interval:
 
     def ends(self, scale: float = 1.0) -> str:
         """The interval, its ends times `scale`, or else the number of shapes, such as (n = 4)."""
-        return format.interval(scale * self.low, scale * self.high) if self.known else f"(n = {len(self.points)})"
+        return format.interval(scale * self.low, scale * self.high) if self.has_ends else f"(n = {len(self.points)})"
 
     def __str__(self) -> str:
         """The estimate, and its interval or else the number of shapes."""
@@ -84,7 +84,7 @@ def geometric_mean(values: Values) -> float | np.ndarray:
         return np.exp(np.log(_checked(values)).mean(axis=-1))
 
 
-def better(first: Groups, second: Groups) -> float:
+def shapes_won(first: Groups, second: Groups) -> float:
     """On how many shapes the median of the first's runs is lower than that of the second's; equal ones are half."""
     a, b = (np.array([median(flat([group])) for group in groups]) for groups in (first, second))
     return float(((a < b) + 0.5 * (a == b)).sum())
@@ -103,7 +103,7 @@ def bootstrap(groups: Groups, statistic: Statistic, *, seed: int = 0, draws: int
         statistic: reduces the last axis. It gets the runs of all shapes together: a shape with more runs weighs more.
 
     Returns:
-        Ends are draws, never interpolated, so they can be +inf; nan below `FEWEST_SHAPES`.
+        Ends are draws, never interpolated, so they can be +inf; nan below `MIN_SHAPES`.
     """
     (value,), (drawn,), points = _resample([groups], statistic, seed, draws)
     return _interval(value, drawn, points[0])
@@ -116,9 +116,9 @@ def typical(groups: Groups) -> Interval:
     interval of a mean over 6 to 12 shapes covers 95 %.
 
     Returns:
-        nan ends below `FEWEST_SHAPES`; the median and the ends may be infinite.
+        nan ends below `MIN_SHAPES`; the median and the ends may be infinite.
     """
-    return _of_median(_of_shapes(groups))
+    return _median_interval(_shape_means(groups))
 
 
 def ratio(first: Groups, second: Groups) -> Interval:
@@ -130,8 +130,8 @@ def ratio(first: Groups, second: Groups) -> Interval:
         ValueError: the two do not have the same shapes with the same numbers of views and seeds.
     """
     if _sizes(first) != _sizes(second):
-        raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
-    return _of_median(_ratio(_of_shapes(first), _of_shapes(second)))
+        raise ValueError(f"{_UNEQUAL_SHAPES} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
+    return _median_interval(_ratio(_shape_means(first), _shape_means(second)))
 
 
 class Verdict(Enum):
@@ -142,16 +142,16 @@ class Verdict(Enum):
     NOT_DECIDABLE = "cannot be decided"  # no data of so few shapes could be rejected
 
 
-def differ(ratios: Sequence[Interval]) -> list[Verdict]:
+def ratio_verdicts(ratios: Sequence[Interval]) -> list[Verdict]:
     """The verdict on each ratio of a family: the sign test over shapes with Holm's step-down at 5 % in all.
 
     A ratio is not decidable if the test would reject nothing even where all shapes of all ratios agree. Ratios of fewer
-    shapes than `FEWEST_SHAPES` are not decidable, and are not counted.
+    shapes than `MIN_SHAPES` are not decidable, and are not counted.
     """
-    counted = [index for index, ratio in enumerate(ratios) if ratio.known]
+    counted = [index for index, ratio in enumerate(ratios) if ratio.has_ends]
     tests = (
-        [_sign_test(ratios[index].points) for index in counted],
-        [_least_chance(len(ratios[index].points)) for index in counted],
+        [_sign_test_p_value(ratios[index].points) for index in counted],
+        [_min_p_value(len(ratios[index].points)) for index in counted],
     )
     rejected, decidable = ({index for index, sure in zip(counted, holm(test), strict=True) if sure} for test in tests)
     open_verdicts = [Verdict.NOT_DISTINGUISHED if i in decidable else Verdict.NOT_DECIDABLE for i in range(len(ratios))]
@@ -169,7 +169,7 @@ def holm(p_values: Values, alpha: float = ALPHA) -> np.ndarray:
 
 def shapes_needed(ratios: int, alpha: float = ALPHA) -> int:
     """The fewest shapes with which the sign test can reject anything in a family of so many ratios."""
-    return next(n for n in count(1) if _least_chance(n) <= alpha / ratios)
+    return next(n for n in count(1) if _min_p_value(n) <= alpha / ratios)
 
 
 def shapes_agreeing(shapes: int, ratios: int) -> int:
@@ -178,28 +178,28 @@ def shapes_agreeing(shapes: int, ratios: int) -> int:
     return shapes + 1 - int(np.searchsorted(chances, ALPHA / ratios, side="right"))
 
 
-def _least_chance(shapes: int) -> float:
+def _min_p_value(shapes: int) -> float:
     """The probability of the sign test if all shapes are on one side of 1."""
     return 2.0 * 0.5**shapes
 
 
-def _sign_test(points: Sequence[float]) -> float:
+def _sign_test_p_value(points: Sequence[float]) -> float:
     """The probability of as many values on one side of 1, if both sides are as likely; values of 1 do not count."""
     below, above = sum(x < 1 for x in points), sum(x > 1 for x in points)
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
 
 
-def _of_shapes(groups: Groups) -> np.ndarray:
+def _shape_means(groups: Groups) -> np.ndarray:
     """The geometric mean of each shape's runs."""
     return np.array([geometric_mean(flat([group])) for group in groups])
 
 
-def _of_median(points: np.ndarray) -> Interval:
+def _median_interval(points: np.ndarray) -> Interval:
     """The median of shapes' values; beyond its ends lie as many as a sign test allows."""
     n = len(points)
     with np.errstate(divide="ignore", invalid="ignore"):  # 0 and inf beside each other: neither is known to be better
         middle = math.exp(np.median(np.log(points)))
-    if n < FEWEST_SHAPES:
+    if n < MIN_SHAPES:
         return Interval(middle, math.nan, math.nan, tuple(points.tolist()))
     chances = special.bdtr(np.arange(n), n, 0.5)  # of at most so many of n values below the median
     beyond, ordered = int(np.searchsorted(chances, ALPHA / 2)) - 1, np.sort(points)
@@ -232,13 +232,13 @@ def share(successes: Values, trials: Values) -> Interval:
         trials: per shape, one or more.
 
     Returns:
-        A share of 1; nan ends below `FEWEST_SHAPES`.
+        A share of 1; nan ends below `MIN_SHAPES`.
     """
     k, m = np.asarray(successes, dtype=float), np.asarray(trials, dtype=float)
     if k.shape != m.shape or not k.size or not ((k >= 0) & (k <= m) & (m >= 1)).all():
         raise ValueError(f"successes must be in 0..trials, trials 1 or more per shape, but they are {k} and {m}")
     value, points = float(k.sum() / m.sum()), tuple((k / m).tolist())
-    if len(k) < FEWEST_SHAPES:
+    if len(k) < MIN_SHAPES:
         return Interval(value, math.nan, math.nan, points)
     return replace(clopper_pearson(value, len(k)), points=points)
 
@@ -267,18 +267,18 @@ def rank(table: dict[Any, dict[Any, float | None]]) -> dict[Any, Interval]:
     ranks = errors.rank(axis=1).fillna(worst)
     if not several_shapes or ranks.empty:
         return dict.fromkeys(table, Interval(worst if several_shapes else math.nan, math.nan, math.nan))
-    return {name: _mean_of(ranks[name].to_numpy()) for name in table}
+    return {name: _mean_interval(ranks[name].to_numpy()) for name in table}
 
 
-def _mean_of(values: np.ndarray) -> Interval:
+def _mean_interval(values: np.ndarray) -> Interval:
     return bootstrap([*values[:, None]], lambda drawn: np.mean(drawn, axis=-1))
 
 
-def as_good(ranks: dict[Any, Interval], best: Any) -> list[Any]:
+def tied_with_best(ranks: dict[Any, Interval], best: Any) -> list[Any]:
     """The other methods whose ranks do not differ from the best one's: the interval of the difference holds 0."""
-    first = np.array(ranks[best].points)
-    others = {name: _mean_of(np.array(found.points) - first) for name, found in ranks.items() if name != best}
-    return [name for name, found in others.items() if found.low <= 0 <= found.high]
+    best_points = np.array(ranks[best].points)
+    others = {name: _mean_interval(np.array(rank.points) - best_points) for name, rank in ranks.items() if name != best}
+    return [name for name, rank in others.items() if rank.low <= 0 <= rank.high]
 
 
 def dominated(costs: Values, errors: Values) -> np.ndarray:
@@ -291,10 +291,10 @@ def dominated(costs: Values, errors: Values) -> np.ndarray:
 
 def on_front(costs: Sequence[float | None], errors: Sequence[float]) -> list[bool]:
     """Whether each point is on the front: it has a cost and a finite error, and none that has both dominates it."""
-    both = [cost is not None and math.isfinite(error) for cost, error in zip(costs, errors, strict=True)]
-    known = [(cost, error) for cost, error, has in zip(costs, errors, both, strict=True) if has]
-    beaten = iter(dominated(*zip(*known, strict=True)) if known else ())
-    return [has and not next(beaten) for has in both]
+    is_complete = [cost is not None and math.isfinite(error) for cost, error in zip(costs, errors, strict=True)]
+    pairs = [(cost, error) for cost, error, has in zip(costs, errors, is_complete, strict=True) if has]
+    is_dominated = iter(dominated(*zip(*pairs, strict=True)) if pairs else ())
+    return [has and not next(is_dominated) for has in is_complete]
 
 
 def front(points: Sequence[Point], *, seed: int = 0, draws: int = 2000) -> list[float]:
@@ -331,7 +331,7 @@ def _ratio(first: float | np.ndarray, second: float | np.ndarray) -> np.ndarray:
         return np.where(first == second, 1.0, np.divide(first, second))
 
 
-_SAME = "all must have the same shapes and seeds, one or more, but have"
+_UNEQUAL_SHAPES = "all must have the same shapes and seeds, one or more, but have"
 
 
 def _sizes(groups: Groups) -> list[list[int]]:
@@ -339,12 +339,12 @@ def _sizes(groups: Groups) -> list[list[int]]:
     sizes = [[len(groups)]]
     while groups and not isinstance(groups[0], np.ndarray):
         sizes.append([len(group) for group in groups])
-        groups = [part for group in groups for part in group]
+        groups = [inner for group in groups for inner in group]
     return [*sizes, [len(group) for group in groups]]
 
 
 def _resample(
-    series: Sequence[Groups], statistic: Statistic, seed: int, draws: int, fewest: int = FEWEST_SHAPES
+    series: Sequence[Groups], statistic: Statistic, seed: int, draws: int, fewest: int = MIN_SHAPES
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The statistic of each series [series], of each draw [series, draws], and of each shape [series, shapes].
 
@@ -352,7 +352,7 @@ def _resample(
     """
     sizes = [_sizes(groups) for groups in series]
     if not sizes or any(other != sizes[0] for other in sizes) or not all(min(level, default=0) for level in sizes[0]):
-        raise ValueError(f"{_SAME} {sizes}: fill in with inf")
+        raise ValueError(f"{_UNEQUAL_SHAPES} {sizes}: fill in with inf")
     values = _checked(np.stack([flat(groups) for groups in series]))
     shapes = np.array([[statistic(_checked(flat([group]))) for group in groups] for groups in series], dtype=float)
     drawn = [np.empty((len(series), 0))]
@@ -365,20 +365,20 @@ def _draw(sizes: list[list[int]], seed: int, draws: int) -> list[np.ndarray]:
     """The indices of the drawn runs, for the sizes of `_sizes`: an array [draws, runs] per number of runs."""
     generator = np.random.default_rng(seed)
     (n,) = sizes[0]
-    node, kept = generator.integers(n, size=(draws, n)), np.ones((draws, n), dtype=bool)
+    node, is_drawn = generator.integers(n, size=(draws, n)), np.ones((draws, n), dtype=bool)
     for level in map(np.array, sizes[1:]):
         size, start = level[node][..., None], (np.cumsum(level) - level)[node][..., None]
-        part = start + generator.integers(size, size=(*node.shape, level.max()))
-        kept = kept[..., None] & (np.arange(level.max()) < size)  # a shape gives as many runs as it has
-        node, kept = part.reshape(draws, -1), kept.reshape(draws, -1)
-    total = kept.sum(axis=1)
-    return [node[total == n][kept[total == n]].reshape(-1, n) for n in np.unique(total)]
+        nodes = start + generator.integers(size, size=(*node.shape, level.max()))
+        is_drawn = is_drawn[..., None] & (np.arange(level.max()) < size)  # a shape gives as many runs as it has
+        node, is_drawn = nodes.reshape(draws, -1), is_drawn.reshape(draws, -1)
+    total = is_drawn.sum(axis=1)
+    return [node[total == n][is_drawn[total == n]].reshape(-1, n) for n in np.unique(total)]
 
 
 def _interval(value: float | np.ndarray, drawn: np.ndarray, points: np.ndarray) -> Interval:
     """The expanded percentile interval of the statistic's draws, and the statistic of each shape."""
     n, shapes = len(points), tuple(points.tolist())
-    if n < FEWEST_SHAPES:
+    if n < MIN_SHAPES:
         return Interval(float(value), math.nan, math.nan, shapes)
     tail = special.ndtr(math.sqrt(n / (n - 1)) * special.stdtrit(n - 1, ALPHA / 2))
     low, high = np.quantile(drawn, tail, method="lower"), np.quantile(drawn, 1 - tail, method="higher")

@@ -7,9 +7,9 @@ from pathlib import Path
 from bench.records.record import PICTURE_FILES, is_outside
 from bench.report.write.paper import key_of, link
 
-FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply", "field.safetensors")
-SUFFIXES = (".png", ".gif", ".webp")  # of pictures
-ALT = {  # what the pictures of a run show
+LINKED_FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply", "field.safetensors")
+PICTURE_SUFFIXES = (".png", ".gif", ".webp")  # of pictures
+PICTURE_TEXTS = {  # what the pictures of a run show
     "summary.png": "Depth, normals, errors of the silhouette and the shape from behind: before, after, truth",
     "strip.png": "The way from the start to the end, in frames",
     "film.gif": "The way from the start to the end, moving",
@@ -37,8 +37,8 @@ class Folder:
     def _linked(self) -> dict[str, bool]:
         """Its files, and whether each is a link."""
         try:
-            with os.scandir(self.path) as found:
-                return {one.name: one.is_symlink() for one in found if one.is_file()}
+            with os.scandir(self.path) as entries:
+                return {entry.name: entry.is_symlink() for entry in entries if entry.is_file()}
         except OSError:
             return {}
 
@@ -55,9 +55,9 @@ class Folder:
 
     def pictures(self) -> list[str]:
         """The names of its pictures, the one that stands for the run first."""
-        found = sorted(name for name in self._linked if Path(name).suffix in SUFFIXES and self.has(name))
+        pictures = sorted(name for name in self._linked if Path(name).suffix in PICTURE_SUFFIXES and self.has(name))
         ranks = {name: rank for rank, name in enumerate(PICTURE_FILES)}
-        return sorted(found, key=lambda name: ranks.get(name, len(ranks)))
+        return sorted(pictures, key=lambda name: ranks.get(name, len(ranks)))
 
     def link(self, name: str) -> str:
         """The address of one of its files."""
@@ -66,4 +66,4 @@ class Folder:
     def links(self) -> dict[str, str]:
         """The addresses of the files that every run may have, by their names."""
         folder = self.link("")
-        return {name: folder + name for name in FILES if self.has(name)}
+        return {name: folder + name for name in LINKED_FILES if self.has(name)}

@@ -27,11 +27,11 @@ TASKS = {
     "stability": "Search for the severity at which a renderer breaks",
     "capacity": "Measure how much model a shape needs",
 }
-LEFT_OUT = ("results_dir", "rerun")  # of a command, which stands for any folder
-MOST_SHOWN = 4  # metrics that the lines print
+OMITTED_KEYS = ("results_dir", "rerun")  # of a command, which stands for any folder
+MAX_PRINTED_METRICS = 4  # metrics that the lines print
 
 
-class Said(NamedTuple):
+class StatusText(NamedTuple):
     """What a status means, and what helps; `remedy` is empty where there is nothing to mend."""
 
     meaning: str
@@ -39,59 +39,63 @@ class Said(NamedTuple):
 
 
 STATUSES = {
-    RunStatus.OK: Said("It ended as planned."),
-    RunStatus.NAN: Said(
+    RunStatus.OK: StatusText("It ended as planned."),
+    RunStatus.NAN: StatusText(
         "The loss became NaN.",
         "Lower task.optimiser.learning_rate. The curve shows the last iteration with a finite loss.",
     ),
-    RunStatus.DIVERGED: Said(
+    RunStatus.DIVERGED: StatusText(
         "The loss rose a hundredfold.",
         "Lower task.optimiser.learning_rate, or the weight of the loss that rises first.",
     ),
-    RunStatus.NOT_REACHED: Said(
+    RunStatus.NOT_REACHED: StatusText(
         "The loss did not fall.",
         "Try more iterations (task.optimiser.iterations), another seed, or a renderer that has the gradient which the "
         "task needs: `task=gradients` compares them.",
     ),
-    RunStatus.EMPTY: Said(
+    RunStatus.EMPTY: StatusText(
         "The field ended without a surface.",
         "Lower task.optimiser.learning_rate, or raise the weight of the loss of the mask. strip.png shows when the "
         "surface was lost.",
     ),
-    RunStatus.TIMEOUT: Said(
+    RunStatus.TIMEOUT: StatusText(
         "A limit of time, or of field values, was reached.",
         "Raise time_limit=SECONDS (null is none), or make the work smaller: scale=smoke, view.resolution=32.",
     ),
-    RunStatus.OOM: Said(
+    RunStatus.OOM: StatusText(
         "A limit of memory was reached.",
         "Raise memory_limit=GIB where the machine has more, or make the work smaller: view.resolution, "
         "evaluation.grid.",
     ),
-    RunStatus.CRASHED: Said(
+    RunStatus.CRASHED: StatusText(
         "An error ended it.",
         "verbose=true shows where the error came from, and isolation=off lets a debugger stop there. log.txt has "
         "all of it.",
     ),
-    RunStatus.KILLED: Said("It was stopped from outside, or is still under way.", "The same command runs it again."),
-    RunStatus.UNSUPPORTED: Said(
+    RunStatus.KILLED: StatusText(
+        "It was stopped from outside, or is still under way.", "The same command runs it again."
+    ),
+    RunStatus.UNSUPPORTED: StatusText(
         "The renderer lacks what the task needs.",
         "This is an answer, not an error. The reason says what is lacking; another renderer or setting may have it.",
     ),
-    RunStatus.REFUSED: Said("The configuration is invalid.", "The reason names the key and what to type instead."),
-    NOT_RUN: Said(
+    RunStatus.REFUSED: StatusText(
+        "The configuration is invalid.", "The reason names the key and what to type instead."
+    ),
+    NOT_RUN: StatusText(
         "A sweep planned it, and it has not been run.",
         "The command of the sweep runs what is missing, and reuses what is there.",
     ),
 }
 
 
-def asked(record: Record) -> str:
+def request_sentence(record: Record) -> str:
     """What the run was asked to do, as a sentence."""
     config = record["config"]
-    said = TASKS.get(record["task"], f"task={record['task']}")
+    task_sentence = TASKS.get(record["task"], f"task={record['task']}")
     resolution, points = setting(config, "view", "resolution"), setting(config, "task", "points")
     iterations, scale = iterations_of(record), setting(config, "scale", "name")
-    parts = [
+    details = [
         f"{record.get('scene') or record['dataset']}",
         f"{points} depth points" if points is not None else "",
         f"{resolution} × {resolution} pixels" if isinstance(resolution, int) else "",
@@ -99,21 +103,24 @@ def asked(record: Record) -> str:
         f"seed {record['seed']}" if record["seed"] is not None else "",
         f"scale={scale}" if scale else "",
     ]
-    return f"{said}: {', '.join(filter(None, parts))}."
+    return f"{task_sentence}: {', '.join(filter(None, details))}."
 
 
 def command(record: Record, results_dir: Path) -> str:
     """The command that makes the run again, for a shell."""
     folder = [] if results_dir.as_posix() == RESULTS else [f"results_dir={results_dir.as_posix()}"]
     overrides = map(str, record.get("overrides") or [])
-    kept = [text for text in overrides if text.partition("=")[0] not in LEFT_OUT]
+    kept = [text for text in overrides if text.partition("=")[0] not in OMITTED_KEYS]
     return shlex.join(["python", "-m", "bench", *kept, *folder])
 
 
 def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
     """The lines that open the run in Python: its values of the table of all runs, its curve, its mesh and its field."""
     results, name = _quoted(folder.parents[1].as_posix()), _quoted(folder.name)
-    shown = ["status", *[metric for metric in metrics.TABLE_METRICS if metric in record["metrics"]][:MOST_SHOWN]]
+    shown = [
+        "status",
+        *[metric for metric in metrics.TABLE_METRICS if metric in record["metrics"]][:MAX_PRINTED_METRICS],
+    ]
     opened = {
         "curve.jsonl": ("import pandas as pd", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)'),
         "mesh.ply": ("import trimesh", 'mesh = trimesh.load(folder / "mesh.ply")'),

@@ -17,7 +17,7 @@ import pandas as pd
 from bench.records.record import MAX_WAIT_FRACTION
 from bench.report.data import flips, statistics
 from bench.report.data.statistics import Interval, shapes_needed
-from bench.report.suite.attempts import APART, Attempt, Gathered, problems_of, suite
+from bench.report.suite.attempts import SETS_WITHOUT_CURVE, Attempt, Gathered, problems_of, suite
 from bench.tables import choice
 
 UNIT = "dist"  # the preset of the row by whose costs all costs are divided
@@ -25,8 +25,8 @@ AT_1, AT_10, END, AREA = OUTCOMES = ("at_1", "at_10", "end", "area")
 AT_SECONDS = "at_seconds"  # of one run of DIST
 BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # the costs at which progress is read
 AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # over whose logarithm progress is averaged
-FEWEST_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
-LEAST_ERROR = 1e-12  # in a logarithm
+MIN_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
+MIN_LOG_ERROR = 1e-12  # in a logarithm
 KEY = ["set", "problem", "seed"]
 ALPHA = 0.02  # of tests in all, at which 5 % of simulated draws of equal rows have a false pair: scenes are skewed
 
@@ -38,21 +38,21 @@ class Standing:
         self.everything = frame_of(gathered.everything)
         self.compared = compared(self.everything, gathered.size)
         self.reached = with_progress(self.compared)
-        self.whole = self.reached[self.reached["whole"]]
-        self.rankings = {outcome: ranking(self.whole, outcome) for outcome in OUTCOMES}
+        self.complete = self.reached[self.reached["complete"]]
+        self.rankings = {outcome: ranking(self.complete, outcome) for outcome in OUTCOMES}
         self.rows = [*self.rankings[AT_1].progress]
-        self.sets = [name for name in suite().errors if name in {*self.whole["set"]}]
-        self.hidden = {budget: rows_with_few_checkpoints(self.whole, budget) for budget in BUDGETS} | {AREA: set()}
+        self.sets = [name for name in suite().errors if name in {*self.complete["set"]}]
+        self.hidden = {budget: rows_with_few_checkpoints(self.complete, budget) for budget in BUDGETS} | {AREA: set()}
 
     @cached_property
     def costs(self) -> dict[str, float]:
         """The median cost of each row's runs over that of DIST's."""
-        return (self.whole["cost"] / self.whole["unit"]).groupby(self.whole["row"]).median().to_dict()
+        return (self.complete["cost"] / self.complete["unit"]).groupby(self.complete["row"]).median().to_dict()
 
     @cached_property
     def lacking(self) -> dict[str, int]:
         """The rows that are not compared, with the number of problems that they lack."""
-        rows = self.compared[~self.compared["whole"] & ~self.compared["tuned"]]
+        rows = self.compared[~self.compared["complete"] & ~self.compared["tuned"]]
         return rows.groupby("row")["missing"].first().to_dict()
 
 
@@ -103,8 +103,8 @@ def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
     reachable = rows.get(unit_row(runs), {*keys})
     needed = problems_of(size) if problems_of(size) <= reachable else reachable
     missing = runs["row"].map({row: len(needed - problems) for row, problems in rows.items()})
-    runs = runs.assign(missing=missing, whole=(missing == 0) & ~runs["tuned"])
-    common = reachable.intersection(*(rows[row] for row in runs.loc[runs["whole"], "row"].unique()))
+    runs = runs.assign(missing=missing, complete=(missing == 0) & ~runs["tuned"])
+    common = reachable.intersection(*(rows[row] for row in runs.loc[runs["complete"], "row"].unique()))
     return _with_errors(runs[keys.isin(common)].reset_index(drop=True))
 
 
@@ -115,7 +115,7 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
 
     finite = runs[np.isfinite(runs["start"])]
     sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any did
-    least = runs[~runs["tuned"]].groupby(["set", "problem"])["final"].min().clip(lower=LEAST_ERROR)
+    least = runs[~runs["tuned"]].groupby(["set", "problem"])["final"].min().clip(lower=MIN_LOG_ERROR)
     stated = [_reference(*line) for line in zip(runs["set"], runs["problem"], runs["scene"], strict=True)]
     paid = runs[runs["ok"] & (runs["cost"] > 0)]
     units = paid[paid["row"] == unit_row(runs)].groupby(KEY)["cost"].median()
@@ -126,7 +126,7 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
         unit=at_problem(units).fillna(runs["set"].map(usual)).fillna(1.0),
     )
     possible = (runs["initial"] > runs["reference"]) & (runs["reference"] > 0)
-    return runs.assign(has_progress=possible & ~runs["set"].isin(APART))
+    return runs.assign(has_progress=possible & ~runs["set"].isin(SETS_WITHOUT_CURVE))
 
 
 def _reference(of_set: str, problem: str, scene: str) -> float | None:
@@ -140,7 +140,7 @@ def progress_curve(run: Any) -> tuple[np.ndarray, np.ndarray]:
     if not run.ok:
         return np.zeros(1), np.zeros(1)
     curve = np.array(run.curve)
-    left = np.log(np.maximum(curve[:, 2], LEAST_ERROR) / run.reference) / np.log(run.initial / run.reference)
+    left = np.log(np.maximum(curve[:, 2], MIN_LOG_ERROR) / run.reference) / np.log(run.initial / run.reference)
     return curve[:, 0] / run.unit, 1 - np.clip(left, 0, 1)
 
 
@@ -160,7 +160,7 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
         line[AREA] = np.interp(AREA_COSTS, costs, progress).mean()
         for name, budget in BUDGETS.items():
             certain = budget == inf or not run.ok  # the end, or the progress of a failed run: 0
-            line[f"{name}_checkpoints"] = FEWEST_CHECKPOINTS if certain else (costs <= budget).sum()
+            line[f"{name}_checkpoints"] = MIN_CHECKPOINTS if certain else (costs <= budget).sum()
         line[f"{AT_1}_next"] = max(line[AT_1], progress[min((costs <= 1).sum(), len(costs) - 1)])
         lines.append(line)
     columns = [*OUTCOMES, *(f"{name}_checkpoints" for name in BUDGETS), f"{AT_1}_next"]
@@ -168,9 +168,9 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def rows_with_few_checkpoints(runs: pd.DataFrame, budget: str) -> set[str]:
-    """The rows that have in some set fewer than `FEWEST_CHECKPOINTS` within a budget, in the median of problems."""
+    """The rows that have in some set fewer than `MIN_CHECKPOINTS` within a budget, in the median of problems."""
     counts = runs.groupby(["row", "set"])[f"{budget}_checkpoints"].median().groupby("row").min()
-    return {*counts[counts < FEWEST_CHECKPOINTS].index}
+    return {*counts[counts < MIN_CHECKPOINTS].index}
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
     """
     runs = runs[runs["set"] == of_set]
     runs = runs[runs.groupby("row")["ok"].transform("mean") >= 0.5]
-    errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=LEAST_ERROR))
+    errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=MIN_LOG_ERROR))
     table = errors.groupby([runs["scene"], runs["row"]]).mean().unstack("row")
     ratios = table.drop(columns=unit_row(runs), errors="ignore").sub(table.get(unit_row(runs)), axis=0)
     ends = flips.bounds(ratios.to_numpy(), ALPHA)
@@ -253,7 +253,7 @@ def timed(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
     pairs, lines = pairs[rows == runs["row"].nunique()].reset_index(drop=True), []
     for run in pairs.itertuples():
         seconds, progress = np.array(run.curve)[:, 1] if run.ok else np.zeros(1), progress_curve(run)[1]
-        count = (seconds <= run.unit_seconds).sum() if run.ok else FEWEST_CHECKPOINTS
+        count = (seconds <= run.unit_seconds).sum() if run.ok else MIN_CHECKPOINTS
         lines.append((np.interp(run.unit_seconds, seconds, progress), count))
     return pairs.join(pd.DataFrame(lines, pairs.index, [AT_SECONDS, f"{AT_SECONDS}_checkpoints"], dtype=float))
 
@@ -270,7 +270,7 @@ def costs(runs: pd.DataFrame, pairs: pd.DataFrame) -> pd.DataFrame:
         evaluations are of all runs.
     """
     scenes, lines = pairs.groupby("set")["scene"].nunique(), []
-    enough = scenes.index[scenes >= statistics.FEWEST_SHAPES]
+    enough = scenes.index[scenes >= statistics.MIN_SHAPES]
     chosen = pd.concat([runs[~runs["set"].isin(enough)], pairs[pairs["set"].isin(enough)]])
     for key, group in chosen[chosen["ok"] & (chosen["cost"] > 0) & (chosen["unit"] > 0)].groupby(["set", "row"]):
         seconds = _ratio(group, "seconds", "unit_seconds") if key[0] in enough else None
@@ -285,5 +285,5 @@ def _ratio(runs: pd.DataFrame, *columns: str) -> Interval:
 
 def wrong_pixels(runs: pd.DataFrame) -> pd.Series:
     """Of each row the mean fraction of an object's pixels that it renders wrongly; all of them where it failed."""
-    rendered = runs[runs["set"].isin(APART) & (runs["initial"] > 0)]
+    rendered = runs[runs["set"].isin(SETS_WITHOUT_CURVE) & (runs["initial"] > 0)]
     return (rendered["final"] / rendered["initial"]).clip(upper=1).groupby(rendered["row"]).mean()

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.report.data.statistics import Interval
 
-GREY = "#777777"  # of lines that belong to no row
+REFERENCE_LINE_COLOUR = "#777777"  # of lines that belong to no row
 Series = dict[str, Any]
 Panel = dict[str, Any]
 
@@ -26,20 +26,20 @@ def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[fl
         more: what the page reads as well, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
     """
     look, x, y = style.look(preset), list(x), list(y)
-    made = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
-    estimates = [one for one in (*x, *y) if isinstance(one, Interval)]
-    if any(one.known for one in estimates):
-        ends = [(one.low, one.high) if one.known else (one.value, one.value) for one in estimates]
-        made |= dict(zip(("low", "high"), map(_values, zip(*ends, strict=True)), strict=True))
-    shapes = [_values(pair) for point in zip(x, y, strict=True) for pair in _of_shapes(*point)]
-    return made | ({"shapes": shapes} if shapes else {}) | more
+    points = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
+    estimates = [estimate for estimate in (*x, *y) if isinstance(estimate, Interval)]
+    if any(estimate.has_ends for estimate in estimates):
+        ends = [(each.low, each.high) if each.has_ends else (each.value, each.value) for each in estimates]
+        points |= dict(zip(("low", "high"), map(_values, zip(*ends, strict=True)), strict=True))
+    shapes = [_values(pair) for point in zip(x, y, strict=True) for pair in _shape_points(*point)]
+    return points | ({"shapes": shapes} if shapes else {}) | more
 
 
-def _of_shapes(x: float | Interval, y: float | Interval) -> Iterable[tuple[float, float]]:
+def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[float, float]]:
     """The points of the single shapes of an estimate without an interval; none of another point."""
-    if not any(isinstance(one, Interval) and not one.known for one in (x, y)):
+    if not any(isinstance(value, Interval) and not value.has_ends for value in (x, y)):
         return ()
-    return product(*(one.points if isinstance(one, Interval) else (one,) for one in (x, y)))
+    return product(*(value.points if isinstance(value, Interval) else (value,) for value in (x, y)))
 
 
 def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
@@ -50,7 +50,15 @@ def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interv
 def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
     """A grey line at a value, between the ends of positions."""
     ends = [min(places := list(x)), max(places)]
-    return {"name": name, "x": ends, "y": [value, value], "colour": GREY, "symbol": "", "dash": "-", **more}
+    return {
+        "name": name,
+        "x": ends,
+        "y": [value, value],
+        "colour": REFERENCE_LINE_COLOUR,
+        "symbol": "",
+        "dash": "-",
+        **more,
+    }
 
 
 def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) -> Panel:
@@ -89,8 +97,8 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     columns = -(-max(len(panels), 1) // lines)
     figure, axes = sheet(height, lines, columns, **how)
     size = {True: len(panels), "row": columns}.get(how.get("sharey"), 1)  # panels with one axis have one edge
-    for place, (axis, panel) in enumerate(zip(axes.flat, panels, strict=False)):
-        _panel(axis, panel, _edge(panels[place // size * size :][:size], "y"))
+    for index, (axis, panel) in enumerate(zip(axes.flat, panels, strict=False)):
+        _panel(axis, panel, _edge(panels[index // size * size :][:size], "y"))
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")
     for axis in axes[:, 1:].flat if "sharey" in how else ():
@@ -206,15 +214,15 @@ def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> No
     Intervals are along x where they are `across`.
     """
     x, y, line = np.minimum(each["x"], edges[0]), np.minimum(each["y"], edges[1]), "dash" in each
-    how: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
-    how |= {"markevery": max(len(x) // 6, 1)} if line else {}
-    how |= {"drawstyle": "steps-post"} if each.get("step") else {}
-    how |= {"mfc": "none"} if each.get("hollow") else {}
-    how |= {"ms": 0.55 * each["size"]} if "size" in each else {}
-    lost = (np.isinf(each["x"]) | np.isinf(each["y"])) & (not line)
-    axis.plot(x[~lost], y[~lost], label=None if each.get("quiet") else each["name"], **how)
-    if lost.any():
-        axis.plot(x[lost], y[lost], "x", color=each["colour"])
+    style_options: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
+    style_options |= {"markevery": max(len(x) // 6, 1)} if line else {}
+    style_options |= {"drawstyle": "steps-post"} if each.get("step") else {}
+    style_options |= {"mfc": "none"} if each.get("hollow") else {}
+    style_options |= {"ms": 0.55 * each["size"]} if "size" in each else {}
+    is_infinite = (np.isinf(each["x"]) | np.isinf(each["y"])) & (not line)
+    axis.plot(x[~is_infinite], y[~is_infinite], label=None if each.get("quiet") else each["name"], **style_options)
+    if is_infinite.any():
+        axis.plot(x[is_infinite], y[is_infinite], "x", color=each["colour"])
     if "low" in each:
         ends = [np.minimum(each[end], edges[not across]) for end in ("low", "high")]
         if line:
@@ -224,10 +232,10 @@ def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> No
         else:
             axis.vlines(x, *ends, color=each["colour"], lw=0.7)
     if "shapes" in each:
-        at, found = np.minimum(each["shapes"], edges).T
-        axis.plot(at, found, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
+        shape_x, shape_y = np.minimum(each["shapes"], edges).T
+        axis.plot(shape_x, shape_y, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
 
 
-def _values(found: Iterable[float | Interval]) -> list[float]:
+def _values(values: Iterable[float | Interval]) -> list[float]:
     """The values, of estimates without their intervals, with five digits."""
-    return [float(f"{one.value if isinstance(one, Interval) else one:.5g}") for one in found]
+    return [float(f"{value.value if isinstance(value, Interval) else value:.5g}") for value in values]

@@ -26,20 +26,20 @@ from bench.report.site.renderers import renderers
 from bench.report.write.paper import papers
 
 ASSETS = Path(__file__).parents[1] / "page"
-FOLDER = "page"  # of the results folder
-PATIENCE = 1.0  # seconds to wait in silence
+PAGE_FOLDER = "page"  # of the results folder
+SILENT_WAIT_SECONDS = 1.0  # seconds to wait in silence
 LIBRARY = "plotly.min.js"
-MOST_MESHES = 100  # of the newest runs; `bench.report meshes=all` makes all
+MAX_MESHES = 100  # of the newest runs; `bench.report meshes=all` makes all
 
 # Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
 UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
-KEY = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")  # of the files with details
+DETAIL_FILE_PATTERN = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")  # of the files with details
 # Letters of a run's key: those with the same share a file of details, since a small file takes a whole block of a disk.
-BEGINNING = 2
+KEY_PREFIX_LETTERS = 2
 ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
-def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
+def write_index(results_dir: Path, *, meshes: int | None = MAX_MESHES) -> Path:
     """Writes `index.html` and the folder `page` beside it from all run folders in `results_dir/runs`; gives the page.
 
     Args:
@@ -59,9 +59,9 @@ def page_lock(results_dir: Path) -> Iterator[None]:
 
     Who waits for it longer than `PATIENCE` is told.
     """
-    lock = file_lock(results_dir, FOLDER)
+    lock = file_lock(results_dir, PAGE_FOLDER)
     try:
-        lock.acquire(timeout=PATIENCE)
+        lock.acquire(timeout=SILENT_WAIT_SECONDS)
     except Timeout:
         print(f"waiting for another process that writes the page of {results_dir}", file=sys.stderr, flush=True)
         lock.acquire()
@@ -73,18 +73,18 @@ def page_lock(results_dir: Path) -> Iterator[None]:
 
 def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: Path, meshes: int | None) -> Path:
     """Writes the page of records that were read within `page_lock`, as `write_index` does; gives it."""
-    data, page = results_dir / FOLDER / "data", results_dir / "index.html"
+    data, page = results_dir / PAGE_FOLDER / "data", results_dir / "index.html"
     folders = [Folder(results_dir, record["folder"]) for record in records]
-    entries, wholes = papers(results_dir)
-    _copy_assets(results_dir / FOLDER)
-    bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:BEGINNING])
+    entries, content_by_key = papers(results_dir)
+    _copy_assets(results_dir / PAGE_FOLDER)
+    bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:KEY_PREFIX_LETTERS])
     details = (
         (name, bundle((folder, detail(record, folder, results_dir)) for folder, record in runs))
         for name, runs in bundles.items()
     )
     _write_all(data, "run", details)
     _write_meshes([folder for folder in folders if folder.has("mesh.ply")], data, meshes)
-    _write_all(data, "paper", wholes.items())
+    _write_all(data, "paper", content_by_key.items())
     lists = {
         "about": {"problems": problems, "meshes": meshes},
         "papers": entries,
@@ -105,16 +105,16 @@ def _write_all(data: Path, kind: str, contents: Iterable[tuple[str, Any]]) -> No
     remove_others(data / kind, keys)
 
 
-def _write_meshes(folders: list[Folder], data: Path, most: int | None) -> None:
+def _write_meshes(folders: list[Folder], data: Path, max_meshes: int | None) -> None:
     """Writes the meshes of the newest runs; one that is there and newer than its mesh is kept."""
     kept = []
     for number, folder in enumerate(folders):
         source = folder.path / "mesh.ply"
-        made = _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key)
-        if not made and (most is None or number < most):
+        is_current = _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key)
+        if not is_current and (max_meshes is None or number < max_meshes):
             write_script(data, "mesh", folder.key, _mesh(source))
-            made = True
-        if made:
+            is_current = True
+        if is_current:
             kept.append(folder.key)
     remove_others(data / "mesh", kept)
 
@@ -152,8 +152,8 @@ def to_script(kind: str, key: str, data: Any) -> str:
 
     Numbers that are not finite are the strings "inf", "-inf" and "nan".
     """
-    parts = (safe_json(part) for part in (kind, key, data))
-    return f"implicitBench.receive({', '.join(parts)});\n"
+    arguments = (safe_json(argument) for argument in (kind, key, data))
+    return f"implicitBench.receive({', '.join(arguments)});\n"
 
 
 def safe_json(data: Any) -> str:
@@ -162,16 +162,20 @@ def safe_json(data: Any) -> str:
         text = ENCODER.encode(data)
     except ValueError:  # a number that is not finite
         text = ENCODER.encode(to_json_values(data))
-    return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return UNSAFE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def remove_others(folder: Path, keys: Iterable[str]) -> None:
     """Removes the scripts of what is gone."""
-    kept = {f"{key}.js" for key in keys}
+    current = {f"{key}.js" for key in keys}
     if folder.is_dir():
-        with os.scandir(folder) as found:
-            gone = [one.name for one in found if one.name not in kept and KEY.fullmatch(one.name)]
-        for name in gone:
+        with os.scandir(folder) as entries:
+            old_names = [
+                entry.name
+                for entry in entries
+                if entry.name not in current and DETAIL_FILE_PATTERN.fullmatch(entry.name)
+            ]
+        for name in old_names:
             (folder / name).unlink(missing_ok=True)
 
 

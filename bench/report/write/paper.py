@@ -15,9 +15,9 @@ from urllib.parse import quote
 from bench.records.read import PLAN_FILE
 from bench.records.record import is_outside, write_text
 from bench.report.data import age
-from bench.report.data.kept import KEPT, join, read_rows, write_rows
+from bench.report.data.kept import FROM_RUNS_CSV, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
-from bench.report.write.caption import SMOKE
+from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.result import Result, Shown, as_markdown, latex, read_shown, write, write_shown
 
 FOLDER = "paper"
@@ -26,8 +26,8 @@ SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
 SHIPPED = ROOT / "results"  # what a checkout has; nothing where the package is installed without it
 STUDIES = ROOT / "bench" / "studies"
-JOINED = "suite"  # the page whose own rows are among the shipped ones already
-BESIDE = "shipped: "  # in front of the name of a row that is shipped, beside rows of the user's own
+SUITE_PAGE = "suite"  # the page whose own rows are among the shipped ones already
+SHIPPED_ROW_PREFIX = "shipped: "  # in front of the name of a row that is shipped, beside rows of the user's own
 
 HEAD = """# Results
 
@@ -44,7 +44,14 @@ where a run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.g
 """
 
 
-BROKEN = (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)  # of an odd or foreign record
+RECORD_ERRORS = (
+    KeyError,
+    ValueError,
+    TypeError,
+    IndexError,
+    AttributeError,
+    ArithmeticError,
+)  # of an odd or foreign record
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ class Study:
     folder keeps of it: with that, its pages are made without runs too.
     """
 
-    place: int
+    order: int
     reads: tuple[Selection, ...]
     pages: dict[str, Callable[..., Result]]
     problem: str = ""  # of a file that cannot be read
@@ -72,39 +79,39 @@ class Study:
             if self.keeps is None or not self.keeps(results_dir).is_dir():
                 return {}
             chosen = [Runs(selection, results_dir, []) for selection in self.reads]
-        found = {}
+        results = {}
         for name, make in self.pages.items():
             try:
-                found[name] = make(*chosen)
+                results[name] = make(*chosen)
             except NoFolder:
-                own = [record for record in records if KEPT not in record]
-                if 2 * self._count(own, results_dir) >= self._count(records, results_dir):
-                    found |= replace(self, pages={name: make}).results(own, results_dir)
-        return found
+                with_folder = [record for record in records if FROM_RUNS_CSV not in record]
+                if 2 * self._count(with_folder, results_dir) >= self._count(records, results_dir):
+                    results |= replace(self, pages={name: make}).results(with_folder, results_dir)
+        return results
 
     def _count(self, records: list[dict[str, Any]], results_dir: Path) -> int:
-        return sum(len(runs.records) for one in self.reads if (runs := choose(records, one, results_dir)))
+        return sum(len(runs.records) for selection in self.reads if (runs := choose(records, selection, results_dir)))
 
 
 @cache
 def studies() -> tuple[Study, ...]:
     """All files of `bench/studies`, in the order of their places; a file that cannot be read has a problem alone."""
-    found: list[Study] = []
+    studies_read: list[Study] = []
     for file in iter_modules([str(STUDIES)]):
         try:
-            read = import_module(f"bench.studies.{file.name}")
-            if taken := {name for study in found for name in study.pages} & {*read.PAGES}:
-                raise ValueError(f"another study has a page {min(taken)}: give it another name")
-            found.append(Study(read.PLACE, read.READS, read.PAGES, keeps=getattr(read, "KEEPS", None)))
-        except (*BROKEN, ImportError, NameError, SyntaxError) as error:
-            found.append(Study(0, (), {}, f"bench/studies/{file.name}.py ({type(error).__name__}: {error})"))
-    return tuple(sorted(found, key=lambda study: study.place))
+            module = import_module(f"bench.studies.{file.name}")
+            if repeated := {name for study in studies_read for name in study.pages} & {*module.PAGES}:
+                raise ValueError(f"another study has a page {min(repeated)}: give it another name")
+            studies_read.append(Study(module.PLACE, module.READS, module.PAGES, keeps=getattr(module, "KEEPS", None)))
+        except (*RECORD_ERRORS, ImportError, NameError, SyntaxError) as error:
+            studies_read.append(Study(0, (), {}, f"bench/studies/{file.name}.py ({type(error).__name__}: {error})"))
+    return tuple(sorted(studies_read, key=lambda study: study.order))
 
 
 def write_paper(
     records: list[dict[str, Any]],
     results_dir: Path,
-    into: Path | None = None,
+    output_dir: Path | None = None,
     problems: list[str] | None = None,
     only: str | None = None,
 ) -> list[Path]:
@@ -124,23 +131,23 @@ def write_paper(
                 raise ValueError(study.problem)
             results = study.results(records, results_dir)
             pages = [
-                (name, result, result.shown(100 * study.place + place, experiments))
-                for place, (name, result) in enumerate(results.items())
+                (name, result, result.shown(100 * study.order + number, experiments))
+                for number, (name, result) in enumerate(results.items())
             ]
-        except BROKEN as error:
+        except RECORD_ERRORS as error:
             if problems is None:
                 raise
-            told = f"{', '.join(study.pages)} ({type(error).__name__}: {error})"
-            problems.append(f"not made: {study.problem or told}")
+            description = f"{', '.join(study.pages)} ({type(error).__name__}: {error})"
+            problems.append(f"not made: {study.problem or description}")
             continue
         for name, result, shown in pages:
-            if into is None or not shown.caption.startswith(SMOKE):
-                written.append(write(result, shown, (into or results_dir) / FOLDER / name)[0])
+            if output_dir is None or not shown.caption.startswith(SMOKE_WARNING):
+                written.append(write(result, shown, (output_dir or results_dir) / FOLDER / name)[0])
     return written
 
 
 @dataclass(frozen=True)
-class Found:
+class Page:
     """A table or figure of a results folder: its name, what it says, its picture and its files by their kind.
 
     Paths of files are seen from the results folder, percent-encoded; `shipped` ones have none.
@@ -154,56 +161,56 @@ class Found:
     shipped: bool = False
 
 
-def find_paper(results_dir: Path) -> list[Found]:
+def find_paper(results_dir: Path) -> list[Page]:
     """The tables and figures of `results_dir/paper` in their order, then shipped ones of other names."""
-    own = _in(results_dir)
-    names = {one.name for one in own}
-    others = [] if results_dir.resolve() == SHIPPED else _in(SHIPPED)
-    shipped = [one for one in others if one.name not in names]
-    return own + [replace(one, picture=None, files={}, shipped=True) for one in shipped]
+    own_pages = _pages_of(results_dir)
+    own_names = {page.name for page in own_pages}
+    others = [] if results_dir.resolve() == SHIPPED else _pages_of(SHIPPED)
+    shipped = [page for page in others if page.name not in own_names]
+    return own_pages + [replace(page, picture=None, files={}, shipped=True) for page in shipped]
 
 
-def _in(results_dir: Path) -> list[Found]:
+def _pages_of(results_dir: Path) -> list[Page]:
     """The tables and figures of a results folder in their order; those that no study made stand last."""
-    found = [found_at(path.with_suffix(""), results_dir) for path in (results_dir / FOLDER).glob("[!.]*.json")]
-    return sorted((one for one in found if one.shown.title), key=lambda one: (one.shown.place or 10**6, one.name))
+    pages = [page_at(path.with_suffix(""), results_dir) for path in (results_dir / FOLDER).glob("[!.]*.json")]
+    return sorted((page for page in pages if page.shown.title), key=lambda page: (page.shown.order or 10**6, page.name))
 
 
-def find_sweeps(results_dir: Path) -> list[Found]:
+def find_sweeps(results_dir: Path) -> list[Page]:
     """The tables of sweeps, the sweep that was asked for last first, each by the name of its sweep."""
     tables = (results_dir / SWEEPS).glob(f"*/{TABLE}.json")
-    folders = sorted((path.parent for path in tables), key=lambda folder: (-_asked(folder), folder.name))
-    return [replace(found_at(folder / TABLE, results_dir), name=folder.name) for folder in folders]
+    folders = sorted((path.parent for path in tables), key=lambda folder: (-_plan_time(folder), folder.name))
+    return [replace(page_at(folder / TABLE, results_dir), name=folder.name) for folder in folders]
 
 
 def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """The entry of each table and figure, those of sweeps last, and by its key all that its own view shows."""
-    entries, wholes = [], {}
-    for found in [*find_paper(results_dir), *find_sweeps(results_dir)]:
-        key = key_of(found.name)
-        shown = found.shown
-        texts = {"question": shown.question, "verdict": shown.verdict, "shipped": found.shipped}
-        texts["sweep"] = found.base.name == TABLE and found.base.parents[1].name == SWEEPS
-        entries.append({"name": found.name, "key": key, "title": (shown.title or found.name).rstrip("."), **texts})
-        wholes[key] = {
+    entries, content_by_key = [], {}
+    for page in [*find_paper(results_dir), *find_sweeps(results_dir)]:
+        key = key_of(page.name)
+        shown = page.shown
+        texts = {"question": shown.question, "verdict": shown.verdict, "shipped": page.shipped}
+        texts["sweep"] = page.base.name == TABLE and page.base.parents[1].name == SWEEPS
+        entries.append({"name": page.name, "key": key, "title": (shown.title or page.name).rstrip("."), **texts})
+        content_by_key[key] = {
             **{"caption": f"{shown.head} {shown.caption}".strip(), "notes": shown.notes, "header": shown.columns},
-            **{"rows": shown.rows + _beside(found, results_dir), "files": found.files, "picture": found.picture},
+            **{"rows": shown.rows + _shipped_rows(page, results_dir), "files": page.files, "picture": page.picture},
             **{"chart": shown.chart, "atlas": shown.atlas, "best": shown.best},
         }
-    return entries, wholes
+    return entries, content_by_key
 
 
-def _beside(found: Found, results_dir: Path) -> list[list[str]]:
+def _shipped_rows(page: Page, results_dir: Path) -> list[list[str]]:
     """The shipped rows of a table of the user's, marked; none where it has them, has other columns, or is shipped."""
-    own = not found.shipped and found.base.parents[1] == results_dir and results_dir.resolve() != SHIPPED
-    if found.name == JOINED or not own:
+    is_of_user = not page.shipped and page.base.parents[1] == results_dir and results_dir.resolve() != SHIPPED
+    if page.name == SUITE_PAGE or not is_of_user:
         return []
-    shipped = found_at(SHIPPED / FOLDER / found.name, SHIPPED).shown
-    same = shipped.columns and shipped.columns == found.shown.columns
-    return [[BESIDE + row[0], *row[1:]] for row in shipped.rows] if same else []
+    shipped = page_at(SHIPPED / FOLDER / page.name, SHIPPED).shown
+    has_same_columns = shipped.columns and shipped.columns == page.shown.columns
+    return [[SHIPPED_ROW_PREFIX + row[0], *row[1:]] for row in shipped.rows] if has_same_columns else []
 
 
-def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[Path]:
+def ship(records: list[dict[str, Any]], results_dir: Path, output_dir: Path) -> list[Path]:
     """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
 
     A page that cannot be drawn keeps what it says, in this version's form, and its head says which version drew it.
@@ -211,11 +218,12 @@ def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[P
     Raises:
         ValueError: where rows that are there cannot be read, and would be lost.
     """
-    every = join(records, read_rows(into / FOLDER))
-    read = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
-    rows, drawn = write_rows(every, read, into / FOLDER), write_paper(every, results_dir, into)
+    all_records = join(records, read_rows(output_dir / FOLDER))
+    experiments = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
+    rows = write_rows(all_records, experiments, output_dir / FOLDER)
+    drawn = write_paper(all_records, results_dir, output_dir)
     own_rows = {name for study in studies() if study.keeps is not None for name in study.pages}
-    for page in _in(into):
+    for page in _pages_of(output_dir):
         table = page.base.with_suffix(".csv")
         if table not in drawn:
             stamp = "" if page.name in own_rows else age.drawn_by(table)
@@ -223,46 +231,46 @@ def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[P
     return [*rows, *drawn]
 
 
-def write_columns(results_dir: Path, given: dict[str, str]) -> None:
+def write_columns(results_dir: Path, options: dict[str, str]) -> None:
     """Writes the LaTeX table of each page or sweep of a key `columns.NAME` again, with these headings alone.
 
     Raises:
         ValueError: where there is no such table, or it has no such column.
     """
-    tables = {page.name: page for page in [*_in(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
-    for key in (key for key in given if key.startswith("columns.")):
+    tables = {page.name: page for page in [*_pages_of(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
+    for key in (key for key in options if key.startswith("columns.")):
         if (page := tables.get(key.removeprefix("columns."))) is None:
             raise ValueError(f"{key}: no table of that name; there are {', '.join(tables) or 'none'}")
-        headings = next(csv.reader([given[key]], skipinitialspace=True))
+        headings = next(csv.reader([options[key]], skipinitialspace=True))
         if unknown := [heading for heading in headings if heading not in page.shown.columns]:
-            known = ",".join(f'"{one}"' if "," in one else one for one in page.shown.columns)
-            raise ValueError(f"{key}: no column {unknown[0]!r}; choose from {known}")
+            choices = ",".join(f'"{heading}"' if "," in heading else heading for heading in page.shown.columns)
+            raise ValueError(f"{key}: no column {unknown[0]!r}; choose from {choices}")
         write_text(page.base.with_suffix(".tex"), latex(page.shown.narrowed(headings), page.name))
 
 
 def write_readme(results_dir: Path) -> Path | None:
     """Writes `results_dir/README.md`, the index of all pages; gives its path, or None where there is no page."""
-    if not (pages := _in(results_dir)):
+    if not (pages := _pages_of(results_dir)):
         return None
     path = results_dir / "README.md"
     write_text(path, HEAD.format(folder=FOLDER) + "".join(map(_line, pages)))
     return path
 
 
-def _asked(folder: Path) -> float:
+def _plan_time(folder: Path) -> float:
     """When the sweep of a folder was last asked for, as its plan was written then; 0 where there is no plan."""
     plan = folder / PLAN_FILE
     return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
-def found_at(base: Path, root: Path) -> Found:
+def page_at(base: Path, root: Path) -> Page:
     """The table or figure whose files in a results folder have that path before their suffix, but for links out."""
     files = {suffix: base.with_name(base.name + suffix) for suffix in (*SUFFIXES, ".png", ".json")}
     within = {suffix: path for suffix, path in files.items() if path.is_file() and not is_outside(path, root)}
     links = {suffix: link(*path.relative_to(root).parts) for suffix, path in within.items()}
     named = {suffix[1:].upper(): links[suffix] for suffix in SUFFIXES if suffix in links}
     shown = read_shown(within[".json"]) if ".json" in within else Shown()
-    return Found(base.name, shown, links.get(".png"), named, base)
+    return Page(base.name, shown, links.get(".png"), named, base)
 
 
 def link(*parts: str) -> str:
@@ -275,7 +283,7 @@ def key_of(name: str) -> str:
     return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
-def _line(page: Found) -> str:
+def _line(page: Page) -> str:
     """A page's line of the index: its question with a link, its answer and its experiments."""
     question = as_markdown(page.shown.question or page.shown.title.rstrip("."))
     answer = page.shown.answer + (f" (drawn by {page.shown.drawn_by})" if page.shown.drawn_by else "")

@@ -55,6 +55,7 @@ _LATEX = {
     "µ": r"$\mu$",
 }
 _POWER = re.compile(r"(?<![\w.-])(-?\d+(?:\.\d+)?)e\+?(-?\d+)(?!\w)")  # such as 2.2e-5
+JSON_KEYS = {"order": "place"}  # fields of Shown with another name in the shipped files
 _MARKDOWN = str.maketrans({character: f"&#{ord(character)};" for character in "|*`[]\\"})
 
 
@@ -111,23 +112,23 @@ class Result:
     @cached_property
     def caption(self) -> str:
         """What is plotted, n, the interval, what failed, and the machine."""
-        interval = caption.kind(self.interval, self.estimates, drawn=self.figure is not None)
+        interval = caption.interval_text(self.interval, self.estimates, drawn=self.figure is not None)
         return caption.caption(self.runs, self.plotted, n=self.n, interval=interval)
 
     @cached_property
     def notes(self) -> list[str]:
         """Warnings, then the notes of its own."""
-        own = [caption.said(self.runs, remark) for remark in self.remarks if remark]
-        return [*caption.warnings(self.runs), *own]
+        remarks = [caption.fill_varying(self.runs, remark) for remark in self.remarks if remark]
+        return [*caption.warnings(self.runs), *remarks]
 
-    def shown(self, place: int = 0, experiments: Iterable[str] = ()) -> "Shown":
-        """All that is read of it, as text; `place` is its place among all pages, `experiments` are what it reads."""
+    def shown(self, order: int = 0, experiments: Iterable[str] = ()) -> "Shown":
+        """The content of the page as text. Pages are sorted by `order`; `experiments` are those that it reads."""
         return Shown(
-            place=place,
+            order=order,
             experiments=[*experiments],
             title=self.title,
             question=self.question,
-            verdict=caption.SMOKE if self.verdict and caption.tried(self.runs) else self.verdict,
+            verdict=caption.SMOKE_WARNING if self.verdict and caption.has_smoke_runs(self.runs) else self.verdict,
             caption=self.caption,
             columns=list(self.table),
             rows=self.table.to_numpy().tolist(),
@@ -143,7 +144,7 @@ class Result:
 class Shown:
     """What a page says: the content of `NAME.json`, of which Markdown, LaTeX and the HTML page are made."""
 
-    place: int = 0
+    order: int = 0
     experiments: list[str] = field(default_factory=list)
     title: str = ""
     question: str = ""
@@ -170,14 +171,16 @@ class Shown:
 
     def narrowed(self, headings: Sequence[str]) -> "Shown":
         """The page with these columns alone, in this order."""
-        places = [self.columns.index(heading) for heading in headings]
-        rows = [[row[place] for place in places] for row in self.rows]
-        best = [[line, places.index(place)] for line, place in self.best if place in places]
+        indices = [self.columns.index(heading) for heading in headings]
+        rows = [[row[index] for index in indices] for row in self.rows]
+        best = [[line, indices.index(index)] for line, index in self.best if index in indices]
         return replace(self, columns=[*headings], rows=rows, best=best)
 
     def to_json(self) -> str:
         """Its content, a line per part; infinite numbers of a chart become null."""
-        parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
+        parts = {
+            JSON_KEYS.get(key, key): value for key, value in asdict(self).items() if value not in ("", [], None, False)
+        }
         encoded = {key: json.dumps(to_json_values(value), ensure_ascii=False) for key, value in parts.items()}
         lines = [f"{json.dumps(key)}: {text}" for key, text in encoded.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
@@ -186,24 +189,26 @@ class Shown:
 def read_shown(path: Path) -> Shown:
     """The content of `NAME.json`; what is missing or of another type is as in an empty page."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+        content = json.loads(path.read_text(encoding="utf-8", errors="replace"))
     except (OSError, ValueError, RecursionError):
-        found = {}
-    known = found if isinstance(found, dict) else {}
-    sound = {f.name: known[f.name] for f in fields(Shown) if f.name in known and _is_sound(f.name, known[f.name])}
-    return Shown(**sound)
+        content = {}
+    parts = content if isinstance(content, dict) else {}
+    keys = {f.name: JSON_KEYS.get(f.name, f.name) for f in fields(Shown)}
+    return Shown(**{name: parts[key] for name, key in keys.items() if key in parts and _is_valid(name, parts[key])})
 
 
-def _is_sound(name: str, value: Any) -> bool:
+def _is_valid(name: str, value: Any) -> bool:
     if name in ("chart", "atlas"):
         return isinstance(value, dict)
     if name == "rows":
-        return isinstance(value, list) and all(_is_sound("columns", row) for row in value)
+        return isinstance(value, list) and all(_is_valid("columns", row) for row in value)
     if name == "best":
-        return isinstance(value, list) and all(isinstance(at, list) and [*map(type, at)] == [int, int] for at in value)
+        return isinstance(value, list) and all(
+            isinstance(cell, list) and [*map(type, cell)] == [int, int] for cell in value
+        )
     if name in ("columns", "notes", "experiments"):
-        return isinstance(value, list) and all(isinstance(one, str) for one in value)
-    return isinstance(value, {"place": int, "drawn": bool}.get(name, str))
+        return isinstance(value, list) and all(isinstance(text, str) for text in value)
+    return isinstance(value, {"order": int, "drawn": bool}.get(name, str))
 
 
 def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[Path]:
@@ -239,11 +244,11 @@ def _write_text(path: Path, text: str) -> None:
 def markdown(shown: Shown, name: str) -> str:
     """The Markdown text of a page: head, question and verdict, title, caption, table, picture and notes."""
     head = [as_markdown(shown.head)] if shown.head else []
-    asked = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
-    parts = [*head, *asked, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
+    question_part = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
+    parts = [*head, *question_part, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
     if shown.columns:
         head, rows = map(as_markdown, shown.columns), _emphasised(shown, as_markdown, "**{}**")
-        rule = ["---" if of_words else "---:" for of_words in _of_words(shown)]
+        rule = ["---" if is_text else "---:" for is_text in _text_columns(shown)]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
     if shown.drawn:
         parts.append(f"![{as_markdown(shown.title)}]({name}.png)")
@@ -258,12 +263,12 @@ def latex(shown: Shown, name: str) -> str:
     A group has the same text in the first column, where it is written once, or the second. The caption is a comment.
     """
     cells = _emphasised(shown, _tex, r"\textbf{{\boldmath {}}}")
-    columns = [[row[place] for row in shown.rows] for place in range(len(shown.columns))]
-    for place, texts in enumerate(columns[:2]):
-        begins = [line for line, text in enumerate(texts) if line == 0 or text != texts[line - 1]]
-        if 1 < len(begins) <= len(texts) / 2 and (place == 0 or len(begins) == len({*texts})):
+    columns = [[row[index] for row in shown.rows] for index in range(len(shown.columns))]
+    for index, texts in enumerate(columns[:2]):
+        starts = [line for line, text in enumerate(texts) if line == 0 or text != texts[line - 1]]
+        if 1 < len(starts) <= len(texts) / 2 and (index == 0 or len(starts) == len({*texts})):
             for line, row in enumerate(cells):
-                row[0] = ("\\midrule\n" if line in begins[1:] else "") + (row[0] if place or line in begins else "")
+                row[0] = ("\\midrule\n" if line in starts[1:] else "") + (row[0] if index or line in starts else "")
             break
     head, *rows = (rf"{' & '.join(row)} \\" for row in (map(_tex_heading, shown.columns, columns), *cells))
     lines = [
@@ -290,20 +295,20 @@ def _aligned(cells: list[str]) -> str:
     return "l" if 2 * sum(bool(re.match(r"\W*[^\W\d]", cell)) for cell in cells) > len(cells) else "r"
 
 
-def _emphasised(shown: Shown, escaped: Callable[[str], str], bold: str) -> list[list[str]]:
+def _emphasised(shown: Shown, escape: Callable[[str], str], bold: str) -> list[list[str]]:
     """The cells of all rows as Markdown or LaTeX, the best ones in bold."""
     return [
-        [bold.format(escaped(cell)) if [line, place] in shown.best else escaped(cell) for place, cell in enumerate(row)]
+        [bold.format(escape(cell)) if [line, column] in shown.best else escape(cell) for column, cell in enumerate(row)]
         for line, row in enumerate(shown.rows)
     ]
 
 
-def _of_words(shown: Shown) -> list[bool]:
+def _text_columns(shown: Shown) -> list[bool]:
     """Of each column, whether it is aligned to the left: the first one, and others without a digit but with a word."""
-    texts = [" ".join(row[place] for row in shown.rows) for place in range(len(shown.columns))]
+    texts = [" ".join(row[column] for row in shown.rows) for column in range(len(shown.columns))]
     return [
-        place == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
-        for place, text in enumerate(texts)
+        column == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
+        for column, text in enumerate(texts)
     ]
 
 

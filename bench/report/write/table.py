@@ -11,14 +11,14 @@ import pandas as pd
 from bench.records import format
 from bench.records.metrics import LOWER
 from bench.report.data import records
-from bench.report.data.records import SCALE, measured, row_of, setting
+from bench.report.data.records import CHAMFER_SCALE, measured, row_of, setting
 from bench.report.data.statistics import Interval
 
-thousandfold = partial(format.number, scale=SCALE)
-ENDS = ("low", "high")  # of an interval
+thousandfold = partial(format.number, scale=CHAMFER_SCALE)
+INTERVAL_ENDS = ("low", "high")  # of an interval
 
 
-def whole(value: float | None) -> str:
+def integer(value: float | None) -> str:
     """A count as text, without decimals."""
     return format.number(value) if value is None else f"{value:.0f}"
 
@@ -38,9 +38,9 @@ def small_percent(share: float | None) -> str:
     return format.number(share) if share is None else f"{format.number(share, 100)} %"
 
 
-def counted(part: float, whole: int, rate: Interval) -> str:
+def count_with_interval(number: float, total: int, rate: Interval) -> str:
     """A count with the interval of its share in per cent, or else the number of shapes, such as 3 of 4 (n = 2)."""
-    return f"{part:g} of {whole} {rate.ends(100)}{' %' if rate.known else ''}"
+    return f"{number:g} of {total} {rate.ends(100)}{' %' if rate.has_ends else ''}"
 
 
 @dataclass(frozen=True)
@@ -77,26 +77,26 @@ class Column:
 
 def to_data(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
     """The raw values of all lines, for the CSV."""
-    kept = [column for column in columns if column.key]
-    return pd.DataFrame([[c.of(line) for c in kept] for line in lines], columns=[c.key for c in kept], dtype=object)
+    in_csv = [column for column in columns if column.key]
+    return pd.DataFrame([[c.of(line) for c in in_csv] for line in lines], columns=[c.key for c in in_csv], dtype=object)
 
 
 def to_table(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
     """The values of all lines as text, for readers."""
-    kept = [column for column in columns if column.heading]
-    return pd.DataFrame([[c.text(line) for c in kept] for line in lines], columns=[c.heading for c in kept])
+    shown = [column for column in columns if column.heading]
+    return pd.DataFrame([[c.text(line) for c in shown] for line in lines], columns=[c.heading for c in shown])
 
 
 def best(columns: Sequence[Column], lines: Sequence[Any]) -> list[list[int]]:
     """The row and the column, in the readable table, of each value that is the best of a column with several values."""
-    found = []
-    for place, column in enumerate([column for column in columns if column.heading]):
+    cells = []
+    for index, column in enumerate([column for column in columns if column.heading]):
         values = [column.of(line) for line in lines] if column.better else []
-        known = [value for value in values if value is not None and math.isfinite(value)]
-        if len({*values}) > 1 and known:
-            top = min(known) if column.better == LOWER else max(known)
-            found += [[line, place] for line, value in enumerate(values) if value == top]
-    return found
+        finite = [value for value in values if value is not None and math.isfinite(value)]
+        if len({*values}) > 1 and finite:
+            top = min(finite) if column.better == LOWER else max(finite)
+            cells += [[line, index] for line, value in enumerate(values) if value == top]
+    return cells
 
 
 def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None) -> Column:
@@ -114,14 +114,16 @@ def estimate(key: str, heading: str, ends: str = "") -> tuple[Column, ...]:
         return format.MISSING if line[key] is None else str(line[key])
 
     value = Column(key, heading, lambda line: line[key] and line[key].value, words=words)
-    low, high = (Column(f"{ends}{end}", value=lambda line, end=end: getattr(line[key], end, None)) for end in ENDS)
+    low, high = (
+        Column(f"{ends}{end}", value=lambda line, end=end: getattr(line[key], end, None)) for end in INTERVAL_ENDS
+    )
     return value, low, high
 
 
-def ends(key: str, of: Callable[[Any], Interval | None]) -> tuple[Column, ...]:
+def ends(key: str, get: Callable[[Any], Interval | None]) -> tuple[Column, ...]:
     """The ends of an interval that a line may lack, in the CSV only."""
     return tuple(
-        Column(f"{key}_{end}", value=lambda line, end=end: getattr(of(line), end, None)) for end in ("low", "high")
+        Column(f"{key}_{end}", value=lambda line, end=end: getattr(get(line), end, None)) for end in ("low", "high")
     )
 
 
@@ -130,7 +132,7 @@ def shown(heading: str, words: Callable[[Any], str]) -> Column:
     return Column("", heading, words=words)
 
 
-def together(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Callable[[Any], str]:
+def joined_cell(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Callable[[Any], str]:
     """The text of several values of a line in one cell; `get` gives the line's value under a key."""
 
     def words(line: Any) -> str:
@@ -155,9 +157,9 @@ def configured(key: str, *path: str, heading: str = "") -> Column:
     return Column(key, heading, lambda record: setting(record["config"], *path), word)
 
 
-def through(part: Callable[[Any], Any], *columns: Column) -> tuple[Column, ...]:
+def through(select: Callable[[Any], Any], *columns: Column) -> tuple[Column, ...]:
     """The columns applied to a part of each line, such as its record."""
-    return tuple(replace(c, value=lambda line, c=c: c.of(part(line))) for c in columns)
+    return tuple(replace(c, value=lambda line, c=c: c.of(select(line))) for c in columns)
 
 
 # Columns that identify a run and give its outcome, for every table of runs.
