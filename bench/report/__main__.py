@@ -14,14 +14,14 @@ USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [colum
   meshes        of how many runs, the newest first, the mesh turns on the page; {MAX_MESHES} unless given, or all
   columns.PAGE  the columns of its LaTeX table, such as columns.table1=Strategy,Queries,Forward; all unless given
   ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
-TYPED = ("results_dir=PATH", "meshes=all", "columns.PAGE=HEADING,HEADING", "ship=PATH")
-KEYS = {text.partition("=")[0]: text for text in TYPED}
+KEY_FORMS = ("results_dir=PATH", "meshes=all", "columns.PAGE=HEADING,HEADING", "ship=PATH")
+KEYS = {text.partition("=")[0]: text for text in KEY_FORMS}
 
 
 def main(arguments: list[str]) -> int:
-    """Writes all pages, the tables of sweeps and `index.html`; gives the exit status.
+    """Writes all pages, the tables of sweeps and `index.html`.
 
-    It is 2 where an argument is wrong, and 1 where a study could not be made.
+    Returns the exit status: 2 if an argument is wrong, 1 if a page could not be made, else 0.
     """
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
@@ -52,7 +52,7 @@ def _report(options: dict[str, str]) -> int:
 
 
 def _write_all(results_dir: Path, meshes: int | None) -> int:
-    """Writes all that is written of a results folder; gives the exit status."""
+    """Writes all pages of a results folder; returns the exit status."""
     records, unread = read_records(results_dir)
     failed_pages: list[str] = []
     page_paths = write_paper(records, results_dir, problems=failed_pages)
@@ -65,10 +65,10 @@ def _write_all(results_dir: Path, meshes: int | None) -> int:
 
 
 def parse_options(arguments: list[str]) -> dict[str, str]:
-    """The arguments by their keys.
+    """Splits the arguments into keys and values.
 
     Raises:
-        ValueError: where one has no known key, or no value.
+        ValueError: a key is unknown, or its value is missing.
     """
     options = {}
     for argument in arguments:

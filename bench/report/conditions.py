@@ -1,4 +1,4 @@
-"""Runs of shape from many views under conditions of which one varies at a time: medians, and their figure."""
+"""Shape from many views: the median error over each condition, with the other conditions neutral; and its figure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,18 +7,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.data.records import (
-    CHAMFER_SCALE,
-    ONE_WAY,
-    Record,
-    by_shape,
-    error,
-    family,
-    grouped,
-    row_of,
-    run_key,
-    setting,
-)
+from bench.report.data import records
+from bench.report.data.records import ONE_WAY, Record, by_shape, error, family, grouped, row_of, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, median
 from bench.report.write import chart
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, estimate, metrics, text
@@ -36,8 +26,8 @@ class Condition:
 
     Args:
         key: its name in the task.
-        label: with its unit.
-        neutral: its value where another varies.
+        label: its name on axes, with the unit.
+        neutral: its value in runs that vary another condition.
     """
 
     key: str
@@ -45,48 +35,42 @@ class Condition:
     neutral: float
 
     def value_of(self, record: Record) -> float:
-        """Its value in a run."""
+        """The value of the condition in a run."""
         return float(setting(record["config"], "task", self.key))
 
 
 def run_columns(conditions: Sequence[Condition], *other_keys: str) -> tuple[Column, ...]:
-    """The columns of the CSV, with these conditions and other settings of the task."""
+    """The columns of the CSV: identity, conditions, other settings of the task, and metrics."""
     keys = (*(configured(condition.key, "task", condition.key) for condition in conditions), *IDENTITY)
     return (FAMILY, *keys, *(configured(key, "task", key) for key in other_keys), *metrics(ONE_WAY, "chamfer_l2"))
 
 
-def median_error(records: Sequence[Record]) -> Interval:
-    """The median error x 1000 over shapes and seeds, in which a run that failed is infinite."""
-    return bootstrap(by_shape({run_key(run): CHAMFER_SCALE * error(run, ONE_WAY) for run in records}), median)
+def median_error(runs: Sequence[Record]) -> Interval:
+    """The median error x 1000 over shapes and seeds; the error of a failed run is infinite."""
+    return bootstrap(by_shape({run_key(run): records.CHAMFER_SCALE * error(run, ONE_WAY) for run in runs}), median)
 
 
-def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
-    """A line per family, row, condition and its value, with all other conditions at their neutral values.
+def lines_of(runs: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+    """A line per family, row, condition and value, from the runs whose other conditions are neutral.
 
-    Each has family, method, preset, the condition as text, the place of the condition, its value `at`, its `runs` and
-    their median `error`.
+    Its keys: family, method, preset, condition (as text), key, position (of the condition), value, runs, error.
     """
     lines = []
     for position, condition in enumerate(conditions):
         others = [other for other in conditions if other != condition]
-        shown = [record for record in records if all(other.value_of(record) == other.neutral for other in others)]
+        shown = [run for run in runs if all(other.value_of(run) == other.neutral for other in others)]
         groups = grouped(shown, lambda record, get=condition.value_of: (family(record), row_of(record), get(record)))
         for (family_name, row, value), group in groups.items():
             line = {"family": family_name, "method": row.name, "preset": row.preset}
-            line |= {
-                "condition": f"{condition.label}: {value:g}",
-                "key": condition.key,
-                "position": position,
-                "value": value,
-            }
-            lines.append(line | {"runs": group, "error": median_error(group)})
+            line |= {"condition": f"{condition.label}: {value:g}", "runs": group, "error": median_error(group)}
+            lines.append(line | {"key": condition.key, "position": position, "value": value})
     return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["value"]))
 
 
 def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], success: float) -> Figure:
     """Draws a row of panels per family: the error over the value of each condition, a line per method.
 
-    `success` is the largest error of a run that counts as one, drawn as a line. What is infinite is drawn at the edge.
+    A line shows `success`, the largest error that counts as a success. Infinite errors are drawn at the edge.
     """
     lines_by_family, panels = grouped(lines, lambda line: line["family"]), []
     for (family_name, family_lines), (position, condition) in product(lines_by_family.items(), enumerate(conditions)):

@@ -1,4 +1,4 @@
-"""Galleries: pictures of runs in a grid with names of rows and columns, in which failures are shown as such."""
+"""Galleries: pictures of runs in a grid with names of rows and columns; failed runs show their status."""
 
 import textwrap
 import zipfile
@@ -22,27 +22,17 @@ from bench.records.format import plural
 from bench.report.data.records import Record, Row, family, grouped, index, row_of
 from bench.report.data.runs import Runs
 
-MAX_PICTURE_INCHES, MAX_COMPARED_INCHES = 0.9, 1.5  # inches of a picture's side at most, and of one beside a colour bar
-ROW_NAMES_INCHES, COLOUR_BAR_INCHES, MARGIN_INCHES = (
-    1.35,
-    0.7,
-    0.05,
-)  # inches of the names of rows at most, of a colour bar, and to the edges
-ROW_NAME_LETTERS = 18  # of a line of a row's name
-HEADING_LETTERS_PER_INCH = 19  # of names of columns
+MAX_PICTURE_INCHES, MAX_COMPARED_INCHES = 0.9, 1.5  # the second if the figure has a colour bar
+MAX_ROW_NAME_INCHES, COLOUR_BAR_INCHES, MARGIN_INCHES = 1.35, 0.7, 0.05
+ROW_NAME_LETTERS, HEADING_LETTERS_PER_INCH = 18, 19
 FRAME_COLOUR = "#d9d9d9"
-PREDICTED, GROUND_TRUTH, START = (
-    "found_",
-    "true_",
-    "start_",
-)  # of images.npz, see `bench.pictures.run_figures.save_gallery`
-SHAPES = tuple(kind + part for kind in (START, PREDICTED, GROUND_TRUTH) for part in ("normals", "hit"))
-FRONT, BEHIND = 0, 1  # its views
+# Prefixes and views of the arrays in images.npz, see `bench.pictures.run_figures.save_gallery`.
+PREDICTED, GROUND_TRUTH, START = "found_", "true_", "start_"
+SHAPES = tuple(kind + array for kind in (START, PREDICTED, GROUND_TRUTH) for array in ("normals", "hit"))
+FRONT, BEHIND = 0, 1
 REFERENCE = ("normals", "reference_normals", "hit", "reference_hit")  # see `bench.pictures.run_figures.save_images`
 COUNT_KEYS = ("size", "hits", "lost", "false", "angle_median", "angle_p99", "angle_max")
-NORMALS_PHRASE = (
-    "Normals are red, green and blue (right, up, towards the camera) of the mesh that is judged"  # of notes
-)
+NORMALS_PHRASE = "Normals are red, green and blue (right, up, towards the camera) of the mesh that is judged"
 Arrays = dict[str, np.ndarray]
 Window = tuple[float, float, float]  # see `style.window`
 Paint = Callable[[Arrays], Sequence[np.ndarray]]  # a picture [height, width, 3] per view; none without a surface
@@ -50,7 +40,7 @@ Paint = Callable[[Arrays], Sequence[np.ndarray]]  # a picture [height, width, 3]
 
 @dataclass(frozen=True)
 class Cell:
-    """Pictures side by side, each with the part of it that is shown, or None, and a note; without any, a blank."""
+    """Pictures side by side, each with its shown window (None: all of it), and a note; by default blank."""
 
     pictures: Sequence[tuple[np.ndarray, Window | None]] = ()
     note: str = ""
@@ -58,7 +48,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Block:
-    """Cells by the name of their row, with the names of their columns; what a row lacks at its end is blank."""
+    """Rows of cells by name, with the names of the columns. A shorter row ends with blank cells."""
 
     title: str
     columns: list[str]
@@ -66,12 +56,12 @@ class Block:
 
 
 def read_arrays(folder: Path, names: Iterable[str]) -> tuple[Arrays, str]:
-    """Arrays of a run folder's images.npz by name; none, and the reason, where one is missing or cannot be read."""
+    """Reads arrays of a run folder's images.npz by name. If one cannot be read, returns none and the reason."""
     path = folder / "images.npz"
     if not path.is_file():
         return {}, "no images.npz"
     try:
-        # Opened here, since numpy does not close a file that it cannot read.
+        # Opened here, as numpy does not close a file that it cannot read.
         with path.open("rb") as raw, np.lib.npyio.NpzFile(raw, allow_pickle=False) as file:
             arrays_by_name = {name: np.asarray(file[name]) for name in names}
     except KeyError as error:
@@ -82,10 +72,10 @@ def read_arrays(folder: Path, names: Iterable[str]) -> tuple[Arrays, str]:
 
 
 class Scene:
-    """The pictures of runs of one scene, of which all show the same part: that with the shapes of all runs."""
+    """The pictures of runs of one scene. All show the same window, which contains the shapes of all runs."""
 
     def __init__(self, runs: Runs, records: Iterable[Record], names: Iterable[str]):
-        """Reads the arrays of those names; `reasons` are why runs have none."""
+        """Reads the named arrays; `reasons` says why runs have none."""
         read = {record["folder"]: read_arrays(runs.folder(record), tuple(names)) for record in records}
         self.reasons = [reason for _, reason in read.values() if reason]
         self.arrays = {folder: arrays for folder, (arrays, _) in read.items() if arrays}
@@ -94,7 +84,7 @@ class Scene:
         self.windows = [style.window([hit[view] for hit in views]) for view in range(min(map(len, views), default=1))]
 
     def cell(self, record: Record | None, paint: Paint, views: Sequence[int] = (FRONT,)) -> Cell:
-        """The pictures of a run in some views, with its status where it did not end ok."""
+        """The pictures of a run in some views, with its status if it did not end ok."""
         if record is None:
             return Cell(note="no run")
         arrays, note = self.arrays.get(record["folder"]), record["status"] if record["status"] != "ok" else ""
@@ -104,23 +94,23 @@ class Scene:
         return Cell([(pictures[view], self.windows[view]) for view in views], note)
 
     def shared(self, records: Iterable[Record], paint: Paint, views: Sequence[int] = (FRONT,)) -> Cell:
-        """What all runs of some records share, as the first of them with pictures has it."""
+        """Pictures that all records share, such as the ground truth, from the first record that has them."""
         record = next((record for record in records if record["folder"] in self.arrays), None)
         return Cell() if record is None else self.cell(record | {"status": "ok"}, paint, views)
 
     def full_picture(self, records: Iterable[Record], name: str) -> Cell:
-        """A whole picture that all runs of some records share, of another camera than the others."""
+        """A picture that all records share and that is not cropped, as another camera took it."""
         arrays = next((self.arrays[record["folder"]] for record in records if record["folder"] in self.arrays), None)
         return Cell() if arrays is None else Cell([(arrays[name], None)])
 
 
 def on_white(colours: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Colours [..., 3] where something is hit, on white."""
+    """Colours [..., 3] of the hits on a white background."""
     return np.where(hit[..., None], np.nan_to_num(colours), 1.0).clip(0, 1)
 
 
 def normals(prefix: str = "") -> Paint:
-    """Pictures of the normals of a shape: right, up and towards the camera as red, green and blue."""
+    """Paints the normals of a shape: right, up and towards the camera are red, green and blue."""
 
     def paint(arrays: Arrays) -> Sequence[np.ndarray]:
         hit = arrays[f"{prefix}hit"]
@@ -131,7 +121,7 @@ def normals(prefix: str = "") -> Paint:
 
 
 def colours(prefix: str = "") -> Paint:
-    """Pictures of the colours of a shape."""
+    """Paints the colours of a shape."""
     return lambda arrays: [on_white(arrays[f"{prefix}colours"], arrays[f"{prefix}hit"])]
 
 
@@ -142,9 +132,9 @@ def colours_above_normals(
     records: Sequence[Record],
     reference: tuple[str, Paint],
 ) -> Block:
-    """A block with the colours of each row and its normals below.
+    """A block with the colours of each row and, below, its normals.
 
-    `first` is the heading of the column before them, and its picture, beside the colours.
+    `reference` is the heading of the first column and the picture that it shows next to the colours.
     """
     record_by_row = {row_of(record): record for record in records}
     heading, paint = reference
@@ -156,7 +146,7 @@ def colours_above_normals(
 
 
 def depth(arrays: Arrays) -> Sequence[np.ndarray]:
-    """A picture of given depths, near ones yellow."""
+    """Paints the given depths; near ones are yellow."""
     depths = arrays["given"][np.isfinite(arrays["given"])]
     low, high = (depths.min(), depths.max()) if depths.size else (0.0, 1.0)
     shown = colormaps["viridis_r"].with_extremes(bad=style.PAPER)
@@ -164,7 +154,7 @@ def depth(arrays: Arrays) -> Sequence[np.ndarray]:
 
 
 def angles(arrays: Arrays) -> np.ndarray:
-    """Angles between normals and the reference's, in degrees; nan where not both hit, or one is not of unit length."""
+    """Angles to the reference's normals in degrees; nan unless both hit and have unit normals."""
     predicted, true = arrays["normals"], arrays["reference_normals"]
     with np.errstate(invalid="ignore"):
         sine = np.linalg.norm(np.cross(predicted, true), axis=-1)  # the cosine alone is inexact for small angles
@@ -174,7 +164,7 @@ def angles(arrays: Arrays) -> np.ndarray:
 
 
 def count_pixels(arrays: Arrays) -> dict[str, Any]:
-    """The size, the number of pixels of each kind, and angles in degrees, by the names in `COUNTED`."""
+    """The size, the number of pixels of each kind, and angles in degrees, by `COUNT_KEYS`."""
     hit, reference_hit, all_angles = arrays["hit"], arrays["reference_hit"], angles(arrays)
     finite = all_angles[np.isfinite(all_angles)]
     percentiles = [float(x) for x in np.percentile(finite, (50, 99, 100))] if finite.size else [None] * 3
@@ -183,7 +173,7 @@ def count_pixels(arrays: Arrays) -> dict[str, Any]:
 
 
 def difference_pictures(largest: float) -> Paint:
-    """Pictures of angles to the reference's normals, up to so many degrees, and of missed and spurious pixels."""
+    """Paints angles to the reference's normals, up to `largest` degrees, and missed and spurious pixels."""
 
     def paint(arrays: Arrays) -> Sequence[np.ndarray]:
         shown = style.error_colours()(np.ma.masked_invalid(angles(arrays)) / largest)[..., :3]
@@ -196,19 +186,19 @@ def difference_pictures(largest: float) -> Paint:
 
 @dataclass(frozen=True)
 class ComparedPictures:
-    """Runs beside a reference: their pictures, the counts of each run, and the end of the scale of angles."""
+    """Runs compared with a reference: pictures, counts per run, notes, and the largest angle of the scale."""
 
     blocks: list[Block]
     counts: list[dict[str, Any]]
-    missing_notes: list[str]
+    missing: list[str]
     largest: float
 
 
 def compare_with_reference(runs: Runs, max_columns: int) -> ComparedPictures:
-    """Compares the runs of one scene with its reference: normals above, differences below, at most so many columns.
+    """Compares the runs of one scene with its reference: normals above, differences below.
 
     The scale of angles ends at the 99th percentile over all pixels, rounded up. The reference is of the largest
-    picture; the name of a run with a smaller one says so.
+    picture; the heading of a smaller picture names its size.
     """
     records = runs.records
     scene = Scene(runs, records, REFERENCE)
@@ -233,13 +223,13 @@ def compare_with_reference(runs: Runs, max_columns: int) -> ComparedPictures:
 
 
 def missing_notes(scenes: Iterable[Scene]) -> list[str]:
-    """A note per reason why runs have no pictures."""
+    """One note per reason why runs have no pictures."""
     reasons = Counter(reason for scene in scenes for reason in scene.reasons)
     return [f"No pictures of {plural(count, 'run')}: {reason}." for reason, count in reasons.items()]
 
 
 def first_shapes(runs: Runs, max_shapes: int, presets: Sequence[str] = ()) -> Runs:
-    """The runs of the first shapes of each family, of the least seed each; of some presets, where these were run."""
+    """The runs of the first shapes of each family, with its least seed; of `presets` only, if any of these was run."""
     records_of_presets = [record for record in runs.records if row_of(record).preset in presets] or runs.records
     chosen = []
     for records in grouped(records_of_presets, family).values():
@@ -254,12 +244,12 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
     """Draws blocks one above the other.
 
     Args:
-        across: pictures side by side in a cell.
-        largest: degrees at the end of the scale of `differences`, which then has a colour bar and a legend.
+        across: the number of pictures side by side in a cell.
+        largest: the largest angle of `difference_pictures` in degrees; with it, a colour bar and a legend are drawn.
     """
     bar = 0.0 if largest is None else COLOUR_BAR_INCHES
     lengths = [min(len(name), ROW_NAME_LETTERS) for block in blocks for name in block.rows]
-    names = ROW_NAMES_INCHES * max(lengths, default=0) / ROW_NAME_LETTERS
+    names = MAX_ROW_NAME_INCHES * max(lengths, default=0) / ROW_NAME_LETTERS
     columns = max([1, *(len(block.columns) for block in blocks)])
     inches = min((style.WIDTH - bar - names) / (columns * across), MAX_COMPARED_INCHES if bar else MAX_PICTURE_INCHES)
     wide = max(round(inches * across * HEADING_LETTERS_PER_INCH), 6)
@@ -274,22 +264,20 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
         fill(axis, block, inches, across)
     if largest is not None:
         _explain(figure, axes, largest)
-    figure.draw_without_rendering()  # the first layout does not know that titles stand above the columns' names
+    figure.draw_without_rendering()  # the first layout ignores that titles are above the names of columns
     return figure
 
 
 def fill(axis: Axes, block: Block, inches: float, across: int = 1) -> None:
-    """Draws a block into axes, with pictures of so many inches.
+    """Draws a block into axes, with pictures of `inches`.
 
-    All pictures are in one pair of axes, since a figure of many axes takes seconds.
+    One pair of axes has all pictures, as a figure of many axes takes seconds.
     """
     style.bare(axis)
     columns, rows = max(len(block.columns), 1), max(len(block.rows), 1)
     axis.set(xlim=(0, columns * across), ylim=(rows, 0), aspect="equal")
     axis.set_xticks([across * (column + 0.5) for column in range(len(block.columns))], block.columns)
-    axis.set_yticks(
-        [line + 0.5 for line in range(len(block.rows))], [_wrapped(name, ROW_NAME_LETTERS) for name in block.rows]
-    )
+    axis.set_yticks(np.arange(len(block.rows)) + 0.5, [_wrapped(name, ROW_NAME_LETTERS) for name in block.rows])
     axis.tick_params(length=0, top=False, bottom=False, labeltop=True, labelbottom=False, labelsize=6)
     axis.set_title(block.title, fontsize=7, loc="left")
     axis.vlines([across * column for column in range(1, columns)], 0, rows, color=FRAME_COLOUR, lw=1)
@@ -305,18 +293,18 @@ def fill(axis: Axes, block: Block, inches: float, across: int = 1) -> None:
 
 
 def _show(axis: Axes, picture: np.ndarray, window: Window | None, corner: tuple[float, float], inches: float) -> None:
-    """Draws a picture so that the part of it in the window fills the square at a place; all of it without a window."""
+    """Draws a picture so that its window, or all of it, fills the unit square at a corner."""
     height, width = (length / max(picture.shape[:2]) for length in picture.shape[:2])
     (top, left, side), (x, y) = window or ((height - 1) / 2, (width - 1) / 2, 1.0), corner
     edges = (x - left / side, x + (width - left) / side, y + (height - top) / side, y - top / side)
-    # A large picture is averaged, so that single pixels stay visible; the pixels of others stay as they are.
+    # Large pictures are averaged, so that single pixels stay visible; small ones keep their pixels.
     sharp = side * max(picture.shape[:2]) <= inches * style.RC["savefig.dpi"]
     shown = axis.imshow(picture, extent=edges, interpolation="nearest" if sharp else "auto")
     shown.set_clip_path(Rectangle((x + 0.01, y + 0.01), 0.98, 0.98, transform=axis.transData))
 
 
 def _explain(figure: Figure, axes: Sequence[Axes], largest: float) -> None:
-    """Draws the colour bar and the legend of `differences`."""
+    """Draws the colour bar and the legend of `difference_pictures`."""
     colours = ScalarMappable(Normalize(0, largest), style.error_colours())
     label = "angle between\nnormals (degrees)"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.9 / len(axes), aspect=25, extend="max", pad=0.01)
@@ -326,5 +314,5 @@ def _explain(figure: Figure, axes: Sequence[Axes], largest: float) -> None:
 
 
 def _wrapped(text: str, letters: int) -> str:
-    """The text in lines of so many letters, besides those that it has."""
+    """The text with its lines broken at `letters`."""
     return "\n".join(piece for line in text.split("\n") for piece in textwrap.wrap(line, letters) or [""])

@@ -21,10 +21,10 @@ from bench.report.write.paper import RECORD_ERRORS, SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
 from bench.report.write.table import Column, count_with_interval, ends, text
 
-ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # behind a heading: which direction is better
-MAX_LISTED_VALUES = 6  # of a swept key that the caption lists
-MAX_DATASET_COLUMNS = 8  # with a column and a panel of their own
-MAX_FALLBACK_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
+ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # after a heading: the better direction
+MAX_LISTED_VALUES = 6  # per swept key
+MAX_DATASET_COLUMNS = 8
+MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `TABLE_METRICS`
 FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
@@ -34,9 +34,9 @@ UNDIRECTED = "Of metrics of which neither direction is better, medians are of th
 
 @dataclass(frozen=True)
 class Sweep:
-    """The runs of a sweep, one per planned cell, each with the name of its row; `swept` are keys with their values.
+    """The runs of a sweep, one per planned cell, each with the name of its row; and the swept keys with their values.
 
-    Cells that are `missing` were not run or killed, and have no run here, unless all are.
+    `missing` is the number of cells that were not run, or killed. They are in `runs` only if no cell ended.
     """
 
     name: str
@@ -46,14 +46,14 @@ class Sweep:
 
     @property
     def metrics(self) -> list[str]:
-        """The names of all metrics that some run has as a number, those that tables show first."""
+        """The names of all metrics that are a number in some run; those that tables show come first."""
         names = {name: None for run in self.runs.records for name in run["metrics"] if measured(run, name) is not None}
         listed = [name for name in TABLE_METRICS if name in names]
         return [*listed, *(name for name in names if name not in TABLE_METRICS)]
 
     @property
     def datasets(self) -> list[str]:
-        """The data sets that every row has runs of; none where these are one alone, or many."""
+        """The data sets of which every row has runs; empty if there is only one, or too many."""
         rows = grouped(self.runs.records, lambda run: run["row"]).values()
         sets, names = [{*map(records.family, runs)} for runs in rows], map(records.family, self.runs.records)
         shared = [name for name in dict.fromkeys(names) if all(name in datasets for datasets in sets)]
@@ -61,9 +61,9 @@ class Sweep:
 
 
 def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) -> list[Path]:
-    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; gives the CSVs' paths.
+    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; returns the CSVs.
 
-    `problems` gets a line for each sweep that no table can be made of.
+    `problems` gets a line for each sweep whose table cannot be made.
     """
     by_folder, studied, written = {record["folder"]: record for record in records}, _studied(), []
     for plan in read_plans(results_dir)[0]:
@@ -78,7 +78,7 @@ def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) 
 
 
 def write_sweep(plan: Plan) -> Path | None:
-    """Writes the table of a sweep that has ended, if no study shows it; gives the path of its readable form."""
+    """Writes the table of a finished sweep, unless a study shows it; returns the path of the Markdown file."""
     if plan.cells[0].config.get("experiment") in _studied():
         return None
     record_by_id = {}
@@ -90,7 +90,7 @@ def write_sweep(plan: Plan) -> Path | None:
 
 
 def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
-    """The sweep of a plan, some of whose runs are known; cells that differ in nothing that counts have one run."""
+    """The sweep of a plan with its known records. Equivalent cells share one run."""
     cells = {cell.id: cell for cell in plan.cells if cell.id in record_by_id}
     runs = [record_by_id[name] for name in cells]
     overrides = [_override_values(cell.overrides) for cell in cells.values()]
@@ -106,10 +106,10 @@ def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
 
 
 def lines(sweep: Sweep) -> list[dict[str, Any]]:
-    """A line per row: its counts, its costs, the interval of each metric's median, and the ratio of the first metric.
+    """A line per row: its counts, its costs, each metric's median with its interval, and the ratio of the first metric.
 
-    The ratio is to the first row, paired by shape; None where there is none. Of the first metric, the median on each
-    data set that all rows have stands under its name with that of the data set.
+    The ratio is to the first row, paired by shape, or None. The median of the first metric on each data set that all
+    rows have is under the name of the metric with that of the data set.
     """
     rows, names = grouped(sweep.runs.records, lambda record: record["row"]), sweep.metrics
     first = next(iter(rows.values()))
@@ -143,17 +143,17 @@ def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
 
 
 def median_of(runs: list[Record], metric: str) -> Interval | None:
-    """The median of a metric over shapes and seeds with its interval, a failed run as the worst value.
+    """The median of a metric over shapes and seeds with its interval; a failed run counts as the worst value.
 
-    Where it is not known which direction of the metric is better, it is that of the runs that have the metric. None
-    where a run that ended ok lacks it, or no run has it.
+    If neither direction of the metric is better, only runs that have it count. None if a run that ended ok lacks the
+    metric, or no run has it.
     """
     values = {run_key(run): value for run in runs if (value := measured(run, metric)) is not None}
     if not values or any(run["status"] == "ok" and run_key(run) not in values for run in runs):
         return None
     if better_direction(metric) == LOWER:
         return _middle({run_key(run): error(run, metric) for run in runs})
-    if better_direction(metric) == HIGHER:  # that of a run that failed is 0, the least such metrics can be
+    if better_direction(metric) == HIGHER:  # a failed run counts as 0, the lowest value of such metrics
         ended = {run_key(run): run["status"] == "ok" for run in runs}
         negated = {key: -values[key] if ok and values[key] == values[key] else 0.0 for key, ok in ended.items()}
         interval = _middle(negated)
@@ -166,7 +166,7 @@ def _middle(values: dict[RunKey, float]) -> Interval:
 
 
 def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | None:
-    """The ratio of medians to those of the first row over the same shapes and seeds; None for that row itself."""
+    """The ratio of medians to those of the first row on the same shapes and seeds; None for the first row itself."""
     mine, theirs = ({run_key(run): error(run, metric) for run in row} for row in (runs, first))
     if not metric or runs is first or set(mine) != set(theirs):
         return None
@@ -206,7 +206,7 @@ def table_of(sweep: Sweep) -> Result:
 
 
 def _panel(lines: list[dict[str, Any]], key: str, title: str, shown: Metric) -> Panel:
-    """A row of the table per line of the panel, with its median and interval along x."""
+    """A panel with a row per line: its median and interval along x."""
     panel_series = [
         series(line["row"], line["preset"], [line[key].times(shown.factor)], [position])
         for position, line in enumerate(lines)
@@ -216,7 +216,7 @@ def _panel(lines: list[dict[str, Any]], key: str, title: str, shown: Metric) -> 
 
 
 def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict[str, Metric]) -> dict[str, str]:
-    """The question and the verdict on the first metric; empty where there is nothing to choose from."""
+    """The question and the verdict on the first metric; empty with fewer than two rows to compare."""
     interval_by_row = {line["row"]: line[lead] for line in lines if lead and line[lead] is not None}
     if len(interval_by_row) < 2:
         return {}
@@ -238,7 +238,7 @@ def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict
 
 
 def _failed(line: dict[str, Any]) -> str:
-    """How many runs failed, with the interval of their share where there is one; the caption has n once."""
+    """How many runs failed, with the interval of their fraction if there is one; the caption has n."""
     count, total = line["failed"], line["runs"]
     return count_with_interval(count, total, line["rate"]) if line["rate"].has_ends else f"{count:g} of {total}"
 
@@ -262,13 +262,13 @@ def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> lis
 
 
 def _estimate(key: str, shown: Metric) -> list[Column]:
-    """The columns of an estimate that a line may lack, and of the ends of its interval: in scene units for the CSV."""
+    """The columns of an estimate, which may be None, and of its interval ends; in the CSV in scene units."""
 
     def words(line: dict[str, Any]) -> str:
         if line[key] is None:
             return format.MISSING
         scaled = line[key].times(shown.factor)
-        return str(scaled) if scaled.has_ends else scaled.alone()  # the caption has n once
+        return str(scaled) if scaled.has_ends else scaled.alone()  # the caption has n
 
     heading, value = f"{shown.label}{ARROWS[shown.better]}", lambda line: getattr(line[key], "value", None)
     return [Column(key, heading, value, words=words, better=shown.better), *ends(key, lambda line: line[key])]
@@ -283,13 +283,13 @@ def _listed(sweep: Sweep) -> str:
 
 
 def _override_values(overrides: list[str]) -> dict[str, str]:
-    """The keys and values of a cell's overrides; a sign that adds a key is no part of it."""
+    """The keys and values of a cell's overrides, without a leading plus sign."""
     pairs = [override.partition("=") for override in overrides if "=" in override]
     return {key.lstrip("+"): value for key, _, value in pairs}
 
 
 def _average_key(record: Record) -> RunKey:
-    """What a row is averaged over: shape, view and seed; a stress is no shape."""
+    """What a row is averaged over: shape, view and seed. A stress is not part of the shape."""
     solid, view, seed = run_key(record)
     return (solid[1] if record["config"].get("stress") else solid, view, seed)
 

@@ -64,7 +64,7 @@ def make(runs: Runs) -> Result:
         verdict=compared.best("errors × 1000 over all numbers of points"),
         remarks=(compare.ERROR, f"{_shapes(compared)} {_iterations(runs)}", *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
-        lines=compared.with_reference_lines({compare.ORACLE: oracle}, published),
+        lines=compared.extended_lines({compare.ORACLE: oracle}, published),
         run_columns=RUNS,
         figure=draw(compared, oracle),
     )

@@ -61,7 +61,7 @@ def make(runs: Runs) -> Result:
         verdict=compared.best("errors × 1000, from truth to prediction"),
         remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
         columns=compared.columns("Ratio to DIST"),
-        lines=compared.with_reference_lines(above, published),
+        lines=compared.extended_lines(above, published),
         run_columns=RUNS,
     )
 

@@ -22,7 +22,7 @@ from bench.report.site.columns import columns, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import mesh_data, read_ply, simplify
-from bench.report.site.renderers import _node, _source
+from bench.report.site.renderers import _preset_settings, _source
 from bench.report.site.words import STATUSES, TASKS, command, request_sentence
 from bench.report.suite.attempts import write_attempts
 from bench.report.write import html
@@ -351,12 +351,12 @@ def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
 
 
 def test_a_variant_has_the_settings_of_what_it_builds_on():
-    built, own = (dict(found) for found in (_node("neus"), _node("neus_budget")))
-    assert own["samples"] == 24 and {*built} <= {*own} and _node("no_such") == {}
+    built, own = (dict(found) for found in (_preset_settings("neus"), _preset_settings("neus_budget")))
+    assert own["samples"] == 24 and {*built} <= {*own} and _preset_settings("no_such") == {}
     assert _source("mypkg.Mine") == ("mypkg.Mine", "")
     suite_rows = [name for name in choices("renderer") if "core" in choice("renderer", name).get("_rows_", {})]
     for name in suite_rows:
-        file, said = _source(_node(name)["_target_"])
+        file, said = _source(_preset_settings(name)["_target_"])
         assert (ROOT / file).is_file() and "Source:" in said, name
 
 

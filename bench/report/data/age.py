@@ -1,4 +1,4 @@
-"""What of a run or a page is of an earlier version: settings that are gone, the engine of its times, its statistics."""
+"""Notes on runs and pages of earlier versions: removed settings, the engine behind the times, old statistics."""
 
 import subprocess
 from functools import cache
@@ -10,7 +10,7 @@ from bench.tables import CONF, LABEL_KEY, read_yaml
 RESTORED_FIELD = "restored"  # the page and version from whose CSV a record without a run folder was restored
 COMPILED_SINCE = "2026-11-26"  # from this day on, compiled code evaluates fields on one thread of a CPU
 UNKNOWN = "unknown"
-REMOVED_SETTINGS = {  # of renderers: the value that equals the behaviour of this version, and the effect of others
+REMOVED_SETTINGS = {  # their value that equals the behaviour of this version, and the effect of another value
     "keep_slope_sign": (True, "which turned the sign of the gradient at flat crossings"),
 }
 ENGINE = (
@@ -20,12 +20,12 @@ ENGINE = (
 
 
 def notes(records: list[Record]) -> list[str]:
-    """Notes on what of the runs is of an earlier version; none where nothing is."""
+    """Notes on runs of earlier versions; empty if there are none."""
     return [note for note in (_old_rows(records), _engine(records), _restored(records)) if note]
 
 
 def removed_settings(record: Record) -> list[str]:
-    """The recorded settings of our renderers that this version does not have, such as KEY=VALUE; such a row is old."""
+    """The recorded settings of the renderer, as KEY=VALUE, that this version does not have. Such a row is old."""
     settings = record["config"].get("renderer") or {}
     arguments = _arguments().get(settings.get("_target_"), settings)
     return [
@@ -37,7 +37,7 @@ def removed_settings(record: Record) -> list[str]:
 
 @cache
 def _arguments() -> dict[str, set[str]]:
-    """The settings of each class of conf/renderer, with those that variants of any class set."""
+    """The settings of each class of conf/renderer, and those that variants set."""
     files = [read_yaml(path) for path in sorted((CONF / "renderer").glob("*.yaml"))]
     classes = grouped(files, lambda file: str(file["_target_"]))
     variants = read_yaml(CONF / "variants.yaml").values()
@@ -54,7 +54,7 @@ def _old_rows(records: list[Record]) -> str:
 
 
 def _engine(records: list[Record]) -> str:
-    """A note where the engine of times is not the default one of today: runs of before a record named its engine."""
+    """A note on times of an earlier engine: their records do not name the engine."""
     environments = [record["environment"] for record in records if record["environment"]]
     unnamed = [
         each
@@ -78,7 +78,7 @@ def _restored(records: list[Record]) -> str:
 
 
 def drawn_by(path: Path) -> str:
-    """The version of the code that drew a file, with its date: the commit that changed it last."""
+    """The version that drew a file: the last commit that changed it, with its date."""
     command = ["git", "log", "-1", "--format=%h of %cs", "--", path.name]
     try:
         log = subprocess.run(command, cwd=path.parent, capture_output=True, text=True, check=True, timeout=10)
@@ -88,7 +88,7 @@ def drawn_by(path: Path) -> str:
 
 
 def head(version: str) -> str:
-    """What stands at the head of a page that this version cannot draw; empty without the version that drew it."""
+    """The head of a page that this version cannot draw; empty if no other version drew it."""
     if not version:
         return ""
     day = version.rpartition(" ")[2]

@@ -1,4 +1,4 @@
-"""Reads the curves of runs from their folders, and gives the median of several runs of one row."""
+"""Reads the curves of runs from their folders, and computes the median curve of a row."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
 
 
 def read(folder: Path, columns: Sequence[str] = COLUMNS) -> tuple[pd.DataFrame, str]:
-    """A row for each line of `curve.jsonl`, with these columns as floats, nan for missing; and a warning, or ""."""
+    """Reads `curve.jsonl`: a row per line with these columns as floats (nan if missing), and a warning or ""."""
     parsed = curve_lines(folder)
     numbered = [line for line in parsed or [] if as_number(line.get("iteration")) is not None]
     rows = [[as_number(line.get(name)) for name in columns] for line in numbered]
@@ -33,8 +33,8 @@ def read(folder: Path, columns: Sequence[str] = COLUMNS) -> tuple[pd.DataFrame, 
 def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.DataFrame:
     """The median, minimum and maximum of a quantity over the runs of a row, and the median of the seconds.
 
-    After the end of a failed run its value counts as infinite, so that no row improves by failed runs. Iterations at
-    which another run has no value are left out.
+    After its end, a failed run counts as infinite, so that failures do not improve a row. Iterations at which another
+    run has no value are left out.
 
     Returns:
         Columns iteration, seconds, median, low, high.
@@ -54,10 +54,10 @@ def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.Da
 
 
 def history_of(runs: Runs, record: Record) -> pd.DataFrame:
-    """A run's error over seconds and evaluations: at its checkpoints, and at its end.
+    """A run's error over seconds and evaluations, at its checkpoints and at its end.
 
-    A line of a curve has the error before its step, but the costs after it, so a checkpoint gets the costs of the line
-    before it.
+    A line of a curve has the error before its step, but the costs after it. So a checkpoint gets the costs of the
+    previous line.
     """
     curve = read(runs.folder(record))[0].sort_values("iteration")
     costs = curve[["seconds", "value_evaluations"]].shift(1, fill_value=0.0)
@@ -72,6 +72,6 @@ def history_of(runs: Runs, record: Record) -> pd.DataFrame:
 
 
 def spearman(points: pd.DataFrame, first: str = "loss", second: str = "error") -> float | None:
-    """The rank correlation of two columns; None for fewer than three points, or where a column does not vary."""
+    """The rank correlation of two columns; None for fewer than three points, or if a column is constant."""
     varied = len(points) > 2 and all(points[column].nunique() > 1 for column in (first, second))
     return float(np.corrcoef(points[[first, second]].rank().T)[0, 1]) if varied else None

@@ -1,4 +1,4 @@
-"""Permutation tests of paired differences: where both sides are equal, each difference has either sign."""
+"""Permutation tests of paired differences: if both sides are equal, each difference can have either sign."""
 
 from functools import cache
 from itertools import product
@@ -7,14 +7,14 @@ import numpy as np
 
 from bench.report.data.statistics import shapes_needed
 
-MAX_EXACT_UNITS = 16  # units of which all signs are tried; of more, 2**15 random signs
+MAX_EXACT_UNITS = 16  # up to here all sign vectors are tested, above it 2**15 random ones
 
 
 @cache
 def signs(units: int) -> np.ndarray:
-    """The signs of units [flips, units]; that of the first unit is positive, and so are all in the first flip.
+    """The sign vectors [flips, units]. The first unit is always positive, and so are all units of the first flip.
 
-    The other half of all flips has the same sums, with the other sign.
+    The other half of the sign vectors gives the same sums with the opposite sign.
     """
     if units <= MAX_EXACT_UNITS:
         return np.array([(1.0, *others)[:units] for others in product((1.0, -1.0), repeat=max(units - 1, 0))])
@@ -24,15 +24,15 @@ def signs(units: int) -> np.ndarray:
 
 
 def p_values(differences: np.ndarray) -> np.ndarray:
-    """The p values [pairs] of differences [units, pairs]: the share of flips whose sum is at least as large."""
+    """The p values [pairs] of differences [units, pairs]: the fraction of flips whose sum is at least as large."""
     sums = np.abs(differences.sum(axis=0))
     return (np.abs(signs(len(differences)) @ differences) >= sums - 1e-12).mean(axis=0)
 
 
 def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
-    """The ends of the confidence intervals of the means of all columns of values [units, columns], at `alpha` in all.
+    """The smallest and largest end of simultaneous confidence intervals of the means of values [units, columns].
 
-    None where there are too few units to reject any mean, or no column.
+    Their joint level is 1 - alpha. None without columns, or with too few units to reject any mean.
     """
     units, columns = values.shape
     if not columns or units < shapes_needed(columns, alpha):
@@ -42,7 +42,7 @@ def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
 
 
 def interval(values: np.ndarray, alpha: float) -> tuple[float, float]:
-    """The confidence interval of the mean of values [units] at level 1 - alpha: the means that are not rejected."""
+    """The confidence interval of the mean of values [units] at level 1 - alpha: the means that the test accepts."""
     flips, ends = signs(len(values)), []
     sums, counts = flips @ values, flips.sum(axis=1)
     for end in (values.min(), values.max()):

@@ -1,4 +1,4 @@
-"""The runs that a study reads: the newest run of each cell of its experiment, as records and as one typed table."""
+"""The runs that a study reads: the newest run of each cell of its experiment, as records and as a typed table."""
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import requested, row_name, started
 from bench.report.data.frame import to_frame
-from bench.report.data.kept import FROM_RUNS_CSV, NO_ATTEMPTS
+from bench.report.data.kept import FROM_RUNS_CSV, UNMEASURED
 from bench.report.data.records import (
     CHAMFER_SCALE,
     Record,
@@ -29,7 +29,7 @@ from bench.report.data.records import (
 )
 
 MACHINE_KEYS = ("cpu", "device", "threads")
-# Rows of one table may differ in these: an error against the truth compares them.
+# Rows of one table may differ in these settings: their errors against the ground truth stay comparable.
 ROW_SETTINGS = ("prior.truncation",)
 
 
@@ -38,10 +38,10 @@ class Selection:
     """The runs that a study reads.
 
     Args:
-        experiment: its name in the runs' configurations.
+        experiment: its name in the configurations of the runs.
         conditions: settings in which runs of one row differ, such as task.points or split.
-        setup: parts of the setup that captions name, where they are known.
-        alike: further parts of the configuration, such as dataset or task, in which only runs like the newest are read.
+        setup: parts of the setup that captions name if they are known.
+        alike: further parts of the configuration, such as task, in which only runs that equal the newest are read.
     """
 
     experiment: str
@@ -51,14 +51,14 @@ class Selection:
 
 
 class NoFolder(LookupError):
-    """A page needs more of a run than its record, such as its curve, and the run folder is gone."""
+    """A page needs a file of a run, such as its curve, but the run folder is gone."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """The runs of an experiment in the order of their rows, a failed or planned one too.
+    """The runs of an experiment in the order of their rows, including failed and planned ones.
 
-    `left_out` counts its runs that are not shown: of another scale, or replaced by a newer run of the same cell.
+    `left_out` is the number of its runs at another scale, or replaced by a newer run of the same cell.
     """
 
     selection: Selection
@@ -72,8 +72,8 @@ class Runs:
         """The table of `bench.load` for these runs, in the order of `records`.
 
         Further columns: row, the name of the row in tables; preset, which decides its look; family; solid and view,
-        the number of the shape and of its view; loop, the seconds in the loop; values, the field values with coarse
-        ones.
+        the numbers of the shape and of its view; loop, the seconds of the loop; values, the field evaluations including
+        coarse ones.
         """
         table = to_frame(self.records)
         rows = [row_of(record) for record in self.records]
@@ -91,44 +91,44 @@ class Runs:
         )
 
     def error(self, metric: str, scale: float = CHAMFER_SCALE) -> pd.Series:
-        """A metric of each run, times `scale`; infinite where the run did not end ok or lacks it."""
+        """A metric of each run, times `scale`; infinite if the run did not end ok or lacks the metric."""
         ok = (self.frame.status == "ok").to_numpy(bool)
         return self.number(metric).where(ok, np.inf).fillna(np.inf) * scale
 
     def number(self, column: str) -> pd.Series:
-        """A column as floats, nan where it is missing or no number."""
+        """A column as floats; nan for missing values and text."""
         values = self.frame[column] if column in self.frame else pd.Series(np.nan, self.frame.index)
         return pd.to_numeric(values.astype(object).where(values.notna(), np.nan), errors="coerce").astype(float)
 
     @property
     def timed(self) -> bool:
-        """Whether the times of most runs can be relied on; where not, charts show field values alone."""
+        """Whether the times of most runs are reliable; if not, charts show field evaluations only."""
         return 2 * sum(map(doubtful, self.records)) < len(self.records)
 
     def setting(self, key: str) -> pd.Series:
-        """A setting of each run as text, such as task.points; empty where it is missing."""
+        """A setting of each run as text, such as task.points; empty if it is missing."""
         column = self.frame.get(f"config.{key}")
         return pd.Series("", self.frame.index) if column is None else column.astype("string").fillna("").astype(object)
 
     def where(self, kept: pd.Series) -> "Runs":
-        """Those runs alone; they are not counted as left out."""
+        """The runs for which `kept` is true. The others do not count as left out."""
         return replace(self, records=[record for record, keep in zip(self.records, kept, strict=True) if keep])
 
     @property
     def executed(self) -> "Runs":
-        """Without cells that were not run, killed or refused, which are no failures; all where no other is there."""
-        is_executed = ~self.frame.status.isin(NO_ATTEMPTS)
-        return self.where(is_executed) if is_executed.any() else self
+        """The runs that are not just planned, killed or refused, as these are no failures; all runs without others."""
+        executed = ~self.frame.status.isin(UNMEASURED)
+        return self.where(executed) if executed.any() else self
 
     def other(self, selection: Selection) -> "Runs | None":
         """The runs of another experiment of the same results folder."""
         return choose(self.everything, selection, self.results_dir)
 
     def folder(self, record: Record) -> Path:
-        """The record's run folder.
+        """The run folder of a record.
 
         Raises:
-            NoFolder: where it is gone, and the record is a row of a shipped table.
+            NoFolder: the record was read from a shipped file, and has no folder here.
         """
         if FROM_RUNS_CSV in record:
             raise NoFolder(record["folder"])
@@ -145,11 +145,11 @@ class Runs:
         return grouped(self.records, family)
 
     def named(self) -> list[Record]:
-        """The records with their readable names under `name`."""
+        """The records with their readable names as `name`."""
         return [{**record, "name": name} for record, name in zip(self.records, self.names(), strict=True)]
 
     def names(self) -> list[str]:
-        """A readable name of each run: its row's, with what else runs differ in: conditions, family, seed, shape."""
+        """A readable name of each run: its row, its conditions, and family, seed and shape if they vary."""
         getters = {"": family, "seed ": itemgetter("seed"), "shape ": index}
         varying = {word: get for word, get in getters.items() if len({str(get(run)) for run in self.records}) > 1}
         return [
@@ -166,9 +166,9 @@ class Runs:
         return [(name, value) for name, value in values.items() if isinstance(value, str | int | float)]
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
-        """The names of the runs by what their times depend on: processor, accelerator, threads, compiled kernels.
+        """The names of the runs by machine: processor, accelerator, threads, and whether kernels are compiled.
 
-        A run that ended before it knew its processor has no machine.
+        A run that ended too early to record its processor is left out.
         """
 
         def machine_of(record: Record) -> tuple[Any, ...]:
@@ -179,7 +179,7 @@ class Runs:
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:
-        """The settings of view and evaluation in which an experiment's runs differ, of prior and field in a family."""
+        """The settings in which runs differ: view and evaluation in an experiment, prior and field in a family."""
         experiments = grouped(self.records, lambda record: record["config"].get("experiment")).values()
         comparisons = [(records, ("view", "evaluation")) for records in experiments]
         families = (records for group in experiments for records in grouped(group, family).values())
@@ -193,19 +193,18 @@ class Runs:
         return list(differing)
 
     def of_newest_scene(self) -> "Runs":
-        """Those runs alone that have the seed and the shape of the one requested last."""
+        """The runs with the seed and the shape of the run that was requested last."""
         newest = max(self.records, key=requested)
         kept = [r for r in self.records if (r["seed"], index(r)) == (newest["seed"], index(newest))]
         return replace(self, records=kept, left_out=self.left_out + len(self.records) - len(kept))
 
 
 def choose(records: list[Record], selection: Selection, results_dir: Path) -> Runs | None:
-    """The newest run of each cell of an experiment, at the scale of the run that was requested last; None without one.
+    """The newest run of each cell of an experiment, at the scale of the run requested last; None without runs.
 
-    A cell is a row, a task, a split, a draw, a shape, a view, a seed and the selection's conditions. A row has one
-    setting, the one that was requested last: runs of a row with other settings would be averaged as one. On one scene,
-    where nothing is averaged, rows of one name are told apart by their renderers' settings. Rows stand in the order in
-    which they started.
+    A cell is a row, task, split, draw, shape, view, seed and the conditions of the selection. Of a row, only runs with
+    the settings requested last are read, so that no average mixes settings. On one scene nothing is averaged: there,
+    rows of one name are distinguished by the settings of their renderers. Rows are in the order of their first start.
     """
     candidates = sorted((r for r in records if r["config"].get("experiment") == selection.experiment), key=started)
     if not candidates:
@@ -224,23 +223,23 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ru
 
 
 def merge_runs(*runs_or_none: Runs | None) -> Runs:
-    """The runs of several experiments as one, for a common caption."""
+    """The runs of several experiments as one object, for a common caption."""
     present = [runs for runs in runs_or_none if runs is not None]
     records = sorted((record for runs in present for record in runs.records), key=started)
     return replace(present[0], records=records, left_out=sum(runs.left_out for runs in present))
 
 
 def shared_loss(records: list[Record]) -> str:
-    """The label of the mask loss that all records have; empty where they differ, or have their renderers' own."""
+    """The label of the silhouette loss that all records share; empty if they differ or use their renderer's loss."""
     labels = {setting(record["config"], "silhouette", "_label_") or "" for record in records}
     return str(labels.pop()) if len(labels) == 1 else ""
 
 
 def named_rows(records: list[Record]) -> list[Record]:
-    """The records with the names of their rows under `row`.
+    """The records with the names of their rows as `row`.
 
-    A mask loss that all share is left out, since captions name it; rows of one name get the settings of the renderer
-    in which they differ, and their presets where these differ.
+    A silhouette loss that all records share is left out, since captions name it. Rows of one name get the settings of
+    the renderer in which they differ, and their presets if these differ.
     """
     shared = {"silhouette": {}} if shared_loss(records) else {}
     names = [row_name(record["config"] | shared, record["renderer"]) for record in records]
@@ -260,7 +259,7 @@ def named_rows(records: list[Record]) -> list[Record]:
 
 
 def renderer_settings(record: Record) -> dict[str, str]:
-    """The settings of the record's renderer as text; none of a draw, whose row has all settings drawn."""
+    """The settings of the record's renderer as text; empty for a draw, as its row covers all drawn settings."""
     if record["config"].get("draw") is not None:
         return {}
     return {str(key): str(value) for key, value in (record["config"].get("renderer") or {}).items()}
@@ -275,18 +274,18 @@ def _without_conditions(record: Record, key: str, selection: Selection) -> Any:
 
 
 def _row_key(record: Record) -> Hashable:
-    """What has one setting: a row in a task, and of a search space a draw."""
+    """The key of runs that must share their settings: a row in a task, and a draw of a search space."""
     return row_of(record), record["task"], record["config"].get("draw")
 
 
 def _row_settings(record: Record, selection: Selection) -> Any:
-    """The settings of a row: the renderer's, the task's without conditions, the loss of the mask, the resolution."""
+    """The settings of a row: renderer, task and silhouette loss without conditions, and the resolution."""
     settings = [_without_conditions(record, key, selection) for key in ("renderer", "task", "silhouette")]
     return [*settings, setting(record["config"], "view", "resolution")]
 
 
 def _cell_key(record: Record, selection: Selection) -> Hashable:
-    """What has one run. A condition that is a node, such as a stress, is named by the shape's family already."""
+    """The key of a cell. A condition that is a node, such as a stress, is part of the shape's family already."""
     values = (setting(record["config"], *key.split(".")) for key in (*selection.conditions, "split"))
     conditions = (str(value) for value in values if not isinstance(value, dict))
     settings = str(sorted(renderer_settings(record).items()))

@@ -12,34 +12,23 @@ from bench.records.record import NEUTRAL_KEYS, as_number, digest, row_name, star
 from bench.report.data.records import OURS, Record, family, grouped, loop_seconds, run_key, setting, value_evaluations
 from bench.report.site.files import Folder
 
-LIST_DIGITS = 5  # of numbers in the list; a run's own page has all of them
+SIGNIFICANT_DIGITS = 5  # a run's own page has all digits
 MAX_REASON_LETTERS = 300
 OBSERVATION_KEYS = (
-    "points",
-    "depths",
-    "mask",
-    "images",
-    "stress",
-    "degrees",
-    "shift",
-    "given",
-    "held_out",
-    "size",
-    "longest",
+    *("points", "depths", "mask", "images", "stress", "degrees", "shift", "given", "held_out", "size", "longest"),
 )
 METRICS = TABLE_METRICS | MEASUREMENT_METRICS
-CUSTOM_RENDERER = "custom"  # the choice of renderer that stands for a user's class
-MAX_NAMED_SETTINGS = 3  # settings in a name
-# Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
+CUSTOM_RENDERER = "custom"  # the preset of a user's class
+MAX_NAMED_SETTINGS = 3
+# Keys of the configuration that have columns of their own, or follow from other keys.
 IN_COLUMNS = NEUTRAL_KEYS | {
     *("dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw", "scale")
 }
-# What is named first where several settings tell runs apart.
 NAMED_FIRST = ("renderer", "task", "field", "method", "silhouette", "view")
 
 
 def columns(records: list[Record], folders: list[Folder]) -> dict[str, Any]:
-    """The columns, with an entry per record each; texts that repeat are numbers of entries in a list of values."""
+    """The columns, with one entry per record. Texts that repeat are stored once and referred to by number."""
     texts = {name: [get(record) for record in records] for name, get in TEXTS.items()}
     texts |= {"name": names(records), "thumb": [folder.thumb() for folder in folders]}
     return {
@@ -57,27 +46,22 @@ def columns(records: list[Record], folders: list[Folder]) -> dict[str, Any]:
 
 
 def names(records: list[Record]) -> list[str]:
-    """The name of each run: that of its row, a user's renderer by its class, and the settings that differ.
+    """The name of each run: the name of its row, or of a user's class, and the settings in which runs differ.
 
-    What differs is written as for the rows of a sweep, so that a setting reads the same in both; what stands in columns
-    of its own, such as shape, seed and scale, is left out. Settings are added as long as one tells apart runs of one
-    task, row and scale that those before it do not, so that what follows from another setting is not repeated; at most
-    `MAX_NAMED_SETTINGS`.
+    Settings are written as in the rows of a sweep. Those with a column of their own, such as seed and scale, are left
+    out. A setting is added only if it distinguishes runs of one task, row and scale that the settings before it do not;
+    at most `MAX_NAMED_SETTINGS` are added.
     """
     run_names = [_base_name(record) for record in records]
     cache: dict[Hashable, dict[str, str]] = {}
     settings = [_settings(record["config"], cache) for record in records]
     for indices in grouped(range(len(records)), lambda index: (records[index]["task"], run_names[index])).values():
         groups = list(grouped(indices, lambda index: (_scale(records[index]), str(settings[index]))).values())
-        group_settings = [settings[group[0]] for group in groups]  # most runs of a list have the same
+        group_settings = [settings[group[0]] for group in groups]  # usually one group
         scales = [_scale(records[group[0]]) for group in groups]
         rows = [run_names[indices[0]]] * len(groups)
-        group_names = make_unique(
-            ordered_settings(group_settings, NAMED_FIRST),
-            groups=[*map(scales.index, scales)],
-            names=rows,
-            limit=MAX_NAMED_SETTINGS,
-        )
+        ordered, numbers = ordered_settings(group_settings, NAMED_FIRST), [*map(scales.index, scales)]
+        group_names = make_unique(ordered, groups=numbers, names=rows, limit=MAX_NAMED_SETTINGS)
         for group, name in zip(groups, group_names, strict=True):
             for index in group:
                 run_names[index] = name
@@ -85,7 +69,7 @@ def names(records: list[Record]) -> list[str]:
 
 
 def _settings(config: dict[str, Any], cache: dict[Hashable, dict[str, str]]) -> dict[str, str]:
-    """The settings of a run that may be in its name, made once for runs that share all of them; `known` has these."""
+    """The settings of a run that its name may show; `cache` keeps the result for runs with equal settings."""
     kept = {key: value for key, value in config.items() if key not in IN_COLUMNS}
     parts = tuple((key, value if isinstance(value, SharedSettings) else repr(value)) for key, value in kept.items())
     if parts not in cache:
@@ -94,7 +78,7 @@ def _settings(config: dict[str, Any], cache: dict[Hashable, dict[str, str]]) -> 
 
 
 def _base_name(record: Record) -> str:
-    """The name of a record's row; of a user's renderer without a label, its class."""
+    """The name of a record's row; for a user's renderer without a label, its class."""
     name = row_name(record["config"], record["renderer"])
     target = str(setting(record["config"], "renderer", "_target_") or "")
     if record["renderer"] == CUSTOM_RENDERER and target and not target.startswith(OURS):
@@ -108,10 +92,10 @@ def _scale(record: Record) -> str:
 
 
 def machine(record: Record) -> str:
-    """The machine that the run's times depend on, with its threads; empty where the run ended before it knew."""
+    """The machine and the threads that the run's times depend on; empty if the run ended too early to record them."""
     environment = record["environment"]
-    parts = [str(environment.get(name) or "") for name in ("cpu", "device")]
-    label, threads = " + ".join(part for part in parts if part and part != "cpu"), environment.get("threads")
+    names = [str(environment.get(key) or "") for key in ("cpu", "device")]
+    label, threads = " + ".join(name for name in names if name and name != "cpu"), environment.get("threads")
     return f"{label}, {plural(threads, 'thread')}" if label and threads else ""
 
 
@@ -151,22 +135,21 @@ def _metrics(records: list[Record]) -> dict[str, Any]:
 
 
 def _tasks(records: list[Record]) -> list[dict[str, Any]]:
-    """The tasks, the one with most runs first: the metrics that their runs have, the one to sort by first."""
-    metrics_by_task: dict[str, set[str]] = {}
+    """The tasks, the most frequent first, with the metrics of their runs; the metric to sort by is first."""
+    metrics_of: dict[str, set[str]] = {}
     for record in records:
         measured = {key for key in METRICS if as_number(record["metrics"].get(key)) is not None}
-        metrics_by_task.setdefault(record["task"], set()).update(measured)
+        metrics_of.setdefault(record["task"], set()).update(measured)
     tasks = []
     for task, count in Counter(record["task"] for record in records).most_common():
         first = SORT_METRICS.get(task)
-        keys = [key for key in METRICS if key in metrics_by_task[task]]
-        keys = sorted(keys, key=lambda key, first=first: key != first)
+        keys = sorted((key for key in METRICS if key in metrics_of[task]), key=lambda key, first=first: key != first)
         tasks.append({"task": task, "count": count, "metrics": keys})
     return tasks
 
 
 def _cell(record: Record) -> str:
-    """What must be alike for two runs to be compared: shape, view, seed, and what the task is given."""
+    """A hash of what runs must share to be compared: shape, view, seed and the observations."""
     task = setting(record["config"], "task")
     observed = {key: task[key] for key in OBSERVATION_KEYS if key in task} if isinstance(task, dict) else {}
     resolution = setting(record["config"], "view", "resolution")
@@ -175,7 +158,7 @@ def _cell(record: Record) -> str:
 
 
 def _coded(values: list[str]) -> dict[str, list]:
-    """Each value once, the most frequent first, and the number of the value at each place."""
+    """The distinct values, the most frequent first, and for each entry the number of its value."""
     counts = Counter(values)
     codes = {value: code for code, (value, _) in enumerate(counts.most_common())}
     return {"values": list(codes), "codes": [codes[value] for value in values]}
@@ -189,15 +172,15 @@ def _reason(record: Record) -> str:
 
 
 def rounded(value: Any) -> int | float | str | None:
-    """A number with few digits; one that is not finite as a word, as the page's scripts have it."""
+    """A number with few digits; an infinite number or nan as a word, which the page's scripts decode."""
     if type(value) is float and isfinite(value):
-        return float(f"{value:.{LIST_DIGITS}g}")
+        return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
     number = as_number(value)
-    return to_json_values(float(f"{number:.{LIST_DIGITS}g}")) if isinstance(number, float) else number
+    return to_json_values(float(f"{number:.{SIGNIFICANT_DIGITS}g}")) if isinstance(number, float) else number
 
 
 def _safely(get: Any, record: Record, default: Any) -> Any:
-    """What a function says of a record; something else where a record from elsewhere holds what it cannot read."""
+    """Returns `get(record)`, or `default` if a foreign record has values that `get` cannot read."""
     try:
         return get(record)
     except (AttributeError, TypeError, ValueError, RecursionError):

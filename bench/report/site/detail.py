@@ -1,4 +1,4 @@
-"""What a run's own page shows: what was asked, what happened, numbers, costs, settings, curve and pictures."""
+"""The data of a run's page: request, status, metrics, costs, settings, curve and pictures."""
 
 from collections.abc import Hashable, Iterable
 from functools import cache, lru_cache
@@ -14,19 +14,19 @@ from bench.report.site.columns import rounded
 from bench.report.site.files import PICTURE_TEXTS, Folder
 from bench.report.site.words import STATUSES, command, lines_open, request_sentence
 
-MAX_CURVE_POINTS = 240  # of a line in a chart; a longer curve is thinned, but for its ends and checkpoints
+MAX_CURVE_POINTS = 240  # longer curves are thinned, but keep their ends and checkpoints
 PHASES = {
     "warmup": "warm-up, off the clock",
     "forward": "optimisation: forward",
     "backward": "optimisation: backward",
     "evaluation": "evaluation and pictures",
 }
-MAX_LOSS_TERMS = 8  # terms of a loss
+MAX_LOSS_TERMS = 8
 LEADING_KEYS = ("label", "field", "split", "index", "seed", "device", "threads", "experiment", "draw")
 
 
 def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
-    """The data of a run's page; the list has its name, scene and status."""
+    """The data of a run's page, except name, scene and status, which are in the list of runs."""
     files = folder.links()
     return {
         "asked": request_sentence(record),
@@ -47,10 +47,10 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
 
 
 def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
-    """Details of runs by their keys, as a script has them: what most of them share stands once, in `texts`.
+    """Details of runs by key, for a script of the page. Content that runs share is stored once, in `texts`.
 
-    Numbers of entries in `texts` stand for the settings of each top-level key, a row of the machine, the name and the
-    definition of a metric, the names of files, and the lines for Python, where a NUL stands for the folder's name.
+    Numbers of entries in `texts` replace the settings of each top-level key, a row of the machine, the name and the
+    definition of a metric, the names of files, and the Python lines, in which NUL replaces the name of the folder.
     """
     numbers: dict[Hashable, int] = {}
 
@@ -71,7 +71,7 @@ def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
 
 
 def settings(record: Record) -> list[tuple[str, str]]:
-    """All settings of the run by dotted keys, what decides it first."""
+    """All settings of the run by dotted key, the most important first."""
     rows: list[tuple[str, str]] = []
     for key, value in sorted(record["config"].items(), key=lambda item: _sort_key(item[0])):
         if key != "results_dir":
@@ -89,7 +89,7 @@ _shared_rows = lru_cache(maxsize=10_000)(_rows)
 
 @cache
 def _sort_key(key: str) -> tuple[int, str]:
-    """The place of a key among others."""
+    """The sort key of a setting."""
     leading = ("task", "renderer", "dataset", *LEADING_KEYS)
     return leading.index(key) if key in leading else len(leading), f"{key}."  # as the first of its settings
 
@@ -98,12 +98,12 @@ def text(value: Any) -> str:
     """A value as text."""
     try:
         return "null" if value is None else str(value)
-    except (RecursionError, ValueError):  # nested too deep; an integer of too many digits
+    except (RecursionError, ValueError):  # nested too deeply, or an integer with too many digits
         return "…"
 
 
 def curve(folder: Folder) -> dict[str, Any] | None:
-    """The lines of `curve.jsonl` as columns, thinned; None without one."""
+    """The lines of `curve.jsonl` as thinned columns; None without a curve."""
     lines = curve_lines(folder.path) if folder.has("curve.jsonl") else None
     numbered = [line for line in lines or [] if as_number(line.get("iteration")) is not None]
     if not numbered:
@@ -131,7 +131,7 @@ def _metrics(record: Record) -> list[list[Any]]:
     return [[name, _value(before.get(name)), _value(after.get(name)), definitions[name]] for name in names]
 
 
-@lru_cache(maxsize=1000)  # most runs of a task have the same
+@lru_cache(maxsize=1000)  # most runs of a task share their definitions
 def _definitions(pairs: tuple[tuple[str, str], ...], names: tuple[str, ...]) -> dict[str, str]:
     return {name: definition(dict(pairs), name) for name in names}
 

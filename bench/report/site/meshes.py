@@ -1,4 +1,4 @@
-"""Makes a run's mesh small enough for the page, as what Plotly draws."""
+"""Simplifies a run's mesh for the page, and encodes it for Plotly."""
 
 import base64
 import io
@@ -9,15 +9,15 @@ import numpy as np
 import trimesh
 
 MAX_SHOWN_VERTICES = 12_000
-MAX_MESH_FILE_BYTES = 200_000_000  # of a mesh file that is read
+MAX_MESH_FILE_BYTES = 200_000_000
 READ_ERRORS = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
 
 def mesh_data(path: Path) -> dict[str, Any]:
-    """The mesh of a PLY file as arrays of Plotly's mesh3d, whose third axis is up where ours is the second.
+    """The mesh of a PLY file as arrays of Plotly's mesh3d, whose third axis is up; here the second axis is up.
 
     Raises:
-        ValueError, OSError: where it is no mesh of triangles; the message says why.
+        ValueError, OSError: the file is no mesh of triangles; the message says why.
     """
     mesh = read_ply(path)
     small = simplify(mesh, MAX_SHOWN_VERTICES)
@@ -31,14 +31,14 @@ def mesh_data(path: Path) -> dict[str, Any]:
 
 
 def read_ply(path: Path) -> trimesh.Trimesh:
-    """Reads a PLY, and nothing that it names; its faces are triangles of its vertices, which are finite."""
+    """Reads a PLY file without the files that it names. Checks that its faces and vertices are valid."""
     if path.stat().st_size > MAX_MESH_FILE_BYTES:
         raise ValueError(f"mesh.ply has more than {MAX_MESH_FILE_BYTES // 10**6} MB")
     content = io.BytesIO(path.read_bytes())
     try:
         mesh = trimesh.load_mesh(content, file_type="ply", process=False, skip_materials=True)
         faces, vertices = mesh.faces, mesh.vertices
-    except READ_ERRORS as error:  # it has no exception of its own
+    except READ_ERRORS as error:  # trimesh has no exception of its own
         raise ValueError(f"mesh.ply could not be read ({' '.join(str(error).split())[:120]})") from None
     if not faces.size or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
         raise ValueError("mesh.ply has no triangles, or triangles not of its vertices, or vertices that are not finite")
@@ -46,10 +46,10 @@ def read_ply(path: Path) -> trimesh.Trimesh:
 
 
 def simplify(mesh: trimesh.Trimesh, max_vertices: int) -> trimesh.Trimesh:
-    """The mesh with at most so many vertices: those in one cell of a grid become one, at their mean."""
+    """Returns the mesh with at most `max_vertices`: vertices in one cell of a grid are merged at their mean."""
     if len(mesh.vertices) <= max_vertices:
         return mesh
-    from open3d import geometry, utility  # only here: it takes seconds to load
+    from open3d import geometry, utility  # imported here, as it takes seconds
 
     has_colours = mesh.visual.kind == "vertex"
     full = geometry.TriangleMesh(utility.Vector3dVector(mesh.vertices), utility.Vector3iVector(mesh.faces))
@@ -66,5 +66,5 @@ def simplify(mesh: trimesh.Trimesh, max_vertices: int) -> trimesh.Trimesh:
 
 
 def _packed(array: np.ndarray, kind: str) -> dict[str, str]:
-    """An array as Plotly reads it from text."""
+    """An array in Plotly's base64 form."""
     return {"dtype": kind, "bdata": base64.b64encode(array.astype(f"<{kind}").tobytes()).decode("ascii")}

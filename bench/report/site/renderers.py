@@ -1,4 +1,4 @@
-"""What the page shows of each renderer of the suite: its progress at each problem, failures, settings and source."""
+"""The data of the page on each renderer of the suite: progress per problem, failures, settings and source."""
 
 import inspect
 import re
@@ -17,13 +17,13 @@ from bench.report.suite.standing import KEY, Standing
 from bench.report.write import paper
 from bench.tables import METHOD, choice, names
 
-SET_BY_SUITE = ("index=", "dataset=", "seed=", "task.", "sizes.", "experiment=")  # overrides that say which problem
+SET_BY_SUITE = ("index=", "dataset=", "seed=", "task.", "sizes.", "experiment=")  # overrides that define the problem
 
 
 def renderers(records: list[Record], results_dir: Path) -> dict[str, Any]:
-    """The problems of the suite, and for each of its rows the progress at each, shipped rows beside one's own.
+    """The problems of the suite, and the progress of each row on each problem; shipped rows and the user's.
 
-    Without rows where a record is odd or foreign: then the suite has no page either, and the report says why.
+    Without rows if a record is odd or foreign: then the suite has no page either, and the report says why.
     """
     try:
         return _progress_of_rows(records, results_dir)
@@ -54,7 +54,7 @@ def _progress_of_rows(records: list[Record], results_dir: Path) -> dict[str, Any
 def _row(
     row: str, runs: pd.DataFrame, problems: list[Any], attempts: dict[Any, Attempt], folders: dict[Any, str]
 ) -> dict[str, Any]:
-    """A row: its progress at the end of each problem, None where it has no attempt; its failures, and the rest."""
+    """A row's final progress on each problem (None without an attempt), its failures, settings and source."""
     by_problem = {(run.set, run.problem, run.seed): run for run in runs.itertuples()}
     solved = [by_problem.get(problem) for problem in problems]
     keys = [run and (run.set, run.problem, run.seed, run.row, run.settings, run.started) for run in solved]
@@ -79,20 +79,20 @@ def _row(
 
 
 def _overrides_of_row(attempt: Attempt) -> list[str]:
-    """The overrides that say which renderer it is."""
+    """The overrides that define the renderer."""
     if attempt.tuned:
         return ["setting=tuned", f"renderer={attempt.preset}"]
     return [text for text in attempt.overrides if not text.lstrip("+").startswith(SET_BY_SUITE)]
 
 
 def _overridden_settings(attempt: Attempt) -> dict[str, Any]:
-    """The settings of the renderer that the command line gave."""
+    """The renderer's settings from the command line."""
     pairs = [text.lstrip("+").partition("=") for text in _overrides_of_row(attempt)]
     return {key.removeprefix("renderer."): value for key, _, value in pairs if key.startswith("renderer.")}
 
 
 def _tuned_settings(attempts: Iterable[Attempt]) -> dict[str, Any]:
-    """The keys of tuned settings that attempts are at, each with its method, one a set."""
+    """The tuned settings of the attempts; each key names its method, one per set."""
     overrides = {text.lstrip("+") for attempt in attempts if attempt.tuned for text in attempt.overrides}
     tuned_names = {text.removeprefix(f"method={TUNED_PREFIX}") for text in overrides} & {*names(f"{METHOD}/tuned")}
     settings_by_name = {name: choice(METHOD, f"{TUNED_PREFIX}{name}") for name in sorted(tuned_names)}
@@ -101,7 +101,7 @@ def _tuned_settings(attempts: Iterable[Attempt]) -> dict[str, Any]:
 
 
 def _preset_settings(preset: str) -> dict[str, Any]:
-    """What the file or the row of a renderer holds, over what it builds on; nothing for another preset."""
+    """The settings of a preset, including those of its bases; empty for an unknown preset."""
     try:
         settings = choice("renderer", preset)
     except KeyError:
@@ -112,7 +112,7 @@ def _preset_settings(preset: str) -> dict[str, Any]:
 
 @cache
 def _source(target: str) -> tuple[str, str]:
-    """The file of a class of ours, with what its docstring says; of another class its name."""
+    """The file and the docstring of a class of this project; for another class, its name."""
     name = target.rpartition(".")[2]
     for path in sorted((paper.ROOT / OURS.rstrip(".")).rglob("*.py")) if target.startswith(OURS) else ():
         if docstring := re.search(

@@ -1,8 +1,8 @@
 """The standing of the suite: how far each row gets, what that costs, and which rows differ significantly.
 
-The progress of a run is 1 - log(error / reference) / log(initial error / reference), from 0 to 1. A failed run has made
-none. Progress is read at two costs, at the end of the run, and as its mean over the logarithm of the cost. The unit of
-cost is DIST's whole run at the same problem. Each set of problems weighs the same.
+The progress of a run is 1 - log(error / reference) / log(initial error / reference), from 0 to 1; for a failed run 0.
+Progress is read at two costs, at the end of the run, and as its mean over the logarithm of the cost. The unit of cost
+is DIST's total cost on the same problem. Each set of problems has the same weight.
 """
 
 from collections.abc import Iterable
@@ -20,15 +20,15 @@ from bench.report.data.statistics import Interval, shapes_needed
 from bench.report.suite.attempts import SETS_WITHOUT_CURVE, Attempt, Gathered, problems_of, suite
 from bench.tables import choice
 
-UNIT = "dist"  # the preset of the row by whose costs all costs are divided
+UNIT = "dist"  # costs are relative to those of this preset
 AT_1, AT_10, END, AREA = OUTCOMES = ("at_1", "at_10", "end", "area")
-AT_SECONDS = "at_seconds"  # of one run of DIST
-BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # the costs at which progress is read
-AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # over whose logarithm progress is averaged
-MIN_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
-MIN_LOG_ERROR = 1e-12  # in a logarithm
+AT_SECONDS = "at_seconds"  # progress at the seconds of DIST's run
+BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # progress is read at these costs
+AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # progress is averaged over these, equally spaced in the logarithm
+MIN_CHECKPOINTS = 3  # with fewer within a cost, progress there is interpolated rather than measured
+MIN_LOG_ERROR = 1e-12  # lower bound before taking the logarithm
 KEY = ["set", "problem", "seed"]
-ALPHA = 0.02  # of tests in all, at which 5 % of simulated draws of equal rows have a false pair: scenes are skewed
+ALPHA = 0.02  # total over all tests; as scenes are skewed, it gives 5 % false pairs in simulations of equal rows
 
 
 class Standing:
@@ -46,12 +46,12 @@ class Standing:
 
     @cached_property
     def costs(self) -> dict[str, float]:
-        """The median cost of each row's runs over that of DIST's."""
+        """The median cost of each row's runs relative to DIST's."""
         return (self.complete["cost"] / self.complete["unit"]).groupby(self.complete["row"]).median().to_dict()
 
     @cached_property
     def lacking(self) -> dict[str, int]:
-        """The rows that are not compared, with the number of problems that they lack."""
+        """The rows that are not compared, with the number of problems they lack."""
         rows = self.compared[~self.compared["complete"] & ~self.compared["tuned"]]
         return rows.groupby("row")["missing"].first().to_dict()
 
@@ -59,8 +59,8 @@ class Standing:
 def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
     """A line per attempt, the oldest first; a key may have several.
 
-    It has the fields of the attempt, `ok`, `tuned`, `machine`, and `timed`, unless the machine was busy. Left out are
-    attempts under other settings than most of their set's; tuned rows have their own settings.
+    Its columns: the fields of the attempt, `ok`, `tuned`, `machine`, and `timed` (the machine was not busy). Attempts
+    with other settings than most of their set are left out; settings of tuned rows are compared separately.
     """
     lines = [vars(attempt) | {"ok": attempt.ok, "tuned": attempt.tuned} for attempt in attempts]
     columns = [*Attempt.__dataclass_fields__, "ok", "tuned"]
@@ -77,25 +77,25 @@ def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
 
 
 def unit_row(runs: pd.DataFrame) -> str:
-    """The row by whose costs others are divided, DIST at its default setting; empty where there is none."""
+    """The row that costs are relative to: DIST at its default settings; empty if there is none."""
     rows = sorted({*runs.loc[(runs["preset"] == UNIT) & ~runs["tuned"], "row"]})
     label = choice("renderer", UNIT).get("_label_")
     return label if label in rows else next(iter(rows), "")
 
 
 def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
-    """The newest attempt of each row at the problems and seeds that all whole rows have.
+    """The newest attempt of each row on the problems and seeds that all complete rows have.
 
-    A row is whole if it has the problems of that size of the suite, or all of DIST's if these are fewer. Other rows
-    stay in the frame, and no comparison has them.
+    A row is complete if it has the problems of that size of the suite, or all of DIST's if these are fewer. Other rows
+    stay in the frame, but are not compared.
 
     Args:
-        everything: as of `frame_of`.
+        everything: the result of `frame_of`.
 
     Returns:
-        A line per attempt, with more columns: `missing`, the number of problems that its row lacks; `whole`, whether
-        its row is compared; `unit`, the cost of DIST's run, or where that failed the median in its set; `initial` and
-        `reference`, the errors between which progress is measured; and `has_progress`, whether there is any to make.
+        A line per attempt with further columns: `missing`, the number of problems that its row lacks; `complete`;
+        `unit`, the cost of DIST's run, or the median in its set if that run failed; `initial` and `reference`, the
+        errors that progress is measured between; and `has_progress`, whether progress is defined.
     """
     runs = everything.drop_duplicates([*KEY, "row"], keep="last")
     keys = pd.Series([*zip(*(runs[name] for name in KEY), strict=True)], runs.index, dtype=object)
@@ -114,7 +114,7 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
         return pd.Series(values.reindex(index).to_numpy(dtype=float), runs.index)
 
     finite = runs[np.isfinite(runs["start"])]
-    sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any did
+    sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any
     least = runs[~runs["tuned"]].groupby(["set", "problem"])["final"].min().clip(lower=MIN_LOG_ERROR)
     stated = [_reference(*line) for line in zip(runs["set"], runs["problem"], runs["scene"], strict=True)]
     paid = runs[runs["ok"] & (runs["cost"] > 0)]
@@ -130,13 +130,13 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _reference(of_set: str, problem: str, scene: str) -> float | None:
-    """The reference error that the suite states; None where it is the least final error of all rows."""
+    """The reference error that the suite states; None if the least final error of all rows is used."""
     errors = suite().references.get(of_set, {})
     return errors.get(problem, errors.get(scene, errors.get("all")))
 
 
 def progress_curve(run: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The costs of a run's checkpoints over the unit, and the progress at each."""
+    """The costs of a run's checkpoints relative to the unit, and the progress at each."""
     if not run.ok:
         return np.zeros(1), np.zeros(1)
     curve = np.array(run.curve)
@@ -145,13 +145,13 @@ def progress_curve(run: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
-    """The attempts that have progress to make, with the progress of each outcome.
+    """The attempts with defined progress, and their progress in each outcome.
 
-    Between checkpoints progress is interpolated, and after its end a run keeps its last one.
+    Progress is interpolated between checkpoints, and constant after the end of a run.
 
     Returns:
         A line per attempt with the columns `OUTCOMES`; `BUDGET_checkpoints`, the number of checkpoints within each of
-        `BUDGETS`; and `at_1_next`, the progress at the first checkpoint beyond `at_1`, or `at_1` if it is more.
+        `BUDGETS`; and `at_1_next`, the larger of `at_1` and the progress at the first checkpoint after it.
     """
     runs, lines = runs[runs["has_progress"]].reset_index(drop=True), []
     for run in runs.itertuples():
@@ -168,7 +168,7 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def rows_with_few_checkpoints(runs: pd.DataFrame, budget: str) -> set[str]:
-    """The rows that have in some set fewer than `MIN_CHECKPOINTS` within a budget, in the median of problems."""
+    """The rows whose median number of checkpoints within a budget is below `MIN_CHECKPOINTS` in some set."""
     counts = runs.groupby(["row", "set"])[f"{budget}_checkpoints"].median().groupby("row").min()
     return {*counts[counts < MIN_CHECKPOINTS].index}
 
@@ -178,11 +178,11 @@ class Ranking:
     """The progress of rows in one outcome, and which of them differ significantly.
 
     Args:
-        progress: of each row the mean over sets of the mean over problems, the largest first.
+        progress: the mean over sets of the mean over problems, by row, the largest first.
         better: the significant pairs, the row with more progress first.
         pairs: the number of all pairs.
         least_p: the least p value of all pairs; 1 without pairs.
-        scenes: the number of scenes, which are the units of the test.
+        scenes: the number of scenes, the units of the test.
     """
 
     progress: dict[str, float]
@@ -193,7 +193,7 @@ class Ranking:
 
     @property
     def decidable(self) -> bool:
-        """Whether so many scenes can show any difference."""
+        """Whether this number of scenes can show any difference."""
         return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs, ALPHA)
 
     def rank(self, row: str) -> str:
@@ -218,16 +218,16 @@ def ranking(runs: pd.DataFrame, outcome: str) -> Ranking:
 
 
 def by_scene(runs: pd.DataFrame, outcome: str) -> pd.DataFrame:
-    """What each scene [scenes, rows] adds to the mean over sets of the mean over problems of a row."""
+    """What each scene [scenes, rows] contributes to a row's mean over sets of the mean over problems."""
     sizes = runs.groupby(["set", "row"]).size().groupby("set").max()
     shares = runs.assign(share=runs[outcome] / runs["set"].map(sizes) / max(len(sizes), 1))
     return shares.pivot_table(index="scene", columns="row", values="share", aggfunc="sum")
 
 
 def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
-    """The bounds of the mean final errors of all rows over DIST's in a set, without rows that failed in most problems.
+    """The bounds of the mean final errors of all rows relative to DIST's in a set, without rows that mostly failed.
 
-    They are of geometric means over scenes, see `flips.bounds`; None where the set has too few scenes for them.
+    The means are geometric, over scenes, see `flips.bounds`. None if the set has too few scenes.
     """
     runs = runs[runs["set"] == of_set]
     runs = runs[runs.groupby("row")["ok"].transform("mean") >= 0.5]
@@ -239,11 +239,11 @@ def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
 
 
 def timed(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
-    """The attempts at problems at which all rows were timed on a machine that timed DIST's run too.
+    """The attempts on problems on which all rows were timed on a machine that also timed DIST's run.
 
     Returns:
-        Their lines, where `unit` and `unit_seconds` are of DIST's newest run on that machine, with the engine of the
-        newest of all. `at_seconds` is the progress at DIST's seconds, `at_seconds_checkpoints` as in `with_progress`.
+        Their lines. `unit` and `unit_seconds` are of DIST's newest run on that machine with the newest kernels.
+        `at_seconds` is the progress at DIST's seconds, `at_seconds_checkpoints` is as in `with_progress`.
     """
     units = everything[(everything["row"] == unit_row(runs)) & everything["timed"] & everything["ok"]]
     units = units[units["kernels"].isin(units["kernels"].iloc[-1:])].drop_duplicates([*KEY, "machine"], keep="last")
@@ -259,15 +259,15 @@ def timed(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
 
 
 def costs(runs: pd.DataFrame, pairs: pd.DataFrame) -> pd.DataFrame:
-    """The costs of whole runs that ended ok over DIST's at the same problems.
+    """The total costs of runs that ended ok, relative to DIST's on the same problems.
 
     Args:
-        pairs: as of `timed`.
+        pairs: the result of `timed`.
 
     Returns:
-        Of each set and row, the index, the medians over scenes of the ratios of `evaluations` and of `seconds`, and the
-        number of `scenes`. Both are of the timed pairs; where these have too few scenes, there are no seconds, and the
-        evaluations are of all runs.
+        By set and row, the medians over scenes of the ratios of `evaluations` and of `seconds`, and the number of
+        `scenes`. They are of the timed pairs; with too few timed scenes, the evaluations are of all runs, without
+        seconds.
     """
     scenes, lines = pairs.groupby("set")["scene"].nunique(), []
     enough = scenes.index[scenes >= statistics.MIN_SHAPES]
@@ -284,6 +284,6 @@ def _ratio(runs: pd.DataFrame, *columns: str) -> Interval:
 
 
 def wrong_pixels(runs: pd.DataFrame) -> pd.Series:
-    """Of each row the mean fraction of an object's pixels that it renders wrongly; all of them where it failed."""
+    """The mean fraction of an object's pixels that each row renders wrongly; 1 for a failed run."""
     rendered = runs[runs["set"].isin(SETS_WITHOUT_CURVE) & (runs["initial"] > 0)]
     return (rendered["final"] / rendered["initial"]).clip(upper=1).groupby(rendered["row"]).mean()

@@ -13,17 +13,15 @@ from bench.report.data.records import Record, doubtful, setting, solid, view
 from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
 
-SMOKE_WARNING = (
-    "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
-)
-MAX_REASON_LETTERS = 160  # characters of a reason in a caption; the CSV has all of it
-MAX_LISTED_NAMES = 4  # that are listed one by one; more are counted
-VARYING = "{shapes and seeds}"  # stands in texts for that over which the runs of an experiment vary
-FEW = "fewer than six shapes"  # statistics.MIN_SHAPES
+SMOKE_WARNING = "Made at scale=smoke, to try things out: nothing follows from these numbers."
+MAX_REASON_LETTERS = 160  # the CSV has the full reason
+MAX_LISTED_NAMES = 4  # more are counted
+VARYING = "{shapes and seeds}"  # placeholder for what the runs of an experiment vary over
+FEW = "fewer than six shapes"  # see statistics.MIN_SHAPES
 
 
 def caption(runs: Runs, plotted: str, *, n: str, interval: str) -> str:
-    """The caption of a `Result`, in four sentences, behind a warning where its runs are of scale=smoke."""
+    """The caption of a `Result` in four sentences, after a warning if runs are of scale=smoke."""
     sample = (n or _sample(runs)) + (f"; {fill_varying(runs, interval)}" if interval else "") + "."
     setup = _setup(runs)
     first = [SMOKE_WARNING if has_smoke_runs(runs) else "", fill_varying(runs, plotted)]
@@ -31,12 +29,12 @@ def caption(runs: Runs, plotted: str, *, n: str, interval: str) -> str:
 
 
 def has_smoke_runs(runs: Runs) -> bool:
-    """Whether there is a run of scale=smoke."""
+    """Whether any run is of scale=smoke."""
     return any(setting(record["config"], "scale", "name") == "smoke" for record in runs.records)
 
 
 def fill_varying(runs: Runs, text: str) -> str:
-    """The text with that over which the runs of an experiment vary in place of `OVER`, such as shapes and seeds."""
+    """Replaces `VARYING` in a text by what the runs vary over, such as shapes and seeds."""
     shapes, views, seeds = _levels(runs)
     levels = [name for name, varies in (("views", views > 1), ("seeds", seeds > 1)) if varies]
     words = " and ".join(["shapes", *levels] if shapes > 1 else levels)
@@ -44,7 +42,7 @@ def fill_varying(runs: Runs, text: str) -> str:
 
 
 def interval_text(interval: str, estimates: Iterable[Interval], *, drawn: bool) -> str:
-    """The kind of interval of the estimates that are shown; that there is none, or points if drawn, of few shapes."""
+    """The kind of interval of the shown estimates; with few shapes, a text that says that there is none."""
     has_interval = [estimate.has_ends for estimate in estimates]
     few_note = f"{FEW}: {'points, ' if drawn else ''}no interval; n in brackets counts shapes"
     if all(has_interval):
@@ -53,13 +51,13 @@ def interval_text(interval: str, estimates: Iterable[Interval], *, drawn: bool) 
 
 
 def undefined(values: Iterable[float]) -> str:
-    """A note on the probabilities and ranks that are not shown; empty where there is none."""
+    """A note on probabilities and ranks that are not defined; empty if all are."""
     none = any(math.isnan(value) for value in values)
     return "One shape and one seed are one draw: from it no probability and no rank is given (–)." if none else ""
 
 
 def warnings(runs: Runs) -> list[str]:
-    """Notes on settings that differ, on times that do not compare or are doubtful, on old runs and on missing ones."""
+    """Notes on differing settings, incomparable or doubtful times, old runs and missing runs."""
     notes = (_mixed(runs), _machines(runs), _loaded(runs), *age.notes(runs.records), _omitted(runs))
     return [note for note in notes if note]
 
@@ -77,7 +75,7 @@ def _levels(runs: Runs) -> tuple[int, int, int]:
 
 
 def _setup(runs: Runs) -> str:
-    """The parts of the setup that are known: scenes, the resolution, prior and loss that all runs have, the machine."""
+    """The known parts of the setup: scenes, machine, and the resolution, prior and loss if all runs share them."""
     if not runs.records:
         return ""
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in runs.records))
@@ -86,7 +84,7 @@ def _setup(runs: Runs) -> str:
     resolution = sizes.pop() if len(sizes) == 1 else None
     config = runs.requested()
     network = setting(config, "prior", "network") or setting(config, "scale", "network") or {}
-    is_own_network = runs.records[0]["dataset"] != "network"  # of others a note of the run says what it is
+    is_own_network = runs.records[0]["dataset"] != "network"  # a note of the run describes other networks
     layers, width = (setting(network, "layers"), setting(network, "width")) if is_own_network else (None, None)
     machines = [_machine(*machine) for machine in runs.machines()]
     parts = {
@@ -103,7 +101,7 @@ def _setup(runs: Runs) -> str:
 def _outcome(runs: Runs) -> str:
     failed = [record for record in runs.named() if record["status"] != "ok"]
     total = len(runs.records)
-    if not total:  # a page of rows that are kept without their runs
+    if not total:  # a page of stored attempts
         return ""
     if not failed:
         return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
@@ -135,7 +133,7 @@ def _machines(runs: Runs) -> str:
 
 
 def _loaded(runs: Runs) -> str:
-    """A warning where times are doubtful."""
+    """A warning about doubtful times."""
     names = [record["name"] for record in runs.named() if doubtful(record)]
     few = _listed(names) if len(names) <= MAX_LISTED_NAMES else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
@@ -143,7 +141,7 @@ def _loaded(runs: Runs) -> str:
 
 
 def _machine(cpu: Any, device: Any, threads: Any, compiled: bool) -> str:
-    parts = [str(part) for part in (cpu, device) if part and part != "cpu"]
+    parts = [str(name) for name in (cpu, device) if name and name != "cpu"]
     more = [plural(threads, "thread")] if threads else []
     return "; ".join([" + ".join(parts), *more, *(["compiled kernels"] if compiled else [])])
 
@@ -154,6 +152,5 @@ def _failure(record: Record) -> str:
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(names[:MAX_LISTED_NAMES]) + (
-        f" and {len(names) - MAX_LISTED_NAMES} more" if len(names) > MAX_LISTED_NAMES else ""
-    )
+    more = len(names) - MAX_LISTED_NAMES
+    return ", ".join(names[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")

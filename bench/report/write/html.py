@@ -1,7 +1,7 @@
-"""Writes `index.html`, and beside it in the folder `page` its scripts and the data that they show.
+"""Writes `index.html`, and into the folder `page` its scripts and their data.
 
-The page names its scripts in the order in which they need each other. By its policy scripts and pictures come from
-beside it, styles may be set by scripts, and nothing is asked of a network.
+The page lists its scripts in the order of their dependencies. Its policy allows scripts and pictures only from its own
+folder, styles set by scripts, and no network.
 """
 
 import json
@@ -26,27 +26,27 @@ from bench.report.site.renderers import renderers
 from bench.report.write.paper import papers
 
 ASSETS = Path(__file__).parents[1] / "page"
-PAGE_FOLDER = "page"  # of the results folder
-SILENT_WAIT_SECONDS = 1.0  # seconds to wait in silence
+PAGE_FOLDER = "page"
+SILENT_WAIT_SECONDS = 1.0
 LIBRARY = "plotly.min.js"
-MAX_MESHES = 100  # of the newest runs; `bench.report meshes=all` makes all
+MAX_MESHES = 100  # `bench.report meshes=all` makes all
 
-# Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
+# In JSON these occur only in strings. Escaped, no string can end a script element or a line.
 UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
-DETAIL_FILE_PATTERN = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")  # of the files with details
-# Letters of a run's key: those with the same share a file of details, since a small file takes a whole block of a disk.
+DETAIL_FILE_PATTERN = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")
+# Runs whose keys begin with the same letters share a file of details, as a small file occupies a whole disk block.
 KEY_PREFIX_LETTERS = 2
 ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
 def write_index(results_dir: Path, *, meshes: int | None = MAX_MESHES) -> Path:
-    """Writes `index.html` and the folder `page` beside it from all run folders in `results_dir/runs`; gives the page.
+    """Writes `index.html` and the folder `page` from all run folders in `results_dir/runs`; returns the page.
 
     Args:
-        meshes: of how many runs, the newest first, the mesh is made ready for the page; None for all.
+        meshes: the number of runs, the newest first, whose mesh is prepared for the page; None for all.
 
     Raises:
-        ValueError: if `results_dir` is not a folder, or one that the page is written to is a link out of it.
+        ValueError: `results_dir` is not a folder, or a folder of the page is a link that leads out of it.
     """
     check_results(results_dir)
     with page_lock(results_dir):
@@ -55,9 +55,9 @@ def write_index(results_dir: Path, *, meshes: int | None = MAX_MESHES) -> Path:
 
 @contextmanager
 def page_lock(results_dir: Path) -> Iterator[None]:
-    """Held while records are read and their page is written: of two that write, the last one's has the runs of both.
+    """Locks the page while records are read and it is written, so that the last of two writers sees the runs of both.
 
-    Who waits for it longer than `PATIENCE` is told.
+    A process that waits longer than `SILENT_WAIT_SECONDS` prints a message.
     """
     lock = file_lock(results_dir, PAGE_FOLDER)
     try:
@@ -72,7 +72,7 @@ def page_lock(results_dir: Path) -> Iterator[None]:
 
 
 def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: Path, meshes: int | None) -> Path:
-    """Writes the page of records that were read within `page_lock`, as `write_index` does; gives it."""
+    """Writes and returns the page of records that were read within `page_lock`, see `write_index`."""
     data, page = results_dir / PAGE_FOLDER / "data", results_dir / "index.html"
     folders = [Folder(results_dir, record["folder"]) for record in records]
     entries, content_by_key = papers(results_dir)
@@ -106,7 +106,7 @@ def _write_all(data: Path, kind: str, contents: Iterable[tuple[str, Any]]) -> No
 
 
 def _write_meshes(folders: list[Folder], data: Path, max_meshes: int | None) -> None:
-    """Writes the meshes of the newest runs; one that is there and newer than its mesh is kept."""
+    """Writes the meshes of the newest runs, and keeps those that are up to date."""
     kept = []
     for number, folder in enumerate(folders):
         source = folder.path / "mesh.ply"
@@ -120,7 +120,7 @@ def _write_meshes(folders: list[Folder], data: Path, max_meshes: int | None) -> 
 
 
 def _mesh(source: Path) -> dict[str, Any]:
-    from bench.report.site.meshes import mesh_data  # only here: runs without meshes need no trimesh
+    from bench.report.site.meshes import mesh_data  # imported here: runs without meshes need no trimesh
 
     try:
         return mesh_data(source)
@@ -129,7 +129,7 @@ def _mesh(source: Path) -> dict[str, Any]:
 
 
 def _is_newer(path: Path, source: Path, key: str) -> bool:
-    """Whether a mesh was made after its source, and the script holds a mesh and nothing else."""
+    """Whether a script is newer than its mesh file, and holds a mesh and nothing else."""
     try:
         if path.is_symlink() or path.stat().st_mtime_ns <= source.stat().st_mtime_ns:
             return False
@@ -157,35 +157,31 @@ def to_script(kind: str, key: str, data: Any) -> str:
 
 
 def safe_json(data: Any) -> str:
-    """JSON in ASCII that can stand within a script element."""
+    """JSON in ASCII that is safe inside a script element."""
     try:
         text = ENCODER.encode(data)
-    except ValueError:  # a number that is not finite
+    except ValueError:  # an infinite number or nan
         text = ENCODER.encode(to_json_values(data))
     return UNSAFE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def remove_others(folder: Path, keys: Iterable[str]) -> None:
-    """Removes the scripts of what is gone."""
+    """Removes the scripts of other keys."""
     current = {f"{key}.js" for key in keys}
     if folder.is_dir():
         with os.scandir(folder) as entries:
-            old_names = [
-                entry.name
-                for entry in entries
-                if entry.name not in current and DETAIL_FILE_PATTERN.fullmatch(entry.name)
-            ]
-        for name in old_names:
+            names = {entry.name for entry in entries if DETAIL_FILE_PATTERN.fullmatch(entry.name)}
+        for name in names - current:
             (folder / name).unlink(missing_ok=True)
 
 
 def write_script(data: Path, kind: str, key: str, content: Any) -> None:
-    """Writes the script that hands over the content of that kind and key."""
+    """Writes the script that hands the content of a kind and key to the page."""
     write_file(data / kind / f"{key}.js", to_script(kind, key, content).encode("ascii"))
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Writes a file, unless it has that content already; what a link leads to may change."""
+    """Writes a file unless it has that content already; a link is always replaced."""
     if path.is_symlink() or not path.is_file() or path.read_bytes() != content:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, content)

@@ -1,4 +1,4 @@
-"""Writes the tables and figures of all studies and their index; finds those of a results folder for index.html."""
+"""Writes the tables and figures of all studies and their index; finds the pages of a results folder."""
 
 import csv
 import hashlib
@@ -21,13 +21,13 @@ from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.result import Result, Shown, as_markdown, latex, read_shown, write, write_shown
 
 FOLDER = "paper"
-SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
+SWEEPS, TABLE = "sweeps", "table"  # the table of a sweep is next to its plan
 SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
-SHIPPED = ROOT / "results"  # what a checkout has; nothing where the package is installed without it
+SHIPPED = ROOT / "results"  # only in a checkout
 STUDIES = ROOT / "bench" / "studies"
-SUITE_PAGE = "suite"  # the page whose own rows are among the shipped ones already
-SHIPPED_ROW_PREFIX = "shipped: "  # in front of the name of a row that is shipped, beside rows of the user's own
+SUITE_PAGE = "suite"  # its rows include the shipped ones
+SHIPPED_ROW_PREFIX = "shipped: "
 
 HEAD = """# Results
 
@@ -44,35 +44,28 @@ where a run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.g
 """
 
 
-RECORD_ERRORS = (
-    KeyError,
-    ValueError,
-    TypeError,
-    IndexError,
-    AttributeError,
-    ArithmeticError,
-)  # of an odd or foreign record
+RECORD_ERRORS = (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)
 
 
 @dataclass(frozen=True)
 class Study:
-    """A file of `bench/studies`: the runs that it reads, and its pages, each made of them by a function.
+    """A file of `bench/studies`: the runs that it reads, and a function for each of its pages.
 
-    A file has `PLACE`, its place among all, `READS`, a `Selection` for each argument of its functions, and `PAGES`,
-    these functions by the names of their pages. It may have `KEEPS`, which gives the folder of rows that a results
-    folder keeps of it: with that, its pages are made without runs too.
+    A file has `PLACE`, its position among all files; `READS`, a `Selection` for each argument of its functions; and
+    `PAGES`, these functions by the names of their pages. It may have `KEEPS`, which returns the folder of its rows in a
+    results folder: then its pages are also made without runs.
     """
 
     order: int
     reads: tuple[Selection, ...]
     pages: dict[str, Callable[..., Result]]
-    problem: str = ""  # of a file that cannot be read
+    problem: str = ""  # why the file cannot be read
     keeps: Callable[[Path], Path] | None = None
 
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
-        """The result of each page; none where there is no run of it, and no row is kept.
+        """The result of each page; empty if there are neither runs nor kept rows.
 
-        A page that needs run folders is made of the runs that have theirs; it is left out where these are the fewer.
+        A page that needs run folders uses the runs that have them; it is left out if these are the minority.
         """
         chosen: list[Runs | None] = [choose(records, selection, results_dir) for selection in self.reads]
         if not any(runs is not None for runs in chosen):
@@ -95,7 +88,7 @@ class Study:
 
 @cache
 def studies() -> tuple[Study, ...]:
-    """All files of `bench/studies`, in the order of their places; a file that cannot be read has a problem alone."""
+    """All files of `bench/studies` by `order`; a file that cannot be read has only a problem."""
     studies_read: list[Study] = []
     for file in iter_modules([str(STUDIES)]):
         try:
@@ -115,13 +108,13 @@ def write_paper(
     problems: list[str] | None = None,
     only: str | None = None,
 ) -> list[Path]:
-    """Writes the files of every page that has runs to the folder `paper`; gives the path of each page's CSV.
+    """Writes the files of every page that has runs to the folder `paper`; returns the pages' CSVs.
 
     Args:
-        into: the folder that gets `paper`; by default the results folder. Where it is another, it is what is shipped:
-            pages of runs of scale=smoke are left out.
-        problems: gets a line for each study that cannot be made of these runs; without it, its error is raised.
-        only: the name of a page, where no other is written.
+        output_dir: the folder that gets `paper`; by default the results folder. Another folder is shipped: it gets no
+            pages of runs of scale=smoke.
+        problems: gets a line for each study that fails on these runs; without it, the error is raised.
+        only: the name of the only page to write.
     """
     written = []
     for study in studies() if only is None else [study for study in studies() if only in study.pages]:
@@ -148,9 +141,9 @@ def write_paper(
 
 @dataclass(frozen=True)
 class Page:
-    """A table or figure of a results folder: its name, what it says, its picture and its files by their kind.
+    """A table or figure of a results folder: its name, its content, its picture and its files by kind.
 
-    Paths of files are seen from the results folder, percent-encoded; `shipped` ones have none.
+    Paths of files are relative to the results folder and percent-encoded; `shipped` pages have none.
     """
 
     name: str
@@ -162,7 +155,7 @@ class Page:
 
 
 def find_paper(results_dir: Path) -> list[Page]:
-    """The tables and figures of `results_dir/paper` in their order, then shipped ones of other names."""
+    """The pages of `results_dir/paper` in their order, then shipped pages of other names."""
     own_pages = _pages_of(results_dir)
     own_names = {page.name for page in own_pages}
     others = [] if results_dir.resolve() == SHIPPED else _pages_of(SHIPPED)
@@ -171,20 +164,20 @@ def find_paper(results_dir: Path) -> list[Page]:
 
 
 def _pages_of(results_dir: Path) -> list[Page]:
-    """The tables and figures of a results folder in their order; those that no study made stand last."""
+    """The pages of a results folder in their order; pages without a study come last."""
     pages = [page_at(path.with_suffix(""), results_dir) for path in (results_dir / FOLDER).glob("[!.]*.json")]
     return sorted((page for page in pages if page.shown.title), key=lambda page: (page.shown.order or 10**6, page.name))
 
 
 def find_sweeps(results_dir: Path) -> list[Page]:
-    """The tables of sweeps, the sweep that was asked for last first, each by the name of its sweep."""
+    """The tables of sweeps by name of the sweep, the last requested first."""
     tables = (results_dir / SWEEPS).glob(f"*/{TABLE}.json")
     folders = sorted((path.parent for path in tables), key=lambda folder: (-_plan_time(folder), folder.name))
     return [replace(page_at(folder / TABLE, results_dir), name=folder.name) for folder in folders]
 
 
 def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """The entry of each table and figure, those of sweeps last, and by its key all that its own view shows."""
+    """The list entry of each page, sweeps last; and the full content of each page by key."""
     entries, content_by_key = [], {}
     for page in [*find_paper(results_dir), *find_sweeps(results_dir)]:
         key = key_of(page.name)
@@ -201,7 +194,7 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
 
 
 def _shipped_rows(page: Page, results_dir: Path) -> list[list[str]]:
-    """The shipped rows of a table of the user's, marked; none where it has them, has other columns, or is shipped."""
+    """The marked shipped rows for a table of the user; empty if its columns differ or it has these rows already."""
     is_of_user = not page.shipped and page.base.parents[1] == results_dir and results_dir.resolve() != SHIPPED
     if page.name == SUITE_PAGE or not is_of_user:
         return []
@@ -211,12 +204,12 @@ def _shipped_rows(page: Page, results_dir: Path) -> list[list[str]]:
 
 
 def ship(records: list[dict[str, Any]], results_dir: Path, output_dir: Path) -> list[Path]:
-    """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
+    """Adds the runs to the shipped files of runs, and redraws the shipped pages, also without run folders.
 
-    A page that cannot be drawn keeps what it says, in this version's form, and its head says which version drew it.
+    A page that cannot be redrawn keeps its content, and its head names the version that drew it.
 
     Raises:
-        ValueError: where rows that are there cannot be read, and would be lost.
+        ValueError: shipped files cannot be read, so their rows would be lost.
     """
     all_records = join(records, read_rows(output_dir / FOLDER))
     experiments = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
@@ -232,10 +225,10 @@ def ship(records: list[dict[str, Any]], results_dir: Path, output_dir: Path) -> 
 
 
 def write_columns(results_dir: Path, options: dict[str, str]) -> None:
-    """Writes the LaTeX table of each page or sweep of a key `columns.NAME` again, with these headings alone.
+    """Writes the LaTeX table of each page or sweep with a key `columns.NAME` again, with only these headings.
 
     Raises:
-        ValueError: where there is no such table, or it has no such column.
+        ValueError: there is no such table, or it has no such column.
     """
     tables = {page.name: page for page in [*_pages_of(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
     for key in (key for key in options if key.startswith("columns.")):
@@ -249,7 +242,7 @@ def write_columns(results_dir: Path, options: dict[str, str]) -> None:
 
 
 def write_readme(results_dir: Path) -> Path | None:
-    """Writes `results_dir/README.md`, the index of all pages; gives its path, or None where there is no page."""
+    """Writes `results_dir/README.md`, the index of all pages; returns its path, or None without pages."""
     if not (pages := _pages_of(results_dir)):
         return None
     path = results_dir / "README.md"
@@ -258,13 +251,13 @@ def write_readme(results_dir: Path) -> Path | None:
 
 
 def _plan_time(folder: Path) -> float:
-    """When the sweep of a folder was last asked for, as its plan was written then; 0 where there is no plan."""
+    """The time of the last request for a sweep: that of its plan file; 0 without a plan."""
     plan = folder / PLAN_FILE
     return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
 def page_at(base: Path, root: Path) -> Page:
-    """The table or figure whose files in a results folder have that path before their suffix, but for links out."""
+    """The page whose files have the path `base` before their suffix; links out of the folder are ignored."""
     files = {suffix: base.with_name(base.name + suffix) for suffix in (*SUFFIXES, ".png", ".json")}
     within = {suffix: path for suffix, path in files.items() if path.is_file() and not is_outside(path, root)}
     links = {suffix: link(*path.relative_to(root).parts) for suffix, path in within.items()}
@@ -273,13 +266,13 @@ def page_at(base: Path, root: Path) -> Page:
     return Page(base.name, shown, links.get(".png"), named, base)
 
 
-def link(*parts: str) -> str:
-    """The address of a file as seen from the results folder, percent-encoded byte for byte."""
-    return "/".join(quote(os.fsencode(part), safe="") for part in parts)
+def link(*names: str) -> str:
+    """The address of a file relative to the results folder, percent-encoded byte by byte."""
+    return "/".join(quote(os.fsencode(name), safe="") for name in names)
 
 
 def key_of(name: str) -> str:
-    """The name of a script of data: letters and digits, whatever its run or table is called."""
+    """The name of a data script: letters and digits, whatever the name of its run or table."""
     return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 

@@ -22,8 +22,8 @@ from bench.report.data.statistics import Interval
 from bench.report.write import caption
 from bench.report.write.table import Column, best, to_data, to_table
 
-# Special characters of LaTeX, and characters that its standard fonts lack; a row that starts with a bracket would be
-# read as the argument of the line break before it.
+# Special characters of LaTeX, and characters that its standard fonts lack. A row that begins with a bracket would be
+# read as the argument of the preceding line break.
 _LATEX = {
     "\\": r"\textbackslash{}",
     "[": "{[}",
@@ -64,22 +64,22 @@ class Result:
     """A table, a figure or both, with the question that it answers.
 
     Args:
-        runs: what it is made of.
+        runs: the runs that it shows.
         title: its title, as a sentence.
         plotted: what is plotted, as a sentence.
         question: as a reader would ask it; empty for a page of pictures.
-        verdict: the answer, one sentence with its numbers between asterisks; empty where the runs do not give it.
+        verdict: the answer, one sentence with its numbers between asterisks; empty if the runs do not give it.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval; empty for none.
-        estimates: those that are shown with it, if there are shapes enough; empty for intervals that always are there.
-        remarks: notes of its own; empty ones are left out.
-        columns: of the table.
-        lines: of the table, as its columns read them.
-        run_columns: of the raw numbers where these have a line per run, not those of the table.
-        data: the raw numbers, including those that the figure plots; by default as the columns have them.
+        estimates: the shown estimates, which may lack an interval; empty if every interval exists.
+        remarks: further notes; empty ones are left out.
+        columns: the columns of the table.
+        lines: the lines of the table, as its columns read them.
+        run_columns: the columns of the raw numbers if these have a line per run.
+        data: the raw numbers, including those of the figure; by default they follow from the columns.
         figure: the figure.
-        chart: panels of series for the page, as `chart.panel_data` makes them.
-        atlas: a grid of cells for the page, as the study `stability` makes it.
+        chart: panels of series for the page, see `chart.panel_data`.
+        atlas: a grid of cells for the page, see the study `stability`.
     """
 
     runs: Runs
@@ -117,7 +117,7 @@ class Result:
 
     @cached_property
     def notes(self) -> list[str]:
-        """Warnings, then the notes of its own."""
+        """Warnings, then remarks."""
         remarks = [caption.fill_varying(self.runs, remark) for remark in self.remarks if remark]
         return [*caption.warnings(self.runs), *remarks]
 
@@ -142,7 +142,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Shown:
-    """What a page says: the content of `NAME.json`, of which Markdown, LaTeX and the HTML page are made."""
+    """The content of a page and of `NAME.json`, from which Markdown, LaTeX and the HTML page are made."""
 
     order: int = 0
     experiments: list[str] = field(default_factory=list)
@@ -152,42 +152,40 @@ class Shown:
     caption: str = ""
     columns: list[str] = field(default_factory=list)
     rows: list[list[str]] = field(default_factory=list)
-    best: list[list[int]] = field(default_factory=list)  # the row and the column of what is set bold
+    best: list[list[int]] = field(default_factory=list)  # the row and the column of each bold cell
     notes: list[str] = field(default_factory=list)
     drawn: bool = False
     chart: dict[str, Any] | None = None
     atlas: dict[str, Any] | None = None
-    drawn_by: str = ""  # the version that drew it, where that is not this one
+    drawn_by: str = ""  # the version that drew it, if not this one
 
     @property
     def head(self) -> str:
-        """By which version it was drawn, where this one cannot draw it."""
+        """A sentence on the version that drew the page, if this one cannot draw it."""
         return age.head(self.drawn_by)
 
     @property
     def answer(self) -> str:
-        """The verdict without stars about its numbers."""
+        """The verdict without asterisks."""
         return self.verdict.replace("*", "")
 
     def narrowed(self, headings: Sequence[str]) -> "Shown":
-        """The page with these columns alone, in this order."""
+        """The page with only these columns, in this order."""
         indices = [self.columns.index(heading) for heading in headings]
         rows = [[row[index] for index in indices] for row in self.rows]
         best = [[line, indices.index(index)] for line, index in self.best if index in indices]
         return replace(self, columns=[*headings], rows=rows, best=best)
 
     def to_json(self) -> str:
-        """Its content, a line per part; infinite numbers of a chart become null."""
-        parts = {
-            JSON_KEYS.get(key, key): value for key, value in asdict(self).items() if value not in ("", [], None, False)
-        }
+        """The content as JSON, a line per part; infinite numbers of a chart become null."""
+        parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
         encoded = {key: json.dumps(to_json_values(value), ensure_ascii=False) for key, value in parts.items()}
-        lines = [f"{json.dumps(key)}: {text}" for key, text in encoded.items()]
+        lines = [f"{json.dumps(JSON_KEYS.get(key, key))}: {text}" for key, text in encoded.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def read_shown(path: Path) -> Shown:
-    """The content of `NAME.json`; what is missing or of another type is as in an empty page."""
+    """Reads `NAME.json`; missing or invalid parts are empty."""
     try:
         content = json.loads(path.read_text(encoding="utf-8", errors="replace"))
     except (OSError, ValueError, RecursionError):
@@ -203,18 +201,16 @@ def _is_valid(name: str, value: Any) -> bool:
     if name == "rows":
         return isinstance(value, list) and all(_is_valid("columns", row) for row in value)
     if name == "best":
-        return isinstance(value, list) and all(
-            isinstance(cell, list) and [*map(type, cell)] == [int, int] for cell in value
-        )
+        return isinstance(value, list) and all(isinstance(v, list) and [*map(type, v)] == [int, int] for v in value)
     if name in ("columns", "notes", "experiments"):
         return isinstance(value, list) and all(isinstance(text, str) for text in value)
     return isinstance(value, {"order": int, "drawn": bool}.get(name, str))
 
 
 def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[Path]:
-    """Writes `base.csv`, `.json`, `.md`, and where there is content `.tex`, `.png`, `.pdf`; gives the paths.
+    """Writes `base.csv`, `.json` and `.md`, and `.tex`, `.png` and `.pdf` if there is content; returns the paths.
 
-    LaTeX has the label `tab:NAME`, by default that of the files.
+    The label in LaTeX is `tab:NAME`; by default NAME is the name of the files.
     """
     base.parent.mkdir(parents=True, exist_ok=True)
     table = base.with_suffix(".csv")
@@ -228,7 +224,7 @@ def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[P
 
 
 def write_shown(shown: Shown, base: Path, *, name: str = "") -> list[Path]:
-    """Writes what a page says: `base.json`, `.md`, and where there is a table `.tex`; gives the paths."""
+    """Writes the content of a page: `base.json`, `.md`, and `.tex` if there is a table; returns the paths."""
     texts = {".json": shown.to_json(), ".md": markdown(shown, base.name)}
     if shown.columns:
         texts[".tex"] = latex(shown, name or base.name)
@@ -258,9 +254,9 @@ def markdown(shown: Shown, name: str) -> str:
 
 
 def latex(shown: Shown, name: str) -> str:
-    """A LaTeX table environment under the title, no larger than the page, with rules between groups of its lines.
+    """A LaTeX table environment with the title, no larger than the page, and with rules between groups of lines.
 
-    A group has the same text in the first column, where it is written once, or the second. The caption is a comment.
+    Lines with equal text in the first column (written once) or in the second are a group. The caption is a comment.
     """
     cells = _emphasised(shown, _tex, r"\textbf{{\boldmath {}}}")
     columns = [[row[index] for row in shown.rows] for index in range(len(shown.columns))]
@@ -289,14 +285,14 @@ def latex(shown: Shown, name: str) -> str:
 
 
 def _aligned(cells: list[str]) -> str:
-    """The LaTeX alignment of a column: left where most cells begin with a letter, in lines where they are long."""
+    """The LaTeX alignment of a column: left if most cells begin with a letter; a paragraph if a cell is long."""
     if any(len(cell) > 60 for cell in cells):
         return r">{\raggedright\arraybackslash}p{0.4\textwidth}"
     return "l" if 2 * sum(bool(re.match(r"\W*[^\W\d]", cell)) for cell in cells) > len(cells) else "r"
 
 
 def _emphasised(shown: Shown, escape: Callable[[str], str], bold: str) -> list[list[str]]:
-    """The cells of all rows as Markdown or LaTeX, the best ones in bold."""
+    """The cells of all rows as Markdown or LaTeX, the best in bold."""
     return [
         [bold.format(escape(cell)) if [line, column] in shown.best else escape(cell) for column, cell in enumerate(row)]
         for line, row in enumerate(shown.rows)
@@ -304,7 +300,7 @@ def _emphasised(shown: Shown, escape: Callable[[str], str], bold: str) -> list[l
 
 
 def _text_columns(shown: Shown) -> list[bool]:
-    """Of each column, whether it is aligned to the left: the first one, and others without a digit but with a word."""
+    """Whether each column is aligned left: the first, and those with words but no digits."""
     texts = [" ".join(row[column] for row in shown.rows) for column in range(len(shown.columns))]
     return [
         column == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
@@ -313,20 +309,20 @@ def _text_columns(shown: Shown) -> list[bool]:
 
 
 def _tex(text: str) -> str:
-    """A text as LaTeX, a dash where there is none."""
+    """A text as LaTeX; a dash if it is empty."""
     escaped = _flat(text).translate(str.maketrans(_LATEX))
     return "--" if text in ("", "N/A") else _POWER.sub(r"$\1\\times10^{\2}$", escaped)
 
 
 def _tex_heading(heading: str, cells: list[str]) -> str:
-    """A heading as LaTeX, in lines where it is longer than the cells below."""
+    """A heading as LaTeX, broken into lines if it is longer than the cells below."""
     lines = textwrap.wrap(_flat(heading), max([12, *map(len, cells)]), break_long_words=False)
     text, side = r" \\ ".join(map(_tex, lines)), "lr"[_aligned(cells) == "r"]
     return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}" if lines[1:] else text
 
 
 def as_markdown(text: str) -> str:
-    """A text on one line, in which nothing has a meaning in Markdown or HTML."""
+    """A text on one line, with the special characters of Markdown and HTML escaped."""
     return html.escape(_flat(text), quote=False).translate(_MARKDOWN)
 
 

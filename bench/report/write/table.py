@@ -15,7 +15,7 @@ from bench.report.data.records import CHAMFER_SCALE, measured, row_of, setting
 from bench.report.data.statistics import Interval
 
 thousandfold = partial(format.number, scale=CHAMFER_SCALE)
-INTERVAL_ENDS = ("low", "high")  # of an interval
+ENDS = ("low", "high")
 
 
 def integer(value: float | None) -> str:
@@ -29,17 +29,17 @@ def word(value: Any) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share of 1 in whole per cent."""
+    """A fraction in whole per cent."""
     return format.number(share) if share is None else f"{100 * share:.0f} %"
 
 
 def small_percent(share: float | None) -> str:
-    """A share of 1 in per cent, with the digits that a small one needs."""
+    """A fraction in per cent, with enough digits for small ones."""
     return format.number(share) if share is None else f"{format.number(share, 100)} %"
 
 
 def count_with_interval(number: float, total: int, rate: Interval) -> str:
-    """A count with the interval of its share in per cent, or else the number of shapes, such as 3 of 4 (n = 2)."""
+    """A count with the interval of its fraction in per cent, or with the number of shapes, such as 3 of 4 (n = 2)."""
     return f"{number:g} of {total} {rate.ends(100)}{' %' if rate.has_ends else ''}"
 
 
@@ -48,12 +48,12 @@ class Column:
     """A column of a table.
 
     Args:
-        key: its name in the CSV; empty for a column that only the readable table has.
-        heading: in the readable table; empty for a column that only the CSV has.
-        value: gives the raw value of a line; by default `line.get(key)`.
+        key: its name in the CSV; empty for a column of the readable table only.
+        heading: its name in the readable table; empty for a column of the CSV only.
+        value: returns the raw value of a line; by default `line.get(key)`.
         show: converts the value to text for readers.
-        words: gives the text of a line for readers, where it depends on more than the value.
-        better: lower or higher, of a column whose best value is set bold; empty for none.
+        words: returns the text of a line for readers, if it depends on more than the value.
+        better: "lower" or "higher" if the best values of the column are bold; else empty.
     """
 
     key: str
@@ -68,7 +68,7 @@ class Column:
         return line.get(self.key) if self.value is None else self.value(line)
 
     def text(self, line: Any) -> str:
-        """The text of a line for readers; what is not a number is missing."""
+        """The text of a line for readers; nan counts as missing."""
         if self.words is not None:
             return self.words(line)
         value = self.of(line)
@@ -88,7 +88,7 @@ def to_table(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
 
 
 def best(columns: Sequence[Column], lines: Sequence[Any]) -> list[list[int]]:
-    """The row and the column, in the readable table, of each value that is the best of a column with several values."""
+    """The row and the column, in the readable table, of the best values of each column with different values."""
     cells = []
     for index, column in enumerate([column for column in columns if column.heading]):
         values = [column.of(line) for line in lines] if column.better else []
@@ -104,36 +104,32 @@ def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None)
 
 
 def estimate(key: str, heading: str, ends: str = "") -> tuple[Column, ...]:
-    """The column of an estimate under a key, which a line may lack, with its interval for readers and its ends.
+    """The column of an estimate with its interval, and CSV columns of its ends; a line may lack the estimate.
 
     Args:
-        ends: in front of `low` and `high`, the names of the ends in the CSV.
+        ends: the prefix of `low` and `high` in the names of the CSV columns.
     """
 
     def words(line: Any) -> str:
         return format.MISSING if line[key] is None else str(line[key])
 
     value = Column(key, heading, lambda line: line[key] and line[key].value, words=words)
-    low, high = (
-        Column(f"{ends}{end}", value=lambda line, end=end: getattr(line[key], end, None)) for end in INTERVAL_ENDS
-    )
+    low, high = (Column(f"{ends}{end}", value=lambda line, end=end: getattr(line[key], end, None)) for end in ENDS)
     return value, low, high
 
 
 def ends(key: str, get: Callable[[Any], Interval | None]) -> tuple[Column, ...]:
-    """The ends of an interval that a line may lack, in the CSV only."""
-    return tuple(
-        Column(f"{key}_{end}", value=lambda line, end=end: getattr(get(line), end, None)) for end in ("low", "high")
-    )
+    """CSV columns of the ends of an interval, which a line may lack."""
+    return tuple(Column(f"{key}_{end}", value=lambda line, end=end: getattr(get(line), end, None)) for end in ENDS)
 
 
 def shown(heading: str, words: Callable[[Any], str]) -> Column:
-    """A column of the readable table only."""
+    """A column of the readable table, not of the CSV."""
     return Column("", heading, words=words)
 
 
 def joined_cell(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Callable[[Any], str]:
-    """The text of several values of a line in one cell; `get` gives the line's value under a key."""
+    """A function that writes several values of a line into one cell; `get` reads a value by its key."""
 
     def words(line: Any) -> str:
         texts = [show(get(line, key)) for key in keys]
@@ -162,7 +158,7 @@ def through(select: Callable[[Any], Any], *columns: Column) -> tuple[Column, ...
     return tuple(replace(c, value=lambda line, c=c: c.of(select(line))) for c in columns)
 
 
-# Columns that identify a run and give its outcome, for every table of runs.
+# Identity and outcome of a run, for every table of runs.
 IDENTITY = (
     text("row", value=lambda record: row_of(record).name),
     *(text(key) for key in ("renderer", "seed")),
@@ -170,7 +166,7 @@ IDENTITY = (
     *(text(key) for key in ("status", "reason", "folder")),
 )
 COMPLETION = (*IDENTITY, *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"))
-PRESET = text("preset")  # of a row, which decides its colour in charts; in the CSV only
+PRESET = text("preset")  # CSV only; it decides the colour of a row in charts
 FAMILY = text("family", value=records.family)
 LOOP = (
     Column("loop_seconds", value=records.loop_seconds),
