@@ -58,7 +58,6 @@ class Gap:
 
 
 def ratio_of(gap: Gap | None) -> Interval | None:
-    """The ratio of a gap, or None."""
     return None if gap is None else gap.ratio
 
 
@@ -100,12 +99,10 @@ class Compared:
 
     @cached_property
     def families(self) -> list[str]:
-        """The families, in the order of the runs."""
         return list(self.runs.families())
 
     @cached_property
     def rows(self) -> list[Row]:
-        """The rows, in the order of the runs."""
         return list(self.runs.rows())
 
     @cached_property
@@ -128,7 +125,6 @@ class Compared:
 
     @cached_property
     def conditions(self) -> list[str]:
-        """The values of the condition, see `ordered`."""
         return ordered({str(value) for value in self.cells["condition"]})
 
     def cells_of(self, family: str, row: Row, condition: str | None = None) -> pd.DataFrame:

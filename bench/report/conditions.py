@@ -35,7 +35,6 @@ class Condition:
     neutral: float
 
     def value_of(self, record: Record) -> float:
-        """The value of the condition in a run."""
         return float(setting(record["config"], "task", self.key))
 
 

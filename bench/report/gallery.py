@@ -121,7 +121,6 @@ def normals(prefix: str = "") -> Paint:
 
 
 def colours(prefix: str = "") -> Paint:
-    """Paints the colours of a shape."""
     return lambda arrays: [on_white(arrays[f"{prefix}colours"], arrays[f"{prefix}hit"])]
 
 
@@ -223,7 +222,6 @@ def compare_with_reference(runs: Runs, max_columns: int) -> ComparedPictures:
 
 
 def missing_notes(scenes: Iterable[Scene]) -> list[str]:
-    """One note per reason why runs have no pictures."""
     reasons = Counter(reason for scene in scenes for reason in scene.reasons)
     return [f"No pictures of {plural(count, 'run')}: {reason}." for reason, count in reasons.items()]
 

@@ -61,7 +61,6 @@ class Tuning:
 
 
 def unfinished(runs: Runs) -> int:
-    """The number of planned runs that have not ended."""
     return sum(record["status"] in UNFINISHED for record in runs.records)
 
 

@@ -66,7 +66,6 @@ def doubtful(record: Record) -> bool:
 
 
 def index(record: Record) -> Any:
-    """The index of the shape in its family."""
     return record["config"].get("index")
 
 

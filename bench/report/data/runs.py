@@ -135,7 +135,6 @@ class Runs:
         return self.results_dir / "runs" / record["folder"]
 
     def requested(self) -> dict[str, Any]:
-        """The configuration of the first run."""
         return self.records[0]["config"]
 
     def rows(self) -> dict[Row, list[Record]]:

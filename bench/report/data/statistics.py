@@ -48,7 +48,6 @@ class Interval:
         return not math.isnan(self.low)
 
     def times(self, scale: float) -> "Interval":
-        """The interval times a number."""
         value, low, high, *points = (scale * x for x in (self.value, self.low, self.high, *self.points))
         return Interval(value, low, high, tuple(points))
 

@@ -89,13 +89,11 @@ _shared_rows = lru_cache(maxsize=10_000)(_rows)
 
 @cache
 def _sort_key(key: str) -> tuple[int, str]:
-    """The sort key of a setting."""
     leading = ("task", "renderer", "dataset", *LEADING_KEYS)
     return leading.index(key) if key in leading else len(leading), f"{key}."  # as the first of its settings
 
 
 def text(value: Any) -> str:
-    """A value as text."""
     try:
         return "null" if value is None else str(value)
     except (RecursionError, ValueError):  # nested too deeply, or an integer with too many digits

@@ -60,10 +60,8 @@ class Folder:
         return sorted(pictures, key=lambda name: ranks.get(name, len(ranks)))
 
     def link(self, name: str) -> str:
-        """The address of one of its files."""
         return link("runs", self.name, name)
 
     def links(self) -> dict[str, str]:
-        """The addresses of its standard files, by name."""
         folder = self.link("")
         return {name: folder + name for name in LINKED_FILES if self.has(name)}

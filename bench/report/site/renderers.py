@@ -79,14 +79,12 @@ def _row(
 
 
 def _overrides_of_row(attempt: Attempt) -> list[str]:
-    """The overrides that define the renderer."""
     if attempt.tuned:
         return ["setting=tuned", f"renderer={attempt.preset}"]
     return [text for text in attempt.overrides if not text.lstrip("+").startswith(SET_BY_SUITE)]
 
 
 def _overridden_settings(attempt: Attempt) -> dict[str, Any]:
-    """The renderer's settings from the command line."""
     pairs = [text.lstrip("+").partition("=") for text in _overrides_of_row(attempt)]
     return {key.removeprefix("renderer."): value for key, _, value in pairs if key.startswith("renderer.")}
 

@@ -103,7 +103,6 @@ def request_sentence(record: Record) -> str:
 
 
 def command(record: Record, results_dir: Path) -> str:
-    """The shell command that repeats the run."""
     folder = [] if results_dir.as_posix() == RESULTS else [f"results_dir={results_dir.as_posix()}"]
     overrides = map(str, record.get("overrides") or [])
     kept = [text for text in overrides if text.partition("=")[0] not in OMITTED_KEYS]

@@ -47,13 +47,11 @@ class Suite:
 
     @property
     def id(self) -> str:
-        """The name with the version."""
         return f"{self.name}-{self.version}"
 
 
 @cache
 def suite() -> Suite:
-    """The suite of this version."""
     return Suite(**read_yaml(CONF / "suite.yaml"))
 
 

@@ -29,7 +29,6 @@ def caption(runs: Runs, plotted: str, *, n: str, interval: str) -> str:
 
 
 def has_smoke_runs(runs: Runs) -> bool:
-    """Whether any run is of scale=smoke."""
     return any(setting(record["config"], "scale", "name") == "smoke" for record in runs.records)
 
 
@@ -133,7 +132,6 @@ def _machines(runs: Runs) -> str:
 
 
 def _loaded(runs: Runs) -> str:
-    """A warning about doubtful times."""
     names = [record["name"] for record in runs.named() if doubtful(record)]
     few = _listed(names) if len(names) <= MAX_LISTED_NAMES else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few

@@ -77,7 +77,6 @@ class Result:
         lines: the lines of the table, as its columns read them.
         run_columns: the columns of the raw numbers if these have a line per run.
         data: the raw numbers, including those of the figure; by default they follow from the columns.
-        figure: the figure.
         chart: panels of series for the page, see `chart.panel_data`.
         atlas: a grid of cells for the page, see the study `stability`.
     """
@@ -106,7 +105,6 @@ class Result:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The numbers as text for readers."""
         return to_table(self.columns, self.lines)
 
     @cached_property
@@ -117,7 +115,6 @@ class Result:
 
     @cached_property
     def notes(self) -> list[str]:
-        """Warnings, then remarks."""
         remarks = [caption.fill_varying(self.runs, remark) for remark in self.remarks if remark]
         return [*caption.warnings(self.runs), *remarks]
 
@@ -166,7 +163,6 @@ class Shown:
 
     @property
     def answer(self) -> str:
-        """The verdict without asterisks."""
         return self.verdict.replace("*", "")
 
     def narrowed(self, headings: Sequence[str]) -> "Shown":

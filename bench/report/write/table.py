@@ -64,7 +64,6 @@ class Column:
     better: str = ""
 
     def of(self, line: Any) -> Any:
-        """The raw value of a line."""
         return line.get(self.key) if self.value is None else self.value(line)
 
     def text(self, line: Any) -> str:
@@ -139,7 +138,6 @@ def joined_cell(get: Callable[[Any, str], Any], show: Callable[[Any], str], *key
 
 
 def metric(name: str, heading: str = "", show: Callable[[Any], str] = format.number) -> Column:
-    """A column with a metric of each record."""
     return Column(name, heading, lambda record: measured(record, name), show)
 
 
@@ -149,7 +147,6 @@ def metrics(*names: str) -> tuple[Column, ...]:
 
 
 def configured(key: str, *path: str, heading: str = "") -> Column:
-    """A column with a setting of each record."""
     return Column(key, heading, lambda record: setting(record["config"], *path), word)
 
 
