@@ -13,7 +13,7 @@ from typing import Any
 from bench.records.folder import archive_run, content_hash, copy_atomically
 from bench.records.read import check_links, read_plans, read_run, run_folders
 from bench.records.record import bad_link, file_lock, is_outside, read_record, write_text
-from bench.report.suite.attempts import place, read_attempts, write_attempts
+from bench.report.suite.attempts import attempts_folder, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
 UNREADABLE = "copied, but it cannot be read and no table shows it: "
@@ -32,7 +32,7 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
         ValueError: if a source is not a results folder, or is or contains `into`, or if `into` is a file.
     """
     for source in sources:
-        if not (source / "runs").is_dir() and not place(source).is_dir():
+        if not (source / "runs").is_dir() and not attempts_folder(source).is_dir():
             raise ValueError(f"{source} is not a results folder: it has no folder runs")
         if not is_outside(into, source):
             raise ValueError(f"{into} is {source} or lies within it: --into must be another folder, outside of it")

@@ -21,11 +21,11 @@ from typing import Any
 from bench.records.format import MISSING, number, plural
 from bench.records.read import RESULTS, read_records
 from bench.report.suite.attempts import (
-    BY_ITSELF,
-    EXPERIMENT,
-    GIVEN,
-    STATED,
-    TUNED,
+    EXPERIMENT_PREFIX,
+    FIXED_KEYS,
+    PROBLEM_SETTINGS,
+    TUNED_PREFIX,
+    TUNED_SUFFIX,
     attempts_of,
     gather,
     read_attempts,
@@ -34,14 +34,14 @@ from bench.report.suite.attempts import (
 )
 from bench.report.suite.standing import BUDGETS, KEY, Standing
 from bench.report.write import paper
-from bench.report.write.html import MOST_MESHES, page_lock, write_page
+from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
 from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 
 PAGE = "suite"  # its file name in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
-TUNED_LABEL = f"label='${{renderer._label_}}{BY_ITSELF}'"
-STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*STATED, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
+TUNED_LABEL = f"label='${{renderer._label_}}{TUNED_SUFFIX}'"
+STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one
 SETTING_VALUES = ("stated", "tuned")  # the set's setting for all renderers, or that of conf/tuned.yaml
 
@@ -75,10 +75,14 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
         key, _, value = argument.partition("=")
         if key in ("suite", "set", "setting"):
             options[key] = value
-        elif re.match(STATED_KEYS_PATTERN, key) and key not in [key_of_setting for key_of_setting, _ in GIVEN.values()]:
+        elif re.match(STATED_KEYS_PATTERN, key) and key not in [
+            key_of_setting for key_of_setting, _ in PROBLEM_SETTINGS.values()
+        ]:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
-        elif key == "label" and (value in shipped_rows() or value.endswith(BY_ITSELF)):
-            raise ValueError(f"label={value} is the name of a shipped row, or ends in '{BY_ITSELF}': type another one")
+        elif key == "label" and (value in shipped_rows() or value.endswith(TUNED_SUFFIX)):
+            raise ValueError(
+                f"label={value} is the name of a shipped row, or ends in '{TUNED_SUFFIX}': type another one"
+            )
         elif "=" in argument:
             overrides.append(argument)
         else:
@@ -106,7 +110,7 @@ def _sweeps(options: dict[str, str], overrides: list[str]) -> list[tuple[str, li
     others = [text for text in overrides if not text.startswith("renderer=")]
     for position, name in enumerate(sets, 1):
         title = f"set {position} of {len(sets)}: {name}"
-        keys = [f"+experiment={EXPERIMENT}{name}", f"sizes.chosen={suite().sizes[options['suite']]}"]
+        keys = [f"+experiment={EXPERIMENT_PREFIX}{name}", f"sizes.chosen={suite().sizes[options['suite']]}"]
         if options["setting"] == "stated":
             sweeps.append((title, [*keys, *overrides]))
             continue
@@ -125,8 +129,8 @@ def _tuned_choices(set_name: str, renderers: list[str]) -> dict[str, list[str]]:
 
     A tuned setting is used with the silhouette loss with which it was tuned.
     """
-    task, overrides = _chosen(read_yaml(CONF / "experiment" / f"{EXPERIMENT}{set_name}.yaml"))["task"], {}
-    for method in (f"{TUNED}{name}" for name in names(f"{METHOD}/tuned")):
+    task, overrides = _chosen(read_yaml(CONF / "experiment" / f"{EXPERIMENT_PREFIX}{set_name}.yaml"))["task"], {}
+    for method in (f"{TUNED_PREFIX}{name}" for name in names(f"{METHOD}/tuned")):
         chosen = _chosen(choice(METHOD, method))
         if chosen.get("task") == task and (not renderers or chosen["renderer"] in renderers):
             overrides[method] = [f"+method={method}", f"silhouette={chosen.get('silhouette', 'own')}", TUNED_LABEL]
@@ -159,14 +163,14 @@ def print_standing(results_dir: Path) -> int:
         records, unread = read_records(results_dir)
         write_attempts(attempts_of(records, results_dir), results_dir)
         written = paper.write_paper(records, results_dir, only=PAGE)
-        index = write_page(records, unread, results_dir, MOST_MESHES)
+        index = write_page(records, unread, results_dir, MAX_MESHES)
     gathered = gather(paper.SHIPPED, results_dir)
     for problem in gathered.problems:
         print(f"not read: {problem}", file=sys.stderr)
     local_rows, standing = {attempt.row for attempt in gathered.local}, Standing(gathered)
     print(f"{plural(len(gathered.local), 'run')} of {results_dir}, in rows with a star; the others are shipped.")
     _print_rows(standing, local_rows)
-    if standing.whole["problem"].nunique() <= MAX_PRINTED_PROBLEMS:
+    if standing.complete["problem"].nunique() <= MAX_PRINTED_PROBLEMS:
         _print_errors(standing, local_rows)
     print(*(path.with_suffix(".png") for path in written if path.with_suffix(".png").is_file()), index, sep="\n")
     return 0
@@ -175,14 +179,14 @@ def print_standing(results_dir: Path) -> int:
 def _print_rows(standing: Standing, local: set[str]) -> None:
     """Prints the progress and possible ranks of each row at each budget, the cost, and the number of failed runs."""
     available = plural(len(standing.everything[KEY].drop_duplicates()), "problem")
-    compared = plural(len(standing.whole[KEY].drop_duplicates()), "problem")
+    compared = plural(len(standing.complete[KEY].drop_duplicates()), "problem")
     print(f"progress on the {compared} that all rows have, of {available} with results; with possible ranks:")
     print(f"{'renderer':<28} {'at 1 x':<14}{'at 10 x':<14}{'at the end':<14} cost, DIST = 1  failed runs")
     for row in standing.rows:
         values = {name: standing.rankings[name].progress[row] for name in BUDGETS}
         shown = {name: MISSING if row in standing.hidden[name] else percent(value) for name, value in values.items()}
         cells = "".join(f"{f'{shown[name]:>5} ({standing.rankings[name].rank(row)})':<14}" for name in BUDGETS)
-        failed = (~standing.whole.loc[standing.whole["row"] == row, "ok"]).sum()
+        failed = (~standing.complete.loc[standing.complete["row"] == row, "ok"]).sum()
         print(f"{row + (' *' if row in local else ''):<28} {cells} {number(standing.costs[row]):>14}  {failed:>11}")
     for row, missing in standing.lacking.items():
         print(f"{row} lacks {plural(missing, 'problem')}, so it is not compared: run the suite for it without set=.")
@@ -190,7 +194,7 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
 
 def _print_errors(standing: Standing, local_rows: set[str]) -> None:
     """Prints the errors of the local runs."""
-    best_errors = standing.whole.groupby(KEY)["final"].min()
+    best_errors = standing.complete.groupby(KEY)["final"].min()
     for run in standing.reached[standing.reached["row"].isin(local_rows)].itertuples():
         errors = f"initial error {number(run.initial)}, final error {number(run.final)}"
         best_error = f"best renderer {number(best_errors.get((run.set, run.problem, run.seed)))}"

@@ -22,7 +22,7 @@ from bench.report.data.runs import Runs, choose, shared_loss
 from bench.report.tuning import (
     CHAMFER,
     PHOTOGRAPHS,
-    SPACE,
+    SPACE_PREFIX,
     TUNING,
     Tuning,
     left_out,
@@ -80,7 +80,7 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
 
 def _origin_keys(method: Tuning, experiment: Runs) -> dict[str, Any]:
     """The keys of a method's row that are not settings: how the settings were chosen, base and label."""
-    records = [record for record in experiment.records if record["method"].removeprefix(SPACE) == method.method]
+    records = [record for record in experiment.records if record["method"].removeprefix(SPACE_PREFIX) == method.method]
     chosen = _chosen_text(method, records, experiment)
     return {"chosen": chosen, "base": f"/method/{method.method}", "label": f"{method.label}, tuned"}
 
@@ -91,7 +91,7 @@ def _chosen_text(method: Tuning, records: list[Record], experiment: Runs) -> str
     name, metric = records[0]["method"], metric_of(experiment)
     return CHOSEN_TEXT.format(
         **{"draw": method.draws[method.best], "draws": len(method.draws), "runs": method.validation.shape[1]},
-        space=name if name.startswith(SPACE) else experiment.selection.experiment,
+        space=name if name.startswith(SPACE_PREFIX) else experiment.selection.experiment,
         error="Chamfer" if metric == CHAMFER else metric,
         best=number(np.exp(method.scores[method.best])),
         middle=number(np.exp(np.median(method.scores))),

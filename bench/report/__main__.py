@@ -6,71 +6,71 @@ from pathlib import Path
 from bench.records.read import RESULTS, check_results, read_records
 from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
-from bench.report.write.html import MOST_MESHES, page_lock, write_page
+from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.paper import ship, write_columns, write_paper, write_readme
 
 USAGE = f"""usage: python -m bench.report [results_dir=PATH] [meshes=all] [columns.PAGE=HEADING,HEADING] [ship=PATH]
   results_dir   the folder with the runs; `{RESULTS}` unless given
-  meshes        of how many runs, the newest first, the mesh turns on the page; {MOST_MESHES} unless given, or all
+  meshes        of how many runs, the newest first, the mesh turns on the page; {MAX_MESHES} unless given, or all
   columns.PAGE  the columns of its LaTeX table, such as columns.table1=Strategy,Queries,Forward; all unless given
   ship          for maintainers (make results): writes the tables and README.md to this folder, and nothing else"""
-TYPED = ("results_dir=PATH", "meshes=all", "columns.PAGE=HEADING,HEADING", "ship=PATH")
-KEYS = {text.partition("=")[0]: text for text in TYPED}
+KEY_FORMS = ("results_dir=PATH", "meshes=all", "columns.PAGE=HEADING,HEADING", "ship=PATH")
+KEYS = {text.partition("=")[0]: text for text in KEY_FORMS}
 
 
 def main(arguments: list[str]) -> int:
-    """Writes all pages, the tables of sweeps and `index.html`; gives the exit status.
+    """Writes all pages, the tables of sweeps and `index.html`.
 
-    It is 2 where an argument is wrong, and 1 where a study could not be made.
+    Returns the exit status: 2 if an argument is wrong, 1 if a page could not be made, else 0.
     """
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
         return 0
     try:
-        given = parsed(arguments)
-        status = _report(given)
-        write_columns(Path(given.get("ship") or given.get("results_dir", RESULTS)), given)
+        options = parse_options(arguments)
+        status = _report(options)
+        write_columns(Path(options.get("ship") or options.get("results_dir", RESULTS)), options)
         return status
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
 
-def _report(given: dict[str, str]) -> int:
-    results_dir, meshes = Path(given.get("results_dir", RESULTS)), _meshes(given.get("meshes", str(MOST_MESHES)))
-    if into := given.get("ship"):
+def _report(options: dict[str, str]) -> int:
+    results_dir, meshes = Path(options.get("results_dir", RESULTS)), _meshes(options.get("meshes", str(MAX_MESHES)))
+    if ship_folder := options.get("ship"):
         records, _ = read_records(results_dir)
-        kept, problems = read_attempts(results_dir)
+        shipped_attempts, problems = read_attempts(results_dir)
         if problems:
             raise ValueError(f"{results_dir} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
-        rows = write_attempts([*attempts_of(records, results_dir), *kept], Path(into))
-        print(*rows, *ship(records, results_dir, Path(into)), write_readme(Path(into)), sep="\n")
+        rows = write_attempts([*attempts_of(records, results_dir), *shipped_attempts], Path(ship_folder))
+        print(*rows, *ship(records, results_dir, Path(ship_folder)), write_readme(Path(ship_folder)), sep="\n")
         return 0
     check_results(results_dir)
     with page_lock(results_dir):
-        return _written(results_dir, meshes)
+        return _write_all(results_dir, meshes)
 
 
-def _written(results_dir: Path, meshes: int | None) -> int:
-    """Writes all that is written of a results folder; gives the exit status."""
+def _write_all(results_dir: Path, meshes: int | None) -> int:
+    """Writes all pages of a results folder; returns the exit status."""
     records, unread = read_records(results_dir)
-    broken: list[str] = []
-    papers = write_paper(records, results_dir, problems=broken)
-    for path in (*papers, *write_sweeps(records, results_dir, broken)):
+    failed_pages: list[str] = []
+    page_paths = write_paper(records, results_dir, problems=failed_pages)
+    for path in (*page_paths, *write_sweeps(records, results_dir, failed_pages)):
         print(path)
-    for problem in [*(f"not read: {problem}" for problem in unread), *broken]:
+    for problem in [*(f"not read: {problem}" for problem in unread), *failed_pages]:
         print(problem, file=sys.stderr)
     print(write_page(records, unread, results_dir, meshes))
-    return 1 if broken else 0
+    return 1 if failed_pages else 0
 
 
-def parsed(arguments: list[str]) -> dict[str, str]:
-    """The arguments by their keys.
+def parse_options(arguments: list[str]) -> dict[str, str]:
+    """Splits the arguments into keys and values.
 
     Raises:
-        ValueError: where one has no known key, or no value.
+        ValueError: a key is unknown, or its value is missing.
     """
-    given = {}
+    options = {}
     for argument in arguments:
         key, _, value = argument.partition("=")
         kind = "columns.PAGE" if key.startswith("columns.") else key
@@ -78,8 +78,8 @@ def parsed(arguments: list[str]) -> dict[str, str]:
             raise ValueError(f"argument must be one of {', '.join(KEYS.values())}, found {argument!r}")
         if not value:
             raise ValueError(f"{key} has no value: type {KEYS[kind]}")
-        given[key] = value
-    return given
+        options[key] = value
+    return options
 
 
 def _meshes(text: str) -> int | None:

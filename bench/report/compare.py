@@ -1,4 +1,4 @@
-"""One comparison of rows on the same shapes: medians per condition, mean errors, ratios, costs, fronts, a figure."""
+"""Compares rows on the same shapes: medians per condition, mean errors, ratios, costs, Pareto fronts, a figure."""
 
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -12,15 +12,15 @@ import pandas as pd
 from bench.records import format
 from bench.records.read import read_plans
 from bench.report.data import statistics
-from bench.report.data.records import SCALE, SHAPENET, Row, RunKey, by_shape, error, row_of, setting, shape
+from bench.report.data.records import CHAMFER_SCALE, SHAPENET, Row, RunKey, by_shape, error, row_of, setting, shape
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, Verdict, geometric_mean
 from bench.report.write import chart
 from bench.report.write.result import Result
 from bench.report.write.table import Column, ends, estimate, text
 
-EVERY = "all families"
-COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "seconds of the loop"}  # and how axes name them
+ALL_FAMILIES = "all families"
+COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "seconds of the loop"}  # with their axis labels
 FAILURE = (
     "In a shape's mean a run that did not end ok has the largest finite error of any row on the same shape, seed and "
     "condition; a shape on which every row failed is left out. A row that lacks a shape of another is on no front."
@@ -36,8 +36,8 @@ RATIO = (
 )
 HOLM = "By the sign test over shapes with Holm's correction"
 METRIC, LABEL = "chamfer_l2", "Chamfer × 1000\n(scene units²)"
-CONDITION = "task.points"  # over which tables have columns
-ORDER = ("dense", "50%", "10%", "100", "50", "20")  # of its values
+CONDITION_KEY = "task.points"  # tables have a column for each of its values
+CONDITION_ORDER = ("dense", "50%", "10%", "100", "50", "20")
 PRIORS = Selection("priors")
 ORACLE = "oracle: the prior's fit to the truth"
 FITTED = "The oracle is a code fitted to the distances of the true mesh (`+experiment=priors`), of all of these shapes."
@@ -46,7 +46,7 @@ Line = dict[str, Any]
 
 @dataclass(frozen=True)
 class Gap:
-    """The ratio of two rows' errors, and on how many of the shapes that both have the first is better, ties half."""
+    """The ratio of two rows' errors, and on how many of their common shapes the first is better (a tie counts half)."""
 
     ratio: Interval
     better: float
@@ -58,7 +58,6 @@ class Gap:
 
 
 def ratio_of(gap: Gap | None) -> Interval | None:
-    """The ratio of a gap; None without one."""
     return None if gap is None else gap.ratio
 
 
@@ -68,10 +67,10 @@ class Compared:
 
     Args:
         runs: at least one.
-        reference: gives the preset of the row that the row of a preset is divided by. Of several rows of that preset
-            it is the first one of the plan of the sweep.
+        reference: maps the preset of a row to the preset of its reference row. If several rows have that preset, the
+            reference is the one that the sweep planned first.
         metric: the error.
-        label: its name on axes.
+        label: the name of the error on axes.
     """
 
     runs: Runs
@@ -81,123 +80,120 @@ class Compared:
 
     @cached_property
     def cells(self) -> pd.DataFrame:
-        """A line per run: family, row, preset, solid, view, seed, at (its condition), ok, costs, its error and score.
+        """A line per run: family, row, preset, solid, view, seed, condition, ok, costs, error and score.
 
-        The score is the error in which a failure has the largest finite error of any row on the same shape, view, seed
-        and condition; it is infinite where every row failed.
+        The score of a run is its error if it is finite, else the largest finite error of any row on the same shape,
+        view, seed and condition. It is infinite if every row failed.
         """
         frame = self.runs.frame
-        found = frame[["family", "row", "preset", "solid", "view", "seed"]].assign(
-            at=self.runs.setting(CONDITION),
+        cells = frame[["family", "row", "preset", "solid", "view", "seed"]].assign(
+            condition=self.runs.setting(CONDITION_KEY),
             ok=(frame.status == "ok").to_numpy(bool),
             error=self.runs.error(self.metric),
             evaluations=frame["values"],
             seconds=frame.loop,
         )
-        places = [found[name] for name in ("family", "solid", "view", "seed", "at")]
-        worst = found.error.where(np.isfinite(found.error)).groupby(places).transform("max")
-        return found.assign(score=found.error.where(np.isfinite(found.error), worst).fillna(math.inf))
+        keys = [cells[name] for name in ("family", "solid", "view", "seed", "condition")]
+        worst = cells.error.where(np.isfinite(cells.error)).groupby(keys).transform("max")
+        return cells.assign(score=cells.error.where(np.isfinite(cells.error), worst).fillna(math.inf))
 
     @cached_property
     def families(self) -> list[str]:
-        """The families, in the order of the runs."""
         return list(self.runs.families())
 
     @cached_property
     def rows(self) -> list[Row]:
-        """The rows, in the order of the runs."""
         return list(self.runs.rows())
 
     @cached_property
     def planned(self) -> list[Row]:
-        """The rows in the order of the sweep that planned most of the runs; others last, in that of the runs.
+        """The rows in the order of the sweep that planned most runs, then the others in the order of the runs.
 
-        It reads all plans, and is asked only where one of several rows is to be chosen.
+        It reads all plans, so it is used only to choose one of several rows.
         """
-        of_run = {record["folder"]: row_of(record) for record in self.runs.records}
+        row_by_id = {record["folder"]: row_of(record) for record in self.runs.records}
         plans, _ = read_plans(self.runs.results_dir)
-        found = [[of_run[cell.id] for cell in plan.cells if cell.id in of_run] for plan in plans]
-        ordered = [row for rows in sorted(found, key=len, reverse=True) for row in rows]
+        planned_rows = [[row_by_id[cell.id] for cell in plan.cells if cell.id in row_by_id] for plan in plans]
+        ordered = [row for rows in sorted(planned_rows, key=len, reverse=True) for row in rows]
         return list(dict.fromkeys([*ordered, *self.rows]))
 
     def reference_of(self, row: Row) -> Row:
-        """The row that a row is divided by; itself where there is no other."""
-        wanted = self.reference(row.preset)
-        found = [other for other in self.rows if other.preset == wanted]
-        return min(found, key=self.planned.index) if len(found) > 1 else next(iter(found), row)
+        """The reference row of a row; the row itself if it has none."""
+        preset = self.reference(row.preset)
+        candidates = [other for other in self.rows if other.preset == preset]
+        return min(candidates, key=self.planned.index) if len(candidates) > 1 else next(iter(candidates), row)
 
     @cached_property
     def conditions(self) -> list[str]:
-        """The values of the condition, in their order."""
-        return ordered({str(value) for value in self.cells["at"]})
+        return ordered({str(value) for value in self.cells["condition"]})
 
-    def part(self, family: str, row: Row, at: str | None = None) -> pd.DataFrame:
-        """The lines of a family, or of `EVERY`, and of a row, at one condition or at all."""
-        cells = self.cells[(self.cells.preset == row.preset) & (self.cells.row == row.name)]
-        cells = cells if family == EVERY else cells[cells.family == family]
-        return cells if at is None else cells[cells["at"] == at]
+    def cells_of(self, family: str, row: Row, condition: str | None = None) -> pd.DataFrame:
+        """The cells of a row in a family, or in `ALL_FAMILIES`; at one condition, or at all."""
+        lines = self.cells[(self.cells.preset == row.preset) & (self.cells.row == row.name)]
+        lines = lines if family == ALL_FAMILIES else lines[lines.family == family]
+        return lines if condition is None else lines[lines["condition"] == condition]
 
-    def median(self, family: str, row: Row, at: str) -> float | None:
-        """The median error over shapes and seeds; None where nothing was planned."""
-        errors = self.part(family, row, at).error
+    def median(self, family: str, row: Row, condition: str) -> float | None:
+        """The median error over shapes and seeds; None if nothing was planned."""
+        errors = self.cells_of(family, row, condition).error
         return float(statistics.median(errors.to_numpy())) if len(errors) else None
 
     def means(self, family: str, row: Row) -> dict[RunKey, float]:
-        """The geometric mean of the scores over all conditions, of each shape, view and seed of a row.
+        """The geometric mean of the scores over all conditions, by shape, view and seed.
 
-        Left out are those without a run at a condition of their family, and those on which every row failed.
+        Left out are those that lack a run at a condition of their family, and those on which every row failed.
         """
-        return {run: mean for run, mean in self._means[row].items() if family in (EVERY, run[0][0])}
+        return {run: mean for run, mean in self._means[row].items() if family in (ALL_FAMILIES, run[0][0])}
 
     @cached_property
     def _means(self) -> dict[Row, dict[RunKey, float]]:
-        wanted = self.cells.groupby("family", sort=False)["at"].nunique()
-        found: dict[Row, dict[RunKey, float]] = {row: {} for row in self.rows}
-        places = ["preset", "row", "family", "solid", "view", "seed"]
-        for (preset, row, family, solid, view, seed), own in self.cells.groupby(places, sort=False, dropna=False):
-            mean = float(geometric_mean(own.score.to_numpy()))
-            if len(own) == wanted[family] and math.isfinite(mean):
-                found[Row(preset, row)][(family, solid), view, seed] = mean
-        return found
+        condition_counts = self.cells.groupby("family", sort=False)["condition"].nunique()
+        means: dict[Row, dict[RunKey, float]] = {row: {} for row in self.rows}
+        columns = ["preset", "row", "family", "solid", "view", "seed"]
+        for (preset, row, family, solid, view, seed), group in self.cells.groupby(columns, sort=False, dropna=False):
+            mean = float(geometric_mean(group.score.to_numpy()))
+            if len(group) == condition_counts[family] and math.isfinite(mean):
+                means[Row(preset, row)][(family, solid), view, seed] = mean
+        return means
 
     def lacking(self, family: str, row: Row) -> int:
-        """The number of shapes, views and seeds that another row has at all conditions and this one has not."""
+        """The number of shapes, views and seeds that another row has at all conditions and this one does not."""
         return len({run for other in self.rows for run in self.means(family, other)} - {*self.means(family, row)})
 
     def error(self, family: str, row: Row) -> Interval:
-        """The median of a row's errors over shapes, each a mean over conditions and seeds; nan without a shape."""
+        """The median over shapes of a row's mean error over conditions and seeds; nan without a shape."""
         groups = by_shape(self.means(family, row))
         return statistics.typical(groups) if groups else Interval(math.nan, math.nan, math.nan)
 
     def gap(self, family: str, first: Row, second: Row) -> Gap | None:
-        """The gap between two rows; None without a common shape."""
+        """The gap between two rows; None if they have no common shape."""
         means = [self.means(family, row) for row in (first, second)]
         common = [run for run in means[0] if run in means[1]]
         ours, theirs = (by_shape({run: each[run] for run in common}) for each in means)
-        return Gap(statistics.ratio(ours, theirs), statistics.better(ours, theirs), len(ours)) if ours else None
+        return Gap(statistics.ratio(ours, theirs), statistics.shapes_won(ours, theirs), len(ours)) if ours else None
 
     @cached_property
     def lines(self) -> list[Line]:
-        """A line per family and row, all families first where there are several.
+        """A line per family and row; with several families, lines over all families come first.
 
-        Each has family, row, preset, the median at each condition, the mean `error`, `ratio` (a `Gap`, or None for the
-        reference), median costs, `front_COST`, "yes" where no row has less error for less cost, `failed`, and how many
-        shapes and seeds it is `lacking`, which keeps it from fronts and verdicts.
+        Its keys: family, row, preset, the median at each condition, the mean `error`, `ratio` (a `Gap`, or None for the
+        reference), median costs, `front_COST` ("yes" if no row has less error for less cost), `failed`, and `lacking`,
+        the number of missing shapes and seeds. A row that lacks some is on no front and in no verdict.
         """
-        names = [EVERY, *self.families] if len(self.families) > 1 else self.families
+        names = [ALL_FAMILIES, *self.families] if len(self.families) > 1 else self.families
         return [line for name in names for line in self._front([self._line(name, row) for row in self.rows])]
 
     def _line(self, family: str, row: Row) -> Line:
-        mine, reference, lacking = self.part(family, row), self.reference_of(row), self.lacking(family, row)
-        costs = {cost: mine[cost][mine.ok].dropna().median() for cost in COSTS}
+        lines, reference, lacking = self.cells_of(family, row), self.reference_of(row), self.lacking(family, row)
+        costs = {cost: lines[cost][lines.ok].dropna().median() for cost in COSTS}
         return {
             **{"family": family, "row": row.name, "preset": row.preset},
-            **{at: self.median(family, row, at) for at in self.conditions},
+            **{condition: self.median(family, row, condition) for condition in self.conditions},
             "error": self.error(family, row),
             "ratio": None if reference == row else self.gap(family, row, reference),
             **{cost: None if math.isnan(value) else float(value) for cost, value in costs.items()},
             "lacking": lacking,
-            "failed": f"{(~mine.ok).sum()} of {len(mine)}" + (f", {lacking} missing" if lacking else ""),
+            "failed": f"{(~lines.ok).sum()} of {len(lines)}" + (f", {lacking} missing" if lacking else ""),
         }
 
     @staticmethod
@@ -213,33 +209,33 @@ class Compared:
         """The lines over all families."""
         return [line for line in self.lines if line["family"] == self.lines[0]["family"]]
 
-    def beside(self, above: dict[str, dict[str, Any]], published: dict[str, dict[str, Line]]) -> list[Line]:
-        """The lines, with others beside those of each family.
+    def extended_lines(self, above: dict[str, dict[str, Any]], published: dict[str, dict[str, Line]]) -> list[Line]:
+        """The lines of each family, with further lines above and published lines below.
 
         Args:
-            above: the medians of further lines, by their names and the families that they have.
-            published: of each family the published rows, with their numbers at the conditions.
+            above: the medians of the further lines, by name and family.
+            published: the published numbers, by family, row and condition.
         """
-        found = []
-        for name in dict.fromkeys(line["family"] for line in self.lines):
-            empty = {"family": name, "error": "", "ratio": None, "failed": ""}
-            found += [
-                empty | {"row": row} | dict.fromkeys(self.conditions, medians[name])
-                for row, medians in above.items()
-                if name in medians
+        lines = []
+        for family in dict.fromkeys(line["family"] for line in self.lines):
+            empty = {"family": family, "error": "", "ratio": None, "failed": ""}
+            lines += [
+                empty | {"row": row} | dict.fromkeys(self.conditions, median_by_family[family])
+                for row, median_by_family in above.items()
+                if family in median_by_family
             ]
-            found += [line for line in self.lines if line["family"] == name]
-            found += [
+            lines += [line for line in self.lines if line["family"] == family]
+            lines += [
                 empty | {"row": f"published: {row}"} | numbers
-                for row, numbers in published.get(name.removeprefix(SHAPENET), {}).items()
+                for row, numbers in published.get(family.removeprefix(SHAPENET), {}).items()
             ]
-        return found
+        return lines
 
     def columns(self, ratio: str) -> list[Column]:
-        """The columns of the lines; the ratio has that heading."""
+        """The columns of the lines; `ratio` is the heading of the ratio."""
         return [
             *(text("family", "Family"), text("row", "Method")),
-            *(Column(at, heading(at)) for at in self.conditions),
+            *(Column(condition, heading(condition)) for condition in self.conditions),
             *estimate("error", "Median over shapes"),
             text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
             *ends("ratio", lambda line: ratio_of(line["ratio"])),
@@ -252,8 +248,8 @@ class Compared:
         """The page of the comparison: a line per family and row, and a figure with a line per row.
 
         Args:
-            changed: further parts of the result: `verdict`, `remarks`, `columns`; and what replaces others: `lines`,
-                `figure`, ...
+            changed: further arguments of the result, such as `verdict`, `remarks` and `columns`. They replace the
+                default ones, such as `lines` and `figure`.
         """
         parts: dict[str, Any] = {
             "plotted": "Median error under each condition, that over shapes of their geometric means, its ratio, and "
@@ -269,39 +265,39 @@ class Compared:
 
     @property
     def comparable(self) -> list[Line]:
-        """The pooled lines that a verdict is on: of rows that lack no shape and have the settings that most runs have.
+        """The pooled lines of rows that lack no shape and have the settings of most runs; verdicts use only these.
 
-        The settings are those of `Runs.mixed`, of which a note says that rows with other values do not compare, and the
-        number of views.
+        The settings are the number of views and those of `Runs.mixed`. A note warns that rows with other values of
+        these do not compare.
         """
-        usual = np.ones(len(self.runs.records), dtype=bool)
+        is_usual = np.ones(len(self.runs.records), dtype=bool)
         for key in (*self.runs.mixed(), "task.images.views"):
             values = self.runs.setting(key)
-            usual &= (values == values.mode()[0]).to_numpy()
-        same = self.runs.where(pd.Series(usual)).rows()
-        return [line for line in self.pooled if not line["lacking"] and Row(line["preset"], line["row"]) in same]
+            is_usual &= (values == values.mode()[0]).to_numpy()
+        usual_rows = self.runs.where(pd.Series(is_usual)).rows()
+        return [line for line in self.pooled if not line["lacking"] and Row(line["preset"], line["row"]) in usual_rows]
 
-    def differing(self, of: str) -> str:
-        """The verdict on the ratios of all rows to their references; see `differing`."""
-        return differing([(line["row"], ratio_of(line["ratio"])) for line in self.comparable], of)
+    def differing(self, versus: str) -> str:
+        """The verdict on the ratios of all rows to their references, see `differing`."""
+        return differing([(line["row"], ratio_of(line["ratio"])) for line in self.comparable], versus)
 
     def best(self, least_of: str) -> str:
-        """The row with the least mean error and the quickest one, as a verdict; empty where there is none."""
+        """The verdict on the row with the least error and the fastest row; empty without comparable rows."""
         lines = self.comparable
-        whole = [line for line in lines if math.isfinite(line["error"].value) and line["seconds"] is not None]
-        if not whole:
+        complete = [line for line in lines if math.isfinite(line["error"].value) and line["seconds"] is not None]
+        if not complete:
             return ""
-        n = len(whole[0]["error"].points)
-        best, quick = (min(whole, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
-        least, other = (
+        n = len(complete[0]["error"].points)
+        best, quickest = (min(complete, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
+        best_text, quickest_text = (
             f"{format.number(line['error'].value)}{mark} ({line['row']}, {format.seconds(line['seconds'])}"
-            for line, mark in ((best, "*"), (quick, ""))
+            for line, mark in ((best, "*"), (quickest, ""))
         )
-        quickest = ", which is the quickest row too)" if best is quick else f"); the quickest row has {other})"
-        return f"The least median of {least_of} is *{least}{quickest}; n = {format.plural(n, 'shape')}."
+        other = ", which is the quickest row too)" if best is quickest else f"); the quickest row has {quickest_text})"
+        return f"The least median of {least_of} is *{best_text}{other}; n = {format.plural(n, 'shape')}."
 
     def panels(self, ratio: str) -> list[chart.Panel]:
-        """Panels of errors, of ratios under that name, and of costs: a line per row, the least error first."""
+        """Panels of errors, of ratios (labelled `ratio`) and of costs: a line per row, the least error first."""
         lines = sorted(self.pooled, key=lambda line: (math.isnan(line["error"].value), line["error"].value))
         costs = {label: cost for cost, label in COSTS.items() if cost != "seconds" or self.runs.timed}
         measures = {
@@ -312,8 +308,8 @@ class Compared:
         panels = []
         for label, values in measures.items():
             points = [
-                chart.series(line["row"], line["preset"], [value], [place])
-                for place, (line, value) in enumerate(zip(lines, values, strict=True))
+                chart.series(line["row"], line["preset"], [value], [position])
+                for position, (line, value) in enumerate(zip(lines, values, strict=True))
                 if value is not None
             ]
             panels.append(chart.panel_data("", label, "", points, rows=[line["row"] for line in lines]))
@@ -322,58 +318,58 @@ class Compared:
         return panels
 
 
-def differing(ratios: Sequence[tuple[str, Interval | None]], of: str) -> str:
-    """The verdict on a family of named ratios, see `statistics.differ`; empty where none has an interval."""
-    tested = [(name, ratio) for name, ratio in ratios if ratio is not None and ratio.known]
+def differing(ratios: Sequence[tuple[str, Interval | None]], versus: str) -> str:
+    """The verdict on a family of named ratios, see `statistics.ratio_verdicts`; empty if none has an interval."""
+    tested = [(name, ratio) for name, ratio in ratios if ratio is not None and ratio.has_ends]
     if not tested:
         return ""
-    verdicts = statistics.differ([ratio for _, ratio in tested])
-    undecided, equal = (verdicts.count(kind) for kind in (Verdict.NOT_DECIDABLE, Verdict.NOT_DISTINGUISHED))
+    verdicts = statistics.ratio_verdicts([ratio for _, ratio in tested])
+    undecided, undistinguished = (verdicts.count(kind) for kind in (Verdict.NOT_DECIDABLE, Verdict.NOT_DISTINGUISHED))
     sizes = sorted({len(ratio.points) for _, ratio in tested})
     if undecided == len(tested):
         few = f"cannot be decided with {' or '.join(map(str, sizes))} shapes"
         needed = f"{format.plural(undecided, 'ratio')} need {statistics.shapes_needed(undecided)} shapes or more"
-        return f"Whether ratios {of} differ from 1 *{few}*: by the sign test with Holm's correction {needed}."
-    sure = [
+        return f"Whether ratios {versus} differ from 1 *{few}*: by the sign test with Holm's correction {needed}."
+    unequal = [
         f"{name} {ratio}" for (name, ratio), verdict in zip(tested, verdicts, strict=True) if verdict is Verdict.DIFFERS
     ]
     parts = [
-        f"*{len(sure)} of {len(tested)}* ratios {of} differ from 1{': ' if sure else ''}{'; '.join(sure)}",
-        f"{equal} cannot be distinguished from 1" if equal else "",
+        f"*{len(unequal)} of {len(tested)}* ratios {versus} differ from 1{': ' if unequal else ''}{'; '.join(unequal)}",
+        f"{undistinguished} cannot be distinguished from 1" if undistinguished else "",
         f"{undecided} cannot be decided with {sizes[0]} shapes" if undecided else "",
     ]
     agreeing = f"{statistics.shapes_agreeing(sizes[-1], len(tested))} of {sizes[-1]} shapes"
-    step = "" if sure else f" The test needs {agreeing} on one side of 1."
+    step = "" if unequal else f" The test needs {agreeing} on one side of 1."
     return f"{HOLM}, {'; '.join(filter(None, parts))}.{step}"
 
 
 def ordered(conditions: Collection[str]) -> list[str]:
-    """Values of the condition, from many points to few; words that are not known last."""
+    """The values of the condition, from many points to few; unknown words come last."""
     numbers = sorted((value for value in conditions if value.isdigit()), key=int, reverse=True)
     words = sorted({*conditions} - {*numbers})
-    return [*(w for w in ORDER if w in words), *numbers, *(w for w in words if w not in ORDER)]
+    return [*(w for w in CONDITION_ORDER if w in words), *numbers, *(w for w in words if w not in CONDITION_ORDER)]
 
 
 def heading(condition: str) -> str:
-    """The heading of a condition's column; a number counts depth points."""
+    """The heading of a condition's column; a number is a number of depth points."""
     return f"{condition} pts" if condition.isdigit() else condition or "Median"
 
 
 def oracles(runs: Runs, metric: str) -> dict[str, float]:
-    """The median Chamfer x 1000 of the prior's fit, of each family of which all shapes were fitted.
+    """The median Chamfer x 1000 of the prior's fits, for each family with fits of all shapes.
 
-    The fits must have been judged as the runs were: with the same split, prior, grid and number of points.
+    The fits must have been evaluated like the runs: with the same split, prior, grid and number of points.
     """
     fits = runs.other(PRIORS)
-    if fits is None or _judged(fits.requested()) != _judged(runs.requested()):
+    if fits is None or _evaluation_settings(fits.requested()) != _evaluation_settings(runs.requested()):
         return {}
-    found = {shape(record): SCALE * error(record, metric) for record in fits.records}
-    wanted = {name: {shape(record) for record in records} for name, records in runs.families().items()}
-    complete = {name: shapes for name, shapes in wanted.items() if shapes <= set(found)}
-    return {name: float(statistics.median([found[one] for one in shapes])) for name, shapes in complete.items()}
+    errors = {shape(record): CHAMFER_SCALE * error(record, metric) for record in fits.records}
+    shapes_by_family = {name: {shape(record) for record in records} for name, records in runs.families().items()}
+    fitted = {name: shapes for name, shapes in shapes_by_family.items() if shapes <= set(errors)}
+    return {name: float(statistics.median([errors[key] for key in shapes])) for name, shapes in fitted.items()}
 
 
-def _judged(config: dict[str, Any]) -> list[Any]:
-    """The settings on which an evaluation depends."""
+def _evaluation_settings(config: dict[str, Any]) -> list[Any]:
+    """The settings that an evaluation depends on."""
     paths = (("split",), ("prior",), ("evaluation", "grid"), ("evaluation", "points"))
     return [setting(config, *path) for path in paths]

@@ -1,4 +1,4 @@
-"""Runs of shape from many views under conditions of which one varies at a time: medians, and their figure."""
+"""Shape from many views: the median error over each condition, with the other conditions neutral; and its figure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,16 +7,17 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.data.records import ONE_WAY, SCALE, Record, by_shape, error, family, grouped, row_of, run_key, setting
+from bench.report.data import records
+from bench.report.data.records import ONE_WAY, Record, by_shape, error, family, grouped, row_of, run_key, setting
 from bench.report.data.statistics import Interval, bootstrap, median
 from bench.report.write import chart
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, estimate, metrics, text
 
-BELOW = "median Chamfer distance from truth to prediction (squared scene units, times 1000)"
+ERROR_TEXT = "median Chamfer distance from truth to prediction (squared scene units, times 1000)"
 LABEL = "Chamfer × 1000, truth to\nprediction (scene units²)"
 INTERVALS = "95 % bootstrap intervals over {shapes and seeds}"
-MEDIAN = estimate("error", "Median")
-NAMED = (text("family", "Family"), text("method", "Method"), text("condition", "Condition"))
+MEDIAN_COLUMNS = estimate("error", "Median")
+NAME_COLUMNS = (text("family", "Family"), text("method", "Method"), text("condition", "Condition"))
 
 
 @dataclass(frozen=True)
@@ -25,55 +26,59 @@ class Condition:
 
     Args:
         key: its name in the task.
-        label: with its unit.
-        neutral: its value where another varies.
+        label: its name on axes, with the unit.
+        neutral: its value in runs that vary another condition.
     """
 
     key: str
     label: str
     neutral: float
 
-    def of(self, record: Record) -> float:
-        """Its value in a run."""
+    def value_of(self, record: Record) -> float:
         return float(setting(record["config"], "task", self.key))
 
 
-def run_columns(conditions: Sequence[Condition], *others: str) -> tuple[Column, ...]:
-    """The columns of the CSV, with these conditions and other settings of the task."""
-    keys = (*(configured(one.key, "task", one.key) for one in conditions), *IDENTITY)
-    return (FAMILY, *keys, *(configured(key, "task", key) for key in others), *metrics(ONE_WAY, "chamfer_l2"))
+def run_columns(conditions: Sequence[Condition], *other_keys: str) -> tuple[Column, ...]:
+    """The columns of the CSV: identity, conditions, other settings of the task, and metrics."""
+    keys = (*(configured(condition.key, "task", condition.key) for condition in conditions), *IDENTITY)
+    return (FAMILY, *keys, *(configured(key, "task", key) for key in other_keys), *metrics(ONE_WAY, "chamfer_l2"))
 
 
-def middle(records: Sequence[Record]) -> Interval:
-    """The median error x 1000 over shapes and seeds, in which a run that failed is infinite."""
-    return bootstrap(by_shape({run_key(run): SCALE * error(run, ONE_WAY) for run in records}), median)
+def median_error(runs: Sequence[Record]) -> Interval:
+    """The median error x 1000 over shapes and seeds; the error of a failed run is infinite."""
+    return bootstrap(by_shape({run_key(run): records.CHAMFER_SCALE * error(run, ONE_WAY) for run in runs}), median)
 
 
-def lines_of(records: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
-    """A line per family, row, condition and its value, with all other conditions at their neutral values.
+def lines_of(runs: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+    """A line per family, row, condition and value, from the runs whose other conditions are neutral.
 
-    Each has family, method, preset, the condition as text, the place of the condition, its value `at`, its `runs` and
-    their median `error`.
+    Its keys: family, method, preset, condition (as text), key, position (of the condition), value, runs, error.
     """
     lines = []
-    for place, one in enumerate(conditions):
-        alone = [r for r in records if all(other.of(r) == other.neutral for other in conditions if other != one)]
-        for (name, row, at), own in grouped(alone, lambda r, one=one: (family(r), row_of(r), one.of(r))).items():
-            told = {"family": name, "method": row.name, "preset": row.preset, "condition": f"{one.label}: {at:g}"}
-            lines.append(told | {"key": one.key, "place": place, "at": at, "runs": own, "error": middle(own)})
-    return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["at"]))
+    for position, condition in enumerate(conditions):
+        others = [other for other in conditions if other != condition]
+        shown = [run for run in runs if all(other.value_of(run) == other.neutral for other in others)]
+        groups = grouped(shown, lambda record, get=condition.value_of: (family(record), row_of(record), get(record)))
+        for (family_name, row, value), group in groups.items():
+            line = {"family": family_name, "method": row.name, "preset": row.preset}
+            line |= {"condition": f"{condition.label}: {value:g}", "runs": group, "error": median_error(group)}
+            lines.append(line | {"key": condition.key, "position": position, "value": value})
+    return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["value"]))
 
 
 def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], success: float) -> Figure:
     """Draws a row of panels per family: the error over the value of each condition, a line per method.
 
-    `success` is the largest error of a run that counts as one, drawn as a line. What is infinite is drawn at the edge.
+    A line shows `success`, the largest error that counts as a success. Infinite errors are drawn at the edge.
     """
-    of_family, panels = grouped(lines, lambda line: line["family"]), []
-    for (name, own), (place, one) in product(of_family.items(), enumerate(conditions)):
-        of_row = grouped([x for x in own if x["place"] == place], lambda line: (line["method"], line["preset"]))
-        drawn = [chart.curve(*row, [x["at"] for x in of], [x["error"] for x in of]) for row, of in of_row.items()]
-        if drawn:
-            drawn.append(chart.level("success: below", [x["at"] for x in own if x["place"] == place], success))
-        panels.append(chart.panel_data(name, one.label, LABEL, drawn))
-    return chart.draw(panels, 2.1 * len(of_family) + 0.5, len(of_family), legend=3, sharey="row")
+    lines_by_family, panels = grouped(lines, lambda line: line["family"]), []
+    for (family_name, family_lines), (position, condition) in product(lines_by_family.items(), enumerate(conditions)):
+        shown = [line for line in family_lines if line["position"] == position]
+        curves = [
+            chart.curve(*row, [line["value"] for line in row_lines], [line["error"] for line in row_lines])
+            for row, row_lines in grouped(shown, lambda line: (line["method"], line["preset"])).items()
+        ]
+        if curves:
+            curves.append(chart.level("success: below", [line["value"] for line in shown], success))
+        panels.append(chart.panel_data(family_name, condition.label, LABEL, curves))
+    return chart.draw(panels, 2.1 * len(lines_by_family) + 0.5, len(lines_by_family), legend=3, sharey="row")

@@ -1,4 +1,4 @@
-"""A line per row with medians, failures and costs, and a figure with a point per run."""
+"""A table line per row with medians, failures and costs; and a figure with a point per run."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -22,24 +22,24 @@ COST = (
 
 
 def scene_of(record: Record) -> str:
-    """The name of a run's scene, for titles: with its number, unless it is a file's or a folder's own object."""
+    """The name of a run's scene for titles, with its index unless it is the object of a file or folder."""
     dataset = record["config"].get("dataset", {})
-    own = dataset.get("path") and not dataset.get("strength") and not index(record)
-    return family(record) if own else f"{family(record)} {index(record)}"
+    is_own_object = dataset.get("path") and not dataset.get("strength") and not index(record)
+    return family(record) if is_own_object else f"{family(record)} {index(record)}"
 
 
 def scored(runs: Runs, name: str) -> pd.Series:
-    """A metric of each run; the worst, infinite or 0, where the run did not end ok, nan where it has no such number."""
+    """A metric of each run; for a failed run the worst value, infinite or 0; nan if a run lacks the metric."""
     ok, worst = runs.frame.status == "ok", 0.0 if metrics.better_direction(name) == "higher" else np.inf
     return runs.number(name).where(ok.to_numpy(bool), worst)
 
 
 def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
-    """A line per row: medians of metrics, in which failed runs are worst, what failed, and the costs of other runs.
+    """A line per row: medians of metrics (failed runs are worst), failures, and median costs of runs that ended ok.
 
-    A metric that a run lacks though it ended ok is None.
+    If a run that ended ok lacks a metric, its median is None.
     """
-    runs = runs.made
+    runs = runs.executed
     frame = runs.frame[["row", "preset"]].assign(
         **{name: scored(runs, name) for name in names},
         ok=(runs.frame.status == "ok").to_numpy(bool),
@@ -47,22 +47,22 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
         evaluations=runs.frame["values"],
     )
     lines = []
-    for (row, preset), own in frame.groupby(["row", "preset"], sort=False):
-        found = {name: None if own[name].isna().any() else float(median(own[name].to_numpy())) for name in names}
-        spent = own[own.ok][["seconds", "evaluations"]].median()
-        costs = {name: None if np.isnan(value) else float(value) for name, value in spent.items()}
-        failed = f"{(~own.ok).sum()} of {len(own)}"
-        lines.append({"method": row, "preset": preset, "runs": len(own), **found, "failed": failed, **costs})
+    for (row, preset), group in frame.groupby(["row", "preset"], sort=False):
+        values = {name: None if group[name].isna().any() else float(median(group[name].to_numpy())) for name in names}
+        median_costs = group[group.ok][["seconds", "evaluations"]].median()
+        costs = {name: None if np.isnan(value) else float(value) for name, value in median_costs.items()}
+        failed = f"{(~group.ok).sum()} of {len(group)}"
+        lines.append({"method": row, "preset": preset, "runs": len(group), **values, "failed": failed, **costs})
     return lines
 
 
 def errors_of(runs: Iterable[Record], metric: str) -> dict[RunKey, float]:
-    """The error of each run; infinite for a failed one."""
+    """The error of each run; infinite for a failed run."""
     return {run_key(record): error(record, metric) for record in runs}
 
 
 def paired_ratio(errors: Mapping[RunKey, float], others: Mapping[RunKey, float]) -> Interval | None:
-    """The ratio of the errors to others over the runs that both have; None without any."""
+    """The ratio of the errors to `others` over the runs of both; None without common runs."""
     both = sorted(set(errors) & set(others), key=str)
     if not both:
         return None
@@ -70,15 +70,15 @@ def paired_ratio(errors: Mapping[RunKey, float], others: Mapping[RunKey, float])
 
 
 def cost(runs: Runs) -> dict[str, pd.Series]:
-    """The seconds of each run under the label of an axis; its field evaluations, if any, where times are doubtful."""
+    """The seconds of each run, or its field evaluations if times are doubtful; by the label of the axis."""
     evaluations = runs.frame["values"].where(runs.frame["values"] > 0)
     return {"seconds in the loop": runs.frame.loop} if runs.timed else {"field evaluations of the run": evaluations}
 
 
-def whole(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
-    """A median of the rows with as many runs as any, by row: those of fewer are not of the same shapes."""
-    most = max((line["runs"] for line in lines), default=0)
-    return {line["method"]: line[name] for line in lines if line["runs"] == most}
+def comparable_medians(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
+    """A median by row, for the rows with the most runs; rows with fewer runs lack shapes."""
+    max_runs = max((line["runs"] for line in lines), default=0)
+    return {line["method"]: line[name] for line in lines if line["runs"] == max_runs}
 
 
 def draw_runs(
@@ -87,20 +87,20 @@ def draw_runs(
     """Draws a panel per measure, with a line per row: a point per run, and a bar at the median of several.
 
     Args:
-        panels: of each measure its values by the label of its axis; nan is not drawn, infinite is at the edge.
-        rows: from above, all of them; by default in the order of the runs.
-        log: whether an axis whose values differ by a factor is logarithmic.
+        panels: the values of each measure, by axis label; nan is not drawn, infinite is drawn at the edge.
+        rows: all rows from top to bottom; by default in the order of the runs.
+        log: whether an axis may be logarithmic.
     """
-    rows, made = list(rows or runs.rows()), []
+    rows, chart_panels = list(rows or runs.rows()), []
     for label, values in panels.items():
         drawn = []
-        for place, row in enumerate(rows):
-            mine = values[(runs.frame.row == row.name) & (runs.frame.preset == row.preset)].dropna().to_numpy(float)
-            spread = np.linspace(-0.25, 0.25, len(mine)) if len(mine) > 1 else np.zeros(len(mine))
-            drawn.append(chart.series(row.name, row.preset, mine, place + spread))
-            if len(mine) > 1 and np.isfinite(middle := float(median(mine))):
-                drawn.append(chart.level("median", [middle] * 2, 0) | {"y": [place - 0.38, place + 0.38]})
+        for position, row in enumerate(rows):
+            points = values[(runs.frame.row == row.name) & (runs.frame.preset == row.preset)].dropna().to_numpy(float)
+            spread = np.linspace(-0.25, 0.25, len(points)) if len(points) > 1 else np.zeros(len(points))
+            drawn.append(chart.series(row.name, row.preset, points, position + spread))
+            if len(points) > 1 and np.isfinite(row_median := float(median(points))):
+                drawn.append(chart.level("median", [row_median] * 2, 0) | {"y": [position - 0.38, position + 0.38]})
         panel = chart.panel_data("", label, "", drawn, rows=[row.name for row in rows])
         panel["x"]["log"] &= log
-        made.append(panel)
-    return chart.draw(made, 0.19 * len(rows) + 0.9, legend=0, sharey=True)
+        chart_panels.append(panel)
+    return chart.draw(chart_panels, 0.19 * len(rows) + 0.9, legend=0, sharey=True)

@@ -1,14 +1,14 @@
-"""All that a file of `bench/studies` is written with: its runs, its result, and the modules for what is between.
+"""Everything that a file of `bench/studies` imports: runs, results, and the modules between them.
 
-`records` reads values of a run, `statistics` and `compare` make numbers of many, `table` has the columns, `chart` and
-`gallery` draw, `style` has the looks of rows and `format` the texts of numbers.
+`records` reads values of one run, `statistics` and `compare` summarise many runs, `table` has the columns, `chart` and
+`gallery` draw, `style` has the looks of rows, and `format` writes numbers.
 """
 
-# ruff: noqa: F401 - what is imported here is passed on
+# ruff: noqa: F401 - these imports are re-exported
 from bench.pictures import style
 from bench.records import format
 from bench.report import compare, conditions, gallery, medians
 from bench.report.data import curves, records, statistics
-from bench.report.data.runs import Runs, Selection, together
+from bench.report.data.runs import Runs, Selection, merge_runs
 from bench.report.write import chart, table
 from bench.report.write.result import Result

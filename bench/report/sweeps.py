@@ -15,16 +15,16 @@ from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
-from bench.report.write.caption import FEW, OVER
+from bench.report.write.caption import FEW, VARYING
 from bench.report.write.chart import Panel, panel_data, series
-from bench.report.write.paper import BROKEN, SWEEPS, TABLE, studies
+from bench.report.write.paper import RECORD_ERRORS, SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
-from bench.report.write.table import Column, counted, ends, text
+from bench.report.write.table import Column, count_with_interval, ends, text
 
-ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # behind a heading: which direction is better
-MOST_VALUES = 6  # of a swept key that the caption lists
-MOST_DATASETS = 8  # with a column and a panel of their own
-MOST_METRICS = 8  # in the readable table, of a task that none of `SHOWN` measures
+ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # after a heading: the better direction
+MAX_LISTED_VALUES = 6  # per swept key
+MAX_DATASET_COLUMNS = 8
+MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `TABLE_METRICS`
 FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
@@ -34,9 +34,9 @@ UNDIRECTED = "Of metrics of which neither direction is better, medians are of th
 
 @dataclass(frozen=True)
 class Sweep:
-    """The runs of a sweep, one per planned cell, each with the name of its row; `swept` are keys with their values.
+    """The runs of a sweep, one per planned cell, each with the name of its row; and the swept keys with their values.
 
-    Cells that are `missing` were not run or killed, and have no run here, unless all are.
+    `missing` is the number of cells that were not run, or killed. They are in `runs` only if no cell ended.
     """
 
     name: str
@@ -46,79 +46,80 @@ class Sweep:
 
     @property
     def metrics(self) -> list[str]:
-        """The names of all metrics that some run has as a number, those that tables show first."""
-        found = {name: None for run in self.runs.records for name in run["metrics"] if measured(run, name) is not None}
-        listed = [name for name in TABLE_METRICS if name in found]
-        return [*listed, *(name for name in found if name not in TABLE_METRICS)]
+        """The names of all metrics that are a number in some run; those that tables show come first."""
+        names = {name: None for run in self.runs.records for name in run["metrics"] if measured(run, name) is not None}
+        listed = [name for name in TABLE_METRICS if name in names]
+        return [*listed, *(name for name in names if name not in TABLE_METRICS)]
 
     @property
     def datasets(self) -> list[str]:
-        """The data sets that every row has runs of; none where these are one alone, or many."""
-        rows = [{*map(records.family, own)} for own in grouped(self.runs.records, lambda run: run["row"]).values()]
-        found = [
-            one for one in dict.fromkeys(map(records.family, self.runs.records)) if all(one in row for row in rows)
-        ]
-        return found if 1 < len(found) <= MOST_DATASETS else []
+        """The data sets of which every row has runs; empty if there is only one, or too many."""
+        rows = grouped(self.runs.records, lambda run: run["row"]).values()
+        sets, names = [{*map(records.family, runs)} for runs in rows], map(records.family, self.runs.records)
+        shared = [name for name in dict.fromkeys(names) if all(name in datasets for datasets in sets)]
+        return shared if 1 < len(shared) <= MAX_DATASET_COLUMNS else []
 
 
-def write_sweeps(known: list[Record], results_dir: Path, problems: list[str]) -> list[Path]:
-    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; gives the CSVs' paths.
+def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) -> list[Path]:
+    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; returns the CSVs.
 
-    `problems` gets a line for each sweep that no table can be made of.
+    `problems` gets a line for each sweep whose table cannot be made.
     """
-    by_folder, studied, written = {record["folder"]: record for record in known}, _studied(), []
+    by_folder, studied, written = {record["folder"]: record for record in records}, _studied(), []
     for plan in read_plans(results_dir)[0]:
         try:
-            if not any(one.id in by_folder for one in plan.cells) or plan.cells[0].config.get("experiment") in studied:
+            has_runs = any(cell.id in by_folder for cell in plan.cells)
+            if not has_runs or plan.cells[0].config.get("experiment") in studied:
                 continue
             written.append(_write(of_plan(plan, by_folder), results_dir / SWEEPS / plan.name)[0])
-        except BROKEN as error:
+        except RECORD_ERRORS as error:
             problems.append(f"not made: {SWEEPS}/{plan.name} ({type(error).__name__}: {error})")
     return written
 
 
 def write_sweep(plan: Plan) -> Path | None:
-    """Writes the table of a sweep that has ended, if no study shows it; gives the path of its readable form."""
+    """Writes the table of a finished sweep, unless a study shows it; returns the path of the Markdown file."""
     if plan.cells[0].config.get("experiment") in _studied():
         return None
-    known = {}
+    record_by_id = {}
     for cell in plan.cells:
         record, _ = read_run(plan.results_dir / "runs" / cell.id, plan.results_dir)
-        known[cell.id] = record or not_run_record(cell, plan)
-    _write(of_plan(plan, known), plan.folder)
+        record_by_id[cell.id] = record or not_run_record(cell, plan)
+    _write(of_plan(plan, record_by_id), plan.folder)
     return plan.folder / f"{TABLE}.md"
 
 
-def of_plan(plan: Plan, known: dict[str, Record]) -> Sweep:
-    """The sweep of a plan, some of whose runs are known; cells that differ in nothing that counts have one run."""
-    cells = {cell.id: cell for cell in plan.cells if cell.id in known}
-    runs = [known[name] for name in cells]
-    asked = [_asked(cell.overrides) for cell in cells.values()]
-    keys = dict.fromkeys(key for one in asked for key in one)
-    swept = {key: list(dict.fromkeys(one[key] for one in asked if key in one)) for key in keys}
+def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
+    """The sweep of a plan with its known records. Equivalent cells share one run."""
+    cells = {cell.id: cell for cell in plan.cells if cell.id in record_by_id}
+    runs = [record_by_id[name] for name in cells]
+    overrides = [_override_values(cell.overrides) for cell in cells.values()]
+    keys = dict.fromkeys(key for values in overrides for key in values)
+    swept = {key: list(dict.fromkeys(values[key] for values in overrides if key in values)) for key in keys}
     swept = {key: values for key, values in swept.items() if len(values) > 1}
-    names = differences(runs, distinguished_by=_apart, swept=[{k: one[k] for k in one if k in swept} for one in asked])
-    named = [run | {"row": name} for run, name in zip(runs, names, strict=True)]
+    overrides = [{key: values[key] for key in values if key in swept} for values in overrides]
+    names = differences(runs, distinguished_by=_average_key, swept=overrides)
+    runs = [run | {"row": name} for run, name in zip(runs, names, strict=True)]
     selection = Selection(plan.cells[0].config.get("experiment") or "", setup=("scenes", "pixels", "machine"))
-    ended = [run for run in named if run["status"] not in UNFINISHED]
-    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or named), len(named) - len(ended))
+    ended = [run for run in runs if run["status"] not in UNFINISHED]
+    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or runs), len(runs) - len(ended))
 
 
 def lines(sweep: Sweep) -> list[dict[str, Any]]:
-    """A line per row: its counts, its costs, the interval of each metric's median, and the ratio of the first metric.
+    """A line per row: its counts, its costs, each metric's median with its interval, and the ratio of the first metric.
 
-    The ratio is to the first row, paired by shape; None where there is none. Of the first metric, the median on each
-    data set that all rows have stands under its name with that of the data set.
+    The ratio is to the first row, paired by shape, or None. The median of the first metric on each data set that all
+    rows have is under the name of the metric with that of the data set.
     """
     rows, names = grouped(sweep.runs.records, lambda record: record["row"]), sweep.metrics
     first = next(iter(rows.values()))
     lead = names[0] if names and better_direction(names[0]) == LOWER else ""
-    found = [_line(row, runs, names) | {"ratio": _ratio(runs, first, lead)} for row, runs in rows.items()]
+    sweep_lines = [_line(row, runs, names) | {"ratio": _ratio(runs, first, lead)} for row, runs in rows.items()]
     for dataset in sweep.datasets if names else ():
-        for line, runs in zip(found, rows.values(), strict=True):
-            own = [run for run in runs if records.family(run) == dataset]
-            line[_on(names[0], dataset)] = median_of(own, names[0])
-    return found
+        for line, runs in zip(sweep_lines, rows.values(), strict=True):
+            dataset_runs = [run for run in runs if records.family(run) == dataset]
+            line[_on(names[0], dataset)] = median_of(dataset_runs, names[0])
+    return sweep_lines
 
 
 def _on(metric: str, dataset: str) -> str:
@@ -134,29 +135,30 @@ def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
     return {
         **{"row": row, "preset": records.row_of(runs[0]).preset, "rate": rate},
         **{"runs": len(runs), "failed": len(runs) - len(ended)},
-        "reasons": "; ".join(f"{said} ({count} runs)" if count > 1 else said for said, count in reasons.items()),
-        "loop_seconds": records.median_of_known(map(records.loop_seconds, ended)),
-        "value_evaluations": records.median_of_known(map(records.value_evaluations, ended)),
+        "reasons": "; ".join(f"{reason} ({count} runs)" if count > 1 else reason for reason, count in reasons.items()),
+        "loop_seconds": records.median_or_none(map(records.loop_seconds, ended)),
+        "value_evaluations": records.median_or_none(map(records.value_evaluations, ended)),
         **{name: median_of(runs, name) for name in names},
     }
 
 
 def median_of(runs: list[Record], metric: str) -> Interval | None:
-    """The median of a metric over shapes and seeds with its interval, a failed run as the worst value.
+    """The median of a metric over shapes and seeds with its interval; a failed run counts as the worst value.
 
-    Where it is not known which direction of the metric is better, it is that of the runs that have the metric. None
-    where a run that ended ok lacks it, or no run has it.
+    If neither direction of the metric is better, only runs that have it count. None if a run that ended ok lacks the
+    metric, or no run has it.
     """
-    known = {run_key(run): value for run in runs if (value := measured(run, metric)) is not None}
-    if not known or any(run["status"] == "ok" and run_key(run) not in known for run in runs):
+    values = {run_key(run): value for run in runs if (value := measured(run, metric)) is not None}
+    if not values or any(run["status"] == "ok" and run_key(run) not in values for run in runs):
         return None
     if better_direction(metric) == LOWER:
         return _middle({run_key(run): error(run, metric) for run in runs})
-    if better_direction(metric) == HIGHER:  # that of a run that failed is 0, the least such metrics can be
+    if better_direction(metric) == HIGHER:  # a failed run counts as 0, the lowest value of such metrics
         ended = {run_key(run): run["status"] == "ok" for run in runs}
-        found = _middle({key: -known[key] if ok and known[key] == known[key] else 0.0 for key, ok in ended.items()})
-        return Interval(-found.value, -found.high, -found.low, tuple(-point for point in found.points))
-    return _middle(known) if all(value > -math.inf for value in known.values()) else None
+        negated = {key: -values[key] if ok and values[key] == values[key] else 0.0 for key, ok in ended.items()}
+        interval = _middle(negated)
+        return Interval(-interval.value, -interval.high, -interval.low, tuple(-point for point in interval.points))
+    return _middle(values) if all(value > -math.inf for value in values.values()) else None
 
 
 def _middle(values: dict[RunKey, float]) -> Interval:
@@ -164,7 +166,7 @@ def _middle(values: dict[RunKey, float]) -> Interval:
 
 
 def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | None:
-    """The ratio of medians to those of the first row over the same shapes and seeds; None for that row itself."""
+    """The ratio of medians to those of the first row on the same shapes and seeds; None for the first row itself."""
     mine, theirs = ({run_key(run): error(run, metric) for run in row} for row in (runs, first))
     if not metric or runs is first or set(mine) != set(theirs):
         return None
@@ -172,21 +174,22 @@ def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | N
 
 
 def table_of(sweep: Sweep) -> Result:
-    found, names = lines(sweep), sweep.metrics
+    table_lines, names = lines(sweep), sweep.metrics
     headings = {name: TABLE_METRICS[name] for name in names if name in TABLE_METRICS}
-    headings = headings or {name: Metric(name) for name in names[:MOST_METRICS]}
+    headings = headings or {name: Metric(name) for name in names[:MAX_FALLBACK_METRICS]}
     stress = any(record["config"].get("stress") for record in sweep.runs.records)
-    more = [name for name in names if name not in headings]
-    known = [line[name].known for line in found for name in headings if line[name] is not None]
-    kinds = ["95 % bootstrap intervals over shapes" if any(known) else "", "" if all(known) else f"{FEW}: no interval"]
+    csv_only = [name for name in names if name not in headings]
+    has_interval = [line[name].has_ends for line in table_lines for name in headings if line[name] is not None]
+    kinds = ["95 % bootstrap intervals over shapes" if any(has_interval) else ""]
+    kinds += [] if all(has_interval) else [f"{FEW}: no interval"]
     lead = names[0] if names and names[0] in headings and better_direction(names[0]) else ""
-    places = {_on(lead, dataset): dataset for dataset in sweep.datasets} or {lead: ""}
-    panels = [_panel(found, key, title, headings[lead]) for key, title in places.items()] if lead else []
+    dataset_by_key = {_on(lead, dataset): dataset for dataset in sweep.datasets} or {lead: ""}
+    panels = [_panel(table_lines, key, title, headings[lead]) for key, title in dataset_by_key.items()] if lead else []
     return Result(
         sweep.runs,
         f"Sweep {sweep.name}.",
-        f"Medians over {OVER}; swept over {_listed(sweep)}.",
-        **_answer(sweep, found, lead, headings),
+        f"Medians over {VARYING}; swept over {_listed(sweep)}.",
+        **_answer(sweep, table_lines, lead, headings),
         n=f"{len(sweep.runs.records)} runs" if stress else "",
         interval="; ".join(filter(None, kinds)) if headings else "",
         chart={"panels": panels} if panels else None,
@@ -194,58 +197,59 @@ def table_of(sweep: Sweep) -> Result:
             FAILURE,
             f"Left out: {sweep.missing} that were not run; the same command runs them." if sweep.missing else "",
             UNDIRECTED if any(not better_direction(name) for name in headings) else "",
-            f"The CSV also has {', '.join(more)}." if more else "",
+            f"The CSV also has {', '.join(csv_only)}." if csv_only else "",
             *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),
         ),
-        columns=_columns(sweep, headings, several=any(line["ratio"] is not None for line in found)),
-        lines=found,
+        columns=_columns(sweep, headings, several=any(line["ratio"] is not None for line in table_lines)),
+        lines=table_lines,
     )
 
 
-def _panel(found: list[dict[str, Any]], key: str, title: str, shown: Metric) -> Panel:
-    """A row of the table per line of the panel, with its median and interval along x."""
-    drawn = [
-        series(line["row"], line["preset"], [line[key].times(shown.factor)], [place])
-        for place, line in enumerate(found)
+def _panel(lines: list[dict[str, Any]], key: str, title: str, shown: Metric) -> Panel:
+    """A panel with a row per line: its median and interval along x."""
+    panel_series = [
+        series(line["row"], line["preset"], [line[key].times(shown.factor)], [position])
+        for position, line in enumerate(lines)
         if line[key] is not None
     ]
-    return panel_data(title, shown.label, "", drawn, rows=[line["row"] for line in found])
+    return panel_data(title, shown.label, "", panel_series, rows=[line["row"] for line in lines])
 
 
-def _answer(sweep: Sweep, found: list[dict[str, Any]], lead: str, headings: dict[str, Metric]) -> dict[str, str]:
-    """The question and the verdict on the first metric; empty where there is nothing to choose from."""
-    known = {line["row"]: line[lead] for line in found if lead and line[lead] is not None}
-    if len(known) < 2:
+def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict[str, Metric]) -> dict[str, str]:
+    """The question and the verdict on the first metric; empty with fewer than two rows to compare."""
+    interval_by_row = {line["row"]: line[lead] for line in lines if lead and line[lead] is not None}
+    if len(interval_by_row) < 2:
         return {}
-    shown, most = headings[lead], better_direction(lead) == HIGHER
-    values = {row: shown.factor * one.value for row, one in known.items()}
+    metric, is_higher_better = headings[lead], better_direction(lead) == HIGHER
+    values = {row: metric.factor * interval.value for row, interval in interval_by_row.items()}
     shapes = format.plural(len({records.solid(run) for run in sweep.runs.records}), "shape")
-    verdict = [format.ends(f"Median {shown.label}", values, shapes, most=most)]
-    first = dict[str, str]()
+    verdict = [format.ends(f"Median {metric.label}", values, shapes, most=is_higher_better)]
+    best = dict[str, str]()
     for dataset in sweep.datasets:
-        own = {line["row"]: one.value for line in found if (one := line[_on(lead, dataset)]) is not None}
-        first |= {dataset: (max if most else min)(own, key=lambda row, own=own: own[row])} if own else {}
-    if len({*first.values()}) > 1:
-        verdict.append(f"Best by data set: {', '.join(f'{dataset} {row}' for dataset, row in first.items())}.")
+        intervals = {line["row"]: line[_on(lead, dataset)] for line in lines}
+        medians = {row: interval.value for row, interval in intervals.items() if interval is not None}
+        best |= {dataset: (max if is_higher_better else min)(medians, key=medians.__getitem__)} if medians else {}
+    if len({*best.values()}) > 1:
+        verdict.append(f"Best by data set: {', '.join(f'{dataset} {row}' for dataset, row in best.items())}.")
     return {
-        "question": f"Which has the {'highest' if most else 'lowest'} {shown.label.split(' (')[0]}?",
+        "question": f"Which has the {'highest' if is_higher_better else 'lowest'} {metric.label.split(' (')[0]}?",
         "verdict": " ".join(filter(None, verdict)),
     }
 
 
 def _failed(line: dict[str, Any]) -> str:
-    """How many runs failed, with the interval of their share where there is one; the caption has n once."""
-    count, whole = line["failed"], line["runs"]
-    return counted(count, whole, line["rate"]) if line["rate"].known else f"{count:g} of {whole}"
+    """How many runs failed, with the interval of their fraction if there is one; the caption has n."""
+    count, total = line["failed"], line["runs"]
+    return count_with_interval(count, total, line["rate"]) if line["rate"].has_ends else f"{count:g} of {total}"
 
 
 def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> list[Column]:
     names, first = sweep.metrics, next(iter(headings.values()), Metric(""))
     ratio = Metric(f"{first.label.split(' (')[0]} over the first row's" if several else "")
-    shown = {_on(names[0], one): first._replace(label=f"{one}: {first.label}") for one in sweep.datasets if names}
+    labels = {_on(names[0], dataset): f"{dataset}: {first.label}" for dataset in sweep.datasets if names}
     return [
         text("row", "Run"),
-        *(column for name, metric in shown.items() for column in _estimate(name, metric)),
+        *(column for name, label in labels.items() for column in _estimate(name, first._replace(label=label))),
         *(column for name in names for column in _estimate(name, headings.get(name, Metric("")))),
         *_estimate("ratio", ratio),
         Column("runs"),
@@ -258,34 +262,34 @@ def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> lis
 
 
 def _estimate(key: str, shown: Metric) -> list[Column]:
-    """The columns of an estimate that a line may lack, and of the ends of its interval: in scene units for the CSV."""
+    """The columns of an estimate, which may be None, and of its interval ends; in the CSV in scene units."""
 
     def words(line: dict[str, Any]) -> str:
         if line[key] is None:
             return format.MISSING
-        found = line[key].times(shown.factor)
-        return str(found) if found.known else found.alone()  # the caption has n once
+        scaled = line[key].times(shown.factor)
+        return str(scaled) if scaled.has_ends else scaled.alone()  # the caption has n
 
     heading, value = f"{shown.label}{ARROWS[shown.better]}", lambda line: getattr(line[key], "value", None)
     return [Column(key, heading, value, words=words, better=shown.better), *ends(key, lambda line: line[key])]
 
 
 def _listed(sweep: Sweep) -> str:
-    told = [
-        f"{key} ({', '.join(values) if len(values) <= MOST_VALUES else f'{len(values)} values'})"
+    key_texts = [
+        f"{key} ({', '.join(values) if len(values) <= MAX_LISTED_VALUES else f'{len(values)} values'})"
         for key, values in sweep.swept.items()
     ]
-    return ", ".join(told) or "nothing"
+    return ", ".join(key_texts) or "nothing"
 
 
-def _asked(overrides: list[str]) -> dict[str, str]:
-    """The keys and values of a cell's overrides; a sign that adds a key is no part of it."""
+def _override_values(overrides: list[str]) -> dict[str, str]:
+    """The keys and values of a cell's overrides, without a leading plus sign."""
     pairs = [override.partition("=") for override in overrides if "=" in override]
     return {key.lstrip("+"): value for key, _, value in pairs}
 
 
-def _apart(record: Record) -> RunKey:
-    """What a row is averaged over: shape, view and seed; a stress is no shape."""
+def _average_key(record: Record) -> RunKey:
+    """What a row is averaged over: shape, view and seed. A stress is not part of the shape."""
     solid, view, seed = run_key(record)
     return (solid[1] if record["config"].get("stress") else solid, view, seed)
 

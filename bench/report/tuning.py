@@ -1,6 +1,6 @@
-"""The runs of the tuning: errors of methods' drawn settings on validation shapes, and the best of them.
+"""The tuning: errors of the drawn settings of each method on validation shapes, and the best draw.
 
-All methods are read on the same draws, shapes and seeds: those of which every method has a run that ended.
+All methods are compared on the same draws, shapes and seeds: those for which every method has a finished run.
 """
 
 from dataclasses import dataclass, replace
@@ -12,16 +12,16 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import NEUTRAL_KEYS
 from bench.report.data.kept import UNFINISHED
-from bench.report.data.records import SCALE, Record, RunKey, error, grouped, run_key
+from bench.report.data.records import CHAMFER_SCALE, Record, RunKey, error, grouped, run_key
 from bench.report.data.runs import Runs, Selection
 
 TUNING = Selection("tuning", ("split",))
-PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")  # validation shapes alone
+PHOTOGRAPHS = replace(TUNING, experiment="tuning_photographs")  # it has validation shapes only
 CHAMFER = "chamfer_l2"
-ERRORS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # that draws are chosen by, where it is not the usual one
-SPACE, TUNED = "space/", "tuned/"  # before the names of methods whose settings are drawn; of those written for them
+SELECTION_METRICS = {PHOTOGRAPHS.experiment: "seen_chamfer_l1"}  # other experiments choose draws by CHAMFER
+SPACE_PREFIX, TUNED_PREFIX = "space/", "tuned/"  # methods whose settings are drawn; methods with tuned settings
 VALIDATION = "validation"
-OTHER = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are no drawn settings
+NOT_DRAWN = ("label", "draw", "dataset", "index", "seed", "split")  # keys of the configuration that are not drawn
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Tuning:
         label: its name for readers.
         draws: the numbers of the draws.
         settings: the drawn settings of each draw, by dotted key.
-        validation: the logarithms [draws, runs] of errors. A run that failed has the largest finite error of any draw
-            of any method on its shape and seed.
+        validation: the logarithms [draws, runs] of errors. A failed run has the largest finite error of any draw of any
+            method on its shape and seed.
         failures: the number of validation runs of each draw that failed.
     """
 
@@ -61,19 +61,18 @@ class Tuning:
 
 
 def unfinished(runs: Runs) -> int:
-    """The number of runs that were planned and have not ended."""
     return sum(record["status"] in UNFINISHED for record in runs.records)
 
 
 def metric_of(runs: Runs) -> str:
     """The error that the draws of an experiment are chosen by."""
-    return ERRORS.get(runs.selection.experiment, CHAMFER)
+    return SELECTION_METRICS.get(runs.selection.experiment, CHAMFER)
 
 
 def tunings(runs: Runs) -> list[Tuning]:
-    """The methods of an experiment, on the draws and the shapes that all of them have; empty where there are none.
+    """The methods of an experiment, on the draws and shapes that all of them have; empty without validation runs.
 
-    Test shapes are not needed; where there are some, a draw has all of them.
+    Test shapes are optional; if there are some, each draw must have all of them.
     """
     ended = [record for record in runs.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
@@ -82,7 +81,7 @@ def tunings(runs: Runs) -> list[Tuning]:
     if cells.empty:
         return []
     cells = cells[cells.groupby(["split", "draw", "run"]).method.transform("nunique") == len(by_method)]
-    places = cells.groupby(["split", "run"]).ngroups  # that a draw needs, of each method
+    places = cells.groupby(["split", "run"]).ngroups  # needed per draw and method
     cells = cells[cells.groupby("draw").draw.transform("size") == places * len(by_method)]
     if VALIDATION not in {*cells.split}:
         return []
@@ -92,40 +91,39 @@ def tunings(runs: Runs) -> list[Tuning]:
 
 
 def left_out(runs: Runs, methods: list[Tuning]) -> list[str]:
-    """A note of the draws that some runs have, and that no method is read on; none where there are none."""
+    """A note on draws that are left out because not all methods have them; empty if there are none."""
     used = {draw for method in methods for draw in method.draws}
     draws = sorted({record["config"]["draw"] for record in runs.records} - used)
     return [f"Left out, since a method or a shape lacks them: draws {', '.join(map(str, draws))}."] if draws else []
 
 
 def _cell(record: Record, keys: list[RunKey], metric: str) -> dict[str, Any]:
-    """A line of the table of runs, with the place of its shape and seed among all."""
+    """A line of the table of runs; `run` is the number of its shape and seed."""
     config, ok = record["config"], record["status"] == "ok"
     return {
         **{"method": record["method"], "split": config["split"], "draw": config["draw"]},
         **{"run": keys.index(run_key(record)), "failed": not ok, "record": record},
-        "error": SCALE * error(record, metric),
+        "error": CHAMFER_SCALE * error(record, metric),
     }
 
 
-def _tuning(own: pd.DataFrame, records: list[Record]) -> Tuning:
-    own = own[own.split == VALIDATION]
-    first = own.groupby("draw").record.first()
-    method, config = own.method.iloc[0].removeprefix(SPACE), first.iloc[0]["config"]
+def _tuning(runs: pd.DataFrame, records: list[Record]) -> Tuning:
+    runs = runs[runs.split == VALIDATION]
+    first = runs.groupby("draw").record.first()
+    method, config = runs.method.iloc[0].removeprefix(SPACE_PREFIX), first.iloc[0]["config"]
     return Tuning(
         method=method,
         label=str(config.get("label") or method),
         draws=first.index.tolist(),
         settings=_settings(first.tolist(), records),
-        validation=own.pivot(index="draw", columns="run", values="error").to_numpy(),
-        failures=own.groupby("draw").failed.sum().to_numpy(),
+        validation=runs.pivot(index="draw", columns="run", values="error").to_numpy(),
+        failures=runs.groupby("draw").failed.sum().to_numpy(),
     )
 
 
 def _settings(records: list[Record], among: list[Record]) -> list[dict[str, Any]]:
-    """The values of some of a method's draws, by dotted key, in which the configurations of any of its draws differ."""
-    every = [flat(record["config"]) for record in among]
-    varies = [name for name in every[0] if len({str(each.get(name)) for each in every}) > 1]
-    names = [name for name in varies if name.partition(".")[0] not in {*OTHER, *NEUTRAL_KEYS}]
-    chosen = [flat(record["config"]) for record in records]
-    return [{name: each[name] for name in names} for each in chosen]
+    """The settings in which the draws `among` differ, by dotted key, for each of `records`."""
+    configs = [flat(record["config"]) for record in among]
+    varies = [name for name in configs[0] if len({str(config.get(name)) for config in configs}) > 1]
+    names = [name for name in varies if name.partition(".")[0] not in {*NOT_DRAWN, *NEUTRAL_KEYS}]
+    return [{name: config[name] for name in names} for config in (flat(record["config"]) for record in records)]

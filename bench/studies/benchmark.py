@@ -96,8 +96,8 @@ def _ratio(cost: str) -> table.Column:
 
 
 COLUMNS = (
-    table.Column("size", "Size", show=table.whole),
-    table.Column("threads", "Threads", show=table.whole),
+    table.Column("size", "Size", show=table.integer),
+    table.Column("threads", "Threads", show=table.integer),
     table.text("renderer", "Renderer"),
     *(*map(table.text, ("status", "reason", "folder")), table.Column("rounds")),
     table.Column(
@@ -112,10 +112,12 @@ COLUMNS = (
     table.Column("peak_memory_bytes"),
     table.Column("work_over_bound", "Work over bound"),
     *map(table.Column, ("rays", "hits", "lost", "false", "wrong")),
-    table.shown("Missed / spurious / wrong depth", table.together(dict.get, table.whole, "lost", "false", "wrong")),
+    table.shown(
+        "Missed / spurious / wrong depth", table.joined_cell(dict.get, table.integer, "lost", "false", "wrong")
+    ),
     *map(table.Column, ("depth_error_median", "depth_error_p99", "depth_error_max")),
     table.shown(
-        "Depth error median / p99", table.together(dict.get, format.number, "depth_error_median", "depth_error_p99")
+        "Depth error median / p99", table.joined_cell(dict.get, format.number, "depth_error_median", "depth_error_p99")
     ),
 )
 

@@ -245,7 +245,7 @@ def _line(claim: Claim, runs: Runs | None) -> dict[str, Any]:
 
 def ratio_of(claim: Claim, runs: Runs) -> statistics.Interval | None:
     """The median over shapes of the ratio of a claim's two rows; None without a common shape."""
-    runs = runs.made
+    runs = runs.executed
     frame = runs.frame[[*SHAPE, "preset"]].assign(error=runs.error(claim.metric, 1))
     sides = []
     bottom_settings = claim.top_settings if claim.bottom_settings is None else claim.bottom_settings
@@ -277,7 +277,7 @@ def _as_number(text: str) -> float | str:
 def verdict_of(claim: Claim, ratio: statistics.Interval) -> str:
     """The verdict of a measured ratio on a claim, by the rules in `NOTES`."""
     least, most = claim.expected
-    if not ratio.known:
+    if not ratio.has_ends:
         as_claimed = least <= ratio.value <= most
         return f"{'as claimed' if as_claimed else 'against the claim'}, {format.plural(len(ratio.points), 'shape')}"
     if ratio.low > most:

@@ -4,7 +4,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.data.records import SHAPENET, Record, Row, by_shape, error, grouped, median_of_known, row_of, setting
+from bench.report.data.records import SHAPENET, Record, Row, by_shape, error, grouped, median_or_none, row_of, setting
 from bench.report.data.statistics import typical
 from bench.report.study import Result, Runs, Selection, compare, format, gallery, medians, table
 
@@ -75,13 +75,13 @@ def make(runs: Runs) -> Result:
 
 def _lines_of(runs: Runs, family: str) -> list[dict[str, Any]]:
     """A line per row of one family; under each preset of `BASELINES`, the ratio to its row."""
-    runs = runs.where(runs.frame.family == family).made
+    runs = runs.where(runs.frame.family == family).executed
     errors = {row: medians.errors_of(records, "chamfer_l1") for row, records in runs.rows().items()}
     baselines = {row: values for row, values in errors.items() if row.preset in BASELINES}
     return [
         line
         | {"family": family, "interval": typical(by_shape(errors[row]))}
-        | {"training": median_of_known(setting(record, "seconds", "training") for record in records)}
+        | {"training": median_or_none(setting(record, "seconds", "training") for record in records)}
         | {base.preset: medians.paired_ratio(errors[row], values) for base, values in baselines.items() if base != row}
         for line, (row, records) in zip(medians.medians(runs, MEDIANS), runs.rows().items(), strict=True)
     ]
@@ -108,7 +108,7 @@ def draw(runs: Runs) -> Figure:
 
 def figures(runs: Runs) -> Result:
     """A line for a success and a failure of each family."""
-    runs = runs.made
+    runs = runs.executed
     rows, by_scene = list(runs.rows()), grouped(runs.records, medians.scene_of)
     shown = {scene: end for group in runs.families().values() for scene, end in _ends(group, rows[0]).items()}
     scenes = {name: gallery.Scene(runs, by_scene[name], (*IMAGES, "normals", "hit")) for name in shown}
@@ -121,7 +121,7 @@ def figures(runs: Runs) -> Result:
         remarks=(
             "The encoder sees only the given image. Normals (right, up, towards the camera as red, green, blue) are "
             "seen by the camera of another image, which is no input of any row.",
-            *gallery.missing(scenes.values()),
+            *gallery.missing_notes(scenes.values()),
         ),
         run_columns=PICTURE_COLUMNS,
         figure=gallery.draw([gallery.Block("", [*IMAGES.values(), *(row.name for row in rows)], lines)]),
@@ -130,7 +130,7 @@ def figures(runs: Runs) -> Result:
 
 def _line(rows: list[Row], records: list[Record], scene: gallery.Scene) -> list[gallery.Cell]:
     record_by_row = {row_of(record): record for record in reversed(records)}  # the first of several trainings
-    images = [scene.whole(records, name) for name in IMAGES]
+    images = [scene.full_picture(records, name) for name in IMAGES]
     return [*images, *(scene.cell(record_by_row.get(row), gallery.normals()) for row in rows)]
 
 

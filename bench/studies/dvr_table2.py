@@ -6,9 +6,9 @@ from typing import Any
 import pandas as pd
 
 from bench.records.metrics import DVR_TABLE2
-from bench.report.data.records import SCALE, Record, Row, grouped, row_of, setting, shared_settings
+from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting, shared_settings
 from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
-from bench.report.tuning import TUNED
+from bench.report.tuning import TUNED_PREFIX
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
@@ -52,8 +52,8 @@ PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN_ERROR, "ps
 
 CURVE_COLUMNS = (
     table.text("method", "Method"),
-    table.Column("iterations", "Iterations", show=table.whole),
-    table.Column("at", "Checkpoint nearest to half", show=table.whole),
+    table.Column("iterations", "Iterations", show=table.integer),
+    table.Column("at", "Checkpoint nearest to half", show=table.integer),
     table.Column("half", "Error at this checkpoint", show=table.thousandfold),
     table.Column("end", "Error at the end", show=table.thousandfold),
     table.Column("fell", "Decrease", show=table.percent),
@@ -71,12 +71,12 @@ def make(runs: Runs) -> Result:
     """A line per row, and the published ones."""
     lines, scenes = sorted(medians.medians(runs, NAMES), key=_error), _scenes(runs)
     published = [
-        {"method": f"published: {name}", **dict(zip(NAMES, (value / SCALE for value in values), strict=False))}
+        {"method": f"published: {name}", **dict(zip(NAMES, (value / CHAMFER_SCALE for value in values), strict=False))}
         for name, values in DVR_TABLE2.items()
     ]
     optimised = [record for record in runs.records if setting(record["config"], "task", "optimiser")]
     panels = {
-        f"{SEEN_LABEL} (scene units)": SCALE * medians.scored(runs, SEEN_ERROR),
+        f"{SEEN_LABEL} (scene units)": CHAMFER_SCALE * medians.scored(runs, SEEN_ERROR),
         **medians.cost(runs),
     }
     return Result(
@@ -87,7 +87,9 @@ def make(runs: Runs) -> Result:
         question="Which method best reconstructs shape and colour from photographs?",
         verdict=format.ends(
             "Median Chamfer-L1 × 1000 of the seen surface, for methods that use no depth",
-            medians.whole([line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR),
+            medians.comparable_medians(
+                [line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR
+            ),
             scenes,
             show=table.thousandfold,
         ),
@@ -106,7 +108,9 @@ def _error(line: dict[str, Any]) -> float:
 
 def _distinct(runs: Runs) -> dict[Row, list[Record]]:
     """The rows except `LOOKALIKES`; all rows if nothing else is left."""
-    distinct = {row: group for row, group in runs.rows().items() if row.preset.removeprefix(TUNED) not in LOOKALIKES}
+    distinct = {
+        row: group for row, group in runs.rows().items() if row.preset.removeprefix(TUNED_PREFIX) not in LOOKALIKES
+    }
     return distinct or runs.rows()
 
 
@@ -128,14 +132,15 @@ def _photograph_settings(runs: Runs) -> str:
 
 def convergence(runs: Runs) -> Result:
     """The error on the seen surface over the iterations, median over scenes; a level for rows without iterations."""
-    runs = runs.made
+    runs = runs.executed
     ends = {Row(line["preset"], line["method"]): line[SEEN_ERROR] for line in medians.medians(runs, (SEEN_ERROR,))}
     curves_by_row = {row: _error_curve(runs, records, ends[row]) for row, records in runs.rows().items()}
     longest = max(curve.index[-1] for curve in curves_by_row.values())
     levels = {row: pd.Series([curve[0]] * 2, [1, longest]) for row, curve in curves_by_row.items() if 0 in curve}
     shown = curves_by_row | levels
     drawn = [
-        chart.curve(row.name, row.preset, shown[row].index, style.finite(SCALE * shown[row])) for row in _distinct(runs)
+        chart.curve(row.name, row.preset, shown[row].index, style.finite(CHAMFER_SCALE * shown[row]))
+        for row in _distinct(runs)
     ]
     lines = [_fall(row, curve) for row, curve in curves_by_row.items() if row not in levels]
     return Result(
@@ -204,7 +209,7 @@ def figures(runs: Runs) -> Result:
         remarks=(
             "Mesh rows have the colours of the photographs that show a vertex. Other rows have the colours of a field.",
             "The figure shows one of several rows with similar results. The run folder of each run has summary.png.",
-            *gallery.missing(scenes.values()),
+            *gallery.missing_notes(scenes.values()),
         ),
         run_columns=PICTURE_COLUMNS,
         figure=gallery.draw(blocks),

@@ -24,18 +24,18 @@ NOTES = (
 
 def make(runs: Runs) -> Result:
     """A line per family, method and value of a condition."""
-    lines = conditions.lines_of(runs.made.records, CONDITIONS)
+    lines = conditions.lines_of(runs.executed.records, CONDITIONS)
     return Result(
         runs,
         "Shape from many views under other focal lengths and initial codes.",
-        f"{conditions.BELOW[0].upper()}{conditions.BELOW[1:]}; in the figure, the median ratio to the error of "
-        "the same shape at 1.",
+        f"{conditions.ERROR_TEXT[0].upper()}{conditions.ERROR_TEXT[1:]}; in the figure, the median ratio to the error of the "
+        "same shape at 1.",
         question="Does another focal length or initial code change the reconstructed shape?",
-        verdict=_verdict(runs.made),
+        verdict=_verdict(runs.executed),
         interval=conditions.INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
-        columns=(*conditions.NAMED, *conditions.MEDIAN),
+        columns=(*conditions.NAME_COLUMNS, *conditions.MEDIAN_COLUMNS),
         lines=lines,
         run_columns=conditions.run_columns(CONDITIONS),
         figure=draw(lines),
@@ -57,7 +57,7 @@ def _ratios(lines: Sequence[dict[str, Any]]) -> dict[float, statistics.Interval]
     """For each value of a condition, the ratio of a method's errors to its errors on the same shapes at value 1."""
     errors = {
         value: medians.errors_of((run for line in value_lines for run in line["runs"]), records.ONE_WAY)
-        for value, value_lines in sorted(records.grouped(lines, lambda line: line["at"]).items())
+        for value, value_lines in sorted(records.grouped(lines, lambda line: line["value"]).items())
     }
     ratios = {value: medians.paired_ratio(value_lines, errors.get(1.0, {})) for value, value_lines in errors.items()}
     return {value: ratio for value, ratio in ratios.items() if ratio}

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from bench.report.data.records import ONE_WAY, SCALE, Record, error, family, grouped, row_of, setting, solid
+from bench.report.data.records import CHAMFER_SCALE, ONE_WAY, Record, error, family, grouped, row_of, setting, solid
 from bench.report.study import Result, Runs, Selection, conditions, format, gallery, statistics, table
 
 PLACE = 55
@@ -29,27 +29,39 @@ UNITS = {"shift": "shifted by {:g}", "degrees": "turned by {:g}°", "scale": "{:
 
 def is_place_known(record: Record) -> bool:
     """Whether a run began in place, and optimised no similarity."""
-    return not setting(record["config"], "task", "similarity") and all(c.of(record) == c.neutral for c in CONDITIONS)
+    return not setting(record["config"], "task", "similarity") and all(
+        c.value_of(record) == c.neutral for c in CONDITIONS
+    )
 
 
 def make(runs: Runs) -> Result:
     """A line per family, method and value of a condition."""
-    lines = conditions.lines_of([record for record in runs.made.records if not is_place_known(record)], CONDITIONS)
+    lines = conditions.lines_of([record for record in runs.executed.records if not is_place_known(record)], CONDITIONS)
     records_by_row = grouped(filter(is_place_known, runs.records), lambda record: (family(record), row_of(record)))
     lines_of_known = [
-        {"family": name, "method": row.name, "condition": PLACE_KNOWN, "runs": group, "error": conditions.middle(group)}
+        {
+            "family": name,
+            "method": row.name,
+            "condition": PLACE_KNOWN,
+            "runs": group,
+            "error": conditions.median_error(group),
+        }
         for (name, row), group in records_by_row.items()
     ]
     return Result(
         runs,
         "Shape from many views, misplaced at the start.",
-        f"Successful runs, and {conditions.BELOW}, over the initial displacement.",
+        f"Successful runs, and {conditions.ERROR_TEXT}, over the initial displacement.",
         question="Is a shape reconstructed if its initial position, rotation or size is wrong?",
         verdict=_verdict(runs),
         interval=conditions.INTERVALS,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
-        columns=(*conditions.NAMED, table.shown("Success", lambda line: _successes(line["runs"])), *conditions.MEDIAN),
+        columns=(
+            *conditions.NAME_COLUMNS,
+            table.shown("Success", lambda line: _successes(line["runs"])),
+            *conditions.MEDIAN_COLUMNS,
+        ),
         lines=lines + lines_of_known,
         run_columns=RUNS,
         figure=conditions.draw(lines, CONDITIONS, MAX_ERROR) if lines else None,
@@ -57,18 +69,20 @@ def make(runs: Runs) -> Result:
 
 
 def _succeeded(record: Record) -> bool:
-    return record["status"] == "ok" and SCALE * error(record, ONE_WAY) < MAX_ERROR
+    return record["status"] == "ok" and CHAMFER_SCALE * error(record, ONE_WAY) < MAX_ERROR
 
 
 def _successes(records: Sequence[Record]) -> str:
     by_shape = [[_succeeded(run) for run in runs] for runs in grouped(records, solid).values()]
     successes = list(map(sum, by_shape))
-    return table.counted(sum(successes), len(records), statistics.share(successes, list(map(len, by_shape))))
+    return table.count_with_interval(
+        sum(successes), len(records), statistics.share(successes, list(map(len, by_shape)))
+    )
 
 
 def _verdict(runs: Runs) -> str:
     """The fraction of successes of each row, over the runs that did not begin in place."""
-    misplaced = [record for record in runs.records if any(c.of(record) != c.neutral for c in CONDITIONS)]
+    misplaced = [record for record in runs.records if any(c.value_of(record) != c.neutral for c in CONDITIONS)]
     shares = {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(misplaced, row_of).items()}
     shapes = format.plural(len({solid(record) for record in misplaced}), "shape")
     return format.ends(
@@ -85,10 +99,10 @@ def pictures(runs: Runs) -> Result:
         "Shapes from many views, misplaced at the start, in pictures.",
         "The first shape of each family: its initial shape and the result of each row, over the initial displacement.",
         remarks=(
-            f"{gallery.JUDGED}, seen from the side of the first photograph.",
+            f"{gallery.NORMALS_PHRASE}, seen from the side of the first photograph.",
             "Start: the misplaced shape of the random code. At “known place”, no similarity transform is optimised.",
             "DIST, Fig. 24, shows photographs of real chairs with the results of PMO. These shapes are synthetic.",
-            *gallery.missing(scenes.values()),
+            *gallery.missing_notes(scenes.values()),
         ),
         run_columns=RUNS,
         figure=gallery.draw([_block(name, records, scenes[name]) for name, records in first.families().items()]),
@@ -98,16 +112,16 @@ def pictures(runs: Runs) -> Result:
 def _block(name: str, records: list[Record], scene: gallery.Scene) -> gallery.Block:
     by_start = dict(sorted(grouped(records, _start).items()))
     starts = [scene.shared(group, gallery.normals(gallery.START)) for group in by_start.values()]
-    rows: dict[str, Any] = {"start": [*starts, scene.shared(records, gallery.normals(gallery.TRUE))]}
+    rows: dict[str, Any] = {"start": [*starts, scene.shared(records, gallery.normals(gallery.GROUND_TRUTH))]}
     for row, row_records in grouped(records, row_of).items():
         record_of = {_start(record): record for record in row_records}
-        rows[row.name] = [scene.cell(record_of.get(start), gallery.normals(gallery.FOUND)) for start in by_start]
+        rows[row.name] = [scene.cell(record_of.get(start), gallery.normals(gallery.PREDICTED)) for start in by_start]
     return gallery.Block(name, [*map(_heading, by_start), "truth"], rows)
 
 
 def _start(record: Record) -> tuple[float, ...]:
     """The displacement of a run's start in each condition, and whether its place is known."""
-    return (*(c.of(record) - c.neutral for c in CONDITIONS), is_place_known(record))
+    return (*(c.value_of(record) - c.neutral for c in CONDITIONS), is_place_known(record))
 
 
 def _heading(start: tuple[float, ...]) -> str:

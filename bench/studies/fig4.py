@@ -11,7 +11,7 @@ NOTES = (
 MAX_COLUMNS = 5
 COLUMNS = (  # a line is a record and the counts of its picture
     *table.through(lambda line: line[0], *table.IDENTITY),
-    *table.through(lambda line: line[1], *map(table.Column, gallery.COUNTED)),
+    *table.through(lambda line: line[1], *map(table.Column, gallery.COUNT_KEYS)),
     *table.through(lambda line: line[0], table.metric("depth_error_median")),
 )
 
@@ -19,7 +19,7 @@ COLUMNS = (  # a line is a record and the counts of its picture
 def make(runs: Runs) -> Result:
     """The reference and a column per row; rows without pictures keep their place."""
     chosen = runs.of_newest_scene()
-    comparison = gallery.compared(chosen, MAX_COLUMNS)
+    comparison = gallery.compare_with_reference(chosen, MAX_COLUMNS)
     data = table.to_data(COLUMNS, zip(chosen.records, comparison.counts, strict=True))
     wrong = dict(zip(chosen.names(), (data["lost"] + data["false"]).astype(float), strict=True))
     return Result(
@@ -28,7 +28,7 @@ def make(runs: Runs) -> Result:
         "Above, normals (right, up, towards the camera as red, green, blue); below, their angle to the normals of the "
         "reference.",
         question="Which pixels does each strategy get wrong?",
-        verdict=format.ends("Missed and spurious pixels", wrong, "one shape", show=table.whole),
+        verdict=format.ends("Missed and spurious pixels", wrong, "one shape", show=table.integer),
         remarks=(*comparison.missing, *NOTES),
         data=data,
         figure=gallery.draw(comparison.blocks, largest=comparison.largest),

@@ -8,16 +8,16 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.data.records import SCALE, Row, grouped, median_of_known, setting
+from bench.report.data.records import CHAMFER_SCALE, Row, grouped, median_or_none, setting
 from bench.report.data.runs import shared_loss
 from bench.report.study import Result, Runs, Selection, chart, curves, format, style, table
 
 PLACE = 220
 READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
-QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", SCALE)}
+QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", CHAMFER_SCALE)}
 TIME_AXES = {"iteration": "iteration", "seconds": "time (seconds)"}
 COLUMNS = (
-    *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.whole)),
+    *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.integer)),
     *(
         table.Column(key, heading, show=table.thousandfold)
         for key, heading in (("end", "End"), ("low", "Smallest"), ("high", "Largest"))
@@ -46,7 +46,7 @@ def make(runs: Runs) -> Result:
         medians[row] = {name: curves.median(row_curves, failed, name) for name in QUANTITIES}
         # A correlation per run, because losses of different shapes cannot be compared.
         rhos = [curves.spearman(curve.dropna(subset=[*QUANTITIES]), *QUANTITIES) for curve in row_curves]
-        correlation = {"spearman": median_of_known(rhos), "n": len(rhos) - rhos.count(None)}
+        correlation = {"spearman": median_or_none(rhos), "n": len(rhos) - rhos.count(None)}
         seconds = medians[row]["chamfer_l2"]["seconds"]
         identity = {"row": row.name, "runs": len(records), "seconds": seconds.iloc[-1] if len(seconds) else None}
         lines.append({**identity, **_end_errors(row_curves, failed), **correlation})

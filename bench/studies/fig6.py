@@ -31,7 +31,7 @@ RUNS = (
 
 def make(runs: Runs) -> Result:
     """A line per method: its success rate at each angle, and its costs."""
-    poses = _poses(runs.made)
+    poses = _poses(runs.executed)
     rows = dict(list(poses.groupby(["row", "preset"], sort=False)))
     angles = sorted(poses.degrees.unique())
     settings = records.setting(runs.requested(), "task") or {}
@@ -92,7 +92,7 @@ def _rate(poses: pd.DataFrame) -> statistics.Interval:
 
 
 def _share(poses: pd.DataFrame | None) -> str:
-    return "" if poses is None else table.counted(float(poses.success.sum()), len(poses), _rate(poses))
+    return "" if poses is None else table.count_with_interval(float(poses.success.sum()), len(poses), _rate(poses))
 
 
 def draw(rows: dict[tuple[str, str], pd.DataFrame]) -> Figure:

@@ -20,7 +20,7 @@ def make(runs: Runs) -> Result:
     """A column of pictures and a line per epsilon, the largest first."""
     chosen = runs.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
-    comparison = gallery.compared(chosen, MAX_COLUMNS)
+    comparison = gallery.compare_with_reference(chosen, MAX_COLUMNS)
     lines = [(record, _counts(record, shown)) for record, shown in zip(chosen.records, comparison.counts, strict=True)]
     return Result(
         chosen,
@@ -68,7 +68,7 @@ def _epsilon(record: records.Record) -> float | None:
 COLUMNS = (  # a line is a record and its counts
     table.shown("Renderer", lambda line: line[0]["renderer"]),
     *table.through(lambda line: line[0], *table.IDENTITY, table.Column("epsilon", "Epsilon", _epsilon)),
-    *table.through(lambda line: line[1], *map(table.Column, gallery.COUNTED)),
+    *table.through(lambda line: line[1], *map(table.Column, gallery.COUNT_KEYS)),
     *table.through(
         lambda line: line[1],
         table.Column("lost_share", "Missed", show=table.small_percent),

@@ -30,7 +30,7 @@ def _name(record: records.Record) -> str:
 
 COLUMNS = (
     table.text("shape", "Shape", _name),
-    *(table.metric(key, DEFINED[key], table.whole) for key in SIZES),
+    *(table.metric(key, DEFINED[key], table.integer) for key in SIZES),
     table.metric("colour_error", DEFINED["colour_error"]),
     table.metric("chamfer_l2", "Chamfer-L2 × 1000", table.thousandfold),
 )
@@ -55,7 +55,7 @@ def make(runs: Runs) -> Result:
             "A “code of the image” is optimised from the colours and the mask of the given image, without depth.",
             f"Lights: colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
             *records.definitions(runs.records, DEFINED),
-            *gallery.missing(scenes.values()),
+            *gallery.missing_notes(scenes.values()),
         ),
         columns=COLUMNS,
         lines=runs.records,
@@ -75,7 +75,7 @@ def _arrays(record: records.Record) -> list[str]:
 
 
 def _block(scene: gallery.Scene, record: records.Record) -> gallery.Block:
-    first, rows = {"": scene.whole([record], "photograph")}, {}
+    first, rows = {"": scene.full_picture([record], "photograph")}, {}
     for prefix, kind in _kinds(record).items():
         paints = [gallery.colours(prefix + side) for side in SIDES.values()]
         paints += [_lit(prefix + SIDES["full size"], light) for light in LIGHTS.values()]
@@ -87,7 +87,7 @@ def _lit(prefix: str, light: tuple[float, float, float]) -> gallery.Paint:
     def paint(arrays: gallery.Arrays) -> list[np.ndarray]:
         colours, normals, hit = (arrays[prefix + name] for name in ("colours", "normals", "hit"))
         cosine = (normals @ light / np.linalg.norm(light)).clip(0)[..., None]
-        return [gallery.coloured(colours * (AMBIENT + (1 - AMBIENT) * cosine), hit)]
+        return [gallery.on_white(colours * (AMBIENT + (1 - AMBIENT) * cosine), hit)]
 
     return paint
 

@@ -170,7 +170,7 @@ def _cosine(value: float | None) -> str:
 
 
 def _column(name: str) -> table.Column:
-    show = table.whole if name in COUNTS else _cosine if name.endswith("cosine") else format.number
+    show = table.integer if name in COUNTS else _cosine if name.endswith("cosine") else format.number
     return table.Column(name, name.replace("_", " ").capitalize(), show=show)
 
 

@@ -36,7 +36,9 @@ def make(runs: Runs) -> Result:
         "Agreement of shape and colours with held-out photographs, medians over folders; the figure has a point per "
         "folder and the median.",
         question="Which method is best on real photographs?",
-        verdict=format.ends("PSNR of held-out photographs (dB)", medians.whole(lines, "psnr"), folders, most=True),
+        verdict=format.ends(
+            "PSNR of held-out photographs (dB)", medians.comparable_medians(lines, "psnr"), folders, most=True
+        ),
         remarks=records.definitions(runs.records, DEFINED),
         columns=(table.text("method", "Method"), *truth_columns, *COLUMNS),
         lines=lines,

@@ -35,7 +35,7 @@ Line = dict[str, Any]
 
 def make(runs: Runs) -> Result:
     """A line per row."""
-    counted = runs.made
+    counted = runs.executed
     pairs = {metric: _pairs(counted, metric) for metric in METRICS}
     lines = [_line(row.name, counted, pairs) for row in runs.rows()]
     scans = len(pairs["chamfer_l2"].groupby(["family", "solid", "seed"]))

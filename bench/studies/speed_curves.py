@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from bench.report.data.records import SCALE, Record, base_renderer, family, index, median_of_known
+from bench.report.data.records import CHAMFER_SCALE, Record, base_renderer, family, index, median_or_none
 from bench.report.study import Result, Runs, Selection, chart, curves, format, statistics, table
 
 PLACE = 90
@@ -15,8 +15,8 @@ COST_AXES = {"seconds": "time (seconds)", "value_evaluations": "field evaluation
 ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
     "The figure has a curve per run of the first setting of each renderer, up to the end of the run.",
-    f"The table has all settings, the number of runs that reached {SCALE * TARGET_ERROR:g} × 10⁻³, and the median time "
-    "to this error. A run that failed or never reached it counts as infinite.",
+    f"The table has all settings, the number of runs that reached {CHAMFER_SCALE * TARGET_ERROR:g} × 10⁻³, and the median "
+    "time to this error. A run that failed or never reached it counts as infinite.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (
@@ -57,20 +57,20 @@ def _line(runs: Runs, records: list[Record]) -> Line:
     return {
         **{"renderer": base_renderer(records[0]), "records": records, "histories": histories},
         **{"runs": len(times), "reached": sum(map(math.isfinite, times)), "time": float(statistics.median(times))},
-        "rank": median_of_known(curves.spearman(history.dropna()) for history in histories),
+        "rank": median_or_none(curves.spearman(history.dropna()) for history in histories),
     }
 
 
 def time_to(history: pd.DataFrame, record: Record) -> float:
     """The seconds at a run's first checkpoint at the target; infinite if it failed or did not reach the target."""
-    below = history[history["error"] <= SCALE * TARGET_ERROR]
+    below = history[history["error"] <= CHAMFER_SCALE * TARGET_ERROR]
     return float(below["seconds"].iloc[0]) if record["status"] == "ok" and len(below) else math.inf
 
 
 def _verdict(lines: list[Line]) -> str:
     """The times of the settings that reach the target in most runs."""
     reached = {line["setting"]: line["time"] for line in lines if math.isfinite(line["time"])}
-    title = f"Median time to an error of {SCALE * TARGET_ERROR:g} (Chamfer × 1000)"
+    title = f"Median time to an error of {CHAMFER_SCALE * TARGET_ERROR:g} (Chamfer × 1000)"
     n = min(line["runs"] for line in lines)
     runs = f"{n} runs per setting; {len(reached)} of {len(lines)} settings reach it in most runs"
     return format.ends(title, reached, runs, show=format.seconds)

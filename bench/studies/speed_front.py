@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table, together
+from bench.report.study import Result, Runs, Selection, chart, format, merge_runs, records, statistics, style, table
 from bench.report.write.caption import undefined
 
 PLACE = 80
@@ -56,7 +56,7 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
     renderer_columns = dict.fromkeys(key for line in lines for key in line if key.startswith("renderer."))
     drawn = [_panel(trial, panel) for trial, panel in panels.items()]
     return Result(
-        together(completion, rendering),
+        merge_runs(completion, rendering),
         "Error over time.",
         "Median error of each setting over its median time; medians over {shapes and seeds}.",
         question="How much time does accuracy cost?",
@@ -107,7 +107,7 @@ def _cells(runs: Runs, trial: Trial, keys: list[records.RunKey]) -> pd.DataFrame
     values, *coarse_values = map(runs.number, trial.values)
     quantities = {
         "seconds": runs.number(trial.seconds),
-        "error": runs.error(trial.error).clip(lower=records.SCALE * MIN_PLOTTED_ERROR),
+        "error": runs.error(trial.error).clip(lower=records.CHAMFER_SCALE * MIN_PLOTTED_ERROR),
         "evaluations": values + sum(counts.fillna(0) for counts in coarse_values),
     }
     cells = pd.DataFrame(quantities)
@@ -173,7 +173,7 @@ def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
         look = {"text": [*map(_hover, settings)], "link": links, "size": 11}
         look |= {"hollow": True} if dominated else {}
         drawn.append(chart.series(renderer, renderer, *([p[key] for p in settings] for key in axes), **look))
-    line = {"colour": chart.GREY, "symbol": "", "dash": "-", "step": True, "quiet": True}
+    line = {"colour": chart.REFERENCE_COLOUR, "symbol": "", "dash": "-", "step": True, "quiet": True}
     drawn.append(chart.series("front", "", *([p[key] for p in _front(panel)] for key in axes), **line))
     return chart.panel_data(trial.title, "time (seconds)", trial.heading, drawn, height=440)
 

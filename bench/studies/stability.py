@@ -77,7 +77,7 @@ def make(runs: Runs) -> Result:
             "Axes (kinds of stress) on which a renderer does not break",
             cells.groupby("row", sort=False)["never"].sum().to_dict(),
             f"{trials:.0f} trials on {len(axes)} axes",
-            show=table.whole,
+            show=table.integer,
             most=True,
         ),
         n=f"{trials:.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
@@ -301,9 +301,9 @@ def _ranked(runs: Runs) -> list[str]:
 def _alike(ranks: dict[str, statistics.Interval]) -> str:
     """A sentence on the rows that cannot be distinguished from the best rank; empty without intervals."""
     best = min(ranks, key=lambda row: ranks[row].value)
-    if not ranks[best].known:
+    if not ranks[best].has_ends:
         return ""
-    similar = statistics.as_good(ranks, best)
+    similar = statistics.tied_with_best(ranks, best)
     if not similar:
         return f"All others can be distinguished from {best}."
     listed = f"*{len(similar)}* of the {len(ranks) - 1} others ({'; '.join(similar)})"

@@ -7,16 +7,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.report.study import Result, Runs, Selection, chart, format, table, together
+from bench.report.study import Result, Runs, Selection, chart, format, merge_runs, table
 from bench.report.suite import standing
-from bench.report.suite.attempts import EXPERIMENT, GIVEN, gather, place, suite
+from bench.report.suite.attempts import EXPERIMENT_PREFIX, PROBLEM_SETTINGS, attempts_folder, gather, suite
 from bench.report.suite.standing import ALPHA, AREA, AT_1, AT_10, AT_SECONDS, BUDGETS, END, OUTCOMES, Ranking, Standing
 from bench.report.write import paper
 from bench.report.write.table import percent
 
 PLACE = 1
-KEEPS = place
-READS = tuple(Selection(f"{EXPERIMENT}{name}", tuple(key for key, _ in GIVEN.values())) for name in suite().errors)
+KEEPS = attempts_folder
+READS = tuple(
+    Selection(f"{EXPERIMENT_PREFIX}{name}", tuple(key for key, _ in PROBLEM_SETTINGS.values()))
+    for name in suite().errors
+)
 HEADINGS = {
     AT_1: "At 1 ×",
     AT_10: "At 10 ×",
@@ -44,7 +47,7 @@ WRONG_PIXELS = (
 
 def make(*several: Runs | None) -> Result:
     """Charts of all sets together and of each set, and a line per row."""
-    runs = together(*several)
+    runs = merge_runs(*several)
     gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
     made = Standing(gathered)
     panels = [_panel(made, name) for name in (None, *made.sets)]
@@ -77,10 +80,10 @@ def make(*several: Runs | None) -> Result:
 
 def make_sets(*several: Runs | None) -> Result:
     """A line per set and row, with the cost of a whole run relative to DIST's; also for tuned rows."""
-    runs = together(*several)
+    runs = merge_runs(*several)
     made = Standing(gather(paper.SHIPPED, runs.results_dir, runs.records))
-    reached = made.reached[made.reached["whole"] | made.reached["tuned"]]
-    pairs, groups = standing.timed(made.whole, made.everything), reached.groupby(["set", "row"])
+    reached = made.reached[made.reached["complete"] | made.reached["tuned"]]
+    pairs, groups = standing.timed(made.complete, made.everything), reached.groupby(["set", "row"])
     lines = groups[[*BUDGETS]].mean().join(groups["preset"].first()).join(standing.costs(reached, pairs))
     lines = lines.join(pairs.groupby(["set", "row"])[AT_SECONDS].mean())
     for of_set, name in ((of_set, name) for of_set in made.sets for name in (*BUDGETS, AT_SECONDS)):
@@ -117,7 +120,7 @@ def make_sets(*several: Runs | None) -> Result:
             *(table.Column(name, HEADINGS[name], show=percent) for name in (*BUDGETS, AT_SECONDS)),
             *table.estimate("evaluations", "Field evaluations of a run, DIST = 1", ends="evaluations_"),
             *table.estimate("seconds", "Runtime of a run, DIST = 1", ends="seconds_"),
-            *(table.Column("scenes", "Scenes", show=table.whole), table.PRESET),
+            *(table.Column("scenes", "Scenes", show=table.integer), table.PRESET),
         ],
         lines=lines.to_dict("records"),
     )
@@ -126,7 +129,7 @@ def make_sets(*several: Runs | None) -> Result:
 def _lines(made: Standing) -> list[dict[str, Any]]:
     wrong, lines = standing.wrong_pixels(made.compared), []
     for row in made.rows:
-        runs = made.whole[made.whole["row"] == row]
+        runs = made.complete[made.complete["row"] == row]
         line = {"row": row, "preset": runs["preset"].iloc[0], "cost": made.costs[row], "wrong": wrong.get(row)}
         for name, ranked in made.rankings.items():
             line[f"{name}_rank"] = ranked.rank(row)
@@ -143,16 +146,16 @@ def _progress(line: dict[str, Any], name: str) -> str:
 
 def _sample(made: Standing) -> str:
     """The numbers of problems, scenes, seeds, renderers and failures, for captions."""
-    problems = format.plural(len(made.whole.groupby(["set", "problem"])), "problem")
-    scenes, seeds = (format.plural(made.whole[name].nunique(), name) for name in ("scene", "seed"))
-    failed, runs = (~made.whole["ok"]).sum(), format.plural(len(made.whole), "run")
+    problems = format.plural(len(made.complete.groupby(["set", "problem"])), "problem")
+    scenes, seeds = (format.plural(made.complete[name].nunique(), name) for name in ("scene", "seed"))
+    failed, runs = (~made.complete["ok"]).sum(), format.plural(len(made.complete), "run")
     renderers = format.plural(len(made.rows), "renderer")
     return f"{problems} ({scenes}, {seeds}) of {suite().id}, {renderers}; {failed or 'none'} of {runs} failed"
 
 
 def _panel(made: Standing, of_set: str | None) -> chart.Panel:
     """The progress of each row over its cost, in one set or in all sets."""
-    runs = made.whole if of_set is None else made.whole[made.whole["set"] == of_set]
+    runs = made.complete if of_set is None else made.complete[made.complete["set"] == of_set]
     lines = [line for row in made.rows if (line := _line(runs[(runs["row"] == row) & (runs["unit"] > 0)]))]
     title = f"{of_set or 'Progress over cost, all sets'}, {format.plural(runs['scene'].nunique(), 'scene')}"
     panel = chart.panel_data(title, COST, "progress", lines)
@@ -211,9 +214,9 @@ def at_end(made: Standing) -> str:
 
 def failures(made: Standing) -> str:
     """The rows that failed in most problems of a set, and the number of other failures."""
-    groups = made.whole.groupby(["row", "set"])["ok"].agg(runs="size", failed=lambda ok: (~ok).sum())
+    groups = made.complete.groupby(["row", "set"])["ok"].agg(runs="size", failed=lambda ok: (~ok).sum())
     most = groups[2 * groups["failed"] > groups["runs"]]
-    failed, runs = (total - most["failed"].sum() for total in (groups["failed"].sum(), len(made.whole)))
+    failed, runs = (total - most["failed"].sum() for total in (groups["failed"].sum(), len(made.complete)))
     if most.empty:
         return f"{failed or 'None'} of {runs} runs failed."
     names = [
@@ -224,12 +227,12 @@ def failures(made: Standing) -> str:
 
 def _notes(made: Standing) -> list[str]:
     """Notes that depend on the runs: missing numbers, bounds, the order without each set, machines."""
-    runs, notes = made.whole, []
+    runs, notes = made.complete, []
     if (rows := made.hidden[AT_1]) and made.rankings[AT_1].decidable:
         later = runs.assign(**{AT_1: runs[AT_1].where(~runs["row"].isin(rows), runs[f"{AT_1}_next"])})
         ranked = standing.ranking(later, AT_1)
         notes.append(
-            f"A dash: in some set, fewer than {standing.FEWEST_CHECKPOINTS} checkpoints lie within that cost, and the "
+            f"A dash: in some set, fewer than {standing.MIN_CHECKPOINTS} checkpoints lie within that cost, and the "
             "ranks use interpolated progress. With the progress of the next checkpoint, "
             f"{len(ranked.better)} pairs differ significantly at 1 ×, instead of {len(made.rankings[AT_1].better)}. "
             f"{leaders(ranked, 'Then')}"

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise
 
-from bench.report.study import Result, Runs, Selection, format, records, table, together
+from bench.report.study import Result, Runs, Selection, format, merge_runs, records, table
 
 PLACE = 10
 ALIKE = ("dataset", "view", "prior", "task")
@@ -40,7 +40,7 @@ CSV_METRICS = (
 
 def make(small: Runs | None, large: Runs | None) -> Result:
     """A line per size and strategy: the paper's in its order, then others in the order of their runs."""
-    runs = together(small, large)
+    runs = merge_runs(small, large)
     rank = {preset: number for number, preset in enumerate(PUBLISHED)}
     runs = replace(
         runs,
@@ -96,7 +96,7 @@ def _size(record: records.Record) -> str:
     if size is not None and size == requested:
         return f"{requested} ({status})" if status else str(requested)
     prefix = f"{requested}: " if requested else ""
-    return f"{table.whole(size)} ({prefix}{record['status']})"
+    return f"{table.integer(size)} ({prefix}{record['status']})"
 
 
 def _step(record: records.Record) -> str:
@@ -142,13 +142,13 @@ COLUMNS = (  # shown columns of a record; metrics are those of the largest finis
     table.metric("forward_seconds", "Forward", format.seconds),
     table.metric("backward_seconds", "Backward", format.seconds),
     table.shown("Time of a step", _step),
-    table.metric("hits", "Reference hits", table.whole),
+    table.metric("hits", "Reference hits", table.integer),
     table.shown(
-        "Missed / spurious / wrong depth", table.together(records.measured, table.whole, "lost", "false", "wrong")
+        "Missed / spurious / wrong depth", table.joined_cell(records.measured, table.integer, "lost", "false", "wrong")
     ),
     table.shown(
         "Depth error median / max",
-        table.together(records.measured, format.number, "depth_error_median", "depth_error_max"),
+        table.joined_cell(records.measured, format.number, "depth_error_median", "depth_error_max"),
     ),
     table.metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
     table.shown("Published evaluations", lambda record: _shown(record, 2)),

@@ -8,7 +8,7 @@ PLACE = 20
 READS = (Selection("table2", ("task.points",)),)
 REFERENCE = "dist_mask"
 HIDDEN_SUFFIXES = ("_paper", "_official")  # the figure leaves out these presets, to stay readable
-# DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, in the order of `compare.ORDER`.
+# DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, by `compare.CONDITION_ORDER`.
 PUBLISHED = {
     "sofa": {
         "DeepSDF": (5.37, 5.56, 5.50, 5.93, 6.03, 7.63),
@@ -41,7 +41,10 @@ RUNS = (
     *table.LOOP,
 )
 PICTURED_PRESETS = ("deepsdf", "dist_depth", "dist_mask")
-ARRAYS = ("given", *(kind + array for kind in (gallery.FOUND, gallery.TRUE) for array in ("normals", "hit")))
+ARRAYS = (
+    "given",
+    *(kind + array for kind in (gallery.PREDICTED, gallery.GROUND_TRUTH) for array in ("normals", "hit")),
+)
 BOTH_SIDES = (gallery.FRONT, gallery.BEHIND)
 
 
@@ -49,7 +52,7 @@ def make(runs: Runs) -> Result:
     """A line per family and row, with the oracle and published numbers of each family."""
     compared, oracle = compare.Compared(runs, lambda _: REFERENCE), compare.oracles(runs, compare.METRIC)
     published = {
-        family: {row: dict(zip(compare.ORDER, numbers, strict=True)) for row, numbers in rows.items()}
+        family: {row: dict(zip(compare.CONDITION_ORDER, numbers, strict=True)) for row, numbers in rows.items()}
         for family, rows in PUBLISHED.items()
     }
     columns = compared.columns("Ratio to DIST with mask")
@@ -60,7 +63,7 @@ def make(runs: Runs) -> Result:
         verdict=compared.best("errors × 1000 over all numbers of depth points"),
         remarks=(compare.ERROR, f"{_shapes(compared)} {_iterations(runs)}", *NOTES),
         columns=[column for column in columns if column.key not in compare.COSTS],
-        lines=compared.beside({compare.ORACLE: oracle}, published),
+        lines=compared.extended_lines({compare.ORACLE: oracle}, published),
         run_columns=RUNS,
         figure=draw(compared, oracle),
     )
@@ -107,10 +110,10 @@ def pictures(runs: Runs) -> Result:
         "Completed shapes in pictures.",
         "The first shape of each family for each number of depth points, seen by the given camera and from behind.",
         remarks=(
-            f"{gallery.JUDGED}; observed depths are yellow near the camera.",
+            f"{gallery.NORMALS_PHRASE}; observed depths are yellow near the camera.",
             "Dense depth includes the mask, and “DIST with mask” always has the mask. DeepSDF has the true normals.",
             "DIST, Figs. 20 to 22, shows shapes of ShapeNet. These are shapes of other families, from another prior.",
-            *gallery.missing(scenes.values()),
+            *gallery.missing_notes(scenes.values()),
         ),
         run_columns=(*RUNS[:2], *table.COMPLETION),
         figure=gallery.draw([_block(name, group, scenes[name]) for name, group in shown.families().items()], across=2),
@@ -122,10 +125,14 @@ def _block(name: str, family_records: list[records.Record], scene: gallery.Scene
     by_points = records.grouped(family_records, _points)
     points = compare.ordered(by_points)
     given_depths = [scene.shared(by_points[p][:1], gallery.depth) for p in points]
-    rows = {"given depths": [*given_depths, scene.shared(family_records, gallery.normals(gallery.TRUE), BOTH_SIDES)]}
+    rows = {
+        "given depths": [*given_depths, scene.shared(family_records, gallery.normals(gallery.GROUND_TRUTH), BOTH_SIDES)]
+    }
     for row, row_records in records.grouped(family_records, records.row_of).items():
         by_row_points = {_points(record): record for record in row_records}
-        rows[row.name] = [scene.cell(by_row_points.get(p), gallery.normals(gallery.FOUND), BOTH_SIDES) for p in points]
+        rows[row.name] = [
+            scene.cell(by_row_points.get(p), gallery.normals(gallery.PREDICTED), BOTH_SIDES) for p in points
+        ]
     return gallery.Block(name, [*map(compare.heading, points), "truth"], rows)
 
 

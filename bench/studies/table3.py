@@ -41,7 +41,7 @@ MAX_SHAPES = 4  # per family in pictures
 def make(runs: Runs) -> Result:
     """A line per family and method, with the start, the oracle and published numbers of each family."""
     compared = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, conditions.LABEL)
-    starts = records.SCALE * runs.number(f"start_{records.ONE_WAY}")
+    starts = records.CHAMFER_SCALE * runs.number(f"start_{records.ONE_WAY}")
     encoded = runs.setting(ENCODER_KEY) != ""
     starts_by_kind = {"initial error, random": starts[~encoded], "initial error, encoder": starts[encoded]}
     above = {
@@ -61,7 +61,7 @@ def make(runs: Runs) -> Result:
         verdict=compared.best("errors × 1000 from ground truth to prediction"),
         remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
         columns=compared.columns("Ratio to DIST"),
-        lines=compared.beside(above, published),
+        lines=compared.extended_lines(above, published),
         run_columns=RUNS,
     )
 
@@ -77,10 +77,10 @@ def pictures(runs: Runs) -> Result:
         "Shapes from many views in pictures.",
         f"Ground truth, initial shape and result of each row, for the first {MAX_SHAPES} shapes of each family.",
         remarks=(
-            f"{gallery.JUDGED}, seen from the side of the first photograph.",
+            f"{gallery.NORMALS_PHRASE}, seen from the side of the first photograph.",
             "Start: the shape of the random initial code, of rows without an encoder. Mesh rows do not run PMO's code.",
             "DIST, Figs. 11 and 23, compares with PMO on shapes of ShapeNet. These are shapes of other families.",
-            *gallery.missing(scenes.values()),
+            *gallery.missing_notes(scenes.values()),
         ),
         run_columns=(table.FAMILY, *table.IDENTITY, *ERROR_COLUMNS),
         figure=gallery.draw([gallery.Block("", ["truth", "start", *names], lines)]),
@@ -90,8 +90,11 @@ def pictures(runs: Runs) -> Result:
 def _cells(names: list[str], group: list[records.Record], scene: gallery.Scene) -> list[gallery.Cell]:
     record_by_row = {records.row_of(record).name: record for record in group}
     drawn = [r for r in group if records.setting(r["config"], *ENCODER_KEY.split(".")) is None]
-    shared = [scene.shared(group, gallery.normals(gallery.TRUE)), scene.shared(drawn, gallery.normals(gallery.START))]
-    return [*shared, *(scene.cell(record_by_row.get(name), gallery.normals(gallery.FOUND)) for name in names)]
+    shared = [
+        scene.shared(group, gallery.normals(gallery.GROUND_TRUTH)),
+        scene.shared(drawn, gallery.normals(gallery.START)),
+    ]
+    return [*shared, *(scene.cell(record_by_row.get(name), gallery.normals(gallery.PREDICTED)) for name in names)]
 
 
 PAGES = {"table3": make, "multiview_gallery": pictures}

@@ -38,7 +38,7 @@ Line = dict[str, Any]
 
 def make(runs: Runs) -> Result:
     """A line per kind of field and steps, and per alpha, over all shapes."""
-    runs = runs.made
+    runs = runs.executed
     frame = runs.frame[SHAPE].assign(
         alpha=runs.number("config.renderer.alpha"),
         truncated=runs.number("config.prior.truncation").notna(),

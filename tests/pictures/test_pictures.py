@@ -17,7 +17,7 @@ from bench.pictures.filmstrip import MAX_STRIP_COLUMNS, SILHOUETTE_ROW, Filmstri
 from bench.pictures.run_figures import InputView, ViewPair, _show_depth, draw_curve, draw_run, enlarged, save_gallery
 from bench.pictures.style import legend_below
 from bench.reconstruct.problem import ReconstructionProblem
-from bench.report.site.files import ALT
+from bench.report.site.files import PICTURE_TEXTS
 from bench.tasks.pose import TRACKED
 from datasets.mesh import Mesh
 from datasets.scene import Truth, View, see
@@ -50,7 +50,7 @@ def test_an_animation_has_a_frame_per_checkpoint_and_a_longer_last_one(inputs, t
     for iteration, radius in enumerate((0.3, 0.45, 0.6)):
         filmstrip.add(iteration, State(sphere(radius), inputs), CAMERA)
     filmstrip.save(tmp_path, "a ball")
-    assert f"film.{suffix}" in ALT
+    assert f"film.{suffix}" in PICTURE_TEXTS
     with Image.open(tmp_path / f"film.{suffix}") as moving:
         assert moving.n_frames == 3
         assert moving.size == (48, 24)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.report.data.age import CHANGED, UNKNOWN, drawn_by, gone_settings, head, notes
+from bench.report.data.age import COMPILED_SINCE, UNKNOWN, drawn_by, head, notes, removed_settings
 from bench.report.data.kept import read_rows
 from bench.report.write.paper import SHIPPED
 
@@ -18,10 +18,10 @@ def record(renderer: dict | None = None, environment: dict | None = None, **more
 
 
 def test_a_recorded_setting_that_no_renderer_has_any_more_makes_a_row_old():
-    assert gone_settings(record(DVR)) == gone_settings(record()) == []
-    assert gone_settings(record(DVR | {"keep_slope_sign": True})) == []  # what this version does
-    assert gone_settings(record(DVR | {"n_of_old": 3})) == ["n_of_old=3"]
-    assert gone_settings(record({"_target_": "mypkg.Mine", "mine": 1})) == []
+    assert removed_settings(record(DVR)) == removed_settings(record()) == []
+    assert removed_settings(record(DVR | {"keep_slope_sign": True})) == []  # what this version does
+    assert removed_settings(record(DVR | {"n_of_old": 3})) == ["n_of_old=3"]
+    assert removed_settings(record({"_target_": "mypkg.Mine", "mine": 1})) == []
     (note,) = notes([record(DVR | {"keep_slope_sign": False})] * 2 + [record(DVR)])
     assert note.startswith("Old rows, with settings that this version does not have: DVR (2 runs with keep_slope_sign=")
 
@@ -30,7 +30,7 @@ def test_the_rows_of_dvr_have_the_setting_that_they_were_made_with():
     rows = [row for row in read_rows(SHIPPED / "paper") if row["config"]["experiment"] == "dvr_table2"]
     recorded = [row["config"]["renderer"].get("keep_slope_sign") for row in rows]
     assert (recorded.count(False), recorded.count(True)) == (0, 8)
-    assert not [row for row in rows if gone_settings(row)]
+    assert not [row for row in rows if removed_settings(row)]
 
 
 def test_times_of_before_the_default_engine_changed_have_a_note():
@@ -56,11 +56,11 @@ def test_the_version_of_a_page_is_the_commit_that_changed_it_last(tmp_path: Path
     for command in (("init", "-q"), ("add", "page.csv"), ("commit", "-qm", "page")):
         subprocess.run(["git", *named, *command], cwd=tmp_path, check=True)
     commit, _, day = drawn_by(page).partition(" of ")
-    assert len(commit) >= 7 and len(day) == len(CHANGED)
+    assert len(commit) >= 7 and len(day) == len(COMPILED_SINCE)
 
 
 @pytest.mark.parametrize(
-    ("version", "engine"), [("a of 2026-11-25", True), (f"a of {CHANGED}", False), (UNKNOWN, False)]
+    ("version", "engine"), [("a of 2026-11-25", True), (f"a of {COMPILED_SINCE}", False), (UNKNOWN, False)]
 )
 def test_the_head_of_a_page_names_its_version_and_its_engine(version: str, engine: bool):
     assert head(version).startswith(f"Drawn by version {version}, with its statistics")

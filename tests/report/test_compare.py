@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import COSTS, EVERY, HOLM, Compared, differing, ordered
+from bench.report.compare import ALL_FAMILIES, COSTS, HOLM, Compared, differing, ordered
 from bench.report.data import statistics
 from bench.report.data.runs import Runs, Selection, choose
 from bench.report.write.result import Result
@@ -65,7 +65,7 @@ def kept(runs, keep):
     return page(type(runs)(runs.selection, runs.results_dir, [*filter(keep, runs.records)]))
 
 
-def line(result, row, family=EVERY):
+def line(result, row, family=ALL_FAMILIES):
     """The only line of the page's data of a row and family."""
     found = result.data[(result.data["row"] == row) & (result.data["family"] == family)]
     assert len(found) == 1

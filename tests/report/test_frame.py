@@ -9,7 +9,7 @@ import bench
 from bench.records import read as read_module
 from bench.records.read import Plan, PlannedCell
 from bench.report.__main__ import main as report
-from bench.report.data.frame import COLUMNS, to_frame
+from bench.report.data.frame import FIXED_COLUMNS, to_frame
 from tests.report.test_report import crashed, record, write_run
 
 
@@ -40,8 +40,8 @@ def test_there_is_a_row_for_each_run_and_each_planned_cell(results):
 
 def test_columns_have_types_that_do_not_depend_on_the_runs(results, tmp_path_factory):
     runs, none = bench.load(results), bench.load(tmp_path_factory.mktemp("none"))
-    assert {name: str(kind) for name, kind in none.dtypes.items()} == COLUMNS
-    assert {name: str(kind) for name, kind in runs.dtypes.items()} | COLUMNS == dict(runs.dtypes.map(str))
+    assert {name: str(kind) for name, kind in none.dtypes.items()} == FIXED_COLUMNS
+    assert {name: str(kind) for name, kind in runs.dtypes.items()} | FIXED_COLUMNS == dict(runs.dtypes.map(str))
     typed = {"chamfer_l2": "Float64", "start_fscore": "Float64", "seconds_total": "Float64", "best": "string"}
     typed |= {"config.renderer.steps": "Int64", "config.renderer.early": "boolean", "config.packages": "string"}
     typed |= {"config.renderer.epsilon": "string", "config.seed": "Int64", "metric_status": "Float64"}

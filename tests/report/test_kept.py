@@ -9,7 +9,7 @@ import pytest
 
 from bench.records.read import read_record, read_records
 from bench.report.__main__ import main
-from bench.report.data.kept import HERE, KEPT, join, read_rows, write_rows
+from bench.report.data.kept import FROM_RUNS_CSV, LOCAL_FIELDS, join, read_rows, write_rows
 from bench.report.data.records import family
 from tests.report.test_report_paper import DYNAMIC, NAIVE, PARALLEL, bands, costs, write_curve, write_run
 
@@ -85,8 +85,8 @@ def test_rows_are_the_records_but_for_what_is_of_the_machine(tmp_path):
     assert str(tmp_path) not in text_of(tmp_path / "paper" / "gradients.runs.csv.gz")
     for record in after:
         (other,) = (one for one in before if one["id"] == record["id"])
-        assert record.keys() - {KEPT} == other.keys() | {"log"}
-        for part in record.keys() - {*HERE, "config"}:
+        assert record.keys() - {FROM_RUNS_CSV} == other.keys() | {"log"}
+        for part in record.keys() - {*LOCAL_FIELDS, "config"}:
             assert record[part] == other[part], part
         assert list(record["metrics"]) == list(other["metrics"])
         own = {key: value for key, value in other["config"].items() if key not in ("results_dir", "dataset")}
@@ -110,9 +110,9 @@ def test_of_the_records_of_a_run_the_newest_that_measured_counts(tmp_path):
         folder = write_run(tmp_path, "table1", None, id="a", status=status, minute=minute)
         return read_record(folder) | more
 
-    kept, planned, newer = record("ok", 5) | {KEPT: True}, record("killed", 7), record("oom", 6)
+    kept, planned, newer = record("ok", 5) | {FROM_RUNS_CSV: True}, record("killed", 7), record("oom", 6)
     assert join([planned], [kept]) == [kept] and join([newer, planned], [kept]) == [newer]
-    own = {key: value for key, value in kept.items() if key != KEPT}
+    own = {key: value for key, value in kept.items() if key != FROM_RUNS_CSV}
     assert join([own], [kept]) == [own]  # with its folder
     assert join([planned], []) == [planned]
 

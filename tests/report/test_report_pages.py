@@ -12,7 +12,7 @@ from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import choose
 from bench.report.write import paper
-from bench.report.write.caption import SMOKE
+from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.paper import find_paper, papers, studies, write_paper
 from bench.report.write.result import Shown, read_shown
 from bench.studies import table1
@@ -164,7 +164,11 @@ def test_a_verdict_of_scale_smoke_is_that_nothing_follows(tmp_path):
         write_run(tmp_path, "table1", label, metrics=costs(), settings={"scale": {"name": "smoke"}})
     write_paper(read_records(tmp_path)[0], tmp_path)
     shown = read_shown(tmp_path / "paper" / "table1.json")
-    assert shown.verdict == SMOKE and shown.question.endswith("?") and shown.experiments == ["table1", "table1_large"]
+    assert (
+        shown.verdict == SMOKE_WARNING
+        and shown.question.endswith("?")
+        and shown.experiments == ["table1", "table1_large"]
+    )
 
 
 @each("text", ["", "[1]", '{"verdict": 1, "chart": []}', "[" * 100_000])

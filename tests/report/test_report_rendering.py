@@ -190,7 +190,7 @@ def test_fig4_counts_what_the_pictures_show(tmp_path):
 
 def test_angles_are_degrees_where_both_hit(tmp_path):
     write_images(tmp_path, tilt=10.0)
-    images = gallery.arrays(tmp_path, gallery.REFERENCE)[0]
+    images = gallery.read_arrays(tmp_path, gallery.REFERENCE)[0]
     angles = gallery.angles(images)
     assert np.isnan(angles).sum() == (~images["hit"]).sum()
     within = np.abs(images["normals"][..., 1]) < 0.1  # the turn is about y
@@ -200,7 +200,7 @@ def test_angles_are_degrees_where_both_hit(tmp_path):
 def test_lost_and_false_pixels_have_their_colours(tmp_path):
     write_images(write_run(tmp_path, "fig4", DYNAMIC), shift=0.1)
     shown = page_of(tmp_path, "fig4").figure.axes[0].get_images()[-1].get_array()
-    images = gallery.arrays(tmp_path / "runs" / "run000", gallery.REFERENCE)[0]
+    images = gallery.read_arrays(tmp_path / "runs" / "run000", gallery.REFERENCE)[0]
     for colour, mask, other in ((style.MISSED, "reference_hit", "hit"), (style.SPURIOUS, "hit", "reference_hit")):
         wrong = images[mask] & ~images[other]
         assert wrong.any() and ((shown == to_rgb(colour)).all(-1) == wrong).all()

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from bench.records.read import read_records
-from bench.report.data.runs import Runs, Selection, choose, together
+from bench.report.data.runs import Runs, Selection, choose, merge_runs
 from tests.report.test_report_paper import write_run
 
 
@@ -62,7 +62,7 @@ def test_each_view_or_deformation_of_a_mesh_file_is_a_cell(tmp_path, strength, s
 def test_runs_of_several_experiments_together_leave_out_what_each_leaves_out(tmp_path):
     for experiment in ("mine", "other", "mine", "other", "other"):
         write_run(tmp_path, experiment, "A")
-    both = together(read(tmp_path), None, read(tmp_path, "other"))
+    both = merge_runs(read(tmp_path), None, read(tmp_path, "other"))
     assert (len(both.records), both.left_out) == (2, 3)
     assert [record["config"]["experiment"] for record in both.records] == ["mine", "other"]
 

@@ -21,9 +21,9 @@ from bench.report.data.records import definition
 from bench.report.site.columns import columns, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
-from bench.report.site.meshes import mesh_data, read_ply, simplified
-from bench.report.site.renderers import _node, _source
-from bench.report.site.words import STATUSES, TASKS, asked, command
+from bench.report.site.meshes import mesh_data, read_ply, simplify
+from bench.report.site.renderers import _preset_settings, _source
+from bench.report.site.words import STATUSES, TASKS, command, request_sentence
 from bench.report.suite.attempts import write_attempts
 from bench.report.write import html
 from bench.report.write.html import safe_json, to_script, write_index
@@ -119,7 +119,7 @@ def test_each_task_has_words():
 
 def test_what_was_asked_is_a_sentence():
     config = {"task": {"points": "100"}, "view": {"resolution": 32}, "scale": {"name": "smoke"}}
-    sentence = asked(record("x", config=config, scene="sofa test 0"))
+    sentence = request_sentence(record("x", config=config, scene="sofa test 0"))
     assert sentence == (
         "Complete a shape from sparse depth and its mask: sofa test 0, 100 depth points, 32 × 32 pixels, seed 0, "
         "scale=smoke."
@@ -197,7 +197,7 @@ def test_a_mesh_is_given_as_plotly_reads_it_with_our_second_axis_up(tmp_path):
 def test_a_large_mesh_is_merged_to_few_vertices_near_the_surface(tmp_path):
     torus = trimesh.creation.torus(1, 0.3, 150, 150)
     torus.visual.vertex_colors = np.tile(np.uint8([40, 80, 120, 255]), (len(torus.vertices), 1))
-    small = simplified(torus, 5000)
+    small = simplify(torus, 5000)
     assert 1000 < len(small.vertices) <= 5000 and small.faces.max() < len(small.vertices)
     around = np.hypot(np.hypot(small.vertices[:, 0], small.vertices[:, 1]) - 1, small.vertices[:, 2])
     assert np.abs(around - 0.3).max() < 0.02
@@ -253,7 +253,7 @@ def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
 
 
 def test_runs_share_scripts_from_which_each_has_its_own_details(tmp_path, monkeypatch):
-    monkeypatch.setattr(html, "BEGINNING", 1)
+    monkeypatch.setattr(html, "KEY_PREFIX_LETTERS", 1)
     for number in range(20):
         made.write(tmp_path, number, folder=f'run "{number}"' if number % 2 else f"run-{number}")
     write_index(tmp_path)
@@ -310,14 +310,14 @@ def test_pages_that_are_written_at_the_same_time_have_all_runs(tmp_path):
 
 def test_who_waits_for_another_page_is_told(tmp_path, monkeypatch):
     write_run(tmp_path, record("one"), "one")
-    other, said = file_lock(tmp_path, html.FOLDER), []
+    other, said = file_lock(tmp_path, html.PAGE_FOLDER), []
 
     def tell(text: str, **_: object) -> None:
         said.append(text)
         other.release()
 
     other.acquire()
-    monkeypatch.setattr(html, "PATIENCE", 0.01)
+    monkeypatch.setattr(html, "SILENT_WAIT_SECONDS", 0.01)
     monkeypatch.setattr(html, "print", tell, raising=False)
     write_index(tmp_path)
     assert said == [f"waiting for another process that writes the page of {tmp_path}"]
@@ -327,8 +327,8 @@ def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
     solved = attempt("Dist", "car test 0", {0: 0.8, 500: 0.0115, 600: 0.001}, preset="dist")
     mine = replace(solved, row="Mine", preset="custom", status="nan", reason="lost", overrides=[
         *solved.overrides, "renderer=custom", "+renderer.steps=7", "label=My own"])  # fmt: skip
-    asked = ["+experiment=core_complete", "+method=tuned/dist_mask", "silhouette=own", "label='Dist, tuned'"]
-    tuned = replace(solved, row="Dist, tuned", overrides=asked)
+    request_sentence = ["+experiment=core_complete", "+method=tuned/dist_mask", "silhouette=own", "label='Dist, tuned'"]
+    tuned = replace(solved, row="Dist, tuned", overrides=request_sentence)
     for name, one in (("a", solved), ("b", mine), ("a", tuned)):
         write_attempts([one], tmp_path / name)
     merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
@@ -351,12 +351,12 @@ def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
 
 
 def test_a_variant_has_the_settings_of_what_it_builds_on():
-    built, own = (dict(found) for found in (_node("neus"), _node("neus_budget")))
-    assert own["samples"] == 24 and {*built} <= {*own} and _node("no_such") == {}
+    built, own = (dict(found) for found in (_preset_settings("neus"), _preset_settings("neus_budget")))
+    assert own["samples"] == 24 and {*built} <= {*own} and _preset_settings("no_such") == {}
     assert _source("mypkg.Mine") == ("mypkg.Mine", "")
     suite_rows = [name for name in choices("renderer") if "core" in choice("renderer", name).get("_rows_", {})]
     for name in suite_rows:
-        file, said = _source(_node(name)["_target_"])
+        file, said = _source(_preset_settings(name)["_target_"])
         assert (ROOT / file).is_file() and "Source:" in said, name
 
 

@@ -5,14 +5,11 @@ import pytest
 from scipy import stats
 
 from bench.report.data.statistics import (
-    FEWEST_SHAPES,
+    MIN_SHAPES,
     Interval,
     Verdict,
-    as_good,
-    better,
     bootstrap,
     clopper_pearson,
-    differ,
     dominated,
     front,
     interquartile_mean,
@@ -21,9 +18,12 @@ from bench.report.data.statistics import (
     paired_bootstrap,
     rank,
     ratio,
+    ratio_verdicts,
     shapes_agreeing,
     shapes_needed,
+    shapes_won,
     share,
+    tied_with_best,
     typical,
 )
 from tests.looped import each
@@ -120,12 +120,12 @@ def test_fewer_than_six_shapes_have_points_and_no_interval(n):
         paired_bootstrap(groups, groups, mean, seed=0),
         share(np.ones(n), 2 * np.ones(n)),
     ):
-        assert math.isnan(found.low) and math.isnan(found.high) and not found.known and len(found.points) == n
+        assert math.isnan(found.low) and math.isnan(found.high) and not found.has_ends and len(found.points) == n
         assert str(found).endswith(f" (n = {n})")
     found = bootstrap(groups, mean, seed=0)
     assert found.value == n / 2 + 0.5 and found.points == tuple(i + 1.0 for i in range(n))
     six = bootstrap(singles(*range(6)), mean, seed=0)
-    assert FEWEST_SHAPES == 6 and six.known and str(six) == f"2.50 {six.ends()}"
+    assert MIN_SHAPES == 6 and six.has_ends and str(six) == f"2.50 {six.ends()}"
 
 
 def test_shapes_with_unequal_numbers_of_seeds():
@@ -235,14 +235,14 @@ def test_a_rank_has_an_interval_over_shapes_and_those_that_do_not_differ_from_th
     found = rank(table)
     assert found["last"].value == found["last"].low == found["last"].high == 3
     assert found["tied"].low < found["tied"].value == 1.5 < found["tied"].high
-    assert as_good(found, "best") == ["tied"]
+    assert tied_with_best(found, "best") == ["tied"]
     paired = {"best": Interval(5, 1, 9, (1, 9) * 6), "next": Interval(6, 2, 10, (2, 10) * 6)}  # worse on each shape
-    assert as_good(paired, "best") == []
+    assert tied_with_best(paired, "best") == []
 
 
 def test_a_shape_at_which_both_are_equally_good_is_half_a_success():
     seeds = [np.array([1.0, 2.0, 9.0]), np.array([1.0, 5.0, 5.0])]  # medians 2 and 5
-    assert better(seeds, singles(3, 4)) == 1 and better(singles(1, 2, 3, INF), singles(2, 2, 2, INF)) == 2
+    assert shapes_won(seeds, singles(3, 4)) == 1 and shapes_won(singles(1, 2, 3, INF), singles(2, 2, 2, INF)) == 2
 
 
 def test_what_failed_or_has_no_cost_is_not_on_the_front():
@@ -290,7 +290,7 @@ def test_the_interval_of_a_median_is_that_of_the_sign_test():
     errors = [np.array([1.0, 4.0]), *(np.array([e]) for e in (1.0, 3.0, 4.0, 8.0, 16.0))]
     found = typical(errors)
     assert (found.value, found.low, found.high) == pytest.approx((math.sqrt(12), 1.0, 16.0))  # of six, all
-    assert not typical(errors[:5]).known
+    assert not typical(errors[:5]).has_ends
     failed = typical([*errors, np.array([math.inf])])
     assert (failed.value, failed.high) == (pytest.approx(4.0), math.inf)
     eight = typical([np.array([2.0**k]) for k in range(8)])
@@ -304,21 +304,21 @@ def test_holm_takes_the_least_chance_first_and_stops_at_the_first_that_does_not_
         return ratio([np.array([0.5])] * below + [np.array([2.0])] * (shapes - below), [np.array([1.0])] * shapes)
 
     yes, no = Verdict.DIFFERS, Verdict.NOT_DISTINGUISHED
-    assert differ([of(10), of(12)]) == [yes, yes]  # .0005 <= .05 / 2, then .039 <= .05
-    assert differ([of(12), of(10), of(10), of(6)]) == [yes, no, no, no]  # .039 > .05 / 3
-    assert differ([of(0), of(5, shapes=5)]) == [yes, Verdict.NOT_DECIDABLE]  # five shapes are not counted
-    assert differ([]) == []
+    assert ratio_verdicts([of(10), of(12)]) == [yes, yes]  # .0005 <= .05 / 2, then .039 <= .05
+    assert ratio_verdicts([of(12), of(10), of(10), of(6)]) == [yes, no, no, no]  # .039 > .05 / 3
+    assert ratio_verdicts([of(0), of(5, shapes=5)]) == [yes, Verdict.NOT_DECIDABLE]  # five shapes are not counted
+    assert ratio_verdicts([]) == []
 
 
 def test_a_family_that_no_data_could_reject_cannot_be_decided():
     def family(shapes: int, ratios: int) -> list[Interval]:
         return [ratio(singles(*[0.5] * shapes), singles(*[1.0] * shapes))] * ratios
 
-    assert differ(family(6, 1)) == [Verdict.DIFFERS]  # 2 / 2^6 = .031
-    assert differ(family(6, 2)) == [Verdict.NOT_DECIDABLE] * 2  # > .05 / 2
-    assert differ(family(8, 7)) == [Verdict.NOT_DECIDABLE] * 7  # .0078 > .05 / 7
-    assert differ(family(9, 7)) == [Verdict.DIFFERS] * 7
-    mixed = differ([*family(6, 1), *family(12, 1)])  # .0005 <= .05 / 2, then .031 <= .05
+    assert ratio_verdicts(family(6, 1)) == [Verdict.DIFFERS]  # 2 / 2^6 = .031
+    assert ratio_verdicts(family(6, 2)) == [Verdict.NOT_DECIDABLE] * 2  # > .05 / 2
+    assert ratio_verdicts(family(8, 7)) == [Verdict.NOT_DECIDABLE] * 7  # .0078 > .05 / 7
+    assert ratio_verdicts(family(9, 7)) == [Verdict.DIFFERS] * 7
+    mixed = ratio_verdicts([*family(6, 1), *family(12, 1)])  # .0005 <= .05 / 2, then .031 <= .05
     assert mixed == [Verdict.DIFFERS] * 2
     assert [shapes_needed(n) for n in (1, 7, 14)] == [6, 9, 10]
     assert [shapes_agreeing(12, 11), shapes_agreeing(12, 1), shapes_agreeing(8, 7)] == [12, 10, 9]
@@ -327,9 +327,11 @@ def test_a_family_that_no_data_could_reject_cannot_be_decided():
 def test_shapes_with_equal_errors_are_no_trials_of_the_sign_test():
     ones = [np.array([1.0])] * 12
     lower, tied = ratio([np.array([0.5])] * 6 + ones[6:], ones), ratio(ones, ones)
-    assert differ([lower]) == [Verdict.DIFFERS]  # 6 of 6 trials: p = 2 / 64 = .031
-    assert differ([lower, lower]) == [Verdict.NOT_DISTINGUISHED] * 2  # above .05 / 2; of 12 trials p would be .0005
-    assert differ([tied]) == [Verdict.NOT_DISTINGUISHED]
+    assert ratio_verdicts([lower]) == [Verdict.DIFFERS]  # 6 of 6 trials: p = 2 / 64 = .031
+    assert (
+        ratio_verdicts([lower, lower]) == [Verdict.NOT_DISTINGUISHED] * 2
+    )  # above .05 / 2; of 12 trials p would be .0005
+    assert ratio_verdicts([tied]) == [Verdict.NOT_DISTINGUISHED]
 
 
 def test_a_ratio_is_paired_by_shape():

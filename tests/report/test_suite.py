@@ -19,10 +19,10 @@ from bench.report.suite import attempts, standing
 from bench.report.suite.attempts import (
     Attempt,
     Gathered,
+    attempts_folder,
     attempts_of,
     gather,
-    joined,
-    place,
+    newest_attempts,
     read_attempts,
     suite,
     write_attempts,
@@ -91,7 +91,7 @@ def judged(attempts: list[Attempt]) -> pd.DataFrame:
 
 def standing_of(attempts: list[Attempt], outcome: str = END) -> Ranking:
     runs = judged(attempts)
-    return ranking(runs[runs["whole"]], outcome)
+    return ranking(runs[runs["complete"]], outcome)
 
 
 def progress(attempts: list[Attempt], outcome: str = END) -> dict[str, float]:
@@ -145,7 +145,7 @@ def test_rows_are_compared_at_the_problems_that_all_whole_rows_have(monkeypatch)
     whole = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)])
     some = [one for one in whole if one.row != "Mine" or one.key[:3] in least]
     runs = judged([one for one in some if one.row != "Part" or one.scene == SCENES[0]])
-    assert {*runs["scene"]} == {*SCENES[:6]} and {*runs.loc[runs["whole"], "row"]} == {"B", "Dist", "Mine"}
+    assert {*runs["scene"]} == {*SCENES[:6]} and {*runs.loc[runs["complete"], "row"]} == {"B", "Dist", "Mine"}
     assert {*runs.loc[runs["row"] == "Part", "missing"]} == {5}
     assert {*judged(made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]))["scene"]} == {*SCENES}
 
@@ -230,7 +230,7 @@ def test_rows_differ_by_the_correction_over_all_pairs_not_over_the_others_of_a_r
 def test_equal_rows_differ_in_at_most_one_of_twenty_draws(outcome):
     """The level of the shipped design: rows are centred in each set, and scenes are drawn among those with its sets."""
     runs = judged(read_attempts(SHIPPED)[0])
-    runs = runs[runs["whole"]]
+    runs = runs[runs["complete"]]
     rows = runs.groupby(["set", "row"])[outcome].transform("mean")
     scores = by_scene(runs.assign(**{outcome: runs[outcome] - rows}), outcome)
     sets = runs.groupby("scene")["set"].agg(lambda of: tuple(sorted({*of}))).reindex(scores.index)
@@ -376,12 +376,12 @@ def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
     older = replace(good, started="2026-01-01T00:00:00+00:00")
     other = replace(good, row="A-b")  # whose file has the same name
     for order in permutations([good, failed, older, other]):
-        assert {one.key: one for one in joined(order)} == {good.key: failed, other.key: other}
+        assert {one.key: one for one in newest_attempts(order)} == {good.key: failed, other.key: other}
     write_attempts([failed, other], tmp_path)
     assert {*map(repr, read_attempts(tmp_path)[0])} == {repr(failed), repr(other)}
     write_attempts([latest := replace(good, started="2026-01-04T00:00:00+00:00")], tmp_path)
     assert sorted(read_attempts(tmp_path)[0], key=lambda one: one.row) == [latest, other]
-    assert [path.name for path in place(tmp_path).iterdir()] == ["a_b.csv"]
+    assert [path.name for path in attempts_folder(tmp_path).iterdir()] == ["a_b.csv"]
 
 
 def test_two_halves_merged_are_the_whole(tmp_path):
@@ -389,13 +389,15 @@ def test_two_halves_merged_are_the_whole(tmp_path):
     write_attempts(whole[:5], tmp_path / "one")
     write_attempts(whole[5:], tmp_path / "two")
     merge.merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
-    by_key = [sorted(joined(of), key=lambda one: one.key) for of in (read_attempts(tmp_path / "both")[0], whole)]
+    by_key = [
+        sorted(newest_attempts(of), key=lambda one: one.key) for of in (read_attempts(tmp_path / "both")[0], whole)
+    ]
     assert by_key[0] == by_key[1]
 
 
 def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
     write_attempts([attempt("A", "s", {0: 1.0, 5: 0.5})], tmp_path)
-    (place(tmp_path) / "b.csv").write_text("set,problem\ncomplete,s\n")
+    (attempts_folder(tmp_path) / "b.csv").write_text("set,problem\ncomplete,s\n")
     found, problems = read_attempts(tmp_path)
     assert len(found) == 1 and problems[0].startswith("b.csv")
     with pytest.raises(ValueError, match=r"b\.csv"):  # whose lines would be lost
@@ -423,7 +425,7 @@ def test_more_problems_of_ones_own_and_of_dist_leave_the_shipped_rows_compared(m
     monkeypatch.setattr(standing, "problems_of", lambda _: {("complete", f"{SCENES[0]}, 20 points", 0)})
     whole = made([("Dist", 0.011, 100.0), ("Mine", 0.01, 100.0)]) + made([("Shipped", 0.02, 100.0)], SCENES[:6])
     runs = judged(whole)
-    assert {*runs.loc[runs["whole"], "row"]} == {"Dist", "Mine", "Shipped"} and {*runs["scene"]} == {*SCENES[:6]}
+    assert {*runs.loc[runs["complete"], "row"]} == {"Dist", "Mine", "Shipped"} and {*runs["scene"]} == {*SCENES[:6]}
 
 
 def test_a_set_in_which_dist_fails_is_measured_by_the_usual_cost():
@@ -598,7 +600,7 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
 
 def test_the_shipped_page_is_that_of_the_shipped_rows():
     runs = judged(read_attempts(SHIPPED)[0])
-    runs = runs[runs["whole"]]
+    runs = runs[runs["complete"]]
     shown = pd.read_csv(SHIPPED / "paper" / "suite.csv").set_index("row")
     for outcome in (AT_1, AT_10, END, AREA):
         ranked = ranking(runs, outcome)
@@ -611,7 +613,7 @@ def test_the_shipped_page_is_that_of_the_shipped_rows():
 
 def test_the_shipped_costs_are_those_of_the_shipped_rows():
     made_of = Standing(gather(SHIPPED, SHIPPED))
-    known = costs(made_of.whole, timed(made_of.whole, made_of.everything))
+    known = costs(made_of.complete, timed(made_of.complete, made_of.everything))
     shown = pd.read_csv(SHIPPED / "paper" / "suite_sets.csv").set_index(["set", "row"])
     for name in ("evaluations", "seconds"):
         values = known[name].dropna().map(lambda ratio: ratio.value)
@@ -623,5 +625,5 @@ def test_the_shipped_rows_are_of_todays_settings():
     each = {(one.set, one.tuned): one for one in read_attempts(SHIPPED)[0]}
     for (of_set, tuned), one in each.items():
         config = OmegaConf.to_container(composed(*one.overrides), resolve=True, throw_on_missing=False)
-        assert one.settings == attempts.settings_of(config, of_set, tuned), of_set
+        assert one.settings == attempts.settings_hash(config, of_set, tuned), of_set
     assert len(each) > 5

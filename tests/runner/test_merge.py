@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from bench.merge import main, merge
 from bench.records.read import Plan, read_records
-from bench.report.suite.attempts import place
+from bench.report.suite.attempts import attempts_folder
 from tests.looped import each
 from tests.runner.driving import planned, stored
 
@@ -169,7 +169,7 @@ def test_a_run_or_a_plan_that_is_a_link_out_of_its_folder_is_not_read(tmp_path):
 
 
 def test_attempts_at_the_suite_that_cannot_be_read_are_named(tmp_path):
-    folder = place(tmp_path / "a")
+    folder = attempts_folder(tmp_path / "a")
     folder.mkdir(parents=True)
     (folder / "newton.csv").write_text("set,problem\ncomplete,a sofa\n")
     _, (problem,) = merge([tmp_path / "a"], tmp_path / "d")

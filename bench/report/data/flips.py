@@ -1,4 +1,4 @@
-"""Permutation tests of paired differences: where both sides are equal, each difference has either sign."""
+"""Permutation tests of paired differences: if both sides are equal, each difference can have either sign."""
 
 from functools import cache
 from itertools import product
@@ -7,32 +7,32 @@ import numpy as np
 
 from bench.report.data.statistics import shapes_needed
 
-MOST_EXACT = 16  # units of which all signs are tried; of more, 2**15 random signs
+MAX_EXACT_UNITS = 16  # up to here all sign vectors are tested, above it 2**15 random ones
 
 
 @cache
 def signs(units: int) -> np.ndarray:
-    """The signs of units [flips, units]; that of the first unit is positive, and so are all in the first flip.
+    """The sign vectors [flips, units]. The first unit is always positive, and so are all units of the first flip.
 
-    The other half of all flips has the same sums, with the other sign.
+    The other half of the sign vectors gives the same sums with the opposite sign.
     """
-    if units <= MOST_EXACT:
+    if units <= MAX_EXACT_UNITS:
         return np.array([(1.0, *others)[:units] for others in product((1.0, -1.0), repeat=max(units - 1, 0))])
-    drawn = np.random.default_rng(0).choice((1.0, -1.0), (2 ** (MOST_EXACT - 1), units))
-    drawn[0] = 1
-    return drawn
+    random_signs = np.random.default_rng(0).choice((1.0, -1.0), (2 ** (MAX_EXACT_UNITS - 1), units))
+    random_signs[0] = 1
+    return random_signs
 
 
 def p_values(differences: np.ndarray) -> np.ndarray:
-    """The p values [pairs] of differences [units, pairs]: the share of flips whose sum is at least as large."""
+    """The p values [pairs] of differences [units, pairs]: the fraction of flips whose sum is at least as large."""
     sums = np.abs(differences.sum(axis=0))
     return (np.abs(signs(len(differences)) @ differences) >= sums - 1e-12).mean(axis=0)
 
 
 def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
-    """The ends of the confidence intervals of the means of all columns of values [units, columns], at `alpha` in all.
+    """The smallest and largest end of simultaneous confidence intervals of the means of values [units, columns].
 
-    None where there are too few units to reject any mean, or no column.
+    Their joint level is 1 - alpha. None without columns, or with too few units to reject any mean.
     """
     units, columns = values.shape
     if not columns or units < shapes_needed(columns, alpha):
@@ -42,14 +42,14 @@ def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
 
 
 def interval(values: np.ndarray, alpha: float) -> tuple[float, float]:
-    """The confidence interval of the mean of values [units] at level 1 - alpha: the means that are not rejected."""
-    drawn, ends = signs(len(values)), []
-    sums, counts = drawn @ values, drawn.sum(axis=1)
+    """The confidence interval of the mean of values [units] at level 1 - alpha: the means that the test accepts."""
+    flips, ends = signs(len(values)), []
+    sums, counts = flips @ values, flips.sum(axis=1)
     for end in (values.min(), values.max()):
-        kept, lost = values.mean(), 2 * end - values.mean()
+        accepted, rejected = values.mean(), 2 * end - values.mean()
         for _ in range(50):
-            mean = (kept + lost) / 2
+            mean = (accepted + rejected) / 2
             p_value = np.mean(np.abs(sums - mean * counts) >= np.abs(sums[0] - mean * counts[0]) - 1e-12)
-            kept, lost = (mean, lost) if p_value > alpha else (kept, mean)
-        ends.append(float(kept))
+            accepted, rejected = (mean, rejected) if p_value > alpha else (accepted, mean)
+        ends.append(float(accepted))
     return ends[0], ends[1]

@@ -13,31 +13,31 @@ from bench.records.read import RESULTS, read_records
 from bench.records.record import row_name, started
 from bench.report.data.records import index
 
-TEXT, CATEGORY, WHOLE, NUMBER, TRUTH, TIME = (
+TEXT, CATEGORY, INTEGER, NUMBER, BOOLEAN, TIME = (
     *("string", "category", "Int64", "Float64", "boolean"),
     "datetime64[ms, UTC]",
 )
-COLUMNS = {  # that every table has, with their types
+FIXED_COLUMNS = {  # every table has them
     **{name: TEXT for name in ("folder", "name")},
     **{name: CATEGORY for name in ("task", "renderer", "method", "dataset", "scene")},
-    **{name: WHOLE for name in ("index", "seed")},
+    **{name: INTEGER for name in ("index", "seed")},
     "status": CATEGORY,
     "reason": TEXT,
     "started": TIME,
-    "reused": TRUTH,
+    "reused": BOOLEAN,
     **{name: NUMBER for name in ("peak_memory_bytes", "flops", "gemm_fraction")},
     **{name: CATEGORY for name in ("cpu", "device")},
-    "threads": WHOLE,
+    "threads": INTEGER,
     "commit": CATEGORY,
-    "dirty": TRUTH,
+    "dirty": BOOLEAN,
 }
-MACHINE = ("cpu", "device", "threads", "commit", "dirty")  # of the record's environment
+ENVIRONMENT_COLUMNS = ("cpu", "device", "threads", "commit", "dirty")
 PREFIXES = {"metrics": "", "metrics_start": "start_", "seconds": "seconds_", "evaluations": "evaluations_"}
 CONFIG = "config."
 
 
 def load(results: str | os.PathLike[str] = RESULTS) -> pd.DataFrame:
-    """All runs of a results folder as a table, a row per run, failed and planned ones included, newest first.
+    """Reads all runs of a results folder into a table, newest first, with a row per run, also failed or planned.
 
     >>> runs = load("results/local")
     >>> runs[["name", "status", "seed"]]
@@ -50,12 +50,12 @@ def load(results: str | os.PathLike[str] = RESULTS) -> pd.DataFrame:
         results: the folder that the runs' `results_dir` named.
 
     Returns:
-        The columns of `COLUMNS`, then of each part of the record what its runs have: metrics by their names,
-        `start_NAME` of the start of an optimisation, `seconds_NAME`, `evaluations_NAME`, and `config.KEY` of all
-        settings. What a run lacks is missing (`pandas.NA`); the files of a run are in `runs/FOLDER` of the folder.
+        The columns of `FIXED_COLUMNS`, then metrics by their names, `start_NAME` for metrics before the optimisation,
+        `seconds_NAME`, `evaluations_NAME`, and `config.KEY` for all settings. Missing values are `pandas.NA`. The files
+        of a run are in `runs/FOLDER` of the results folder.
 
     Raises:
-        ValueError: where there is no such folder.
+        ValueError: the folder does not exist.
     """
     records, problems = read_records(Path(results))
     if problems:
@@ -70,32 +70,32 @@ def to_frame(records: Iterable[dict[str, Any]]) -> pd.DataFrame:
 
 
 def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
-    """The values of each column, None where a run has none."""
-    columns: dict[str, list[Any]] = {name: [None] * len(records) for name in COLUMNS}
-    for place, record in enumerate(records):
+    """The values of each column; None if a run has no value."""
+    columns: dict[str, list[Any]] = {name: [None] * len(records) for name in FIXED_COLUMNS}
+    for row, record in enumerate(records):
         for name, value in _row(record).items():
             if name not in columns:
                 columns[name] = [None] * len(records)
-            columns[name][place] = value
-    return {name: columns[name] for name in dict.fromkeys((*COLUMNS, *sorted(columns, key=_place)))}
+            columns[name][row] = value
+    return {name: columns[name] for name in dict.fromkeys((*FIXED_COLUMNS, *sorted(columns, key=_sort_key)))}
 
 
 def _row(record: dict[str, Any]) -> dict[str, Any]:
-    """The values of a run by column; a metric that has the name of another column gets `metric_` in front."""
-    row = {name: record.get(name) for name in COLUMNS}
-    row |= {name: None if (value := record["environment"].get(name)) == "" else value for name in MACHINE}
+    """The values of a run by column; a metric named like a fixed column gets the prefix `metric_`."""
+    row = {name: record.get(name) for name in FIXED_COLUMNS}
+    row |= {name: None if (value := record["environment"].get(name)) == "" else value for name in ENVIRONMENT_COLUMNS}
     row |= {"name": row_name(record["config"], record["renderer"]), "index": index(record)}
     row |= {"started": started(record), "method": record.get("method") or None, "scene": record.get("scene") or None}
-    for part, prefix in PREFIXES.items():
-        named = {f"{prefix}{name}": value for name, value in record[part].items()}
-        row |= {f"metric_{name}" if name in COLUMNS else name: _cell(value) for name, value in named.items()}
+    for section, prefix in PREFIXES.items():
+        named = {f"{prefix}{name}": value for name, value in record[section].items()}
+        row |= {f"metric_{name}" if name in FIXED_COLUMNS else name: _cell(value) for name, value in named.items()}
     return row | {name: _cell(value) for name, value in flat(record["config"], CONFIG).items()}
 
 
 def _series(values: list[Any], kind: str) -> pd.Series:
-    """A column of that type; categories are text, also where there are none.
+    """A column of that type; categories are text, also if the column is empty.
 
-    A record from elsewhere may hold what is not of the type: its column is text then.
+    If a foreign record has values of another type, the column becomes text.
     """
     if kind != CATEGORY:
         try:
@@ -103,28 +103,28 @@ def _series(values: list[Any], kind: str) -> pd.Series:
         except (TypeError, ValueError, OverflowError):
             return pd.Series([None if value is None else str(value) for value in values], dtype=TEXT)
     texts = [None if value is None else str(value) for value in values]
-    known = pd.Index(sorted({text for text in texts if text is not None}), dtype="str")
-    return pd.Series(pd.Categorical(texts, categories=known))
+    categories = pd.Index(sorted({text for text in texts if text is not None}), dtype="str")
+    return pd.Series(pd.Categorical(texts, categories=categories))
 
 
 def _cell(value: Any) -> Any:
-    """A value that a cell can hold: a list becomes text."""
+    """A value that fits into a cell: a list becomes text."""
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
-def _place(name: str) -> tuple[int, str]:
-    """Metrics first, then the start's, seconds, evaluations and settings, each by name."""
+def _sort_key(name: str) -> tuple[int, str]:
+    """Sorts metrics first, then initial metrics, seconds, evaluations and settings; each group by name."""
     prefixes = [*list(PREFIXES.values())[1:], CONFIG]
-    return next((place for place, prefix in enumerate(prefixes, 1) if name.startswith(prefix)), 0), name
+    return next((rank for rank, prefix in enumerate(prefixes, 1) if name.startswith(prefix)), 0), name
 
 
 def _type(name: str, values: list[Any]) -> str:
-    """The type of a column: of a measured one number, unless it is text; of a setting by its values."""
-    if name in COLUMNS:
-        return COLUMNS[name]
+    """The type of a column: a setting's follows from its values, a measured column is a number unless it has text."""
+    if name in FIXED_COLUMNS:
+        return FIXED_COLUMNS[name]
     kinds = {type(value) for value in values if value is not None}
     if kinds == {bool}:
-        return TRUTH
+        return BOOLEAN
     if kinds == {int} and name.startswith(CONFIG):
-        return WHOLE
+        return INTEGER
     return NUMBER if kinds <= {int, float} and (kinds or not name.startswith(CONFIG)) else TEXT

@@ -1,11 +1,11 @@
-"""The rows that a shipped table is drawn from: `paper/EXPERIMENT.runs.csv.gz`, a line per run.
+"""The records that shipped tables are drawn from: `paper/EXPERIMENT.runs.csv.gz`, a line per run.
 
-A line is a record without what its folder alone has (curves, pictures), and outlives the folder. A column is a field by
-its dotted name, such as `metrics.NAME` or `config.KEY.KEY`. A cell is the value as JSON, or text as it is where that is
-no JSON. An empty cell means that the run has no such field.
+A line is a record without the other files of its run folder (curves, pictures), and outlives the folder. A column is a
+field by its dotted name, such as `metrics.NAME` or `config.KEY.KEY`. A cell is the value as JSON; text that is not also
+JSON stands without quotes. An empty cell means that the run has no such field.
 
-A row with the field `restored` was made from the CSV of a page whose run folders are gone. It has of the settings what
-that page shows, starts at the time of the page's commit, and has one number for the seconds of its loop.
+A row with the field `restored` was made from the CSV of a page whose run folders are gone. It has only the settings
+that the page shows, the time of the page's commit as its start, and one number for the seconds of its loop.
 """
 
 import csv
@@ -18,50 +18,50 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import started, write_bytes
-from bench.report.data.lines import UNREADABLE
+from bench.report.data.lines import READ_ERRORS
 from bench.report.data.records import Record, grouped, setting
 
 SUFFIX = ".runs.csv.gz"
 CONFIG = "config."
-KEPT = "kept"  # marks a record that was read here
-UNFINISHED = ("not_run", "killed")  # statuses of runs that say nothing of a row
-NO_ATTEMPTS = (*UNFINISHED, "refused")  # those of runs that did not measure what they were to measure
-HERE = ("log", "overrides", "environment.diff", "environment.platform", KEPT)
-HERE += ("config.results_dir", "config.priors_dir")  # what is of the machine, or can be looked up
+FROM_RUNS_CSV = "kept"  # the field that marks a record read from such a file
+UNFINISHED = ("not_run", "killed")
+UNMEASURED = (*UNFINISHED, "refused")  # statuses that say nothing about a renderer
+LOCAL_FIELDS = ("log", "overrides", "environment.diff", "environment.platform", FROM_RUNS_CSV)
+LOCAL_FIELDS += ("config.results_dir", "config.priors_dir")  # they depend on the machine, or follow from other fields
 
 
 def join(records: Iterable[Record], kept: Iterable[Record]) -> list[Record]:
-    """One record of each run: the newest that measured something; of the same the one that has its folder."""
-    ordered = sorted([*kept, *records], key=lambda record: (record["status"] not in NO_ATTEMPTS, started(record)))
+    """One record per run: the newest that measured something; of equal ones, the one with a run folder."""
+    ordered = sorted([*kept, *records], key=lambda record: (record["status"] not in UNMEASURED, started(record)))
     return sorted({record["id"]: record for record in ordered}.values(), key=started, reverse=True)
 
 
 def write_rows(records: Iterable[Record], experiments: Iterable[str], folder: Path) -> list[Path]:
-    """Writes the runs of each experiment to a folder, but planned ones and those of scale=smoke; gives the files."""
-    measured = (record for record in records if record["status"] not in NO_ATTEMPTS)
+    """Writes the measured runs of each experiment, except those of scale=smoke; returns the files."""
+    measured = (record for record in records if record["status"] not in UNMEASURED)
     sound = (record for record in measured if setting(record["config"], "scale", "name") != "smoke")
     groups = grouped(sound, lambda record: record["config"].get("experiment"))
     return [_write(folder / f"{name}{SUFFIX}", groups[name]) for name in dict.fromkeys(experiments) if name in groups]
 
 
 def read_rows(folder: Path) -> list[Record]:
-    """The records of all such files of a folder.
+    """Reads the records of all such files of a folder.
 
     Raises:
-        ValueError: where one cannot be read, with its name.
+        ValueError: a file cannot be read.
     """
     records = list[Record]()
     for path in sorted(folder.glob(f"[!.]*{SUFFIX}")):
         try:
             with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
                 records += map(_record, csv.DictReader(file))
-        except (*UNREADABLE, AttributeError, EOFError, zlib.error) as error:
+        except (*READ_ERRORS, AttributeError, EOFError, zlib.error) as error:
             raise ValueError(f"{path} cannot be read, mend it or move it away: {error!r}") from error
     return records
 
 
 def _write(path: Path, records: list[Record]) -> Path:
-    """Writes records to a file, in an order and without a date, so that the same records give the same bytes."""
+    """Writes records to a file, sorted and without a date, so that the same records give the same bytes."""
     lines = [_cells(record) for record in sorted(records, key=lambda record: (started(record), record["id"]))]
     names = sorted(dict.fromkeys(name for line in lines for name in line), key=_rank)
     text = StringIO()
@@ -74,7 +74,7 @@ def _write(path: Path, records: list[Record]) -> Path:
 
 
 def _rank(name: str) -> str:
-    """By what columns are sorted: settings by name; those of other fields, such as metrics, stay in their order."""
+    """The sort key of a column: settings are sorted by name; other fields, such as metrics, keep their order."""
     return name if name.startswith(CONFIG) else name.partition(".")[0]
 
 
@@ -84,13 +84,13 @@ def _cells(value: Any, name: str = "") -> dict[str, str]:
         inner = [_cells(item, f"{name}.{key}".lstrip(".")) for key, item in value.items()]
         return {column: cell for cells in inner for column, cell in cells.items()}
     if isinstance(value, str) and name.startswith(CONFIG) and value.startswith("/"):
-        value = "/".join(["", *Path(value).parts[-2:]])  # which name the family of a folder of data
+        value = "/".join(["", *Path(value).parts[-2:]])  # the last two parts name the family
     bare = isinstance(value, str) and value and _value(value) == value
-    return {} if name in HERE else {name: value if bare else json.dumps(value)}
+    return {} if name in LOCAL_FIELDS else {name: value if bare else json.dumps(value)}
 
 
 def _has_columns(value: Any, name: str) -> bool:
-    """Whether each key has a column: of settings at any depth, of other fields, whose keys have dots, at the first."""
+    """Whether each key of a value has a column: settings at any depth, other fields only at the first level."""
     if not isinstance(value, dict) or not value:
         return False
     return not any("." in key for key in value) if f"{name}.".startswith(CONFIG) else "." not in name
@@ -107,7 +107,7 @@ def _record(cells: dict[str, str]) -> Record:
     if lacking := {"id", "status", "config"} - record.keys():
         raise ValueError(f"a line has no {', '.join(sorted(lacking))}")
     started(record)
-    return record | {KEPT: True, "log": []}
+    return record | {FROM_RUNS_CSV: True, "log": []}
 
 
 def _value(cell: str) -> Any:

@@ -1,4 +1,4 @@
-"""A dataclass as a line of a CSV file: text as it is, other values as JSON."""
+"""Writes dataclasses as lines of a CSV file: text unchanged, other values as JSON."""
 
 import csv
 import json
@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 from bench.records.record import from_json_values, to_json_values, write_text
 
 Item = TypeVar("Item")
-UNREADABLE = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)  # of a damaged file
+READ_ERRORS = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)
 
 
 def write_lines(path: Path, kind: type, items: Iterable[Any]) -> Path:
-    """Writes items of a dataclass to a file, a line each."""
+    """Writes one line per item of a dataclass."""
     text = StringIO()
     table = csv.DictWriter(text, [field.name for field in fields(kind)], lineterminator="\n")
     table.writeheader()
@@ -28,10 +28,10 @@ def write_lines(path: Path, kind: type, items: Iterable[Any]) -> Path:
 
 
 def read_lines(path: Path, kind: type[Item]) -> list[Item]:
-    """The items of a dataclass that a file holds.
+    """Reads the items of a dataclass from a file.
 
     Raises:
-        one of UNREADABLE: where the file is damaged, or a line has other cells than the dataclass has fields.
+        one of READ_ERRORS: the file is damaged, or its columns are not the fields of the dataclass.
     """
     with path.open(encoding="utf-8", newline="") as file:
         return [kind(**{f.name: _value(line[f.name], f.type) for f in fields(kind)}) for line in csv.DictReader(file)]

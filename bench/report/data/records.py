@@ -10,11 +10,11 @@ import numpy as np
 
 from bench.records.record import as_number, row_name
 
-SCALE = 1000.0  # of Chamfer distances, in tables and figures
-ONE_WAY = "chamfer_gt_to_pred"  # the metric of shape from many views
-SHAPENET = "shapenet_"  # beginning of the families of `dataset=shapenet`; the class follows
-DOUBTFUL = ("loaded machine", "shared device", "missing synchronisation")  # beginnings of notes on times
-OURS = "renderers."  # beginning of the targets of this project's renderers
+CHAMFER_SCALE = 1000.0  # tables and figures show Chamfer distances times this
+ONE_WAY = "chamfer_gt_to_pred"  # the error of shape from many views
+SHAPENET = "shapenet_"  # before the class, in the families of `dataset=shapenet`
+DOUBTFUL = ("loaded machine", "shared device", "missing synchronisation")  # notes on times begin so
+OURS = "renderers."  # the targets of this project's renderers begin so
 Record = dict[str, Any]
 RunKey = tuple[Any, ...]  # solid, view, seed, and further conditions, such as the number of points
 Item, Key = TypeVar("Item"), TypeVar("Key", bound=Hashable)
@@ -26,8 +26,8 @@ class Row:
 
     Args:
         preset: the chosen method, or else the renderer.
-        name: the run's label, or else the renderer's label, or else the renderer's file; with its loss of the mask,
-            where an experiment's rows differ in that.
+        name: the run's label, else the renderer's label, else the renderer's file. It includes the silhouette loss if
+            the rows of an experiment differ in it.
     """
 
     preset: str
@@ -41,13 +41,13 @@ def row_of(record: Record) -> Row:
 
 
 def base_renderer(record: Record) -> str:
-    """The renderer of which a preset is a variant: its class in lower case; for a user's class, its preset."""
+    """The class of the renderer in lower case; for a user's class, the preset."""
     target = str(setting(record["config"], "renderer", "_target_") or "")
     return target.rpartition(".")[2].lower() if target.startswith(OURS) else record["renderer"]
 
 
 def family(record: Record) -> str:
-    """The name of the record's dataset: the family, a class of ShapeNet, or the end of the path of meshes."""
+    """The name of the record's data set: the family, a class of ShapeNet, or the end of the path of meshes."""
     path, synset = (setting(record["config"], "dataset", key) for key in ("path", "synset"))
     if synset:
         return f"{SHAPENET}{synset}"
@@ -55,7 +55,7 @@ def family(record: Record) -> str:
 
 
 def iterations_of(record: Record) -> int | None:
-    """The number of the optimiser's iterations, which a task without an optimiser has among its own settings."""
+    """The number of iterations: of the optimiser, or of a task without one."""
     config = record["config"]
     return setting(config, "task", "optimiser", "iterations") or setting(config, "task", "iterations")
 
@@ -66,41 +66,40 @@ def doubtful(record: Record) -> bool:
 
 
 def index(record: Record) -> Any:
-    """The number of the shape in its family."""
     return record["config"].get("index")
 
 
 def measured(record: Record, name: str) -> int | float | None:
-    """The metric of that name; None where there is no such number."""
+    """The metric of that name; None if it is missing or no number."""
     return as_number(record["metrics"].get(name))
 
 
 def error(record: Record, name: str) -> float:
-    """The metric of that name as the run's error: infinite where the run did not end ok, or has no such number."""
+    """The metric of that name as the run's error; infinite if the run did not end ok or has no such number."""
     value = measured(record, name) if record["status"] == "ok" else None
     return math.inf if value is None or math.isnan(value) else value
 
 
 def loop_seconds(record: Record) -> float | None:
-    """The seconds in the optimisation loop; None where the record does not have them. A restored row has their sum."""
+    """The seconds of the optimisation loop, or None. A restored row has only their sum."""
     spent = [record["seconds"].get(name) for name in ("forward", "backward")]
     return record["seconds"].get("loop") if None in spent else sum(spent)
 
 
 def value_evaluations(record: Record) -> float | None:
-    """The number of field values computed in the loop, coarse ones included; None where the record does not have it."""
+    """The number of field evaluations in the loop, including coarse ones; None if it is not recorded."""
     value = record["evaluations"].get("value")
     return None if value is None else value + record["evaluations"].get("coarse", 0)
 
 
-def median_of_known(values: Iterable[float | None]) -> float | None:
-    """The median of the values that are known; None where there is none."""
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
+def median_or_none(values: Iterable[float | None]) -> float | None:
+    """The median of the values that are not None; None without any."""
+    numbers = [value for value in values if value is not None]
+    return float(np.median(numbers)) if numbers else None
 
 
 def setting(config: dict[str, Any], *path: str) -> Any:
-    """The value of a configuration under nested keys; None where a key is missing."""
+    """The value of a configuration under nested keys; None if a key is missing."""
     node: Any = config
     for key in path:
         node = node.get(key) if isinstance(node, dict) else None
@@ -108,10 +107,10 @@ def setting(config: dict[str, Any], *path: str) -> Any:
 
 
 def shared_settings(records: list[Record], names: dict[str, tuple[str, ...]]) -> str:
-    """A note on which settings all records share, and in which they differ; empty where no record has any.
+    """A note on the settings that all records share, and on those in which they differ; empty without settings.
 
     Args:
-        names: the path of each setting in a configuration, by the name that the note has for it.
+        names: the path of each setting in a configuration, by the name of the setting in the note.
     """
     values = {
         name: {str(value): value for record in records if (value := setting(record["config"], *path)) is not None}
@@ -124,22 +123,22 @@ def shared_settings(records: list[Record], names: dict[str, tuple[str, ...]]) ->
 
 
 def _ordered(values: Iterable[Any]) -> list[str]:
-    """Values as text, numbers by their size and before words."""
+    """Values as text: numbers sorted by size, then words."""
     return [str(value) for value in sorted(values, key=lambda x: (1, str(x)) if as_number(x) is None else (0, x))]
 
 
 def shape(record: Record) -> tuple[str, Any]:
-    """The shape of a run: its family and its number there."""
+    """The family and the index of a run's shape."""
     return family(record), index(record)
 
 
 def solid(record: Record) -> tuple[str, Any]:
-    """The shape of a run, one for all numbers of a mesh file that is not deformed: these are its views."""
+    """The shape of a run. All indices of a mesh file without deformation are one shape: they are its views."""
     return family(record), None if _is_view(record) else index(record)
 
 
 def view(record: Record) -> Any:
-    """The number of the view of a mesh file that is not deformed; 0 for others, whose shapes have a view each."""
+    """The view of a mesh file without deformation; 0 for other shapes, which have one view each."""
     return index(record) if _is_view(record) else 0
 
 
@@ -162,45 +161,45 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 
 def by_shape(values: dict[RunKey, float]) -> list[Any]:
-    """The numbers of runs as an array per shape, with an entry per seed; where shapes have views, as a list of these.
+    """The numbers of runs as one array per shape, with an entry per seed; if shapes have views, a list of such arrays.
 
-    Runs with equal solid and view are of one array, whatever else their keys have.
+    Runs with equal solid and view share an array, whatever else their keys have.
     """
     shapes = [grouped(runs, lambda run: run[1]).values() for runs in grouped(values, lambda run: run[0]).values()]
     arrays = [[np.array([values[run] for run in runs]) for runs in views] for views in shapes]
-    return arrays if any(len(views) > 1 for views in arrays) else [of_view for (of_view,) in arrays]
+    return arrays if any(len(views) > 1 for views in arrays) else [views for (views,) in arrays]
 
 
-def definition(known: dict[str, Any], name: str) -> Any:
-    """The definition of a metric; empty where there is none.
+def definition(texts_by_names: dict[str, Any], name: str) -> Any:
+    """The definition of a metric; empty without one.
 
-    A key is a list of names, such as "lost, false". It is also that of another band's metric of that name, such as
-    "frontal.code_cosine", and of names that begin so: "saved_..." and "depth_error" of depth_error_p99.
+    A key lists names, such as "lost, false". A name also covers metrics of a band, such as "frontal.code_cosine", and
+    metrics that begin with it: "saved_..." covers saved_rays, and "depth_error" covers depth_error_p99.
     """
-    keys = [(part.strip(), words) for key, words in known.items() for part in key.split(",")]
+    keys = [(alias.strip(), words) for key, words in texts_by_names.items() for alias in key.split(",")]
     last = name.rsplit(".", 1)[-1]
-    for fits in (
-        lambda part: part == name,
-        lambda part: part.endswith("...") and name.startswith(part[:-3]),
-        lambda part: part.rsplit(".", 1)[-1] == last,
-        lambda part: last.startswith(f"{part.rsplit('.', 1)[-1]}_"),
+    for matches in (
+        lambda alias: alias == name,
+        lambda alias: alias.endswith("...") and name.startswith(alias[:-3]),
+        lambda alias: alias.rsplit(".", 1)[-1] == last,
+        lambda alias: last.startswith(f"{alias.rsplit('.', 1)[-1]}_"),
     ):
-        for part, words in keys:
-            if fits(part):
+        for alias, words in keys:
+            if matches(alias):
                 return words
     return ""
 
 
 def definitions(records: list[Record], names: dict[str, str]) -> list[str]:
-    """A line with the headings and the definition of each metric that is shown; `names` has the heading by metric."""
+    """A line per definition, with the headings of its metrics; `names` maps each shown metric to its heading."""
     lines: dict[str, list[str]] = {}
     for name, heading in names.items():
-        told = next(filter(None, (str(definition(record["definitions"], name)) for record in records)), "")
-        lines.setdefault(told, []).append(heading)
-    return [f"{', '.join(dict.fromkeys(headings))}: {told}" for told, headings in lines.items() if told]
+        text = next(filter(None, (str(definition(record["definitions"], name)) for record in records)), "")
+        lines.setdefault(text, []).append(heading)
+    return [f"{', '.join(dict.fromkeys(headings))}: {text}" for text, headings in lines.items() if text]
 
 
 def repeated(records: list[Record]) -> str:
-    """The number of repeats of the times, as text, such as 3, 1 or 3, 1 to 3; empty where no record has it."""
+    """The numbers of repeats of the timing as text, such as 3, 1 or 3, 1 to 3; empty if none is recorded."""
     times = sorted({int(n) for record in records if (n := measured(record, "repeats")) is not None})
     return " or ".join(map(str, times)) if len(times) < 3 else f"{times[0]} to {times[-1]}"

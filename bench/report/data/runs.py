@@ -1,4 +1,4 @@
-"""The runs that a study reads: the newest run of each cell of its experiment, as records and as one typed table."""
+"""The runs that a study reads: the newest run of each cell of its experiment, as records and as a typed table."""
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
@@ -13,11 +13,23 @@ import pandas as pd
 from bench.records.names import flat
 from bench.records.record import requested, row_name, started
 from bench.report.data.frame import to_frame
-from bench.report.data.kept import KEPT, NO_ATTEMPTS
-from bench.report.data.records import SCALE, Record, Row, doubtful, family, grouped, index, row_of, setting, solid, view
+from bench.report.data.kept import FROM_RUNS_CSV, UNMEASURED
+from bench.report.data.records import (
+    CHAMFER_SCALE,
+    Record,
+    Row,
+    doubtful,
+    family,
+    grouped,
+    index,
+    row_of,
+    setting,
+    solid,
+    view,
+)
 
-MACHINE = ("cpu", "device", "threads")
-# Rows of one table may differ in these: an error against the truth compares them.
+MACHINE_KEYS = ("cpu", "device", "threads")
+# Rows of one table may differ in these settings: their errors against the ground truth stay comparable.
 ROW_SETTINGS = ("prior.truncation",)
 
 
@@ -26,10 +38,10 @@ class Selection:
     """The runs that a study reads.
 
     Args:
-        experiment: its name in the runs' configurations.
+        experiment: its name in the configurations of the runs.
         conditions: settings in which runs of one row differ, such as task.points or split.
-        setup: parts of the setup that captions name, where they are known.
-        alike: further parts of the configuration, such as dataset or task, in which only runs like the newest are read.
+        setup: parts of the setup that captions name if they are known.
+        alike: further parts of the configuration, such as task, in which only runs that equal the newest are read.
     """
 
     experiment: str
@@ -39,14 +51,14 @@ class Selection:
 
 
 class NoFolder(LookupError):
-    """A page needs more of a run than its record, such as its curve, and the run folder is gone."""
+    """A page needs a file of a run, such as its curve, but the run folder is gone."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """The runs of an experiment in the order of their rows, a failed or planned one too.
+    """The runs of an experiment in the order of their rows, including failed and planned ones.
 
-    `left_out` counts its runs that are not shown: of another scale, or replaced by a newer run of the same cell.
+    `left_out` is the number of its runs at another scale, or replaced by a newer run of the same cell.
     """
 
     selection: Selection
@@ -60,14 +72,14 @@ class Runs:
         """The table of `bench.load` for these runs, in the order of `records`.
 
         Further columns: row, the name of the row in tables; preset, which decides its look; family; solid and view,
-        the number of the shape and of its view; loop, the seconds in the loop; values, the field values with coarse
-        ones.
+        the numbers of the shape and of its view; loop, the seconds of the loop; values, the field evaluations including
+        coarse ones.
         """
         table = to_frame(self.records)
         rows = [row_of(record) for record in self.records]
         coarse = table.evaluations_coarse.fillna(0) if "evaluations_coarse" in table else 0
         missing = pd.Series(pd.NA, table.index, dtype="Float64")
-        forward, backward, loop = (table.get(f"seconds_{part}", missing) for part in ("forward", "backward", "loop"))
+        forward, backward, loop = (table.get(f"seconds_{phase}", missing) for phase in ("forward", "backward", "loop"))
         return table.assign(
             row=[row.name for row in rows],
             preset=[row.preset for row in rows],
@@ -78,52 +90,51 @@ class Runs:
             values=(table.get("evaluations_value", missing) + coarse).astype(float),
         )
 
-    def error(self, metric: str, scale: float = SCALE) -> pd.Series:
-        """A metric of each run, times `scale`; infinite where the run did not end ok or lacks it."""
+    def error(self, metric: str, scale: float = CHAMFER_SCALE) -> pd.Series:
+        """A metric of each run, times `scale`; infinite if the run did not end ok or lacks the metric."""
         ok = (self.frame.status == "ok").to_numpy(bool)
         return self.number(metric).where(ok, np.inf).fillna(np.inf) * scale
 
     def number(self, column: str) -> pd.Series:
-        """A column as floats, nan where it is missing or no number."""
+        """A column as floats; nan for missing values and text."""
         values = self.frame[column] if column in self.frame else pd.Series(np.nan, self.frame.index)
         return pd.to_numeric(values.astype(object).where(values.notna(), np.nan), errors="coerce").astype(float)
 
     @property
     def timed(self) -> bool:
-        """Whether the times of most runs can be relied on; where not, charts show field values alone."""
+        """Whether the times of most runs are reliable; if not, charts show field evaluations only."""
         return 2 * sum(map(doubtful, self.records)) < len(self.records)
 
     def setting(self, key: str) -> pd.Series:
-        """A setting of each run as text, such as task.points; empty where it is missing."""
+        """A setting of each run as text, such as task.points; empty if it is missing."""
         column = self.frame.get(f"config.{key}")
         return pd.Series("", self.frame.index) if column is None else column.astype("string").fillna("").astype(object)
 
     def where(self, kept: pd.Series) -> "Runs":
-        """Those runs alone; they are not counted as left out."""
+        """The runs for which `kept` is true. The others do not count as left out."""
         return replace(self, records=[record for record, keep in zip(self.records, kept, strict=True) if keep])
 
     @property
-    def made(self) -> "Runs":
-        """Without cells that were not run, killed or refused, which are no failures; all where no other is there."""
-        made = ~self.frame.status.isin(NO_ATTEMPTS)
-        return self.where(made) if made.any() else self
+    def executed(self) -> "Runs":
+        """The runs that are not just planned, killed or refused, as these are no failures; all runs without others."""
+        executed = ~self.frame.status.isin(UNMEASURED)
+        return self.where(executed) if executed.any() else self
 
     def other(self, selection: Selection) -> "Runs | None":
         """The runs of another experiment of the same results folder."""
         return choose(self.everything, selection, self.results_dir)
 
     def folder(self, record: Record) -> Path:
-        """The record's run folder.
+        """The run folder of a record.
 
         Raises:
-            NoFolder: where it is gone, and the record is a row of a shipped table.
+            NoFolder: the record was read from a shipped file, and has no folder here.
         """
-        if KEPT in record:
+        if FROM_RUNS_CSV in record:
             raise NoFolder(record["folder"])
         return self.results_dir / "runs" / record["folder"]
 
     def requested(self) -> dict[str, Any]:
-        """The configuration of the first run."""
         return self.records[0]["config"]
 
     def rows(self) -> dict[Row, list[Record]]:
@@ -133,147 +144,148 @@ class Runs:
         return grouped(self.records, family)
 
     def named(self) -> list[Record]:
-        """The records with their readable names under `name`."""
+        """The records with their readable names as `name`."""
         return [{**record, "name": name} for record, name in zip(self.records, self.names(), strict=True)]
 
     def names(self) -> list[str]:
-        """A readable name of each run: its row's, with what else runs differ in: conditions, family, seed, shape."""
-        parts = {"": family, "seed ": itemgetter("seed"), "shape ": index}
-        varied = {word: part for word, part in parts.items() if len({str(part(record)) for record in self.records}) > 1}
+        """A readable name of each run: its row, its conditions, and family, seed and shape if they vary."""
+        getters = {"": family, "seed ": itemgetter("seed"), "shape ": index}
+        varying = {word: get for word, get in getters.items() if len({str(get(run)) for run in self.records}) > 1}
         return [
             row_of(record).name
             + "".join(f", {value} {name}" for name, value in self._conditions(record))
-            + "".join(f", {word}{part(record)}" for word, part in varied.items())
+            + "".join(f", {word}{get(record)}" for word, get in varying.items())
             for record in self.records
         ]
 
     def _conditions(self, record: Record) -> list[tuple[str, Any]]:
-        found = {
+        values = {
             key.rpartition(".")[2]: setting(record["config"], *key.split(".")) for key in self.selection.conditions
         }
-        return [(name, value) for name, value in found.items() if isinstance(value, str | int | float)]
+        return [(name, value) for name, value in values.items() if isinstance(value, str | int | float)]
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
-        """The names of the runs by what their times depend on: processor, accelerator, threads, compiled kernels.
+        """The names of the runs by machine: processor, accelerator, threads, and whether kernels are compiled.
 
-        A run that ended before it knew its processor has no machine.
+        A run that ended too early to record its processor is left out.
         """
 
         def machine_of(record: Record) -> tuple[Any, ...]:
-            said = record["environment"]
-            return (*(said.get(key) for key in MACHINE), said.get("kernels") == "compiled")
+            environment = record["environment"]
+            return (*(environment.get(key) for key in MACHINE_KEYS), environment.get("kernels") == "compiled")
 
         machines = grouped([record for record in self.named() if record["environment"].get("cpu")], machine_of)
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:
-        """The settings of view and evaluation in which an experiment's runs differ, of prior and field in a family."""
+        """The settings in which runs differ: view and evaluation in an experiment, prior and field in a family."""
         experiments = grouped(self.records, lambda record: record["config"].get("experiment")).values()
-        together = [(records, ("view", "evaluation")) for records in experiments]
-        families = (records for own in experiments for records in grouped(own, family).values())
-        together += [(records, ("prior", "field")) for records in families]
-        found: dict[str, None] = {}
-        for records, parts in together:
-            known = [flat({part: record["config"].get(part) for part in parts}, "") for record in records]
-            ignored = {*self.selection.conditions, *ROW_SETTINGS}
-            keys = dict.fromkeys(key for one in known for key in one if key not in ignored)
-            found |= {key: None for key in keys if len({str(one[key]) for one in known if key in one}) > 1}
-        return list(found)
+        comparisons = [(records, ("view", "evaluation")) for records in experiments]
+        families = (records for group in experiments for records in grouped(group, family).values())
+        comparisons += [(records, ("prior", "field")) for records in families]
+        differing, ignored = dict[str, None](), {*self.selection.conditions, *ROW_SETTINGS}
+        for records, sections in comparisons:
+            configs = [flat({key: record["config"].get(key) for key in sections}, "") for record in records]
+            keys = dict.fromkeys(key for config in configs for key in config if key not in ignored)
+            texts = {key: {str(config[key]) for config in configs if key in config} for key in keys}
+            differing |= {key: None for key in keys if len(texts[key]) > 1}
+        return list(differing)
 
     def of_newest_scene(self) -> "Runs":
-        """Those runs alone that have the seed and the shape of the one requested last."""
+        """The runs with the seed and the shape of the run that was requested last."""
         newest = max(self.records, key=requested)
         kept = [r for r in self.records if (r["seed"], index(r)) == (newest["seed"], index(newest))]
         return replace(self, records=kept, left_out=self.left_out + len(self.records) - len(kept))
 
 
 def choose(records: list[Record], selection: Selection, results_dir: Path) -> Runs | None:
-    """The newest run of each cell of an experiment, at the scale of the run that was requested last; None without one.
+    """The newest run of each cell of an experiment, at the scale of the run requested last; None without runs.
 
-    A cell is a row, a task, a split, a draw, a shape, a view, a seed and the selection's conditions. A row has one
-    setting, the one that was requested last: runs of a row with other settings would be averaged as one. On one scene,
-    where nothing is averaged, rows of one name are told apart by their renderers' settings. Rows stand in the order in
-    which they started.
+    A cell is a row, task, split, draw, shape, view, seed and the conditions of the selection. Of a row, only runs with
+    the settings requested last are read, so that no average mixes settings. On one scene nothing is averaged: there,
+    rows of one name are distinguished by the settings of their renderers. Rows are in the order of their first start.
     """
-    found = sorted((r for r in records if r["config"].get("experiment") == selection.experiment), key=started)
-    if not found:
+    candidates = sorted((r for r in records if r["config"].get("experiment") == selection.experiment), key=started)
+    if not candidates:
         return None
     shared = [key for key in ("scale.name", "split", *selection.alike) if key not in selection.conditions]
-    newest = max(found, key=requested)
-    same = [r for r in found if all(_part(r, key, selection) == _part(newest, key, selection) for key in shared)]
+    newest = max(candidates, key=requested)
+    wanted = [_without_conditions(newest, key, selection) for key in shared]
+    chosen = [run for run in candidates if [_without_conditions(run, key, selection) for key in shared] == wanted]
     if "dataset" not in selection.alike:
-        last = {_row(record): _setting(record, selection) for record in sorted(same, key=requested)}
-        same = [record for record in same if _setting(record, selection) == last[_row(record)]]
+        newest = {_row_key(run): _row_settings(run, selection) for run in sorted(chosen, key=requested)}
+        chosen = [record for record in chosen if _row_settings(record, selection) == newest[_row_key(record)]]
     cells: dict[Hashable, Record] = {}
-    for record in same:
-        cells[_cell(record, selection)] = record  # keeps the place of the first record, with the content of the newest
-    return Runs(selection, results_dir, named_rows(list(cells.values())), len(found) - len(cells), records)
+    for record in chosen:  # a cell keeps the position of its first record, with the content of the newest
+        cells[_cell_key(record, selection)] = record
+    return Runs(selection, results_dir, named_rows(list(cells.values())), len(candidates) - len(cells), records)
 
 
-def together(*several: Runs | None) -> Runs:
-    """The runs of several experiments as one, for a common caption."""
-    known = [runs for runs in several if runs is not None]
-    records = sorted((record for runs in known for record in runs.records), key=started)
-    return replace(known[0], records=records, left_out=sum(runs.left_out for runs in known))
+def merge_runs(*runs_or_none: Runs | None) -> Runs:
+    """The runs of several experiments as one object, for a common caption."""
+    present = [runs for runs in runs_or_none if runs is not None]
+    records = sorted((record for runs in present for record in runs.records), key=started)
+    return replace(present[0], records=records, left_out=sum(runs.left_out for runs in present))
 
 
 def shared_loss(records: list[Record]) -> str:
-    """The label of the mask loss that all records have; empty where they differ, or have their renderers' own."""
+    """The label of the silhouette loss that all records share; empty if they differ or use their renderer's loss."""
     labels = {setting(record["config"], "silhouette", "_label_") or "" for record in records}
     return str(labels.pop()) if len(labels) == 1 else ""
 
 
 def named_rows(records: list[Record]) -> list[Record]:
-    """The records with the names of their rows under `row`.
+    """The records with the names of their rows as `row`.
 
-    A mask loss that all share is left out, since captions name it; rows of one name get the settings of the renderer
-    in which they differ, and their presets where these differ.
+    A silhouette loss that all records share is left out, since captions name it. Rows of one name get the settings of
+    the renderer in which they differ, and their presets if these differ.
     """
     shared = {"silhouette": {}} if shared_loss(records) else {}
     names = [row_name(record["config"] | shared, record["renderer"]) for record in records]
-    alike = grouped(range(len(records)), lambda place: (names[place], row_of(records[place]).preset))
-    for places in alike.values():
-        settings = {place: renderer_settings(records[place]) for place in places}
-        keys = dict.fromkeys(key for one in settings.values() for key in one)
-        differ = [key for key in keys if len({one.get(key) for one in settings.values()}) > 1]
-        for place, own in settings.items():
-            told = [f"{key.strip('_')} {own[key]}" for key in differ if key in own]
-            names[place] += f" ({', '.join(told)})" if told else ""
-    presets = grouped(range(len(records)), lambda place: names[place])
-    several = {name for name, own in presets.items() if len({row_of(records[place]).preset for place in own}) > 1}
-    names = [f"{n}, {row_of(r).preset}" if n in several else n for n, r in zip(names, records, strict=True)]
+    presets = [row_of(record).preset for record in records]
+    positions_by_row = grouped(range(len(records)), lambda position: (names[position], presets[position]))
+    for positions in positions_by_row.values():
+        settings = {position: renderer_settings(records[position]) for position in positions}
+        keys = dict.fromkeys(key for values in settings.values() for key in values)
+        differ = [key for key in keys if len({values.get(key) for values in settings.values()}) > 1]
+        for position, row_settings in settings.items():
+            differences = [f"{key.strip('_')} {row_settings[key]}" for key in differ if key in row_settings]
+            names[position] += f" ({', '.join(differences)})" if differences else ""
+    presets_by_name = grouped(zip(names, presets, strict=True), lambda pair: pair[0])
+    ambiguous = {name for name, pairs in presets_by_name.items() if len({*pairs}) > 1}
+    names = [f"{name}, {preset}" if name in ambiguous else name for name, preset in zip(names, presets, strict=True)]
     return [record | {"row": name} for record, name in zip(records, names, strict=True)]
 
 
 def renderer_settings(record: Record) -> dict[str, str]:
-    """The settings of the record's renderer as text; none of a draw, whose row has all settings drawn."""
+    """The settings of the record's renderer as text; empty for a draw, as its row covers all drawn settings."""
     if record["config"].get("draw") is not None:
         return {}
     return {str(key): str(value) for key, value in (record["config"].get("renderer") or {}).items()}
 
 
-def _part(record: Record, key: str, selection: Selection) -> Any:
-    found = setting(record["config"], *key.split("."))
-    if not isinstance(found, dict) or not any(one.startswith(f"{key}.") for one in selection.conditions):
-        return found
-    kept = [name for name in found if f"{key}.{name}" not in selection.conditions]
-    return {name: _part(record, f"{key}.{name}", selection) for name in kept}
+def _without_conditions(record: Record, key: str, selection: Selection) -> Any:
+    node = setting(record["config"], *key.split("."))
+    if not isinstance(node, dict) or not any(condition.startswith(f"{key}.") for condition in selection.conditions):
+        return node
+    names = [name for name in node if f"{key}.{name}" not in selection.conditions]
+    return {name: _without_conditions(record, f"{key}.{name}", selection) for name in names}
 
 
-def _row(record: Record) -> Hashable:
-    """What has one setting: a row in a task, and of a search space a draw."""
+def _row_key(record: Record) -> Hashable:
+    """The key of runs that must share their settings: a row in a task, and a draw of a search space."""
     return row_of(record), record["task"], record["config"].get("draw")
 
 
-def _setting(record: Record, selection: Selection) -> Any:
-    """The settings of a row: the renderer's, the task's without conditions, the loss of the mask, the resolution."""
-    parts = [_part(record, key, selection) for key in ("renderer", "task", "silhouette")]
-    return [*parts, setting(record["config"], "view", "resolution")]
+def _row_settings(record: Record, selection: Selection) -> Any:
+    """The settings of a row: renderer, task and silhouette loss without conditions, and the resolution."""
+    settings = [_without_conditions(record, key, selection) for key in ("renderer", "task", "silhouette")]
+    return [*settings, setting(record["config"], "view", "resolution")]
 
 
-def _cell(record: Record, selection: Selection) -> Hashable:
-    """What has one run. A condition that is a node, such as a stress, is named by the shape's family already."""
-    found = (setting(record["config"], *key.split(".")) for key in (*selection.conditions, "split"))
-    conditions = (str(value) for value in found if not isinstance(value, dict))
+def _cell_key(record: Record, selection: Selection) -> Hashable:
+    """The key of a cell. A condition that is a node, such as a stress, is part of the shape's family already."""
+    values = (setting(record["config"], *key.split(".")) for key in (*selection.conditions, "split"))
+    conditions = (str(value) for value in values if not isinstance(value, dict))
     settings = str(sorted(renderer_settings(record).items()))
-    return (*_row(record), settings, *solid(record), view(record), record["seed"], *conditions)
+    return (*_row_key(record), settings, *solid(record), view(record), record["seed"], *conditions)

@@ -1,11 +1,11 @@
 """Statistics of methods' errors over runs: averages, intervals, ranks and Pareto fronts.
 
 Lower is better. A run that failed or is missing has the error +inf. A method's errors are groups: an array per shape,
-with the errors of its seeds, or a list per shape with an array per view. Where methods are compared, the same place in
-their groups means the same shape, view and seed.
+with the errors of its seeds, or a list per shape with an array per view. When methods are compared, the same position
+in their groups means the same shape, view and seed.
 
-The independent unit is the shape. Below `FEWEST_SHAPES` no interval is given: its ends are nan, and the values of the
-shapes stand in `Interval.points` to be shown instead. From one run alone no probability and no rank is given.
+The independent unit is the shape. With fewer than `MIN_SHAPES` shapes there is no interval: its ends are nan, and the
+values of the shapes are in `Interval.points`, to be shown instead. One run gives no probability and no rank.
 """
 
 import math
@@ -22,19 +22,19 @@ from scipy import special  # scipy.stats would take 0.6 s and 60 MiB
 from bench.records import format
 
 Values = np.ndarray | Sequence[float]
-Groups = Sequence[Any]  # of each shape an array of its seeds, or a sequence of such arrays, one per view
+Groups = Sequence[Any]  # per shape an array of its seeds, or a sequence of such arrays, one per view
 Statistic = Callable[[np.ndarray], float | np.ndarray]  # reduces the last axis, as `interquartile_mean` does
 Point = tuple[Groups, Groups]  # the costs and the errors of one setting
-LEVEL = 0.95  # of all intervals
-ALPHA = 1 - LEVEL  # the probability of any false rejection among the tests of a page
-FEWEST_SHAPES = 6  # with an interval: the extremes of five enclose a median with a probability of 94 %, of four 88 %
+CONFIDENCE_LEVEL = 0.95
+ALPHA = 1 - CONFIDENCE_LEVEL  # the probability of any false rejection among the tests of a page
+MIN_SHAPES = 6  # an interval of five shapes would cover their median with a probability of only 94 %
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and the ends of its confidence interval; nan ends where there are too few shapes for one.
+    """An estimate and the ends of its confidence interval; with too few shapes the ends are nan.
 
-    `points` are the estimates of the single shapes, which are shown where there is no interval.
+    `points` are the estimates of the single shapes, which are shown instead of a missing interval.
     """
 
     value: float
@@ -43,21 +43,20 @@ class Interval:
     points: tuple[float, ...] = field(default=(), compare=False, repr=False)
 
     @property
-    def known(self) -> bool:
+    def has_ends(self) -> bool:
         """Whether there is an interval."""
         return not math.isnan(self.low)
 
     def times(self, scale: float) -> "Interval":
-        """The same times a number."""
         value, low, high, *points = (scale * x for x in (self.value, self.low, self.high, *self.points))
         return Interval(value, low, high, tuple(points))
 
     def ends(self, scale: float = 1.0) -> str:
-        """The interval, its ends times `scale`, or else the number of shapes, such as (n = 4)."""
-        return format.interval(scale * self.low, scale * self.high) if self.known else f"(n = {len(self.points)})"
+        """The interval times `scale` as text; without an interval the number of shapes, such as (n = 4)."""
+        return format.interval(scale * self.low, scale * self.high) if self.has_ends else f"(n = {len(self.points)})"
 
     def __str__(self) -> str:
-        """The estimate, and its interval or else the number of shapes."""
+        """The estimate with its interval, or with the number of shapes."""
         return f"{self.alone()} {self.ends()}"
 
     def alone(self) -> str:
@@ -66,26 +65,26 @@ class Interval:
 
 
 def interquartile_mean(values: Values) -> float | np.ndarray:
-    """The mean of the middle half [...] of values [..., n]; a value at the edge of that half counts in part."""
+    """The mean of the middle half [...] of values [..., n]; a value at the edge of that half counts partly."""
     ordered = np.sort(_checked(values), axis=-1)
     n, i = ordered.shape[-1], np.arange(ordered.shape[-1])
-    share = np.clip(np.minimum(i + 1, 0.75 * n) - np.maximum(i, 0.25 * n), 0, None)  # of each in the middle half
+    share = np.clip(np.minimum(i + 1, 0.75 * n) - np.maximum(i, 0.25 * n), 0, None)  # inside the middle half
     return (ordered[..., share > 0] * share[share > 0]).sum(axis=-1) / (n / 2)
 
 
 def median(values: Values) -> float | np.ndarray:
-    """The median [...] of values [..., n]; for even n the mean of the middle two, +inf where one of them is."""
+    """The median [...] of values [..., n]; for even n the mean of the middle two, +inf if one of them is."""
     return np.median(_checked(values), axis=-1)
 
 
 def geometric_mean(values: Values) -> float | np.ndarray:
-    """The geometric mean [...] of values [..., n] of 0 or more; +inf where one of them is."""
-    with np.errstate(divide="ignore"):  # of 0
+    """The geometric mean [...] of values [..., n] of 0 or more; +inf if one of them is."""
+    with np.errstate(divide="ignore"):  # log(0)
         return np.exp(np.log(_checked(values)).mean(axis=-1))
 
 
-def better(first: Groups, second: Groups) -> float:
-    """On how many shapes the median of the first's runs is lower than that of the second's; equal ones are half."""
+def shapes_won(first: Groups, second: Groups) -> float:
+    """The number of shapes on which the median of the first's runs is lower; a tie counts half."""
     a, b = (np.array([median(flat([group])) for group in groups]) for groups in (first, second))
     return float(((a < b) + 0.5 * (a == b)).sum())
 
@@ -93,17 +92,17 @@ def better(first: Groups, second: Groups) -> float:
 def bootstrap(groups: Groups, statistic: Statistic, *, seed: int = 0, draws: int = 2000) -> Interval:
     """The statistic of all runs with its hierarchical bootstrap interval over shapes, views and seeds.
 
-    A draw takes shapes with replacement, of each drawn shape views with replacement, and of each drawn view seeds with
-    replacement (Davison and Hinkley 1997, Sec. 3.8). The percentiles are widened for few shapes (Hesterberg 2015, "What
-    teachers should know about the bootstrap": expanded percentile interval). The interval covers 95 % or more with six
-    shapes or more, of interquartile means and medians of errors; where seeds vary as much as shapes it is too wide
-    (covers 99 %), as their spread enters at each stage.
+    A draw takes shapes with replacement, then views of each drawn shape, then seeds of each drawn view (Davison and
+    Hinkley 1997, Sec. 3.8). The percentiles are widened for few shapes (Hesterberg 2015, "What teachers should know
+    about the bootstrap": expanded percentile interval). For interquartile means and medians of errors of six shapes or
+    more, the interval covers 95 % or more. If seeds vary as much as shapes, it is too wide (99 %), as the spread of
+    seeds enters at each stage.
 
     Args:
-        statistic: reduces the last axis. It gets the runs of all shapes together: a shape with more runs weighs more.
+        statistic: reduces the last axis. It gets the runs of all shapes at once: a shape with more runs weighs more.
 
     Returns:
-        Ends are draws, never interpolated, so they can be +inf; nan below `FEWEST_SHAPES`.
+        Ends are draws, never interpolated, so they can be +inf; nan with fewer than `MIN_SHAPES` shapes.
     """
     (value,), (drawn,), points = _resample([groups], statistic, seed, draws)
     return _interval(value, drawn, points[0])
@@ -112,26 +111,26 @@ def bootstrap(groups: Groups, statistic: Statistic, *, seed: int = 0, draws: int
 def typical(groups: Groups) -> Interval:
     """The median over shapes of the geometric mean of their runs, with the interval of the sign test.
 
-    Its ends are the values of shapes, so it holds whatever their distribution: where 15 % of shapes fail badly, no
-    interval of a mean over 6 to 12 shapes covers 95 %.
+    Its ends are values of shapes, so it is valid for any distribution. If 15 % of shapes fail badly, no interval of a
+    mean over 6 to 12 shapes covers 95 %.
 
     Returns:
-        nan ends below `FEWEST_SHAPES`; the median and the ends may be infinite.
+        The ends are nan with fewer than `MIN_SHAPES` shapes; the median and the ends may be infinite.
     """
-    return _of_median(_of_shapes(groups))
+    return _median_interval(_shape_means(groups))
 
 
 def ratio(first: Groups, second: Groups) -> Interval:
     """The median over shapes of the ratio of two errors, each the geometric mean of the shape's runs; see `typical`.
 
-    Where both fail on a shape, neither is better: its ratio is 1.
+    If both fail on a shape, its ratio is 1: neither is better.
 
     Raises:
         ValueError: the two do not have the same shapes with the same numbers of views and seeds.
     """
     if _sizes(first) != _sizes(second):
-        raise ValueError(f"{_SAME} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
-    return _of_median(_ratio(_of_shapes(first), _of_shapes(second)))
+        raise ValueError(f"{_UNEQUAL_SHAPES} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
+    return _median_interval(_ratio(_shape_means(first), _shape_means(second)))
 
 
 class Verdict(Enum):
@@ -142,16 +141,16 @@ class Verdict(Enum):
     NOT_DECIDABLE = "cannot be decided"  # no data of so few shapes could be rejected
 
 
-def differ(ratios: Sequence[Interval]) -> list[Verdict]:
-    """The verdict on each ratio of a family: the sign test over shapes with Holm's step-down at 5 % in all.
+def ratio_verdicts(ratios: Sequence[Interval]) -> list[Verdict]:
+    """The verdict on each ratio of a family: the sign test over shapes with Holm's step-down at a total of 5 %.
 
-    A ratio is not decidable if the test would reject nothing even where all shapes of all ratios agree. Ratios of fewer
-    shapes than `FEWEST_SHAPES` are not decidable, and are not counted.
+    A ratio is not decidable if the test would not reject even if all shapes of all ratios agreed. Ratios of fewer than
+    `MIN_SHAPES` shapes are not decidable, and do not count as tests.
     """
-    counted = [index for index, ratio in enumerate(ratios) if ratio.known]
+    counted = [index for index, ratio in enumerate(ratios) if ratio.has_ends]
     tests = (
-        [_sign_test(ratios[index].points) for index in counted],
-        [_least_chance(len(ratios[index].points)) for index in counted],
+        [_sign_test_p_value(ratios[index].points) for index in counted],
+        [_min_p_value(len(ratios[index].points)) for index in counted],
     )
     rejected, decidable = ({index for index, sure in zip(counted, holm(test), strict=True) if sure} for test in tests)
     open_verdicts = [Verdict.NOT_DISTINGUISHED if i in decidable else Verdict.NOT_DECIDABLE for i in range(len(ratios))]
@@ -159,7 +158,7 @@ def differ(ratios: Sequence[Interval]) -> list[Verdict]:
 
 
 def holm(p_values: Values, alpha: float = ALPHA) -> np.ndarray:
-    """Which of several hypotheses are rejected at `alpha` in all, by the step-down of Holm (1979)."""
+    """Which hypotheses the step-down procedure of Holm (1979) rejects at a total level `alpha`."""
     ordered = np.argsort(p_values, kind="stable")
     passed = np.asarray(p_values)[ordered] <= alpha / (len(ordered) - np.arange(len(ordered)))
     rejected = np.zeros(len(ordered), dtype=bool)
@@ -168,40 +167,40 @@ def holm(p_values: Values, alpha: float = ALPHA) -> np.ndarray:
 
 
 def shapes_needed(ratios: int, alpha: float = ALPHA) -> int:
-    """The fewest shapes with which the sign test can reject anything in a family of so many ratios."""
-    return next(n for n in count(1) if _least_chance(n) <= alpha / ratios)
+    """The fewest shapes with which the sign test can reject anything in a family of that many ratios."""
+    return next(n for n in count(1) if _min_p_value(n) <= alpha / ratios)
 
 
 def shapes_agreeing(shapes: int, ratios: int) -> int:
-    """How many of the shapes must be on one side of 1 for Holm's first step to reject; one more than all if none do."""
-    chances = 2 * special.bdtr(np.arange(shapes), shapes, 0.5)  # of at most so many on the other side
+    """How many shapes must be on one side of 1 for Holm's first step to reject; `shapes` + 1 if it cannot."""
+    chances = 2 * special.bdtr(np.arange(shapes), shapes, 0.5)  # of at most i shapes on the other side
     return shapes + 1 - int(np.searchsorted(chances, ALPHA / ratios, side="right"))
 
 
-def _least_chance(shapes: int) -> float:
-    """The probability of the sign test if all shapes are on one side of 1."""
+def _min_p_value(shapes: int) -> float:
+    """The p value of the sign test if all shapes are on one side of 1."""
     return 2.0 * 0.5**shapes
 
 
-def _sign_test(points: Sequence[float]) -> float:
-    """The probability of as many values on one side of 1, if both sides are as likely; values of 1 do not count."""
+def _sign_test_p_value(points: Sequence[float]) -> float:
+    """The two-sided p value of the sign test on values against 1; values of 1 do not count."""
     below, above = sum(x < 1 for x in points), sum(x > 1 for x in points)
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
 
 
-def _of_shapes(groups: Groups) -> np.ndarray:
+def _shape_means(groups: Groups) -> np.ndarray:
     """The geometric mean of each shape's runs."""
     return np.array([geometric_mean(flat([group])) for group in groups])
 
 
-def _of_median(points: np.ndarray) -> Interval:
-    """The median of shapes' values; beyond its ends lie as many as a sign test allows."""
+def _median_interval(points: np.ndarray) -> Interval:
+    """The median of the shapes' values, with the interval of the sign test."""
     n = len(points)
-    with np.errstate(divide="ignore", invalid="ignore"):  # 0 and inf beside each other: neither is known to be better
+    with np.errstate(divide="ignore", invalid="ignore"):  # log(0), and 0 next to inf: no median
         middle = math.exp(np.median(np.log(points)))
-    if n < FEWEST_SHAPES:
+    if n < MIN_SHAPES:
         return Interval(middle, math.nan, math.nan, tuple(points.tolist()))
-    chances = special.bdtr(np.arange(n), n, 0.5)  # of at most so many of n values below the median
+    chances = special.bdtr(np.arange(n), n, 0.5)  # of at most i of n values below the median
     beyond, ordered = int(np.searchsorted(chances, ALPHA / 2)) - 1, np.sort(points)
     return Interval(middle, float(ordered[beyond]), float(ordered[-1 - beyond]), tuple(points.tolist()))
 
@@ -211,7 +210,7 @@ def paired_bootstrap(
 ) -> Interval:
     """The ratio of the first's statistic to the second's, with its interval over the same draws of both.
 
-    Equal statistics have the ratio 1, also if both are +inf or 0: where both fail, neither is better.
+    Equal statistics have the ratio 1, also if both are +inf or 0: if both fail, neither is better.
 
     Raises:
         ValueError: the two do not have the same shapes with the same numbers of views and seeds.
@@ -221,30 +220,30 @@ def paired_bootstrap(
 
 
 def share(successes: Values, trials: Values) -> Interval:
-    """The share of successes among all trials of all shapes, with an interval over shapes.
+    """The fraction of successes among all trials of all shapes, with an interval over shapes.
 
-    The interval is that of `clopper_pearson` with as many trials as there are shapes. Trials of one shape depend on
-    each other, so that all of them are worth between one trial and their number; the design effect that would say how
-    many (Rao and Scott 1992) cannot be estimated from so few shapes: intervals with it cover 91 % at 16 shapes.
+    The interval is that of `clopper_pearson` with as many trials as shapes. Trials of one shape are not independent.
+    Their design effect (Rao and Scott 1992) cannot be estimated from so few shapes: intervals with it cover 91 % at 16
+    shapes.
 
     Args:
         successes: per shape; a tie is half a success.
         trials: per shape, one or more.
 
     Returns:
-        A share of 1; nan ends below `FEWEST_SHAPES`.
+        A fraction; the ends are nan with fewer than `MIN_SHAPES` shapes.
     """
     k, m = np.asarray(successes, dtype=float), np.asarray(trials, dtype=float)
     if k.shape != m.shape or not k.size or not ((k >= 0) & (k <= m) & (m >= 1)).all():
         raise ValueError(f"successes must be in 0..trials, trials 1 or more per shape, but they are {k} and {m}")
     value, points = float(k.sum() / m.sum()), tuple((k / m).tolist())
-    if len(k) < FEWEST_SHAPES:
+    if len(k) < MIN_SHAPES:
         return Interval(value, math.nan, math.nan, points)
     return replace(clopper_pearson(value, len(k)), points=points)
 
 
 def clopper_pearson(value: float, n: float) -> Interval:
-    """A share among n independent trials with its exact interval (Clopper and Pearson 1934); n need not be whole."""
+    """A fraction of n independent trials with its exact interval (Clopper and Pearson 1934); n may be fractional."""
     if not 0 <= value <= 1 or n < 1:
         raise ValueError(f"the share must be in 0..1 and n at least 1, but they are {value} and {n}: count the trials")
     k, tail = value * n, ALPHA / 2
@@ -254,35 +253,35 @@ def clopper_pearson(value: float, n: float) -> Interval:
 
 
 def rank(table: dict[Any, dict[Any, float | None]]) -> dict[Any, Interval]:
-    """Each method's mean rank over the shapes with its bootstrap interval, 1 is the best; equal errors share a rank.
+    """Each method's mean rank over the shapes with its bootstrap interval. Rank 1 is best; equal errors share a rank.
 
-    A method without a finite error for a shape has the worst rank there: the number of methods. A shape at which all
-    methods fail is left out. From one shape no rank is given: nan. `Interval.points` are the ranks of the shapes.
+    On a shape, a method without a finite error gets the worst rank: the number of methods. A shape on which all methods
+    fail is left out. With one shape the rank is nan. `Interval.points` are the ranks of the shapes.
 
     Args:
-        table: the errors of each method by shape, or by anything else that is compared.
+        table: the errors of each method by shape, or by another unit.
     """
     worst, several_shapes = float(len(table)), len({shape for errors in table.values() for shape in errors}) > 1
     errors = pd.DataFrame(table, dtype=float).replace(math.inf, math.nan).dropna(how="all")
     ranks = errors.rank(axis=1).fillna(worst)
     if not several_shapes or ranks.empty:
         return dict.fromkeys(table, Interval(worst if several_shapes else math.nan, math.nan, math.nan))
-    return {name: _mean_of(ranks[name].to_numpy()) for name in table}
+    return {name: _mean_interval(ranks[name].to_numpy()) for name in table}
 
 
-def _mean_of(values: np.ndarray) -> Interval:
+def _mean_interval(values: np.ndarray) -> Interval:
     return bootstrap([*values[:, None]], lambda drawn: np.mean(drawn, axis=-1))
 
 
-def as_good(ranks: dict[Any, Interval], best: Any) -> list[Any]:
-    """The other methods whose ranks do not differ from the best one's: the interval of the difference holds 0."""
-    first = np.array(ranks[best].points)
-    others = {name: _mean_of(np.array(found.points) - first) for name, found in ranks.items() if name != best}
-    return [name for name, found in others.items() if found.low <= 0 <= found.high]
+def tied_with_best(ranks: dict[Any, Interval], best: Any) -> list[Any]:
+    """The other methods that cannot be distinguished from the best: the interval of the rank difference contains 0."""
+    best_points = np.array(ranks[best].points)
+    others = {name: _mean_interval(np.array(rank.points) - best_points) for name, rank in ranks.items() if name != best}
+    return [name for name, rank in others.items() if rank.low <= 0 <= rank.high]
 
 
 def dominated(costs: Values, errors: Values) -> np.ndarray:
-    """Whether another of the points [..., n] is no worse in both and better in one; equal points do not dominate."""
+    """Whether another of the points [..., n] is no worse in both and better in one. Equal points do not dominate."""
     costs, errors = _checked(costs), _checked(errors)
     mine, other = (costs[..., :, None], errors[..., :, None]), (costs[..., None, :], errors[..., None, :])
     no_worse = (other[0] <= mine[0]) & (other[1] <= mine[1])
@@ -290,18 +289,18 @@ def dominated(costs: Values, errors: Values) -> np.ndarray:
 
 
 def on_front(costs: Sequence[float | None], errors: Sequence[float]) -> list[bool]:
-    """Whether each point is on the front: it has a cost and a finite error, and none that has both dominates it."""
-    both = [cost is not None and math.isfinite(error) for cost, error in zip(costs, errors, strict=True)]
-    known = [(cost, error) for cost, error, has in zip(costs, errors, both, strict=True) if has]
-    beaten = iter(dominated(*zip(*known, strict=True)) if known else ())
-    return [has and not next(beaten) for has in both]
+    """Whether each point is on the front: it has a cost and a finite error, and no such point dominates it."""
+    is_complete = [cost is not None and math.isfinite(error) for cost, error in zip(costs, errors, strict=True)]
+    pairs = [(cost, error) for cost, error, has in zip(costs, errors, is_complete, strict=True) if has]
+    is_dominated = iter(dominated(*zip(*pairs, strict=True)) if pairs else ())
+    return [has and not next(is_dominated) for has in is_complete]
 
 
 def front(points: Sequence[Point], *, seed: int = 0, draws: int = 2000) -> list[float]:
-    """The probability of each setting to be on the Pareto front of medians, over bootstrap draws of shapes and seeds.
+    """The probability that each setting is on the Pareto front of medians, over bootstrap draws of shapes and seeds.
 
-    All settings get the same shapes and seeds in a draw. A setting whose median is infinite is not on the front. One
-    run of each gives no probability: nan.
+    All settings get the same shapes and seeds in a draw. A setting whose median is infinite is not on the front. With
+    one run per setting the probability is nan.
     """
     if points and len(flat(points[0][0])) < 2:
         return [math.nan] * len(points)
@@ -311,12 +310,12 @@ def front(points: Sequence[Point], *, seed: int = 0, draws: int = 2000) -> list[
 
 
 def flat(groups: Groups) -> np.ndarray:
-    """The values of all runs, shape after shape."""
+    """The values of all runs, shape by shape."""
     return np.concatenate([group if isinstance(group, np.ndarray) else flat(group) for group in groups])
 
 
 def _checked(values: Values) -> np.ndarray:
-    """The values as an array of floats; raises ValueError where there are none, or one is nan or -inf."""
+    """The values as an array of floats; raises ValueError if there are none, or one is nan or -inf."""
     array = np.asarray(values, dtype=float)
     if not array.shape[-1]:
         raise ValueError("values must be one or more, but there are none: a run that is missing is inf")
@@ -326,33 +325,33 @@ def _checked(values: Values) -> np.ndarray:
 
 
 def _ratio(first: float | np.ndarray, second: float | np.ndarray) -> np.ndarray:
-    """first / second, 1 where they are equal."""
+    """first / second; 1 if they are equal, also for 0 and inf."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         return np.where(first == second, 1.0, np.divide(first, second))
 
 
-_SAME = "all must have the same shapes and seeds, one or more, but have"
+_UNEQUAL_SHAPES = "all must have the same shapes and seeds, one or more, but have"
 
 
 def _sizes(groups: Groups) -> list[list[int]]:
-    """The number of shapes, then that of views of each shape, then that of seeds of each view; without views, two."""
+    """Per level the group sizes: the number of shapes, of views per shape (if any), of seeds per view or shape."""
     sizes = [[len(groups)]]
     while groups and not isinstance(groups[0], np.ndarray):
         sizes.append([len(group) for group in groups])
-        groups = [part for group in groups for part in group]
+        groups = [inner for group in groups for inner in group]
     return [*sizes, [len(group) for group in groups]]
 
 
 def _resample(
-    series: Sequence[Groups], statistic: Statistic, seed: int, draws: int, fewest: int = FEWEST_SHAPES
+    series: Sequence[Groups], statistic: Statistic, seed: int, draws: int, fewest: int = MIN_SHAPES
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The statistic of each series [series], of each draw [series, draws], and of each shape [series, shapes].
 
-    Without draws where there are fewer shapes than `fewest`.
+    There are no draws with fewer shapes than `fewest`.
     """
     sizes = [_sizes(groups) for groups in series]
     if not sizes or any(other != sizes[0] for other in sizes) or not all(min(level, default=0) for level in sizes[0]):
-        raise ValueError(f"{_SAME} {sizes}: fill in with inf")
+        raise ValueError(f"{_UNEQUAL_SHAPES} {sizes}: fill in with inf")
     values = _checked(np.stack([flat(groups) for groups in series]))
     shapes = np.array([[statistic(_checked(flat([group]))) for group in groups] for groups in series], dtype=float)
     drawn = [np.empty((len(series), 0))]
@@ -365,20 +364,20 @@ def _draw(sizes: list[list[int]], seed: int, draws: int) -> list[np.ndarray]:
     """The indices of the drawn runs, for the sizes of `_sizes`: an array [draws, runs] per number of runs."""
     generator = np.random.default_rng(seed)
     (n,) = sizes[0]
-    node, kept = generator.integers(n, size=(draws, n)), np.ones((draws, n), dtype=bool)
+    node, is_drawn = generator.integers(n, size=(draws, n)), np.ones((draws, n), dtype=bool)
     for level in map(np.array, sizes[1:]):
         size, start = level[node][..., None], (np.cumsum(level) - level)[node][..., None]
-        part = start + generator.integers(size, size=(*node.shape, level.max()))
-        kept = kept[..., None] & (np.arange(level.max()) < size)  # a shape gives as many runs as it has
-        node, kept = part.reshape(draws, -1), kept.reshape(draws, -1)
-    total = kept.sum(axis=1)
-    return [node[total == n][kept[total == n]].reshape(-1, n) for n in np.unique(total)]
+        nodes = start + generator.integers(size, size=(*node.shape, level.max()))
+        is_drawn = is_drawn[..., None] & (np.arange(level.max()) < size)  # a group gives as many entries as it has
+        node, is_drawn = nodes.reshape(draws, -1), is_drawn.reshape(draws, -1)
+    total = is_drawn.sum(axis=1)
+    return [node[total == n][is_drawn[total == n]].reshape(-1, n) for n in np.unique(total)]
 
 
 def _interval(value: float | np.ndarray, drawn: np.ndarray, points: np.ndarray) -> Interval:
     """The expanded percentile interval of the statistic's draws, and the statistic of each shape."""
     n, shapes = len(points), tuple(points.tolist())
-    if n < FEWEST_SHAPES:
+    if n < MIN_SHAPES:
         return Interval(float(value), math.nan, math.nan, shapes)
     tail = special.ndtr(math.sqrt(n / (n - 1)) * special.stdtrit(n - 1, ALPHA / 2))
     low, high = np.quantile(drawn, tail, method="lower"), np.quantile(drawn, 1 - tail, method="higher")

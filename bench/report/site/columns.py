@@ -12,24 +12,25 @@ from bench.records.record import NEUTRAL_KEYS, as_number, digest, row_name, star
 from bench.report.data.records import OURS, Record, family, grouped, loop_seconds, run_key, setting, value_evaluations
 from bench.report.site.files import Folder
 
-DIGITS = 5  # of numbers in the list; a run's own page has all of them
-LONGEST_REASON = 300
-GIVEN = ("points", "depths", "mask", "images", "stress", "degrees", "shift", "given", "held_out", "size", "longest")
+SIGNIFICANT_DIGITS = 5  # a run's own page has all digits
+MAX_REASON_LETTERS = 300
+OBSERVATION_KEYS = (
+    *("points", "depths", "mask", "images", "stress", "degrees", "shift", "given", "held_out", "size", "longest"),
+)
 METRICS = TABLE_METRICS | MEASUREMENT_METRICS
-CUSTOM = "custom"  # the choice of renderer that stands for a user's class
-MOST_TOLD = 3  # settings in a name
-# Parts of a configuration that a list of runs shows in columns of their own, or that follow from others.
+CUSTOM_RENDERER = "custom"  # the preset of a user's class
+MAX_NAMED_SETTINGS = 3
+# Keys of the configuration that have columns of their own, or follow from other keys.
 IN_COLUMNS = NEUTRAL_KEYS | {
     *("dataset", "stress", "seed", "index", "split", "label", "experiment", "packages", "draw", "scale")
 }
-# What is named first where several settings tell runs apart.
-TOLD_FIRST = ("renderer", "task", "field", "method", "silhouette", "view")
+NAMED_FIRST = ("renderer", "task", "field", "method", "silhouette", "view")
 
 
 def columns(records: list[Record], folders: list[Folder]) -> dict[str, Any]:
-    """The columns, with an entry per record each; texts that repeat are numbers of entries in a list of values."""
-    texts = {name: [of(record) for record in records] for name, of in TEXTS.items()}
-    texts |= {"name": names(records), "thumb": [one.thumb() for one in folders]}
+    """The columns, with one entry per record. Texts that repeat are stored once and referred to by number."""
+    texts = {name: [get(record) for record in records] for name, get in TEXTS.items()}
+    texts |= {"name": names(records), "thumb": [folder.thumb() for folder in folders]}
     return {
         "count": len(records),
         "folder": [folder.name for folder in folders],
@@ -37,54 +38,52 @@ def columns(records: list[Record], folders: list[Folder]) -> dict[str, Any]:
         "key": [folder.key for folder in folders],
         "reason": [_reason(record) for record in records],
         "texts": {name: _coded(values) for name, values in texts.items()},
-        "numbers": {name: [rounded(of(record)) for record in records] for name, of in NUMBERS.items()},
+        "numbers": {name: [rounded(get(record)) for record in records] for name, get in NUMBERS.items()},
         "metrics": _metrics(records),
-        "reused": [place for place, record in enumerate(records) if record["reused"]],
+        "reused": [index for index, record in enumerate(records) if record["reused"]],
         "tasks": _tasks(records),
     }
 
 
 def names(records: list[Record]) -> list[str]:
-    """The name of each run: that of its row, a user's renderer by its class, and the settings that differ.
+    """The name of each run: the name of its row, or of a user's class, and the settings in which runs differ.
 
-    What differs is written as for the rows of a sweep, so that a setting reads the same in both; what stands in columns
-    of its own, such as shape, seed and scale, is left out. Settings are added as long as one tells apart runs of one
-    task, row and scale that those before it do not, so that what follows from another setting is not repeated; at most
-    `MOST_TOLD`.
+    Settings are written as in the rows of a sweep. Those with a column of their own, such as seed and scale, are left
+    out. A setting is added only if it distinguishes runs of one task, row and scale that the settings before it do not;
+    at most `MAX_NAMED_SETTINGS` are added.
     """
-    found = [_base_name(record) for record in records]
-    known: dict[Hashable, dict[str, str]] = {}
-    settings = [_settings(record["config"], known) for record in records]
-    for places in grouped(range(len(records)), lambda place: (records[place]["task"], found[place])).values():
-        alike = list(grouped(places, lambda place: (_scale(records[place]), str(settings[place]))).values())
-        different = [settings[same[0]] for same in alike]  # most runs of a list have the same
-        scales = [_scale(records[same[0]]) for same in alike]
-        rows = [found[places[0]]] * len(alike)
-        told = make_unique(
-            ordered_settings(different, TOLD_FIRST), groups=[*map(scales.index, scales)], names=rows, limit=MOST_TOLD
-        )
-        for same, name in zip(alike, told, strict=True):
-            for place in same:
-                found[place] = name
-    return found
+    run_names = [_base_name(record) for record in records]
+    cache: dict[Hashable, dict[str, str]] = {}
+    settings = [_settings(record["config"], cache) for record in records]
+    for indices in grouped(range(len(records)), lambda index: (records[index]["task"], run_names[index])).values():
+        groups = list(grouped(indices, lambda index: (_scale(records[index]), str(settings[index]))).values())
+        group_settings = [settings[group[0]] for group in groups]  # usually one group
+        scales = [_scale(records[group[0]]) for group in groups]
+        rows = [run_names[indices[0]]] * len(groups)
+        ordered, numbers = ordered_settings(group_settings, NAMED_FIRST), [*map(scales.index, scales)]
+        group_names = make_unique(ordered, groups=numbers, names=rows, limit=MAX_NAMED_SETTINGS)
+        for group, name in zip(groups, group_names, strict=True):
+            for index in group:
+                run_names[index] = name
+    return run_names
 
 
-def _settings(config: dict[str, Any], known: dict[Hashable, dict[str, str]]) -> dict[str, str]:
-    """The settings of a run that may be in its name, made once for runs that share all of them; `known` has these."""
+def _settings(config: dict[str, Any], cache: dict[Hashable, dict[str, str]]) -> dict[str, str]:
+    """The settings of a run that its name may show; `cache` keeps the result for runs with equal settings."""
     kept = {key: value for key, value in config.items() if key not in IN_COLUMNS}
     parts = tuple((key, value if isinstance(value, SharedSettings) else repr(value)) for key, value in kept.items())
-    if parts not in known:
-        known[parts] = settings_of(kept, ())
-    return known[parts]
+    if parts not in cache:
+        cache[parts] = settings_of(kept, ())
+    return cache[parts]
 
 
 def _base_name(record: Record) -> str:
-    """The name of a record's row; of a user's renderer without a label, its class."""
+    """The name of a record's row; for a user's renderer without a label, its class."""
     name = row_name(record["config"], record["renderer"])
     target = str(setting(record["config"], "renderer", "_target_") or "")
-    if record["renderer"] == CUSTOM and target and not target.startswith(OURS):
-        own = target.rpartition(".")[2]
-        return name.replace(CUSTOM, own, 1) if name.startswith(CUSTOM) else name
+    if record["renderer"] == CUSTOM_RENDERER and target and not target.startswith(OURS):
+        class_name = target.rpartition(".")[2]
+        return name.replace(CUSTOM_RENDERER, class_name, 1) if name.startswith(CUSTOM_RENDERER) else name
     return name
 
 
@@ -93,10 +92,10 @@ def _scale(record: Record) -> str:
 
 
 def machine(record: Record) -> str:
-    """The machine that the run's times depend on, with its threads; empty where the run ended before it knew."""
+    """The machine and the threads that the run's times depend on; empty if the run ended too early to record them."""
     environment = record["environment"]
-    parts = [str(environment.get(name) or "") for name in ("cpu", "device")]
-    label, threads = " + ".join(part for part in parts if part and part != "cpu"), environment.get("threads")
+    names = [str(environment.get(key) or "") for key in ("cpu", "device")]
+    label, threads = " + ".join(name for name in names if name and name != "cpu"), environment.get("threads")
     return f"{label}, {plural(threads, 'thread')}" if label and threads else ""
 
 
@@ -124,64 +123,65 @@ TEXTS = {
 
 
 def _metrics(records: list[Record]) -> dict[str, Any]:
-    found = {}
+    columns = {}
     for key, metric in METRICS.items():
-        after, before = (
-            [rounded(record[part].get(key)) for record in records] for part in ("metrics", "metrics_start")
+        final, initial = (
+            [rounded(record[section].get(key)) for record in records] for section in ("metrics", "metrics_start")
         )
-        if any(value is not None for value in after):
-            start = before if any(value is not None for value in before) else None
-            found[key] = {"key": key, **metric._asdict(), "after": after, "before": start}
-    return found
+        if any(value is not None for value in final):
+            shown_initial = initial if any(value is not None for value in initial) else None
+            columns[key] = {"key": key, **metric._asdict(), "after": final, "before": shown_initial}
+    return columns
 
 
 def _tasks(records: list[Record]) -> list[dict[str, Any]]:
-    """The tasks, the one with most runs first: the metrics that their runs have, the one to sort by first."""
-    known: dict[str, set[str]] = {}
+    """The tasks, the most frequent first, with the metrics of their runs; the metric to sort by is first."""
+    metrics_of: dict[str, set[str]] = {}
     for record in records:
         measured = {key for key in METRICS if as_number(record["metrics"].get(key)) is not None}
-        known.setdefault(record["task"], set()).update(measured)
-    found = []
+        metrics_of.setdefault(record["task"], set()).update(measured)
+    tasks = []
     for task, count in Counter(record["task"] for record in records).most_common():
         first = SORT_METRICS.get(task)
-        keys = sorted((key for key in METRICS if key in known[task]), key=lambda key, first=first: key != first)
-        found.append({"task": task, "count": count, "metrics": keys})
-    return found
+        keys = sorted((key for key in METRICS if key in metrics_of[task]), key=lambda key, first=first: key != first)
+        tasks.append({"task": task, "count": count, "metrics": keys})
+    return tasks
 
 
 def _cell(record: Record) -> str:
-    """What must be alike for two runs to be compared: shape, view, seed, and what the task is given."""
+    """A hash of what runs must share to be compared: shape, view, seed and the observations."""
     task = setting(record["config"], "task")
-    given = {key: task[key] for key in GIVEN if key in task} if isinstance(task, dict) else {}
-    about = [record["task"], record["dataset"], run_key(record), given, setting(record["config"], "view", "resolution")]
-    return digest([about, record["config"].get("split")])
+    observed = {key: task[key] for key in OBSERVATION_KEYS if key in task} if isinstance(task, dict) else {}
+    resolution = setting(record["config"], "view", "resolution")
+    identity = [record["task"], record["dataset"], run_key(record), observed, resolution]
+    return digest([identity, record["config"].get("split")])
 
 
 def _coded(values: list[str]) -> dict[str, list]:
-    """Each value once, the most frequent first, and the number of the value at each place."""
+    """The distinct values, the most frequent first, and for each entry the number of its value."""
     counts = Counter(values)
-    numbers = {value: place for place, (value, _) in enumerate(counts.most_common())}
-    return {"values": list(numbers), "codes": [numbers[value] for value in values]}
+    codes = {value: code for code, (value, _) in enumerate(counts.most_common())}
+    return {"values": list(codes), "codes": [codes[value] for value in values]}
 
 
 def _reason(record: Record) -> str:
     reason = " ".join(record["reason"].split())
     if record["status"] == "ok":
         return ""
-    return (reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + " …") or "no reason recorded"
+    return (reason if len(reason) <= MAX_REASON_LETTERS else reason[:MAX_REASON_LETTERS] + " …") or "no reason recorded"
 
 
 def rounded(value: Any) -> int | float | str | None:
-    """A number with few digits; one that is not finite as a word, as the page's scripts have it."""
+    """A number with few digits; an infinite number or nan as a word, which the page's scripts decode."""
     if type(value) is float and isfinite(value):
-        return float(f"{value:.{DIGITS}g}")
-    known = as_number(value)
-    return to_json_values(float(f"{known:.{DIGITS}g}")) if isinstance(known, float) else known
+        return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+    number = as_number(value)
+    return to_json_values(float(f"{number:.{SIGNIFICANT_DIGITS}g}")) if isinstance(number, float) else number
 
 
-def _safely(of: Any, record: Record, otherwise: Any) -> Any:
-    """What a function says of a record; something else where a record from elsewhere holds what it cannot read."""
+def _safely(get: Any, record: Record, default: Any) -> Any:
+    """Returns `get(record)`, or `default` if a foreign record has values that `get` cannot read."""
     try:
-        return of(record)
+        return get(record)
     except (AttributeError, TypeError, ValueError, RecursionError):
-        return otherwise
+        return default

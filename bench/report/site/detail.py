@@ -1,4 +1,4 @@
-"""What a run's own page shows: what was asked, what happened, numbers, costs, settings, curve and pictures."""
+"""The data of a run's page: request, status, metrics, costs, settings, curve and pictures."""
 
 from collections.abc import Hashable, Iterable
 from functools import cache, lru_cache
@@ -11,25 +11,25 @@ from bench.records.read import CHECKPOINT_METRICS, NOT_LOSS_TERMS, curve_lines
 from bench.records.record import as_number
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
-from bench.report.site.files import ALT, Folder
-from bench.report.site.words import STATUSES, asked, command, lines_open
+from bench.report.site.files import PICTURE_TEXTS, Folder
+from bench.report.site.words import STATUSES, command, lines_open, request_sentence
 
-MOST_POINTS = 240  # of a line in a chart; a longer curve is thinned, but for its ends and checkpoints
+MAX_CURVE_POINTS = 240  # longer curves are thinned, but keep their ends and checkpoints
 PHASES = {
     "warmup": "warm-up, off the clock",
     "forward": "optimisation: forward",
     "backward": "optimisation: backward",
     "evaluation": "evaluation and pictures",
 }
-MOST_LINES = 8  # terms of a loss
-TOP = ("label", "field", "split", "index", "seed", "device", "threads", "experiment", "draw")
+MAX_LOSS_TERMS = 8
+LEADING_KEYS = ("label", "field", "split", "index", "seed", "device", "threads", "experiment", "draw")
 
 
 def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
-    """The data of a run's page; the list has its name, scene and status."""
+    """The data of a run's page, except name, scene and status, which are in the list of runs."""
     files = folder.links()
     return {
-        "asked": asked(record),
+        "asked": request_sentence(record),
         "reason": record["reason"],
         "said": STATUSES[record["status"]]._asdict(),
         "notes": [text(note) for note in record["notes"]],
@@ -39,7 +39,7 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "environment": [(text(key), text(value)) for key, value in record["environment"].items()],
         "settings": settings(record),
         "files": files,
-        "pictures": [[name, folder.link(name), ALT.get(name, "")] for name in folder.pictures()],
+        "pictures": [[name, folder.link(name), PICTURE_TEXTS.get(name, "")] for name in folder.pictures()],
         "curve": curve(folder),
         "command": command(record, results_dir),
         "python": lines_open(record, results_dir / "runs" / folder.name, files),
@@ -47,10 +47,10 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
 
 
 def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
-    """Details of runs by their keys, as a script has them: what most of them share stands once, in `texts`.
+    """Details of runs by key, for a script of the page. Content that runs share is stored once, in `texts`.
 
-    Numbers of entries in `texts` stand for the settings of each top-level key, a row of the machine, the name and the
-    definition of a metric, the names of files, and the lines for Python, where a NUL stands for the folder's name.
+    Numbers of entries in `texts` replace the settings of each top-level key, a row of the machine, the name and the
+    definition of a metric, the names of files, and the Python lines, in which NUL replaces the name of the folder.
     """
     numbers: dict[Hashable, int] = {}
 
@@ -58,99 +58,97 @@ def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
         return numbers.setdefault(entry, len(numbers))
 
     runs = {}
-    for folder, whole in details:
-        parts = groupby(whole["settings"], key=lambda row: row[0].partition(".")[0])
-        runs[folder.key] = whole | {
-            "settings": [number(tuple(rows)) for _, rows in parts],
-            "environment": [number(row) for row in whole["environment"]],
-            "metrics": [[number(name), *values, number(words)] for name, *values, words in whole["metrics"]],
-            "files": number(tuple(whole["files"])),
-            "python": number(whole["python"].replace(f'"{folder.name}"', '"\0"')),
+    for folder, content in details:
+        settings_by_section = groupby(content["settings"], key=lambda row: row[0].partition(".")[0])
+        runs[folder.key] = content | {
+            "settings": [number(tuple(rows)) for _, rows in settings_by_section],
+            "environment": [number(row) for row in content["environment"]],
+            "metrics": [[number(name), *values, number(words)] for name, *values, words in content["metrics"]],
+            "files": number(tuple(content["files"])),
+            "python": number(content["python"].replace(f'"{folder.name}"', '"\0"')),
         }
     return {"texts": list(numbers), "runs": runs}
 
 
 def settings(record: Record) -> list[tuple[str, str]]:
-    """All settings of the run by dotted keys, what decides it first."""
+    """All settings of the run by dotted key, the most important first."""
     rows: list[tuple[str, str]] = []
-    for key, value in sorted(record["config"].items(), key=lambda item: _place(item[0])):
+    for key, value in sorted(record["config"].items(), key=lambda item: _sort_key(item[0])):
         if key != "results_dir":
             rows += _shared_rows(key, value) if isinstance(value, SharedSettings) else _rows(key, value)
     return rows
 
 
 def _rows(key: str, value: Any) -> list[tuple[str, str]]:
-    known = flat({key: value}) if isinstance(value, dict) else {key: value}
-    return [(key, text(known[key])) for key in sorted(known)]
+    value_by_key = flat({key: value}) if isinstance(value, dict) else {key: value}
+    return [(key, text(value_by_key[key])) for key in sorted(value_by_key)]
 
 
 _shared_rows = lru_cache(maxsize=10_000)(_rows)
 
 
 @cache
-def _place(key: str) -> tuple[int, str]:
-    """The place of a key among others."""
-    first = ("task", "renderer", "dataset", *TOP)
-    return first.index(key) if key in first else len(first), f"{key}."  # as the first of its settings
+def _sort_key(key: str) -> tuple[int, str]:
+    leading = ("task", "renderer", "dataset", *LEADING_KEYS)
+    return leading.index(key) if key in leading else len(leading), f"{key}."  # as the first of its settings
 
 
 def text(value: Any) -> str:
-    """A value as text."""
     try:
         return "null" if value is None else str(value)
-    except (RecursionError, ValueError):  # nested too deep; an integer of too many digits
+    except (RecursionError, ValueError):  # nested too deeply, or an integer with too many digits
         return "…"
 
 
 def curve(folder: Folder) -> dict[str, Any] | None:
-    """The lines of `curve.jsonl` as columns, thinned; None without one."""
+    """The lines of `curve.jsonl` as thinned columns; None without a curve."""
     lines = curve_lines(folder.path) if folder.has("curve.jsonl") else None
-    sound = [line for line in lines or [] if as_number(line.get("iteration")) is not None]
-    if not sound:
+    numbered = [line for line in lines or [] if as_number(line.get("iteration")) is not None]
+    if not numbered:
         return None
-    keys = dict.fromkeys(key for line in sound for key in line)
+    keys = dict.fromkeys(key for line in numbered for key in line)
     terms = [key for key in keys if key not in (*NOT_LOSS_TERMS, *CHECKPOINT_METRICS)]
-    terms = [key for key in terms if any(as_number(line.get(key)) is not None for line in sound)][:MOST_LINES]
-    kept = [sound[place] for place in _kept(sound)]
+    terms = [key for key in terms if any(as_number(line.get(key)) is not None for line in numbered)][:MAX_LOSS_TERMS]
+    thinned = [numbered[index] for index in _kept_indices(numbered)]
     names = [*NOT_LOSS_TERMS, *terms]
-    return {"terms": terms, **{name: [rounded(line.get(name)) for line in kept] for name in names}}
+    return {"terms": terms, **{name: [rounded(line.get(name)) for line in thinned] for name in names}}
 
 
-def _kept(lines: list[dict[str, Any]]) -> list[int]:
-    step = max(1, -(-len(lines) // MOST_POINTS))
-    every = {0, len(lines) - 1, *range(0, len(lines), step)}
-    checkpoints = [place for place, line in enumerate(lines) if as_number(line.get("chamfer_l2")) is not None]
-    thinned = checkpoints[:: max(1, -(-len(checkpoints) // MOST_POINTS))]
-    return sorted(every | set(thinned) | set(checkpoints[-1:]))
+def _kept_indices(lines: list[dict[str, Any]]) -> list[int]:
+    step = max(1, -(-len(lines) // MAX_CURVE_POINTS))
+    regular = {0, len(lines) - 1, *range(0, len(lines), step)}
+    checkpoints = [index for index, line in enumerate(lines) if as_number(line.get("chamfer_l2")) is not None]
+    thinned = checkpoints[:: max(1, -(-len(checkpoints) // MAX_CURVE_POINTS))]
+    return sorted(regular | set(thinned) | set(checkpoints[-1:]))
 
 
 def _metrics(record: Record) -> list[list[Any]]:
     names = tuple(dict.fromkeys([*record["metrics"], *record["metrics_start"]]))
-    told = _definitions(tuple((key, text(words)) for key, words in record["definitions"].items()), names)
+    definitions = _definitions(tuple((key, text(words)) for key, words in record["definitions"].items()), names)
     before, after = record["metrics_start"], record["metrics"]
-    return [[name, _value(before.get(name)), _value(after.get(name)), told[name]] for name in names]
+    return [[name, _value(before.get(name)), _value(after.get(name)), definitions[name]] for name in names]
 
 
-@lru_cache(maxsize=1000)  # most runs of a task have the same
-def _definitions(known: tuple[tuple[str, str], ...], names: tuple[str, ...]) -> dict[str, str]:
-    return {name: definition(dict(known), name) for name in names}
+@lru_cache(maxsize=1000)  # most runs of a task share their definitions
+def _definitions(pairs: tuple[tuple[str, str], ...], names: tuple[str, ...]) -> dict[str, str]:
+    return {name: definition(dict(pairs), name) for name in names}
 
 
 def _value(value: Any) -> int | float | str | None:
-    known = as_number(value)
-    return known if known is not None or value is None else text(value)
+    number = as_number(value)
+    return number if number is not None or value is None else text(value)
 
 
 def _costs(record: Record) -> dict[str, Any]:
     seconds, evaluations = record["seconds"], record["evaluations"]
     total = as_number(seconds.get("total"))
     phases = [[label, as_number(seconds.get(key)), key in ("forward", "backward")] for key, label in PHASES.items()]
-    known = [phase for phase in phases if phase[1] is not None]
-    rest = None if total is None else total - sum(phase[1] for phase in known)
-    if rest is not None and known and rest > 0:
-        known.append(["start, set-up and the rest", rest, False])
+    timed_phases = [phase for phase in phases if phase[1] is not None]
+    rest = None if total is None else total - sum(phase[1] for phase in timed_phases)
+    if rest is not None and timed_phases and rest > 0:
+        timed_phases.append(["start, set-up and the rest", rest, False])
     return {
-        "phases": known,
+        "phases": timed_phases,
         "total": total,
         "evaluations": [[name, as_number(evaluations.get(name))] for name in evaluations],
         "flops": as_number(record["flops"]),

@@ -1,4 +1,4 @@
-"""The files of a run that the page links to: those that are there, and lie within the results folder."""
+"""The files of a run that the page links to: existing files inside the results folder."""
 
 import os
 from functools import cached_property
@@ -7,9 +7,9 @@ from pathlib import Path
 from bench.records.record import PICTURE_FILES, is_outside
 from bench.report.write.paper import key_of, link
 
-FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply", "field.safetensors")
-SUFFIXES = (".png", ".gif", ".webp")  # of pictures
-ALT = {  # what the pictures of a run show
+LINKED_FILES = ("record.json", "config.yaml", "curve.jsonl", "log.txt", "mesh.ply", "field.safetensors")
+PICTURE_SUFFIXES = (".png", ".gif", ".webp")
+PICTURE_TEXTS = {
     "summary.png": "Depth, normals, errors of the silhouette and the shape from behind: before, after, truth",
     "strip.png": "The way from the start to the end, in frames",
     "film.gif": "The way from the start to the end, moving",
@@ -21,7 +21,7 @@ ALT = {  # what the pictures of a run show
 
 
 class Folder:
-    """A run's folder as the page sees it, with links relative to `index.html`."""
+    """A run folder, with links relative to `index.html`."""
 
     def __init__(self, results_dir: Path, name: str) -> None:
         self.name, self.path = name, results_dir / "runs" / name
@@ -30,40 +30,38 @@ class Folder:
 
     @property
     def key(self) -> str:
-        """The name of the run's files among those of the page."""
+        """The name of the run's files in the page's data."""
         return key_of(self.name)
 
     @cached_property
     def _linked(self) -> dict[str, bool]:
-        """Its files, and whether each is a link."""
+        """The names of its files, and whether each is a link."""
         try:
-            with os.scandir(self.path) as found:
-                return {one.name: one.is_symlink() for one in found if one.is_file()}
+            with os.scandir(self.path) as entries:
+                return {entry.name: entry.is_symlink() for entry in entries if entry.is_file()}
         except OSError:
             return {}
 
     def has(self, name: str) -> bool:
-        """Whether it has this file, and not a link to something outside of the results folder."""
+        """Whether it has this file, and the file is inside the results folder."""
         if name not in self._linked:
             return False
-        linked = self.linked or self._linked[name]  # others are not resolved, which takes time
+        linked = self.linked or self._linked[name]  # only links are resolved, as that is slow
         return not linked or not is_outside(self.path / name, self.results_dir)
 
     def thumb(self) -> str:
-        """The picture that stands for the run; empty without one."""
+        """The picture that represents the run; empty without one."""
         return next((name for name in PICTURE_FILES if self.has(name)), "")
 
     def pictures(self) -> list[str]:
-        """The names of its pictures, the one that stands for the run first."""
-        found = sorted(name for name in self._linked if Path(name).suffix in SUFFIXES and self.has(name))
+        """The names of its pictures, the one that represents the run first."""
+        pictures = sorted(name for name in self._linked if Path(name).suffix in PICTURE_SUFFIXES and self.has(name))
         ranks = {name: rank for rank, name in enumerate(PICTURE_FILES)}
-        return sorted(found, key=lambda name: ranks.get(name, len(ranks)))
+        return sorted(pictures, key=lambda name: ranks.get(name, len(ranks)))
 
     def link(self, name: str) -> str:
-        """The address of one of its files."""
         return link("runs", self.name, name)
 
     def links(self) -> dict[str, str]:
-        """The addresses of the files that every run may have, by their names."""
         folder = self.link("")
-        return {name: folder + name for name in FILES if self.has(name)}
+        return {name: folder + name for name in LINKED_FILES if self.has(name)}

@@ -1,4 +1,4 @@
-"""Makes a run's mesh small enough for the page, as what Plotly draws."""
+"""Simplifies a run's mesh for the page, and encodes it for Plotly."""
 
 import base64
 import io
@@ -8,63 +8,63 @@ from typing import Any
 import numpy as np
 import trimesh
 
-MOST_VERTICES = 12_000
-MOST_BYTES = 200_000_000  # of a mesh file that is read
+MAX_SHOWN_VERTICES = 12_000
+MAX_MESH_FILE_BYTES = 200_000_000
 READ_ERRORS = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
 
 def mesh_data(path: Path) -> dict[str, Any]:
-    """The mesh of a PLY file as arrays of Plotly's mesh3d, whose third axis is up where ours is the second.
+    """The mesh of a PLY file as arrays of Plotly's mesh3d, whose third axis is up; here the second axis is up.
 
     Raises:
-        ValueError, OSError: where it is no mesh of triangles; the message says why.
+        ValueError, OSError: the file is no mesh of triangles; the message says why.
     """
-    whole = read_ply(path)
-    small = simplified(whole, MOST_VERTICES)
+    mesh = read_ply(path)
+    small = simplify(mesh, MAX_SHOWN_VERTICES)
     x, y, z = small.vertices.T
     data = {name: _packed(values, "f4") for name, values in {"x": x, "y": -z, "z": y}.items()}
     data |= {name: _packed(corners, "u2") for name, corners in zip("ijk", small.faces.T, strict=True)}
-    data |= {"shown": [len(x), len(small.faces)], "whole": [len(whole.vertices), len(whole.faces)]}
+    data |= {"shown": [len(x), len(small.faces)], "whole": [len(mesh.vertices), len(mesh.faces)]}
     if small.visual.kind == "vertex":
         data["vertexcolor"] = [f"#{colour[:3].tobytes().hex()}" for colour in small.visual.vertex_colors]
     return data
 
 
 def read_ply(path: Path) -> trimesh.Trimesh:
-    """Reads a PLY, and nothing that it names; its faces are triangles of its vertices, which are finite."""
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"mesh.ply has more than {MOST_BYTES // 10**6} MB")
+    """Reads a PLY file without the files that it names. Checks that its faces and vertices are valid."""
+    if path.stat().st_size > MAX_MESH_FILE_BYTES:
+        raise ValueError(f"mesh.ply has more than {MAX_MESH_FILE_BYTES // 10**6} MB")
     content = io.BytesIO(path.read_bytes())
     try:
         mesh = trimesh.load_mesh(content, file_type="ply", process=False, skip_materials=True)
         faces, vertices = mesh.faces, mesh.vertices
-    except READ_ERRORS as error:  # it has no exception of its own
+    except READ_ERRORS as error:  # trimesh has no exception of its own
         raise ValueError(f"mesh.ply could not be read ({' '.join(str(error).split())[:120]})") from None
     if not faces.size or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
         raise ValueError("mesh.ply has no triangles, or triangles not of its vertices, or vertices that are not finite")
     return mesh
 
 
-def simplified(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
-    """The mesh with at most so many vertices: those in one cell of a grid become one, at their mean."""
-    if len(mesh.vertices) <= most:
+def simplify(mesh: trimesh.Trimesh, max_vertices: int) -> trimesh.Trimesh:
+    """Returns the mesh with at most `max_vertices`: vertices in one cell of a grid are merged at their mean."""
+    if len(mesh.vertices) <= max_vertices:
         return mesh
-    from open3d import geometry, utility  # only here: it takes seconds to load
+    from open3d import geometry, utility  # imported here, as it takes seconds
 
-    coloured = mesh.visual.kind == "vertex"
-    whole = geometry.TriangleMesh(utility.Vector3dVector(mesh.vertices), utility.Vector3iVector(mesh.faces))
-    if coloured:
-        whole.vertex_colors = utility.Vector3dVector(mesh.visual.vertex_colors[:, :3] / 255)
-    small, cell = whole, 1e-3 * mesh.scale
-    while len(small.vertices) > most:
-        cell *= max(1.1, (len(small.vertices) / most) ** 0.5)
-        small = whole.simplify_vertex_clustering(cell)
-    colours = (255 * np.asarray(small.vertex_colors)).round().astype("u1") if coloured else None
+    has_colours = mesh.visual.kind == "vertex"
+    full = geometry.TriangleMesh(utility.Vector3dVector(mesh.vertices), utility.Vector3iVector(mesh.faces))
+    if has_colours:
+        full.vertex_colors = utility.Vector3dVector(mesh.visual.vertex_colors[:, :3] / 255)
+    simple, cell = full, 1e-3 * mesh.scale
+    while len(simple.vertices) > max_vertices:
+        cell *= max(1.1, (len(simple.vertices) / max_vertices) ** 0.5)
+        simple = full.simplify_vertex_clustering(cell)
+    colours = (255 * np.asarray(simple.vertex_colors)).round().astype("u1") if has_colours else None
     return trimesh.Trimesh(
-        np.asarray(small.vertices), np.asarray(small.triangles), vertex_colors=colours, process=False
+        np.asarray(simple.vertices), np.asarray(simple.triangles), vertex_colors=colours, process=False
     )
 
 
 def _packed(array: np.ndarray, kind: str) -> dict[str, str]:
-    """An array as Plotly reads it from text."""
+    """An array in Plotly's base64 form."""
     return {"dtype": kind, "bdata": base64.b64encode(array.astype(f"<{kind}").tobytes()).decode("ascii")}

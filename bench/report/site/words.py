@@ -1,4 +1,4 @@
-"""What a run was asked and what its status means, in words; the command that makes it again, lines that open it."""
+"""Texts on a run: its request, the meaning of its status, the command that repeats it, Python lines that open it."""
 
 import json
 import shlex
@@ -27,71 +27,71 @@ TASKS = {
     "stability": "Search for the severity at which a renderer breaks",
     "capacity": "Measure how much model a shape needs",
 }
-LEFT_OUT = ("results_dir", "rerun")  # of a command, which stands for any folder
-MOST_SHOWN = 4  # metrics that the lines print
+OMITTED_KEYS = ("results_dir", "rerun")  # the command names no folder but the default one
+MAX_PRINTED_METRICS = 4
 
 
-class Said(NamedTuple):
-    """What a status means, and what helps; `remedy` is empty where there is nothing to mend."""
+class Help(NamedTuple):
+    """The meaning of a status, and a remedy; it is empty if nothing is wrong."""
 
     meaning: str
     remedy: str = ""
 
 
 STATUSES = {
-    RunStatus.OK: Said("It ended as planned."),
-    RunStatus.NAN: Said(
+    RunStatus.OK: Help("It ended as planned."),
+    RunStatus.NAN: Help(
         "The loss became NaN.",
         "Lower task.optimiser.learning_rate. The curve shows the last iteration with a finite loss.",
     ),
-    RunStatus.DIVERGED: Said(
+    RunStatus.DIVERGED: Help(
         "The loss rose a hundredfold.",
         "Lower task.optimiser.learning_rate, or the weight of the loss that rises first.",
     ),
-    RunStatus.NOT_REACHED: Said(
+    RunStatus.NOT_REACHED: Help(
         "The loss did not fall.",
         "Try more iterations (task.optimiser.iterations), another seed, or a renderer that has the gradient which the "
         "task needs: `task=gradients` compares them.",
     ),
-    RunStatus.EMPTY: Said(
+    RunStatus.EMPTY: Help(
         "The field ended without a surface.",
         "Lower task.optimiser.learning_rate, or raise the weight of the loss of the mask. strip.png shows when the "
         "surface was lost.",
     ),
-    RunStatus.TIMEOUT: Said(
+    RunStatus.TIMEOUT: Help(
         "A limit of time, or of field values, was reached.",
         "Raise time_limit=SECONDS (null is none), or make the work smaller: scale=smoke, view.resolution=32.",
     ),
-    RunStatus.OOM: Said(
+    RunStatus.OOM: Help(
         "A limit of memory was reached.",
         "Raise memory_limit=GIB where the machine has more, or make the work smaller: view.resolution, "
         "evaluation.grid.",
     ),
-    RunStatus.CRASHED: Said(
+    RunStatus.CRASHED: Help(
         "An error ended it.",
         "verbose=true shows where the error came from, and isolation=off lets a debugger stop there. log.txt has "
         "all of it.",
     ),
-    RunStatus.KILLED: Said("It was stopped from outside, or is still under way.", "The same command runs it again."),
-    RunStatus.UNSUPPORTED: Said(
+    RunStatus.KILLED: Help("It was stopped from outside, or is still under way.", "The same command runs it again."),
+    RunStatus.UNSUPPORTED: Help(
         "The renderer lacks what the task needs.",
         "This is an answer, not an error. The reason says what is lacking; another renderer or setting may have it.",
     ),
-    RunStatus.REFUSED: Said("The configuration is invalid.", "The reason names the key and what to type instead."),
-    NOT_RUN: Said(
+    RunStatus.REFUSED: Help("The configuration is invalid.", "The reason names the key and what to type instead."),
+    NOT_RUN: Help(
         "A sweep planned it, and it has not been run.",
         "The command of the sweep runs what is missing, and reuses what is there.",
     ),
 }
 
 
-def asked(record: Record) -> str:
-    """What the run was asked to do, as a sentence."""
+def request_sentence(record: Record) -> str:
+    """The task, scene and size of the run, as a sentence."""
     config = record["config"]
-    said = TASKS.get(record["task"], f"task={record['task']}")
+    task_sentence = TASKS.get(record["task"], f"task={record['task']}")
     resolution, points = setting(config, "view", "resolution"), setting(config, "task", "points")
     iterations, scale = iterations_of(record), setting(config, "scale", "name")
-    parts = [
+    details = [
         f"{record.get('scene') or record['dataset']}",
         f"{points} depth points" if points is not None else "",
         f"{resolution} × {resolution} pixels" if isinstance(resolution, int) else "",
@@ -99,21 +99,21 @@ def asked(record: Record) -> str:
         f"seed {record['seed']}" if record["seed"] is not None else "",
         f"scale={scale}" if scale else "",
     ]
-    return f"{said}: {', '.join(filter(None, parts))}."
+    return f"{task_sentence}: {', '.join(filter(None, details))}."
 
 
 def command(record: Record, results_dir: Path) -> str:
-    """The command that makes the run again, for a shell."""
     folder = [] if results_dir.as_posix() == RESULTS else [f"results_dir={results_dir.as_posix()}"]
     overrides = map(str, record.get("overrides") or [])
-    kept = [text for text in overrides if text.partition("=")[0] not in LEFT_OUT]
+    kept = [text for text in overrides if text.partition("=")[0] not in OMITTED_KEYS]
     return shlex.join(["python", "-m", "bench", *kept, *folder])
 
 
 def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
-    """The lines that open the run in Python: its values of the table of all runs, its curve, its mesh and its field."""
+    """The Python lines that open the run: its row in the table of runs, its curve, its mesh and its field."""
     results, name = _quoted(folder.parents[1].as_posix()), _quoted(folder.name)
-    shown = ["status", *[metric for metric in metrics.TABLE_METRICS if metric in record["metrics"]][:MOST_SHOWN]]
+    names = [metric for metric in metrics.TABLE_METRICS if metric in record["metrics"]]
+    shown = ["status", *names[:MAX_PRINTED_METRICS]]
     opened = {
         "curve.jsonl": ("import pandas as pd", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)'),
         "mesh.ply": ("import trimesh", 'mesh = trimesh.load(folder / "mesh.ply")'),
@@ -133,5 +133,5 @@ def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A text as Python reads it, in double quotes where that is the same."""
+    """A text as a Python literal, in double quotes if possible."""
     return json.dumps(text, ensure_ascii=False) if text.isprintable() else repr(text)

@@ -1,7 +1,7 @@
-"""The rows of the suite: an attempt of a renderer at a problem, with its curve of cost and error.
+"""Attempts of the suite: one run of a renderer on one problem, with its curve of cost and error.
 
-Attempts are made of runs, and kept as CSV files, a file a renderer and a line an attempt, so that results outlive the
-run folders and are joined over days and machines.
+Attempts are made from runs, and stored as CSV files: a file per renderer, a line per attempt. So results outlive the
+run folders, and can be merged from several days and machines.
 """
 
 import re
@@ -16,27 +16,28 @@ from typing import Any
 from bench.records.names import flat
 from bench.records.read import curve_lines
 from bench.records.record import RunStatus, as_number, digest, renderer_name
-from bench.report.data.kept import NO_ATTEMPTS
-from bench.report.data.lines import UNREADABLE, read_lines, write_lines
+from bench.report.data.kept import UNMEASURED
+from bench.report.data.lines import READ_ERRORS, read_lines, write_lines
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
 
-FOLDER = "suite"  # of a results folder, with a folder a version in it
-EXPERIMENT = "core_"  # in front of the name of a set
-GIVEN = {  # the setting in which the problems of a scene differ, and its name
+SUITE_FOLDER = "suite"  # it has a folder per version
+EXPERIMENT_PREFIX = "core_"  # before the name of a set
+PROBLEM_SETTINGS = {  # per set: the setting that distinguishes the problems of a scene, and its text
     **{"complete": ("task.points", "{} points"), "pose": ("task.degrees", "{:g} degrees")},
     **{"reconstruct": ("task.images.texture", "{}"), "render": ("task.size", "{} pixels")},
 }
-APART = ("render",)  # sets without a course of error over cost
-TUNED = "tuned/"  # in front of the name of a method with its tuned setting
-BY_ITSELF = ", tuned"  # behind the name of the row of a renderer at its own setting
-FREE = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"  # what such a setting may set
-STATED = ("task", "view", "evaluation", "silhouette", "field", "prior", "split")  # by a set, for all renderers
+SETS_WITHOUT_CURVE = ("render",)
+TUNED_PREFIX = "tuned/"  # before the name of a method with tuned settings
+TUNED_SUFFIX = ", tuned"  # after the name of a row with tuned settings
+TUNABLE_KEYS = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"
+# A set fixes these for all renderers; tuned settings may only change TUNABLE_KEYS.
+FIXED_KEYS = ("task", "view", "evaluation", "silhouette", "field", "prior", "split")
 
 
 @dataclass(frozen=True)
 class Suite:
-    """The content of `conf/suite.yaml`; its comments say what it means."""
+    """The content of `conf/suite.yaml`, where comments explain it."""
 
     name: str
     version: int
@@ -46,45 +47,43 @@ class Suite:
 
     @property
     def id(self) -> str:
-        """The name with the version."""
         return f"{self.name}-{self.version}"
 
 
 @cache
 def suite() -> Suite:
-    """The suite of this version."""
     return Suite(**read_yaml(CONF / "suite.yaml"))
 
 
 @cache
 def problems_of(size: str) -> set[tuple[Any, ...]]:
-    """The set, problem and seed of all cells of a size of the suite: a row that has them is compared."""
-    found: set[tuple[Any, ...]] = set()
+    """The set, problem and seed of all cells of a size of the suite. A row needs all of them to be compared."""
+    keys: set[tuple[Any, ...]] = set()
     for name in suite().errors:
-        node = read_yaml(CONF / "experiment" / f"{EXPERIMENT}{name}.yaml")
-        chosen = {key: str(value).split(",") for key, value in node["sizes"][suite().sizes[size]].items()}
-        parts = [chosen.pop(key) for key in ("families", "shapes", "seeds")]
-        text = GIVEN.get(name, ("", ""))[1]
-        for name_of, index, seed, *given in product(*parts, *chosen.values()):
-            named = [text.format(float(one) if one.isdecimal() and ":g" in text else one) for one in given]
-            problem = ", ".join([f"{name_of} {node.get('split', 'test')} {index}", *named])
-            found.add((name, problem, int(seed)))
-    return found
+        experiment = read_yaml(CONF / "experiment" / f"{EXPERIMENT_PREFIX}{name}.yaml")
+        sizes = {key: str(value).split(",") for key, value in experiment["sizes"][suite().sizes[size]].items()}
+        axes = [sizes.pop(key) for key in ("families", "shapes", "seeds")]
+        form = PROBLEM_SETTINGS.get(name, ("", ""))[1]
+        for family_name, index, seed, *amounts in product(*axes, *sizes.values()):
+            values = [float(text) if text.isdecimal() and ":g" in form else text for text in amounts]
+            problem = ", ".join([f"{family_name} {experiment.get('split', 'test')} {index}", *map(form.format, values)])
+            keys.add((name, problem, int(seed)))
+    return keys
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A run of a renderer at a problem of the suite.
+    """A run of a renderer on a problem of the suite.
 
     Args:
-        set, problem, scene, seed: what was to be solved; a scene has a problem for each amount of what is given.
-        row, preset: the renderer's name in tables, and what decides its look.
-        start, final: the errors before and after; `final` is infinite where the run did not end ok.
+        set, problem, scene, seed: what was to be solved; a scene has a problem per value in `PROBLEM_SETTINGS`.
+        row, preset: the renderer's name in tables, and the preset that decides its look.
+        start, final: the errors before and after; `final` is infinite if the run did not end ok.
         cost, operations, seconds: of the loop, or of one rendering; `cost` as `renderers.field.Counts.cost`.
-        waited: share of its time that the run waited for a processor.
-        settings, code: hashes of what the set states for all renderers, and of the code.
-        curve: at each checkpoint the cost, the seconds and the error.
-        overrides: the command line that makes it again.
+        waited: fraction of its time that the run waited for a processor.
+        settings, code: hashes of the settings that the set fixes, and of the code.
+        curve: cost, seconds and error at each checkpoint.
+        overrides: the command line that repeats the run.
     """
 
     set: str
@@ -114,48 +113,49 @@ class Attempt:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What there is one attempt of: its set, problem, seed, row and settings."""
+        """The identity of an attempt: set, problem, seed, row and settings."""
         return self.set, self.problem, self.seed, self.row, self.settings
 
     @property
     def ok(self) -> bool:
-        """Whether its errors count; those of a run that ended otherwise do not."""
+        """Whether the run ended ok; the errors of other runs do not count."""
         return self.status == "ok"
 
     @property
     def tuned(self) -> bool:
-        """Whether it is at the renderer's own setting, not at the one of the set."""
-        return self.row.endswith(BY_ITSELF)
+        """Whether it has the renderer's tuned settings, not those of the set."""
+        return self.row.endswith(TUNED_SUFFIX)
 
 
 def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
-    """The attempts among the records of a results folder; a run that was planned and not made is none."""
-    return [one for record in records if (one := _attempt(record, results_dir / "runs" / record["folder"]))]
+    """The attempts among the records of a results folder; planned runs are none."""
+    return [attempt for record in records if (attempt := _attempt(record, results_dir / "runs" / record["folder"]))]
 
 
-def joined(attempts: Iterable[Attempt]) -> list[Attempt]:
-    """One attempt of each key: of several the newest, in whatever order they come."""
-    return [*{one.key: one for one in sorted(attempts, key=lambda one: (one.started, repr(one)))}.values()]
+def newest_attempts(attempts: Iterable[Attempt]) -> list[Attempt]:
+    """The newest attempt of each key, whatever the order."""
+    ordered = sorted(attempts, key=lambda attempt: (attempt.started, repr(attempt)))
+    return [*{attempt.key: attempt for attempt in ordered}.values()]
 
 
 def _attempt(record: Record, folder: Path) -> Attempt | None:
-    config, said = record["config"], record["environment"]
-    of_set = {f"{EXPERIMENT}{name}": name for name in suite().errors}.get(config.get("experiment"))
-    if of_set is None or record["status"] in NO_ATTEMPTS:
+    config, environment = record["config"], record["environment"]
+    set_name = {f"{EXPERIMENT_PREFIX}{name}": name for name in suite().errors}.get(config.get("experiment"))
+    if set_name is None or record["status"] in UNMEASURED:
         return None
-    error, ok = suite().errors[of_set], record["status"] == "ok"
+    error, ok = suite().errors[set_name], record["status"] == "ok"
     scene = f"{family(record)} {config.get('split')} {config.get('index')}"
-    given, text = GIVEN.get(of_set, ("", ""))
-    named = [text.format(setting(config, *given.split(".")))] if given else []
-    final, start = (_finite(record[part].get(error)) for part in ("metrics", "metrics_start"))
+    amount_key, form = PROBLEM_SETTINGS.get(set_name, ("", ""))
+    amount_texts = [form.format(setting(config, *amount_key.split(".")))] if amount_key else []
+    final, start = (_finite(record[section].get(error)) for section in ("metrics", "metrics_start"))
     curve = _curve(record, folder, final if ok else None)
-    tuned = str(record.get("method") or "").startswith(TUNED)
-    asked = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
-    changed = [text.removeprefix("renderer.") for text in asked if re.match(r"renderer\.[^_]", text)]
-    row = ", ".join([renderer_name(config, record["renderer"]), *changed])  # without the loss, which is the set's
+    tuned = str(record.get("method") or "").startswith(TUNED_PREFIX)
+    overrides = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
+    changes = [text.removeprefix("renderer.") for text in overrides if re.match(r"renderer\.[^_]", text)]
+    row = ", ".join([renderer_name(config, record["renderer"]), *changes])  # without the loss, which is the set's
     return Attempt(
-        **{"set": of_set, "problem": ", ".join([scene, *named]), "scene": scene, "seed": record["seed"]},
-        row=row.removesuffix(BY_ITSELF) + BY_ITSELF if tuned else row,
+        **{"set": set_name, "problem": ", ".join([scene, *amount_texts]), "scene": scene, "seed": record["seed"]},
+        row=row.removesuffix(TUNED_SUFFIX) + TUNED_SUFFIX if tuned else row,
         preset=record["renderer"] if tuned else record.get("method") or record["renderer"],
         status=str(record["status"]),
         reason=record["reason"],
@@ -164,84 +164,85 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         cost=curve[-1][0] if curve else 0.0,
         operations=record["flops"],
         seconds=loop_seconds(record),
-        waited=said.get("waited_share"),
-        **{name: said.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
-        threads=said.get("threads"),
+        waited=environment.get("waited_share"),
+        **{name: environment.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
+        threads=environment.get("threads"),
         **{"started": record["started"], "code": record.get("code", "")},
-        settings=settings_of(config, of_set, tuned),
+        settings=settings_hash(config, set_name, tuned),
         curve=curve,
-        overrides=portable(record.get("overrides", ())),
+        overrides=portable_overrides(record.get("overrides", ())),
     )
 
 
 def _finite(value: Any) -> float:
-    """A number; infinite where it is none."""
+    """The value as a number; infinite if it is nan or no number."""
     number = as_number(value)
     return inf if number is None or isnan(number) else number
 
 
-def portable(overrides: Iterable[str]) -> list[str]:
-    """Those of a run that say what it is, not where: no option of the command, no setting of Hydra's."""
+def portable_overrides(overrides: Iterable[str]) -> list[str]:
+    """The overrides that define the run: without folders, options of the command and settings of Hydra."""
     return [text for text in overrides if not text.lstrip("+~").startswith(("results_dir=", "hydra", "-"))]
 
 
-def settings_of(config: dict[str, Any], of_set: str, tuned: bool) -> str:
-    """A hash of what a set states for all renderers, without what its problems, or tuned settings, differ in."""
-    known, (given, _) = flat({part: config.get(part) for part in STATED}), GIVEN.get(of_set, ("", ""))
-    left = [key for key in known if key == given or (tuned and re.match(FREE, key))]
-    return digest({key: str(value) for key, value in known.items() if key not in left})
+def settings_hash(config: dict[str, Any], set_name: str, tuned: bool) -> str:
+    """A hash of the settings that a set fixes, without those in which problems or tuned settings differ."""
+    values = flat({key: config.get(key) for key in FIXED_KEYS})
+    amount_key, _ = PROBLEM_SETTINGS.get(set_name, ("", ""))
+    varying = [key for key in values if key == amount_key or (tuned and re.match(TUNABLE_KEYS, key))]
+    return digest({key: str(value) for key, value in values.items() if key not in varying})
 
 
 def _curve(record: Record, folder: Path, final: float | None) -> list[list[float]]:
-    """The checkpoints, and the end; a line has the error before its step, and the costs after it."""
-    error = suite().errors[record["config"]["experiment"].removeprefix(EXPERIMENT)]
+    """The checkpoints and the end of a run. A line has the error before its step, and the costs after it."""
+    error = suite().errors[record["config"]["experiment"].removeprefix(EXPERIMENT_PREFIX)]
     lines = curve_lines(folder) or []
-    of_rendering = record["metrics"].get("cost"), record["seconds"].get("forward")  # of a run without a loop
-    found, spent = list[list[float]](), [0.0 if lines else as_number(number) or 0.0 for number in of_rendering]
+    rendering_costs = record["metrics"].get("cost"), record["seconds"].get("forward")  # if the run has no loop
+    checkpoints, costs = list[list[float]](), [0.0 if lines else as_number(number) or 0.0 for number in rendering_costs]
     for line in lines:
         if line.get(error) is not None:
-            found.append([*spent, _finite(line[error])])
-        spent = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]
-    end = [[*spent, final]] if final is not None else []
-    return [[float(f"{number:.5g}") for number in point] for point in found + end]
+            checkpoints.append([*costs, _finite(line[error])])
+        costs = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]
+    end = [[*costs, final]] if final is not None else []
+    return [[float(f"{number:.5g}") for number in point] for point in checkpoints + end]
 
 
-def place(results_dir: Path) -> Path:
-    """The folder of the attempts at this version of the suite."""
-    return results_dir / FOLDER / suite().id
+def attempts_folder(results_dir: Path) -> Path:
+    """The folder of the attempts on this version of the suite."""
+    return results_dir / SUITE_FOLDER / suite().id
 
 
 def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]:
-    """Joins attempts to those of a results folder; gives the files, one a row.
+    """Merges attempts into those of a results folder; returns the files, one per row.
 
     Raises:
-        ValueError: where a file of the folder cannot be read, whose content would be lost.
+        ValueError: a file of the folder cannot be read, so its content would be lost.
     """
-    folder, (kept, problems) = place(results_dir), read_attempts(results_dir)
+    folder, (stored, problems) = attempts_folder(results_dir), read_attempts(results_dir)
     if problems:
         raise ValueError(f"{folder} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
-    ordered = sorted(joined([*kept, *attempts]), key=lambda attempt: attempt.key)
+    ordered = sorted(newest_attempts([*stored, *attempts]), key=lambda attempt: attempt.key)
     files = grouped(ordered, lambda attempt: re.sub(r"[^a-z0-9]+", "_", attempt.row.lower()).strip("_") or "row")
     folder.mkdir(parents=True, exist_ok=True)
     return [write_lines(folder / f"{name}.csv", Attempt, group) for name, group in sorted(files.items())]
 
 
 def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
-    """The attempts that results folders keep, and a message for each file that cannot be read."""
+    """Reads the attempts of results folders; also returns a message for each file that cannot be read."""
     attempts, problems = list[Attempt](), list[str]()
-    for path in (path for folder in folders for path in sorted(place(folder).glob("[!.]*.csv"))):
+    for path in (path for folder in folders for path in sorted(attempts_folder(folder).glob("[!.]*.csv"))):
         try:
             attempts += [*map(_checked, read_lines(path, Attempt))]
-        except UNREADABLE as error:
+        except READ_ERRORS as error:
             problems.append(f"{path.name}: {error!r}")
     return attempts, problems
 
 
 def _checked(attempt: Attempt) -> Attempt:
-    """The attempt, if its numbers make sense.
+    """Returns the attempt if its numbers make sense.
 
     Raises:
-        ValueError, TypeError: where they do not.
+        ValueError, TypeError: they do not.
     """
     numbers = [attempt.start, attempt.final, attempt.cost, *(number for point in attempt.curve for number in point)]
     costs, end = [point[:2] for point in attempt.curve], [[attempt.cost, float(f"{attempt.final:.5g}")]]
@@ -256,7 +257,7 @@ def _checked(attempt: Attempt) -> Attempt:
 
 @dataclass(frozen=True)
 class Gathered:
-    """All attempts in any order, the `local` ones of a results folder, and a message for each file that is unread."""
+    """All attempts in any order, the `local` ones of a results folder, and a message for each unreadable file."""
 
     everything: list[Attempt]
     local: list[Attempt]
@@ -264,15 +265,15 @@ class Gathered:
 
     @property
     def size(self) -> str:
-        """The size of the suite at which rows are compared: the least one if a local row lacks problems of quick."""
+        """The size of the suite to compare rows on: smoke if a local row lacks problems of quick."""
         rows = grouped((attempt for attempt in self.local if not attempt.tuned), lambda attempt: attempt.row).values()
-        whole = all(problems_of("quick") <= {attempt.key[:3] for attempt in row} for row in rows)
-        return "quick" if whole else "smoke"
+        is_complete = all(problems_of("quick") <= {attempt.key[:3] for attempt in row} for row in rows)
+        return "quick" if is_complete else "smoke"
 
 
 def gather(shipped: Path, results_dir: Path, records: Iterable[Record] = ()) -> Gathered:
-    """The attempts that are shipped; and local ones, which a results folder keeps or which are among its records."""
-    kept, problems = read_attempts(shipped)
+    """Collects the shipped attempts and the local ones: stored in a results folder, or among its records."""
+    shipped_attempts, problems = read_attempts(shipped)
     local, unread = ([], []) if results_dir.resolve() == shipped.resolve() else read_attempts(results_dir)
     local += attempts_of(records, results_dir)
-    return Gathered([*kept, *local], local, [*problems, *unread])
+    return Gathered([*shipped_attempts, *local], local, [*problems, *unread])

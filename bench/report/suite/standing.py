@@ -1,8 +1,8 @@
 """The standing of the suite: how far each row gets, what that costs, and which rows differ significantly.
 
-The progress of a run is 1 - log(error / reference) / log(initial error / reference), from 0 to 1. A failed run has made
-none. Progress is read at two costs, at the end of the run, and as its mean over the logarithm of the cost. The unit of
-cost is DIST's whole run at the same problem. Each set of problems weighs the same.
+The progress of a run is 1 - log(error / reference) / log(initial error / reference), from 0 to 1; for a failed run 0.
+Progress is read at two costs, at the end of the run, and as its mean over the logarithm of the cost. The unit of cost
+is DIST's total cost on the same problem. Each set of problems has the same weight.
 """
 
 from collections.abc import Iterable
@@ -17,18 +17,18 @@ import pandas as pd
 from bench.records.record import MAX_WAIT_FRACTION
 from bench.report.data import flips, statistics
 from bench.report.data.statistics import Interval, shapes_needed
-from bench.report.suite.attempts import APART, Attempt, Gathered, problems_of, suite
+from bench.report.suite.attempts import SETS_WITHOUT_CURVE, Attempt, Gathered, problems_of, suite
 from bench.tables import choice
 
-UNIT = "dist"  # the preset of the row by whose costs all costs are divided
+UNIT = "dist"  # costs are relative to those of this preset
 AT_1, AT_10, END, AREA = OUTCOMES = ("at_1", "at_10", "end", "area")
-AT_SECONDS = "at_seconds"  # of one run of DIST
-BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # the costs at which progress is read
-AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # over whose logarithm progress is averaged
-FEWEST_CHECKPOINTS = 3  # within a cost: below it, progress there is more interpolated than measured
-LEAST_ERROR = 1e-12  # in a logarithm
+AT_SECONDS = "at_seconds"  # progress at the seconds of DIST's run
+BUDGETS = {AT_1: 1.0, AT_10: 10.0, END: inf}  # progress is read at these costs
+AREA_COSTS = np.geomspace(0.3, 30.0, 49)  # progress is averaged over these, equally spaced in the logarithm
+MIN_CHECKPOINTS = 3  # with fewer within a cost, progress there is interpolated rather than measured
+MIN_LOG_ERROR = 1e-12  # lower bound before taking the logarithm
 KEY = ["set", "problem", "seed"]
-ALPHA = 0.02  # of tests in all, at which 5 % of simulated draws of equal rows have a false pair: scenes are skewed
+ALPHA = 0.02  # total over all tests; as scenes are skewed, it gives 5 % false pairs in simulations of equal rows
 
 
 class Standing:
@@ -38,29 +38,29 @@ class Standing:
         self.everything = frame_of(gathered.everything)
         self.compared = compared(self.everything, gathered.size)
         self.reached = with_progress(self.compared)
-        self.whole = self.reached[self.reached["whole"]]
-        self.rankings = {outcome: ranking(self.whole, outcome) for outcome in OUTCOMES}
+        self.complete = self.reached[self.reached["complete"]]
+        self.rankings = {outcome: ranking(self.complete, outcome) for outcome in OUTCOMES}
         self.rows = [*self.rankings[AT_1].progress]
-        self.sets = [name for name in suite().errors if name in {*self.whole["set"]}]
-        self.hidden = {budget: rows_with_few_checkpoints(self.whole, budget) for budget in BUDGETS} | {AREA: set()}
+        self.sets = [name for name in suite().errors if name in {*self.complete["set"]}]
+        self.hidden = {budget: rows_with_few_checkpoints(self.complete, budget) for budget in BUDGETS} | {AREA: set()}
 
     @cached_property
     def costs(self) -> dict[str, float]:
-        """The median cost of each row's runs over that of DIST's."""
-        return (self.whole["cost"] / self.whole["unit"]).groupby(self.whole["row"]).median().to_dict()
+        """The median cost of each row's runs relative to DIST's."""
+        return (self.complete["cost"] / self.complete["unit"]).groupby(self.complete["row"]).median().to_dict()
 
     @cached_property
     def lacking(self) -> dict[str, int]:
-        """The rows that are not compared, with the number of problems that they lack."""
-        rows = self.compared[~self.compared["whole"] & ~self.compared["tuned"]]
+        """The rows that are not compared, with the number of problems they lack."""
+        rows = self.compared[~self.compared["complete"] & ~self.compared["tuned"]]
         return rows.groupby("row")["missing"].first().to_dict()
 
 
 def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
     """A line per attempt, the oldest first; a key may have several.
 
-    It has the fields of the attempt, `ok`, `tuned`, `machine`, and `timed`, unless the machine was busy. Left out are
-    attempts under other settings than most of their set's; tuned rows have their own settings.
+    Its columns: the fields of the attempt, `ok`, `tuned`, `machine`, and `timed` (the machine was not busy). Attempts
+    with other settings than most of their set are left out; settings of tuned rows are compared separately.
     """
     lines = [vars(attempt) | {"ok": attempt.ok, "tuned": attempt.tuned} for attempt in attempts]
     columns = [*Attempt.__dataclass_fields__, "ok", "tuned"]
@@ -77,25 +77,25 @@ def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
 
 
 def unit_row(runs: pd.DataFrame) -> str:
-    """The row by whose costs others are divided, DIST at its default setting; empty where there is none."""
+    """The row that costs are relative to: DIST at its default settings; empty if there is none."""
     rows = sorted({*runs.loc[(runs["preset"] == UNIT) & ~runs["tuned"], "row"]})
     label = choice("renderer", UNIT).get("_label_")
     return label if label in rows else next(iter(rows), "")
 
 
 def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
-    """The newest attempt of each row at the problems and seeds that all whole rows have.
+    """The newest attempt of each row on the problems and seeds that all complete rows have.
 
-    A row is whole if it has the problems of that size of the suite, or all of DIST's if these are fewer. Other rows
-    stay in the frame, and no comparison has them.
+    A row is complete if it has the problems of that size of the suite, or all of DIST's if these are fewer. Other rows
+    stay in the frame, but are not compared.
 
     Args:
-        everything: as of `frame_of`.
+        everything: the result of `frame_of`.
 
     Returns:
-        A line per attempt, with more columns: `missing`, the number of problems that its row lacks; `whole`, whether
-        its row is compared; `unit`, the cost of DIST's run, or where that failed the median in its set; `initial` and
-        `reference`, the errors between which progress is measured; and `has_progress`, whether there is any to make.
+        A line per attempt with further columns: `missing`, the number of problems that its row lacks; `complete`;
+        `unit`, the cost of DIST's run, or the median in its set if that run failed; `initial` and `reference`, the
+        errors that progress is measured between; and `has_progress`, whether progress is defined.
     """
     runs = everything.drop_duplicates([*KEY, "row"], keep="last")
     keys = pd.Series([*zip(*(runs[name] for name in KEY), strict=True)], runs.index, dtype=object)
@@ -103,8 +103,8 @@ def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
     reachable = rows.get(unit_row(runs), {*keys})
     needed = problems_of(size) if problems_of(size) <= reachable else reachable
     missing = runs["row"].map({row: len(needed - problems) for row, problems in rows.items()})
-    runs = runs.assign(missing=missing, whole=(missing == 0) & ~runs["tuned"])
-    common = reachable.intersection(*(rows[row] for row in runs.loc[runs["whole"], "row"].unique()))
+    runs = runs.assign(missing=missing, complete=(missing == 0) & ~runs["tuned"])
+    common = reachable.intersection(*(rows[row] for row in runs.loc[runs["complete"], "row"].unique()))
     return _with_errors(runs[keys.isin(common)].reset_index(drop=True))
 
 
@@ -114,8 +114,8 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
         return pd.Series(values.reindex(index).to_numpy(dtype=float), runs.index)
 
     finite = runs[np.isfinite(runs["start"])]
-    sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any did
-    least = runs[~runs["tuned"]].groupby(["set", "problem"])["final"].min().clip(lower=LEAST_ERROR)
+    sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any
+    least = runs[~runs["tuned"]].groupby(["set", "problem"])["final"].min().clip(lower=MIN_LOG_ERROR)
     stated = [_reference(*line) for line in zip(runs["set"], runs["problem"], runs["scene"], strict=True)]
     paid = runs[runs["ok"] & (runs["cost"] > 0)]
     units = paid[paid["row"] == unit_row(runs)].groupby(KEY)["cost"].median()
@@ -126,32 +126,32 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
         unit=at_problem(units).fillna(runs["set"].map(usual)).fillna(1.0),
     )
     possible = (runs["initial"] > runs["reference"]) & (runs["reference"] > 0)
-    return runs.assign(has_progress=possible & ~runs["set"].isin(APART))
+    return runs.assign(has_progress=possible & ~runs["set"].isin(SETS_WITHOUT_CURVE))
 
 
 def _reference(of_set: str, problem: str, scene: str) -> float | None:
-    """The reference error that the suite states; None where it is the least final error of all rows."""
+    """The reference error that the suite states; None if the least final error of all rows is used."""
     errors = suite().references.get(of_set, {})
     return errors.get(problem, errors.get(scene, errors.get("all")))
 
 
 def progress_curve(run: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The costs of a run's checkpoints over the unit, and the progress at each."""
+    """The costs of a run's checkpoints relative to the unit, and the progress at each."""
     if not run.ok:
         return np.zeros(1), np.zeros(1)
     curve = np.array(run.curve)
-    left = np.log(np.maximum(curve[:, 2], LEAST_ERROR) / run.reference) / np.log(run.initial / run.reference)
+    left = np.log(np.maximum(curve[:, 2], MIN_LOG_ERROR) / run.reference) / np.log(run.initial / run.reference)
     return curve[:, 0] / run.unit, 1 - np.clip(left, 0, 1)
 
 
 def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
-    """The attempts that have progress to make, with the progress of each outcome.
+    """The attempts with defined progress, and their progress in each outcome.
 
-    Between checkpoints progress is interpolated, and after its end a run keeps its last one.
+    Progress is interpolated between checkpoints, and constant after the end of a run.
 
     Returns:
         A line per attempt with the columns `OUTCOMES`; `BUDGET_checkpoints`, the number of checkpoints within each of
-        `BUDGETS`; and `at_1_next`, the progress at the first checkpoint beyond `at_1`, or `at_1` if it is more.
+        `BUDGETS`; and `at_1_next`, the larger of `at_1` and the progress at the first checkpoint after it.
     """
     runs, lines = runs[runs["has_progress"]].reset_index(drop=True), []
     for run in runs.itertuples():
@@ -160,7 +160,7 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
         line[AREA] = np.interp(AREA_COSTS, costs, progress).mean()
         for name, budget in BUDGETS.items():
             certain = budget == inf or not run.ok  # the end, or the progress of a failed run: 0
-            line[f"{name}_checkpoints"] = FEWEST_CHECKPOINTS if certain else (costs <= budget).sum()
+            line[f"{name}_checkpoints"] = MIN_CHECKPOINTS if certain else (costs <= budget).sum()
         line[f"{AT_1}_next"] = max(line[AT_1], progress[min((costs <= 1).sum(), len(costs) - 1)])
         lines.append(line)
     columns = [*OUTCOMES, *(f"{name}_checkpoints" for name in BUDGETS), f"{AT_1}_next"]
@@ -168,9 +168,9 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def rows_with_few_checkpoints(runs: pd.DataFrame, budget: str) -> set[str]:
-    """The rows that have in some set fewer than `FEWEST_CHECKPOINTS` within a budget, in the median of problems."""
+    """The rows whose median number of checkpoints within a budget is below `MIN_CHECKPOINTS` in some set."""
     counts = runs.groupby(["row", "set"])[f"{budget}_checkpoints"].median().groupby("row").min()
-    return {*counts[counts < FEWEST_CHECKPOINTS].index}
+    return {*counts[counts < MIN_CHECKPOINTS].index}
 
 
 @dataclass(frozen=True)
@@ -178,11 +178,11 @@ class Ranking:
     """The progress of rows in one outcome, and which of them differ significantly.
 
     Args:
-        progress: of each row the mean over sets of the mean over problems, the largest first.
+        progress: the mean over sets of the mean over problems, by row, the largest first.
         better: the significant pairs, the row with more progress first.
         pairs: the number of all pairs.
         least_p: the least p value of all pairs; 1 without pairs.
-        scenes: the number of scenes, which are the units of the test.
+        scenes: the number of scenes, the units of the test.
     """
 
     progress: dict[str, float]
@@ -193,7 +193,7 @@ class Ranking:
 
     @property
     def decidable(self) -> bool:
-        """Whether so many scenes can show any difference."""
+        """Whether this number of scenes can show any difference."""
         return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs, ALPHA)
 
     def rank(self, row: str) -> str:
@@ -218,20 +218,20 @@ def ranking(runs: pd.DataFrame, outcome: str) -> Ranking:
 
 
 def by_scene(runs: pd.DataFrame, outcome: str) -> pd.DataFrame:
-    """What each scene [scenes, rows] adds to the mean over sets of the mean over problems of a row."""
+    """What each scene [scenes, rows] contributes to a row's mean over sets of the mean over problems."""
     sizes = runs.groupby(["set", "row"]).size().groupby("set").max()
     shares = runs.assign(share=runs[outcome] / runs["set"].map(sizes) / max(len(sizes), 1))
     return shares.pivot_table(index="scene", columns="row", values="share", aggfunc="sum")
 
 
 def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
-    """The bounds of the mean final errors of all rows over DIST's in a set, without rows that failed in most problems.
+    """The bounds of the mean final errors of all rows relative to DIST's in a set, without rows that mostly failed.
 
-    They are of geometric means over scenes, see `flips.bounds`; None where the set has too few scenes for them.
+    The means are geometric, over scenes, see `flips.bounds`. None if the set has too few scenes.
     """
     runs = runs[runs["set"] == of_set]
     runs = runs[runs.groupby("row")["ok"].transform("mean") >= 0.5]
-    errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=LEAST_ERROR))
+    errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=MIN_LOG_ERROR))
     table = errors.groupby([runs["scene"], runs["row"]]).mean().unstack("row")
     ratios = table.drop(columns=unit_row(runs), errors="ignore").sub(table.get(unit_row(runs)), axis=0)
     ends = flips.bounds(ratios.to_numpy(), ALPHA)
@@ -239,11 +239,11 @@ def bounds(runs: pd.DataFrame, of_set: str) -> tuple[float, float] | None:
 
 
 def timed(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
-    """The attempts at problems at which all rows were timed on a machine that timed DIST's run too.
+    """The attempts on problems on which all rows were timed on a machine that also timed DIST's run.
 
     Returns:
-        Their lines, where `unit` and `unit_seconds` are of DIST's newest run on that machine, with the engine of the
-        newest of all. `at_seconds` is the progress at DIST's seconds, `at_seconds_checkpoints` as in `with_progress`.
+        Their lines. `unit` and `unit_seconds` are of DIST's newest run on that machine with the newest kernels.
+        `at_seconds` is the progress at DIST's seconds, `at_seconds_checkpoints` is as in `with_progress`.
     """
     units = everything[(everything["row"] == unit_row(runs)) & everything["timed"] & everything["ok"]]
     units = units[units["kernels"].isin(units["kernels"].iloc[-1:])].drop_duplicates([*KEY, "machine"], keep="last")
@@ -253,24 +253,24 @@ def timed(runs: pd.DataFrame, everything: pd.DataFrame) -> pd.DataFrame:
     pairs, lines = pairs[rows == runs["row"].nunique()].reset_index(drop=True), []
     for run in pairs.itertuples():
         seconds, progress = np.array(run.curve)[:, 1] if run.ok else np.zeros(1), progress_curve(run)[1]
-        count = (seconds <= run.unit_seconds).sum() if run.ok else FEWEST_CHECKPOINTS
+        count = (seconds <= run.unit_seconds).sum() if run.ok else MIN_CHECKPOINTS
         lines.append((np.interp(run.unit_seconds, seconds, progress), count))
     return pairs.join(pd.DataFrame(lines, pairs.index, [AT_SECONDS, f"{AT_SECONDS}_checkpoints"], dtype=float))
 
 
 def costs(runs: pd.DataFrame, pairs: pd.DataFrame) -> pd.DataFrame:
-    """The costs of whole runs that ended ok over DIST's at the same problems.
+    """The total costs of runs that ended ok, relative to DIST's on the same problems.
 
     Args:
-        pairs: as of `timed`.
+        pairs: the result of `timed`.
 
     Returns:
-        Of each set and row, the index, the medians over scenes of the ratios of `evaluations` and of `seconds`, and the
-        number of `scenes`. Both are of the timed pairs; where these have too few scenes, there are no seconds, and the
-        evaluations are of all runs.
+        By set and row, the medians over scenes of the ratios of `evaluations` and of `seconds`, and the number of
+        `scenes`. They are of the timed pairs; with too few timed scenes, the evaluations are of all runs, without
+        seconds.
     """
     scenes, lines = pairs.groupby("set")["scene"].nunique(), []
-    enough = scenes.index[scenes >= statistics.FEWEST_SHAPES]
+    enough = scenes.index[scenes >= statistics.MIN_SHAPES]
     chosen = pd.concat([runs[~runs["set"].isin(enough)], pairs[pairs["set"].isin(enough)]])
     for key, group in chosen[chosen["ok"] & (chosen["cost"] > 0) & (chosen["unit"] > 0)].groupby(["set", "row"]):
         seconds = _ratio(group, "seconds", "unit_seconds") if key[0] in enough else None
@@ -284,6 +284,6 @@ def _ratio(runs: pd.DataFrame, *columns: str) -> Interval:
 
 
 def wrong_pixels(runs: pd.DataFrame) -> pd.Series:
-    """Of each row the mean fraction of an object's pixels that it renders wrongly; all of them where it failed."""
-    rendered = runs[runs["set"].isin(APART) & (runs["initial"] > 0)]
+    """The mean fraction of an object's pixels that each row renders wrongly; 1 for a failed run."""
+    rendered = runs[runs["set"].isin(SETS_WITHOUT_CURVE) & (runs["initial"] > 0)]
     return (rendered["final"] / rendered["initial"]).clip(upper=1).groupby(rendered["row"]).mean()

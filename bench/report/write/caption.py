@@ -13,53 +13,52 @@ from bench.report.data.records import Record, doubtful, setting, solid, view
 from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
 
-SMOKE = "Made at scale=smoke, to try things out: nothing follows from these numbers."  # at the beginning of a caption
-LONGEST_REASON = 160  # characters of a reason in a caption; the CSV has all of it
-MOST_NAMED = 4  # that are listed one by one; more are counted
-OVER = "{shapes and seeds}"  # stands in texts for that over which the runs of an experiment vary
-FEW = "fewer than six shapes"  # statistics.FEWEST_SHAPES
+SMOKE_WARNING = "Made at scale=smoke, to try things out: nothing follows from these numbers."
+MAX_REASON_LETTERS = 160  # the CSV has the full reason
+MAX_LISTED_NAMES = 4  # more are counted
+VARYING = "{shapes and seeds}"  # placeholder for what the runs of an experiment vary over
+FEW = "fewer than six shapes"  # see statistics.MIN_SHAPES
 
 
 def caption(runs: Runs, plotted: str, *, n: str, interval: str) -> str:
-    """The caption of a `Result`, in four sentences, behind a warning where its runs are of scale=smoke."""
-    sample = (n or _sample(runs)) + (f"; {said(runs, interval)}" if interval else "") + "."
+    """The caption of a `Result` in four sentences, after a warning if runs are of scale=smoke."""
+    sample = (n or _sample(runs)) + (f"; {fill_varying(runs, interval)}" if interval else "") + "."
     setup = _setup(runs)
-    first = [SMOKE if tried(runs) else "", said(runs, plotted)]
+    first = [SMOKE_WARNING if has_smoke_runs(runs) else "", fill_varying(runs, plotted)]
     return " ".join(filter(None, [*first, f"n = {sample}", _outcome(runs), f"{setup}." if setup else ""]))
 
 
-def tried(runs: Runs) -> bool:
-    """Whether there is a run of scale=smoke."""
+def has_smoke_runs(runs: Runs) -> bool:
     return any(setting(record["config"], "scale", "name") == "smoke" for record in runs.records)
 
 
-def said(runs: Runs, text: str) -> str:
-    """The text with that over which the runs of an experiment vary in place of `OVER`, such as shapes and seeds."""
+def fill_varying(runs: Runs, text: str) -> str:
+    """Replaces `VARYING` in a text by what the runs vary over, such as shapes and seeds."""
     shapes, views, seeds = _levels(runs)
     levels = [name for name, varies in (("views", views > 1), ("seeds", seeds > 1)) if varies]
     words = " and ".join(["shapes", *levels] if shapes > 1 else levels)
-    return text.replace(OVER, words if shapes > 1 else f"{words} of one shape" if words else "one shape")
+    return text.replace(VARYING, words if shapes > 1 else f"{words} of one shape" if words else "one shape")
 
 
-def kind(interval: str, shown: Iterable[Interval], *, drawn: bool) -> str:
-    """The kind of interval of the estimates that are shown; that there is none, or points if drawn, of few shapes."""
-    known = [estimate.known for estimate in shown]
-    none = f"{FEW}: {'points, ' if drawn else ''}no interval; n in brackets counts shapes"
-    if all(known):
+def interval_text(interval: str, estimates: Iterable[Interval], *, drawn: bool) -> str:
+    """The kind of interval of the shown estimates; with few shapes, a text that says that there is none."""
+    has_interval = [estimate.has_ends for estimate in estimates]
+    few_note = f"{FEW}: {'points, ' if drawn else ''}no interval; n in brackets counts shapes"
+    if all(has_interval):
         return interval
-    return f"{interval}; {none}" if any(known) else none
+    return f"{interval}; {few_note}" if any(has_interval) else few_note
 
 
 def undefined(values: Iterable[float]) -> str:
-    """A note on the probabilities and ranks that are not shown; empty where there is none."""
+    """A note on probabilities and ranks that are not defined; empty if all are."""
     none = any(math.isnan(value) for value in values)
     return "One shape and one seed are one draw: from it no probability and no rank is given (–)." if none else ""
 
 
 def warnings(runs: Runs) -> list[str]:
-    """Notes on settings that differ, on times that do not compare or are doubtful, on old runs and on missing ones."""
-    said = (_mixed(runs), _compared(runs), _loaded(runs), *age.notes(runs.records), _omitted(runs))
-    return [note for note in said if note]
+    """Notes on differing settings, incomparable or doubtful times, old runs and missing runs."""
+    notes = (_mixed(runs), _machines(runs), _loaded(runs), *age.notes(runs.records), _omitted(runs))
+    return [note for note in notes if note]
 
 
 def _sample(runs: Runs) -> str:
@@ -71,11 +70,11 @@ def _sample(runs: Runs) -> str:
 def _levels(runs: Runs) -> tuple[int, int, int]:
     records = runs.records
     shapes = {(solid(record), record["config"].get("split")) for record in records}
-    return len(shapes), *(len({part(record) for record in records}) for part in (view, itemgetter("seed")))
+    return len(shapes), *(len({getter(record) for record in records}) for getter in (view, itemgetter("seed")))
 
 
 def _setup(runs: Runs) -> str:
-    """The parts of the setup that are known: scenes, the resolution, prior and loss that all runs have, the machine."""
+    """The known parts of the setup: scenes, machine, and the resolution, prior and loss if all runs share them."""
     if not runs.records:
         return ""
     scenes = list(dict.fromkeys(str(record.get("scene") or "") for record in runs.records))
@@ -84,8 +83,8 @@ def _setup(runs: Runs) -> str:
     resolution = sizes.pop() if len(sizes) == 1 else None
     config = runs.requested()
     network = setting(config, "prior", "network") or setting(config, "scale", "network") or {}
-    ours = runs.records[0]["dataset"] != "network"  # of others a note of the run says what it is
-    layers, width = (setting(network, "layers"), setting(network, "width")) if ours else (None, None)
+    is_own_network = runs.records[0]["dataset"] != "network"  # a note of the run describes other networks
+    layers, width = (setting(network, "layers"), setting(network, "width")) if is_own_network else (None, None)
     machines = [_machine(*machine) for machine in runs.machines()]
     parts = {
         "scenes": f"{'Scene' if len(shown) == 1 else f'{len(shown)} scenes:'} {_listed(shown)}",
@@ -94,18 +93,18 @@ def _setup(runs: Runs) -> str:
         "machine": f"{len(machines)} machines, see the notes" if len(machines) > 1 else "".join(machines),
     }
     loss = shared_loss(runs.records)
-    known = [parts[name] for name in runs.selection.setup if parts[name]]
-    return "; ".join(known + ([f"every row with {loss}"] if loss else []))
+    known_parts = [parts[name] for name in runs.selection.setup if parts[name]]
+    return "; ".join(known_parts + ([f"every row with {loss}"] if loss else []))
 
 
 def _outcome(runs: Runs) -> str:
     failed = [record for record in runs.named() if record["status"] != "ok"]
     total = len(runs.records)
-    if not total:  # a page of rows that are kept without their runs
+    if not total:  # a page of stored attempts
         return ""
     if not failed:
         return f"All {total} runs ended ok." if total > 1 else "The run ended ok."
-    if len(failed) <= MOST_NAMED:
+    if len(failed) <= MAX_LISTED_NAMES:
         listed = "; ".join(_failure(record) for record in failed)
     else:
         statuses = Counter(record["status"] for record in failed).most_common()
@@ -120,11 +119,11 @@ def _omitted(runs: Runs) -> str:
 
 
 def _mixed(runs: Runs) -> str:
-    found = runs.mixed()
-    return f"Runs differ in {_listed(found)}: rows with other values do not compare." if found else ""
+    keys = runs.mixed()
+    return f"Runs differ in {_listed(keys)}: rows with other values do not compare." if keys else ""
 
 
-def _compared(runs: Runs) -> str:
+def _machines(runs: Runs) -> str:
     machines = runs.machines()
     if len(machines) < 2:
         return ""
@@ -133,23 +132,23 @@ def _compared(runs: Runs) -> str:
 
 
 def _loaded(runs: Runs) -> str:
-    """A warning where times are doubtful."""
     names = [record["name"] for record in runs.named() if doubtful(record)]
-    few = _listed(names) if len(names) <= MOST_NAMED else f"{len(names)} of {len(runs.records)} runs"
+    few = _listed(names) if len(names) <= MAX_LISTED_NAMES else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
     return f"Doubtful times, see the notes of the run: {rows}." if names else ""
 
 
 def _machine(cpu: Any, device: Any, threads: Any, compiled: bool) -> str:
-    parts = [str(part) for part in (cpu, device) if part and part != "cpu"]
+    parts = [str(name) for name in (cpu, device) if name and name != "cpu"]
     more = [plural(threads, "thread")] if threads else []
     return "; ".join([" + ".join(parts), *more, *(["compiled kernels"] if compiled else [])])
 
 
 def _failure(record: Record) -> str:
-    reason = textwrap.shorten(record["reason"] or "no reason recorded", LONGEST_REASON, placeholder=" …")
+    reason = textwrap.shorten(record["reason"] or "no reason recorded", MAX_REASON_LETTERS, placeholder=" …")
     return f"{record['name']}: {record['status']} ({reason.rstrip('.')})"
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
+    more = len(names) - MAX_LISTED_NAMES
+    return ", ".join(names[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -1,4 +1,4 @@
-"""Charts as data: panels of series, drawn here as a figure, and by the page so that they answer the mouse."""
+"""Charts as data: panels of series, drawn here as a figure, and by the page as an interactive chart."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,55 +12,55 @@ from matplotlib.figure import Figure
 from bench.pictures import style
 from bench.report.data.statistics import Interval
 
-GREY = "#777777"  # of lines that belong to no row
+REFERENCE_COLOUR = "#777777"
 Series = dict[str, Any]
 Panel = dict[str, Any]
 
 
 def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[float | Interval], **more: Any) -> Series:
-    """Points with the colour and marker that their preset has in every figure; of estimates with their intervals.
+    """Points with the colour and marker of their preset, the same in every figure; estimates have intervals.
 
     Args:
-        x, y: the values. Those of y, or in a panel with names of rows those of x, may be estimates: where one has no
-            interval, the points of its shapes are drawn, small.
-        more: what the page reads as well, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
+        x, y: the values. Those of y (those of x in a panel with named rows) may be estimates. If one has no interval,
+            small points show its shapes.
+        more: further data for the page, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
     """
     look, x, y = style.look(preset), list(x), list(y)
-    made = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
-    estimates = [one for one in (*x, *y) if isinstance(one, Interval)]
-    if any(one.known for one in estimates):
-        ends = [(one.low, one.high) if one.known else (one.value, one.value) for one in estimates]
-        made |= dict(zip(("low", "high"), map(_values, zip(*ends, strict=True)), strict=True))
-    shapes = [_values(pair) for point in zip(x, y, strict=True) for pair in _of_shapes(*point)]
-    return made | ({"shapes": shapes} if shapes else {}) | more
+    points = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
+    estimates = [estimate for estimate in (*x, *y) if isinstance(estimate, Interval)]
+    if any(estimate.has_ends for estimate in estimates):
+        ends = [(each.low, each.high) if each.has_ends else (each.value, each.value) for each in estimates]
+        points |= dict(zip(("low", "high"), map(_values, zip(*ends, strict=True)), strict=True))
+    shapes = [_values(pair) for point in zip(x, y, strict=True) for pair in _shape_points(*point)]
+    return points | ({"shapes": shapes} if shapes else {}) | more
 
 
-def _of_shapes(x: float | Interval, y: float | Interval) -> Iterable[tuple[float, float]]:
-    """The points of the single shapes of an estimate without an interval; none of another point."""
-    if not any(isinstance(one, Interval) and not one.known for one in (x, y)):
+def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[float, float]]:
+    """The points of the single shapes of an estimate without an interval; empty for other points."""
+    if not any(isinstance(value, Interval) and not value.has_ends for value in (x, y)):
         return ()
-    return product(*(one.points if isinstance(one, Interval) else (one,) for one in (x, y)))
+    return product(*(value.points if isinstance(value, Interval) else (value,) for value in (x, y)))
 
 
 def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
-    """As `series`, joined by a line."""
+    """A `series` whose points a line joins."""
     return series(name, preset, x, y, **{"dash": style.look(preset).line} | more)
 
 
 def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
-    """A grey line at a value, between the ends of positions."""
+    """A grey horizontal line at a value, from the smallest to the largest position."""
     ends = [min(places := list(x)), max(places)]
-    return {"name": name, "x": ends, "y": [value, value], "colour": GREY, "symbol": "", "dash": "-", **more}
+    return {"name": name, "x": ends, "y": [value, value], "colour": REFERENCE_COLOUR, "symbol": "", "dash": "-", **more}
 
 
 def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) -> Panel:
-    """A panel of a chart; an axis is logarithmic where its values are positive and span a factor above 3.
+    """A panel of a chart. An axis is logarithmic if its values are positive and span a factor above 3.
 
-    Positions that have names are not: where the first one has no value, the others are positive.
+    An axis with named positions is never logarithmic.
 
     Args:
-        x, y: what its axes carry, with the unit.
-        more: what the page reads as well; `ticks` and `rows`, the names of the positions 0, 1, ... along x and down y.
+        x, y: the titles of its axes, with the unit.
+        more: further data for the page; `ticks` and `rows`, the names of the positions 0, 1, ... along x and down y.
     """
     axes = {}
     for letter, name, names in (("x", x, "ticks"), ("y", y, "rows")):
@@ -80,7 +80,7 @@ def sheet(
 
 @style.styled
 def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int = 4, **how: Any) -> Figure:
-    """Draws panels as a figure of that height in inches, so many lines of them, with one legend below.
+    """Draws panels as a figure: `height` in inches, `lines` lines of panels, one legend below.
 
     Args:
         legend: the columns of the legend; 0 for none.
@@ -88,9 +88,9 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     """
     columns = -(-max(len(panels), 1) // lines)
     figure, axes = sheet(height, lines, columns, **how)
-    size = {True: len(panels), "row": columns}.get(how.get("sharey"), 1)  # panels with one axis have one edge
-    for place, (axis, panel) in enumerate(zip(axes.flat, panels, strict=False)):
-        _panel(axis, panel, _edge(panels[place // size * size :][:size], "y"))
+    size = {True: len(panels), "row": columns}.get(how.get("sharey"), 1)  # panels that share an axis share its edge
+    for index, (axis, panel) in enumerate(zip(axes.flat, panels, strict=False)):
+        _panel(axis, panel, _edge(panels[index // size * size :][:size], "y"))
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")
     for axis in axes[:, 1:].flat if "sharey" in how else ():
@@ -125,7 +125,7 @@ def draw_lead(panels: Sequence[Panel], ranks: Mapping[str, Mapping[str, str]]) -
 
 
 def _fractions(axis: Axes, panel: Panel) -> None:
-    """Draws lines of fractions, with a point at the end of each, or a cross at that of a row that failed."""
+    """Draws lines of fractions, with a point at the end of each, or a cross if the row failed."""
     for line in panel["series"]:
         axis.plot(line["x"], line["y"], color=line["colour"], ls=line["dash"])
         end = {"marker": "x" if line.get("failed") else "o", "color": line["colour"], "clip_on": False, "zorder": 3}
@@ -138,7 +138,7 @@ def _fractions(axis: Axes, panel: Panel) -> None:
 
 
 def _name_lines(axis: Axes, lines: Sequence[Series]) -> None:
-    """Writes the name of each line above the axes, joined to its end; behind its end where that is below a half."""
+    """Writes the name of each line above the axes, joined to its end; next to its end if that is below 0.5."""
     above, across = axis.get_xaxis_transform(), axis.transScale + axis.transLimits
     position = -1.0
     for line in sorted(lines, key=lambda line: line["x"][-1]):
@@ -147,7 +147,7 @@ def _name_lines(axis: Axes, lines: Sequence[Series]) -> None:
         if end[1] < 0.5:
             axis.annotate(name, end, (4, 0), textcoords="offset points", va="center", **look)
             continue
-        position = max(across.transform(end)[0], position + 0.08)  # of the width of the axes, between two names
+        position = max(across.transform(end)[0], position + 0.08)  # at least this fraction of the width between names
         cost = across.inverted().transform((position, 0))[0]
         axis.plot([end[0], cost], [end[1], 1.02], transform=above, lw=0.6, color=line["colour"], clip_on=False)
         axis.text(cost, 1.03, name, transform=above, rotation=40, rotation_mode="anchor", **look)
@@ -173,14 +173,14 @@ def _shown(panel: Panel) -> list[Series]:
 
 
 def _drawn(panel: Panel, letter: str) -> list[float]:
-    """All values along an axis, with those of single shapes and the ends of intervals: with names of rows, of x."""
+    """All values along an axis, including shapes and ends of intervals; these are along x if rows have names."""
     ends = ("low", "high") if letter == ("x" if "rows" in panel else "y") else ()
     values = [v for each in _shown(panel) for key in (letter, *ends) for v in each.get(key, ())]
     return values + [pair["xy".index(letter)] for each in _shown(panel) for pair in each.get("shapes", ())]
 
 
 def _edge(panels: Sequence[Panel], letter: str) -> float:
-    """Where what is infinite is drawn: beyond all else of panels that share an axis."""
+    """The position of infinite values: beyond all finite values of panels that share an axis."""
     return 2 * max((v for panel in panels for v in _drawn(panel, letter) if math.isfinite(v)), default=1.0)
 
 
@@ -201,20 +201,20 @@ def _panel(axis: Axes, panel: Panel, edge: float) -> None:
 
 
 def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> None:
-    """Draws a series; what is infinite at the edge, points as crosses there; intervals as a band or as bars.
+    """Draws a series: intervals as a band or bars, infinite values at the edge, infinite points as crosses.
 
-    Intervals are along x where they are `across`.
+    Intervals are along x if `across`.
     """
     x, y, line = np.minimum(each["x"], edges[0]), np.minimum(each["y"], edges[1]), "dash" in each
-    how: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
-    how |= {"markevery": max(len(x) // 6, 1)} if line else {}
-    how |= {"drawstyle": "steps-post"} if each.get("step") else {}
-    how |= {"mfc": "none"} if each.get("hollow") else {}
-    how |= {"ms": 0.55 * each["size"]} if "size" in each else {}
-    lost = (np.isinf(each["x"]) | np.isinf(each["y"])) & (not line)
-    axis.plot(x[~lost], y[~lost], label=None if each.get("quiet") else each["name"], **how)
-    if lost.any():
-        axis.plot(x[lost], y[lost], "x", color=each["colour"])
+    style_options: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
+    style_options |= {"markevery": max(len(x) // 6, 1)} if line else {}
+    style_options |= {"drawstyle": "steps-post"} if each.get("step") else {}
+    style_options |= {"mfc": "none"} if each.get("hollow") else {}
+    style_options |= {"ms": 0.55 * each["size"]} if "size" in each else {}
+    is_infinite = (np.isinf(each["x"]) | np.isinf(each["y"])) & (not line)
+    axis.plot(x[~is_infinite], y[~is_infinite], label=None if each.get("quiet") else each["name"], **style_options)
+    if is_infinite.any():
+        axis.plot(x[is_infinite], y[is_infinite], "x", color=each["colour"])
     if "low" in each:
         ends = [np.minimum(each[end], edges[not across]) for end in ("low", "high")]
         if line:
@@ -224,10 +224,10 @@ def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> No
         else:
             axis.vlines(x, *ends, color=each["colour"], lw=0.7)
     if "shapes" in each:
-        at, found = np.minimum(each["shapes"], edges).T
-        axis.plot(at, found, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
+        shape_x, shape_y = np.minimum(each["shapes"], edges).T
+        axis.plot(shape_x, shape_y, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
 
 
-def _values(found: Iterable[float | Interval]) -> list[float]:
-    """The values, of estimates without their intervals, with five digits."""
-    return [float(f"{one.value if isinstance(one, Interval) else one:.5g}") for one in found]
+def _values(values: Iterable[float | Interval]) -> list[float]:
+    """The values, or those of estimates, with five digits."""
+    return [float(f"{value.value if isinstance(value, Interval) else value:.5g}") for value in values]

@@ -1,7 +1,7 @@
-"""Writes `index.html`, and beside it in the folder `page` its scripts and the data that they show.
+"""Writes `index.html`, and into the folder `page` its scripts and their data.
 
-The page names its scripts in the order in which they need each other. By its policy scripts and pictures come from
-beside it, styles may be set by scripts, and nothing is asked of a network.
+The page lists its scripts in the order of their dependencies. Its policy allows scripts and pictures only from its own
+folder, styles set by scripts, and no network.
 """
 
 import json
@@ -26,27 +26,27 @@ from bench.report.site.renderers import renderers
 from bench.report.write.paper import papers
 
 ASSETS = Path(__file__).parents[1] / "page"
-FOLDER = "page"  # of the results folder
-PATIENCE = 1.0  # seconds to wait in silence
+PAGE_FOLDER = "page"
+SILENT_WAIT_SECONDS = 1.0
 LIBRARY = "plotly.min.js"
-MOST_MESHES = 100  # of the newest runs; `bench.report meshes=all` makes all
+MAX_MESHES = 100  # `bench.report meshes=all` makes all
 
-# Within a JSON text these occur in strings only. Escaped, no string can end a script element or a line.
+# In JSON these occur only in strings. Escaped, no string can end a script element or a line.
 UNSAFE = re.compile("[<>&\u2028\u2029\x7f]")
-KEY = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")  # of the files with details
-# Letters of a run's key: those with the same share a file of details, since a small file takes a whole block of a disk.
-BEGINNING = 2
+DETAIL_FILE_PATTERN = re.compile(r"[0-9a-f]{2}([0-9a-f]{14})?\.js")
+# Runs whose keys begin with the same letters share a file of details, as a small file occupies a whole disk block.
+KEY_PREFIX_LETTERS = 2
 ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", ":"), default=str)
 
 
-def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
-    """Writes `index.html` and the folder `page` beside it from all run folders in `results_dir/runs`; gives the page.
+def write_index(results_dir: Path, *, meshes: int | None = MAX_MESHES) -> Path:
+    """Writes `index.html` and the folder `page` from all run folders in `results_dir/runs`; returns the page.
 
     Args:
-        meshes: of how many runs, the newest first, the mesh is made ready for the page; None for all.
+        meshes: the number of runs, the newest first, whose mesh is prepared for the page; None for all.
 
     Raises:
-        ValueError: if `results_dir` is not a folder, or one that the page is written to is a link out of it.
+        ValueError: `results_dir` is not a folder, or a folder of the page is a link that leads out of it.
     """
     check_results(results_dir)
     with page_lock(results_dir):
@@ -55,13 +55,13 @@ def write_index(results_dir: Path, *, meshes: int | None = MOST_MESHES) -> Path:
 
 @contextmanager
 def page_lock(results_dir: Path) -> Iterator[None]:
-    """Held while records are read and their page is written: of two that write, the last one's has the runs of both.
+    """Locks the page while records are read and it is written, so that the last of two writers sees the runs of both.
 
-    Who waits for it longer than `PATIENCE` is told.
+    A process that waits longer than `SILENT_WAIT_SECONDS` prints a message.
     """
-    lock = file_lock(results_dir, FOLDER)
+    lock = file_lock(results_dir, PAGE_FOLDER)
     try:
-        lock.acquire(timeout=PATIENCE)
+        lock.acquire(timeout=SILENT_WAIT_SECONDS)
     except Timeout:
         print(f"waiting for another process that writes the page of {results_dir}", file=sys.stderr, flush=True)
         lock.acquire()
@@ -72,19 +72,19 @@ def page_lock(results_dir: Path) -> Iterator[None]:
 
 
 def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: Path, meshes: int | None) -> Path:
-    """Writes the page of records that were read within `page_lock`, as `write_index` does; gives it."""
-    data, page = results_dir / FOLDER / "data", results_dir / "index.html"
+    """Writes and returns the page of records that were read within `page_lock`, see `write_index`."""
+    data, page = results_dir / PAGE_FOLDER / "data", results_dir / "index.html"
     folders = [Folder(results_dir, record["folder"]) for record in records]
-    entries, wholes = papers(results_dir)
-    _copy_assets(results_dir / FOLDER)
-    bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:BEGINNING])
+    entries, content_by_key = papers(results_dir)
+    _copy_assets(results_dir / PAGE_FOLDER)
+    bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:KEY_PREFIX_LETTERS])
     details = (
         (name, bundle((folder, detail(record, folder, results_dir)) for folder, record in runs))
         for name, runs in bundles.items()
     )
     _write_all(data, "run", details)
     _write_meshes([folder for folder in folders if folder.has("mesh.ply")], data, meshes)
-    _write_all(data, "paper", wholes.items())
+    _write_all(data, "paper", content_by_key.items())
     lists = {
         "about": {"problems": problems, "meshes": meshes},
         "papers": entries,
@@ -105,22 +105,22 @@ def _write_all(data: Path, kind: str, contents: Iterable[tuple[str, Any]]) -> No
     remove_others(data / kind, keys)
 
 
-def _write_meshes(folders: list[Folder], data: Path, most: int | None) -> None:
-    """Writes the meshes of the newest runs; one that is there and newer than its mesh is kept."""
+def _write_meshes(folders: list[Folder], data: Path, max_meshes: int | None) -> None:
+    """Writes the meshes of the newest runs, and keeps those that are up to date."""
     kept = []
     for number, folder in enumerate(folders):
         source = folder.path / "mesh.ply"
-        made = _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key)
-        if not made and (most is None or number < most):
+        is_current = _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key)
+        if not is_current and (max_meshes is None or number < max_meshes):
             write_script(data, "mesh", folder.key, _mesh(source))
-            made = True
-        if made:
+            is_current = True
+        if is_current:
             kept.append(folder.key)
     remove_others(data / "mesh", kept)
 
 
 def _mesh(source: Path) -> dict[str, Any]:
-    from bench.report.site.meshes import mesh_data  # only here: runs without meshes need no trimesh
+    from bench.report.site.meshes import mesh_data  # imported here: runs without meshes need no trimesh
 
     try:
         return mesh_data(source)
@@ -129,7 +129,7 @@ def _mesh(source: Path) -> dict[str, Any]:
 
 
 def _is_newer(path: Path, source: Path, key: str) -> bool:
-    """Whether a mesh was made after its source, and the script holds a mesh and nothing else."""
+    """Whether a script is newer than its mesh file, and holds a mesh and nothing else."""
     try:
         if path.is_symlink() or path.stat().st_mtime_ns <= source.stat().st_mtime_ns:
             return False
@@ -152,36 +152,36 @@ def to_script(kind: str, key: str, data: Any) -> str:
 
     Numbers that are not finite are the strings "inf", "-inf" and "nan".
     """
-    parts = (safe_json(part) for part in (kind, key, data))
-    return f"implicitBench.receive({', '.join(parts)});\n"
+    arguments = (safe_json(argument) for argument in (kind, key, data))
+    return f"implicitBench.receive({', '.join(arguments)});\n"
 
 
 def safe_json(data: Any) -> str:
-    """JSON in ASCII that can stand within a script element."""
+    """JSON in ASCII that is safe inside a script element."""
     try:
         text = ENCODER.encode(data)
-    except ValueError:  # a number that is not finite
+    except ValueError:  # an infinite number or nan
         text = ENCODER.encode(to_json_values(data))
-    return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return UNSAFE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def remove_others(folder: Path, keys: Iterable[str]) -> None:
-    """Removes the scripts of what is gone."""
-    kept = {f"{key}.js" for key in keys}
+    """Removes the scripts of other keys."""
+    current = {f"{key}.js" for key in keys}
     if folder.is_dir():
-        with os.scandir(folder) as found:
-            gone = [one.name for one in found if one.name not in kept and KEY.fullmatch(one.name)]
-        for name in gone:
+        with os.scandir(folder) as entries:
+            names = {entry.name for entry in entries if DETAIL_FILE_PATTERN.fullmatch(entry.name)}
+        for name in names - current:
             (folder / name).unlink(missing_ok=True)
 
 
 def write_script(data: Path, kind: str, key: str, content: Any) -> None:
-    """Writes the script that hands over the content of that kind and key."""
+    """Writes the script that hands the content of a kind and key to the page."""
     write_file(data / kind / f"{key}.js", to_script(kind, key, content).encode("ascii"))
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Writes a file, unless it has that content already; what a link leads to may change."""
+    """Writes a file unless it has that content already; a link is always replaced."""
     if path.is_symlink() or not path.is_file() or path.read_bytes() != content:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, content)

@@ -1,4 +1,4 @@
-"""Writes the tables and figures of all studies and their index; finds those of a results folder for index.html."""
+"""Writes the tables and figures of all studies and their index; finds the pages of a results folder."""
 
 import csv
 import hashlib
@@ -15,19 +15,19 @@ from urllib.parse import quote
 from bench.records.read import PLAN_FILE
 from bench.records.record import is_outside, write_text
 from bench.report.data import age
-from bench.report.data.kept import KEPT, join, read_rows, write_rows
+from bench.report.data.kept import FROM_RUNS_CSV, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
-from bench.report.write.caption import SMOKE
+from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.result import Result, Shown, as_markdown, latex, read_shown, write, write_shown
 
 FOLDER = "paper"
-SWEEPS, TABLE = "sweeps", "table"  # tables of sweeps lie beside their plans
+SWEEPS, TABLE = "sweeps", "table"  # the table of a sweep is next to its plan
 SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
-SHIPPED = ROOT / "results"  # what a checkout has; nothing where the package is installed without it
+SHIPPED = ROOT / "results"  # only in a checkout
 STUDIES = ROOT / "bench" / "studies"
-JOINED = "suite"  # the page whose own rows are among the shipped ones already
-BESIDE = "shipped: "  # in front of the name of a row that is shipped, beside rows of the user's own
+SUITE_PAGE = "suite"  # its rows include the shipped ones
+SHIPPED_ROW_PREFIX = "shipped: "
 
 HEAD = """# Results
 
@@ -44,77 +44,77 @@ where a run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.g
 """
 
 
-BROKEN = (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)  # of an odd or foreign record
+RECORD_ERRORS = (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError)
 
 
 @dataclass(frozen=True)
 class Study:
-    """A file of `bench/studies`: the runs that it reads, and its pages, each made of them by a function.
+    """A file of `bench/studies`: the runs that it reads, and a function for each of its pages.
 
-    A file has `PLACE`, its place among all, `READS`, a `Selection` for each argument of its functions, and `PAGES`,
-    these functions by the names of their pages. It may have `KEEPS`, which gives the folder of rows that a results
-    folder keeps of it: with that, its pages are made without runs too.
+    A file has `PLACE`, its position among all files; `READS`, a `Selection` for each argument of its functions; and
+    `PAGES`, these functions by the names of their pages. It may have `KEEPS`, which returns the folder of its rows in a
+    results folder: then its pages are also made without runs.
     """
 
-    place: int
+    order: int
     reads: tuple[Selection, ...]
     pages: dict[str, Callable[..., Result]]
-    problem: str = ""  # of a file that cannot be read
+    problem: str = ""  # why the file cannot be read
     keeps: Callable[[Path], Path] | None = None
 
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
-        """The result of each page; none where there is no run of it, and no row is kept.
+        """The result of each page; empty if there are neither runs nor kept rows.
 
-        A page that needs run folders is made of the runs that have theirs; it is left out where these are the fewer.
+        A page that needs run folders uses the runs that have them; it is left out if these are the minority.
         """
         chosen: list[Runs | None] = [choose(records, selection, results_dir) for selection in self.reads]
         if not any(runs is not None for runs in chosen):
             if self.keeps is None or not self.keeps(results_dir).is_dir():
                 return {}
             chosen = [Runs(selection, results_dir, []) for selection in self.reads]
-        found = {}
+        results = {}
         for name, make in self.pages.items():
             try:
-                found[name] = make(*chosen)
+                results[name] = make(*chosen)
             except NoFolder:
-                own = [record for record in records if KEPT not in record]
-                if 2 * self._count(own, results_dir) >= self._count(records, results_dir):
-                    found |= replace(self, pages={name: make}).results(own, results_dir)
-        return found
+                with_folder = [record for record in records if FROM_RUNS_CSV not in record]
+                if 2 * self._count(with_folder, results_dir) >= self._count(records, results_dir):
+                    results |= replace(self, pages={name: make}).results(with_folder, results_dir)
+        return results
 
     def _count(self, records: list[dict[str, Any]], results_dir: Path) -> int:
-        return sum(len(runs.records) for one in self.reads if (runs := choose(records, one, results_dir)))
+        return sum(len(runs.records) for selection in self.reads if (runs := choose(records, selection, results_dir)))
 
 
 @cache
 def studies() -> tuple[Study, ...]:
-    """All files of `bench/studies`, in the order of their places; a file that cannot be read has a problem alone."""
-    found: list[Study] = []
+    """All files of `bench/studies` by `order`; a file that cannot be read has only a problem."""
+    studies_read: list[Study] = []
     for file in iter_modules([str(STUDIES)]):
         try:
-            read = import_module(f"bench.studies.{file.name}")
-            if taken := {name for study in found for name in study.pages} & {*read.PAGES}:
-                raise ValueError(f"another study has a page {min(taken)}: give it another name")
-            found.append(Study(read.PLACE, read.READS, read.PAGES, keeps=getattr(read, "KEEPS", None)))
-        except (*BROKEN, ImportError, NameError, SyntaxError) as error:
-            found.append(Study(0, (), {}, f"bench/studies/{file.name}.py ({type(error).__name__}: {error})"))
-    return tuple(sorted(found, key=lambda study: study.place))
+            module = import_module(f"bench.studies.{file.name}")
+            if repeated := {name for study in studies_read for name in study.pages} & {*module.PAGES}:
+                raise ValueError(f"another study has a page {min(repeated)}: give it another name")
+            studies_read.append(Study(module.PLACE, module.READS, module.PAGES, keeps=getattr(module, "KEEPS", None)))
+        except (*RECORD_ERRORS, ImportError, NameError, SyntaxError) as error:
+            studies_read.append(Study(0, (), {}, f"bench/studies/{file.name}.py ({type(error).__name__}: {error})"))
+    return tuple(sorted(studies_read, key=lambda study: study.order))
 
 
 def write_paper(
     records: list[dict[str, Any]],
     results_dir: Path,
-    into: Path | None = None,
+    output_dir: Path | None = None,
     problems: list[str] | None = None,
     only: str | None = None,
 ) -> list[Path]:
-    """Writes the files of every page that has runs to the folder `paper`; gives the path of each page's CSV.
+    """Writes the files of every page that has runs to the folder `paper`; returns the pages' CSVs.
 
     Args:
-        into: the folder that gets `paper`; by default the results folder. Where it is another, it is what is shipped:
-            pages of runs of scale=smoke are left out.
-        problems: gets a line for each study that cannot be made of these runs; without it, its error is raised.
-        only: the name of a page, where no other is written.
+        output_dir: the folder that gets `paper`; by default the results folder. Another folder is shipped: it gets no
+            pages of runs of scale=smoke.
+        problems: gets a line for each study that fails on these runs; without it, the error is raised.
+        only: the name of the only page to write.
     """
     written = []
     for study in studies() if only is None else [study for study in studies() if only in study.pages]:
@@ -124,26 +124,26 @@ def write_paper(
                 raise ValueError(study.problem)
             results = study.results(records, results_dir)
             pages = [
-                (name, result, result.shown(100 * study.place + place, experiments))
-                for place, (name, result) in enumerate(results.items())
+                (name, result, result.shown(100 * study.order + number, experiments))
+                for number, (name, result) in enumerate(results.items())
             ]
-        except BROKEN as error:
+        except RECORD_ERRORS as error:
             if problems is None:
                 raise
-            told = f"{', '.join(study.pages)} ({type(error).__name__}: {error})"
-            problems.append(f"not made: {study.problem or told}")
+            description = f"{', '.join(study.pages)} ({type(error).__name__}: {error})"
+            problems.append(f"not made: {study.problem or description}")
             continue
         for name, result, shown in pages:
-            if into is None or not shown.caption.startswith(SMOKE):
-                written.append(write(result, shown, (into or results_dir) / FOLDER / name)[0])
+            if output_dir is None or not shown.caption.startswith(SMOKE_WARNING):
+                written.append(write(result, shown, (output_dir or results_dir) / FOLDER / name)[0])
     return written
 
 
 @dataclass(frozen=True)
-class Found:
-    """A table or figure of a results folder: its name, what it says, its picture and its files by their kind.
+class Page:
+    """A table or figure of a results folder: its name, its content, its picture and its files by kind.
 
-    Paths of files are seen from the results folder, percent-encoded; `shipped` ones have none.
+    Paths of files are relative to the results folder and percent-encoded; `shipped` pages have none.
     """
 
     name: str
@@ -154,68 +154,69 @@ class Found:
     shipped: bool = False
 
 
-def find_paper(results_dir: Path) -> list[Found]:
-    """The tables and figures of `results_dir/paper` in their order, then shipped ones of other names."""
-    own = _in(results_dir)
-    names = {one.name for one in own}
-    others = [] if results_dir.resolve() == SHIPPED else _in(SHIPPED)
-    shipped = [one for one in others if one.name not in names]
-    return own + [replace(one, picture=None, files={}, shipped=True) for one in shipped]
+def find_paper(results_dir: Path) -> list[Page]:
+    """The pages of `results_dir/paper` in their order, then shipped pages of other names."""
+    own_pages = _pages_of(results_dir)
+    own_names = {page.name for page in own_pages}
+    others = [] if results_dir.resolve() == SHIPPED else _pages_of(SHIPPED)
+    shipped = [page for page in others if page.name not in own_names]
+    return own_pages + [replace(page, picture=None, files={}, shipped=True) for page in shipped]
 
 
-def _in(results_dir: Path) -> list[Found]:
-    """The tables and figures of a results folder in their order; those that no study made stand last."""
-    found = [found_at(path.with_suffix(""), results_dir) for path in (results_dir / FOLDER).glob("[!.]*.json")]
-    return sorted((one for one in found if one.shown.title), key=lambda one: (one.shown.place or 10**6, one.name))
+def _pages_of(results_dir: Path) -> list[Page]:
+    """The pages of a results folder in their order; pages without a study come last."""
+    pages = [page_at(path.with_suffix(""), results_dir) for path in (results_dir / FOLDER).glob("[!.]*.json")]
+    return sorted((page for page in pages if page.shown.title), key=lambda page: (page.shown.order or 10**6, page.name))
 
 
-def find_sweeps(results_dir: Path) -> list[Found]:
-    """The tables of sweeps, the sweep that was asked for last first, each by the name of its sweep."""
+def find_sweeps(results_dir: Path) -> list[Page]:
+    """The tables of sweeps by name of the sweep, the last requested first."""
     tables = (results_dir / SWEEPS).glob(f"*/{TABLE}.json")
-    folders = sorted((path.parent for path in tables), key=lambda folder: (-_asked(folder), folder.name))
-    return [replace(found_at(folder / TABLE, results_dir), name=folder.name) for folder in folders]
+    folders = sorted((path.parent for path in tables), key=lambda folder: (-_plan_time(folder), folder.name))
+    return [replace(page_at(folder / TABLE, results_dir), name=folder.name) for folder in folders]
 
 
 def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """The entry of each table and figure, those of sweeps last, and by its key all that its own view shows."""
-    entries, wholes = [], {}
-    for found in [*find_paper(results_dir), *find_sweeps(results_dir)]:
-        key = key_of(found.name)
-        shown = found.shown
-        texts = {"question": shown.question, "verdict": shown.verdict, "shipped": found.shipped}
-        texts["sweep"] = found.base.name == TABLE and found.base.parents[1].name == SWEEPS
-        entries.append({"name": found.name, "key": key, "title": (shown.title or found.name).rstrip("."), **texts})
-        wholes[key] = {
+    """The list entry of each page, sweeps last; and the full content of each page by key."""
+    entries, content_by_key = [], {}
+    for page in [*find_paper(results_dir), *find_sweeps(results_dir)]:
+        key = key_of(page.name)
+        shown = page.shown
+        texts = {"question": shown.question, "verdict": shown.verdict, "shipped": page.shipped}
+        texts["sweep"] = page.base.name == TABLE and page.base.parents[1].name == SWEEPS
+        entries.append({"name": page.name, "key": key, "title": (shown.title or page.name).rstrip("."), **texts})
+        content_by_key[key] = {
             **{"caption": f"{shown.head} {shown.caption}".strip(), "notes": shown.notes, "header": shown.columns},
-            **{"rows": shown.rows + _beside(found, results_dir), "files": found.files, "picture": found.picture},
+            **{"rows": shown.rows + _shipped_rows(page, results_dir), "files": page.files, "picture": page.picture},
             **{"chart": shown.chart, "atlas": shown.atlas, "best": shown.best},
         }
-    return entries, wholes
+    return entries, content_by_key
 
 
-def _beside(found: Found, results_dir: Path) -> list[list[str]]:
-    """The shipped rows of a table of the user's, marked; none where it has them, has other columns, or is shipped."""
-    own = not found.shipped and found.base.parents[1] == results_dir and results_dir.resolve() != SHIPPED
-    if found.name == JOINED or not own:
+def _shipped_rows(page: Page, results_dir: Path) -> list[list[str]]:
+    """The marked shipped rows for a table of the user; empty if its columns differ or it has these rows already."""
+    is_of_user = not page.shipped and page.base.parents[1] == results_dir and results_dir.resolve() != SHIPPED
+    if page.name == SUITE_PAGE or not is_of_user:
         return []
-    shipped = found_at(SHIPPED / FOLDER / found.name, SHIPPED).shown
-    same = shipped.columns and shipped.columns == found.shown.columns
-    return [[BESIDE + row[0], *row[1:]] for row in shipped.rows] if same else []
+    shipped = page_at(SHIPPED / FOLDER / page.name, SHIPPED).shown
+    has_same_columns = shipped.columns and shipped.columns == page.shown.columns
+    return [[SHIPPED_ROW_PREFIX + row[0], *row[1:]] for row in shipped.rows] if has_same_columns else []
 
 
-def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[Path]:
-    """Adds the rows of runs to those of shipped tables, and draws these anew, with or without the runs' folders.
+def ship(records: list[dict[str, Any]], results_dir: Path, output_dir: Path) -> list[Path]:
+    """Adds the runs to the shipped files of runs, and redraws the shipped pages, also without run folders.
 
-    A page that cannot be drawn keeps what it says, in this version's form, and its head says which version drew it.
+    A page that cannot be redrawn keeps its content, and its head names the version that drew it.
 
     Raises:
-        ValueError: where rows that are there cannot be read, and would be lost.
+        ValueError: shipped files cannot be read, so their rows would be lost.
     """
-    every = join(records, read_rows(into / FOLDER))
-    read = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
-    rows, drawn = write_rows(every, read, into / FOLDER), write_paper(every, results_dir, into)
+    all_records = join(records, read_rows(output_dir / FOLDER))
+    experiments = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
+    rows = write_rows(all_records, experiments, output_dir / FOLDER)
+    drawn = write_paper(all_records, results_dir, output_dir)
     own_rows = {name for study in studies() if study.keeps is not None for name in study.pages}
-    for page in _in(into):
+    for page in _pages_of(output_dir):
         table = page.base.with_suffix(".csv")
         if table not in drawn:
             stamp = "" if page.name in own_rows else age.drawn_by(table)
@@ -223,59 +224,59 @@ def ship(records: list[dict[str, Any]], results_dir: Path, into: Path) -> list[P
     return [*rows, *drawn]
 
 
-def write_columns(results_dir: Path, given: dict[str, str]) -> None:
-    """Writes the LaTeX table of each page or sweep of a key `columns.NAME` again, with these headings alone.
+def write_columns(results_dir: Path, options: dict[str, str]) -> None:
+    """Writes the LaTeX table of each page or sweep with a key `columns.NAME` again, with only these headings.
 
     Raises:
-        ValueError: where there is no such table, or it has no such column.
+        ValueError: there is no such table, or it has no such column.
     """
-    tables = {page.name: page for page in [*_in(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
-    for key in (key for key in given if key.startswith("columns.")):
+    tables = {page.name: page for page in [*_pages_of(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
+    for key in (key for key in options if key.startswith("columns.")):
         if (page := tables.get(key.removeprefix("columns."))) is None:
             raise ValueError(f"{key}: no table of that name; there are {', '.join(tables) or 'none'}")
-        headings = next(csv.reader([given[key]], skipinitialspace=True))
+        headings = next(csv.reader([options[key]], skipinitialspace=True))
         if unknown := [heading for heading in headings if heading not in page.shown.columns]:
-            known = ",".join(f'"{one}"' if "," in one else one for one in page.shown.columns)
-            raise ValueError(f"{key}: no column {unknown[0]!r}; choose from {known}")
+            choices = ",".join(f'"{heading}"' if "," in heading else heading for heading in page.shown.columns)
+            raise ValueError(f"{key}: no column {unknown[0]!r}; choose from {choices}")
         write_text(page.base.with_suffix(".tex"), latex(page.shown.narrowed(headings), page.name))
 
 
 def write_readme(results_dir: Path) -> Path | None:
-    """Writes `results_dir/README.md`, the index of all pages; gives its path, or None where there is no page."""
-    if not (pages := _in(results_dir)):
+    """Writes `results_dir/README.md`, the index of all pages; returns its path, or None without pages."""
+    if not (pages := _pages_of(results_dir)):
         return None
     path = results_dir / "README.md"
     write_text(path, HEAD.format(folder=FOLDER) + "".join(map(_line, pages)))
     return path
 
 
-def _asked(folder: Path) -> float:
-    """When the sweep of a folder was last asked for, as its plan was written then; 0 where there is no plan."""
+def _plan_time(folder: Path) -> float:
+    """The time of the last request for a sweep: that of its plan file; 0 without a plan."""
     plan = folder / PLAN_FILE
     return plan.stat().st_mtime if plan.is_file() else 0.0
 
 
-def found_at(base: Path, root: Path) -> Found:
-    """The table or figure whose files in a results folder have that path before their suffix, but for links out."""
+def page_at(base: Path, root: Path) -> Page:
+    """The page whose files have the path `base` before their suffix; links out of the folder are ignored."""
     files = {suffix: base.with_name(base.name + suffix) for suffix in (*SUFFIXES, ".png", ".json")}
     within = {suffix: path for suffix, path in files.items() if path.is_file() and not is_outside(path, root)}
     links = {suffix: link(*path.relative_to(root).parts) for suffix, path in within.items()}
     named = {suffix[1:].upper(): links[suffix] for suffix in SUFFIXES if suffix in links}
     shown = read_shown(within[".json"]) if ".json" in within else Shown()
-    return Found(base.name, shown, links.get(".png"), named, base)
+    return Page(base.name, shown, links.get(".png"), named, base)
 
 
-def link(*parts: str) -> str:
-    """The address of a file as seen from the results folder, percent-encoded byte for byte."""
-    return "/".join(quote(os.fsencode(part), safe="") for part in parts)
+def link(*names: str) -> str:
+    """The address of a file relative to the results folder, percent-encoded byte by byte."""
+    return "/".join(quote(os.fsencode(name), safe="") for name in names)
 
 
 def key_of(name: str) -> str:
-    """The name of a script of data: letters and digits, whatever its run or table is called."""
+    """The name of a data script: letters and digits, whatever the name of its run or table."""
     return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
-def _line(page: Found) -> str:
+def _line(page: Page) -> str:
     """A page's line of the index: its question with a link, its answer and its experiments."""
     question = as_markdown(page.shown.question or page.shown.title.rstrip("."))
     answer = page.shown.answer + (f" (drawn by {page.shown.drawn_by})" if page.shown.drawn_by else "")

@@ -22,8 +22,8 @@ from bench.report.data.statistics import Interval
 from bench.report.write import caption
 from bench.report.write.table import Column, best, to_data, to_table
 
-# Special characters of LaTeX, and characters that its standard fonts lack; a row that starts with a bracket would be
-# read as the argument of the line break before it.
+# Special characters of LaTeX, and characters that its standard fonts lack. A row that begins with a bracket would be
+# read as the argument of the preceding line break.
 _LATEX = {
     "\\": r"\textbackslash{}",
     "[": "{[}",
@@ -55,6 +55,7 @@ _LATEX = {
     "µ": r"$\mu$",
 }
 _POWER = re.compile(r"(?<![\w.-])(-?\d+(?:\.\d+)?)e\+?(-?\d+)(?!\w)")  # such as 2.2e-5
+JSON_KEYS = {"order": "place"}  # fields of Shown with another name in the shipped files
 _MARKDOWN = str.maketrans({character: f"&#{ord(character)};" for character in "|*`[]\\"})
 
 
@@ -63,22 +64,21 @@ class Result:
     """A table, a figure or both, with the question that it answers.
 
     Args:
-        runs: what it is made of.
+        runs: the runs that it shows.
         title: its title, as a sentence.
         plotted: what is plotted, as a sentence.
         question: as a reader would ask it; empty for a page of pictures.
-        verdict: the answer, one sentence with its numbers between asterisks; empty where the runs do not give it.
+        verdict: the answer, one sentence with its numbers between asterisks; empty if the runs do not give it.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval; empty for none.
-        estimates: those that are shown with it, if there are shapes enough; empty for intervals that always are there.
-        remarks: notes of its own; empty ones are left out.
-        columns: of the table.
-        lines: of the table, as its columns read them.
-        run_columns: of the raw numbers where these have a line per run, not those of the table.
-        data: the raw numbers, including those that the figure plots; by default as the columns have them.
-        figure: the figure.
-        chart: panels of series for the page, as `chart.panel_data` makes them.
-        atlas: a grid of cells for the page, as the study `stability` makes it.
+        estimates: the shown estimates, which may lack an interval; empty if every interval exists.
+        remarks: further notes; empty ones are left out.
+        columns: the columns of the table.
+        lines: the lines of the table, as its columns read them.
+        run_columns: the columns of the raw numbers if these have a line per run.
+        data: the raw numbers, including those of the figure; by default they follow from the columns.
+        chart: panels of series for the page, see `chart.panel_data`.
+        atlas: a grid of cells for the page, see the study `stability`.
     """
 
     runs: Runs
@@ -105,29 +105,27 @@ class Result:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The numbers as text for readers."""
         return to_table(self.columns, self.lines)
 
     @cached_property
     def caption(self) -> str:
         """What is plotted, n, the interval, what failed, and the machine."""
-        interval = caption.kind(self.interval, self.estimates, drawn=self.figure is not None)
+        interval = caption.interval_text(self.interval, self.estimates, drawn=self.figure is not None)
         return caption.caption(self.runs, self.plotted, n=self.n, interval=interval)
 
     @cached_property
     def notes(self) -> list[str]:
-        """Warnings, then the notes of its own."""
-        own = [caption.said(self.runs, remark) for remark in self.remarks if remark]
-        return [*caption.warnings(self.runs), *own]
+        remarks = [caption.fill_varying(self.runs, remark) for remark in self.remarks if remark]
+        return [*caption.warnings(self.runs), *remarks]
 
-    def shown(self, place: int = 0, experiments: Iterable[str] = ()) -> "Shown":
-        """All that is read of it, as text; `place` is its place among all pages, `experiments` are what it reads."""
+    def shown(self, order: int = 0, experiments: Iterable[str] = ()) -> "Shown":
+        """The content of the page as text. Pages are sorted by `order`; `experiments` are those that it reads."""
         return Shown(
-            place=place,
+            order=order,
             experiments=[*experiments],
             title=self.title,
             question=self.question,
-            verdict=caption.SMOKE if self.verdict and caption.tried(self.runs) else self.verdict,
+            verdict=caption.SMOKE_WARNING if self.verdict and caption.has_smoke_runs(self.runs) else self.verdict,
             caption=self.caption,
             columns=list(self.table),
             rows=self.table.to_numpy().tolist(),
@@ -141,9 +139,9 @@ class Result:
 
 @dataclass(frozen=True)
 class Shown:
-    """What a page says: the content of `NAME.json`, of which Markdown, LaTeX and the HTML page are made."""
+    """The content of a page and of `NAME.json`, from which Markdown, LaTeX and the HTML page are made."""
 
-    place: int = 0
+    order: int = 0
     experiments: list[str] = field(default_factory=list)
     title: str = ""
     question: str = ""
@@ -151,65 +149,64 @@ class Shown:
     caption: str = ""
     columns: list[str] = field(default_factory=list)
     rows: list[list[str]] = field(default_factory=list)
-    best: list[list[int]] = field(default_factory=list)  # the row and the column of what is set bold
+    best: list[list[int]] = field(default_factory=list)  # the row and the column of each bold cell
     notes: list[str] = field(default_factory=list)
     drawn: bool = False
     chart: dict[str, Any] | None = None
     atlas: dict[str, Any] | None = None
-    drawn_by: str = ""  # the version that drew it, where that is not this one
+    drawn_by: str = ""  # the version that drew it, if not this one
 
     @property
     def head(self) -> str:
-        """By which version it was drawn, where this one cannot draw it."""
+        """A sentence on the version that drew the page, if this one cannot draw it."""
         return age.head(self.drawn_by)
 
     @property
     def answer(self) -> str:
-        """The verdict without stars about its numbers."""
         return self.verdict.replace("*", "")
 
     def narrowed(self, headings: Sequence[str]) -> "Shown":
-        """The page with these columns alone, in this order."""
-        places = [self.columns.index(heading) for heading in headings]
-        rows = [[row[place] for place in places] for row in self.rows]
-        best = [[line, places.index(place)] for line, place in self.best if place in places]
+        """The page with only these columns, in this order."""
+        indices = [self.columns.index(heading) for heading in headings]
+        rows = [[row[index] for index in indices] for row in self.rows]
+        best = [[line, indices.index(index)] for line, index in self.best if index in indices]
         return replace(self, columns=[*headings], rows=rows, best=best)
 
     def to_json(self) -> str:
-        """Its content, a line per part; infinite numbers of a chart become null."""
+        """The content as JSON, a line per part; infinite numbers of a chart become null."""
         parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
         encoded = {key: json.dumps(to_json_values(value), ensure_ascii=False) for key, value in parts.items()}
-        lines = [f"{json.dumps(key)}: {text}" for key, text in encoded.items()]
+        lines = [f"{json.dumps(JSON_KEYS.get(key, key))}: {text}" for key, text in encoded.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def read_shown(path: Path) -> Shown:
-    """The content of `NAME.json`; what is missing or of another type is as in an empty page."""
+    """Reads `NAME.json`; missing or invalid parts are empty."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+        content = json.loads(path.read_text(encoding="utf-8", errors="replace"))
     except (OSError, ValueError, RecursionError):
-        found = {}
-    known = found if isinstance(found, dict) else {}
-    sound = {f.name: known[f.name] for f in fields(Shown) if f.name in known and _is_sound(f.name, known[f.name])}
-    return Shown(**sound)
+        content = {}
+    parts = content if isinstance(content, dict) else {}
+    keys = {f.name: JSON_KEYS.get(f.name, f.name) for f in fields(Shown)}
+    return Shown(**{name: parts[key] for name, key in keys.items() if key in parts and _is_valid(name, parts[key])})
 
 
-def _is_sound(name: str, value: Any) -> bool:
+def _is_valid(name: str, value: Any) -> bool:
     if name in ("chart", "atlas"):
         return isinstance(value, dict)
     if name == "rows":
-        return isinstance(value, list) and all(_is_sound("columns", row) for row in value)
+        return isinstance(value, list) and all(_is_valid("columns", row) for row in value)
     if name == "best":
-        return isinstance(value, list) and all(isinstance(at, list) and [*map(type, at)] == [int, int] for at in value)
+        return isinstance(value, list) and all(isinstance(v, list) and [*map(type, v)] == [int, int] for v in value)
     if name in ("columns", "notes", "experiments"):
-        return isinstance(value, list) and all(isinstance(one, str) for one in value)
-    return isinstance(value, {"place": int, "drawn": bool}.get(name, str))
+        return isinstance(value, list) and all(isinstance(text, str) for text in value)
+    return isinstance(value, {"order": int, "drawn": bool}.get(name, str))
 
 
 def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[Path]:
-    """Writes `base.csv`, `.json`, `.md`, and where there is content `.tex`, `.png`, `.pdf`; gives the paths.
+    """Writes `base.csv`, `.json` and `.md`, and `.tex`, `.png` and `.pdf` if there is content; returns the paths.
 
-    LaTeX has the label `tab:NAME`, by default that of the files.
+    The label in LaTeX is `tab:NAME`; by default NAME is the name of the files.
     """
     base.parent.mkdir(parents=True, exist_ok=True)
     table = base.with_suffix(".csv")
@@ -223,7 +220,7 @@ def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[P
 
 
 def write_shown(shown: Shown, base: Path, *, name: str = "") -> list[Path]:
-    """Writes what a page says: `base.json`, `.md`, and where there is a table `.tex`; gives the paths."""
+    """Writes the content of a page: `base.json`, `.md`, and `.tex` if there is a table; returns the paths."""
     texts = {".json": shown.to_json(), ".md": markdown(shown, base.name)}
     if shown.columns:
         texts[".tex"] = latex(shown, name or base.name)
@@ -239,11 +236,11 @@ def _write_text(path: Path, text: str) -> None:
 def markdown(shown: Shown, name: str) -> str:
     """The Markdown text of a page: head, question and verdict, title, caption, table, picture and notes."""
     head = [as_markdown(shown.head)] if shown.head else []
-    asked = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
-    parts = [*head, *asked, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
+    question_part = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
+    parts = [*head, *question_part, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
     if shown.columns:
         head, rows = map(as_markdown, shown.columns), _emphasised(shown, as_markdown, "**{}**")
-        rule = ["---" if of_words else "---:" for of_words in _of_words(shown)]
+        rule = ["---" if is_text else "---:" for is_text in _text_columns(shown)]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
     if shown.drawn:
         parts.append(f"![{as_markdown(shown.title)}]({name}.png)")
@@ -253,17 +250,17 @@ def markdown(shown: Shown, name: str) -> str:
 
 
 def latex(shown: Shown, name: str) -> str:
-    """A LaTeX table environment under the title, no larger than the page, with rules between groups of its lines.
+    """A LaTeX table environment with the title, no larger than the page, and with rules between groups of lines.
 
-    A group has the same text in the first column, where it is written once, or the second. The caption is a comment.
+    Lines with equal text in the first column (written once) or in the second are a group. The caption is a comment.
     """
     cells = _emphasised(shown, _tex, r"\textbf{{\boldmath {}}}")
-    columns = [[row[place] for row in shown.rows] for place in range(len(shown.columns))]
-    for place, texts in enumerate(columns[:2]):
-        begins = [line for line, text in enumerate(texts) if line == 0 or text != texts[line - 1]]
-        if 1 < len(begins) <= len(texts) / 2 and (place == 0 or len(begins) == len({*texts})):
+    columns = [[row[index] for row in shown.rows] for index in range(len(shown.columns))]
+    for index, texts in enumerate(columns[:2]):
+        starts = [line for line, text in enumerate(texts) if line == 0 or text != texts[line - 1]]
+        if 1 < len(starts) <= len(texts) / 2 and (index == 0 or len(starts) == len({*texts})):
             for line, row in enumerate(cells):
-                row[0] = ("\\midrule\n" if line in begins[1:] else "") + (row[0] if place or line in begins else "")
+                row[0] = ("\\midrule\n" if line in starts[1:] else "") + (row[0] if index or line in starts else "")
             break
     head, *rows = (rf"{' & '.join(row)} \\" for row in (map(_tex_heading, shown.columns, columns), *cells))
     lines = [
@@ -284,44 +281,44 @@ def latex(shown: Shown, name: str) -> str:
 
 
 def _aligned(cells: list[str]) -> str:
-    """The LaTeX alignment of a column: left where most cells begin with a letter, in lines where they are long."""
+    """The LaTeX alignment of a column: left if most cells begin with a letter; a paragraph if a cell is long."""
     if any(len(cell) > 60 for cell in cells):
         return r">{\raggedright\arraybackslash}p{0.4\textwidth}"
     return "l" if 2 * sum(bool(re.match(r"\W*[^\W\d]", cell)) for cell in cells) > len(cells) else "r"
 
 
-def _emphasised(shown: Shown, escaped: Callable[[str], str], bold: str) -> list[list[str]]:
-    """The cells of all rows as Markdown or LaTeX, the best ones in bold."""
+def _emphasised(shown: Shown, escape: Callable[[str], str], bold: str) -> list[list[str]]:
+    """The cells of all rows as Markdown or LaTeX, the best in bold."""
     return [
-        [bold.format(escaped(cell)) if [line, place] in shown.best else escaped(cell) for place, cell in enumerate(row)]
+        [bold.format(escape(cell)) if [line, column] in shown.best else escape(cell) for column, cell in enumerate(row)]
         for line, row in enumerate(shown.rows)
     ]
 
 
-def _of_words(shown: Shown) -> list[bool]:
-    """Of each column, whether it is aligned to the left: the first one, and others without a digit but with a word."""
-    texts = [" ".join(row[place] for row in shown.rows) for place in range(len(shown.columns))]
+def _text_columns(shown: Shown) -> list[bool]:
+    """Whether each column is aligned left: the first, and those with words but no digits."""
+    texts = [" ".join(row[column] for row in shown.rows) for column in range(len(shown.columns))]
     return [
-        place == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
-        for place, text in enumerate(texts)
+        column == 0 or (any(map(str.isalpha, text)) and not any(map(str.isdigit, text)))
+        for column, text in enumerate(texts)
     ]
 
 
 def _tex(text: str) -> str:
-    """A text as LaTeX, a dash where there is none."""
+    """A text as LaTeX; a dash if it is empty."""
     escaped = _flat(text).translate(str.maketrans(_LATEX))
     return "--" if text in ("", "N/A") else _POWER.sub(r"$\1\\times10^{\2}$", escaped)
 
 
 def _tex_heading(heading: str, cells: list[str]) -> str:
-    """A heading as LaTeX, in lines where it is longer than the cells below."""
+    """A heading as LaTeX, broken into lines if it is longer than the cells below."""
     lines = textwrap.wrap(_flat(heading), max([12, *map(len, cells)]), break_long_words=False)
     text, side = r" \\ ".join(map(_tex, lines)), "lr"[_aligned(cells) == "r"]
     return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}" if lines[1:] else text
 
 
 def as_markdown(text: str) -> str:
-    """A text on one line, in which nothing has a meaning in Markdown or HTML."""
+    """A text on one line, with the special characters of Markdown and HTML escaped."""
     return html.escape(_flat(text), quote=False).translate(_MARKDOWN)
 
 

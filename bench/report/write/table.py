@@ -11,14 +11,14 @@ import pandas as pd
 from bench.records import format
 from bench.records.metrics import LOWER
 from bench.report.data import records
-from bench.report.data.records import SCALE, measured, row_of, setting
+from bench.report.data.records import CHAMFER_SCALE, measured, row_of, setting
 from bench.report.data.statistics import Interval
 
-thousandfold = partial(format.number, scale=SCALE)
-ENDS = ("low", "high")  # of an interval
+thousandfold = partial(format.number, scale=CHAMFER_SCALE)
+ENDS = ("low", "high")
 
 
-def whole(value: float | None) -> str:
+def integer(value: float | None) -> str:
     """A count as text, without decimals."""
     return format.number(value) if value is None else f"{value:.0f}"
 
@@ -29,18 +29,18 @@ def word(value: Any) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share of 1 in whole per cent."""
+    """A fraction in whole per cent."""
     return format.number(share) if share is None else f"{100 * share:.0f} %"
 
 
 def small_percent(share: float | None) -> str:
-    """A share of 1 in per cent, with the digits that a small one needs."""
+    """A fraction in per cent, with enough digits for small ones."""
     return format.number(share) if share is None else f"{format.number(share, 100)} %"
 
 
-def counted(part: float, whole: int, rate: Interval) -> str:
-    """A count with the interval of its share in per cent, or else the number of shapes, such as 3 of 4 (n = 2)."""
-    return f"{part:g} of {whole} {rate.ends(100)}{' %' if rate.known else ''}"
+def count_with_interval(number: float, total: int, rate: Interval) -> str:
+    """A count with the interval of its fraction in per cent, or with the number of shapes, such as 3 of 4 (n = 2)."""
+    return f"{number:g} of {total} {rate.ends(100)}{' %' if rate.has_ends else ''}"
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Column:
     """A column of a table.
 
     Args:
-        key: its name in the CSV; empty for a column that only the readable table has.
-        heading: in the readable table; empty for a column that only the CSV has.
-        value: gives the raw value of a line; by default `line.get(key)`.
+        key: its name in the CSV; empty for a column of the readable table only.
+        heading: its name in the readable table; empty for a column of the CSV only.
+        value: returns the raw value of a line; by default `line.get(key)`.
         show: converts the value to text for readers.
-        words: gives the text of a line for readers, where it depends on more than the value.
-        better: lower or higher, of a column whose best value is set bold; empty for none.
+        words: returns the text of a line for readers, if it depends on more than the value.
+        better: "lower" or "higher" if the best values of the column are bold; else empty.
     """
 
     key: str
@@ -64,11 +64,10 @@ class Column:
     better: str = ""
 
     def of(self, line: Any) -> Any:
-        """The raw value of a line."""
         return line.get(self.key) if self.value is None else self.value(line)
 
     def text(self, line: Any) -> str:
-        """The text of a line for readers; what is not a number is missing."""
+        """The text of a line for readers; nan counts as missing."""
         if self.words is not None:
             return self.words(line)
         value = self.of(line)
@@ -77,26 +76,26 @@ class Column:
 
 def to_data(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
     """The raw values of all lines, for the CSV."""
-    kept = [column for column in columns if column.key]
-    return pd.DataFrame([[c.of(line) for c in kept] for line in lines], columns=[c.key for c in kept], dtype=object)
+    in_csv = [column for column in columns if column.key]
+    return pd.DataFrame([[c.of(line) for c in in_csv] for line in lines], columns=[c.key for c in in_csv], dtype=object)
 
 
 def to_table(columns: Sequence[Column], lines: Iterable[Any]) -> pd.DataFrame:
     """The values of all lines as text, for readers."""
-    kept = [column for column in columns if column.heading]
-    return pd.DataFrame([[c.text(line) for c in kept] for line in lines], columns=[c.heading for c in kept])
+    shown = [column for column in columns if column.heading]
+    return pd.DataFrame([[c.text(line) for c in shown] for line in lines], columns=[c.heading for c in shown])
 
 
 def best(columns: Sequence[Column], lines: Sequence[Any]) -> list[list[int]]:
-    """The row and the column, in the readable table, of each value that is the best of a column with several values."""
-    found = []
-    for place, column in enumerate([column for column in columns if column.heading]):
+    """The row and the column, in the readable table, of the best values of each column with different values."""
+    cells = []
+    for index, column in enumerate([column for column in columns if column.heading]):
         values = [column.of(line) for line in lines] if column.better else []
-        known = [value for value in values if value is not None and math.isfinite(value)]
-        if len({*values}) > 1 and known:
-            top = min(known) if column.better == LOWER else max(known)
-            found += [[line, place] for line, value in enumerate(values) if value == top]
-    return found
+        finite = [value for value in values if value is not None and math.isfinite(value)]
+        if len({*values}) > 1 and finite:
+            top = min(finite) if column.better == LOWER else max(finite)
+            cells += [[line, index] for line, value in enumerate(values) if value == top]
+    return cells
 
 
 def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None) -> Column:
@@ -104,10 +103,10 @@ def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None)
 
 
 def estimate(key: str, heading: str, ends: str = "") -> tuple[Column, ...]:
-    """The column of an estimate under a key, which a line may lack, with its interval for readers and its ends.
+    """The column of an estimate with its interval, and CSV columns of its ends; a line may lack the estimate.
 
     Args:
-        ends: in front of `low` and `high`, the names of the ends in the CSV.
+        ends: the prefix of `low` and `high` in the names of the CSV columns.
     """
 
     def words(line: Any) -> str:
@@ -118,20 +117,18 @@ def estimate(key: str, heading: str, ends: str = "") -> tuple[Column, ...]:
     return value, low, high
 
 
-def ends(key: str, of: Callable[[Any], Interval | None]) -> tuple[Column, ...]:
-    """The ends of an interval that a line may lack, in the CSV only."""
-    return tuple(
-        Column(f"{key}_{end}", value=lambda line, end=end: getattr(of(line), end, None)) for end in ("low", "high")
-    )
+def ends(key: str, get: Callable[[Any], Interval | None]) -> tuple[Column, ...]:
+    """CSV columns of the ends of an interval, which a line may lack."""
+    return tuple(Column(f"{key}_{end}", value=lambda line, end=end: getattr(get(line), end, None)) for end in ENDS)
 
 
 def shown(heading: str, words: Callable[[Any], str]) -> Column:
-    """A column of the readable table only."""
+    """A column of the readable table, not of the CSV."""
     return Column("", heading, words=words)
 
 
-def together(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Callable[[Any], str]:
-    """The text of several values of a line in one cell; `get` gives the line's value under a key."""
+def joined_cell(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Callable[[Any], str]:
+    """A function that writes several values of a line into one cell; `get` reads a value by its key."""
 
     def words(line: Any) -> str:
         texts = [show(get(line, key)) for key in keys]
@@ -141,7 +138,6 @@ def together(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: 
 
 
 def metric(name: str, heading: str = "", show: Callable[[Any], str] = format.number) -> Column:
-    """A column with a metric of each record."""
     return Column(name, heading, lambda record: measured(record, name), show)
 
 
@@ -151,16 +147,15 @@ def metrics(*names: str) -> tuple[Column, ...]:
 
 
 def configured(key: str, *path: str, heading: str = "") -> Column:
-    """A column with a setting of each record."""
     return Column(key, heading, lambda record: setting(record["config"], *path), word)
 
 
-def through(part: Callable[[Any], Any], *columns: Column) -> tuple[Column, ...]:
+def through(select: Callable[[Any], Any], *columns: Column) -> tuple[Column, ...]:
     """The columns applied to a part of each line, such as its record."""
-    return tuple(replace(c, value=lambda line, c=c: c.of(part(line))) for c in columns)
+    return tuple(replace(c, value=lambda line, c=c: c.of(select(line))) for c in columns)
 
 
-# Columns that identify a run and give its outcome, for every table of runs.
+# Identity and outcome of a run, for every table of runs.
 IDENTITY = (
     text("row", value=lambda record: row_of(record).name),
     *(text(key) for key in ("renderer", "seed")),
@@ -168,7 +163,7 @@ IDENTITY = (
     *(text(key) for key in ("status", "reason", "folder")),
 )
 COMPLETION = (*IDENTITY, *metrics("chamfer_l2", "chamfer_l1", "normal_consistency", "mask_iou"))
-PRESET = text("preset")  # of a row, which decides its colour in charts; in the CSV only
+PRESET = text("preset")  # CSV only; it decides the colour of a row in charts
 FAMILY = text("family", value=records.family)
 LOOP = (
     Column("loop_seconds", value=records.loop_seconds),

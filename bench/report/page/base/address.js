@@ -1,4 +1,4 @@
-/* The address of what is shown, behind the #: a path, and a query that restores filters, sorting and search. */
+/* The address of the view, after the #: a path, and a query that restores filters, sorting and search. */
 (function (bench) {
   "use strict";
 
@@ -17,7 +17,7 @@
     }
   }
 
-  /* The link to a place; empty values of the query are left out. */
+  /* The link to a view; empty values of the query are left out. */
   function to(path, query = {}) {
     const kept = Object.entries(query).filter(([, value]) => value !== "" && value !== null && value !== undefined);
     const words = new URLSearchParams(kept).toString();
@@ -26,7 +26,7 @@
 
   let quiet = null;
 
-  /* Writes the address without a new entry in the history, and without showing it anew. */
+  /* Writes the address without a new entry in the history, and without showing it again. */
   function keep(path, query) {
     const link = to(path, query);
     if (link === location.hash) return;
@@ -34,7 +34,7 @@
     location.replace(link);
   }
 
-  /* Calls back when the address changes, but for changes by `keep`. */
+  /* Calls `show` when the address changes, except by `keep`. */
   function follow(show) {
     window.addEventListener("hashchange", () => {
       const own = quiet !== null && location.hash === quiet;

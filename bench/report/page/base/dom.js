@@ -1,5 +1,5 @@
-/* Builds elements. Text only ever becomes text, and an address must lead into the results folder: nothing that a record
-   says is read as markup or as code. */
+/* Builds elements. Text stays text, and an address must lead into the results folder, so that nothing in a record is read
+   as markup or code. */
 (function (bench) {
   "use strict";
 
@@ -8,7 +8,7 @@
   const ATTRIBUTE =
     /^(aria-[a-z]+|data-[a-z]+|id|role|type|title|alt|loading|scope|colspan|width|height|tabindex|placeholder)$/;
 
-  /* The address, if it is a place of this page, a file of the results folder or a picture that is written into the page. */
+  /* The address if it is a view of this page, a file of the results folder or an embedded picture; else null. */
   function safeAddress(address) {
     const text = String(address);
     if (text.startsWith("#") || PICTURE.test(text)) return text;
@@ -38,8 +38,8 @@
 
   /* Replaces all children of an element; those that are missing, false or empty are left out. */
   function fill(parent, ...children) {
-    const known = children.flat(Infinity).filter((child) => ![null, undefined, false, ""].includes(child));
-    parent.replaceChildren(...known.map((child) => (child instanceof Node ? child : String(child))));
+    const shown = children.flat(Infinity).filter((child) => ![null, undefined, false, ""].includes(child));
+    parent.replaceChildren(...shown.map((child) => (child instanceof Node ? child : String(child))));
     return parent;
   }
 
@@ -53,14 +53,14 @@
     element("dl.facts", null, rows.map(([name, value]) =>
       element("div", null, element("dt", null, name), element("dd", null, value))));
 
-  /* What a promise gives, as `show` makes it, or a note on why it is not there. */
+  /* Shows the value of a promise by `show`, or the message of its error. */
   function later(promise, show) {
     const home = element("div", null, element("p.soft", null, "Loading …"));
     promise.then((data) => fill(home, show(data)), (error) => fill(home, element("p.note", null, error.message)));
     return home;
   }
 
-  /* Buttons of which one is pressed: names by key. */
+  /* Buttons, one of which is pressed; `names` by key. */
   function choice(label, names, pressed, press) {
     const buttons = Object.entries(names).map(([key, name]) => {
       const click = (event) => {
@@ -74,9 +74,9 @@
 
   /* Text in which the words between asterisks are strong. */
   const emphasised = (text) =>
-    String(text).split("*").map((part, place) => (place % 2 ? element("strong", null, part) : part));
+    String(text).split("*").map((part, index) => (index % 2 ? element("strong", null, part) : part));
 
-  /* A name in letters of one width that may be broken behind its dots and underscores. */
+  /* A name in monospace that may be broken after its dots and underscores. */
   const code = (name) =>
     element("code", null, String(name).split(/(?<=[._])/).flatMap((part, n) => (n ? [element("wbr"), part] : part)));
 

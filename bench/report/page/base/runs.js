@@ -1,4 +1,4 @@
-/* The runs as the page reads them: a text, a number or a metric of the run at a place of the list; and its status. */
+/* The runs as the page reads them: texts, numbers and metrics by the index of a run; and the badge of a status. */
 (function (bench) {
   "use strict";
 
@@ -34,36 +34,36 @@
       metric.after = metric.after.map(decoded);
       metric.before = metric.before && metric.before.map(decoded);
     }
-    const places = new Map([...data.key, ...data.folder].map((name, n) => [name, n % data.count]));
+    const indices = new Map([...data.key, ...data.folder].map((name, n) => [name, n % data.count]));
     const reused = new Set(data.reused);
-    const found = [];
-    const text = (place, column) => texts[column].values[texts[column].codes[place]];
+    const searchTexts = [];
+    const text = (index, column) => texts[column].values[texts[column].codes[index]];
 
-    /* The words of a run that a search looks through. */
-    function words(place) {
-      const parts = () => [...SEARCHED.map((part) => text(place, part)), data.folder[place], data.reason[place]];
-      return (found[place] = found[place] || parts().join(" ").toLowerCase());
+    /* The text of a run that a search reads. */
+    function words(index) {
+      const parts = () => [...SEARCHED.map((part) => text(index, part)), data.folder[index], data.reason[index]];
+      return (searchTexts[index] = searchTexts[index] || parts().join(" ").toLowerCase());
     }
 
-    /* The folder, or the key of the run where a folder's name is no text that an address can have. */
-    function name(place) {
+    /* The folder; or the key of the run if an address cannot contain the name of the folder. */
+    function name(index) {
       try {
-        return encodeURIComponent(data.folder[place]) && data.folder[place];
+        return encodeURIComponent(data.folder[index]) && data.folder[index];
       } catch {
-        return data.key[place];
+        return data.key[index];
       }
     }
 
-    /* The details of a run: what it shares with others stands once in their script, and has numbers here. */
-    function told({texts, runs}, place) {
-      const run = runs[data.key[place]];
+    /* The details of a run, with the numbers of shared texts replaced by the texts. */
+    function expanded({texts, runs}, index) {
+      const run = runs[data.key[index]];
       return {
         ...run,
         settings: run.settings.flatMap((part) => texts[part]),
         environment: run.environment.map((row) => texts[row]),
         metrics: run.metrics.map(([name, before, after, words]) => [texts[name], before, after, texts[words]]),
-        files: Object.fromEntries(texts[run.files].map((name) => [name, data.address[place] + name])),
-        python: texts[run.python].replaceAll("\0", data.folder[place]),
+        files: Object.fromEntries(texts[run.files].map((name) => [name, data.address[index] + name])),
+        python: texts[run.python].replaceAll("\0", data.folder[index]),
       };
     }
 
@@ -74,16 +74,16 @@
       ...{count: data.count, tasks: data.tasks, metrics, text, words, name},
       codes: (column) => texts[column].codes,
       values: (column) => texts[column].values,
-      number: (place, column) => numbers[column][place],
-      folder: (place) => data.folder[place],
-      reason: (place) => data.reason[place],
-      reused: (place) => reused.has(place),
-      place: (wanted) => places.get(wanted),
-      detail: (place) => bench.store.load("run", data.key[place].slice(0, 2)).then((whole) => told(whole, place)),
-      mesh: (place) => bench.store.load("mesh", data.key[place]).catch((error) => (meshes === null ? Promise.reject(error) : {none: unmade})),
-      picture: (place) => text(place, "thumb") && data.address[place] + text(place, "thumb"),
-      link: (place) => bench.address.to(["run", name(place)]),
-      title: (place) => `${text(place, "name")}, ${text(place, "scene")}`,
+      number: (index, column) => numbers[column][index],
+      folder: (index) => data.folder[index],
+      reason: (index) => data.reason[index],
+      reused: (index) => reused.has(index),
+      indexOf: (name) => indices.get(name),
+      detail: (index) => bench.store.load("run", data.key[index].slice(0, 2)).then((content) => expanded(content, index)),
+      mesh: (index) => bench.store.load("mesh", data.key[index]).catch((error) => (meshes === null ? Promise.reject(error) : {none: unmade})),
+      picture: (index) => text(index, "thumb") && data.address[index] + text(index, "thumb"),
+      link: (index) => bench.address.to(["run", name(index)]),
+      title: (index) => `${text(index, "name")}, ${text(index, "scene")}`,
     };
   }
 

@@ -1,4 +1,4 @@
-/* Keeps the data that scripts hand over, and loads more by a script element: a page from a file has no other way. */
+/* Keeps the data of scripts, and loads more by script elements, the only way for a page that was opened from a file. */
 (function (bench) {
   "use strict";
 
@@ -15,7 +15,7 @@
 
   const have = (kind, key) => received.get(`${kind}/${key}`);
 
-  /* A promise of data of that kind and key; rejected with a sentence where its file is not there. */
+  /* A promise of the data of a kind and key; rejected with a message if its file is missing. */
   function load(kind, key) {
     const name = `${kind}/${key}`;
     if (received.has(name)) return Promise.resolve(received.get(name));
@@ -38,14 +38,14 @@
 
   let library = null;
 
-  /* A promise of Plotly, which lies beside the page and is loaded when a chart or mesh first needs it. */
+  /* A promise of Plotly, which is loaded when a chart or mesh first needs it. */
   function plotly() {
     if (window.Plotly) return Promise.resolve(window.Plotly);
     library = library || script("page/plotly.min.js").then(() => window.Plotly);
     return library;
   }
 
-  /* A number, of which the scripts write those that are not finite as words; null for a missing one. */
+  /* A number; scripts write infinite numbers and nan as words, and missing numbers as null. */
   const decoded = (value) => (typeof value === "string" && Object.hasOwn(NON_FINITE, value) ? NON_FINITE[value] : value);
 
   Object.assign(bench, {receive, store: {have, load, plotly, decoded}});

@@ -20,7 +20,7 @@
   /* A chart of {panels: [{title, x: {title, log, reversed}, y: likewise, rows, series}]}. A series is {name, colour, symbol,
      dash, x, y, text, link, low, high, size, hollow, off}: with a dash it has lines, with a symbol points. Series of one name
      are shown and hidden together. A point with a link opens it. `focus` is the name of the series to bring out. With
-     `rows`, their names stand down the y axis in place of a legend, and `low` and `high` are of x. */
+     `rows`, their names stand down the y axis instead of a legend, and `low` and `high` are of x. */
   function chart(spec, {label, focus} = {}) {
     const shown = later(bench.store.plotly(), (plotly) => drawn(plotly, spec, focus));
     return element("div.chart", {role: "group", "aria-label": label || "Chart"}, shown);
@@ -31,12 +31,12 @@
     const off = new Set(series.filter((each) => each.off).map(({name}) => name));
     const looks = new Map(series.map((each) => [each.name, each]));
     const names = [...new Set(series.filter(({quiet}) => !quiet).map(({name}) => name))];
-    const places = spec.panels.map(({title}) => element("div.panel", {role: "img", "aria-label": title || "Panel"}));
-    const redraw = () => places.forEach((place, n) => drawPanel(plotly, place, spec.panels[n], off, focus));
+    const targets = spec.panels.map(({title}) => element("div.panel", {role: "img", "aria-label": title || "Panel"}));
+    const redraw = () => targets.forEach((target, n) => drawPanel(plotly, target, spec.panels[n], off, focus));
     const many = spec.panels.length > MANY;
     const entries = names.map((name) => entry(looks.get(name), off, redraw));
     const legend = names.length > 1 && !spec.panels.some(({rows}) => rows) && element(`div.legend${many ? ".above" : ""}`, null, entries);
-    const panels = element(`div.panels${many ? ".many" : ""}`, null, places);
+    const panels = element(`div.panels${many ? ".many" : ""}`, null, targets);
     requestAnimationFrame(redraw);
     bench.onTheme(panels, redraw);
     return [many && legend, panels, !many && legend, spec.note && element("p.soft", null, spec.note)];
@@ -56,14 +56,14 @@
     return element("button.entry", {type: "button", "aria-pressed": String(!off.has(name)), click}, swatch, name);
   }
 
-  function drawPanel(plotly, place, panel, off, focus) {
-    if (!place.isConnected) return;
+  function drawPanel(plotly, target, panel, off, focus) {
+    if (!target.isConnected) return;
     const front = ({name}) => Number(name === focus); // drawn last, over the others
     const shown = panel.series.filter(({name}) => !off.has(name)).sort((a, b) => front(a) - front(b));
     const traces = shown.map((series) => trace(series, focus, panel.rows ? "x" : "y"));
-    plotly.react(place, traces, layout(panel, place), {displayModeBar: false, responsive: true});
-    place.removeAllListeners("plotly_click");
-    place.on("plotly_click", ({points: [point]}) => {
+    plotly.react(target, traces, layout(panel, target), {displayModeBar: false, responsive: true});
+    target.removeAllListeners("plotly_click");
+    target.on("plotly_click", ({points: [point]}) => {
       const {link} = shown[point.curveNumber];
       const address = link && bench.dom.safeAddress(link[point.pointNumber]);
       if (address) location.hash = address;
@@ -97,14 +97,14 @@
 
   const hover = ({name, x, y, text}) =>
     x.map((each, n) => {
-      const said = text ? [].concat(text[n]) : [`${number(each)}, ${number(y[n])}`];
-      return [`<b>${plain(name)}</b>`, ...said.map(plain)].join("<br>");
+      const lines = text ? [].concat(text[n]) : [`${number(each)}, ${number(y[n])}`];
+      return [`<b>${plain(name)}</b>`, ...lines.map(plain)].join("<br>");
     });
 
-  function layout(panel, place) {
+  function layout(panel, target) {
     const style = getComputedStyle(document.documentElement);
     const own = (name) => style.getPropertyValue(name).trim();
-    const [line, narrow] = [own("--line"), place.clientWidth < 460];
+    const [line, narrow] = [own("--line"), target.clientWidth < 460];
     const axis = ({title, log, reversed}, letter) => ({
       ...(log ? ticks(panel.series.flatMap((series) => series[letter]), narrow) : {}),
       autorange: reversed ? "reversed" : true,
@@ -129,15 +129,15 @@
   }
 
   const namedAxis = (names) => {
-    const tickvals = names.map((_, place) => place);
+    const tickvals = names.map((_, index) => index);
     return {tickvals, ticktext: names.map(plain), range: [names.length - 0.5, -0.5], autorange: false};
   };
 
   /* Plain numbers as ticks of a logarithmic axis: powers of ten, and numbers between them where there are few. */
   function ticks(values, narrow) {
-    const known = values.map(decoded).filter((value) => value > 0 && Number.isFinite(value));
-    if (!known.length) return {};
-    const [low, high] = [Math.log10(Math.min(...known)), Math.log10(Math.max(...known))];
+    const finite = values.map(decoded).filter((value) => value > 0 && Number.isFinite(value));
+    if (!finite.length) return {};
+    const [low, high] = [Math.log10(Math.min(...finite)), Math.log10(Math.max(...finite))];
     const span = high - low;
     const steps = span > (narrow ? 1.6 : 2.6) ? [1] : span > 0.8 ? [1, 2, 5] : [1, 1.5, 2, 3, 4, 5, 6, 8];
     const tickvals = [];

@@ -3,90 +3,90 @@
   "use strict";
 
   const FILTERS = {scale: "Scale", family: "Shapes", renderer: "Renderer", status: "Status", machine: "Machine", experiment: "Experiment"};
-  const SILENT = new Set(["not_run", "killed", "refused"]); // say nothing of a method
-  const LINKED = ["name"]; // set by links alone, and shown as a word that can be taken away
+  const SILENT = new Set(["not_run", "killed", "refused"]); // these say nothing about a method
+  const LINKED = ["name"]; // set only by links, and shown as a removable chip
 
-  /* The places of the runs that the query asks for, and of each filter the counts of its values under all others. */
+  /* The indices of the runs that match the query, and for each filter the counts of its values under all other filters. */
   function choose(runs, query) {
     const columns = ["task", ...Object.keys(FILTERS), ...LINKED].filter((column) => query[column]);
     const wanted = columns.map((column) => [column, runs.codes(column), runs.values(column).indexOf(query[column])]);
     const counts = Object.fromEntries(Object.keys(FILTERS).map((column) => [column, new Map()]));
     const words = (query.q || "").toLowerCase().split(/\s+/).filter(Boolean);
-    const places = [];
-    for (let place = 0; place < runs.count; place++) {
-      const missed = wanted.filter(([, codes, code]) => codes[place] !== code);
-      if (missed.length > 1 || !words.every((word) => runs.words(place).includes(word))) continue;
-      if (!missed.length) places.push(place);
+    const indices = [];
+    for (let index = 0; index < runs.count; index++) {
+      const missed = wanted.filter(([, codes, code]) => codes[index] !== code);
+      if (missed.length > 1 || !words.every((word) => runs.words(index).includes(word))) continue;
+      if (!missed.length) indices.push(index);
       for (const column of missed.length ? [missed[0][0]] : Object.keys(FILTERS)) {
-        const code = runs.codes(column)[place];
+        const code = runs.codes(column)[index];
         if (counts[column]) counts[column].set(code, (counts[column].get(code) || 0) + 1);
       }
     }
-    return {places, counts};
+    return {indices, counts};
   }
 
-  /* The median; of an even number the mean of the middle two; null of none. */
+  /* The median; for an even number the mean of the middle two; null without values. */
   function median(values) {
     const sorted = Float64Array.from(values).sort();
     const [low, high] = [sorted[(sorted.length - 1) >> 1], sorted[sorted.length >> 1]];
     return sorted.length ? (low === high ? low : (low + high) / 2) : null;
   }
 
-  /* The places of each value of a key. */
-  function grouped(places, key) {
+  /* The indices by the value of a key. */
+  function grouped(indices, key) {
     const groups = new Map();
-    for (const place of places) groups.has(key(place)) ? groups.get(key(place)).push(place) : groups.set(key(place), [place]);
+    for (const index of indices) groups.has(key(index)) ? groups.get(key(index)).push(index) : groups.set(key(index), [index]);
     return groups;
   }
 
-  /* The runs that compare, {scale, cells, places}: of one scale and of the scenes that all of their methods have. The group
-     with the most comes first, and others follow until each method is in one; those alone have no `cells`. */
-  function groups(runs, places) {
-    const judged = places.filter((place) => !SILENT.has(runs.text(place, "status")));
-    return [...grouped(judged, (place) => runs.text(place, "scale"))].flatMap(([scale, own]) =>
+  /* Groups of comparable runs {scale, cells, indices}: of one scale, on the scenes that all of their methods have. The
+     largest group comes first, and others follow until each method is in one. Single methods have no `cells`. */
+  function groups(runs, indices) {
+    const judged = indices.filter((index) => !SILENT.has(runs.text(index, "status")));
+    return [...grouped(judged, (index) => runs.text(index, "scale"))].flatMap(([scale, own]) =>
       common(own, runs.codes("name"), runs.codes("cell")).map((group) => ({scale, ...group})));
   }
 
-  function common(places, names, cells) {
-    const covers = new Map(); // of each scene, its methods
-    for (const [cell, own] of grouped(places, (place) => cells[place])) covers.set(cell, new Set(own.map((place) => names[place])));
+  function common(indices, names, cells) {
+    const covers = new Map(); // the methods by scene
+    for (const [cell, own] of grouped(indices, (index) => cells[index])) covers.set(cell, new Set(own.map((index) => names[index])));
     const sets = new Map([...covers.values()].map((methods) => [[...methods].sort().join(), methods]));
-    const scenes = (methods) => [...covers].filter(([, own]) => [...methods].every((one) => own.has(one))).map(([cell]) => cell);
+    const scenes = (methods) => [...covers].filter(([, names]) => [...methods].every((name) => names.has(name))).map(([cell]) => cell);
     const found = [...sets.values()].filter(({size}) => size > 1).map((methods) => ({methods, cells: new Set(scenes(methods))}));
     found.sort((a, b) => b.methods.size * b.cells.size - a.methods.size * a.cells.size);
     const shown = new Set();
     const kept = found.filter(({methods}) => {
-      const more = [...methods].some((one) => !shown.has(one));
-      for (const one of methods) shown.add(one);
+      const more = [...methods].some((name) => !shown.has(name));
+      for (const name of methods) shown.add(name);
       return more;
     });
     const groups = kept.map(({methods, cells: of}) =>
-      ({cells: of.size, places: places.filter((place) => methods.has(names[place]) && of.has(cells[place]))}));
-    const alone = places.filter((place) => !shown.has(names[place]));
-    return alone.length ? [...groups, {cells: 0, places: alone}] : groups;
+      ({cells: of.size, indices: indices.filter((index) => methods.has(names[index]) && of.has(cells[index]))}));
+    const alone = indices.filter((index) => !shown.has(names[index]));
+    return alone.length ? [...groups, {cells: 0, indices: alone}] : groups;
   }
 
-  /* A row per name: its runs, what they cover, its failures, and medians in which a run that failed is the worst. */
-  function methods(runs, places, metrics) {
-    return [...grouped(places, (place) => runs.text(place, "name"))].map(([name, own]) => {
-      const ok = own.filter((place) => runs.text(place, "status") === "ok");
-      const covered = new Set(own.map((place) => runs.codes("cell")[place])).size;
+  /* A row per name: runs, scenes, failures, and medians in which a failed run counts as worst. */
+  function methods(runs, indices, metrics) {
+    return [...grouped(indices, (index) => runs.text(index, "name"))].map(([name, own]) => {
+      const ok = own.filter((index) => runs.text(index, "status") === "ok");
+      const covered = new Set(own.map((index) => runs.codes("cell")[index])).size;
       const row = {name, runs: own.length, failed: own.length - ok.length, covered};
       for (const key of metrics) row[key] = middle(runs, own, key);
       for (const key of ["loop", "total", "values"])
-        row[key] = median(ok.map((place) => runs.number(place, key)).filter((value) => value !== null));
+        row[key] = median(ok.map((index) => runs.number(index, key)).filter((value) => value !== null));
       return row;
     });
   }
 
-  /* The median of a metric; null where no run that ended ok has it, or where none did and neither direction is better. */
-  function middle(runs, places, key) {
+  /* The median of a metric; null if no run that ended ok has it, or if none did and neither direction is better. */
+  function middle(runs, indices, key) {
     const {better, after} = runs.metrics[key];
     const worst = better === "higher" ? -Infinity : Infinity;
-    const ok = places.filter((place) => runs.text(place, "status") === "ok");
-    const known = ok.map((place) => after[place]).filter((value) => value !== null && !Number.isNaN(value));
-    if (!known.length) return ok.length || !better ? null : worst;
-    return median(better ? [...known, ...Array(places.length - known.length).fill(worst)] : known);
+    const ok = indices.filter((index) => runs.text(index, "status") === "ok");
+    const values = ok.map((index) => after[index]).filter((value) => value !== null && !Number.isNaN(value));
+    if (!values.length) return ok.length || !better ? null : worst;
+    return median(better ? [...values, ...Array(indices.length - values.length).fill(worst)] : values);
   }
 
   bench.choose = {FILTERS, LINKED, SILENT, choose, groups, methods};

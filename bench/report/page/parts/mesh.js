@@ -12,9 +12,9 @@
   const drawn = new Set();
 
   /* A viewer of the mesh of a run; viewers that share a list turn together. */
-  function mesh(place, together = []) {
-    const loaded = Promise.all([bench.runs.mesh(place), bench.store.plotly()]);
-    const show = ([data, plotly]) => (data.none ? soft(data.none) : viewer(plotly, data, bench.runs.title(place), together));
+  function mesh(index, together = []) {
+    const loaded = Promise.all([bench.runs.mesh(index), bench.store.plotly()]);
+    const show = ([data, plotly]) => (data.none ? soft(data.none) : viewer(plotly, data, bench.runs.title(index), together));
     return element("div.mesh", null, later(loaded, show));
   }
 

@@ -6,8 +6,8 @@
   const ON_A_PAGE = 100;
   const LONGEST_LINE = 44; // characters of a cell that stays in one line
 
-  /* A table of columns {key, label, unit, kind, head, cell, get, down} over items, in a place of its own.
-     A column with `get` sorts; with `down` from the greatest. `state` is {sort, order, page}, which `changed` is told of;
+  /* A table of columns {key, label, unit, kind, head, cell, get, down} over items, in an element of its own.
+     A column with `get` sorts; with `down` from the greatest. `state` is {sort, order, page}, `changed` gets it;
      without it items are sorted by the column `first`, or as they come. `ordered` gets the items in their order. */
   function table(columns, items, {caption, state = {}, changed, first, ordered, cards} = {}) {
     const home = element(`div${cards ? ".cards" : ""}`);
@@ -54,7 +54,7 @@
   const cell = ({label, kind, head, cell: show}, item) =>
     element(`${head ? "th" : "td"}.${kind || "words"}`, {"data-label": label, scope: head && "row"}, show(item));
 
-  /* What a phone shows in place of the headings, which it has no room for. */
+  /* A phone shows this instead of the headings. */
   function chooser(columns, by, set) {
     const options = columns.map(({key, label}) => element("option", {value: key}, label));
     const change = ({target}) => set({sort: target.value, order: ""}, "sort");
@@ -82,13 +82,13 @@
     link.focus();
   }
 
-  /* Sorts items by a value; those without one come last in either direction. */
+  /* Sorts items by a value; items without a value come last in either direction. */
   function sort(items, get, down) {
     const missing = (value) => value === null || value === undefined || value === "" || Number.isNaN(value);
-    const values = items.map((item, place) => ({item, place, value: get(item)}));
+    const values = items.map((item, index) => ({item, index, value: get(item)}));
     values.sort((a, b) => {
-      if (missing(a.value) || missing(b.value)) return missing(a.value) - missing(b.value) || a.place - b.place;
-      return a.value === b.value ? a.place - b.place : a.value < b.value === !down ? -1 : 1;
+      if (missing(a.value) || missing(b.value)) return missing(a.value) - missing(b.value) || a.indexOf - b.indexOf;
+      return a.value === b.value ? a.indexOf - b.indexOf : a.value < b.value === !down ? -1 : 1;
     });
     return values.map(({item}) => item);
   }
@@ -98,16 +98,16 @@
   function written(header, rows, {best = [], named, link} = {}) {
     const bold = new Set(best.map(String));
     const heads = Math.max(0, header.indexOf(named));
-    const columns = header.map((label, place) => {
-      const cells = rows.map((row) => row[place] || "");
+    const columns = header.map((label, index) => {
+      const cells = rows.map((row) => row[index] || "");
       const filled = cells.filter((text) => text && text !== "–" && text !== "∞");
       const numeric = filled.length > 0 && filled.filter((text) => NUMBER.test(text)).length >= 0.7 * filled.length;
       const line = Math.max(0, ...cells.map((text) => text.length)) <= LONGEST_LINE;
       const kind = numeric ? "number" : line ? "words.line" : "words";
-      const get = (row) => (numeric ? leading(row[place]) : (row[place] || "").toLowerCase());
-      const text = (row) => (bold.has(`${rows.indexOf(row)},${place}`) ? element("strong", null, row[place]) : row[place]);
-      const cell = link && place === heads ? (row) => element("a", {href: link(row[place])}, row[place]) : text;
-      return {key: String(place), label, kind, get, head: place === heads, cell};
+      const get = (row) => (numeric ? leading(row[index]) : (row[index] || "").toLowerCase());
+      const text = (row) => (bold.has(`${rows.indexOf(row)},${index}`) ? element("strong", null, row[index]) : row[index]);
+      const cell = link && index === heads ? (row) => element("a", {href: link(row[index])}, row[index]) : text;
+      return {key: String(index), label, kind, get, head: index === heads, cell};
     });
     return table(columns, rows);
   }
@@ -115,7 +115,7 @@
   const NUMBER = /^[^\w–]*(-?[\d.,]+(?:e-?\d+)?)\s*([kMGTP](?=B?\b))?/;
   const UNITS = {ms: 1e-3, min: 60, h: 3600, k: 1e3, M: 1e6, G: 1e9, T: 1e12, P: 1e15};
 
-  /* The first number of a text, such as 1.43M or 12 ms; infinite for ∞, null where there is none. */
+  /* The first number of a text, such as 1.43M or 12 ms; infinite for ∞, null without a number. */
   function leading(text) {
     const found = NUMBER.exec(text || "");
     if (text === "∞" || !found) return text === "∞" ? Infinity : null;
@@ -125,22 +125,22 @@
 
   let picked = [];
 
-  /* A box that picks a run to compare; a third one takes the place of the second. */
-  function pick(place) {
-    const change = ({target}) => choose([...picked.filter((each) => each !== place).slice(0, 1), ...(target.checked ? [place] : [])]);
-    const checked = picked.includes(place);
-    return element("input", {type: "checkbox", "aria-label": `Compare ${bench.runs.title(place)}`, "data-pick": place, checked, change});
+  /* A box that picks a run to compare; a third one replaces the second. */
+  function pick(index) {
+    const change = ({target}) => choose([...picked.filter((each) => each !== index).slice(0, 1), ...(target.checked ? [index] : [])]);
+    const checked = picked.includes(index);
+    return element("input", {type: "checkbox", "aria-label": `Compare ${bench.runs.title(index)}`, "data-pick": index, checked, change});
   }
 
   /* Shows the picked runs in a bar at the lower edge. */
-  function choose(places) {
-    picked = places;
+  function choose(indices) {
+    picked = indices;
     for (const box of document.querySelectorAll("[data-pick]")) box.checked = picked.includes(Number(box.dataset.pick));
     const home = document.getElementById("picks");
     home.hidden = !picked.length;
     const href = bench.address.to(["compare", ...picked.map(bench.runs.name)]);
     fill(home,
-      picked.map((place, n) => element("span.picked", null, element(`b.${"ab"[n]}`, null, "AB"[n]), bench.runs.title(place))),
+      picked.map((index, n) => element("span.picked", null, element(`b.${"ab"[n]}`, null, "AB"[n]), bench.runs.title(index))),
       picked.length === 2 ? element("a.button", {href}, "Compare") : soft("Pick another run to compare with."),
       element("button", {type: "button", click: () => choose([])}, "Clear"));
   }

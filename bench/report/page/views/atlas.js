@@ -10,7 +10,7 @@
     const names = data.rows.map((row) => element("th.turned", {scope: "col"}, element("span", null, row)));
     const lines = data.axes.flatMap((axis, line) => {
       const first = line === 0 || data.axes[line - 1].group !== axis.group;
-      const cells = data.rows.map((_, place) => element("td", null, cell(data, line, place, opened)));
+      const cells = data.rows.map((_, index) => element("td", null, cell(data, line, index, opened)));
       const title = element("th.words", {scope: "row"}, axis.title, element("small", null, axis.unit));
       return [first && group(axis.group, data.rows.length), element("tr", null, title, cells)];
     });
@@ -33,21 +33,21 @@
     return made;
   }
 
-  const words = (found) => (found.status === "unsupported" ? found.status : found.full);
+  const words = (result) => (result.status === "unsupported" ? result.status : result.full);
 
-  function cell(data, line, place, opened) {
-    const found = data.cells[line][place];
-    if (!found) return null;
+  function cell(data, line, index, opened) {
+    const result = data.cells[line][index];
+    if (!result) return null;
     const click = ({currentTarget}) => {
       for (const other of document.querySelectorAll(".cell[aria-pressed]")) other.removeAttribute("aria-pressed");
       currentTarget.setAttribute("aria-pressed", "true");
-      open(data.axes[line], data.rows[place], found, opened);
+      open(data.axes[line], data.rows[index], result, opened);
       currentTarget.scrollIntoView({block: "nearest", inline: "nearest"}); // of a table that has become narrower
     };
-    const label = `${data.axes[line].title}, ${data.rows[place]}: ${words(found)}`;
-    const button = element("button.cell", {type: "button", "aria-label": label, click}, found.short);
-    if (found.shade === null) return button;
-    const step = Math.min(SHADES.length - 1, Math.floor(found.shade * SHADES.length));
+    const label = `${data.axes[line].title}, ${data.rows[index]}: ${words(result)}`;
+    const button = element("button.cell", {type: "button", "aria-label": label, click}, result.short);
+    if (result.shade === null) return button;
+    const step = Math.min(SHADES.length - 1, Math.floor(result.shade * SHADES.length));
     return painted(button, SHADES[step], step < 2 || step > 4 ? "#fff" : "#1c2430");
   }
 
@@ -64,18 +64,18 @@
     next.querySelector("button").focus();
   }
 
-  function open(axis, row, found, opened) {
-    const run = bench.runs.place(found.folder);
-    const known = run !== undefined;
+  function open(axis, row, result, opened) {
+    const run = bench.runs.indexOf(result.folder);
+    const isListed = run !== undefined;
     fill(opened,
       element("h2", null, `${axis.title}, ${row}`),
-      element("p", null, `Breaks: ${words(found)}. ${found.reason || ""} `,
-        known ? element("a", {href: bench.runs.link(run)}, "The run") : soft("Its run is not among these results.")),
+      element("p", null, `Breaks: ${words(result)}. ${result.reason || ""} `,
+        isListed ? element("a", {href: bench.runs.link(run)}, "The run") : soft("Its run is not among these results.")),
       later(curves(), (panels) => {
         const panel = panels.find((each) => each.axis === axis.axis);
         return panel && bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row});
       }),
-      known && later(bench.runs.detail(run), failure));
+      isListed && later(bench.runs.detail(run), failure));
     if (getComputedStyle(opened).position !== "sticky") opened.scrollIntoView({block: "nearest"});
   }
 
@@ -87,9 +87,9 @@
   }
 
   function failure({pictures}) {
-    const found = pictures.find(([name]) => name === "failure.png");
-    if (!found) return soft("This run has no picture of a failure.");
-    const [, src, alt] = found;
+    const result = pictures.find(([name]) => name === "failure.png");
+    if (!result) return soft("This run has no picture of a failure.");
+    const [, src, alt] = result;
     return element("figure", null, element("img.figure", {src, alt}), element("figcaption", null, alt));
   }
 

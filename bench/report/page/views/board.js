@@ -6,7 +6,7 @@
   const {element, fill, soft, choice} = bench.dom;
   const {number, count, seconds, date, plural, label, MISSING} = bench.format;
   const {FILTERS, LINKED, SILENT} = bench.choose;
-  const MOST_METRICS = 6;
+  const MAX_METRICS = 6;
 
   /* Fills a section with the board that the query asks for, and keeps it in step with its controls. */
   function board(home, query) {
@@ -33,8 +33,8 @@
       if (search.value !== (state.q || "")) search.value = state.q || "";
       fill(filters, Object.keys(FILTERS).map((column) => filter(column, state, chosen.counts[column], change)));
       fill(chips, chipsOf(state, change));
-      fill(found, chosen.places.length ? rows(state, chosen.places, keep) : element("p.empty", null, "No run fits. Take a filter away."));
-      if (focused) filters.querySelector(`[data-column="${focused}"]`)?.focus(); // its list has been made anew
+      fill(found, chosen.indices.length ? rows(state, chosen.indices, keep) : element("p.empty", null, "No run fits. Take a filter away."));
+      if (focused) filters.querySelector(`[data-column="${focused}"]`)?.focus(); // its list has been rebuilt
     }
 
     fill(home,
@@ -45,7 +45,7 @@
     show();
   }
 
-  /* What of the state stands in the address: all but what is so without it. */
+  /* The part of the state that the address needs: all except defaults. */
   const asked = (state) => ({...state, task: state.task || "all", view: state.view === "methods" ? "" : state.view});
 
   function tabs(state) {
@@ -70,7 +70,7 @@
     return known.length > 1 || state[column] ? element("label.pick", null, FILTERS[column], select) : null;
   }
 
-  /* The filters that are set, each with a button that takes it away. */
+  /* The active filters, each with a button that removes it. */
   function chipsOf(state, change) {
     const set = [...LINKED, ...Object.keys(FILTERS), "q"].filter((column) => state[column]);
     const chip = (column) => {
@@ -83,29 +83,29 @@
   }
 
   /* How many runs there are, whose machines their times are of, and the table. */
-  function rows(state, places, changed) {
+  function rows(state, indices, changed) {
     const {runs} = bench;
-    const statuses = places.map((place) => runs.text(place, "status"));
+    const statuses = indices.map((index) => runs.text(index, "status"));
     const silent = statuses.filter((one) => SILENT.has(one)).length;
     const failed = statuses.filter((one) => one !== "ok").length - silent;
     const ended = failed ? `${failed.toLocaleString("en")} did not end ok` : silent ? "none failed" : "all ended ok";
     const unmade = silent ? `, ${silent.toLocaleString("en")} not run, killed or refused` : "";
-    const of = places.length < runs.count ? ` of ${runs.count.toLocaleString("en")}` : "";
-    const said = `${plural(places.length, "run")}${of}, ${ended}${unmade}.`;
+    const of = indices.length < runs.count ? ` of ${runs.count.toLocaleString("en")}` : "";
+    const summary = `${plural(indices.length, "run")}${of}, ${ended}${unmade}.`;
     const task = runs.tasks.find((each) => each.task === state.task);
-    const known = (key) => places.some((place) => runs.metrics[key].after[place] !== null);
-    const metrics = (task ? task.metrics : []).filter(known).slice(0, MOST_METRICS);
-    const boards = state.view === "methods" ? ofMethods(state, places, metrics) : [ofRuns(state, places, metrics)];
+    const known = (key) => indices.some((index) => runs.metrics[key].after[index] !== null);
+    const metrics = (task ? task.metrics : []).filter(known).slice(0, MAX_METRICS);
+    const boards = state.view === "methods" ? ofMethods(state, indices, metrics) : [ofRuns(state, indices, metrics)];
     const tables = boards.map(({title, columns, items, ...how}) =>
-      [title && element("h3", null, title), bench.table(columns, items, {...how, caption: title || said, state, changed, cards: true})]);
-    return [element("p.count", {"aria-live": "polite"}, said), machines(places), element("div", {id: "board-list"}, tables)];
+      [title && element("h3", null, title), bench.table(columns, items, {...how, caption: title || summary, state, changed, cards: true})]);
+    return [element("p.count", {"aria-live": "polite"}, summary), machines(indices), element("div", {id: "board-list"}, tables)];
   }
 
   /* A table for each group of runs that compare. */
-  function ofMethods(state, places, metrics) {
+  function ofMethods(state, indices, metrics) {
     const ranks = metrics.length > 0 && bench.runs.metrics[metrics[0]].better !== "";
     const first = ranks ? metrics[0] : metrics.length ? "name" : "loop";
-    return bench.choose.groups(bench.runs, places).map(({scale, cells, places: own}) => {
+    return bench.choose.groups(bench.runs, indices).map(({scale, cells, indices: own}) => {
       const items = bench.choose.methods(bench.runs, own, metrics);
       const ordered = (all) => all.forEach((row, n) => (row.rank = ranks && cells ? n + 1 : null));
       const on = cells
@@ -139,27 +139,27 @@
     ];
   }
 
-  function ofRuns(state, places, metrics) {
+  function ofRuns(state, indices, metrics) {
     const {runs} = bench;
     const measured = (key) => {
       const {label: name, factor, better, after, before} = runs.metrics[key];
-      const ok = (place) => (runs.text(place, "status") === "ok" ? after[place] : null);
-      const start = (place) => before && before[place] !== null && element("small", null, `from ${number(before[place], factor)}`);
-      const show = (value, place) => [number(after[place], factor), start(place)];
+      const ok = (index) => (runs.text(index, "status") === "ok" ? after[index] : null);
+      const start = (index) => before && before[index] !== null && element("small", null, `from ${number(before[index], factor)}`);
+      const show = (value, index) => [number(after[index], factor), start(index)];
       return numeric(key, label(name), ok, show, {unit: before && "start below", down: better === "higher"});
     };
-    const text = (key, name, cell) => ({key, label: name, get: (place) => runs.text(place, key).toLowerCase(), cell});
-    const reused = (place) => runs.reused(place) && element("small", null, "reused");
+    const text = (key, name, cell) => ({key, label: name, get: (index) => runs.text(index, key).toLowerCase(), cell});
+    const reused = (index) => runs.reused(index) && element("small", null, "reused");
     const columns = [
       {key: "pick", label: "Compare", kind: "pick", cell: bench.pick},
       {key: "picture", label: "Picture", kind: "thumb", cell: thumb},
-      {...text("name", "Run", (place) => named(place, state)), head: true},
-      text("status", "Status", (place) => [bench.badge(runs.text(place, "status")), reused(place)]),
+      {...text("name", "Run", (index) => named(index, state)), head: true},
+      text("status", "Status", (index) => [bench.badge(runs.text(index, "status")), reused(index)]),
       ...metrics.map(measured),
-      ...costs((place, key) => runs.number(place, key), "in all below"),
-      numeric("started", "Started", (place) => runs.number(place, "started"), (value) => soft(date(value)), {unit: "UTC", down: true}),
+      ...costs((index, key) => runs.number(index, key), "in all below"),
+      numeric("started", "Started", (index) => runs.number(index, "started"), (value) => soft(date(value)), {unit: "UTC", down: true}),
     ];
-    return {columns, items: places, first: metrics[0] || "started"};
+    return {columns, items: indices, first: metrics[0] || "started"};
   }
 
   const costs = (get, unit) => [
@@ -168,32 +168,32 @@
     numeric("values", "Field values", (item) => get(item, "values"), count),
   ];
 
-  function thumb(place) {
-    const src = bench.runs.picture(place);
+  function thumb(index) {
+    const src = bench.runs.picture(index);
     if (!src) return element("span.soft", {"aria-hidden": "true"}, MISSING);
     const image = element("img", {src, alt: "", loading: "lazy", width: 60, height: 48});
-    return element("a", {href: bench.runs.link(place), tabindex: "-1", "aria-hidden": "true"}, image);
+    return element("a", {href: bench.runs.link(index), tabindex: "-1", "aria-hidden": "true"}, image);
   }
 
-  function named(place, state) {
+  function named(index, state) {
     const {runs} = bench;
-    const seed = `seed ${runs.number(place, "seed") ?? MISSING}`;
-    const [task, scene, experiment] = ["task", "scene", "experiment"].map((key) => runs.text(place, key));
-    const scale = runs.values("scale").length > 1 && runs.text(place, "scale");
+    const seed = `seed ${runs.number(index, "seed") ?? MISSING}`;
+    const [task, scene, experiment] = ["task", "scene", "experiment"].map((key) => runs.text(index, key));
+    const scale = runs.values("scale").length > 1 && runs.text(index, "scale");
     const about = [state.task ? "" : task, scene, seed, experiment, scale && `scale=${scale}`];
-    const reason = runs.reason(place);
+    const reason = runs.reason(index);
     return [
-      element("a", {href: runs.link(place)}, runs.text(place, "name")),
+      element("a", {href: runs.link(index)}, runs.text(index, "name")),
       element("small", null, about.filter(Boolean).join(" · ")),
       reason && element("small.reason", {title: reason}, reason),
     ];
   }
 
   /* A word on machines where the times that are shown are of several. */
-  function machines(places) {
-    const timed = places.filter((place) => bench.runs.number(place, "loop") !== null || bench.runs.number(place, "total") !== null);
+  function machines(indices) {
+    const timed = indices.filter((index) => bench.runs.number(index, "loop") !== null || bench.runs.number(index, "total") !== null);
     const counts = new Map();
-    for (const machine of timed.map((place) => bench.runs.text(place, "machine")).filter(Boolean))
+    for (const machine of timed.map((index) => bench.runs.text(index, "machine")).filter(Boolean))
       counts.set(machine, (counts.get(machine) || 0) + 1);
     const sorted = [...counts].sort((a, b) => b[1] - a[1]);
     if (sorted.length < 2) return sorted.length ? element("p.soft", null, `Times of ${sorted[0][0]}.`) : null;
@@ -202,7 +202,7 @@
       `Choose one under Machine to compare seconds. ${sorted.map(([machine, n]) => `${machine}: ${plural(n, "run")}`).join("; ")}.`);
   }
 
-  /* The leaderboards by themselves. */
+  /* The leaderboards alone. */
   function leaderboards(home, query) {
     const boards = element("section", {"aria-labelledby": "board"});
     fill(home, element("h1.unseen", null, "Leaderboards"), boards);

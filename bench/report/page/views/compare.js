@@ -5,22 +5,22 @@
   const {element, fill, soft, section, details: fold, later, code} = bench.dom;
   const {number, count, seconds, size, label, MISSING} = bench.format;
   const SIDES = ["A", "B"];
-  const MOST = 6;  // keys that are named in a line
+  const MAX_NAMED_KEYS = 6;  // keys that are named in a line
 
   function compare(home, names) {
     const {runs} = bench;
-    const places = names.map(runs.place);
-    if (places.length !== 2 || places.includes(undefined)) {
+    const indices = names.map(runs.indexOf);
+    if (indices.length !== 2 || indices.includes(undefined)) {
       const link = element("a", {href: bench.address.to(["runs"], {view: "runs"})}, "list of runs");
       return fill(home, element("h1", null, "Compare two runs"), element("p", null, "Pick two in the ", link, "."));
     }
-    const swapped = bench.address.to(["compare", ...places.map(runs.name).reverse()]);
+    const swapped = bench.address.to(["compare", ...indices.map(runs.name).reverse()]);
     return fill(home,
       element("p.crumbs", null, element("a", {href: "#/"}, "All results")),
       element("h1", null, "Two runs side by side"),
-      element("div.two", null, places.map(heading)),
+      element("div.two", null, indices.map(heading)),
       element("p", null, element("a.button", {href: swapped}, "Swap")),
-      later(Promise.all(places.map(runs.detail)), (details) => parts(places, details)));
+      later(Promise.all(indices.map(runs.detail)), (details) => parts(indices, details)));
   }
 
   const mark = (n) => element(`b.${"ab"[n]}`, null, SIDES[n]);
@@ -28,25 +28,25 @@
   /* Both sides, each with its letter: on a phone they stand below each other. */
   const paired = (made) => element("div.two", null, made.map((each, n) => element("div", null, element("p", null, mark(n)), each)));
 
-  function heading(place, n) {
+  function heading(index, n) {
     const {runs} = bench;
-    const about = runs.reason(place) || `seed ${runs.number(place, "seed") ?? MISSING}`;
+    const about = runs.reason(index) || `seed ${runs.number(index, "seed") ?? MISSING}`;
     return element("div.side", null,
-      element("p", null, mark(n), element("a", {href: runs.link(place)}, runs.title(place))),
-      element("p", null, bench.badge(runs.text(place, "status")), " ", soft(about)));
+      element("p", null, mark(n), element("a", {href: runs.link(index)}, runs.title(index))),
+      element("p", null, bench.badge(runs.text(index, "status")), " ", soft(about)));
   }
 
-  function parts(places, details) {
+  function parts(indices, details) {
     const turning = [];
-    const named = details.map(({curve}, n) => ({name: `${SIDES[n]}: ${bench.runs.text(places[n], "name")}`, curve}));
+    const named = details.map(({curve}, n) => ({name: `${SIDES[n]}: ${bench.runs.text(indices[n], "name")}`, curve}));
     return [
       warning(details),
       section("Metrics after the run", metrics(details)),
       section("Settings that differ", settings(details)),
-      section("Costs", costs(places, details)),
+      section("Costs", costs(indices, details)),
       section("Curves", bench.curves(named)),
       details.every(({files}) => files["mesh.ply"]) &&
-        section("Meshes", paired(places.map((place) => bench.mesh(place, turning)))),
+        section("Meshes", paired(indices.map((index) => bench.mesh(index, turning)))),
       section("Pictures", pictures(details)),
     ];
   }
@@ -72,8 +72,8 @@
   /* That more than the renderer differs, so that the metrics may differ for another reason. */
   function warning(details) {
     const keys = differing(details).keys.filter((key) => key !== "label" && !/^renderer\b/.test(key));
-    const shown = keys.slice(0, MOST).flatMap((key, n) => (n ? [", ", code(key)] : [code(key)]));
-    const more = keys.length > MOST ? ` and ${keys.length - MOST} more` : "";
+    const shown = keys.slice(0, MAX_NAMED_KEYS).flatMap((key, n) => (n ? [", ", code(key)] : [code(key)]));
+    const more = keys.length > MAX_NAMED_KEYS ? ` and ${keys.length - MAX_NAMED_KEYS} more` : "";
     return keys.length > 0 && element("p.note", null, "Not only the renderer differs: ", shown, `${more}. The metrics may differ for that reason.`);
   }
 
@@ -104,17 +104,17 @@
     return [shown.size > 0 && made([...shown.keys()]), rest.length > 0 && more];
   }
 
-  function costs(places, details) {
+  function costs(indices, details) {
     const {runs} = bench;
     const rows = [
-      ["Optimisation", (n) => runs.number(places[n], "loop"), seconds],
-      ["In all", (n) => runs.number(places[n], "total"), seconds],
-      ["Field values", (n) => runs.number(places[n], "values"), count],
-      ["Gradients of the field", (n) => runs.number(places[n], "gradients"), count],
+      ["Optimisation", (n) => runs.number(indices[n], "loop"), seconds],
+      ["In all", (n) => runs.number(indices[n], "total"), seconds],
+      ["Field values", (n) => runs.number(indices[n], "values"), count],
+      ["Gradients of the field", (n) => runs.number(indices[n], "gradients"), count],
       ["Operations", (n) => details[n].costs.flops, count],
       ["Peak memory", (n) => details[n].costs.peak_memory_bytes, size],
     ];
-    const [a, b] = places.map((place) => runs.text(place, "machine") || "an unknown machine");
+    const [a, b] = indices.map((index) => runs.text(index, "machine") || "an unknown machine");
     return [
       table("Cost", rows, ([name]) => name, ([, get, show], n) => show(get(n)), "number", ratio(([, get], n) => get(n))),
       a !== b && element("p.note", null, `Seconds do not compare: A is of ${a}, B of ${b}.`),

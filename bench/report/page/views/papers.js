@@ -25,9 +25,9 @@
   function answer(data) {
     const {panels = []} = data.chart || {};
     const drawn = element("div");
-    const show = (place) => fill(drawn, bench.chart({panels: [{...panels[place], title: ""}]}, {label: panels[place].title}));
+    const show = (index) => fill(drawn, bench.chart({panels: [{...panels[index], title: ""}]}, {label: panels[index].title}));
     if (panels.length) show(0);
-    const titles = Object.fromEntries(panels.map(({title}, place) => [place, title]));
+    const titles = Object.fromEntries(panels.map(({title}, index) => [index, title]));
     return [
       panels.length > 1 && choice("Set of problems", titles, "0", show),
       drawn,
@@ -53,31 +53,31 @@
     fill(home, element("h1", null, "Tables"), all().length ? answers(all()) : element("p", null, "There is no table yet."));
   }
 
-  function heading(known) {
-    const shipped = known.shipped && "Shipped with the program: not of the runs on this page.";
+  function heading(entry) {
+    const shipped = entry.shipped && "Shipped with the program: not of the runs on this page.";
     return [
-      element("h1", null, known.question || known.title),
-      element("p.soft", null, [known.question && `${known.title}.`, shipped].filter(Boolean).join(" ")),
-      known.verdict && element("p.answer", null, emphasised(known.verdict)),
+      element("h1", null, entry.question || entry.title),
+      element("p.soft", null, [entry.question && `${entry.title}.`, shipped].filter(Boolean).join(" ")),
+      entry.verdict && element("p.answer", null, emphasised(entry.verdict)),
     ];
   }
 
   function paper(home, name) {
-    const known = find(name);
+    const entry = find(name);
     const back = element("p.crumbs", null, element("a", {href: "#/tables"}, "All tables"));
-    if (!known) return fill(home, back, element("h1", null, "There is no such table"));
-    return fill(home, back, heading(known), later(bench.store.load("paper", known.key), (data) => parts(known, data)));
+    if (!entry) return fill(home, back, element("h1", null, "There is no such table"));
+    return fill(home, back, heading(entry), later(bench.store.load("paper", entry.key), (data) => parts(entry, data)));
   }
 
   /* What answers the mouse, the picture, the table, caption and files; what shows the same twice is folded. */
-  function parts(known, data) {
-    const image = () => element("img.figure", {src: data.picture, alt: data.caption || known.title, loading: "lazy"});
+  function parts(entry, data) {
+    const image = () => element("img.figure", {src: data.picture, alt: data.caption || entry.title, loading: "lazy"});
     const picture = data.picture && element("figure", null, element("a", {href: data.files.PDF || data.picture}, image()));
     const links = Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "]);
-    const table = data.rows.length > 0 && bench.written(data.header, data.rows, known.name === SUITE ? STANDING : data);
+    const table = data.rows.length > 0 && bench.written(data.header, data.rows, entry.name === SUITE ? STANDING : data);
     return [
       data.atlas && bench.atlas(data.atlas),
-      data.chart && bench.chart(data.chart, {label: known.title}),
+      data.chart && bench.chart(data.chart, {label: entry.title}),
       picture && (data.atlas || data.chart) ? details("The figure as in the paper", picture) : picture,
       element("p.caption", null, data.caption),
       table && data.atlas ? details("The table, with intervals", table) : table,

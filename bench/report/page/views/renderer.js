@@ -36,11 +36,11 @@
   function failure({failed, progress, runs}, {problems}) {
     const tried = progress.filter((each) => each !== null).length;
     if (!failed.length) return element("p", null, `It fails in none of ${plural(tried, "run")}.`);
-    const [place, status, reason] = failed[0];
-    const run = bench.runs.place(runs[place]);
+    const [index, status, reason] = failed[0];
+    const run = bench.runs.indexOf(runs[index]);
     return element("div", null,
       element("p", null, `It fails in ${failed.length} of ${plural(tried, "run")}. The first:`),
-      element("p", null, bench.badge(status), ` ${named(problems[place])}: ${reason.replace(/\.?$/, ".")}`),
+      element("p", null, bench.badge(status), ` ${named(problems[index])}: ${reason.replace(/\.?$/, ".")}`),
       run !== undefined && later(bench.runs.detail(run), ({pictures}) => {
         const found = pictures.find(([name]) => name === "failure.png") || pictures[0];
         return found && bench.picture(found);
@@ -49,26 +49,26 @@
 
   /* Its progress at each problem and that of the best renderer: the largest gap first. */
   function behind(own, {problems, rows}) {
-    const most = problems.map((_, place) => Math.max(...rows.map(({progress}) => progress[place] ?? 0)));
-    const failed = new Map(own.failed.map(([place, said]) => [place, said]));
-    const gap = (place) => most[place] - own.progress[place];
-    const tried = problems.map((_, place) => place).filter((place) => own.progress[place] !== null);
-    const places = tried.filter((place) => gap(place) > 0).sort((a, b) => gap(b) - gap(a));
+    const most = problems.map((_, index) => Math.max(...rows.map(({progress}) => progress[index] ?? 0)));
+    const failed = new Map(own.failed.map(([index, said]) => [index, said]));
+    const gap = (index) => most[index] - own.progress[index];
+    const tried = problems.map((_, index) => index).filter((index) => own.progress[index] !== null);
+    const indices = tried.filter((index) => gap(index) > 0).sort((a, b) => gap(b) - gap(a));
     const share = (key, label, get) =>
-      ({key, label, kind: "number", unit: "% of the way to the best possible error", get, cell: (place) => (100 * get(place)).toFixed(0)});
+      ({key, label, kind: "number", unit: "% of the way to the best possible error", get, cell: (index) => (100 * get(index)).toFixed(0)});
     const columns = [
-      {key: "problem", label: "Problem", head: true, get: (place) => named(problems[place]), cell: (place) => named(problems[place])},
-      share("progress", "Progress", (place) => own.progress[place]),
-      share("most", "Of the best", (place) => most[place]),
-      {label: "Run", cell: (place) => [bench.badge(failed.get(place) || "ok"), " ", run(own.runs[place])]},
+      {key: "problem", label: "Problem", head: true, get: (index) => named(problems[index]), cell: (index) => named(problems[index])},
+      share("progress", "Progress", (index) => own.progress[index]),
+      share("most", "Of the best", (index) => most[index]),
+      {label: "Run", cell: (index) => [bench.badge(failed.get(index) || "ok"), " ", run(own.runs[index])]},
     ];
-    if (!places.length) return element("p", null, `No renderer makes more progress in any of ${plural(tried.length, "run")}.`);
-    return bench.table(columns, places, {caption: "Where others make more progress"});
+    if (!indices.length) return element("p", null, `No renderer makes more progress in any of ${plural(tried.length, "run")}.`);
+    return bench.table(columns, indices, {caption: "Where others make more progress"});
   }
 
   function run(folder) {
-    const place = bench.runs.place(folder);
-    return place !== undefined && element("a", {href: bench.runs.link(place)}, "open");
+    const index = bench.runs.indexOf(folder);
+    return index !== undefined && element("a", {href: bench.runs.link(index)}, "open");
   }
 
   bench.renderer = renderer;

@@ -7,34 +7,34 @@
 
   function run(home, name) {
     const {runs} = bench;
-    const place = runs.place(name);
+    const index = runs.indexOf(name);
     const back = element("a", {href: "#/runs"}, "All runs");
-    if (place === undefined)
+    if (index === undefined)
       return fill(home, element("h1", null, "There is no such run"), element("p", null, `No run is called ${name}. `, back));
-    const task = runs.text(place, "task");
+    const task = runs.text(index, "task");
     const others = element("a", {href: bench.address.to(["runs"], {task, view: "runs"})}, task.replace(/_/g, " "));
     return fill(home,
       element("p.crumbs", null, element("a", {href: "#/"}, "All results"), " / ", others),
-      element("h1", null, runs.title(place)),
+      element("h1", null, runs.title(index)),
       element("p.about", null,
-        bench.badge(runs.text(place, "status")),
-        soft(`seed ${runs.number(place, "seed") ?? "–"} · ${date(runs.number(place, "started"))} UTC`),
-        element("label.pick-run", null, bench.pick(place), "Compare")),
-      later(runs.detail(place), (detail) => parts(place, detail)));
+        bench.badge(runs.text(index, "status")),
+        soft(`seed ${runs.number(index, "seed") ?? "–"} · ${date(runs.number(index, "started"))} UTC`),
+        element("label.pick-run", null, bench.pick(index), "Compare")),
+      later(runs.detail(index), (detail) => parts(index, detail)));
   }
 
-  function parts(place, detail) {
+  function parts(index, detail) {
     const [first, ...others] = detail.pictures;
     const unlisted = !detail.metrics.some(([name]) => Object.hasOwn(bench.runs.metrics, name));
     const links = Object.entries(detail.files).map(([name, href]) => [element("a", {href}, name), " "]);
     return [
       element("p.asked", null, detail.asked),
-      happened(place, detail),
+      happened(index, detail),
       section("Result", element("div.two", null, unlisted ? null : result(detail.metrics), first && picture(first)),
         detail.metrics.length
           ? Object.assign(details(`All ${detail.metrics.length} metrics, with definitions`, recorded(detail.metrics)), {open: unlisted})
           : element("p.soft", null, "This run measured nothing.")),
-      detail.files["mesh.ply"] && section("Mesh", bench.mesh(place)),
+      detail.files["mesh.ply"] && section("Mesh", bench.mesh(index)),
       detail.curve && section("Curve", bench.curves([{name: "run", curve: detail.curve}])),
       others.length > 0 && section("Pictures", element("div.pictures", null, others.map(picture))),
       section("Costs", costs(detail.costs)),
@@ -42,15 +42,15 @@
         copied(detail.command, "Copy the command"),
         element("p.soft", null, "Configurations are code: read one that is not yours first.")),
       section("Open it in Python", copied(detail.python, "Copy the lines that open it")),
-      section("Files", element("p.files", null, element("code", null, bench.runs.folder(place)), " ", links)),
+      section("Files", element("p.files", null, element("code", null, bench.runs.folder(index)), " ", links)),
       details(`All ${detail.settings.length} settings`, facts(detail.settings)),
       detail.environment.length > 0 && details("Machine and versions", facts(detail.environment)),
     ];
   }
 
   /* The status in words, the reason, what helps, and the notes. */
-  function happened(place, {said, reason, notes, log}) {
-    const ok = bench.runs.text(place, "status") === "ok";
+  function happened(index, {said, reason, notes, log}) {
+    const ok = bench.runs.text(index, "status") === "ok";
     const lines = log.length === 1 ? "line" : `${log.length} lines`;
     return element(`div.happened${ok ? ".ok" : ""}`, null,
       element("p", null, element("strong", null, said.meaning), ` ${reason || (ok ? "" : "No reason was recorded.")}`),
