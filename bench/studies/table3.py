@@ -56,8 +56,8 @@ def make(runs: Runs) -> Result:
     return compared.result(
         "Shape from many views, without a mask.",
         "Which method best reconstructs a shape from photographs of many views, without a mask?",
-        plotted="Median error over {shapes and seeds}; median over shapes alone, with its ratio to DIST; median cost of "
-        "runs that ended ok.",
+        plotted="Median error over {shapes and seeds}; median over shapes alone, with its ratio to DIST; median cost "
+        "of runs that ended ok.",
         verdict=compared.best("errors × 1000 from ground truth to prediction"),
         remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
         columns=compared.columns("Ratio to DIST"),
