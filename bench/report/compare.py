@@ -20,19 +20,19 @@ from bench.report.write.result import Result
 from bench.report.write.table import Column, ends, estimate, text
 
 ALL_FAMILIES = "all families"
-COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "seconds of the loop"}  # with their axis labels
+COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "runtime (seconds)"}  # with their axis labels
 FAILURE = (
-    "In a shape's mean a run that did not end ok has the largest finite error of any row on the same shape, seed and "
-    "condition; a shape on which every row failed is left out. A row that lacks a shape of another is on no front."
+    "In the mean of a shape, a failed run has the largest finite error of all rows on the same shape, seed and "
+    "condition. A shape on which every row failed is left out."
 )
 ERROR = (
-    "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000. A run that did "
-    "not end ok, or was planned and not run, counts as infinite."
+    "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000. A failed "
+    "run, or a planned run that was not made, counts as infinite."
 )
 INTERVAL = "95 % intervals over shapes (of the sign test)"
 RATIO = (
-    "A ratio is the median over shapes of that of their geometric means; after it stand the shapes on which the row is "
-    "better, ties half."
+    "A ratio is the median over shapes of the ratio of the two rows' geometric mean errors. After it stands the number "
+    "of shapes on which the row is better; a tie counts as half."
 )
 HOLM = "By the sign test over shapes with Holm's correction"
 METRIC, LABEL = "chamfer_l2", "Chamfer × 1000\n(scene units²)"
@@ -40,7 +40,7 @@ CONDITION_KEY = "task.points"  # tables have a column for each of its values
 CONDITION_ORDER = ("dense", "50%", "10%", "100", "50", "20")
 PRIORS = Selection("priors")
 ORACLE = "oracle: the prior's fit to the truth"
-FITTED = "The oracle is a code fitted to the distances of the true mesh (`+experiment=priors`), of all of these shapes."
+FITTED = "The oracle is a latent code fitted to the distances of the true mesh (`+experiment=priors`), for all shapes."
 Line = dict[str, Any]
 
 
@@ -177,11 +177,11 @@ class Compared:
         """A line per family and row; with several families, lines over all families come first.
 
         Its keys: family, row, preset, the median at each condition, the mean `error`, `ratio` (a `Gap`, or None for the
-        reference), median costs, `front_COST` ("yes" if no row has less error for less cost), `failed`, and `lacking`,
-        the number of missing shapes and seeds. A row that lacks some is on no front and in no verdict.
+        reference), median costs, `failed`, and `lacking`, the number of missing shapes and seeds. A row that lacks some
+        is in no verdict.
         """
         names = [ALL_FAMILIES, *self.families] if len(self.families) > 1 else self.families
-        return [line for name in names for line in self._front([self._line(name, row) for row in self.rows])]
+        return [self._line(name, row) for name in names for row in self.rows]
 
     def _line(self, family: str, row: Row) -> Line:
         lines, reference, lacking = self.cells_of(family, row), self.reference_of(row), self.lacking(family, row)
@@ -195,14 +195,6 @@ class Compared:
             "lacking": lacking,
             "failed": f"{(~lines.ok).sum()} of {len(lines)}" + (f", {lacking} missing" if lacking else ""),
         }
-
-    @staticmethod
-    def _front(lines: list[Line]) -> list[Line]:
-        for cost in COSTS:
-            costs = [None if line["lacking"] else line[cost] for line in lines]
-            front = statistics.on_front(costs, [line["error"].value for line in lines])
-            lines = [line | {f"front_{cost}": "yes" if on else ""} for line, on in zip(lines, front, strict=True)]
-        return lines
 
     @property
     def pooled(self) -> list[Line]:
@@ -239,8 +231,10 @@ class Compared:
             *estimate("error", "Median over shapes"),
             text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
             *ends("ratio", lambda line: ratio_of(line["ratio"])),
-            *(Column("evaluations", "Values", show=format.count), Column("seconds", "Loop", show=format.seconds)),
-            *(text(f"front_{cost}") for cost in COSTS),
+            *(
+                Column("evaluations", "Field evaluations", show=format.count),
+                Column("seconds", "Runtime", show=format.seconds),
+            ),
             *(text("failed", "Failed"), text("preset")),
         ]
 
@@ -252,8 +246,8 @@ class Compared:
                 default ones, such as `lines` and `figure`.
         """
         parts: dict[str, Any] = {
-            "plotted": "Median error under each condition, that over shapes of their geometric means, its ratio, and "
-            "the median cost of runs that ended ok.",
+            "plotted": "Median error under each condition; median over shapes of their geometric means, with its "
+            "ratio; median cost of runs that ended ok.",
             "interval": INTERVAL,
             "estimates": [line["error"] for line in self.lines],
             "lines": self.lines,
@@ -293,8 +287,8 @@ class Compared:
             f"{format.number(line['error'].value)}{mark} ({line['row']}, {format.seconds(line['seconds'])}"
             for line, mark in ((best, "*"), (quickest, ""))
         )
-        other = ", which is the quickest row too)" if best is quickest else f"); the quickest row has {quickest_text})"
-        return f"The least median of {least_of} is *{best_text}{other}; n = {format.plural(n, 'shape')}."
+        other = ", which is also the fastest row)" if best is quickest else f"); the fastest row has {quickest_text})"
+        return f"The smallest median of {least_of} is *{best_text}{other}; n = {format.plural(n, 'shape')}."
 
     def panels(self, ratio: str) -> list[chart.Panel]:
         """Panels of errors, of ratios (labelled `ratio`) and of costs: a line per row, the least error first."""

@@ -16,8 +16,8 @@ from bench.report.write.table import Column, text
 
 COST = (
     text("failed", "Failed"),
-    Column("seconds", "Loop", show=format.seconds),
-    Column("evaluations", "Evaluations", show=lambda value: "none" if value == 0 else format.count(value)),
+    Column("seconds", "Runtime", show=format.seconds),
+    Column("evaluations", "Field evaluations", show=lambda value: "none" if value == 0 else format.count(value)),
 )
 
 
@@ -72,7 +72,7 @@ def paired_ratio(errors: Mapping[RunKey, float], others: Mapping[RunKey, float])
 def cost(runs: Runs) -> dict[str, pd.Series]:
     """The seconds of each run, or its field evaluations if times are doubtful; by the label of the axis."""
     evaluations = runs.frame["values"].where(runs.frame["values"] > 0)
-    return {"seconds in the loop": runs.frame.loop} if runs.timed else {"field evaluations of the run": evaluations}
+    return {"runtime (seconds)": runs.frame.loop} if runs.timed else {"field evaluations of the run": evaluations}
 
 
 def comparable_medians(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:

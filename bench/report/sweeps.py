@@ -256,7 +256,7 @@ def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> lis
         Column("failed", "Failed", words=_failed),
         *ends("failed", lambda line: line["rate"]),
         text("reasons"),
-        Column("loop_seconds", "Loop", show=format.seconds),
+        Column("loop_seconds", "Runtime", show=format.seconds),
         Column("value_evaluations", "Field values", show=format.count),
     ]
 

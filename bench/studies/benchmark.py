@@ -101,7 +101,9 @@ COLUMNS = (
     table.text("renderer", "Renderer"),
     *(*map(table.text, ("status", "reason", "folder")), table.Column("rounds")),
     table.Column(
-        "queries", "Evaluations", words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries"))
+        "queries",
+        "Field evaluations",
+        words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries")),
     ),
     table.Column("coarse_queries"),
     table.Column("forward_seconds", "Forward", show=format.seconds),

@@ -28,8 +28,8 @@ def make(runs: Runs) -> Result:
     return Result(
         runs,
         "Shape from many views under other focal lengths and initial codes.",
-        f"{conditions.ERROR_TEXT[0].upper()}{conditions.ERROR_TEXT[1:]}; in the figure, the median ratio to the error of the "
-        "same shape at 1.",
+        f"{conditions.ERROR_TEXT[0].upper()}{conditions.ERROR_TEXT[1:]}; in the figure, the median ratio to the error "
+        "of the same shape at 1.",
         question="Does another focal length or initial code change the reconstructed shape?",
         verdict=_verdict(runs.executed),
         interval=conditions.INTERVALS,

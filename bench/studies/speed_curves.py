@@ -15,8 +15,8 @@ COST_AXES = {"seconds": "time (seconds)", "value_evaluations": "field evaluation
 ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
     "The figure has a curve per run of the first setting of each renderer, up to the end of the run.",
-    f"The table has all settings, the number of runs that reached {CHAMFER_SCALE * TARGET_ERROR:g} × 10⁻³, and the median "
-    "time to this error. A run that failed or never reached it counts as infinite.",
+    f"The table has all settings, the number of runs that reached {CHAMFER_SCALE * TARGET_ERROR:g} × 10⁻³, and the "
+    "median time to this error. A run that failed or never reached it counts as infinite.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (

@@ -88,7 +88,7 @@ def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
 
 
 def _shapes(compared: compare.Compared) -> str:
-    counts = compared.cells.groupby(["family", "row", "at"], observed=True).solid.nunique()
+    counts = compared.cells.groupby(["family", "row", "condition"], observed=True).solid.nunique()
     return f"Shapes per family and row: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
 
 

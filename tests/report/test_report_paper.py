@@ -168,12 +168,12 @@ def test_times_of_different_machines_are_not_compared_without_saying_so(tmp_path
     results = tmp_path_factory.mktemp("results")
     write_run(results, "table1", DYNAMIC, metrics=costs())
     write_run(results, "table1", PARALLEL, environment={"waited_share": 0.1}, status="killed")
-    assert "do not compare" not in told(page_of(results, "table1"))
+    assert "Do not compare times" not in told(page_of(results, "table1"))
     write_run(results, "table1", NAIVE, metrics=costs(), environment={**MACHINE, **other})
     made = chosen(results, "table1")
     assert made.names() == [DYNAMIC, PARALLEL, NAIVE]  # no planned row is lost for it
     result = table1.make(made, None)
-    (warning,) = [note for note in result.notes if note.startswith("Times of rows from different machines")]
+    (warning,) = [note for note in result.notes if note.startswith("Do not compare times of different machines")]
     assert all(words in warning for words in (*map(str, other.values()), f"({NAIVE})", f"({DYNAMIC})"))
     assert "2 machines, see the notes" in result.caption
 
@@ -205,7 +205,7 @@ def test_a_strategy_whose_forerunner_is_missing_is_not_credited_with_what_both_s
 def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
     write_run(tmp_path, "table1", NAIVE, metrics=costs(), notes=["loaded machine: threads waited 31% of their time"])
     write_run(tmp_path, "table1", DYNAMIC, metrics=costs())
-    assert f"Doubtful times, see the notes of the run: {NAIVE}." in page_of(tmp_path, "table1").notes
+    assert f"Times are not reliable, see the notes of the runs: {NAIVE}." in page_of(tmp_path, "table1").notes
 
 
 def test_hostile_words_are_escaped_everywhere(tmp_path):

@@ -97,7 +97,7 @@ def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp
     assert list(zip(*(page.data[key] for key in ("size", "threads", "forward_ratio")), strict=True))[:-1] == lines
     assert set(page.data["renderer"][1:6:2]) == {"newton"}
     line = page.table.iloc[1]
-    assert (line["Evaluations"], line["Forward ratio"]) == ("1.00k + 3.00k coarse", "0.75 (0.50–1.00)")
+    assert (line["Field evaluations"], line["Forward ratio"]) == ("1.00k + 3.00k coarse", "0.75 (0.50–1.00)")
     assert line["Missed / spurious / wrong depth"] == "1 / 2 / 3"
     assert list(page.table["Forward ratio"].iloc[[0, -1]]) == ["1", "–"]  # of the first renderer, and of a failed run
     assert (

@@ -122,13 +122,22 @@ def test_a_line_has_the_medians_over_scenes_with_failed_runs_worst(tmp_path):
     names = ["Accuracy", "Completeness", "Chamfer-L1, seen", "all"]
     assert newton[names].tolist() == ["10.0", "30.0", "20.0", "60.0"]
     assert newton[["PSNR", "SSIM", "Mask IoU"]].tolist() == ["22.0", "0.220", "0.900"]
-    assert newton[["Failed", "Loop", "Evaluations"]].tolist() == ["0 of 3", "2.00 s", "1.00k"]
+    assert newton[["Failed", "Runtime", "Field evaluations"]].tolist() == ["0 of 3", "2.00 s", "1.00k"]
     idr = line_of(result, IDR)
     assert idr[names].tolist() == ["∞"] * 4  # also of a failed run that has numbers
     assert idr[["PSNR", "SSIM", "Mask IoU"]].tolist() == ["0", "0", "0"]
-    assert idr[["Failed", "Loop", "Evaluations"]].tolist() == ["2 of 3", "8.00 s", "1.00k"]  # of runs that ended
+    assert idr[["Failed", "Runtime", "Field evaluations"]].tolist() == [
+        "2 of 3",
+        "8.00 s",
+        "1.00k",
+    ]  # of runs that ended
     hull = line_of(result, HULL)
-    assert hull[["Chamfer-L1, seen", "Failed", "Loop", "Evaluations"]].tolist() == ["50.0", "0 of 1", "500 ms", "none"]
+    assert hull[["Chamfer-L1, seen", "Failed", "Runtime", "Field evaluations"]].tolist() == [
+        "50.0",
+        "0 of 1",
+        "500 ms",
+        "none",
+    ]
     assert len(result.data) == 7 and set(result.data["status"]) == {"ok", "empty", "crashed"}
     assert result.data["seen_chamfer_l1"].tolist()[:3] == [0.02, 0.01, 0.04]
     assert "2 of 7 runs did not end ok" in result.shown().caption
@@ -142,7 +151,9 @@ def test_published_lines_are_marked_and_cost_nothing_that_is_known(tmp_path):
     dvr = table.loc["published: DVR (RGB)"]
     assert dvr[["Accuracy", "Completeness", "Chamfer-L1, seen"]].tolist() == ["1.05", "0.760", "0.907"]
     published = table.iloc[1:]
-    assert (published[["all", "PSNR", "SSIM", "Mask IoU", "Failed", "Loop", "Evaluations"]] == "–").all(axis=None)
+    assert (published[["all", "PSNR", "SSIM", "Mask IoU", "Failed", "Runtime", "Field evaluations"]] == "–").all(
+        axis=None
+    )
     assert set(result.data["row"]) == {NEWTON}
     assert "cannot be compared directly" in told(result)
 
@@ -189,7 +200,7 @@ def test_photographs_need_no_chamfer(tmp_path):
         photographed(tmp_path, NEWTON, PHOTO_SCORES | {"psnr": psnr}, dataset=dataset)
         photographed(tmp_path, HULL, PHOTO_SCORES | {"psnr": 12.0}, dataset=dataset, seconds=0.5)
     result = page_of(tmp_path, "photos")
-    heads = ["Method", "PSNR (dB)", "SSIM", "Mask IoU", "least", "Failed", "Loop", "Evaluations"]
+    heads = ["Method", "PSNR (dB)", "SSIM", "Mask IoU", "least", "Failed", "Runtime", "Field evaluations"]
     assert list(result.table.columns) == heads
     assert line_of(result, NEWTON).tolist() == ["23.0", "0.500", "0.900", "0.800", "0 of 2", "2.00 s", "1.00k"]
     assert line_of(result, HULL).tolist() == ["12.0", "0.500", "0.900", "0.800", "0 of 2", "500 ms", "none"]

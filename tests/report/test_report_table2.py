@@ -71,7 +71,10 @@ def test_another_setting_of_the_shared_parts_is_told(tmp_path):
     write_run(
         tmp_path, "table2", OTHER, task="completion", dataset="sofa", settings={"view": {"resolution": 8}}, minute=0
     )
-    assert "Runs differ in view.resolution: rows with other values do not compare." in page_of(tmp_path, "table2").notes
+    assert (
+        "Runs differ in view.resolution: do not compare rows with different values."
+        in page_of(tmp_path, "table2").notes
+    )
 
 
 @pytest.mark.parametrize("odd", [{"renderer": {"epsilon": 1.0}}, {"silhouette": {"weight": 9}}, {"task": {"code": 1}}])
@@ -130,9 +133,9 @@ def test_captions_name_what_varies_and_a_try_at_smoke(tmp_path):
     assert "Median error over seeds of one shape for each" in caption()
     write(1, 0)
     assert "Median error over shapes and seeds for each" in caption()
-    assert "nothing follows" not in caption()
+    assert "do not interpret" not in caption()
     write(0, 0, scale={"name": "smoke"})
-    assert caption().startswith("Made at scale=smoke, to try things out: nothing follows from these numbers.")
+    assert caption().startswith("Made at scale=smoke, to try things out: do not interpret these numbers.")
     assert "Median error over one shape for each" in caption()
 
 

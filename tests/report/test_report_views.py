@@ -60,7 +60,7 @@ def test_table_3_has_medians_ratios_and_published_numbers(tmp_path):
     ours, idr = row(result, "DIST"), row(result, "IDR")
     assert (ours["Median"], ours["Median over shapes"], ours["Failed"]) == ("2.00", "2.00 (n = 3)", "0 of 3")
     assert (ours["Ratio to DIST"], idr["Ratio to DIST"]) == ("", "2.00 (n = 3); 0 of 3")
-    assert (ours["Loop"], ours["Values"]) == ("3.00 s", "5.00k")
+    assert (ours["Runtime"], ours["Field evaluations"]) == ("3.00 s", "5.00k")
     assert row(result, "initial error, random")["Median"] == "8.00"
     assert row(result, "published: DIST, random start")["Median"] == "0.919"
     assert row(result, "published: PMO, random start")["Median"] == "1.187"  # as the paper prints it
@@ -213,7 +213,7 @@ def test_a_row_of_another_resolution_is_in_no_headline(tmp_path):
         write_run(tmp_path, "table3", "DVR", task="multiview", method="multiview_dvr", settings=view, **small)
     result = page_of(tmp_path, "table3")
     assert "DVR" not in result.verdict and "*1.00* (IDR" in result.verdict
-    assert row(result, "DVR")["Median"] == "0.500" and "rows with other values do not compare" in told(result)
+    assert row(result, "DVR")["Median"] == "0.500" and "do not compare rows with different values" in told(result)
 
 
 def test_a_single_run_of_one_condition_has_a_page(tmp_path):

@@ -14,7 +14,6 @@ from bench.report.data.statistics import (
     front,
     interquartile_mean,
     median,
-    on_front,
     paired_bootstrap,
     rank,
     ratio,
@@ -243,12 +242,6 @@ def test_a_rank_has_an_interval_over_shapes_and_those_that_do_not_differ_from_th
 def test_a_shape_at_which_both_are_equally_good_is_half_a_success():
     seeds = [np.array([1.0, 2.0, 9.0]), np.array([1.0, 5.0, 5.0])]  # medians 2 and 5
     assert shapes_won(seeds, singles(3, 4)) == 1 and shapes_won(singles(1, 2, 3, INF), singles(2, 2, 2, INF)) == 2
-
-
-def test_what_failed_or_has_no_cost_is_not_on_the_front():
-    costs, errors = [1.0, 2.0, None, 0.5, 3.0], [3.0, 2.0, 1.0, INF, 2.0]
-    assert on_front(costs, errors) == [True, True, False, False, False]
-    assert on_front([1.0, None], [INF, 1.0]) == [False, False]
 
 
 def test_dominated():

@@ -288,14 +288,6 @@ def dominated(costs: Values, errors: Values) -> np.ndarray:
     return (no_worse & ((other[0] < mine[0]) | (other[1] < mine[1]))).any(axis=-1)
 
 
-def on_front(costs: Sequence[float | None], errors: Sequence[float]) -> list[bool]:
-    """Whether each point is on the front: it has a cost and a finite error, and no such point dominates it."""
-    is_complete = [cost is not None and math.isfinite(error) for cost, error in zip(costs, errors, strict=True)]
-    pairs = [(cost, error) for cost, error, has in zip(costs, errors, is_complete, strict=True) if has]
-    is_dominated = iter(dominated(*zip(*pairs, strict=True)) if pairs else ())
-    return [has and not next(is_dominated) for has in is_complete]
-
-
 def front(points: Sequence[Point], *, seed: int = 0, draws: int = 2000) -> list[float]:
     """The probability that each setting is on the Pareto front of medians, over bootstrap draws of shapes and seeds.
 

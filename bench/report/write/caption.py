@@ -13,7 +13,7 @@ from bench.report.data.records import Record, doubtful, setting, solid, view
 from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
 
-SMOKE_WARNING = "Made at scale=smoke, to try things out: nothing follows from these numbers."
+SMOKE_WARNING = "Made at scale=smoke, to try things out: do not interpret these numbers."
 MAX_REASON_LETTERS = 160  # the CSV has the full reason
 MAX_LISTED_NAMES = 4  # more are counted
 VARYING = "{shapes and seeds}"  # placeholder for what the runs of an experiment vary over
@@ -120,7 +120,7 @@ def _omitted(runs: Runs) -> str:
 
 def _mixed(runs: Runs) -> str:
     keys = runs.mixed()
-    return f"Runs differ in {_listed(keys)}: rows with other values do not compare." if keys else ""
+    return f"Runs differ in {_listed(keys)}: do not compare rows with different values." if keys else ""
 
 
 def _machines(runs: Runs) -> str:
@@ -128,14 +128,14 @@ def _machines(runs: Runs) -> str:
     if len(machines) < 2:
         return ""
     each = [f"{_machine(*machine) or 'unnamed machine'} ({_listed(rows)})" for machine, rows in machines.items()]
-    return f"Times of rows from different machines, numbers of threads or kernels do not compare: {'; '.join(each)}."
+    return f"Do not compare times of different machines, numbers of threads or kernels: {'; '.join(each)}."
 
 
 def _loaded(runs: Runs) -> str:
     names = [record["name"] for record in runs.named() if doubtful(record)]
     few = _listed(names) if len(names) <= MAX_LISTED_NAMES else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
-    return f"Doubtful times, see the notes of the run: {rows}." if names else ""
+    return f"Times are not reliable, see the notes of the runs: {rows}." if names else ""
 
 
 def _machine(cpu: Any, device: Any, threads: Any, compiled: bool) -> str:

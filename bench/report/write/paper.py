@@ -32,12 +32,12 @@ SHIPPED_ROW_PREFIX = "shipped: "
 HEAD = """# Results
 
 `make results` writes this page and [paper]({folder}): do not edit. Each question links to its page with the table, the
-figure and the notes. Beside the page are its table as CSV (raw numbers, in scene units), JSON and LaTeX, and its figure
+figure and the notes. The same folder has the table as CSV (raw numbers, in scene units), JSON and LaTeX, and the figure
 as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs of an experiment again. [conf](../conf/README.md)
 lists the experiments and how long they take. A page that cannot be drawn from rows names the version that drew it.
 
-`paper/NAME.runs.csv.gz` has the runs of the experiment NAME: one line per run, one column per field, and an empty cell
-where a run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.gz")` reads it, in the checkout's folder.
+`paper/NAME.runs.csv.gz` has the runs of the experiment NAME: one line per run, one column per field. A cell is empty if
+the run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.gz")` reads it, in the checkout's folder.
 
 | question | answer | experiment |
 |---|---|---|
