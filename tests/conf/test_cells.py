@@ -45,5 +45,5 @@ def write(scale: str) -> None:
 
 
 if __name__ == "__main__":
-    for asked in sys.argv[1:] or SCALES:
-        write(asked)
+    for scale_name in sys.argv[1:] or SCALES:
+        write(scale_name)

@@ -40,7 +40,7 @@ SHARED_ROWS = {
     "speed_accuracy": "speed_completion",
     "core": "core_complete",
 }  # an experiment that sweeps over rows that several share
-COMPARING = {"table1": 23, "fig4": 7, "fig5": 9, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
+COMPARING = {"table1": 24, "fig4": 7, "fig5": 9, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
 COMPARING |= {"core": 11}
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
