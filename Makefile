@@ -33,11 +33,12 @@ mutants: .venv/ready-dev ## installs mutmut, then changes the code in one place 
 results: .venv/ready ## for maintainers: writes what is shipped, results/paper and results/README.md, from results/local
 	$(BIN)/python -m bench.report ship=results
 
-lint: .venv/ready-dev ## ruff (lint and format), pyright, README's length
+lint: .venv/ready-dev ## ruff (lint and format), pyright, README's length, plain words
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/python -m tests.readme
+	$(BIN)/python -m tests.words
 
 setup: .venv/ready-dev
 

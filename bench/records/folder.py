@@ -82,7 +82,7 @@ class Identity:
         files += [_class_counts_hash(str(dataset["path"]))] if "synset" in dataset else []
         hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
         targets = {*_values_of_key(hashed, "_target_")}
-        targets |= {module for (part, key), module in LOADED_BY_NAME.items() if (hashed.get(part) or {}).get(key)}
+        targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}
         code = _our_code_hash(frozenset(targets), bool(packages))
         return digest([code, *(_package_hash(name) for name in packages), *files])
 
