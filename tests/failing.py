@@ -1,4 +1,4 @@
-"""A renderer that fails on request, in each of the ways in which runs end badly."""
+"""A renderer that fails on request, in each way in which a run can fail."""
 
 import ctypes
 import os
@@ -14,14 +14,12 @@ from renderers.rendering import Rendering
 
 
 class Failing:
-    """IDR, until it is asked for its third rendering with a gradient; then it fails as `how` says.
-
-    What is wrong with its silhouette loss is so from the first one on.
+    """IDR, except that its third rendering with a gradient fails; a wrong silhouette loss is wrong from the start.
 
     Args:
-        how: it fails, one of FAILURES.
+        how: the way to fail, one of FAILURES.
         pause: seconds before each rendering.
-        limits: unused here: seconds for each way to fail, to which the `time_limit` of a sweep over `how` refers.
+        limits: seconds for each way to fail. Unused here: the `time_limit` of a sweep over `how` refers to it.
     """
 
     capabilities = Capabilities(needs=(Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
@@ -52,7 +50,7 @@ def _not_a_number(rendering: Rendering) -> Rendering:
 
 
 def _short(rendering: Rendering) -> Rendering:
-    return Rendering(**{part: getattr(rendering, part)[:-1] for part in RENDERING_TENSORS})
+    return Rendering(**{name: getattr(rendering, name)[:-1] for name in RENDERING_TENSORS})
 
 
 def _loop(rendering: Rendering) -> Rendering:
