@@ -1,4 +1,4 @@
-"""Numbers of the papers that stand in YAML, typed a second time."""
+"""Numbers of the papers in YAML files, typed a second time."""
 
 from tests.looped import each
 
@@ -30,6 +30,6 @@ STATED = [
 @each("override, key, value, where", STATED)
 def test_a_number_of_a_paper_is_as_stated(compose_config, override, key, value, where):
     node = compose_config(override)
-    for part in key.split("."):
-        node = node[part]
+    for name in key.split("."):
+        node = node[name]
     assert node == value, where

@@ -63,7 +63,7 @@ def by_program(*arguments: str, cwd: Path = ROOT, **environment: str) -> Command
     """Runs Python with these arguments in a separate program, and with these environment variables."""
     program, variables = [sys.executable, *arguments], os.environ | environment
     completed = subprocess.run(
-        program, cwd=cwd, env=variables, capture_output=True, text=True, timeout=60 * PATIENCE, check=False
+        program, cwd=cwd, env=variables, capture_output=True, text=True, timeout=20 * PATIENCE, check=False
     )
     return CommandResult(completed.returncode, completed.stdout, completed.stderr)
 
