@@ -77,8 +77,7 @@ def test_samples_are_signed_distances_of_the_mesh():
     half = torch.tensor([[0.5, 0.2, 0.3], [0.5, 0.5, 0.3]])
     beyond = samples.points.abs() - half[:, None]
     exact = beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0)
-    assert samples.points.shape == (2, 600, 3)
-    assert torch.allclose(samples.distances, exact, atol=1e-5)
+    assert samples.points.shape == (2, 600, 3) and torch.allclose(samples.distances, exact, atol=1e-5)
     near = (samples.distances.abs() < 0.03).float().mean()
     assert 0.5 < near < 0.8  # half of the samples lie close to the surface, a third around it
 
@@ -158,8 +157,7 @@ def test_a_prior_of_colours_learns_them_and_is_kept(tmp_path):
         shapes = prior.decoder.at(prior.codes)
         wrong = (shapes.paint(samples.surface) - samples.colours).abs().mean()
         plain = (samples.colours.mean(dim=1, keepdim=True) - samples.colours).abs().mean()
-        assert wrong < 0.4 * plain
-        assert shapes(samples.surface).abs().mean() < 0.03
+        assert wrong < 0.4 * plain and shapes(samples.surface).abs().mean() < 0.03
         half = prior.codes[0] * torch.tensor([1.0] * 4 + [-1.0] * 4)  # the same shape with another texture
         points, other = samples.surface[0], prior.decoder.at(half)
         assert torch.equal(other(points), prior.decoder.at(prior.codes[0])(points))

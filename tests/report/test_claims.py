@@ -14,24 +14,21 @@ from tests.report.test_report_paper import page_of, write_run
 SHAPES = tuple(range(6))
 
 
-@each(
-    "expected, published, low, value, high, verdict",
-    [
-        (SMALLER, 0.5, 0.5, 0.8, 0.9, "holds"),  # half of the effect is 0.71
-        (SMALLER, 0.5, 0.75, 0.8, 0.9, "weaker"),
-        (SMALLER, 0.5, 0.75, 0.8, 1.1, "less than half the effect"),
-        (SMALLER, None, 0.5, 0.8, 0.9, "holds"),
-        (SMALLER, 0.5, 0.5, 0.6, 1.1, "not decided"),
-        (SMALLER, 0.5, 1.1, 1.2, 1.3, "does not hold"),
-        (NO_LARGER, None, 1.01, 1.1, 1.4, "larger (size not decided)"),
-        (NO_LARGER, None, 0.5, 0.6, 0.7, "holds"),
-        (NO_LARGER, None, 0.5, 1.0, 1.3, "not decided"),
-        (NO_LARGER, None, 1.3, 1.4, 1.5, "does not hold"),
-        (SMALLER, 0.5, nan, 0.6, nan, "as claimed, 4 shapes"),
-        (SMALLER, 0.5, nan, 1.6, nan, "against the claim, 4 shapes"),
-        (NO_LARGER, None, nan, 1.3, nan, "against the claim, 4 shapes"),
-    ],
-)
+@each("expected, published, low, value, high, verdict", [
+    (SMALLER, 0.5, 0.5, 0.8, 0.9, "holds"),  # half of the effect is 0.71
+    (SMALLER, 0.5, 0.75, 0.8, 0.9, "weaker"),
+    (SMALLER, 0.5, 0.75, 0.8, 1.1, "less than half the effect"),
+    (SMALLER, None, 0.5, 0.8, 0.9, "holds"),
+    (SMALLER, 0.5, 0.5, 0.6, 1.1, "not decided"),
+    (SMALLER, 0.5, 1.1, 1.2, 1.3, "does not hold"),
+    (NO_LARGER, None, 1.01, 1.1, 1.4, "larger (size not decided)"),
+    (NO_LARGER, None, 0.5, 0.6, 0.7, "holds"),
+    (NO_LARGER, None, 0.5, 1.0, 1.3, "not decided"),
+    (NO_LARGER, None, 1.3, 1.4, 1.5, "does not hold"),
+    (SMALLER, 0.5, nan, 0.6, nan, "as claimed, 4 shapes"),
+    (SMALLER, 0.5, nan, 1.6, nan, "against the claim, 4 shapes"),
+    (NO_LARGER, None, nan, 1.3, nan, "against the claim, 4 shapes"),
+])  # fmt: skip
 def test_a_verdict_follows_the_rule(expected, published, low, value, high, verdict):
     claim = Claim("a paper", "a claim", published, expected=expected)
     assert verdict_of(claim, Interval(value, low, high, (value,) * 4)) == verdict

@@ -116,15 +116,12 @@ def test_a_reason_stays_text_and_becomes_no_script(results):
         script(path)  # asserts that it holds data only, without < > & that could end it
 
 
-@each(
-    "environment, named",
-    [
-        ({"cpu": "Some CPU", "threads": 2, "device": "cpu"}, "Some CPU, 2 threads"),
-        ({"cpu": "Some CPU", "threads": 1, "device": "Some GPU"}, "Some CPU + Some GPU, 1 thread"),
-        ({}, ""),  # a run that ended in its set-up has no machine
-        ({"cpu": "Other CPU", "device": "cpu"}, ""),
-    ],
-)
+@each("environment, named", [
+    ({"cpu": "Some CPU", "threads": 2, "device": "cpu"}, "Some CPU, 2 threads"),
+    ({"cpu": "Some CPU", "threads": 1, "device": "Some GPU"}, "Some CPU + Some GPU, 1 thread"),
+    ({}, ""),  # a run that ended in its set-up has no machine
+    ({"cpu": "Other CPU", "device": "cpu"}, ""),
+])  # fmt: skip
 def test_a_machine_is_named_by_what_times_depend_on(environment, named):
     assert machine(record("a", environment=environment)) == named
 
@@ -170,21 +167,16 @@ def test_command_prints_the_page_last(results, capsys):
     assert printed.out.splitlines()[-1] == str(results / "index.html") and (results / "index.html").is_file()
 
 
-@each(
-    "argument, named",
-    [
-        ("results_dir=/no/such/folder", "there is no such folder; name one that has runs, or make a run"),
-        ("result_dir=x", "argument must be one of results_dir=PATH"),
-        ("results_dir=", "results_dir has no value: type results_dir=PATH"),
-        ("meshes=many", "a number of runs or all"),
-        ("columns=Step", "columns.PAGE=HEADING,HEADING, ship=PATH, found 'columns=Step'"),
-        ("columns.table1=", "columns.table1 has no value: type columns.PAGE=HEADING,HEADING"),
-    ],
-)
+@each("argument, named", [
+    ("results_dir=/no/such/folder", "there is no such folder; name one that has runs, or make a run"),
+    ("result_dir=x", "argument must be one of results_dir=PATH"),
+    ("results_dir=", "results_dir has no value: type results_dir=PATH"), ("meshes=many", "a number of runs or all"),
+    ("columns=Step", "columns.PAGE=HEADING,HEADING, ship=PATH, found 'columns=Step'"),
+    ("columns.table1=", "columns.table1 has no value: type columns.PAGE=HEADING,HEADING"),
+])  # fmt: skip
 def test_command_refuses_unknown_arguments(argument, named, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main([argument]) == 2
-    assert named in capsys.readouterr().err
+    assert main([argument]) == 2 and named in capsys.readouterr().err
     assert not list(tmp_path.iterdir())  # nothing is written before all is known to be sound
 
 

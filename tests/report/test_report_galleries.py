@@ -103,8 +103,7 @@ def test_shapes_from_many_views_have_the_truth_and_the_start_in_their_row(tmp_pa
     assert list(dict.fromkeys(row for row, _ in colours)) == [f"car {index}" for index in range(4)]
     normals = {"truth": TOWARDS, "start": RIGHT, "DIST": UP, "Mesh, 48³": RIGHT}
     assert all(colours["car 0", column] == COLOURS[normal] for column, normal in normals.items())
-    assert notes(result.figure) == ["diverged"]
-    assert "n = 8 runs (4 shapes, 1 seed)" in result.caption
+    assert notes(result.figure) == ["diverged"] and "n = 8 runs (4 shapes, 1 seed)" in result.caption
 
 
 def test_misplaced_shapes_are_in_the_order_of_the_displacement(tmp_path):

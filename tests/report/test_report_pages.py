@@ -40,29 +40,21 @@ def record(**changed) -> dict:
     return {"renderer": "dist", "method": "", "dataset": "car", "config": {}, **changed}
 
 
-@each(
-    "changed, preset, name",
-    [
-        ({"renderer": "dist_aggressive"}, "dist_aggressive", "dist_aggressive"),
-        ({"renderer": "dist_capped", "config": {"renderer": {"_label_": "capped"}}}, "dist_capped", "capped"),
-        ({"config": {"label": "mine", "renderer": {"_label_": "DIST"}}}, "dist", "mine"),
-        ({"method": "dist_mask", "config": {"label": "DIST with mask"}}, "dist_mask", "DIST with mask"),
-        ({"method": "pose_icp_plane"}, "pose_icp_plane", "dist"),
-    ],
-)
+@each("changed, preset, name", [
+    ({"renderer": "dist_aggressive"}, "dist_aggressive", "dist_aggressive"),
+    ({"renderer": "dist_capped", "config": {"renderer": {"_label_": "capped"}}}, "dist_capped", "capped"),
+    ({"config": {"label": "mine", "renderer": {"_label_": "DIST"}}}, "dist", "mine"),
+    ({"method": "dist_mask", "config": {"label": "DIST with mask"}}, "dist_mask", "DIST with mask"),
+    ({"method": "pose_icp_plane"}, "pose_icp_plane", "dist"),
+])  # fmt: skip
 def test_a_row_is_its_preset_under_a_name(changed, preset, name):
     assert row_of(record(**changed)) == Row(preset, name)
 
 
-@each(
-    "renderer, target, base",
-    [
-        ("dist_aggressive", "renderers.DIST", "dist"),
-        ("dvr", "renderers.DVR", "dvr"),
-        ("mine", "mypkg.rendering.Mine", "mine"),
-        ("naive", None, "naive"),
-    ],
-)
+@each("renderer, target, base", [
+    ("dist_aggressive", "renderers.DIST", "dist"), ("dvr", "renderers.DVR", "dvr"),
+    ("mine", "mypkg.rendering.Mine", "mine"), ("naive", None, "naive"),
+])  # fmt: skip
 def test_the_base_of_a_preset_is_its_class_or_a_users_preset(renderer, target, base):
     assert base_renderer(record(renderer=renderer, config={"renderer": {"_target_": target}})) == base
 

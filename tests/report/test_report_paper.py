@@ -133,17 +133,12 @@ def test_the_newest_run_counts_and_a_row_keeps_its_position(tmp_path):
     assert [(r["config"]["label"], r["metrics"]["queries"]) for r in records] == [("a", 3), ("b", 1), ("c", 4)]
 
 
-@each(
-    "changed, merged",
-    [
-        ({"settings": {"view": {"resolution": 32}}}, False),
-        ({"settings": {"dataset": {"name": "sofa"}}}, False),
-        ({"environment": {**MACHINE, "threads": 4}}, True),
-        ({"environment": {}, "status": "crashed"}, True),
-        ({"settings": {"results_dir": "elsewhere", "verbose": True, "packages": ["mine"], "priors_dir": "p"}}, True),
-        ({"settings": {"renderer": {"epsilon": 1e-3}, "seed": 5, "index": 2}, "renderer": "dvr"}, True),
-    ],
-)
+@each("changed, merged", [
+    ({"settings": {"view": {"resolution": 32}}}, False), ({"settings": {"dataset": {"name": "sofa"}}}, False),
+    ({"environment": {**MACHINE, "threads": 4}}, True), ({"environment": {}, "status": "crashed"}, True),
+    ({"settings": {"results_dir": "elsewhere", "verbose": True, "packages": ["mine"], "priors_dir": "p"}}, True),
+    ({"settings": {"renderer": {"epsilon": 1e-3}, "seed": 5, "index": 2}, "renderer": "dvr"}, True),
+])  # fmt: skip
 def test_only_what_may_be_compared_is_merged(tmp_path_factory, changed, merged):
     results = tmp_path_factory.mktemp("results")
     write_run(results, "table1", DYNAMIC, metrics=costs(), **changed)
@@ -243,8 +238,7 @@ def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_pat
         ("columns.tabel1=Step", "columns.tabel1: no table of that name; there are table1, gradients, "),
     ):
         capsys.readouterr()
-        assert main([f"results_dir={copy}", argument]) == 2
-        assert named in capsys.readouterr().err
+        assert main([f"results_dir={copy}", argument]) == 2 and named in capsys.readouterr().err
 
 
 def gradient_metrics(factor: float = 1.0, camera: bool = True) -> dict:

@@ -101,8 +101,7 @@ def test_the_charts_of_the_page_have_the_numbers_and_lead_to_the_runs(four_setti
 def test_a_checkpoint_has_the_costs_before_it(four_settings):
     data = page_of(four_settings, "speed_curves").data
     good = data[(data["row"] == "good") & (data["index"] == 0)]
-    assert good["error"].tolist() == [9, 5, 3, 0.5]
-    assert good["seconds"].tolist() == [0, 1, 2, 3]
+    assert good["error"].tolist() == [9, 5, 3, 0.5] and good["seconds"].tolist() == [0, 1, 2, 3]
     assert good["value_evaluations"].tolist() == [0, 100, 200, 300]
     assert good["loss"].tolist()[:3] == [5, 4, 3] and math.isnan(good["loss"].iloc[3])
 
@@ -153,8 +152,7 @@ def test_a_validation_shape_is_not_taken_for_a_test_shape(tmp_path):
     write_run(tmp_path, "speed_completion", "dist", task="completion", dataset="sofa", metrics={"chamfer_l2": 9},
               settings=settings, minute=0)  # fmt: skip
     result = page_of(tmp_path, "speed_front")
-    assert result.data["error"].tolist() == [1.0]
-    assert "Not shown: 1 run" in page_text(result)
+    assert result.data["error"].tolist() == [1.0] and "Not shown: 1 run" in page_text(result)
 
 
 def test_renderings_of_another_size_are_not_compared(tmp_path):

@@ -176,8 +176,7 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     swept_and_ran(tmp_path, cells, (0.001, 0.001))
     report([f"results_dir={tmp_path}"])
     folder = tmp_path / "sweeps" / "completion-1"
-    assert str(folder / "table.csv") in capsys.readouterr().out
-    assert not (tmp_path / "paper").exists()
+    assert str(folder / "table.csv") in capsys.readouterr().out and not (tmp_path / "paper").exists()
     (page,) = find_sweeps(tmp_path)
     assert (page.name, page.shown.title) == ("completion-1", "Sweep completion-1.")
     assert page.shown.columns[:2] == ["Run", "Chamfer (x1000) ↓"] and page.shown.rows[0][:2] == ["DIST", "1.00"]

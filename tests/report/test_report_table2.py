@@ -141,10 +141,8 @@ def test_the_figure_has_a_panel_a_family_and_a_line_a_row(tmp_path):
     figure = page_of(tmp_path, "table2").figure
     (axis,) = [axis for axis in figure.axes if axis.axison]
     lines = {line.get_label(): line.get_ydata() for line in axis.lines}
-    assert list(lines[REFERENCE]) == [1.0, 1.0]
-    assert all(math.isnan(y) for y in lines[OTHER])
-    assert lines["1.5 times that"][0] == pytest.approx(0.3)
-    assert axis.get_title() == "sofa"
+    assert list(lines[REFERENCE]) == [1.0, 1.0] and all(math.isnan(y) for y in lines[OTHER])
+    assert lines["1.5 times that"][0] == pytest.approx(0.3) and axis.get_title() == "sofa"
 
 
 def write_prior_fit(results, chamfer, **changed):

@@ -204,21 +204,18 @@ def test_a_mesh_that_names_a_texture_reads_no_other_file(tmp_path, caplog):
     assert len(read_ply(tmp_path / "mesh.ply").faces) == 1280 and not caplog.records
 
 
-@each(
-    "change, why",
-    [
-        (lambda content: content[:-40], "unexpected length"),
-        (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "unexpected length"),
-        (lambda content: content.replace(b"binary_little", b"binary_big"), "not of its vertices"),
-        (lambda content: content.replace(b"double x", b"double u"), "no field of name x"),
-        (lambda content: content.replace(b"double x", b"double y"), "could not be read"),
-        (lambda content: content.replace(b"double x", b"object x"), "could not be read"),
-        (lambda content: content.replace(b"uchar int", b"double int"), "could not be read"),
-        (lambda content: b"", "Not a ply file"),
-        (lambda content: content[:-4] + b"\xff\xff\xff\x7f", "not of its vertices"),
-        (lambda content: content[:MESH_HEADER_BYTES] + b"\xff" * 8 + content[MESH_HEADER_BYTES + 8 :], "not finite"),
-    ],
-)
+@each("change, why", [
+    (lambda content: content[:-40], "unexpected length"),
+    (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "unexpected length"),
+    (lambda content: content.replace(b"binary_little", b"binary_big"), "not of its vertices"),
+    (lambda content: content.replace(b"double x", b"double u"), "no field of name x"),
+    (lambda content: content.replace(b"double x", b"double y"), "could not be read"),
+    (lambda content: content.replace(b"double x", b"object x"), "could not be read"),
+    (lambda content: content.replace(b"uchar int", b"double int"), "could not be read"),
+    (lambda content: b"", "Not a ply file"),
+    (lambda content: content[:-4] + b"\xff\xff\xff\x7f", "not of its vertices"),
+    (lambda content: content[:MESH_HEADER_BYTES] + b"\xff" * 8 + content[MESH_HEADER_BYTES + 8 :], "not finite"),
+])  # fmt: skip
 def test_a_mesh_that_cannot_be_read_is_an_error(tmp_path, change, why):
     made.write_mesh(tmp_path / "mesh.ply")
     (tmp_path / "mesh.ply").write_bytes(change((tmp_path / "mesh.ply").read_bytes()))

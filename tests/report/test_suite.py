@@ -451,8 +451,7 @@ def test_a_few_problems_of_the_user_are_compared_with_shipped_rows_on_these_only
      ("models.size=free", "is stated by the suite")],
 )  # fmt: skip
 def test_a_wrong_argument_is_named(argument, words, capsys):
-    assert main([argument]) == 2
-    assert words in capsys.readouterr().err
+    assert main([argument]) == 2 and words in capsys.readouterr().err
 
 
 def test_a_label_of_a_shipped_row_is_refused(tmp_path, monkeypatch):
