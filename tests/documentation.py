@@ -132,17 +132,17 @@ def make_files(folder: Path) -> dict[str, str]:
     return {word: str(path) for word, path in named.items()} | {"SCANS": str(folder / "scans")}
 
 
-def filled(command: Command, made: dict[str, str]) -> list[str]:
+def filled(command: Command, paths: dict[str, str]) -> list[str]:
     """A command's arguments, with the paths of files for its placeholders and without `...`."""
-    named = {"NAME": "sofa", **made}
+    named = {"NAME": "sofa", **paths}
     if SCANS.search(str(command)):
-        named["FOLDER"] = made["SCANS"]
+        named["FOLDER"] = paths["SCANS"]
     elif DENSE_DEPTHS in command.words:
-        named["FOLDER"] = made["DEPTHS"]
+        named["FOLDER"] = paths["DEPTHS"]
     elif NETWORK.search(str(command)):
-        named |= {"FOLDER": made["NETWORK"], "FILE": made["fox.npz"]}
+        named |= {"FOLDER": paths["NETWORK"], "FILE": paths["fox.npz"]}
     elif "dataset=mesh" in command.words:
-        named |= {"FOLDER": made["chairs/"], "FILE": made["YOURS.obj"]}
+        named |= {"FOLDER": paths["chairs/"], "FILE": paths["YOURS.obj"]}
     folders = ["--config-dir", "my_conf", "packages=[my_package]"] if command.arguments == ("renderer=mine",) else []
-    kept = [argument for argument in (*folders, *command.arguments) if argument not in ("...", "...,")]
-    return [key + equals + named.get(value, value) for key, equals, value in (word.rpartition("=") for word in kept)]
+    words = [argument for argument in (*folders, *command.arguments) if argument not in ("...", "...,")]
+    return [key + equals + named.get(value, value) for key, equals, value in (word.rpartition("=") for word in words)]

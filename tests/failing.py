@@ -84,23 +84,13 @@ def _segfault(rendering: Rendering) -> Rendering:
 
 
 def _hog(rendering: Rendering) -> Rendering:
-    kept = []
+    tensors = []
     while True:
-        kept.append(torch.ones(2**24))  # 64 MiB, written to
+        tensors.append(torch.ones(2**24))  # 64 MiB, written to
 
 
-FAILURES = {
-    "not": lambda rendering: rendering,
-    "raise": _raise,
-    "not_a_number": _not_a_number,
-    "short": _short,
-    "loop": _loop,
-    "native_loop": _native_loop,
-    "leave": _leave,
-    "kill": _kill,
-    "terminate": _terminate,
-    "segfault": _segfault,
-    "hog": _hog,
-    "detached_loss": lambda rendering: rendering,
-}
+_WAYS = (_raise, _not_a_number, _short, _loop, _native_loop, _leave, _kill, _terminate, _segfault, _hog)
+FAILURES = {way.__name__[1:]: way for way in _WAYS} | dict.fromkeys(
+    ("not", "detached_loss"), lambda rendering: rendering
+)
 LOSSES = {"detached_loss": lambda loss: loss.detach() + 1}

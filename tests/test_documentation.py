@@ -48,7 +48,7 @@ ENDED = ("ok", "not_reached", "empty", "diverged", "timeout", "oom", "unsupporte
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory) -> Iterator[dict[str, str]]:
+def placeholder_paths(tmp_path_factory) -> Iterator[dict[str, str]]:
     """The paths of placeholders in commands; the code of CONTRIBUTING can be imported."""
     folder = tmp_path_factory.mktemp("documentation")
     named = documentation.make_files(folder)
@@ -77,9 +77,9 @@ def test_every_command_is_there():
     assert [name for name in packages if importlib.util.find_spec(f"{name}.__main__") is None] == []
 
 
-def test_every_command_composes(made):
+def test_every_command_composes(placeholder_paths):
     for command in COMPOSED:
-        arguments = filled(command, made)
+        arguments = filled(command, placeholder_paths)
         if "+experiment=sofa" in arguments:  # stands for any, which the tests of conf compose
             continue
         config = first_cell(arguments).config
@@ -118,12 +118,17 @@ def test_the_code_of_the_readme_runs(tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def task_results(made, tmp_path_factory) -> Path:
+def task_results(placeholder_paths, tmp_path_factory) -> Path:
     """The results of the sweep of CONTRIBUTING's experiment over its task."""
     results = tmp_path_factory.mktemp("task") / "results"
     (sweep,) = [command for command in COMMANDS if "+experiment=coverage" in command.words]
     result = typed(
-        *filled(sweep, made), "dataset=sofa", "scale=smoke", "isolation=off", "threads=1", f"results_dir={results}"
+        *filled(sweep, placeholder_paths),
+        "dataset=sofa",
+        "scale=smoke",
+        "isolation=off",
+        "threads=1",
+        f"results_dir={results}",
     )
     assert result.code == 0, result.err
     return results
@@ -134,9 +139,9 @@ def test_the_task_of_contributing_counts_what_it_says(task_results):
     assert list(runs.status) == ["ok"] * 2 and (runs.hits > 100).all()
 
 
-def test_the_dataset_of_contributing_is_completed(made, tmp_path):
+def test_the_dataset_of_contributing_is_completed(placeholder_paths, tmp_path):
     (command,) = [command for command in COMMANDS if "dataset=rings" in command.words]
-    result = typed(*filled(command, made), *SMALL, "field=box", f"results_dir={tmp_path}")
+    result = typed(*filled(command, placeholder_paths), *SMALL, "field=box", f"results_dir={tmp_path}")
     assert result.out, result.err
     record = bench.load(tmp_path).iloc[0]
     assert record.scene == "rings test 0" and record.status in ENDED
@@ -161,9 +166,9 @@ def test_the_study_of_contributing_is_a_table(task_results, tmp_path, monkeypatc
     assert not list((task_results / "sweeps").glob("*/table.csv"))  # a page shows it
 
 
-def first_arguments(command: Command, made: dict[str, str]) -> list[str]:
+def first_arguments(command: Command, placeholder_paths: dict[str, str]) -> list[str]:
     """The arguments of the first cell of a command, on this machine."""
-    options = options_of([text for text in filled(command, made) if not text.startswith("hydra")])
+    options = options_of([text for text in filled(command, placeholder_paths) if not text.startswith("hydra")])
     typed = [text.partition("=")[0] for text in options.overrides]
     with composing(*config_dirs(options)):
         composer = Composer([*options.overrides, "scale=smoke"] if options.multirun else options.overrides)
@@ -180,30 +185,30 @@ def first_arguments(command: Command, made: dict[str, str]) -> list[str]:
 @pytest.mark.parametrize(
     "command", [c for c in COMPOSED if c.module == "bench" and not re.search("NAME|plan=true", str(c))], ids=str
 )
-def test_every_command_runs(made, tmp_path, command):
+def test_every_command_runs(placeholder_paths, tmp_path, command):
     if {"+method=stereo", documentation.DENSE} & set(command.words):
         pytest.importorskip("cv2", reason="stereo is an extra: pip install -e '.[stereo]'")
     fitted = {"+experiment=table1", "+experiment=gradients"} & set(command.words)
     small = SMALL_EVALUATION if "+method=single_view" in command.words else SMALL_FITTED_NETWORK if fitted else QUICK
-    result = typed(*first_arguments(command, made), *small, f"results_dir={tmp_path}")
+    result = typed(*first_arguments(command, placeholder_paths), *small, f"results_dir={tmp_path}")
     assert result.out, result.err
     record = bench.load(tmp_path).iloc[0]
     assert record.status in ENDED, record.reason
 
 
 @pytest.mark.slow
-def test_the_other_commands_run(made, tmp_path):
+def test_the_other_commands_run(placeholder_paths, tmp_path):
     """All run in one folder, which has a run, results folders and a folder of photographs."""
     result = typed("renderer=newton", *QUICK, f"results_dir={tmp_path / 'A'}")
-    named = made | dict.fromkeys(("RUN", "RUN..."), result.out.splitlines()[-1])
+    named = placeholder_paths | dict.fromkeys(("RUN", "RUN..."), result.out.splitlines()[-1])
     for other in ("B", "C", "BEFORE", "AFTER"):
         shutil.copytree(tmp_path / "A", tmp_path / other)
     named["PATH"] = str(tmp_path / "A")
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "local").symlink_to(tmp_path / "A")
-    elsewhere = ("bench", "pytest", "bench.judge", "bench.suite")  # tested in files of their own
-    here = [c for c in COMMANDS if c.module not in elsewhere]
-    for command in here:
+    elsewhere_tested = ("bench", "pytest", "bench.judge", "bench.suite")  # tested in files of their own
+    tested = [c for c in COMMANDS if c.module not in elsewhere_tested]
+    for command in tested:
         words = filled(command, named) + (list(QUICK) if command.module in HYDRA else [])
         ran = by_program("-m", command.module, *words, cwd=tmp_path, PYTHONPATH=str(ROOT))
         explained = "has no runs of the tuning" in ran.err or (ran.code == 2 and not command.arguments)
@@ -211,9 +216,9 @@ def test_the_other_commands_run(made, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_contract_of_contributing_holds(made, tmp_path):
+def test_the_contract_of_contributing_holds(placeholder_paths, tmp_path):
     (contract,) = [command for command in COMMANDS if command.module == "pytest"]
-    paths = os.pathsep.join([str(ROOT), str(Path(made["my_conf"]).parent)])
+    paths = os.pathsep.join([str(ROOT), str(Path(placeholder_paths["my_conf"]).parent)])
     ran = by_program("-m", "pytest", *contract.arguments, PYTHONPATH=paths)
     assert ran.code == 0, ran.out[-3000:]
 

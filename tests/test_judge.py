@@ -93,8 +93,8 @@ def test_a_cloud_is_a_truth_and_has_no_normals(files, capsys):
 
 
 def test_in_the_unit_sphere_the_size_of_the_files_does_not_count(files, capsys):
-    made = [read_mesh(files / name / "small.ply") for name in ("truth", "found")]
-    for mesh, name in zip(made, ("a", "small"), strict=True):
+    meshes = [read_mesh(files / name / "small.ply") for name in ("truth", "found")]
+    for mesh, name in zip(meshes, ("a", "small"), strict=True):
         mesh.moved(np.array([[7.0, 0, 0, 50], [0, 7, 0, 1], [0, 0, 7, -9], [0, 0, 0, 1]])).save(files / f"{name}.ply")
     first = judged(capsys, *pair(files, "small"), "--unit-sphere")
     second = judged(capsys, files / "small.ply", "--truth", files / "a.ply", *FEW, "--unit-sphere")

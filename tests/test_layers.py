@@ -142,31 +142,23 @@ def test_conf_holds_yaml_only():
 
 
 WRONG = (
-    ("renderers.dist", "from datasets.scene import Scene"),
+    ("renderers.dist", "from datasets.scene import Scene"), ("renderers.dist", "import numpy as np"),
     ("renderers.dist", "def f():\n    from bench.config import build"),
-    ("renderers.dist", "import numpy as np"),
     ("renderers.fields.mlp", "from ...bench import config"),
-    ("datasets.scene", "import bench.records"),
-    ("datasets.scene", "if True:\n    import conf"),
+    ("datasets.scene", "import bench.records"), ("datasets.scene", "if True:\n    import conf"),
     ("bench.runner.run", "from tests.renderers.analytic_cases import CASES"),
     ("bench.runner.run", "from bench.report.write.html import write_index"),
-    ("bench.records.record", "def f():\n    import bench.report"),
-    ("bench.records.record", "import torch"),
-    ("bench.runner.run", "from bench.merge import merge"),
-    ("bench.report.write.html", "from torch import Tensor"),
-    ("bench.report.write.html", "from bench import solve"),
+    ("bench.records.record", "def f():\n    import bench.report"), ("bench.records.record", "import torch"),
+    ("bench.runner.run", "from bench.merge import merge"), ("bench.report.write.html", "from torch import Tensor"),
+    ("bench.report.write.html", "from bench import solve"), ("bench.report", "import renderers"),
     ("bench.report.write.html", "from ...solve.solve import COST_DEFINITIONS"),
-    ("bench.report", "import renderers"),
-    ("bench", "import torch"),
-    ("conf", "from bench import config"),
-    ("bench.runner.run", "from os import *"),
-    ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"),
-    ("tests.test_layers", "from sys import path"),
+    ("bench", "import torch"), ("conf", "from bench import config"), ("bench.runner.run", "from os import *"),
+    ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"), ("tests.test_layers", "from sys import path"),
     ("bench.__main__", "import bench.studies.completion"),
     ("bench.report.write.html", "from ...studies.completion import make"),
     ("bench.studies.completion", "from .table1 import make"),
     ("bench.studies.completion", "from bench.setup.inputs import Task"),
-)
+)  # fmt: skip
 RIGHT = (
     ("renderers.dist", "import math\nimport torch\nfrom jaxtyping import Float\nfrom renderers.field import Field"),
     ("renderers.fields.mlp", "from ..field import Kind\nfrom .analytic import Shape"),
@@ -174,11 +166,10 @@ RIGHT = (
     ("bench.runner.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
     ("bench.__main__", "from bench.report.write.html import write_index"),
     ("bench.report.write.html", "import plotly, os.path\nfrom bench.records import format\nfrom . import caption"),
-    ("bench", "import os"),
-    ("benchmark.report", "import datasets_of_others"),
+    ("bench", "import os"), ("benchmark.report", "import datasets_of_others"),
     ("bench.report.write.paper", "from bench import studies"),
     ("bench.studies.completion", "import pandas as pd\nfrom bench.report.data.statistics import geometric"),
-)
+)  # fmt: skip
 
 
 def test_the_checker_finds_what_is_wrong_and_lets_pass_what_is_right():

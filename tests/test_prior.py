@@ -50,7 +50,7 @@ class Boxes:
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory):
+def cached_prior(tmp_path_factory):
     """A folder with a prior that was trained once, and the prior."""
     folder = tmp_path_factory.mktemp("a cache") / "priors"
     return folder, prior_for(Boxes(), SETTINGS, folder, CPU, silent)
@@ -60,8 +60,8 @@ def never(*_, **__):
     raise AssertionError("a prior was trained although there is one")
 
 
-def test_a_prior_learns_its_shapes(kept):
-    _, prior = kept
+def test_a_prior_learns_its_shapes(cached_prior):
+    _, prior = cached_prior
     samples = distance_samples(Boxes(), Split.TRAIN, replace(SETTINGS, seed=9), 3, silent)
     fitted, mean_shape = fit_error(prior.decoder, samples, None), fit_error(prior.decoder, samples, None, steps=0)
     assert mean_shape > 0.05 and fitted < 0.25 * mean_shape
@@ -110,8 +110,8 @@ def test_beyond_its_truncation_a_prior_is_not_constrained():
         replace(SETTINGS, truncation=0.0)
 
 
-def test_a_prior_is_kept_with_its_record(kept):
-    folder, prior = kept
+def test_a_prior_is_kept_with_its_record(cached_prior):
+    folder, prior = cached_prior
     key = prior_key(Boxes(), SETTINGS)
     assert sorted(path.name for path in folder.glob("[!.]*")) == [f"boxes-{key}.json", f"boxes-{key}.safetensors"]
     record = json.loads((folder / f"boxes-{key}.json").read_text())
@@ -138,8 +138,8 @@ def test_a_prior_of_one_shape_is_evaluated_on_that_shape_at_its_code(tmp_path, m
     assert record["surface_error"]["training"] < 0.02
 
 
-def test_a_kept_prior_is_loaded_and_not_trained_again(kept, monkeypatch):
-    folder, prior = kept
+def test_a_kept_prior_is_loaded_and_not_trained_again(cached_prior, monkeypatch):
+    folder, prior = cached_prior
     monkeypatch.setattr(prior_store, "train", never)
     again = prior_for(Boxes(), SETTINGS, folder, CPU, silent)
     points = torch.rand(100, 3)
@@ -165,8 +165,8 @@ def test_a_prior_of_colours_learns_them_and_is_kept(tmp_path):
     assert find_prior(Boxes(), replace(settings, colour=replace(colour, size=0.5)), tmp_path) is None
 
 
-def test_another_dataset_or_setting_has_another_key(kept, monkeypatch):
-    folder, _ = kept
+def test_another_dataset_or_setting_has_another_key(cached_prior, monkeypatch):
+    folder, _ = cached_prior
     changes = ({"steps": 401}, {"seed": 1}, {"network": replace(SETTINGS.network, width=47)})
     assert all(find_prior(Boxes(), replace(SETTINGS, **change), folder) is None for change in changes)
     assert find_prior(Boxes(widest=0.6), SETTINGS, folder) is None
@@ -175,8 +175,8 @@ def test_another_dataset_or_setting_has_another_key(kept, monkeypatch):
     assert find_prior(Boxes(), SETTINGS, folder) is None
 
 
-def test_a_damaged_prior_is_an_error_with_a_remedy(kept, tmp_path):
-    path = find_prior(Boxes(), SETTINGS, kept[0])
+def test_a_damaged_prior_is_an_error_with_a_remedy(cached_prior, tmp_path):
+    path = find_prior(Boxes(), SETTINGS, cached_prior[0])
     (tmp_path / path.name).write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=rf"the prior .*{path.name} cannot be read .*: delete it, and it is trained"):
         prior_for(Boxes(), SETTINGS, tmp_path, CPU, silent)

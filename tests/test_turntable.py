@@ -21,8 +21,8 @@ RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 
 def ball(radius: float = 0.8, centre: tuple[float, float, float] = (0, 0, 0), split: int = 0) -> Mesh:
     """A sphere, red on the negative side of the axis `split` and blue on the other."""
-    made = icosphere(radius, centre)
-    return replace(made, colours=np.where(made.vertices[:, [split]] < centre[split], RED, BLUE))
+    sphere = icosphere(radius, centre)
+    return replace(sphere, colours=np.where(sphere.vertices[:, [split]] < centre[split], RED, BLUE))
 
 
 def frames_of(path: Path) -> list[np.ndarray]:

@@ -112,9 +112,9 @@ def camera_of(pixels: int, *, field_of_view: float = 50.0, angles: tuple[float, 
     return ViewSampler(2.5, field_of_view, (0.0, 0.0), (0.0, 0.0), pixels).camera(*angles)
 
 
-def mesh_of(made: trimesh.Trimesh) -> Mesh:
+def mesh_of(mesh: trimesh.Trimesh) -> Mesh:
     """A mesh of trimesh as a `Mesh`."""
-    return Mesh(np.array(made.vertices), np.array(made.faces))
+    return Mesh(np.array(mesh.vertices), np.array(mesh.faces))
 
 
 def icosphere(radius: float, centre: Any = (0.0, 0.0, 0.0), subdivisions: int = 4) -> Mesh:
@@ -132,22 +132,14 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
     blank = torch.zeros(camera.height, camera.width)
     view = View(camera, blank, blank[..., None].expand(-1, -1, 3), blank.bool())
     scene = Scene("a scene", TRIANGLE, view)
+    sizes = {"grid": 16, "points": 50, "fscore_threshold": 0.02, "picture": 8}
     inputs = RunInputs(
-        renderer=renderer,
-        scene_name=scene.name,
-        make_scene=lambda: scene,
-        views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
-        make_prior=lambda: prior,
-        make_pixel_precise=lambda: (renderer, []),
-        evaluation=EvaluationSettings(
-            grid=16, points=50, fscore_threshold=0.02, picture=8, gallery=None, every=None, film=None
-        ),
-        seed=0,
-        device=CPU,
-        cache=folder / "cache",
-        field=FieldChoice("prior", None),
+        renderer=renderer, scene_name=scene.name, make_scene=lambda: scene, make_prior=lambda: prior,
+        make_pixel_precise=lambda: (renderer, []), views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
+        evaluation=EvaluationSettings(**sizes, gallery=None, every=None, film=None), seed=0, device=CPU,
+        cache=folder / "cache", field=FieldChoice("prior", None),
         prior_choice=PriorChoice(SceneNetwork(prior.decoder, prior.codes, DISTANCE_FACTS, ()), scene_code=0),
-    )
+    )  # fmt: skip
     record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
     record.environment = {"gemm_peak_flops": PEAK}
     return RunContext(replace(inputs, **changed), folder, record, silent)

@@ -113,8 +113,8 @@ def test_a_table_has_no_row_twice_and_no_text_that_should_be_a_number(table):
 def builds(config: DictConfig) -> None:
     """Asserts that all of a configuration resolves, and that its nodes build objects of their kinds."""
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    made = {node: build_part(config, node) for node in PARTS}  # other nodes read the scale
-    assert all(isinstance(made[node], kind) for node, kind in KINDS.items())
+    built = {node: build_part(config, node) for node in PARTS}  # other nodes read the scale
+    assert all(isinstance(built[node], kind) for node, kind in KINDS.items())
     build(config.view, "view", target="datasets.views.ViewSampler")
 
 
@@ -344,8 +344,8 @@ def test_a_user_renderer_needs_only_its_class(compose_config, tmp_path, monkeypa
     with pytest.raises(ValueError, match=r"names 'mypkg_of_mine\.Yours', which cannot be imported"):
         build_part(compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Yours"), "renderer")
     config = compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "+renderer.size=3")
-    made, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
-    assert (type(made).__name__, made.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
+    built, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
+    assert (type(built).__name__, built.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
     with pytest.raises(ValueError, match="renderer has no key 'sise': did you mean size"):
         load("renderer", "custom", _target_="mypkg_of_mine.Mine", sise=3)
     with pytest.raises(ValueError, match=r"dataset\._target_ names 'mypkg_of_mine\.Mine': type packages="):

@@ -2,7 +2,7 @@
 
 from tests.looped import each
 
-# Override of the default configuration, key, value, and where the paper states it.
+# Override of the default configuration, key, value, and the source in the paper.
 STATED = [
     ("renderer=idr", "renderer.mask_weight", 100.0, "IDR: rho"),
     ("renderer=idr", "renderer.mask_sharpness", 50.0, "IDR: its sharpness at the start"),

@@ -64,8 +64,8 @@ def test_user_renderers_have_rows_in_an_experiment_that_compares_renderers(tmp_p
         assert row_name(cells[name].config, name) == f"{label}, DIST's mask loss"
     under_another = cells["dist"].config | {"silhouette": {"_label_": "IDR's mask loss"}}
     assert row_name(under_another, "dist") == "DIST, our default, IDR's mask loss"
-    made = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])
-    assert (type(made).__name__, made.size) == ("Mine", 3)
+    built = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])
+    assert (type(built).__name__, built.size) == ("Mine", 3)
     assert cells["mine_first"].config["renderer"]["size"] == 4
     assert cells["mine_on_keinert"].config["renderer"]["alpha"] == 1.1
     assert not any({"_rows_", "_look_"} & {*cell.config["renderer"]} for cell in plan.cells)

@@ -53,7 +53,7 @@ def ratio_of_eight(ratios):
     return statistics.ratio([np.array([ratio]) for ratio in ratios * 4], [np.ones(1)] * 8)
 
 
-def kept(runs, keep):
+def page_of_kept(runs, keep):
     """The page of the runs that `keep` selects."""
     return page(type(runs)(runs.selection, runs.results_dir, [*filter(keep, runs.records)]))
 
@@ -93,7 +93,7 @@ def test_conditions_stand_from_many_points_to_few():
 
 
 def test_without_the_reference_there_is_no_ratio_and_no_verdict(complete_runs):
-    result = kept(complete_runs, lambda record: record["renderer"] != "dist")
+    result = page_of_kept(complete_runs, lambda record: record["renderer"] != "dist")
     assert set(result.data["ratio"]) == {""} and "ratios to" not in result.verdict
 
 
@@ -113,7 +113,7 @@ def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean_and_the_row_has_
         cell = (record["method"], record["config"]["index"], record["config"]["task"]["points"])
         return record["dataset"] == "sofa" and cell != ("newton_mask", 5, "100")
 
-    result = kept(complete_runs, keep)
+    result = page_of_kept(complete_runs, keep)
     newton = line(result, "newton with mask", "sofa")
     assert newton["ratio"].endswith("(n = 5); 5 of 5") and newton["failed"] == "0 of 11, 1 missing"
     assert newton["front_evaluations"] == "" and "newton" not in result.verdict  # though it has the fewest values
@@ -122,7 +122,7 @@ def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean_and_the_row_has_
 
 def test_rows_without_a_common_shape_are_not_ranked(complete_runs):
     datasets = {"dist_mask": "sofa", "newton_mask": "plane"}
-    assert kept(complete_runs, lambda record: datasets.get(record["method"]) == record["dataset"]).verdict == ""
+    assert page_of_kept(complete_runs, lambda record: datasets.get(record["method"]) == record["dataset"]).verdict == ""
 
 
 def test_the_reference_is_the_first_row_of_the_plan_not_the_oldest_of_its_preset(tmp_path):

@@ -108,10 +108,10 @@ def test_of_the_records_of_a_run_the_newest_that_measured_counts(tmp_path):
         folder = write_run(tmp_path, "table1", None, id="a", status=status, minute=minute)
         return read_record(folder) | more
 
-    kept, planned, newer = record("ok", 5) | {KEPT: True}, record("killed", 7), record("oom", 6)
-    assert join([planned], [kept]) == [kept] and join([newer, planned], [kept]) == [newer]
-    measured = {key: value for key, value in kept.items() if key != KEPT}
-    assert join([measured], [kept]) == [measured]  # the record with a folder
+    shipped, planned, newer = record("ok", 5) | {KEPT: True}, record("killed", 7), record("oom", 6)
+    assert join([planned], [shipped]) == [shipped] and join([newer, planned], [shipped]) == [newer]
+    measured = {key: value for key, value in shipped.items() if key != KEPT}
+    assert join([measured], [shipped]) == [measured]  # the record with a folder
     assert join([planned], []) == [planned]
 
 

@@ -50,40 +50,36 @@ def test_a_setting_reads_the_same_in_a_list_and_in_the_table_of_its_sweep():
     assert [name.removeprefix("DIST, ") for name in names(swept)] == differences(swept)
 
 
-def test_runs_are_named_by_what_differs():
-    swept = [record("x", **renderer(_label_="DIST", steps=steps, alpha=1.5)) for steps in (20, 50)]
-    assert names(swept) == ["DIST, steps 20", "DIST, steps 50"]
-    same = [record("x", **renderer(_label_="DIST", steps=20), seed=seed) for seed in (0, 1)]
-    assert names(same) == ["DIST", "DIST"]
+def custom(**config) -> dict:
+    return {"renderer": "custom", "config": config}
 
 
-def test_a_setting_that_follows_from_another_is_not_named():
-    sizes = (("small", 32), ("large", 64))
-    configs = [{"field": {"name": name}, "view": {"resolution": size}} for name, size in sizes]
-    assert names([record("x", config=config) for config in configs]) == ["dist, field small", "dist, field large"]
+@each("changes, expected", [
+    ([renderer(_label_="DIST", steps=steps, alpha=1.5) for steps in (20, 50)], ["DIST, steps 20", "DIST, steps 50"]),
+    ([{"seed": seed, **renderer(_label_="DIST", steps=20)} for seed in (0, 1)], ["DIST", "DIST"]),
+    ([{"config": {"field": {"name": name}, "view": {"resolution": size}}} for name, size in (("a", 32), ("b", 64))],
+     ["dist, field a", "dist, field b"]),  # the resolution follows from the field
+    ([custom(renderer={"_target_": f"mypkg.{name}"}) for name in ("Mine", "Other")], ["Mine", "Other"]),
+    ([custom(label="Ours", renderer={"_target_": "mypkg.Mine"})], ["Ours"]),
+])  # fmt: skip
+def test_runs_are_named_by_what_differs(changes, expected):
+    assert names([record("x", **changed) for changed in changes]) == expected
 
 
 def test_scale_has_a_column_and_neither_it_nor_what_follows_from_it_is_in_names():
     sizes = (("smoke", 32), ("desk", 64))
-    made = [record("x", folder="x", config={"scale": {"name": n}, "view": {"resolution": r}, "task": {"points": p}})
+    records = [record("x", folder="x", config={"scale": {"name": n}, "view": {"resolution": r}, "task": {"points": p}})
             for n, r in sizes for p in (20, 100)]  # fmt: skip
-    assert names(made) == ["dist, points 20", "dist, points 100"] * 2
-    scales = columns(made, [Folder(Path("none"), f"run{number}") for number in range(4)])["texts"]["scale"]
+    assert names(records) == ["dist, points 20", "dist, points 100"] * 2
+    scales = columns(records, [Folder(Path("none"), f"run{number}") for number in range(4)])["texts"]["scale"]
     assert [scales["values"][code] for code in scales["codes"]] == ["smoke", "smoke", "desk", "desk"]
-
-
-def test_user_renderers_are_named_by_their_class():
-    by_class = [record("x", renderer="custom", **renderer(_target_=f"mypkg.{name}")) for name in ("Mine", "Other")]
-    assert names(by_class) == ["Mine", "Other"]
-    labelled = record("x", renderer="custom", config={"label": "Ours", "renderer": {"_target_": "mypkg.Mine"}})
-    assert names([labelled]) == ["Ours"]
 
 
 def test_at_most_three_settings_are_named_and_equal_ends_in_full():
     configs = [{"task": {"a": n & 1, "b": n & 2, "c": n & 4, "d": n & 8}} for n in range(16)]
     assert max(name.count(",") for name in names([record("x", config=config) for config in configs])) == 3
-    alike = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
-    assert names([record("x", config=config) for config in alike])[3] == "dist, weight 2, task.weight 1"
+    two_weights = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
+    assert names([record("x", config=config) for config in two_weights])[3] == "dist, weight 2, task.weight 1"
 
 
 def test_an_odd_configuration_is_shown_too_and_cut_off_if_it_is_too_deep(tmp_path):
@@ -168,8 +164,8 @@ def test_a_long_curve_is_thinned_but_keeps_its_ends_and_checkpoints(tmp_path):
     folder = write_run(tmp_path, record("one"), "one")
     lines = [{"iteration": n, "total": 1.0} | ({"chamfer_l2": 0.1} if n == 1001 else {}) for n in range(5000)]
     (folder / "curve.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    kept = curve(Folder(tmp_path, "one"))["iteration"]
-    assert len(kept) < 250 and {0, 1001, 4999} <= set(kept)
+    iterations = curve(Folder(tmp_path, "one"))["iteration"]
+    assert len(iterations) < 250 and {0, 1001, 4999} <= set(iterations)
 
 
 def unpacked(packed: dict) -> np.ndarray:

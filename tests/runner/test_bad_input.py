@@ -44,7 +44,7 @@ def assert_one_line(err: str, *words: str) -> None:
     assert len(line) < 400 and all(word in line for word in words), (line, words)
 
 
-@each("argument, words", [
+@each("arguments, words", [
     ("task=compleetion", ("unknown task 'compleetion'", "did you mean completion")),
     ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, idr, mesh_proxy, naive, neus", "and variants")),
     ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
@@ -64,9 +64,12 @@ def assert_one_line(err: str, *words: str) -> None:
     ("--renderer=dist", ("unknown option '--renderer=dist'", "write renderer=VALUE")),
     ("--seed", ("settings have no dashes, write seed=VALUE",)),
     ("renderer=[dist,dvr]", ("one renderer", "-m renderer=A,B")),
+    ("renderer=custom renderer.steps=3", ("+renderer.steps=VALUE",)),
+    ("task.colour_weight=1", ("set prior=textured field=prior",)),
+    ("task.colour_weight=1 prior=textured field=grid_8", ("set prior=textured field=prior",)),
 ])  # fmt: skip
-def test_an_invalid_command_line_is_an_error_with_the_nearest_name(monkeypatch, argument, words):
-    assert_one_line(explained(monkeypatch, argument), *words)
+def test_an_invalid_command_line_is_an_error_with_the_nearest_name(monkeypatch, arguments, words):
+    assert_one_line(explained(monkeypatch, *arguments.split()), *words)
 
 
 def explained(monkeypatch, *arguments: str) -> str:
@@ -96,15 +99,6 @@ def test_unknown_kernels_are_refused_before_a_run(bench, tmp_path, no_prior, mon
     status, _, err = bench(*TINY, f"results_dir={tmp_path / 'results'}")
     assert status == 2 and not (tmp_path / "results").exists()
     assert_one_line(err, "IMPLICIT_BENCH_KERNELS must be torch or compiled, not 'quick'")
-
-
-def test_an_argument_of_a_user_renderer_takes_a_plus(monkeypatch):
-    assert_one_line(explained(monkeypatch, "renderer=custom", "renderer.steps=3"), "+renderer.steps=VALUE")
-
-
-@each("arguments", [("task.colour_weight=1",), ("task.colour_weight=1", "prior=textured", "field=grid_8")])
-def test_colours_need_a_prior_with_colours(monkeypatch, arguments):
-    assert_one_line(explained(monkeypatch, *arguments), "set prior=textured field=prior")
 
 
 def test_a_mistyped_key_in_a_row_of_the_users_names_its_file(bench, tmp_path, no_prior):

@@ -124,14 +124,14 @@ def test_the_later_of_two_requests_of_one_run_or_sweep_is_kept(tmp_path):
 
 def test_a_damaged_record_is_kept_but_never_before_a_complete_one(tmp_path):
     for number, damage in enumerate(("", "{", "[1]", '{"schema": 99}')):
-        here = tmp_path / str(number)
-        folder = write_run(here / "a", CELLS[0])
+        folder_of_case = tmp_path / str(number)
+        folder = write_run(folder_of_case / "a", CELLS[0])
         (folder / "record.json").write_text(damage)
-        write_run(here / "b", CELLS[0], "killed")
-        merge([here / "a", here / "b"], here / "d")
-        assert [record["status"] for record in read_records(here / "d")[0]] == ["killed"]
-        (kept,) = (here / "d" / "earlier").iterdir()
-        assert (kept / "record.json").read_text() == damage
+        write_run(folder_of_case / "b", CELLS[0], "killed")
+        merge([folder_of_case / "a", folder_of_case / "b"], folder_of_case / "d")
+        assert [record["status"] for record in read_records(folder_of_case / "d")[0]] == ["killed"]
+        (earlier,) = (folder_of_case / "d" / "earlier").iterdir()
+        assert (earlier / "record.json").read_text() == damage
 
 
 @each("damage, words", [

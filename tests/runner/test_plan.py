@@ -291,11 +291,11 @@ def plan_of(plain, tmp_path):
     """A plan of one cell for each list of overrides."""
 
     def plan(*cells: tuple[str, ...]) -> Plan:
-        made = []
+        planned_cells = []
         for number, overrides in enumerate(cells):
             config = plain(*overrides, "isolation=off")
-            made.append(PlannedCell(f"c-{number}", list(overrides), "completion", "dist", "sofa", 0, config))
-        return Plan("p", Path(tmp_path), made)
+            planned_cells.append(PlannedCell(f"c-{number}", list(overrides), "completion", "dist", "sofa", 0, config))
+        return Plan("p", Path(tmp_path), planned_cells)
 
     return plan
 
