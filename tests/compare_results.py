@@ -1,7 +1,7 @@
-"""`python -m tests.compare_results BEFORE AFTER`: whether runs gave the same numbers, times aside.
+"""`python -m tests.compare_results BEFORE AFTER`: whether runs gave the same numbers, without times.
 
-Each folder holds results folders of the same names, each with one run. Prints a row per run and exits with 1 where a
-metric or a count differs in the last digit, or is on one side only.
+Each folder holds results folders of the same names, each with one run. Prints a row per run. Exits with 1 if a metric
+or a count differs in the last digit, or is on one side only.
 """
 
 import sys
@@ -11,14 +11,14 @@ from typing import Any
 from bench.records.record import read_record
 
 PARTS = ("metrics", "metrics_start", "evaluations")
-TIMES = ("seconds", "overhead", "gemm", "peak_memory")  # in the name of a number that no two runs share
+TIMING_WORDS = ("seconds", "overhead", "gemm", "peak_memory")
 
 
 def numbers(record: dict[str, Any]) -> dict[str, Any]:
     """All metrics and counts of a record by name, without times."""
-    flat = {f"{part}.{name}": value for part in PARTS for name, value in record[part].items()}
+    flat = {f"{section}.{name}": value for section in PARTS for name, value in record[section].items()}
     flat |= {"status": record["status"], "flops": record["flops"]}
-    return {name: value for name, value in flat.items() if not any(word in name for word in TIMES)}
+    return {name: value for name, value in flat.items() if not any(word in name for word in TIMING_WORDS)}
 
 
 def record_of(results: Path) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def record_of(results: Path) -> dict[str, Any]:
 
 
 def compared(before: Path, after: Path) -> tuple[int, list[str]]:
-    """How many numbers are the same in the runs of two results folders, and a line for each that is not."""
+    """The number of equal numbers in the runs of two results folders, and a line for each other number."""
     first, second = numbers(record_of(before)), numbers(record_of(after))
     names = dict.fromkeys([*first, *second])
     different = [name for name in names if repr(first.get(name)) != repr(second.get(name))]
@@ -36,7 +36,7 @@ def compared(before: Path, after: Path) -> tuple[int, list[str]]:
 
 
 def main(before: Path, after: Path) -> int:
-    """Compares all results folders that stand in both places."""
+    """Compares the results folders of the same name; gives the exit status."""
     failed = 0
     for folder in sorted(path for path in before.iterdir() if (path / "runs").is_dir()):
         if not (after / folder.name / "runs").is_dir():

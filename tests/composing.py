@@ -12,7 +12,7 @@ from bench.runner.compose import Composer, composing, without_hydra
 
 @cache
 def composed(*overrides: str, hydra: bool = False) -> DictConfig:
-    """The configuration of some overrides, with Hydra's own node where it is asked for: only to be read."""
+    """The configuration of overrides, read-only; with Hydra's own node if `hydra` is set."""
     with composing():
         composer = Composer(overrides)
         config = composer.shared_config()
@@ -28,11 +28,7 @@ def identified(*arguments: str) -> Identity:
 
 
 def cells_of(*overrides: str, folder: Path | None = None) -> list[Identity]:
-    """The cells of a sweep.
-
-    Args:
-        folder: of the user's, as after `--config-dir`.
-    """
+    """The cells of a sweep, with a folder of a user's configurations as after `--config-dir`."""
     with composing(*([folder] if folder else [])):
         composer = Composer(overrides)
         return composer.cells(composer.swept(composer.shared_config()))

@@ -1,4 +1,4 @@
-"""Shared by all tests. CHECK_TYPES=1 checks the types and shapes of every call of ours, in twice the time."""
+"""Shared by all tests. CHECK_TYPES=1 checks the types and shapes of every call of this project, in twice the time."""
 
 import bench  # noqa: F401, before all else: it sets the OpenMP variables, which torch reads once
 
@@ -27,8 +27,8 @@ CHECKED = beartype(conf=BeartypeConf(is_pep484_tower=True))  # PEP 484 takes an 
 def checked(function: Callable) -> Callable:
     """Checks the types of a call, each once.
 
-    jaxtyping calls one function before a call, with its arguments, and one after it, with its arguments again and its
-    result. The second one has the names of the shapes from the first one, so that here it looks at the result alone.
+    jaxtyping calls one function before a call, with its arguments, and a second one after it, with its result too.
+    The second function has the names of the shapes from the first, so this function checks only its result.
     """
     result = function.__annotations__.get("return", Any)  # the first function gives Any
     if result is not Any:
@@ -45,7 +45,7 @@ settings.load_profile("implicit-bench")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The renderer of yours that the contract takes: `-k custom --renderer=mypkg.Mine`."""
+    """Adds the renderer that the contract tests: `-k custom --renderer=mypkg.Mine`."""
     parser.addoption("--renderer", default="tests.user_renderer.Mine", help="class of a renderer, as PACKAGE.CLASS")
 
 
@@ -53,30 +53,30 @@ SLOWEST = ("runner/test_launchers.py", "runner/test_resume.py", "conf/", "runner
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begins with the slowest files, so that no process of pytest-xdist is left alone with one at the end."""
+    """Begins with the slowest files, so that no process of pytest-xdist runs one of them alone at the end."""
 
-    def place(item: pytest.Item) -> int:
+    def rank(item: pytest.Item) -> int:
         path = item.path.as_posix()
-        return next((n for n, part in enumerate(SLOWEST) if f"/tests/{part}" in path), len(SLOWEST))
+        return next((n for n, prefix in enumerate(SLOWEST) if f"/tests/{prefix}" in path), len(SLOWEST))
 
-    items.sort(key=place)
+    items.sort(key=rank)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Lets pass what beartype says of OmegaConf's classes, which build on `typing`; all other warnings are errors."""
+    """Ignores beartype's warning about OmegaConf's classes, which build on `typing`; other warnings are errors."""
     config.option.loadscopereorder = False  # of pytest-xdist, which would begin with the files that have most tests
     config.addinivalue_line("filterwarnings", "ignore::beartype.roar.BeartypeDecorHintPep585DeprecationWarning")
 
 
 def pytest_collection_finish() -> None:
-    """Freezes what imports made, so that the garbage collector skips it."""
+    """Freezes the objects that imports created, so that the garbage collector skips them."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> None:
-    """The tensors of tests are small: a second thread costs more than it brings."""
+    """Uses one thread: the tensors of tests are small, and a second thread costs more than it saves."""
     import torch
 
     torch.set_num_threads(1)
@@ -84,7 +84,7 @@ def one_thread() -> None:
 
 @contextmanager
 def forgetting_modules(folder: Path) -> Iterator[None]:
-    """Modules of a folder that the block imports are no longer imported after it."""
+    """After the block, the modules that it imported from a folder are no longer imported."""
     before = {*sys.modules}
     yield
     for name in sys.modules.keys() - before:
@@ -94,19 +94,19 @@ def forgetting_modules(folder: Path) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def forgotten_modules(tmp_path_factory) -> Iterator[None]:
-    """A user's module that a test wrote is no longer imported in the next test, which may write another of that name.
+    """Forgets a user's module that a test wrote: the next test may write another module of that name.
 
-    Modules elsewhere stay: half of PyTorch, imported a second time, fails.
+    Modules elsewhere stay, since parts of PyTorch cannot be imported twice.
     """
     with forgetting_modules(tmp_path_factory.getbasetemp().resolve()):
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
-def asked_once() -> Iterator[None]:
-    """Caches, for runs in this process, what each run would find out anew; `tests.runner.spared` is for runs in others.
+def cached_probes() -> Iterator[None]:
+    """Caches git's output and the machine's matrix product rate for all runs in this process.
 
-    These are what git says, and the machine's matrix product rate.
+    `tests.runner.spared` does so for runs in other processes.
     """
     import torch
 
@@ -114,11 +114,11 @@ def asked_once() -> Iterator[None]:
     from bench.runner import process
 
     measure = environment.gemm_peak
-    rate = cache(lambda *asked: measure(*asked[:-1]))  # for each number of threads
+    rate = cache(lambda *arguments: measure(*arguments[:-1]))  # for each number of threads
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(environment, "_git", cache(environment._git))
         patch.setattr(environment, "gemm_peak", lambda *on: rate(*on, torch.get_num_threads()))
-        # One server of processes serves all tests: it loads all that runs import, pytest too, which is their program.
+        # One server of processes serves all tests. It loads all that runs import, and pytest, which is their program.
         loaded = [*process.preloaded_modules(), "pytest", "tests.runner.spared"]
         patch.setattr(process, "preloaded_modules", lambda: loaded)
         yield
@@ -134,18 +134,18 @@ def compose_config() -> Callable:
 
 @pytest.fixture
 def isolated(tmp_path) -> Callable:
-    """A command line in this process, whose runs have processes of their own: gives its exit status and outputs."""
+    """Runs a command line in this process, and its runs in other processes; gives its exit status and outputs."""
     from tests.runner.driving import command
 
     def run(*arguments: str):
-        given = any(argument.startswith("results_dir=") for argument in arguments)
-        return command(*arguments, *([] if given else [f"results_dir={tmp_path / 'r'}"]))
+        has_results_dir = any(argument.startswith("results_dir=") for argument in arguments)
+        return command(*arguments, *([] if has_results_dir else [f"results_dir={tmp_path / 'r'}"]))
 
     return run
 
 
 class Clock:
-    """A clock that goes on by what is slept, at once, and by a microsecond each time that it is read."""
+    """A clock that advances by each sleep, without waiting, and by a microsecond each time that it is read."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -160,7 +160,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch) -> Clock:
-    """Stands in for the machine's clock, so that a test of times does not depend on how busy the machine is."""
+    """Replaces the machine's clock, so that a test of times does not depend on how busy the machine is."""
     stand_in = Clock()
     monkeypatch.setattr(time, "perf_counter", stand_in.read)
     monkeypatch.setattr(time, "sleep", stand_in.sleep)

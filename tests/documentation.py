@@ -1,4 +1,4 @@
-"""What the README files show: their commands, their code and their links; and the files that commands need."""
+"""The commands, the code and the links of the README files, and the files that the commands need."""
 
 import re
 import shlex
@@ -24,7 +24,7 @@ CODE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"\s{2,}# .*$")
 SPAN = re.compile(r"`((?:python -m |-m \+experiment=)[^`]+)`")  # tables leave `python -m bench` out
 LINK = re.compile(r"\]\(([^)#\s]*)(#[^)\s]*)?\)")
-DENSE = "task.depths.points=dense"  # of photographs that have depths
+DENSE_DEPTHS = "task.depths.points=dense"
 NETWORK = re.compile(r"field_path=|prior\.path=")
 SCANS = re.compile(r"dataset=scans|\+experiment=scans")
 
@@ -38,7 +38,6 @@ class Command:
 
     @property
     def module(self) -> str:
-        """What follows `python -m`."""
         return self.words[2]
 
     @property
@@ -55,38 +54,38 @@ def text_of(file: str) -> str:
 
 def commands() -> list[Command]:
     """All `python -m ...` of the README files: indented lines without their comments, and spans within text."""
-    found = {}
+    by_text = {}
     for file in FILES:
         bare = CODE.sub("", text_of(file))
         lines = [COMMENT.sub("", line).strip() for line in bare.splitlines() if line.startswith("    ")]
         spans = [" ".join(span.split()) for span in SPAN.findall(bare.replace("\n", " "))]
-        whole = [f"python -m bench {span}" if span.startswith("-m ") else span for span in spans]
-        for part in (part.strip() for line in (*lines, *whole) for part in line.split("&&")):
-            if part.startswith("python -m "):
-                found.setdefault(part, Command(file, tuple(shlex.split(part))))
-    return list(found.values())
+        full_spans = [f"python -m bench {span}" if span.startswith("-m ") else span for span in spans]
+        for text in (text.strip() for line in (*lines, *full_spans) for text in line.split("&&")):
+            if text.startswith("python -m "):
+                by_text.setdefault(text, Command(file, tuple(shlex.split(text))))
+    return list(by_text.values())
 
 
 def code_of(file: str, language: str) -> list[str]:
-    """The blocks of that language in a README file."""
-    return [code for found, code in CODE.findall(text_of(file)) if found == language]
+    """The code blocks of one language in a README file."""
+    return [code for block_language, code in CODE.findall(text_of(file)) if block_language == language]
 
 
 def links() -> list[tuple[str, str, str]]:
-    """The links to other files of the project: where they stand, the file, the heading."""
-    found = [(file, path, anchor) for file in FILES for path, anchor in LINK.findall(CODE.sub("", text_of(file)))]
-    return [link for link in found if ":" not in link[1]]
+    """The links to other files of the project: the file with the link, the linked file, the heading."""
+    all_links = [(file, path, anchor) for file in FILES for path, anchor in LINK.findall(CODE.sub("", text_of(file)))]
+    return [link for link in all_links if ":" not in link[1]]
 
 
 def anchors(text: str) -> set[str]:
-    """The addresses of headings, as GitHub makes them, and those that a text sets itself."""
+    """The addresses of headings, as GitHub makes them, and those that a text sets explicitly."""
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     plain = [re.sub(r"[^\w\- ]", "", re.sub(r"<[^>]*>", "", heading)).strip().lower() for heading in headings]
     return {heading.replace(" ", "-") for heading in plain} | set(re.findall(r'<a id="([^"]+)">', text))
 
 
 def make_files(folder: Path) -> dict[str, str]:
-    """Makes what the words of commands stand for, in a folder; gives the path of each word."""
+    """Writes the files that placeholders in commands stand for; gives the path of each placeholder."""
     mine = (f"mine/conf/{group}" for group in ("renderer", "task", "experiment", "dataset"))
     for name in ("captures", "scans", "chairs", "network", *mine):
         (folder / name).mkdir(parents=True)
@@ -106,14 +105,12 @@ def make_files(folder: Path) -> dict[str, str]:
     named |= {"FOLDER": folder / "captures", "chairs/": folder / "chairs", "my_conf": folder / "mine" / "conf"}
     named |= {"FILE": folder / "picture.png", "MASK": folder / "mask.png"}
     deepsdf_folder(folder / "network", 0.1 * torch.arange(4.0)[:, None])
-    named["NETWORK"] = folder / "network"
     (folder / "depths").mkdir()
     if find_spec("cv2"):
         dvr(folder / "depths")
-    named["DEPTHS"] = folder / "depths"
     ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS).apply_translation(CENTRE)
     trimesh.PointCloud(ball.vertices).export(folder / "tola.ply")
-    named["tola.ply,colmap.ply"] = folder / "tola.ply"
+    named |= {"NETWORK": folder / "network", "DEPTHS": folder / "depths", "tola.ply,colmap.ply": folder / "tola.ply"}
     named |= dict.fromkeys(("fox.npz", "mine.npz"), npz(folder, arrays()).path)
     shapenet = write_shapenet(folder / "ShapeNetCore.v2")
     for name in IDS:
@@ -121,15 +118,11 @@ def make_files(folder: Path) -> dict[str, str]:
     boxes = ShapeNet(str(shapenet), "sofa", None, "onet")
     sampler = ViewSampler(2.5, 50.0, (0, 360), (15, 35), resolution=32)  # pixels of single_view at smoke
     named["NMR"] = write_renders(folder / "NMR", boxes, sampler, views=24)
-    named |= {
-        "ShapeNetCore.v1": shapenet,
-        "ShapeNetCore.v2": shapenet,
-        "SPLIT": write_split(folder / "sofas_test.json", IDS[:2]),
-    }
-    (folder / "mine" / "my_package.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
-    (folder / "mine" / "mypkg.py").write_text(code_of("CONTRIBUTING.md", "python")[0])
-    (folder / "mine" / "mytask.py").write_text(code_of("CONTRIBUTING.md", "python")[1])
-    (folder / "mine" / "mydata.py").write_text(code_of("CONTRIBUTING.md", "python")[3])
+    named |= dict.fromkeys(("ShapeNetCore.v1", "ShapeNetCore.v2"), shapenet)
+    named["SPLIT"] = write_split(folder / "sofas_test.json", IDS[:2])
+    blocks = code_of("CONTRIBUTING.md", "python")
+    for module, block in (("my_package", 0), ("mypkg", 0), ("mytask", 1), ("mydata", 3)):
+        (folder / "mine" / f"{module}.py").write_text(blocks[block])
     yaml = dict(zip(("task", "experiment", "dataset"), code_of("CONTRIBUTING.md", "yaml"), strict=True))
     for group, text in yaml.items():
         name = "rings" if group == "dataset" else "coverage"
@@ -139,18 +132,17 @@ def make_files(folder: Path) -> dict[str, str]:
     return {word: str(path) for word, path in named.items()} | {"SCANS": str(folder / "scans")}
 
 
-def filled(command: Command, made: dict[str, str]) -> list[str]:
-    """A command's arguments with the made files in place of words, and without dots that stand for others."""
-    mesh = "dataset=mesh" in command.words
-    named = {"NAME": "sofa", **made}
+def filled(command: Command, paths: dict[str, str]) -> list[str]:
+    """A command's arguments, with the paths of files for its placeholders and without `...`."""
+    named = {"NAME": "sofa", **paths}
     if SCANS.search(str(command)):
-        named["FOLDER"] = made["SCANS"]
-    elif DENSE in command.words:
-        named["FOLDER"] = made["DEPTHS"]
+        named["FOLDER"] = paths["SCANS"]
+    elif DENSE_DEPTHS in command.words:
+        named["FOLDER"] = paths["DEPTHS"]
     elif NETWORK.search(str(command)):
-        named |= {"FOLDER": made["NETWORK"], "FILE": made["fox.npz"]}
-    elif mesh:
-        named |= {"FOLDER": made["chairs/"], "FILE": made["YOURS.obj"]}
-    own = ["--config-dir", "my_conf", "packages=[my_package]"] if command.arguments == ("renderer=mine",) else []
-    kept = [argument for argument in (*own, *command.arguments) if argument not in ("...", "...,")]
-    return [key + is_ + named.get(value, value) for key, is_, value in (one.rpartition("=") for one in kept)]
+        named |= {"FOLDER": paths["NETWORK"], "FILE": paths["fox.npz"]}
+    elif "dataset=mesh" in command.words:
+        named |= {"FOLDER": paths["chairs/"], "FILE": paths["YOURS.obj"]}
+    folders = ["--config-dir", "my_conf", "packages=[my_package]"] if command.arguments == ("renderer=mine",) else []
+    words = [argument for argument in (*folders, *command.arguments) if argument not in ("...", "...,")]
+    return [key + equals + named.get(value, value) for key, equals, value in (word.rpartition("=") for word in words)]

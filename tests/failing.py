@@ -1,4 +1,4 @@
-"""A renderer that fails on request, in each of the ways in which runs end badly."""
+"""A renderer that fails on request, in each way in which a run can fail."""
 
 import ctypes
 import os
@@ -14,14 +14,12 @@ from renderers.rendering import Rendering
 
 
 class Failing:
-    """IDR, until it is asked for its third rendering with a gradient; then it fails as `how` says.
-
-    What is wrong with its silhouette loss is so from the first one on.
+    """IDR, except that its third rendering with a gradient fails; a wrong silhouette loss is wrong from the start.
 
     Args:
-        how: it fails, one of FAILURES.
+        how: the way to fail, one of FAILURES.
         pause: seconds before each rendering.
-        limits: unused here: seconds for each way to fail, to which the `time_limit` of a sweep over `how` refers.
+        limits: seconds for each way to fail. Unused here: the `time_limit` of a sweep over `how` refers to it.
     """
 
     capabilities = Capabilities(needs=(Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
@@ -52,7 +50,7 @@ def _not_a_number(rendering: Rendering) -> Rendering:
 
 
 def _short(rendering: Rendering) -> Rendering:
-    return Rendering(**{part: getattr(rendering, part)[:-1] for part in RENDERING_TENSORS})
+    return Rendering(**{name: getattr(rendering, name)[:-1] for name in RENDERING_TENSORS})
 
 
 def _loop(rendering: Rendering) -> Rendering:
@@ -86,23 +84,13 @@ def _segfault(rendering: Rendering) -> Rendering:
 
 
 def _hog(rendering: Rendering) -> Rendering:
-    kept = []
+    tensors = []
     while True:
-        kept.append(torch.ones(2**24))  # 64 MiB, written to
+        tensors.append(torch.ones(2**24))  # 64 MiB, written to
 
 
-FAILURES = {
-    "not": lambda rendering: rendering,
-    "raise": _raise,
-    "not_a_number": _not_a_number,
-    "short": _short,
-    "loop": _loop,
-    "native_loop": _native_loop,
-    "leave": _leave,
-    "kill": _kill,
-    "terminate": _terminate,
-    "segfault": _segfault,
-    "hog": _hog,
-    "detached_loss": lambda rendering: rendering,
-}
+_WAYS = (_raise, _not_a_number, _short, _loop, _native_loop, _leave, _kill, _terminate, _segfault, _hog)
+FAILURES = {way.__name__[1:]: way for way in _WAYS} | dict.fromkeys(
+    ("not", "detached_loss"), lambda rendering: rendering
+)
 LOSSES = {"detached_loss": lambda loss: loss.detach() + 1}

@@ -1,4 +1,4 @@
-"""One test for many values, where each of them is cheap and all are alike."""
+"""One test for many values that are cheap to test."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -7,11 +7,11 @@ from typing import Any
 
 
 def each(names: str, values: Sequence[Any]) -> Callable[[Callable], Callable]:
-    """Runs a test with each of the values in turn, as `parametrize` does in as many tests; the failing one is named.
+    """Runs a test with each value in turn, as `parametrize` does in separate tests; a failure names its value.
 
     Args:
-        names: of the test's arguments, separated by commas.
-        values: of the argument, or tuples of the arguments.
+        names: the test's arguments, separated by commas.
+        values: the values of the argument, or tuples of values of the arguments.
     """
     keys = [name.strip() for name in names.split(",")]
 
@@ -22,14 +22,14 @@ def each(names: str, values: Sequence[Any]) -> Callable[[Callable], Callable]:
         @wraps(test)
         def looped(**fixtures: Any) -> None:
             for value in values:
-                given = dict(zip(keys, value, strict=True)) if len(keys) > 1 else {keys[0]: value}
+                arguments = dict(zip(keys, value, strict=True)) if len(keys) > 1 else {keys[0]: value}
                 try:
-                    test(**fixtures, **given)
+                    test(**fixtures, **arguments)
                 except BaseException as error:
-                    error.add_note(f"with {given}")
+                    error.add_note(f"with {arguments}")
                     raise
 
-        looped.__signature__ = signature.replace(parameters=left)  # by which pytest knows the fixtures
+        looped.__signature__ = signature.replace(parameters=left)  # pytest reads the fixtures from it
         return looped
 
     return decorate

@@ -1,4 +1,4 @@
-"""A scan in DTU's folders: the points of a sphere of 20 mm above a table, what was observed, and the table's plane."""
+"""A scan in DTU's folders: points of a sphere of 20 mm, the mask of observed cells, and the plane of a table."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Files of networks as people have them: an octahedron, exactly."""
+"""Files of networks in users' formats, whose field is an octahedron exactly."""
 
 import json
 from pathlib import Path
@@ -11,11 +11,11 @@ from torch import Tensor
 from bench.config import load
 from datasets.network_files import NetworkFile
 
-RADIUS = 0.5  # of the octahedron's faces about the origin
+RADIUS = 0.5  # distance of the octahedron's faces from the origin
 
 
 def arrays(factor: float = 1.0, level: float = 0.0) -> dict[str, Any]:
-    """An octahedron, exactly: (|x| + |y| + |z|) / sqrt(3) - RADIUS, times a factor, and a level."""
+    """The layers of the field ((|x| + |y| + |z|) / sqrt(3) - RADIUS) * factor + level."""
     axes = np.eye(3, dtype=np.float32)
     return {
         **{"0000.dense.A": np.concatenate([axes, -axes], axis=1), "0000.dense.b": np.zeros(6, np.float32)},
@@ -29,8 +29,8 @@ def octahedron(points: Tensor) -> Tensor:
     return points.abs().sum(-1) / np.sqrt(3) - RADIUS
 
 
-def npz(folder: Path, found: dict[str, Any]) -> NetworkFile:
-    np.savez(folder / "shape.npz", **found)
+def npz(folder: Path, layers: dict[str, Any]) -> NetworkFile:
+    np.savez(folder / "shape.npz", **layers)
     return load("dataset", "network", path=str(folder / "shape.npz"))
 
 
@@ -43,8 +43,8 @@ def deepsdf_folder(folder: Path, codes: Any, dtype: torch.dtype = torch.float32)
     state |= {"module.lin1.weight": last.float(), "module.lin1.bias": torch.tensor([-RADIUS])}
     specs = {"NetworkSpecs": {"dims": [8], "geom_dimension": 3, "weight_norm": False}, "CodeLength": 1}
     stored = {"model_state_dict": {name: value.to(dtype) for name, value in state.items()}, "epoch": 3}
-    for part, content in (("ModelParameters", stored), ("LatentCodes", {"latent_codes": codes})):
-        (folder / part).mkdir()
-        torch.save(content, folder / part / "latest.pth")
+    for subfolder, content in (("ModelParameters", stored), ("LatentCodes", {"latent_codes": codes})):
+        (folder / subfolder).mkdir()
+        torch.save(content, folder / subfolder / "latest.pth")
     (folder / "specs.json").write_text(json.dumps(specs))
     return load("dataset", "network", path=str(folder))

@@ -1,4 +1,4 @@
-"""Photographs of a ball from known cameras, written in each format, and ways to change what was written."""
+"""Photographs of a sphere from given cameras, written in each format, and functions that change these files."""
 
 import json
 import os
@@ -17,34 +17,34 @@ from datasets.own_photographs import Capture, ReadSettings
 from datasets.views import look_at
 from renderers.camera import Camera
 
-CENTRE, RADIUS = np.array([0.4, -1.1, 2.0]), 0.35  # of the ball, in the world of the files
+CENTRE, RADIUS = np.array([0.4, -1.1, 2.0]), 0.35  # world frame of the files
 NUMBERED = "{:03d}.png"
 SIZE = 40, 48  # height and width
 FOCAL, MIDDLE = 60.0, (25.0, 19.0)  # pixels; the principal point is not in the middle
-HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # between the two places where a first pixel's centre may be
+HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # a first pixel's centre is at 0 or at 0.5
 READ, PLAIN = ReadSettings(48), ReadSettings(48, masks=False)
 POINTS = CENTRE + 0.5 * RADIUS * (np.random.default_rng(0).random((50, 3)) - 0.5)
 
 
 def cameras(count: int = 10) -> list[Camera]:
-    """Cameras all around the ball, two thirds of them from above."""
+    """Cameras all around the sphere, two thirds of them from above."""
     intrinsics = torch.tensor([[FOCAL, 0, MIDDLE[0]], [0, FOCAL, MIDDLE[1]], [0, 0, 1]])
-    centre, found = torch.from_numpy(CENTRE).float(), []
+    centre, result = torch.from_numpy(CENTRE).float(), []
     for i in range(count):
         across, up = 2.4 * i, (0.7, -0.5, 0.1)[i % 3]
         toward = [np.cos(up) * np.sin(across), np.sin(up), np.cos(up) * np.cos(across)]
         eye = centre + 1.5 * torch.tensor(toward, dtype=torch.float32)
-        found.append(Camera(intrinsics, look_at(eye, centre), *SIZE))
-    return found
+        result.append(Camera(intrinsics, look_at(eye, centre), *SIZE))
+    return result
 
 
 def matrices() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Intrinsics and world_to_camera of each."""
-    return [(one.intrinsics.double().numpy(), one.world_to_camera.double().numpy()) for one in cameras()]
+    """The intrinsics and world_to_camera of each camera."""
+    return [(camera.intrinsics.double().numpy(), camera.world_to_camera.double().numpy()) for camera in cameras()]
 
 
 def image(camera: Camera, *, alpha: bool = False) -> tuple[Image.Image, Image.Image]:
-    """The ball in a colour for each side, before grey; and its mask."""
+    """The image of the sphere before grey, and its mask."""
     rays = camera.rays().flat()
     towards = torch.from_numpy(CENTRE).float() - rays.origins
     closest = (towards * rays.directions).sum(-1)
@@ -57,7 +57,7 @@ def image(camera: Camera, *, alpha: bool = False) -> tuple[Image.Image, Image.Im
 
 
 def write_images(folder: Path, images: str, *, masks: str = NUMBERED, alpha: bool = False, names: str = NUMBERED):
-    """Writes the images, and the masks, where these have names, into a folder of their own."""
+    """Writes the images, and the masks, if these have names, into separate folders."""
     (folder / images).mkdir(parents=True, exist_ok=True)
     for i, camera in enumerate(cameras()):
         picture, mask = image(camera, alpha=alpha)
@@ -72,13 +72,13 @@ def idr(folder: Path) -> None:
     scale, stored = np.diag([0.5, 0.5, 0.5, 1.0]), {}
     scale[:3, 3] = CENTRE + 0.05
     for i, (intrinsics, motion) in enumerate(matrices()):
-        projection = np.vstack([-3.0 * (intrinsics - HALF) @ motion[:3], np.eye(4)[3]])  # of any scale and sign
+        projection = np.vstack([-3.0 * (intrinsics - HALF_PIXEL) @ motion[:3], np.eye(4)[3]])  # of any scale and sign
         stored |= {f"world_mat_{i}": projection, f"scale_mat_{i}": scale}
     np.savez(folder / "cameras_sphere.npz", **stored)
 
 
 def dvr(folder: Path) -> None:
-    """Intrinsics onto an image from -1 to 1, and depths of 1.25 as OpenEXR's files; OpenCV is an extra."""
+    """Writes intrinsics onto an image from -1 to 1, and depths of 1.25 as OpenEXR files; OpenCV is an extra."""
     os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
     cv2 = pytest.importorskip("cv2", reason="OpenCV is an extra: pip install -e '.[stereo]'")
     write_images(folder, "image")
@@ -96,8 +96,8 @@ def dvr(folder: Path) -> None:
 
 def nerf(folder: Path) -> None:
     write_images(folder, "train", masks="", alpha=True, names="r_{}.png")
-    places = [(np.linalg.inv(motion) @ OPENGL).tolist() for _, motion in matrices()]
-    frames = [{"file_path": f"./train/r_{i}", "transform_matrix": place} for i, place in enumerate(places)]
+    poses = [(np.linalg.inv(motion) @ OPENGL).tolist() for _, motion in matrices()]
+    frames = [{"file_path": f"./train/r_{i}", "transform_matrix": pose} for i, pose in enumerate(poses)]
     stored = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": MIDDLE[0], "cy": MIDDLE[1], "w": SIZE[1], "h": SIZE[0]}
     (folder / "transforms.json").write_text(json.dumps({**stored, "frames": frames}))
 
@@ -106,24 +106,24 @@ def middlebury(folder: Path) -> None:
     write_images(folder, ".", names="ball{:04d}.png", masks="ball{:04d}.png")
     lines = ["10"]
     for i, (intrinsics, motion) in enumerate(matrices()):
-        numbers = [*(intrinsics - HALF).flatten(), *motion[:3, :3].flatten(), *motion[:3, 3]]
+        numbers = [*(intrinsics - HALF_PIXEL).flatten(), *motion[:3, :3].flatten(), *motion[:3, 3]]
         lines.append(f"ball{i:04d}.png " + " ".join(map(str, numbers)))
     (folder / "ball_par.txt").write_text("\n".join(lines) + "\n")
 
 
 def blended_mvs(folder: Path) -> None:
-    """BlendedMVS's files, with an image beside them that is masked."""
+    """Writes BlendedMVS's files, and one masked image that is no view."""
     write_images(folder, "blended_images", names="{:08d}.jpg")
     image(cameras()[0])[0].save(folder / "blended_images" / "00000000_masked.jpg")
     (folder / "cams").mkdir()
     for i, (intrinsics, motion) in enumerate(matrices()):
-        first, second = (" ".join(map(str, one.ravel())) for one in (motion, intrinsics))
+        first, second = (" ".join(map(str, matrix.ravel())) for matrix in (motion, intrinsics))
         text = f"extrinsic\n{first}\n\nintrinsic\n{second}\n\n1.0 0.01 128 2.0\n"
         (folder / "cams" / f"{i:08d}_cam.txt").write_text(text)
 
 
 def colmap(folder: Path) -> None:
-    """COLMAP's text files; pycolmap is an extra."""
+    """Writes COLMAP's text files; pycolmap is an extra."""
     pytest.importorskip("pycolmap", reason="pycolmap is an extra: pip install -e '.[colmap]'")
     write_images(folder, "images")
     (folder / "sparse" / "0").mkdir(parents=True)
@@ -137,7 +137,7 @@ def colmap(folder: Path) -> None:
 
 
 def llff(folder: Path) -> None:
-    """Cameras of images four times as large, whose principal point is in the middle."""
+    """Writes cameras of images four times as large, whose principal point is in the middle."""
     write_images(folder, "images_4")
     rows = []
     for _, motion in matrices():
@@ -154,14 +154,14 @@ FORMATS = {
 
 
 def off(capture: Capture, middle: tuple[float, float] = MIDDLE, away: float = 0.0) -> float:
-    """Most pixels by which points of the world are seen elsewhere than by the cameras that took the photographs."""
+    """The largest error in pixels between the cameras of a capture and those that took the photographs."""
     back = np.linalg.inv(capture.to_world)
     unit = torch.from_numpy((POINTS + away) @ back[:3, :3].T + back[:3, 3]).float()
     errors = []
     for shot in capture.shots:
         _, motion = matrices()[int(re.findall(r"\d+", shot.name)[-1])]
-        seen = POINTS @ motion[:3, :3].T + motion[:3, 3]
-        expected = FOCAL * seen[:, :2] / seen[:, 2:] + middle
+        in_camera = POINTS @ motion[:3, :3].T + motion[:3, 3]
+        expected = FOCAL * in_camera[:, :2] / in_camera[:, 2:] + middle
         errors.append(np.abs(shot.camera.project(unit)[0].numpy() - expected).max())
     return float(max(errors))
 
@@ -176,18 +176,18 @@ def changed(folder: Path, change: Callable) -> None:
 def moved(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     """Rewrites each matrix of transforms.json."""
 
-    def all_of(stored) -> None:
-        for one in stored["frames"]:
-            one["transform_matrix"] = change(np.array(one["transform_matrix"])).tolist()
+    def move_all(stored) -> None:
+        for frame in stored["frames"]:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
 
-    changed(folder, all_of)
+    changed(folder, move_all)
 
 
 def rewritten(file: Path, change: Callable[[dict], dict]) -> None:
     """Rewrites a .npz file."""
     with np.load(file) as stored:
-        known = dict(stored)
-    np.savez(file, **change(known))
+        arrays = dict(stored)
+    np.savez(file, **change(arrays))
 
 
 def repainted(files: list[Path], change: Callable[[np.ndarray], np.ndarray]) -> None:

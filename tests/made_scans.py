@@ -1,4 +1,4 @@
-"""A folder of range scans of a sphere, as Stanford keeps such scans: poses, points, and the whole surface."""
+"""A folder of range scans of a sphere in Stanford's layout: poses, points, and the complete surface."""
 
 from pathlib import Path
 
@@ -7,17 +7,17 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 RADIUS, CENTRE = 0.2, np.array([0.3, -0.1, 0.05])
-TURNS = (0.0, 90.0, 200.0)  # degrees about y, of the scanner
+TURNS = (0.0, 90.0, 200.0)  # degrees of the scanner about y
 
 
 def scanned_from(turn: float, noise: float) -> tuple[np.ndarray, Rotation, np.ndarray]:
-    """Points of the half of the sphere that a scanner at +z of its own axes sees, in these axes, and their motion."""
+    """Points of the half of the sphere that a scanner sees, in the scanner's axes, and the motion to the world."""
     draw = np.random.default_rng(int(turn))
-    own = draw.normal(size=(20000, 3))
-    own[:, 2] = np.abs(own[:, 2])
-    own *= (RADIUS + noise * draw.normal(size=(len(own), 1))) / np.linalg.norm(own, axis=1, keepdims=True)
+    points = draw.normal(size=(20000, 3))
+    points[:, 2] = np.abs(points[:, 2])
+    points *= (RADIUS + noise * draw.normal(size=(len(points), 1))) / np.linalg.norm(points, axis=1, keepdims=True)
     to_world, shift = Rotation.from_euler("y", turn, degrees=True), np.array([0.01, 0.02, turn / 1000])
-    return own + to_world.inv().apply(CENTRE - shift), to_world, shift
+    return points + to_world.inv().apply(CENTRE - shift), to_world, shift
 
 
 def write_scans(folder: Path, noise: float = 0.0) -> Path:

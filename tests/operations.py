@@ -1,4 +1,4 @@
-"""PyTorch's operations, counted on a CPU as a GPU would feel them: each is a launch, and some make the host wait."""
+"""Counts PyTorch's operations on a CPU as a GPU would execute them: each is a launch, some make the host wait."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -9,21 +9,21 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-# What only looks at numbers in another way, or only makes room.
+# Views and allocations, which compute nothing.
 FREE = (
     *("alias", "as_strided", "chunk", "detach", "diagonal", "empty", "expand", "lift_fresh", "narrow", "new_empty"),
     *("permute", "reshape", "resize", "select", "slice", "split", "squeeze", "t", "transpose", "unbind", "unfold"),
     *("unsqueeze", "view", "_reshape_alias", "_unsafe_view"),
 )
-# Whose result, or its size, the host must know before it goes on.
+# The host must wait for the result, or its size.
 WAITS = ("nonzero", "_local_scalar_dense", "masked_select", "unique", "is_nonzero", "equal", "repeat_interleave")
 
 
 class Operations(TorchDispatchMode):
-    """Within it operations are counted, those of backward passes too.
+    """Counts the operations within it, also those of backward passes.
 
-    `launches` counts all that compute, `waits` by name those that make the host wait, and `made` how many results of
-    each size in numbers were made, other than in place.
+    `launches` counts all that compute. `waits` counts, by name, those that make the host wait. `made` counts, by the
+    number of elements, the results that were not computed in place.
     """
 
     def __init__(self) -> None:

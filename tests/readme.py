@@ -14,31 +14,33 @@ COLUMNS = (
     *("completion: field evaluations over DIST's", "completion: time over DIST's"),
 )
 HEAD = f"| {' | '.join(COLUMNS)} |\n|---|{'---:|' * (len(COLUMNS) - 1)}\n"
-LINES, NUMBERS, WORDS = 120, 60, 25  # at most, the last of a sentence
+MAX_LINES, MAX_NUMBERS, MAX_WORDS = 120, 60, 25  # the last is per sentence
 BLOCK = re.compile(r"^```[\s\S]*?^```$|^ {4}.*$|<[^>]*>", re.MULTILINE)  # what is typed, and HTML
 ADDRESS = re.compile(r"!?\[([^]]*)\]\([^)]*\)")  # the text of a link stays
 CODE = re.compile(r"`[^`]*`")
 NUMBER = re.compile(r"(?<![\w.])[-−]?\d[\d,.]*")
-ENDS = re.compile(r"(?<=[.!?])\s+|\n\s*\n|\n(?=#|\s*[-*] |\s*\d+\. )|\||^#.*$", re.MULTILINE)  # of sentences
+SENTENCE_ENDS = re.compile(r"(?<=[.!?])\s+|\n\s*\n|\n(?=#|\s*[-*] |\s*\d+\. )|\||^#.*$", re.MULTILINE)
 
 
 def wrongs(text: str) -> list[str]:
-    """What is too long in a README, a line for each; code and addresses have no numbers and are a word."""
+    """A line for each fault of a README; code and addresses count as one word without a number."""
     prose = CODE.sub("code", ADDRESS.sub(r"\1", BLOCK.sub("", text)))
     lines, numbers = len(text.splitlines()), len(NUMBER.findall(prose))
-    found = [f"{lines} lines, at most {LINES}: move some to the README of a folder"] if lines > LINES else []
-    found += [f"{numbers} numbers, at most {NUMBERS}: leave them to results/paper"] if numbers > NUMBERS else []
-    for sentence in (" ".join(part.split()) for part in ENDS.split(prose)):
-        words = sum(any(map(str.isalnum, word)) for word in sentence.split(" "))
-        found += [f"a sentence of {words} words, at most {WORDS}: {sentence}"] if words > WORDS else []
-    return found
+    messages = [f"{lines} lines, at most {MAX_LINES}: move some to the README of a folder"] if lines > MAX_LINES else []
+    if numbers > MAX_NUMBERS:
+        messages.append(f"{numbers} numbers, at most {MAX_NUMBERS}: leave them to results/paper")
+    for sentence in SENTENCE_ENDS.split(prose):
+        words = sum(any(map(str.isalnum, word)) for word in sentence.split())
+        if words > MAX_WORDS:
+            messages.append(f"a sentence of {words} words, at most {MAX_WORDS}: {' '.join(sentence.split())}")
+    return messages
 
 
 def recommendation() -> str:
-    """README's first answer, by rule: of the renderers that lead at 1 ×, that which is among the best on hard scenes.
+    """README's first answer: of the renderers that lead at 1 ×, the one among the best on hard scenes.
 
     Raises:
-        ValueError: where one of its sentences does not hold any more; another one must be written.
+        ValueError: a sentence does not hold any more; another one must be written.
     """
     lines, presets = _lines("suite"), {line["row"]: line["preset"] for line in _lines("suite")}
     page = json.loads((PAPER / "suite.json").read_text(encoding="utf-8"))
@@ -121,5 +123,5 @@ def _percent(text: str) -> str:
 
 
 if __name__ == "__main__":
-    said = wrongs(README.read_text(encoding="utf-8"))
-    sys.exit("\n".join(f"README.md has {each}" for each in said) or None)
+    faults = wrongs(README.read_text(encoding="utf-8"))
+    sys.exit("\n".join(f"README.md has {each}" for each in faults) or None)

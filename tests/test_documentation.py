@@ -1,11 +1,10 @@
-"""The README files show commands that compose, code that runs, and links that lead somewhere."""
+"""The README files show commands that compose, code that runs, and links whose targets exist."""
 
 import importlib.util
 import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -24,33 +23,33 @@ from bench.runner.command import config_dirs, expand_field_file, options_of
 from bench.runner.compose import Composer, composing
 from tests import documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
-from tests.runner.driving import SMALLEST
+from tests.runner.driving import SMALLEST, by_program
 from tests.runner.driving import command as typed
 
 HYDRA = ("bench", "bench.prior", "bench.train")  # commands whose arguments are choices and keys
 COMMANDS = documentation.commands()
 COMPOSED = [command for command in COMMANDS if command.module in HYDRA]
 SMALL = (*SMALLEST, "task.optimiser.iterations=3", "view.resolution=16", "task.points=20")
-QUICK = (  # with all sizes of scale=smoke that make a run last
+QUICK = (  # all sizes of scale=smoke on which the runtime depends
     "scale=smoke", "isolation=off", "threads=1", "scale.grid=24", "scale.sweep_grid=24", "scale.points=200",
     "scale.picture=16", "scale.iterations=3", "scale.priors.own.shapes=4", "scale.priors.own.steps=10",
     "scale.fit_iterations=3", "scale.fit_steps=20", "scale.rendering=16", "scale.multiview.iterations=2",
     "scale.reconstruction.iterations=4", "scale.single_view.steps=3", "scale.stability.search.levels=3",
     "scale.gradient_pixels=12",
 )  # fmt: skip
-SHIPPED = (  # of networks that are shipped for scale=desk alone
+SMALL_EVALUATION = (  # for networks that are shipped at scale=desk only
     "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200", "evaluation.picture=null",
 )  # fmt: skip
-FITTED = (  # of experiments on a network that is fitted to one shape: a small one
+SMALL_FITTED_NETWORK = (
     *QUICK, "prior.network.layers=2", "prior.network.width=16", "prior.network.code_length=4", "prior.network.skip=0",
     "prior.steps=20", "prior.samples=500", "view.resolution=16",
 )  # fmt: skip
-ENDED = ("ok", "not_reached", "empty", "diverged", "timeout", "oom", "unsupported")  # a run that did what it can
+ENDED = ("ok", "not_reached", "empty", "diverged", "timeout", "oom", "unsupported")  # the command worked
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory) -> Iterator[dict[str, str]]:
-    """The files that commands name; what is written in CONTRIBUTING can be imported."""
+def placeholder_paths(tmp_path_factory) -> Iterator[dict[str, str]]:
+    """The paths of placeholders in commands; the code of CONTRIBUTING can be imported."""
     folder = tmp_path_factory.mktemp("documentation")
     named = documentation.make_files(folder)
     with pytest.MonkeyPatch.context() as patch:
@@ -78,15 +77,15 @@ def test_every_command_is_there():
     assert [name for name in packages if importlib.util.find_spec(f"{name}.__main__") is None] == []
 
 
-def test_every_command_composes(made):
+def test_every_command_composes(placeholder_paths):
     for command in COMPOSED:
-        arguments = filled(command, made)
+        arguments = filled(command, placeholder_paths)
         if "+experiment=sofa" in arguments:  # stands for any, which the tests of conf compose
             continue
         config = first_cell(arguments).config
         check_names(config)
-        for part in ("renderer", "task"):  # of others, the tests of conf build every choice
-            build(config[part], part, config["packages"])
+        for node in ("renderer", "task"):  # of others, the tests of conf build every choice
+            build(config[node], node, config["packages"])
 
 
 def test_every_link_leads_to_a_file_and_a_heading():
@@ -119,52 +118,57 @@ def test_the_code_of_the_readme_runs(tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def own_task(made, tmp_path_factory) -> Path:
-    """The results of the task of CONTRIBUTING, which its experiment sweeps over."""
-    results = tmp_path_factory.mktemp("own") / "results"
+def task_results(placeholder_paths, tmp_path_factory) -> Path:
+    """The results of the sweep of CONTRIBUTING's experiment over its task."""
+    results = tmp_path_factory.mktemp("task") / "results"
     (sweep,) = [command for command in COMMANDS if "+experiment=coverage" in command.words]
-    done = typed(
-        *filled(sweep, made), "dataset=sofa", "scale=smoke", "isolation=off", "threads=1", f"results_dir={results}"
+    result = typed(
+        *filled(sweep, placeholder_paths),
+        "dataset=sofa",
+        "scale=smoke",
+        "isolation=off",
+        "threads=1",
+        f"results_dir={results}",
     )
-    assert done.code == 0, done.err
+    assert result.code == 0, result.err
     return results
 
 
-def test_the_task_of_contributing_counts_what_it_says(own_task):
-    runs = bench.load(own_task)
+def test_the_task_of_contributing_counts_what_it_says(task_results):
+    runs = bench.load(task_results)
     assert list(runs.status) == ["ok"] * 2 and (runs.hits > 100).all()
 
 
-def test_the_dataset_of_contributing_is_completed(made, tmp_path):
+def test_the_dataset_of_contributing_is_completed(placeholder_paths, tmp_path):
     (command,) = [command for command in COMMANDS if "dataset=rings" in command.words]
-    done = typed(*filled(command, made), *SMALL, "field=box", f"results_dir={tmp_path}")
-    assert done.out, done.err
+    result = typed(*filled(command, placeholder_paths), *SMALL, "field=box", f"results_dir={tmp_path}")
+    assert result.out, result.err
     record = bench.load(tmp_path).iloc[0]
     assert record.scene == "rings test 0" and record.status in ENDED
 
 
-def test_the_study_of_contributing_is_a_table(own_task, tmp_path, monkeypatch):
+def test_the_study_of_contributing_is_a_table(task_results, tmp_path, monkeypatch):
     (tmp_path / "coverage.py").write_text(code_of("CONTRIBUTING.md", "python")[2])
     monkeypatch.setattr(paper, "STUDIES", tmp_path)
     monkeypatch.setattr(bench.studies, "__path__", [str(tmp_path)])
     paper.studies.cache_clear()
-    own = list((own_task / "sweeps").glob("*/table.*"))  # written when the sweep ended: it had no page then
-    assert len(own) == 4
-    for path in own:
+    tables = list((task_results / "sweeps").glob("*/table.*"))  # written when the sweep ended, before its study existed
+    assert len(tables) == 4
+    for path in tables:
         path.unlink()
     try:
-        report([f"results_dir={own_task}"])
-        (page,) = (found.shown for found in paper.find_paper(own_task) if not found.shipped)
-    finally:  # after the last use of the studies of this test
+        report([f"results_dir={task_results}"])
+        (page,) = (candidate.shown for candidate in paper.find_paper(task_results) if not candidate.shipped)
+    finally:
         paper.studies.cache_clear()
         sys.modules.pop("bench.studies.coverage", None)
     assert page.columns[0] == "Run" and len(page.rows) == 2 and page.question
-    assert not list((own_task / "sweeps").glob("*/table.csv"))  # a page shows it
+    assert not list((task_results / "sweeps").glob("*/table.csv"))  # a page shows it
 
 
-def cell_of(command: Command, made: dict[str, str]) -> list[str]:
-    """The first cell of a command, on this machine."""
-    options = options_of([text for text in filled(command, made) if not text.startswith("hydra")])
+def first_arguments(command: Command, placeholder_paths: dict[str, str]) -> list[str]:
+    """The arguments of the first cell of a command, on this machine."""
+    options = options_of([text for text in filled(command, placeholder_paths) if not text.startswith("hydra")])
     typed = [text.partition("=")[0] for text in options.overrides]
     with composing(*config_dirs(options)):
         composer = Composer([*options.overrides, "scale=smoke"] if options.multirun else options.overrides)
@@ -181,58 +185,53 @@ def cell_of(command: Command, made: dict[str, str]) -> list[str]:
 @pytest.mark.parametrize(
     "command", [c for c in COMPOSED if c.module == "bench" and not re.search("NAME|plan=true", str(c))], ids=str
 )
-def test_every_command_runs(made, tmp_path, command):
+def test_every_command_runs(placeholder_paths, tmp_path, command):
     if {"+method=stereo", documentation.DENSE} & set(command.words):
         pytest.importorskip("cv2", reason="stereo is an extra: pip install -e '.[stereo]'")
     fitted = {"+experiment=table1", "+experiment=gradients"} & set(command.words)
-    small = SHIPPED if "+method=single_view" in command.words else FITTED if fitted else QUICK
-    done = typed(*cell_of(command, made), *small, f"results_dir={tmp_path}")
-    assert done.out, done.err
+    small = SMALL_EVALUATION if "+method=single_view" in command.words else SMALL_FITTED_NETWORK if fitted else QUICK
+    result = typed(*first_arguments(command, placeholder_paths), *small, f"results_dir={tmp_path}")
+    assert result.out, result.err
     record = bench.load(tmp_path).iloc[0]
     assert record.status in ENDED, record.reason
 
 
 @pytest.mark.slow
-def test_the_other_commands_run(made, tmp_path):
-    """In one folder, whose words they have: a run, results folders, a folder of photographs."""
-    done = typed("renderer=newton", *QUICK, f"results_dir={tmp_path / 'A'}")
-    named = made | dict.fromkeys(("RUN", "RUN..."), done.out.splitlines()[-1])
+def test_the_other_commands_run(placeholder_paths, tmp_path):
+    """All run in one folder, which has a run, results folders and a folder of photographs."""
+    result = typed("renderer=newton", *QUICK, f"results_dir={tmp_path / 'A'}")
+    named = placeholder_paths | dict.fromkeys(("RUN", "RUN..."), result.out.splitlines()[-1])
     for other in ("B", "C", "BEFORE", "AFTER"):
         shutil.copytree(tmp_path / "A", tmp_path / other)
     named["PATH"] = str(tmp_path / "A")
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "local").symlink_to(tmp_path / "A")
-    elsewhere = ("bench", "pytest", "bench.judge", "bench.suite")  # tested in files of their own
-    here = [c for c in COMMANDS if c.module not in elsewhere]
-    for command in here:
+    elsewhere_tested = ("bench", "pytest", "bench.judge", "bench.suite")  # tested in files of their own
+    tested = [c for c in COMMANDS if c.module not in elsewhere_tested]
+    for command in tested:
         words = filled(command, named) + (list(QUICK) if command.module in HYDRA else [])
-        ran = subprocess.run(
-            [sys.executable, "-m", command.module, *words], cwd=tmp_path, capture_output=True, text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False,
-        )  # fmt: skip
-        told = "has no runs of the tuning" in ran.stderr or (ran.returncode == 2 and not command.arguments)
-        assert ran.returncode == 0 or told, (str(command), ran.stderr)
+        ran = by_program("-m", command.module, *words, cwd=tmp_path, PYTHONPATH=str(ROOT))
+        explained = "has no runs of the tuning" in ran.err or (ran.code == 2 and not command.arguments)
+        assert ran.code == 0 or explained, (str(command), ran.err)
 
 
 @pytest.mark.slow
-def test_the_contract_of_contributing_holds(made, tmp_path):
+def test_the_contract_of_contributing_holds(placeholder_paths, tmp_path):
     (contract,) = [command for command in COMMANDS if command.module == "pytest"]
-    paths = os.pathsep.join([str(ROOT), str(Path(made["my_conf"]).parent)])
-    ran = subprocess.run(
-        [sys.executable, "-m", "pytest", *contract.arguments], cwd=ROOT, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": paths}, check=False,
-    )  # fmt: skip
-    assert ran.returncode == 0, ran.stdout[-3000:]
+    paths = os.pathsep.join([str(ROOT), str(Path(placeholder_paths["my_conf"]).parent)])
+    ran = by_program("-m", "pytest", *contract.arguments, PYTHONPATH=paths)
+    assert ran.code == 0, ran.out[-3000:]
 
 
-SETTINGS_OF_SPEED = re.compile(r"(dist_alpha|dist_epsilon|dist_steps|dvr_fixed)_")  # the README has these with a star
+# The README names these families of renderers with a star.
+SETTINGS_OF_SPEED = re.compile(r"(dist_alpha|dist_epsilon|dist_steps|dvr_fixed)_")
 
 
 @pytest.mark.parametrize("group", ["renderer", "experiment"])
 def test_the_page_of_choices_names_every_file(group):
     names = {name for name in tables.names(group) if not name.startswith("_")}
-    said = set(re.findall(r"(?:`|\+experiment=)([a-z0-9_]+)[` ]", text_of("conf/README.md")))
-    assert {name for name in names if not SETTINGS_OF_SPEED.match(name)} <= said
+    mentioned = set(re.findall(r"(?:`|\+experiment=)([a-z0-9_]+)[` ]", text_of("conf/README.md")))
+    assert {name for name in names if not SETTINGS_OF_SPEED.match(name)} <= mentioned
 
 
 def test_the_table_of_the_papers_has_the_numbers_of_shapes_that_are_shipped():

@@ -1,4 +1,4 @@
-"""The command bench.judge: closed forms, pairs of files, worlds and masks of photographs, rows, and its errors."""
+"""The command bench.judge: closed forms, pairs of files, cameras and masks of photographs, records, and errors."""
 
 import re
 from pathlib import Path
@@ -57,7 +57,7 @@ def plate(height: float) -> Mesh:
 
 @pytest.fixture
 def files(tmp_path) -> Path:
-    """Spheres of two sizes beside larger ones, and a plate beside a shifted one."""
+    """Two spheres and a plate as truth; larger spheres and a shifted plate as results."""
     for folder, more, height in (("truth", 0.0, 0.0), ("found", 0.2, 1.0)):
         (tmp_path / folder).mkdir()
         ball(2.0 + more).save(tmp_path / folder / "small.ply")
@@ -67,35 +67,34 @@ def files(tmp_path) -> Path:
 
 
 def test_spheres_and_plates_are_as_far_apart_as_they_were_made(files, capsys):
-    # A point's nearest one lies beside its nearest place, by about half the spacing of 4,000 points: 0.06 of 4 pi 2^2.
-    for name, apart, beside in (("small", 0.2, 0.06), ("plate", 1.0, 0.08)):
-        found = judged(capsys, *pair(files, name))[name]
-        most = (apart**2 + 2 * beside**2) ** 0.5
+    # A nearest point is off the nearest surface point by half the spacing of 4,000 points: 0.06 for 4 pi 2^2.
+    for name, distance, sampling_error in (("small", 0.2, 0.06), ("plate", 1.0, 0.08)):
+        metrics = judged(capsys, *pair(files, name))[name]
+        upper = (distance**2 + 2 * sampling_error**2) ** 0.5
         for metric in ("accuracy", "completeness", "chamfer_l1"):
-            assert 0.99 * apart < found[metric] < most
-        assert 0.98 * apart**2 < found["chamfer_gt_to_pred"] < most**2 and found["normal_consistency"] > 0.99
-        assert found["chamfer_l2"] == pytest.approx(2 * found["chamfer_gt_to_pred"], rel=0.1)
+            assert 0.99 * distance < metrics[metric] < upper
+        assert 0.98 * distance**2 < metrics["chamfer_gt_to_pred"] < upper**2 and metrics["normal_consistency"] > 0.99
+        assert metrics["chamfer_l2"] == pytest.approx(2 * metrics["chamfer_gt_to_pred"], rel=0.1)
 
 
 def test_the_threshold_is_in_units_or_per_cent_of_the_truths_extent(files, capsys):
     texts = ("0.999", "1.1", "1.005", f"{100.5 / 200**0.5}%")
-    given = [(*pair(files, "plate"), f"--threshold={text}") for text in (*texts, "0", "-1", "x", "1%%")]
-    none, most, some, same = (judged(capsys, *one)["plate"]["fscore"] for one in given[:4])
-    assert none == 0 and most > 0.99 and 0.2 < some == same < 0.95  # no point is nearer than 1
-    for one in given[4:]:
-        assert "--threshold must be a positive number, or one with %" in refused(capsys, *one)
+    commands = [(*pair(files, "plate"), f"--threshold={text}") for text in (*texts, "0", "-1", "x", "1%%")]
+    none, most, absolute, percentage = (judged(capsys, *arguments)["plate"]["fscore"] for arguments in commands[:4])
+    assert none == 0 and most > 0.99 and 0.2 < absolute == percentage < 0.95  # no point is nearer than 1
+    assert all("--threshold must be a positive number" in refused(capsys, *arguments) for arguments in commands[4:])
 
 
 def test_a_cloud_is_a_truth_and_has_no_normals(files, capsys):
     points = on_ball(6000, 2.0)  # more than are drawn, from below to above
     trimesh.PointCloud(points[points[:, 2].argsort()]).export(files / "cloud.ply")
-    found = judged(capsys, files / "found/small.ply", "--truth", files / "cloud.ply", *FEW)["small"]
-    assert "normal_consistency" not in found and found["chamfer_l1"] == pytest.approx(0.2, abs=0.02)
+    metrics = judged(capsys, files / "found/small.ply", "--truth", files / "cloud.ply", *FEW)["small"]
+    assert "normal_consistency" not in metrics and metrics["chamfer_l1"] == pytest.approx(0.2, abs=0.02)
 
 
 def test_in_the_unit_sphere_the_size_of_the_files_does_not_count(files, capsys):
-    made = [read_mesh(files / name / "small.ply") for name in ("truth", "found")]
-    for mesh, name in zip(made, ("a", "small"), strict=True):
+    meshes = [read_mesh(files / name / "small.ply") for name in ("truth", "found")]
+    for mesh, name in zip(meshes, ("a", "small"), strict=True):
         mesh.moved(np.array([[7.0, 0, 0, 50], [0, 7, 0, 1], [0, 0, 7, -9], [0, 0, 0, 1]])).save(files / f"{name}.ply")
     first = judged(capsys, *pair(files, "small"), "--unit-sphere")
     second = judged(capsys, files / "small.ply", "--truth", files / "a.ply", *FEW, "--unit-sphere")
@@ -123,16 +122,16 @@ def test_a_mesh_of_another_size_or_place_than_its_truth_is_a_likely_mistake(file
         return [note for note in notes if note.startswith("warning")]
 
     ball(2.0, (0, 0, 0)).save(files / "truth.ply")
-    for radius, apart in ((2.0, 1.35), (2.36, 0.0), (1.69, 0.0)):  # overlaps of 2.9 / 5.6, and of .61
-        assert warned(radius, (apart, 0, 0)) == warned(radius, (0, apart, 0)) == []
-    for radius, apart, words in (
+    for radius, shift in ((2.0, 1.35), (2.36, 0.0), (1.69, 0.0)):  # overlaps of 2.9 / 5.6, and of .61
+        assert warned(radius, (shift, 0, 0)) == warned(radius, (0, shift, 0)) == []
+    for radius, shift, words in (
         (2.0, 1.45, "1 times as large as the truth, and their boxes overlap by 49%"),  # 2.83 / 5.73
         (2.0, 9.0, "1 times as large as the truth, and their boxes overlap by 0%"),
         (2.44, 0.0, "1.22 times as large as the truth"),
         (1.64, 0.0, "0.82 times as large as the truth"),
         (2000.0, 0.0, "1e+03 times as large as the truth"),
     ):
-        (warning,) = warned(radius, (0, 0, apart))
+        (warning,) = warned(radius, (0, 0, shift))
         assert words in warning and warning.endswith("The mesh of a run is in its unit sphere")
 
 
@@ -144,15 +143,15 @@ def test_a_plate_is_compared_by_its_box_though_it_has_no_volume(files, capsys):
 
 
 def test_a_folder_has_a_row_for_each_truth_and_medians(files, capsys):
-    whole = judged(capsys, files / "found", "--truth", files / "truth", *FEW)
-    for metric, middle in whole.pop("median").items():
-        assert middle == sorted(whole[name][metric] for name in ("large", "plate", "small"))[1]
+    complete = judged(capsys, files / "found", "--truth", files / "truth", *FEW)
+    for metric, middle in complete.pop("median").items():
+        assert middle == sorted(complete[name][metric] for name in ("large", "plate", "small"))[1]
     (files / "found/large.ply").unlink()
     (files / "found/plate.ply").write_bytes(b"")
-    found = judged(capsys, files / "found", "--truth", files / "truth", *FEW, code=1)
-    assert list(found) == ["notes", "large", "plate", "small", "median"]
-    assert found["large"]["chamfer_l1"] == found["plate"]["chamfer_l1"] == found["median"]["chamfer_l1"] == np.inf
-    assert found["large"]["fscore"] == 0 < found["small"]["normal_consistency"]
+    incomplete = judged(capsys, files / "found", "--truth", files / "truth", *FEW, code=1)
+    assert list(incomplete) == ["notes", "large", "plate", "small", "median"]
+    assert [incomplete[name]["chamfer_l1"] for name in ("large", "plate", "median")] == [np.inf] * 3
+    assert incomplete["large"]["fscore"] == 0 < incomplete["small"]["normal_consistency"]
     plate(0.0).save(files / "found/stray.ply")
     error = refused(capsys, files / "found", "--truth", files / "truth")
     assert "stray.ply has no truth: name it as a file of" in error
@@ -183,35 +182,34 @@ def test_dtus_protocol_and_meshes_of_photographs_unit_sphere_and_masks(tmp_path,
     (tmp_path / "photos").mkdir()
     idr(tmp_path / "photos")
     write_dtu(tmp_path / "dtu", on_ball(4000, RADIUS) - CENTRE + PHOTOGRAPHED, plane=(0, 0, 1, 0), centre=PHOTOGRAPHED)
-    there = ball(1.03 * RADIUS, PHOTOGRAPHED)
-    there.save(tmp_path / "there65.ply")
+    in_world = ball(1.03 * RADIUS, PHOTOGRAPHED)
+    in_world.save(tmp_path / "there65.ply")
     capture = read_capture(tmp_path / "photos", ReadSettings(800))
-    there.moved(np.linalg.inv(capture.to_world)).save(tmp_path / "scan65.ply")
-    away = ball(0.1 * RADIUS, PHOTOGRAPHED + np.array([0, 0, 1.6 * RADIUS]))
-    faces = np.concatenate([there.faces, away.faces + len(there.vertices)])
-    Mesh(np.concatenate([there.vertices, away.vertices]), faces).save(tmp_path / "both65.ply")
-    expected = dtu_metrics(there, read_scan(tmp_path / "dtu", 65), seed=0)
-    where = ("--dtu", tmp_path / "dtu")
-    first = judged(capsys, tmp_path / "there65.ply", *where)
+    in_world.moved(np.linalg.inv(capture.to_world)).save(tmp_path / "scan65.ply")
+    stray = ball(0.1 * RADIUS, PHOTOGRAPHED + np.array([0, 0, 1.6 * RADIUS]))
+    faces = np.concatenate([in_world.faces, stray.faces + len(in_world.vertices)])
+    Mesh(np.concatenate([in_world.vertices, stray.vertices]), faces).save(tmp_path / "both65.ply")
+    expected = dtu_metrics(in_world, read_scan(tmp_path / "dtu", 65), seed=0)
+    dtu = ("--dtu", tmp_path / "dtu")
+    first = judged(capsys, tmp_path / "there65.ply", *dtu)
     assert first["there65"] == pytest.approx(expected, rel=1e-3) and tuple(first["there65"]) == METRIC_NAMES
     assert any("DVR (RGB): 0.907" in note for note in first["notes"])
-    moved = judged(capsys, tmp_path / "scan65.ply", *where, "--to-world", tmp_path / "photos")
+    moved = judged(capsys, tmp_path / "scan65.ply", *dtu, "--to-world", tmp_path / "photos")
     assert moved["scan65"] == pytest.approx(expected, rel=1e-3)
-    plain = judged(capsys, tmp_path / "both65.ply", *where)["both65"]
-    culled = judged(capsys, tmp_path / "both65.ply", *where, "--cull", tmp_path / "photos")["both65"]
+    plain = judged(capsys, tmp_path / "both65.ply", *dtu)["both65"]
+    culled = judged(capsys, tmp_path / "both65.ply", *dtu, "--cull", tmp_path / "photos")["both65"]
     assert plain["dtu_accuracy"] > 1.1 * culled["dtu_accuracy"] and culled == pytest.approx(expected, rel=0.05)
-    both = read_mesh(tmp_path / "both65.ply").moved(np.linalg.inv(capture.to_world))
-    both.save(tmp_path / "moved65.ply")
+    read_mesh(tmp_path / "both65.ply").moved(np.linalg.inv(capture.to_world)).save(tmp_path / "moved65.ply")
     more = ("--to-world", tmp_path / "photos", "--cull", tmp_path / "photos")
-    assert judged(capsys, tmp_path / "moved65.ply", *where, *more)["moved65"] == pytest.approx(culled, rel=1e-3)
-    away.save(tmp_path / "away65.ply")
-    error = refused(capsys, tmp_path / "away65.ply", *where, "--cull", tmp_path / "photos")
+    assert judged(capsys, tmp_path / "moved65.ply", *dtu, *more)["moved65"] == pytest.approx(culled, rel=1e-3)
+    stray.save(tmp_path / "away65.ply")
+    error = refused(capsys, tmp_path / "away65.ply", *dtu, "--cull", tmp_path / "photos")
     assert "leave nothing of the mesh" in error
     ball(1.0, PHOTOGRAPHED + 500).save(tmp_path / "far65.ply")
-    assert "nothing of the mesh lies within 20 mm of scan 65" in refused(capsys, tmp_path / "far65.ply", *where)
+    assert "nothing of the mesh lies within 20 mm of scan 65" in refused(capsys, tmp_path / "far65.ply", *dtu)
 
 
-def test_of_the_run_folder_of_photographs_the_mesh_in_their_world_is_judged(files, capsys):
+def test_a_run_on_photographs_is_judged_by_its_mesh_in_their_world(files, capsys):
     (files / "run").mkdir()
     (files / "run/record.json").write_text("{}")
     ball(9.0).save(files / "run/mesh.ply")
@@ -221,13 +219,13 @@ def test_of_the_run_folder_of_photographs_the_mesh_in_their_world_is_judged(file
     assert judged(capsys, *judge)["run"]["accuracy"] == pytest.approx(0.2, rel=0.1)
 
 
-def test_the_printed_unit_of_a_metric_is_that_of_its_definition():
+def test_the_printed_unit_of_a_metric_is_in_its_definition():
     for name, unit in metric_units(Judge(None, "1%", 1, 0, False, None, None)).items():
         kinds = {"from 0 to 1": "", "in squared scene units": "unit²", "in scene units": "unit"}
         assert unit == next(kinds[words] for words in kinds if words in DEFINITIONS[name]), name
 
 
-def test_rows_stand_beside_runs_and_are_merged(files, capsys):
+def test_records_join_those_of_runs_and_are_merged(files, capsys):
     (files / "found/large.ply").unlink()
     results, common = files / "results", ("--truth", files / "truth", *FEW, "--method", "My net")
     for _ in range(2):  # the second time they are replaced
@@ -241,7 +239,7 @@ def test_rows_stand_beside_runs_and_are_merged(files, capsys):
     assert "My net" in "".join(file.read_text() for file in (results / "page" / "data" / "list").rglob("*.js"))
 
 
-def test_a_row_may_answer_the_problem_of_a_run(files, capsys):
+def test_a_record_may_name_the_problem_of_a_run(files, capsys):
     config = {"dataset": {"path": "photos"}, "index": 0, "task": {"longest": 96}, "renderer": {"_label_": "Newton"}}
     config |= {"silhouette": {"_label_": "hinge"}}
     run = Record("run", "reconstruction", "newton", "photos", 3, config, scene="scan65")
@@ -254,7 +252,6 @@ def test_a_row_may_answer_the_problem_of_a_run(files, capsys):
     assert (row.name, row.task, row.dataset, row.seed, row.scene) == ("NeuS", "reconstruction", "photos", 3, "scan65")
     assert row.config["task"] == {"longest": 96} and "units of the truth's file" in row.definitions["accuracy"]
     assert (folder / "mesh.ply").is_file()
-    error = refused(capsys, files / "found", "--truth", files / "truth", *more)
-    assert "--like names the problem of one run" in error
+    assert "--like names the problem of one run" in refused(capsys, files / "found", "--truth", files / "truth", *more)
     Record("run", "completion", "newton", "mesh", 3, config, scene="spot").write(files / "run")
     assert "in scene units: add --unit-sphere" in refused(capsys, *pair(files, "small"), *more)

@@ -1,8 +1,6 @@
-"""Who may import whom: renderers <- datasets <- bench, in bench room by room; and that tests check types."""
+"""Imports go one way: renderers <- datasets <- bench, in bench room by room; and tests check types."""
 
 import ast
-import os
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +12,7 @@ from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
 
 from tests.conftest import checked, forgetting_modules
+from tests.runner.driving import by_program
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("renderers", "datasets", "bench", "conf", "tests")
@@ -33,15 +32,15 @@ COMMANDS = (
     "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune",
     "bench.turntable", "bench.verify",
 )  # fmt: skip
-# No run imports these, which decide what is run.
+# These modules decide what is run; no run imports them.
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.runner.library",)  # reads where this process finds modules, for the process that it starts
 RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
-ALSO = {"renderers.mesh_proxy": {"numpy", "open3d", "skimage"}}  # a method that is made of what others maintain
+ALSO = {"renderers.mesh_proxy": {"numpy", "open3d", "skimage"}}  # a renderer built on other libraries
 WITHOUT_TORCH = ("bench.records", "bench.report", STUDIES, "bench.pictures.style", "bench.pictures.size_chart")
-COMMON = "datasets.extras"  # without torch, and of use to all but renderers
-OWN = ("bench.report", "bench.records", "bench.tables")
-REPORT_MAY = (COMMON, *OWN, "bench.pictures.style", "bench.pictures.size_chart")
+COMMON = "datasets.extras"  # without torch; renderers may not use it
+DATA_ROOMS = ("bench.report", "bench.records", "bench.tables")
+REPORT_MAY = (COMMON, *DATA_ROOMS, "bench.pictures.style", "bench.pictures.size_chart")
 
 
 def imported(tree: ast.AST, module: str, is_package: bool) -> set[str]:
@@ -71,46 +70,46 @@ def room(name: str) -> str:
 
 
 def backward(module: str, names: set[str]) -> list[str]:
-    """The imports of a module from rooms behind its own, and from rooms that have no place in the order."""
+    """The imports of a module from rooms behind its own."""
     if module.endswith(".__main__") or module in COMMANDS:  # nothing imports them
         return []
-    here, found = room(module), []
-    for name in (name for name in names if room(name) in ROOMS and here in ROOMS):
-        there = room(name)
-        if there != here and ROOMS.index(there) > ROOMS.index(here):
-            found.append(f"imports {name} from a room behind {here}")
-    return found
+    own_room, messages = room(module), []
+    for name in (name for name in names if room(name) in ROOMS and own_room in ROOMS):
+        other_room = room(name)
+        if other_room != own_room and ROOMS.index(other_room) > ROOMS.index(own_room):
+            messages.append(f"imports {name} from a room behind {own_room}")
+    return messages
 
 
 def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
-    """What the source of a module does that it may not do."""
+    """The faults of a module's source."""
     tree = ast.parse(source)
     names = imported(tree, module, is_package) - {STUDIES}
     top = module.split(".")[0]
-    found = [f"imports {name}" for name in names if within(name, *FORBIDDEN.get(top, ()))]
+    messages = [f"imports {name}" for name in names if within(name, *FORBIDDEN.get(top, ()))]
     command = [name for name in names if ".__main__" in name or within(name, *COMMANDS)]
-    found += [f"imports a command: {name}" for name in command if top == "bench"]
-    found += backward(module, names)
+    messages += [f"imports a command: {name}" for name in command if top == "bench"]
+    messages += backward(module, names)
     if top == "renderers":
-        found += [
-            f"imports {name}" for name in names if name.split(".")[0] not in RENDERERS_MAY | ALSO.get(module, set())
-        ]
+        allowed = RENDERERS_MAY | ALSO.get(module, set())
+        messages += [f"imports {name}" for name in names if name.split(".")[0] not in allowed]
     if within(module, *WITHOUT_TORCH):
         slow = [name for name in names if within(name, "torch", "renderers", "datasets")]
-        found += [f"imports {name}" for name in slow if not within(name, COMMON)]
+        messages += [f"imports {name}" for name in slow if not within(name, COMMON)]
     if within(module, "bench.report", STUDIES):
-        found += [f"imports {name}" for name in names if name.split(".")[0] in OURS and not within(name, *REPORT_MAY)]
+        ours = [name for name in names if name.split(".")[0] in OURS]
+        messages += [f"imports {name}" for name in ours if not within(name, *REPORT_MAY)]
     if top == "bench":  # a study neither
-        found += [f"imports a study: {name}" for name in names if within(name, STUDIES)]
+        messages += [f"imports a study: {name}" for name in names if within(name, STUDIES)]
     if module == "bench":  # runs before every import of bench.report, and before torch may be imported
-        found += [f"imports {name}" for name in names if name.split(".")[0] not in sys.stdlib_module_names]
+        messages += [f"imports {name}" for name in names if name.split(".")[0] not in sys.stdlib_module_names]
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names):
-            found.append("has a star import")
+            messages.append("has a star import")
         of_sys = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sys"
         if of_sys and node.attr == "path" and module not in PASSES_PATH_ON:
-            found.append("touches sys.path")
-    return found + ["touches sys.path" for name in names if name == "sys.path"]
+            messages.append("touches sys.path")
+    return messages + ["touches sys.path" for name in names if name == "sys.path"]
 
 
 def modules() -> list[Path]:
@@ -124,15 +123,15 @@ def named(path: Path) -> tuple[str, bool]:
 
 
 def test_imports_go_one_way():
-    found = {str(path): wrongs(path.read_text(), *named(path)) for path in modules()}
-    assert {path.relative_to(ROOT).parts[0] for path in modules()} == {*OURS} and len(found) > 200
-    assert {path: wrong for path, wrong in found.items() if wrong} == {}
+    faults = {str(path): wrongs(path.read_text(), *named(path)) for path in modules()}
+    assert {path.relative_to(ROOT).parts[0] for path in modules()} == {*OURS} and len(faults) > 200
+    assert {path: wrong for path, wrong in faults.items() if wrong} == {}
 
 
-def test_every_room_has_its_place():
-    there = {path.stem for path in (ROOT / "bench").iterdir() if path.is_dir() and list(path.glob("*.py"))}
-    there |= {path.stem for path in (ROOT / "bench").glob("*.py")} - {"__init__", "__main__"}
-    assert there | {"studies"} == {*ROOMS, *map(room, COMMANDS)}
+def test_every_room_is_in_the_order_of_imports():
+    rooms = {path.stem for path in (ROOT / "bench").iterdir() if path.is_dir() and list(path.glob("*.py"))}
+    rooms |= {path.stem for path in (ROOT / "bench").glob("*.py")} - {"__init__", "__main__"}
+    assert rooms | {"studies"} == {*ROOMS, *map(room, COMMANDS)}
 
 
 def test_conf_holds_yaml_only():
@@ -141,31 +140,23 @@ def test_conf_holds_yaml_only():
 
 
 WRONG = (
-    ("renderers.dist", "from datasets.scene import Scene"),
+    ("renderers.dist", "from datasets.scene import Scene"), ("renderers.dist", "import numpy as np"),
     ("renderers.dist", "def f():\n    from bench.config import build"),
-    ("renderers.dist", "import numpy as np"),
     ("renderers.fields.mlp", "from ...bench import config"),
-    ("datasets.scene", "import bench.records"),
-    ("datasets.scene", "if True:\n    import conf"),
+    ("datasets.scene", "import bench.records"), ("datasets.scene", "if True:\n    import conf"),
     ("bench.runner.run", "from tests.renderers.analytic_cases import CASES"),
     ("bench.runner.run", "from bench.report.write.html import write_index"),
-    ("bench.records.record", "def f():\n    import bench.report"),
-    ("bench.records.record", "import torch"),
-    ("bench.runner.run", "from bench.merge import merge"),
-    ("bench.report.write.html", "from torch import Tensor"),
-    ("bench.report.write.html", "from bench import solve"),
+    ("bench.records.record", "def f():\n    import bench.report"), ("bench.records.record", "import torch"),
+    ("bench.runner.run", "from bench.merge import merge"), ("bench.report.write.html", "from torch import Tensor"),
+    ("bench.report.write.html", "from bench import solve"), ("bench.report", "import renderers"),
     ("bench.report.write.html", "from ...solve.solve import COST_DEFINITIONS"),
-    ("bench.report", "import renderers"),
-    ("bench", "import torch"),
-    ("conf", "from bench import config"),
-    ("bench.runner.run", "from os import *"),
-    ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"),
-    ("tests.test_layers", "from sys import path"),
+    ("bench", "import torch"), ("conf", "from bench import config"), ("bench.runner.run", "from os import *"),
+    ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"), ("tests.test_layers", "from sys import path"),
     ("bench.__main__", "import bench.studies.completion"),
     ("bench.report.write.html", "from ...studies.completion import make"),
     ("bench.studies.completion", "from .table1 import make"),
     ("bench.studies.completion", "from bench.setup.inputs import Task"),
-)
+)  # fmt: skip
 RIGHT = (
     ("renderers.dist", "import math\nimport torch\nfrom jaxtyping import Float\nfrom renderers.field import Field"),
     ("renderers.fields.mlp", "from ..field import Kind\nfrom .analytic import Shape"),
@@ -173,21 +164,16 @@ RIGHT = (
     ("bench.runner.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
     ("bench.__main__", "from bench.report.write.html import write_index"),
     ("bench.report.write.html", "import plotly, os.path\nfrom bench.records import format\nfrom . import caption"),
-    ("bench", "import os"),
-    ("benchmark.report", "import datasets_of_others"),
+    ("bench", "import os"), ("benchmark.report", "import datasets_of_others"),
     ("bench.report.write.paper", "from bench import studies"),
     ("bench.studies.completion", "import pandas as pd\nfrom bench.report.data.statistics import geometric"),
-)
+)  # fmt: skip
 
 
-def test_the_checker_finds_what_is_wrong():
-    for module, source in WRONG:
-        assert wrongs(source, module, is_package=module in ("bench", "bench.report", "conf")), (module, source)
-
-
-def test_the_checker_lets_pass_what_is_right():
-    for module, source in RIGHT:
-        assert wrongs(source, module, is_package=module == "bench") == [], (module, source)
+def test_the_checker_finds_what_is_wrong_and_lets_pass_what_is_right():
+    for module, source in (*WRONG, *RIGHT):
+        messages = wrongs(source, module, is_package=module in ("bench", "bench.report", "conf"))
+        assert bool(messages) is ((module, source) in WRONG), (module, source, messages)
 
 
 @jaxtyped(typechecker=checked)
@@ -201,23 +187,20 @@ def test_types_and_shapes_are_checked_of_arguments_and_of_results():
     for arguments in wrong:
         with pytest.raises(TypeCheckError, match="parameters"):
             _first(*arguments)
-    with pytest.raises(TypeCheckError, match="return value"):  # of shape (4, 3), where n is (4,)
+    with pytest.raises(TypeCheckError, match="return value"):  # its shape is (4, 3), but n is (4,)
         _first(torch.zeros(4, 3), 1)
 
 
 def test_only_modules_that_a_test_wrote_are_forgotten_after_it(tmp_path):
-    """PyTorch itself may lie under the system's temporary folder, with the virtual environment of a clone there."""
+    """PyTorch itself may be under the system's temporary folder, in the virtual environment of a clone."""
     with forgetting_modules(tmp_path):
         for name, folder in (("written_by_a_test", tmp_path), ("of_an_environment", tmp_path.parent)):
             sys.modules[name] = ModuleType(name)
             sys.modules[name].__file__ = str(folder / f"{name}.py")
-    assert "written_by_a_test" not in sys.modules
-    assert sys.modules.pop("of_an_environment").__file__
+    assert "written_by_a_test" not in sys.modules and sys.modules.pop("of_an_environment").__file__
 
 
 @pytest.mark.slow
 def test_make_test_types_checks_every_call_of_ours():
     code = "import tests.conftest, torch; from renderers.fields.analytic import sphere; sphere().rotate(torch.eye(4))"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CHECK_TYPES": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert "TypeCheckError" in done.stderr
+    assert "TypeCheckError" in by_program("-c", code, PYTHONPATH=str(ROOT), CHECK_TYPES="1").err

@@ -1,4 +1,4 @@
-"""The wheel and the sdist have all that runs need, and say one version."""
+"""The wheel and the sdist have all files that runs need, and one version."""
 
 import os
 import re
@@ -19,23 +19,24 @@ from bench.__main__ import console
 from bench.records.read import RESULTS
 from bench.runner.executors import EXTRA_BY_EXECUTOR
 from datasets.extras import install_command, version
+from tests.runner.driving import by_program
 from tests.test_layers import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "conf", "datasets", "renderers")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 VERSION = PROJECT["project"]["version"]
-LEFT_OUT = ("results/",)  # of the sdist
+NOT_IN_SDIST = ("results/",)
 DEMO = ("task=completion", "renderer=dist", "scale=smoke", "threads=1", "evaluation.picture=null")
 
 
 def tracked() -> list[str]:
-    """The files of the project, as git has them, those that are new but not ignored included."""
-    asked = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    """The files of the project that git tracks, and new files that are not ignored."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     if not (ROOT / ".git").exists():
         pytest.skip("git says which files a package must have, and this is no clone")
-    said = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    return [name for name in said.splitlines() if (ROOT / name).is_file()]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [name for name in listed.splitlines() if (ROOT / name).is_file()]
 
 
 def of_packages(names: list[str]) -> set[str]:
@@ -54,10 +55,10 @@ def test_there_is_one_version_everywhere():
     assert cited["version"] == VERSION and cited["cff-version"] == "1.2.0"
     assert f"version = {{{VERSION}}}" in (ROOT / "README.md").read_text(encoding="utf-8")
     headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert VERSION in headings[:2]  # what is unreleased may stand before it
+    assert VERSION in headings[:2]  # unreleased changes may come before it
 
 
-def test_an_extra_is_installed_into_the_checkout_or_beside_the_installed_package(tmp_path, monkeypatch):
+def test_an_extra_is_installed_into_the_checkout_or_with_the_installed_package(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     assert install_command("ray") == "pip install -e '.[ray]'"
     monkeypatch.chdir(tmp_path)
@@ -69,19 +70,17 @@ def test_a_library_that_is_not_installed_has_no_version():
     assert version("no-such-library") is None and version("torch")
 
 
-def test_every_extra_that_a_message_names_is_there():
+def test_every_extra_that_a_message_names_exists():
     sources = [(ROOT / path).read_text(encoding="utf-8") for path in of_packages(tracked()) if path.endswith(".py")]
-    named = [found for source in sources for found in re.findall(r"""\binstall_command\(["'](\w+)["']\)""", source)]
+    named = [extra for source in sources for extra in re.findall(r"""\binstall_command\(["'](\w+)["']\)""", source)]
     assert len(named) >= 4
     assert {*named, *EXTRA_BY_EXECUTOR.values()} <= set(PROJECT["project"]["optional-dependencies"])
 
 
 def started(folder: Path, *arguments: str) -> tuple[int, str]:
-    """The exit status and standard error of Python in a folder, which comes before all others that have modules."""
-    paths = {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
-    program = [sys.executable, *arguments]
-    done = subprocess.run(program, cwd=folder, env=os.environ | paths, capture_output=True, text=True, check=False)
-    return done.returncode, done.stderr
+    """The exit status and standard error of Python in a folder, whose modules come before all others."""
+    result = by_program(*arguments, cwd=folder, PYTHONPATH=os.pathsep.join([str(folder), str(ROOT)]))
+    return result.code, result.err
 
 
 @pytest.mark.parametrize("file", ["datasets/__init__.py", "renderers.py"])
@@ -89,9 +88,9 @@ def test_another_package_in_the_place_of_ours_is_an_error_in_one_line(tmp_path, 
     path = tmp_path / file
     path.parent.mkdir(exist_ok=True)
     path.write_text('"""Of another project."""\nraise RuntimeError("it was imported")')
-    said = f"{path} is not the package {file.split('/')[0].removesuffix('.py')} of implicit-bench"
+    message = f"{path} is not the package {file.split('/')[0].removesuffix('.py')} of implicit-bench"
     code, err = started(tmp_path, "-m", "bench.report", "--help")
-    assert code == 1 and err.startswith(f"error: {said}") and len(err.splitlines()) == 1
+    assert code == 1 and err.startswith(f"error: {message}") and len(err.splitlines()) == 1
     assert "an environment of its own (python -m venv)" in err
 
 
@@ -105,7 +104,7 @@ def test_a_package_that_was_installed_over_ours_is_an_error(tmp_path):
     assert code == 1 and "ImportError" in err and "not the package conf of implicit-bench" in err
 
 
-def test_a_conf_of_ones_own_does_no_harm(tmp_path):
+def test_a_users_conf_module_does_no_harm(tmp_path):
     (tmp_path / "conf.py").write_text("project = 'documentation'")
     assert started(tmp_path, "-c", "import bench") == (0, "")
 
@@ -119,16 +118,16 @@ def test_the_command_has_a_word_for_every_module_that_runs(monkeypatch, capsys):
         code, (out, err) = console(), capsys.readouterr()
         return code, out + err
 
-    code, told = typed("--help")
-    assert code == 0 and typed() == (0, told)
-    words = re.findall(r"^  implicit-bench (\w+) ?[^:]*: \w", told, re.MULTILINE)
+    code, help_text = typed("--help")
+    assert code == 0 and typed() == (0, help_text)
+    words = re.findall(r"^  implicit-bench (\w+) ?[^:]*: \w", help_text, re.MULTILINE)
     assert {*words} == {"run", "report", *(name.removeprefix("bench.") for name in COMMANDS)}
     assert typed("verfy", "RUN") == (2, "error: unknown word 'verfy': did you mean verify?\n") and not started
     assert typed("run", "-m", "seed=0,1")[1] == typed("judge", "--help")[1] == ""
     assert started == [["-m", "bench", "-m", "seed=0,1"], ["-m", "bench.judge", "--help"]]
 
 
-def test_results_are_not_of_the_checkout():
+def test_results_are_not_in_the_checkout():
     assert yaml.safe_load((ROOT / "conf" / "config.yaml").read_text(encoding="utf-8"))["results_dir"] == RESULTS
     ignored = subprocess.run(["git", "check-ignore", "-q", f"{RESULTS}/runs"], cwd=ROOT, check=False)
     assert ignored.returncode == 0 or not (ROOT / ".git").exists()
@@ -154,7 +153,7 @@ def built(tmp_path_factory) -> Path:
     """A folder with the wheel and the sdist of the project's files."""
     folder = tmp_path_factory.mktemp("package")
     for name in tracked():
-        if not name.startswith(LEFT_OUT):
+        if not name.startswith(NOT_IN_SDIST):
             (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, folder / "source" / name)
     code = "from setuptools import build_meta as b; b.build_sdist('../dist'); b.build_wheel('../dist')"
@@ -175,13 +174,13 @@ def test_the_sdist_has_every_file_but_results(built):
     (sdist,) = built.glob(f"implicit_bench-{VERSION}.tar.gz")
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    wanted = {name for name in tracked() if not name.startswith(LEFT_OUT) and name != ".gitignore"}
+    wanted = {name for name in tracked() if not name.startswith(NOT_IN_SDIST) and name != ".gitignore"}
     assert wanted - names == set()
 
 
 @pytest.mark.slow
 def test_the_wheel_runs_from_an_empty_folder(built, tmp_path):
-    """In an environment of its own, which has the libraries of this one, but not this project."""
+    """The new environment has the libraries of this one, but not this project."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True)
     python = tmp_path / "venv" / "bin" / "python"
     install = [sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", "-q"]
@@ -193,11 +192,11 @@ def test_the_wheel_runs_from_an_empty_folder(built, tmp_path):
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
 
     def run(*arguments: str) -> str:
-        done = subprocess.run(
+        process = subprocess.run(
             [python, *arguments], cwd=empty, env=environment, capture_output=True, text=True, check=False
         )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        assert process.returncode == 0, process.stderr
+        return process.stdout
 
     assert run("-c", "import bench; print(bench.__file__)").startswith(str(libraries))
     folder = empty / run("-m", "bench", *DEMO).splitlines()[-1]
@@ -205,7 +204,7 @@ def test_the_wheel_runs_from_an_empty_folder(built, tmp_path):
     assert [path.name for path in empty.iterdir()] == ["results"]
     assert run("-m", "bench.report").splitlines()[-1] == "results/local/index.html"
     assert run(python.with_name("implicit-bench"), "report").splitlines()[-1] == "results/local/index.html"
-    said = run(
+    printed = run(
         "-c", "import bench; r = bench.load(); print(r.status[0], r['commit'].isna()[0] or r['commit'][0] == '')"
     )
-    assert said.split() == ["ok", "True"]
+    assert printed.split() == ["ok", "True"]

@@ -1,4 +1,4 @@
-"""Shape priors: that a small one learns, how they are kept, and that the shipped ones belong to this code."""
+"""Shape priors: a small one learns, they are cached, and the shipped ones match this code."""
 
 import json
 from dataclasses import dataclass, replace
@@ -29,23 +29,14 @@ from tests.tiny import CPU, cell_from, mesh_of, silent
 
 SETTINGS = PriorSettings(
     network=NetworkSettings(layers=3, width=48, code_length=4, skip=1, narrow=False),
-    shapes=3,
-    samples=600,
-    steps=400,
-    shapes_per_step=3,
-    points_per_step=256,
-    learning_rate=5e-3,
-    beta2=0.99,
-    code_sigma=0.1,
-    code_penalty=1e-4,
-    surface_width=0.05,
-    seed=0,
-)
+    shapes=3, samples=600, steps=400, shapes_per_step=3, points_per_step=256, learning_rate=5e-3, beta2=0.99,
+    code_sigma=0.1, code_penalty=1e-4, surface_width=0.05, seed=0,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes from flat to tall; unseen ones lie between those of the training part."""
+    """Boxes from flat to tall; held-out heights are between those of training."""
 
     name: str = "boxes"
     widest: float = 0.5
@@ -59,8 +50,8 @@ class Boxes:
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    """A folder with a prior that was trained once, and what the call gave."""
+def cached_prior(tmp_path_factory):
+    """A folder with a prior that was trained once, and the prior."""
     folder = tmp_path_factory.mktemp("a cache") / "priors"
     return folder, prior_for(Boxes(), SETTINGS, folder, CPU, silent)
 
@@ -69,17 +60,16 @@ def never(*_, **__):
     raise AssertionError("a prior was trained although there is one")
 
 
-def test_a_prior_learns_its_shapes(kept):
-    _, prior = kept
+def test_a_prior_learns_its_shapes(cached_prior):
+    _, prior = cached_prior
     samples = distance_samples(Boxes(), Split.TRAIN, replace(SETTINGS, seed=9), 3, silent)
     fitted, mean_shape = fit_error(prior.decoder, samples, None), fit_error(prior.decoder, samples, None, steps=0)
-    zero = torch.zeros(3, 4)
-    assert mean_shape > 0.05
-    assert fitted < 0.25 * mean_shape
+    assert mean_shape > 0.05 and fitted < 0.25 * mean_shape
     with torch.no_grad():
-        own, mean = ((prior.decoder.at(code)(samples.points) - samples.distances).abs() for code in (prior.codes, zero))
-    assert own.mean() < 0.35 * mean.mean()  # anywhere, so that a field that is zero around the surface does not do
-    assert own[samples.distances.abs() < 0.02].mean() < 0.25 * mean_shape
+        fields = [prior.decoder.at(code)(samples.points) for code in (prior.codes, torch.zeros(3, 4))]
+    errors, mean_errors = ((field - samples.distances).abs() for field in fields)
+    assert errors.mean() < 0.35 * mean_errors.mean()  # far from the surface too: a field that is zero near it fails
+    assert errors[samples.distances.abs() < 0.02].mean() < 0.25 * mean_shape
 
 
 def test_samples_are_signed_distances_of_the_mesh():
@@ -87,8 +77,7 @@ def test_samples_are_signed_distances_of_the_mesh():
     half = torch.tensor([[0.5, 0.2, 0.3], [0.5, 0.5, 0.3]])
     beyond = samples.points.abs() - half[:, None]
     exact = beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0)
-    assert samples.points.shape == (2, 600, 3)
-    assert torch.allclose(samples.distances, exact, atol=1e-5)
+    assert samples.points.shape == (2, 600, 3) and torch.allclose(samples.distances, exact, atol=1e-5)
     near = (samples.distances.abs() < 0.03).float().mean()
     assert 0.5 < near < 0.8  # half of the samples lie close to the surface, a third around it
 
@@ -106,23 +95,23 @@ def test_beyond_its_truncation_a_prior_is_not_constrained():
     points = 2 * torch.nn.functional.normalize(torch.randn(3, 64, 3), dim=-1)
 
     def trained(distance: float, truncation: float | None):
-        """A network that begins as a sphere of radius 0.5, after steps at points far outside of it."""
+        """A network that begins as a sphere of radius 0.5, after steps at points far outside it."""
         settings = replace(SETTINGS, steps=3, points_per_step=8, truncation=truncation, code_penalty=0.0)
         samples = DistanceSamples(points, torch.full((3, 64), distance))
         return train(samples, settings, CPU, silent).decoder.state_dict()
 
-    def equal(one: dict, other: dict) -> bool:
-        return all(torch.equal(one[name], other[name]) for name in one)
+    def equal(first: dict, other: dict) -> bool:
+        return all(torch.equal(first[name], other[name]) for name in first)
 
-    begun = trained(0.9, 0.1)
-    assert equal(begun, trained(0.2, 0.1))  # neither 0.9 nor 0.2 says more than "beyond 0.1"
-    assert not equal(begun, trained(0.9, None))
+    truncated = trained(0.9, 0.1)
+    assert equal(truncated, trained(0.2, 0.1))  # both 0.9 and 0.2 are beyond 0.1
+    assert not equal(truncated, trained(0.9, None))
     with pytest.raises(ValueError, match=r"prior\.truncation must be positive.*null compares distances everywhere"):
         replace(SETTINGS, truncation=0.0)
 
 
-def test_a_prior_is_kept_with_its_record(kept):
-    folder, prior = kept
+def test_a_prior_is_kept_with_its_record(cached_prior):
+    folder, prior = cached_prior
     key = prior_key(Boxes(), SETTINGS)
     assert sorted(path.name for path in folder.glob("[!.]*")) == [f"boxes-{key}.json", f"boxes-{key}.safetensors"]
     record = json.loads((folder / f"boxes-{key}.json").read_text())
@@ -149,8 +138,8 @@ def test_a_prior_of_one_shape_is_evaluated_on_that_shape_at_its_code(tmp_path, m
     assert record["surface_error"]["training"] < 0.02
 
 
-def test_a_kept_prior_is_loaded_and_not_trained_again(kept, monkeypatch):
-    folder, prior = kept
+def test_a_kept_prior_is_loaded_and_not_trained_again(cached_prior, monkeypatch):
+    folder, prior = cached_prior
     monkeypatch.setattr(prior_store, "train", never)
     again = prior_for(Boxes(), SETTINGS, folder, CPU, silent)
     points = torch.rand(100, 3)
@@ -168,31 +157,26 @@ def test_a_prior_of_colours_learns_them_and_is_kept(tmp_path):
         shapes = prior.decoder.at(prior.codes)
         wrong = (shapes.paint(samples.surface) - samples.colours).abs().mean()
         plain = (samples.colours.mean(dim=1, keepdim=True) - samples.colours).abs().mean()
-        assert wrong < 0.4 * plain
-        assert shapes(samples.surface).abs().mean() < 0.03
-        half = prior.codes[0] * torch.tensor([1.0] * 4 + [-1.0] * 4)  # another texture on the same shape
+        assert wrong < 0.4 * plain and shapes(samples.surface).abs().mean() < 0.03
+        half = prior.codes[0] * torch.tensor([1.0] * 4 + [-1.0] * 4)  # the same shape with another texture
         points, other = samples.surface[0], prior.decoder.at(half)
         assert torch.equal(other(points), prior.decoder.at(prior.codes[0])(points))
         assert (other.paint(points) - shapes.paint(samples.surface)[0]).abs().max() > 0.01
     assert find_prior(Boxes(), replace(settings, colour=replace(colour, size=0.5)), tmp_path) is None
 
 
-def test_another_dataset_or_setting_has_another_key(kept, monkeypatch):
-    folder, _ = kept
-    others = [
-        (Boxes(widest=0.6), SETTINGS),
-        (Boxes(), replace(SETTINGS, steps=401)),
-        (Boxes(), replace(SETTINGS, seed=1)),
-        (Boxes(), replace(SETTINGS, network=replace(SETTINGS.network, width=47))),
-    ]
-    assert all(find_prior(dataset, settings, folder) is None for dataset, settings in others)
+def test_another_dataset_or_setting_has_another_key(cached_prior, monkeypatch):
+    folder, _ = cached_prior
+    changes = ({"steps": 401}, {"seed": 1}, {"network": replace(SETTINGS.network, width=47)})
+    assert all(find_prior(Boxes(), replace(SETTINGS, **change), folder) is None for change in changes)
+    assert find_prior(Boxes(widest=0.6), SETTINGS, folder) is None
     assert find_prior(Boxes(), SETTINGS, folder) is not None
     monkeypatch.setattr(prior_store, "VERSION", prior_store.VERSION + 1)
     assert find_prior(Boxes(), SETTINGS, folder) is None
 
 
-def test_a_damaged_prior_is_an_error_with_a_remedy(kept, tmp_path):
-    path = find_prior(Boxes(), SETTINGS, kept[0])
+def test_a_damaged_prior_is_an_error_with_a_remedy(cached_prior, tmp_path):
+    path = find_prior(Boxes(), SETTINGS, cached_prior[0])
     (tmp_path / path.name).write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=rf"the prior .*{path.name} cannot be read .*: delete it, and it is trained"):
         prior_for(Boxes(), SETTINGS, tmp_path, CPU, silent)
@@ -204,19 +188,16 @@ def shipped_records() -> list[dict]:
 
 @pytest.mark.parametrize("truncation", ["null", 0.1])
 @pytest.mark.parametrize("family", sorted(FAMILIES))
-def test_the_shipped_priors_are_those_of_the_configuration(family, truncation, compose_config, tmp_path, monkeypatch):
+def test_the_shipped_priors_match_the_configuration(family, truncation, compose_config, tmp_path, monkeypatch):
     desk = cell_from(compose_config(f"dataset={family}", "scale=desk", f"prior.truncation={truncation}"))
     dataset, settings = desk.inputs.dataset, desk.inputs.prior_choice.source
     (record,) = (record for record in shipped_records() if record["key"] == prior_key(dataset, settings))
-    assert record["dataset"]["name"] == family
-    assert record["settings"] == settings.identity
-    assert probe(dataset) == pytest.approx(record["probe"], rel=1e-4)  # the family is as it was
+    assert (record["dataset"]["name"], record["settings"]) == (family, settings.identity)
+    assert probe(dataset) == pytest.approx(record["probe"], rel=1e-4)  # the family has not changed
     error = record["surface_error"]
     assert max(error["validation"], error["training"]) < 0.003 and error["mean_shape"] > 5 * error["validation"]
     path = find_prior(dataset, settings, tmp_path)
-    assert path == SHIPPED / f"{dataset.name}-{record['key']}.safetensors"
-    assert path.stat().st_size < 1_000_000
-
+    assert path == SHIPPED / f"{dataset.name}-{record['key']}.safetensors" and path.stat().st_size < 1_000_000
     monkeypatch.setattr(prior_store, "train", never)
     prior = prior_for(dataset, settings, tmp_path, CPU, silent)
     assert prior.codes.shape == (settings.shapes, settings.network.code_length)

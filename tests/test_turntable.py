@@ -1,4 +1,4 @@
-"""The command bench.turntable: what turns, in which colours, into which file, and its errors."""
+"""The command bench.turntable: its frames, colours, files and errors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,30 +19,30 @@ SIZE = 32
 RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 
 
-def ball(radius: float = 0.8, at: tuple[float, float, float] = (0, 0, 0), split: int = 0) -> Mesh:
+def ball(radius: float = 0.8, centre: tuple[float, float, float] = (0, 0, 0), split: int = 0) -> Mesh:
     """A sphere, red on the negative side of the axis `split` and blue on the other."""
-    made = icosphere(radius, at)
-    return replace(made, colours=np.where(made.vertices[:, [split]] < at[split], RED, BLUE))
+    sphere = icosphere(radius, centre)
+    return replace(sphere, colours=np.where(sphere.vertices[:, [split]] < centre[split], RED, BLUE))
 
 
 def frames_of(path: Path) -> list[np.ndarray]:
     with Image.open(path) as moving:
         frames = []
-        for place in range(getattr(moving, "n_frames", 1)):
-            moving.seek(place)
+        for index in range(getattr(moving, "n_frames", 1)):
+            moving.seek(index)
             frames.append(np.asarray(moving.convert("RGB"), dtype=float) / 255)
         return frames
 
 
-def at_once(capsys: pytest.CaptureFixture, *arguments: object) -> Path:
-    """Runs the command with small frames; the file that its last line names."""
+def small_turntable(capsys: pytest.CaptureFixture, *arguments: object) -> Path:
+    """Runs the command with small frames; gives the file that its last line names."""
     assert main([*map(str, arguments), "--frames", "4", "--size", str(SIZE)]) == 0
     return Path(capsys.readouterr().out.splitlines()[-1])
 
 
-def drawn(mesh: Mesh, part: int, frames: int = 4) -> list[np.ndarray]:
-    """The frames of a part, 0 for colours, 1 for normals and 2 for depth, before they are written."""
-    return [frame[:, part * SIZE : (part + 1) * SIZE] / 255 for frame in turntable(mesh, frames, SIZE)]
+def drawn(mesh: Mesh, column: int, frames: int = 4) -> list[np.ndarray]:
+    """The frames of a column before they are written: 0 for colours, 1 for normals and 2 for depth."""
+    return [frame[:, column * SIZE : (column + 1) * SIZE] / 255 for frame in turntable(mesh, frames, SIZE)]
 
 
 def red(image: np.ndarray) -> np.ndarray:
@@ -52,7 +52,7 @@ def red(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("suffix", ["webp", "gif"])
 def test_the_red_half_is_on_the_left_and_half_a_turn_later_on_the_right(tmp_path, capsys, suffix):
     ball().save(tmp_path / "ball.ply")
-    path = at_once(capsys, tmp_path / "ball.ply", "--into", tmp_path / "new" / f"a.{suffix}")
+    path = small_turntable(capsys, tmp_path / "ball.ply", "--into", tmp_path / "new" / f"a.{suffix}")
     assert path == tmp_path / "new" / f"a.{suffix}"
     first, quarter, half, _ = (frame[:, :SIZE] for frame in frames_of(path))
     middle = SIZE // 2
@@ -69,23 +69,21 @@ def test_colours_are_interpolated_over_a_triangle():
     inside = np.ptp(frame, axis=-1) > 0.02
     rows, columns = (np.nonzero(inside.any(axis=axis))[0] for axis in (1, 0))
     assert frame[rows[-2], columns[1]].argmax() == 0  # the lower left corner is red
-    assert frame[rows[-2], columns[-2]].argmax() == 1
-    assert frame[rows[1], SIZE // 2].argmax() == 2
+    assert frame[rows[-2], columns[-2]].argmax() == 1 and frame[rows[1], SIZE // 2].argmax() == 2
     centre = frame[round(rows[0] + 2 / 3 * (rows[-1] - rows[0])), SIZE // 2]
     assert centre == pytest.approx([1 / 3] * 3, abs=0.06)
 
 
 def test_depth_has_one_scale_over_all_frames():
-    frames = drawn(ball(0.2, at=(0, 0, 0.7)), 2)
+    frames = drawn(ball(0.2, (0, 0, 0.7)), 2)
     viridis = colormaps["viridis_r"](np.arange(256))[:, :3]
 
-    def places(frame: np.ndarray) -> np.ndarray:
+    def colour_indices(frame: np.ndarray) -> np.ndarray:
         shown = frame[frame.min(axis=-1) < 0.5]
         return np.abs(shown[:, None] - viridis).sum(-1).argmin(-1)
 
-    near, side, far, _ = map(places, frames)
-    assert near.max() < 50 and far.min() > 190
-    assert side.min() > 80 and side.max() < 175
+    near, side, far, _ = map(colour_indices, frames)
+    assert near.max() < 50 and far.min() > 190 and side.min() > 80 and side.max() < 175
 
 
 def test_a_mesh_without_colours_is_shaded_and_its_normals_face_the_camera():
@@ -94,8 +92,8 @@ def test_a_mesh_without_colours_is_shaded_and_its_normals_face_the_camera():
     shaded = drawn(outward, 0)[0]
     assert np.ptp(shaded, axis=-1).max() == 0
     assert shaded[10, 12, 0] > shaded[21, 20, 0] + 0.2  # light from the upper left
-    for part in (0, 1):
-        assert drawn(inward, part)[0] == pytest.approx(drawn(outward, part)[0], abs=0.01)
+    for column in (0, 1):
+        assert drawn(inward, column)[0] == pytest.approx(drawn(outward, column)[0], abs=0.01)
     normals = drawn(outward, 1)[1]
     assert (normals[0] == 1).all() and normals[SIZE // 2, SIZE // 2, 2] > 0.9  # white around; it faces the camera
 
@@ -104,16 +102,16 @@ def test_a_run_folder_gets_its_turntable_and_a_mesh_file_one_in_the_current_fold
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run").mkdir()
     ball().save(tmp_path / "run" / "mesh.ply")
-    assert at_once(capsys, tmp_path / "run") == tmp_path / "run" / "turntable.webp"
-    mesh = ball(radius=50.0, at=(300, 0, 0))
+    assert small_turntable(capsys, tmp_path / "run") == tmp_path / "run" / "turntable.webp"
+    mesh = ball(50.0, (300, 0, 0))
     Mesh(mesh.vertices, mesh.faces[::2]).save("half.ply")  # open
-    assert at_once(capsys, "half.ply") == Path("turntable.webp")
+    assert small_turntable(capsys, "half.ply") == Path("turntable.webp")
     shown = frames_of(tmp_path / "turntable.webp")[0].min(axis=-1) < 0.9
     assert shown[:, :SIZE].any(axis=1).sum() > 0.8 * SIZE  # scaled until it fills the picture
 
 
 def test_a_mesh_in_the_unit_sphere_stays_and_another_is_moved_into_it():
-    inside, outside = ball(0.3, at=(0.5, 0, 0)), ball(0.3, at=(0.8, 0, 0))
+    inside, outside = ball(0.3, (0.5, 0, 0)), ball(0.3, (0.8, 0, 0))
     assert np.array_equal(make_upright(inside, "y").vertices, inside.vertices)
     moved = make_upright(outside, "y").vertices
     assert np.linalg.norm(moved, axis=1).max() == pytest.approx(1)
@@ -122,8 +120,8 @@ def test_a_mesh_in_the_unit_sphere_stays_and_another_is_moved_into_it():
 
 def test_up_turns_an_axis_upwards():
     for up in UPRIGHT:
-        way = (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
-        turned = make_upright(ball(0.2, at=tuple(0.5 * way)), up)
+        axis = (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
+        turned = make_upright(ball(0.2, tuple(0.5 * axis)), up)
         assert turned.vertices.mean(axis=0) == pytest.approx([0, 0.5, 0], abs=1e-6), up
         assert turned.volume > 0  # not mirrored
 
@@ -136,13 +134,13 @@ def test_every_kind_of_file_is_read_with_its_colours(tmp_path, suffix):
     trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=rgba, process=False).export(path)
     read = read_mesh(path)
     assert read.repairs == () and len(read.faces) == len(mesh.faces)
-    if suffix == "stl":  # which has none
+    if suffix == "stl":  # STL has no colours
         assert read.colours is None
     else:
         assert read.colours == pytest.approx(np.where(read.vertices[:, [0]] < 0, RED, BLUE))
 
 
-def test_colours_of_vertices_beside_a_texture_are_read(tmp_path):
+def test_colours_of_vertices_are_read_if_there_is_also_a_texture(tmp_path):
     corners = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 0 0 1\n"
     (tmp_path / "a.obj").write_text(f"{corners}vt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
     assert read_mesh(tmp_path / "a.obj").colours == pytest.approx(np.stack([RED, RED, BLUE]))

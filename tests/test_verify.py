@@ -1,4 +1,4 @@
-"""A run's metrics are computed again from the field that it left."""
+"""A run's metrics are computed again from its saved field."""
 
 import json
 import os
@@ -20,7 +20,7 @@ SMALL = (
     "renderer=dist", "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200",
     "evaluation.every=null", "evaluation.picture=null", "view.resolution=16", "task.optimiser.iterations=3",
 )  # fmt: skip
-GONE = "gone"  # of a metric that is deleted
+DELETED = "deleted"
 PHOTOGRAPHS = ("task.images.views=6", "task.longest=16", "task.held_out=3", "task.rays=64")
 RUNS = {
     "a code of the prior": ("task=completion", "task.points=20"),
@@ -33,14 +33,12 @@ RUNS = {
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> dict[str, Path]:
     """The folders of small runs by the kind of their field."""
-    folder, found = tmp_path_factory.mktemp("results"), {}
-    for name, chosen in RUNS.items():
-        done = command(*chosen, *SMALL, f"results_dir={folder}")
-        found[name] = Path(done.out.splitlines()[-1])
-        assert (found[name] / FIELD_FILE).is_file(), done.err + str(
-            json.loads((found[name] / "record.json").read_text())
-        )
-    return found
+    results, folders = tmp_path_factory.mktemp("results"), {}
+    for name, overrides in RUNS.items():
+        result = command(*overrides, *SMALL, f"results_dir={results}")
+        folders[name] = Path(result.out.splitlines()[-1])
+        assert (folders[name] / FIELD_FILE).is_file(), result.err + (folders[name] / "record.json").read_text()
+    return folders
 
 
 @pytest.fixture
@@ -53,7 +51,7 @@ def edit(folder: Path, **changed) -> None:
     """Changes values of a record."""
     record = json.loads((folder / "record.json").read_text())
     metrics = record["metrics"] | changed.pop("metrics", {})
-    record["metrics"] = {name: value for name, value in metrics.items() if value != GONE}
+    record["metrics"] = {name: value for name, value in metrics.items() if value != DELETED}
     (folder / "record.json").write_text(json.dumps(record | changed))
 
 
@@ -70,29 +68,29 @@ def scale(folder: Path, metric: str, factor: float) -> None:
 
 
 CAUSES = ("cpu", "threads", "torch")
-F = "f" * 40  # a code that is not today's
+F = "f" * 40  # the hash of other code
 
 
 @pytest.mark.parametrize("spoil, words", [
-    (lambda run: edit(run, code=F), ("agrees: copy, from its field",)),  # no difference where metrics agree
+    (lambda run: edit(run, code=F), ("agrees: copy, from its field",)),  # metrics agree, so other code is not reported
     (lambda run: edit(run, metrics={"chamfer_l1": 1e-3}), ("differs: copy", "chamfer_l1 is 0.00100 in", "edited?")),
     (lambda run: edit(run, metrics={"fscore": 0.5}, code=F), ("fscore is 0.500", "the code differs: ffffffffffff")),
     (lambda run: scale(run, "chamfer_l2", 1.001), ("differs: copy", "chamfer_l2 is ", "edited?")),
     (lambda run: scale(run, "chamfer_l1", 1.00001), ("agrees: copy, from its field",)),  # sums in another order
     (lambda run: edit(run, metrics={"chamfer_l1": "nan"}), ("differs: copy", "chamfer_l1 is nan in", "edited?")),
-    (lambda run: edit(run, metrics={"fscore": GONE}), ("fscore is not there in the record, now", "edited?")),
+    (lambda run: edit(run, metrics={"fscore": DELETED}), ("fscore is not there in the record, now", "edited?")),
     (lambda run: edit(run, metrics={"fscore": 0.5}, environment={}), [f"{cause} differs: None" for cause in CAUSES]),
     (lambda run: (run / FIELD_FILE).unlink(), (f"left out: copy, from its field: it has no {FIELD_FILE}",)),
     (lambda run: os.truncate(run / FIELD_FILE, 999), ("not compared: copy", "be cut short")),
     (lambda run: (run / "record.json").write_text("{"), ("not compared: copy", "record.json is not JSON")),
 ])  # fmt: skip
-def test_an_edited_metric_is_found_and_the_cause_told(copied, capsys, spoil, words):
+def test_an_edited_metric_is_reported_with_its_cause(copied, capsys, spoil, words):
     spoil(copied)
     code, out = main([str(copied)]), capsys.readouterr().out
     assert code == (not out.startswith("agrees")) and all(word in out for word in words), out
 
 
-def test_of_a_run_whose_field_is_read_the_field_alone_decides_what_is_run_again(copied):
+def test_only_the_field_of_a_run_that_is_read_decides_whether_its_reader_runs_again(copied):
     config = {"dataset": {"path": str(copied)}}
     first = Identity({}, config).code
     edit(copied, asked="later")
@@ -107,10 +105,12 @@ def test_a_folder_without_runs_is_an_error(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_the_field_of_a_run_is_that_of_a_scene(runs, name):
+def test_the_field_of_a_run_can_be_a_scene(runs, name):
     folder = runs[name]
     inputs = cell_from(composed("task=ablation", "dataset=network", f"dataset.path={folder}")).inputs
     fitted, field = inputs.fitted(), bench.load_field(folder)
     points = torch.rand(100, 3) - 0.5
-    values, own = fitted.decoder.at(fitted.codes[0])(points), field(points)
-    torch.testing.assert_close(values * (own.sum() / values.sum()), own, rtol=0, atol=1e-5)  # a bound is divided
+    values, field_values = fitted.decoder.at(fitted.codes[0])(points), field(points)
+    torch.testing.assert_close(
+        values * (field_values.sum() / values.sum()), field_values, rtol=0, atol=1e-5
+    )  # a bound is scaled

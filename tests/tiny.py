@@ -1,4 +1,4 @@
-"""Networks whose field is known, and all that a task needs about them; nothing is trained."""
+"""Networks with a known field, and all objects that a task needs with them; nothing is trained."""
 
 import json
 from dataclasses import replace
@@ -27,9 +27,9 @@ from renderers.fields.network import FieldStatistics
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
-FACTS = FieldStatistics(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, (1.0, 1.0, 1.0), slope_p99=1.0)  # of a distance
+DISTANCE_FACTS = FieldStatistics(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, near=(1.0, 1.0, 1.0), nearly_all=1.0)
 TRIANGLE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
-PEAK = 1e10  # operations a second that the machine of a run is said to do
+PEAK = 1e10  # operations per second of the machine in a record
 
 
 class Blind:
@@ -45,17 +45,17 @@ class Blind:
 
 
 def altered(settings: Any, changed: dict[str, Any]) -> Any:
-    """Settings with other values; "optimiser.iterations" is a value of the settings within."""
+    """Settings with other values; "optimiser.iterations" is a value of nested settings."""
     for name, value in changed.items():
-        part, _, rest = name.partition(".")
-        settings = replace(settings, **{part: altered(getattr(settings, part), {rest: value}) if rest else value})
+        field, _, rest = name.partition(".")
+        settings = replace(settings, **{field: altered(getattr(settings, field), {rest: value}) if rest else value})
     return settings
 
 
 def phases_of(run: RunContext, task: Any) -> list[str]:
     """The phases that a task reports when it is executed, in their order."""
     phases: dict[str, None] = {}
-    task.execute(replace(run, progress=lambda phase, done, total, loss=None: phases.setdefault(phase)))
+    task.execute(replace(run, progress=lambda phase, finished, total, loss=None: phases.setdefault(phase)))
     return list(phases)
 
 
@@ -74,7 +74,7 @@ def cell_from(config: DictConfig) -> Cell:
     return build_cell(plain(config))
 
 
-def silent(phase: str, done: int, total: int, loss: float | None = None) -> None:
+def silent(phase: str, finished: int, total: int, loss: float | None = None) -> None:
     """No progress is shown."""
 
 
@@ -91,9 +91,9 @@ def plane_decoder(normal: Any, code_weights: Any, offset: float) -> Decoder:
 
 
 def ball_prior(radius: float = 0.5, width: int = 128) -> Prior:
-    """A polyhedron near a ball about the first three numbers of a code; the fourth one swells it. It has two codes.
+    """A polyhedron near a sphere about the first three numbers of a code; the fourth number adds to the radius.
 
-    Its field is nearly a distance: max(normal . x, 0) has the mean |x| / 4 over all directions.
+    It has two codes. Its field is nearly a distance: max(normal . x, 0) has the mean |x| / 4 over all directions.
     """
     heights = 1 - (2 * torch.arange(width) + 1) / width
     turns = torch.pi * (1 + 5**0.5) * torch.arange(width)
@@ -112,9 +112,9 @@ def camera_of(pixels: int, *, field_of_view: float = 50.0, angles: tuple[float, 
     return ViewSampler(2.5, field_of_view, (0.0, 0.0), (0.0, 0.0), pixels).camera(*angles)
 
 
-def mesh_of(made: trimesh.Trimesh) -> Mesh:
-    """A mesh of trimesh as one of ours."""
-    return Mesh(np.array(made.vertices), np.array(made.faces))
+def mesh_of(mesh: trimesh.Trimesh) -> Mesh:
+    """A mesh of trimesh as a `Mesh`."""
+    return Mesh(np.array(mesh.vertices), np.array(mesh.faces))
 
 
 def icosphere(radius: float, centre: Any = (0.0, 0.0, 0.0), subdivisions: int = 4) -> Mesh:
@@ -128,26 +128,18 @@ def scene_of(mesh: Mesh, camera: Camera) -> Scene:
 
 
 def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed: Any) -> RunContext:
-    """A run under way in a folder; its scene has no image of its own, since tasks that measure need none."""
+    """A run under way in a folder; its scene has a blank image, since tasks that measure need none."""
     blank = torch.zeros(camera.height, camera.width)
     view = View(camera, blank, blank[..., None].expand(-1, -1, 3), blank.bool())
     scene = Scene("a scene", TRIANGLE, view)
+    sizes = {"grid": 16, "points": 50, "fscore_threshold": 0.02, "picture": 8}
     inputs = RunInputs(
-        renderer=renderer,
-        scene_name=scene.name,
-        make_scene=lambda: scene,
-        views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
-        make_prior=lambda: prior,
-        make_pixel_precise=lambda: (renderer, []),
-        evaluation=EvaluationSettings(
-            grid=16, points=50, fscore_threshold=0.02, picture=8, gallery=None, every=None, film=None
-        ),
-        seed=0,
-        device=CPU,
-        cache=folder / "cache",
-        field=FieldChoice("prior", None),
-        prior_choice=PriorChoice(SceneNetwork(prior.decoder, prior.codes, FACTS, ()), scene_code=0),
-    )
+        renderer=renderer, scene_name=scene.name, make_scene=lambda: scene, make_prior=lambda: prior,
+        make_pixel_precise=lambda: (renderer, []), views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
+        evaluation=EvaluationSettings(**sizes, gallery=None, every=None, film=None), seed=0, device=CPU,
+        cache=folder / "cache", field=FieldChoice("prior", None),
+        prior_choice=PriorChoice(SceneNetwork(prior.decoder, prior.codes, DISTANCE_FACTS, ()), scene_code=0),
+    )  # fmt: skip
     record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
     record.environment = {"gemm_peak_flops": PEAK}
     return RunContext(replace(inputs, **changed), folder, record, silent)

@@ -1,4 +1,4 @@
-"""What a user's own package may hold: a renderer in fifteen lines, out of shared functions."""
+"""A user's package: a renderer in fifteen lines that calls shared functions."""
 
 from renderers import IDR, Capabilities, Field, Kind, Rays, Rendering
 

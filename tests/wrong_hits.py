@@ -1,4 +1,4 @@
-"""A renderer whose hits are wrong on request, in each of the ways that the first check of a run looks for."""
+"""A renderer whose hits are wrong on request, in each way that the first check of a run looks for."""
 
 from dataclasses import replace
 
@@ -7,16 +7,11 @@ import torch
 from bench.config import load
 from renderers.rendering import Rendering
 
-ENDLESS = 11  # hits without a finite distance
+ENDLESS_HITS = 11
 
 
 class WrongHits:
-    """A shipped renderer, but for the distances of its hits.
-
-    Args:
-        how: they are wrong, one of WRONG.
-        name: of the renderer.
-    """
+    """A shipped renderer, named by `name`, whose hits have wrong distances: `how` is one of WRONG."""
 
     def __init__(self, how: str = "short", name: str = "dist") -> None:
         self.how, self.inner = how, load("renderer", name)
@@ -32,7 +27,7 @@ class WrongHits:
 
 
 def _endless(rendering: Rendering) -> torch.Tensor:
-    hits = rendering.hit.flatten().nonzero().squeeze(-1)[:ENDLESS]
+    hits = rendering.hit.flatten().nonzero().squeeze(-1)[:ENDLESS_HITS]
     factor = torch.ones_like(rendering.distance).flatten().index_fill(0, hits, torch.nan)
     return rendering.distance * factor.view_as(rendering.distance)
 

@@ -1,4 +1,4 @@
-"""The cells of every experiment have the names and overrides of cells.json: no change of the driver moves a run.
+"""The cells of every experiment have the names and overrides of cells.json, whatever changes in the driver.
 
 After a change of settings, `python -m tests.conf.test_cells` writes the file again; it takes minutes.
 """
@@ -20,18 +20,18 @@ EXPECTED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.is_file() else {
 
 
 def summary(experiment: str, scale: str) -> dict[str, int | str]:
-    """How many cells an experiment has, and a digest of their names and overrides."""
+    """The number of cells of an experiment, and a digest of their names and overrides."""
     cells = cells_of(f"+experiment={experiment}", f"scale={scale}")
     return {"cells": len(cells), "digest": digest([[cell.name, cell.overrides] for cell in cells])}
 
 
 @pytest.mark.parametrize("scale", [SCALES[0], pytest.param(SCALES[1], marks=pytest.mark.slow)])
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_an_experiment_has_the_cells_that_it_had(experiment: str, scale: str):
+def test_an_experiment_has_its_written_cells(experiment: str, scale: str):
     assert summary(experiment, scale) == EXPECTED[scale][experiment]
 
 
-def test_every_experiment_has_its_cells_written_down():
+def test_the_cells_of_every_experiment_are_written():
     assert {scale: {*EXPECTED[scale]} for scale in SCALES} == {scale: {*EXPERIMENTS} for scale in SCALES}
 
 

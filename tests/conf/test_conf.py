@@ -1,4 +1,4 @@
-"""Every YAML in conf composes and builds; a mistake in one is told with its key and the nearest right one."""
+"""Every YAML in conf composes and builds; the message on a mistake has its key and the nearest valid key."""
 
 from dataclasses import replace
 from functools import cache
@@ -24,48 +24,37 @@ from tests.datasets.test_shapenet import write_shapenet
 from tests.looped import each
 from tests.made_scans import write_scans
 
-IDR_ARGUMENTS = {
-    "steps": 7,
-    "epsilon": 1e-4,
-    "least_slope": 1e-3,
-    "mask_sharpness": 50.0,
-    "mask_weight": 100.0,
-    "sphere_radius": 1.0,
-}
+IDR_ARGUMENTS = {"steps": 7, "epsilon": 1e-4, "least_slope": 1e-3, "mask_sharpness": 50.0, "mask_weight": 100.0}
+IDR_ARGUMENTS["sphere_radius"] = 1.0
 EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
-SINGLE = {"fitted"}  # of one run, and without a table or figure of its own
-# The table or figure of an experiment, where it has another name: one that joins several experiments.
+SINGLE_RUN_EXPERIMENTS = {"fitted"}  # without a table or figure
+# The experiments that share the table or figure of another name.
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
-SHARED_ROWS = {
-    "speed_accuracy": "speed_completion",
-    "core": "core_complete",
-}  # an experiment that sweeps over rows that several share
+# An experiment that sweeps over rows that several experiments share.
+SHARED_ROWS = {"speed_accuracy": "speed_completion", "core": "core_complete"}
 COMPARING = {"table1": 24, "fig4": 7, "fig5": 9, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
 COMPARING |= {"core": 11}
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
-LINEAR = [
-    "packages=[torch]",
-    "dataset.module._target_=torch.nn.Linear",
-    "+dataset.module={in_features:3,out_features:1}",
-]
+LINEAR = ["packages=[torch]", "dataset.module._target_=torch.nn.Linear"]
+LINEAR += ["+dataset.module={in_features:3,out_features:1}"]
 CUSTOM = ("renderer._target_=renderers.IDR", *(f"+renderer.{k}={v}" for k, v in IDR_ARGUMENTS.items()))
 
 
 def visible(group: str) -> list[str]:
-    """The choices of a group that are no mere base of others."""
+    """The choices of a group, without those that are only bases of others."""
     return [name for name in names(group) if not name.startswith("_")]
 
 
 def together() -> list[dict[str, str]]:
-    """Choices of all groups, so that each stands in a composition, which takes a tenth of a second."""
+    """Combinations of choices of all groups, in which each choice occurs; a composition takes 0.1 seconds."""
     stresses, tasks = visible("stress"), [name for name in visible("task") if name != "stability"]
     stresses.remove("none")
     judged = [("stability", stress) for stress in stresses] + [(task, "none") for task in tasks]
     columns = {group: visible(group) for group in names_of_groups() if group not in ("task", "stress")}
     count = max(len(judged), *map(len, columns.values()))
-    rows = [{group: column[at % len(column)] for group, column in columns.items()} for at in range(count)]
-    return [row | dict(zip(("task", "stress"), judged[at % len(judged)], strict=True)) for at, row in enumerate(rows)]
+    rows = [{group: column[n % len(column)] for group, column in columns.items()} for n in range(count)]
+    return [row | dict(zip(("task", "stress"), judged[n % len(judged)], strict=True)) for n, row in enumerate(rows)]
 
 
 def names_of_groups() -> tuple[str, ...]:
@@ -78,13 +67,13 @@ METHODS = [*visible("method"), *(f"tuned/{name}" for name in visible("method/tun
 
 @pytest.fixture(scope="session")
 def paths(tmp_path_factory) -> dict[str, str]:
-    """What the datasets of files need as `dataset.path`."""
+    """The `dataset.path` that each dataset of files needs."""
     mesh, scans = tmp_path_factory.mktemp("mesh") / "box.obj", tmp_path_factory.mktemp("scans")
     trimesh.creation.box().export(mesh)
-    unread = dict.fromkeys(("photos", "network", "module"), str(mesh.parent))  # whose content is not read to build it
+    unread = dict.fromkeys(("photos", "network", "module"), str(mesh.parent))  # building it reads no content
     unread["depth_image"] = str(mesh)
-    found = unread | {"mesh": str(mesh), "scans": str(write_scans(scans))}
-    return found | {"shapenet": str(write_shapenet(tmp_path_factory.mktemp("shapenet")))}
+    paths_by_dataset = unread | {"mesh": str(mesh), "scans": str(write_scans(scans))}
+    return paths_by_dataset | {"shapenet": str(write_shapenet(tmp_path_factory.mktemp("shapenet")))}
 
 
 @cache
@@ -96,11 +85,11 @@ def cells(name: str) -> list[list[str]]:
     return [[text for text in cell if not text.startswith("+experiment=")] for cell in (swept[0], swept[-1])]
 
 
-def build_part(config: DictConfig, part: str):
-    return build(config[part], part, list(config.packages), CLASS_OF_NODE.get(part, ""))
+def build_part(config: DictConfig, node: str):
+    return build(config[node], node, list(config.packages), CLASS_OF_NODE.get(node, ""))
 
 
-def test_no_yaml_lies_where_it_is_not_looked_for():
+def test_every_yaml_is_in_a_folder_that_is_searched():
     assert {path.stem for path in CONF.glob("*.yaml")} == {"config", "suite", *GROUP_OF_TABLE}
     folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")} - {"."}
     files = {"task", "renderer", "dataset", "prior", "scale", "tracker", "experiment", "hydra/launcher"}
@@ -115,17 +104,17 @@ def test_no_yaml_sets_the_mode_of_hydra():
 
 @pytest.mark.parametrize("table", GROUP_OF_TABLE)
 def test_a_table_has_no_row_twice_and_no_text_that_should_be_a_number(table):
-    """Which plain YAML does not tell: of two rows it takes the last, and 1e-3 is a text to it."""
+    """A YAML reader reports neither: it takes the last of two rows, and reads 1e-3 as text."""
     strict = OmegaConf.to_container(OmegaConf.load(CONF / f"{table}.yaml"), resolve=False)
     assert strict == read_yaml(CONF / f"{table}.yaml")
     assert not {path.stem for path in (CONF / GROUP_OF_TABLE[table]).glob("*.yaml")} & {*strict}
 
 
 def builds(config: DictConfig) -> None:
-    """Asserts that all of a configuration resolves, and that its parts are what their places ask for."""
+    """Asserts that all of a configuration resolves, and that its nodes build objects of their kinds."""
     OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    made = {part: build_part(config, part) for part in PARTS}  # a scale is read by the others
-    assert all(isinstance(made[part], kind) for part, kind in KINDS.items())
+    built = {node: build_part(config, node) for node in PARTS}  # other nodes read the scale
+    assert all(isinstance(built[node], kind) for node, kind in KINDS.items())
     build(config.view, "view", target="datasets.views.ViewSampler")
 
 
@@ -149,86 +138,80 @@ def test_every_choice_composes_and_builds(paths, row):
     renderer = build_part(config, "renderer")
     if row["renderer"] != "custom":
         alone = load("renderer", row["renderer"])
-        steps = {name: getattr(renderer, name) for name in ("sharpening",) if hasattr(renderer, name)}  # the task's
+        steps = {name: getattr(renderer, name) for name in ("sharpening",) if hasattr(renderer, name)}  # from the task
         assert replace(alone, **steps) == renderer
     assert load("silhouette", row["silhouette"]) == build_part(config, "silhouette")
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_composes_and_builds(name):
-    cloud = ["task.cloud=points.ply"] if name.startswith("cloud") else []  # the row has the file's name
+    cloud = ["task.cloud=points.ply"] if name.startswith("cloud") else []  # the row contains the file's name
     builds(composed(f"+method={name}", *cloud))
 
 
-@pytest.mark.parametrize("place", [0, -1], ids=["first", "last"])
+@pytest.mark.parametrize("position", [0, -1], ids=["first", "last"])
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_the_first_and_last_cell_of_an_experiment_compose_and_build(paths, name, place):
-    """The first at desk scale; the last at the papers', and of a mesh where it is of no dataset of its own."""
-    cell, asked = cells(name)[place], [f"dataset.path={paths[name]}"] if name in paths else []
-    if place:
+def test_the_first_and_last_cell_of_an_experiment_compose_and_build(paths, name, position):
+    """The first cell at desk scale; the last at the papers' scale, of a mesh if it names no dataset."""
+    cell, more = cells(name)[position], [f"dataset.path={paths[name]}"] if name in paths else []
+    if position:
         mesh = ["dataset=mesh", f"dataset.path={paths['mesh']}"]
-        asked = ["scale=paper", *(asked if any(text.startswith("dataset=") for text in cell) else mesh)]
-    config = composed(*cell, f"+experiment={name}", *asked)
+        more = ["scale=paper", *(more if any(text.startswith("dataset=") for text in cell) else mesh)]
+    config = composed(*cell, f"+experiment={name}", *more)
     builds(config)
-    assert config.experiment == (None if name in SINGLE else JOINED.get(name, name))
+    assert config.experiment == (None if name in SINGLE_RUN_EXPERIMENTS else JOINED.get(name, name))
     for key, _, value in (text.removeprefix("+").partition("=") for text in cell):
         if key in ("renderer", "method"):
-            if not place:
+            if not position:
                 brings_its_own(cell, config, key, value)
         elif key == "dataset":
             assert config.dataset.name == value
         elif key == "silhouette":
             assert config.task.silhouette == choice("silhouette", value)
         elif key != "stress":
-            found, asked = OmegaConf.select(config, key), yaml.safe_load(value.replace(":", ": "))
-            # Of a node, the rest of it stays.
-            assert (
-                asked.items() <= dict(found).items()
-                if isinstance(asked, dict)
-                else found == (asked if found is None else type(found)(value))
-            )
+            actual, expected = OmegaConf.select(config, key), yaml.safe_load(value.replace(":", ": "))
+            if isinstance(expected, dict):  # other settings of a node stay
+                assert expected.items() <= dict(actual).items()
+            else:
+                assert actual == (expected if actual is None else type(actual)(value))
 
 
 def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) -> None:
     """Asserts that an experiment changes nothing that a renderer or a method sets."""
     default = composed()
-    size = "scale.reconstruction.iterations"  # schedules follow it
+    size = "scale.reconstruction.iterations"  # schedules depend on it
     iterations = OmegaConf.select(config, size)
-    asked = [f"{size}={iterations}"] if iterations != OmegaConf.select(default, size) else []
-    if "fit" in config.task:  # of a stress
-        asked += [f"task.optimiser.iterations={config.task.fit.iterations}"]
+    overrides = [f"{size}={iterations}"] if iterations != OmegaConf.select(default, size) else []
+    if "fit" in config.task:  # a stress
+        overrides += [f"task.optimiser.iterations={config.task.fit.iterations}"]
     draw = [text for text in cell if text.startswith("draw=")]
-    alone = composed(f"{'+' if key == 'method' else ''}{key}={value}", *draw, *asked)
+    alone = composed(f"{'+' if key == 'method' else ''}{key}={value}", *draw, *overrides)
     assert config.label == alone.label
     assert build_part(config, "renderer") == build_part(alone, "renderer")
     if key == "method":
         assert config.task._target_ == alone.task._target_
-        own = choice("method", value).get("view")
-        assert own is None or config.view.resolution == alone.view.resolution
+        view_settings = choice("method", value).get("view")
+        assert view_settings is None or config.view.resolution == alone.view.resolution
 
 
 def test_every_sweep_is_of_more_than_one_cell():
-    assert {name for name in EXPERIMENTS if cells(name)[0] != cells(name)[1]} == {*EXPERIMENTS} - SINGLE
+    assert {name for name in EXPERIMENTS if cells(name)[0] != cells(name)[1]} == {*EXPERIMENTS} - SINGLE_RUN_EXPERIMENTS
 
 
-PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2), the official code's clamp, and nothing of ours
+PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2), the official code's clamp, no changes of ours
     steps=50, epsilon=5e-5, alpha=1.5, extra_step_cap=None, step_clamp=0.1, active_only=True, coarse_to_fine=True,
-    careful_split=False,
-    step_back=False, least_step=0.0, relaxation=0.0, slope_samples=0, n_gradient_samples=1, sphere_radius=1.0,
-    silhouette_signed=False,
-    silhouette_average="all",
+    careful_split=False, step_back=False, least_step=0.0, relaxation=0.0, slope_samples=0, n_gradient_samples=1,
+    sphere_radius=1.0, silhouette_signed=False, silhouette_average="all",
 )  # fmt: skip
-FIRST = Naive(  # "Naive sphere tracing": ray by ray, with all steps in the graph
+NAIVE = Naive(  # "Naive sphere tracing": ray by ray, with all steps in the graph
     steps=50, epsilon=5e-5, gradient="unrolled", n_gradient_samples=None, serial=True, sphere_radius=1.0,
     silhouette_signed=False, silhouette_average="all",
 )  # fmt: skip
+PARALLEL = replace(NAIVE, gradient="practical", n_gradient_samples=1, serial=False)
 TABLE1 = {  # each row of the paper adds one thing to the row before
-    "naive_serial": ("Naive sphere tracing", FIRST),
-    "naive_practical": ("+ practical grad.", replace(FIRST, gradient="practical", n_gradient_samples=1)),
-    "naive_practical_parallel": (
-        "+ parallel",
-        replace(FIRST, gradient="practical", n_gradient_samples=1, serial=False),
-    ),
+    "naive_serial": ("Naive sphere tracing", NAIVE),
+    "naive_practical": ("+ practical grad.", replace(NAIVE, gradient="practical", n_gradient_samples=1)),
+    "naive_practical_parallel": ("+ parallel", PARALLEL),
     "dist_dynamic": ("+ dynamic", replace(PAPER, alpha=1.0, coarse_to_fine=False)),
     "dist_aggressive": ("+ aggressive", replace(PAPER, coarse_to_fine=False)),
     "dist_coarse_to_fine": ("+ coarse-to-fine", PAPER),
@@ -243,12 +226,12 @@ def test_table_1_begins_with_the_rows_of_the_paper():
     assert composed("+experiment=table1", hydra=True).hydra.sweeper.params.renderer.split(",")[:7] == [*TABLE1]
 
 
-def test_variants_are_what_they_are_called():
+def test_variants_have_the_settings_of_their_names():
     dist, dvr = load("renderer", "dist"), load("renderer", "dvr")
     early, unclamped = replace(dvr, early_stop=True), replace(PAPER, coarse_to_fine=False, step_clamp=None)
     official = {"silhouette_signed": True, "silhouette_average": "missed_plus_spurious"}
     for name, wanted in {
-        "naive_parallel": replace(FIRST, serial=False),
+        "naive_parallel": replace(NAIVE, serial=False),
         "dist_aggressive_unclamped": unclamped,
         "dist_unclamped": replace(PAPER, step_clamp=None),
         "dist_capped": replace(unclamped, extra_step_cap=0.01),
@@ -262,19 +245,18 @@ def test_variants_are_what_they_are_called():
         assert load("renderer", name) == wanted, name
 
 
-def test_every_renderer_has_a_label_of_its_own_and_says_where_it_has_a_row():
-    own = [choice("renderer", name) for name in names("renderer") if name != "custom"]
-    labels = [node["_label_"] for node in own]
+def test_every_renderer_has_its_own_label_and_names_its_rows():
+    nodes = [choice("renderer", name) for name in names("renderer") if name != "custom"]
+    labels = [node["_label_"] for node in nodes]
     assert len(set(labels)) == len(labels) >= 30
-    places = [(experiment, place) for node in own for experiment, place in node["_rows_"].items()]
-    assert len(set(places)) == len(places)
-    assert {experiment for experiment, _ in places} == set(COMPARING)
+    ranks = [(experiment, rank) for node in nodes for experiment, rank in node["_rows_"].items()]
+    assert len(set(ranks)) == len(ranks) and {experiment for experiment, _ in ranks} == set(COMPARING)
 
 
 @each("name", [*COMPARING])
-def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_places(name):
+def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_ranks(name):
     rows = {renderer: choice("renderer", renderer).get("_rows_", {}) for renderer in names("renderer")}
-    named = {renderer: places[name] for renderer, places in rows.items() if name in places}
+    named = {renderer: ranks[name] for renderer, ranks in rows.items() if name in ranks}
     experiment = SHARED_ROWS.get(name, name)
     params = composed(f"+experiment={experiment}", hydra=True).hydra.sweeper.params
     assert params.renderer.split(",") == sorted(named, key=lambda renderer: named[renderer])
@@ -282,19 +264,19 @@ def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_pl
 
 
 @each("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour per class
-def test_rows_of_an_experiment_are_told_apart(name):
+def test_rows_of_an_experiment_have_different_looks(name):
     params = composed(f"+experiment={name}", hydra=True).hydra.get("sweeper", {}).get("params") or {}
     rows = str(params.get("+method") or params.get("renderer") or "dist").split(",")
-    alike = [row for row in rows if not row.startswith("tuned/")]  # drawn as their methods, hollow
-    assert len({(look(row).colour, look(row).marker) for row in alike}) == len(alike)
+    solid = [row for row in rows if not row.startswith("tuned/")]  # tuned rows are hollow
+    assert len({(look(row).colour, look(row).marker) for row in solid}) == len(solid)
 
 
 def label_of(group: str, name: str) -> str:
-    """The name of a method or a renderer in tables, its own or that of what it builds on; empty without one."""
-    own = choice(group, name)
-    bases = [base for base in own.get("defaults", ()) if isinstance(base, str) and base != "_self_"]
+    """The name of a method or a renderer in tables, perhaps inherited from its base; empty without one."""
+    settings = choice(group, name)
+    bases = [base for base in settings.get("defaults", ()) if isinstance(base, str) and base != "_self_"]
     inherited = [label_of(group, base.removeprefix(f"/{group}/")) for base in bases]
-    return own.get("label") or own.get("_label_") or next(filter(None, inherited), "")
+    return settings.get("label") or settings.get("_label_") or next(filter(None, inherited), "")
 
 
 def test_rows_of_one_label_have_one_look():
@@ -302,14 +284,14 @@ def test_rows_of_one_label_have_one_look():
     for group in ("method", "renderer"):
         for name in names(group):
             looks.setdefault(label_of(group, name) or name, set()).add(look(name))
-    assert {label: found for label, found in looks.items() if len(found) > 1} == {}
+    assert {label: label_looks for label, label_looks in looks.items() if len(label_looks) > 1} == {}
 
 
-def test_a_row_that_conf_does_not_know_has_a_colour_of_no_renderer():
+def test_an_unknown_row_has_a_colour_of_no_renderer():
     classes = {name: type(load("renderer", name)) for name in visible("renderer") if name != "custom"}
-    known = {(look(name).colour, cls) for name, cls in classes.items()}
-    colours = {colour for colour, _ in known}
-    assert len(known) == len(colours) > 20  # a colour is of one class
+    class_colours = {(look(name).colour, cls) for name, cls in classes.items()}
+    colours = {colour for colour, _ in class_colours}
+    assert len(class_colours) == len(colours) > 20  # each colour has one class
     assert not colours & {*style.FALLBACK_COLOURS}
 
 
@@ -318,8 +300,8 @@ def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers
     assert params.renderer == "dist"
 
 
-def test_measuring_experiments_measure_the_shape_that_their_network_was_fitted_to(compose_config):
-    deepsdf, small = (8, 512, 256, 4), (4, 128, 64, 2)  # DIST, B.1; and of what takes central differences
+def test_measuring_experiments_use_the_shape_that_their_network_was_fitted_to(compose_config):
+    deepsdf, small = (8, 512, 256, 4), (4, 128, 64, 2)  # DIST, B.1; and the network for central differences
     for name, scale, size, layers in (
         ("table1", "smoke", 64, deepsdf), ("table1_large", "desk", 512, deepsdf), ("fig4", "paper", 512, deepsdf),
         ("fig7", "desk", 256, deepsdf), ("gradients", "desk", 256, small),
@@ -331,7 +313,7 @@ def test_measuring_experiments_measure_the_shape_that_their_network_was_fitted_t
         assert (network.layers, network.width, network.code_length, network.skip) == layers
 
 
-def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
+def test_figure_7_has_the_papers_settings_over_epsilon(compose_config):
     config = compose_config("+experiment=fig7", "renderer.epsilon=5e-3")
     assert build_part(config, "renderer") == replace(PAPER, epsilon=5e-3)
     assert config.label == "epsilon 0.005"
@@ -343,20 +325,18 @@ def test_figure_7_is_of_the_papers_setting_over_epsilon(compose_config):
     (["task=single_view", "task.training.steps=39", "renderer=volsdf_budget"], 39),
     (["task=ablation", "renderer=unisurf"], 100),
 ])  # fmt: skip
-def test_a_volume_is_sharp_at_the_end_of_whatever_it_optimises(compose_config, overrides, iterations):
+def test_a_volume_is_sharp_at_the_end_of_each_kind_of_optimisation(compose_config, overrides, iterations):
     assert compose_config(*overrides).renderer.sharpening == iterations
 
 
 def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_config):
     practical = ("renderer=naive", "renderer.gradient=practical")
-    with pytest.raises(
-        ValueError, match="n_gradient_samples must be given for gradient=practical: n_gradient_samples=1"
-    ):
+    with pytest.raises(ValueError, match=r"n_gradient_samples must be given .*: n_gradient_samples=1"):
         build_part(compose_config(*practical), "renderer")
     assert build_part(compose_config(*practical, "renderer.n_gradient_samples=2"), "renderer").n_gradient_samples == 2
 
 
-def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, monkeypatch):
+def test_a_user_renderer_needs_only_its_class(compose_config, tmp_path, monkeypatch):
     (tmp_path / "mypkg_of_mine.py").write_text(CLASS)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ValueError, match=r"renderer\._target_ must be given"):
@@ -364,27 +344,24 @@ def test_a_renderer_of_ones_own_needs_its_class_only(compose_config, tmp_path, m
     with pytest.raises(ValueError, match=r"names 'mypkg_of_mine\.Yours', which cannot be imported"):
         build_part(compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Yours"), "renderer")
     config = compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "+renderer.size=3")
-    made, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
-    assert (type(made).__name__, made.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
+    built, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
+    assert (type(built).__name__, built.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)
     with pytest.raises(ValueError, match="renderer has no key 'sise': did you mean size"):
         load("renderer", "custom", _target_="mypkg_of_mine.Mine", sise=3)
     with pytest.raises(ValueError, match=r"dataset\._target_ names 'mypkg_of_mine\.Mine': type packages="):
-        build({"_target_": "mypkg_of_mine.Mine"}, "dataset")  # only the renderer names its package by its class
+        build({"_target_": "mypkg_of_mine.Mine"}, "dataset")  # only a renderer's class names its package
 
 
-def test_a_choice_loads_as_a_library_with_what_it_builds_on_and_says_what_is_wrong():
+def test_a_choice_loads_from_python_with_its_base_and_reports_mistakes():
     assert load("renderer", "dist_coarse_to_fine") == PAPER
-    practical = replace(FIRST, gradient="practical", n_gradient_samples=1, serial=False, steps=7)
-    assert load("renderer", "naive_practical_parallel", steps=7) == practical
-    for wrong, name, more in (
-        ("unknown renderer 'dits': did you mean dist", "dits", {}),
-        ("renderer has no key 'samples': did you mean .*n_gradient_samples", "dist_aggressive", {"samples": 3}),
-    ):
-        with pytest.raises(ValueError, match=wrong):
-            load("renderer", name, **more)
+    assert load("renderer", "naive_practical_parallel", steps=7) == replace(PARALLEL, steps=7)
+    with pytest.raises(ValueError, match="unknown renderer 'dits': did you mean dist"):
+        load("renderer", "dits")
+    with pytest.raises(ValueError, match=r"renderer has no key 'samples': did you mean .*n_gradient_samples"):
+        load("renderer", "dist_aggressive", samples=3)
 
 
-@each("part, override, message", [
+@each("node, override, message", [
     ("renderer", "+renderer.epsilom=1", r"renderer has no key 'epsilom': did you mean epsilon"),
     ("prior", "+scale.network.widht=1", r"prior\.network has no key 'widht': did you mean width"),
     ("renderer", "+renderer.xyzzy=1", r"renderer has no key 'xyzzy': it has active_only, alpha, .*steps"),
@@ -397,24 +374,24 @@ def test_a_choice_loads_as_a_library_with_what_it_builds_on_and_says_what_is_wro
     ("task", "task.code.average=median", r"task\.code\.average must be one of sum, mean, not 'median'"),
     ("task", "task.silhouette=hinge", r"task\.silhouette must have a _target_, not be 'hinge'"),
 ])  # fmt: skip
-def test_a_wrong_key_or_value_is_an_error_with_the_remedy(compose_config, part, override, message):
+def test_a_wrong_key_or_value_is_an_error_with_the_remedy(compose_config, node, override, message):
     with pytest.raises(ValueError, match=message):
-        build_part(compose_config(override), part)
+        build_part(compose_config(override), node)
 
 
-def test_a_setting_within_another_says_where_it_stands(compose_config):
+def test_the_message_on_a_nested_setting_names_its_path(compose_config):
     with pytest.raises(ValueError, match=r"^task\.images: noise must be at least 0, not -1"):
         build_part(compose_config("task=multiview", "task.images.noise=-1"), "task")
 
 
-def test_a_mask_loss_is_refused_where_no_task_reads_it(compose_config):
+def test_a_silhouette_loss_is_refused_if_the_task_does_not_read_it(compose_config):
     with pytest.raises(ValueError, match=r"only task=completion, .*reconstruction and single_view read silhouette"):
         check_names(compose_config("task=gradients", "silhouette=hinge"))
     for task in ("completion", "stability", "gradients"):
         check_names(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
 
 
-def test_a_draw_is_refused_where_no_setting_is_drawn(compose_config):
+def test_a_draw_is_refused_if_no_setting_is_drawn(compose_config):
     with pytest.raises(ValueError, match=r"only a method of method/space reads draw: add \+method=space/NAME"):
         check_draw(compose_config("renderer=dist", "draw=3"))
     check_draw(compose_config("+method=space/dist_mask", "draw=3"))

@@ -1,8 +1,8 @@
-"""Numbers of the papers that stand in YAML, typed a second time."""
+"""Numbers of the papers in YAML files, typed a second time."""
 
 from tests.looped import each
 
-# Override of the default configuration, key, value, and where the paper states it.
+# Override of the default configuration, key, value, and the source in the paper.
 STATED = [
     ("renderer=idr", "renderer.mask_weight", 100.0, "IDR: rho"),
     ("renderer=idr", "renderer.mask_sharpness", 50.0, "IDR: its sharpness at the start"),
@@ -30,6 +30,6 @@ STATED = [
 @each("override, key, value, where", STATED)
 def test_a_number_of_a_paper_is_as_stated(compose_config, override, key, value, where):
     node = compose_config(override)
-    for part in key.split("."):
-        node = node[part]
+    for name in key.split("."):
+        node = node[name]
     assert node == value, where

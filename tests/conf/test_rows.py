@@ -1,4 +1,4 @@
-"""A renderer is one file and one YAML: every experiment that compares renderers then has a row for it."""
+"""A renderer is one file and one YAML; every experiment that compares renderers has a row for it."""
 
 import re
 from pathlib import Path
@@ -30,7 +30,7 @@ ROWS = "mine_on_keinert: {base: dist_keinert, _label_: 'Keinert, 1.1', _rows_: {
 
 @pytest.fixture
 def package(tmp_path, monkeypatch) -> str:
-    """A user's package, with YAMLs in a folder of the user's: `--config-dir`."""
+    """A user's package, and a folder of YAML files for `--config-dir`."""
     name = f"user_package_{tmp_path.name}"
     (tmp_path / f"{name}.py").write_text(CLASS)
     (tmp_path / "conf/renderer").mkdir(parents=True)
@@ -42,7 +42,7 @@ def package(tmp_path, monkeypatch) -> str:
 
 
 def swept(*arguments: str, folder: Path | None = None) -> Plan:
-    """The plan of a sweep, with a folder of a user's YAMLs."""
+    """The plan of a sweep, with a folder of a user's YAML files."""
     return plan_of(cells_of(*arguments, "scale=smoke", folder=folder))
 
 
@@ -51,54 +51,47 @@ def rows(plan: Plan) -> list[str]:
     return list(dict.fromkeys(cell.renderer for cell in plan.cells))
 
 
-def test_renderers_of_ones_own_have_rows_in_an_experiment_that_compares_renderers(tmp_path, package):
+def test_user_renderers_have_rows_in_an_experiment_that_compares_renderers(tmp_path, package):
     plan = swept("+experiment=stability", "stress=thin_plate", f"packages=[{package}]", folder=tmp_path / "conf")
-    first, found, one_loss = ["mine_first"], rows(plan), ", DIST's mask loss"
-    assert found[: len(first)] == first
-    assert found[-2:] == ["mine", "mine_on_dist"]  # they say nothing of rows
-    assert len(found) == len(plan.cells) == len(first) + 21 + 2 + 1
-    assert found[-3] == "mine_on_keinert"  # of its own table
-    assert "custom" not in found and "mine_nowhere" not in found
+    renderers = rows(plan)
+    assert renderers[0] == "mine_first" and renderers[-2:] == ["mine", "mine_on_dist"]  # the last two have no _rows_
+    assert len(renderers) == len(plan.cells) == 1 + 21 + 2 + 1
+    assert renderers[-3] == "mine_on_keinert"  # from the user's table
+    assert "custom" not in renderers and "mine_nowhere" not in renderers
     cells = {cell.renderer: cell for cell in plan.cells}
-    assert row_name(cells["mine"].config, "mine") == "mine" + one_loss
-    assert row_name(cells["mine_on_dist"].config, "mine_on_dist") == "mine_on_dist" + one_loss  # not dist's label
-    assert row_name(cells["dist"].config, "dist") == "DIST, our default" + one_loss
+    labels = {"mine": "mine", "mine_on_dist": "mine_on_dist", "dist": "DIST, our default"}  # not dist's label
+    for name, label in (labels | {"mine_first": "Mine, first", "mine_on_keinert": "Keinert, 1.1"}).items():
+        assert row_name(cells[name].config, name) == f"{label}, DIST's mask loss"
     under_another = cells["dist"].config | {"silhouette": {"_label_": "IDR's mask loss"}}
     assert row_name(under_another, "dist") == "DIST, our default, IDR's mask loss"
-    made = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])
-    assert (type(made).__name__, made.size) == ("Mine", 3)
-    assert row_name(cells["mine_first"].config, "mine_first") == "Mine, first" + one_loss
+    built = build(OmegaConf.create(cells["mine"].config["renderer"]), "renderer", [package])
+    assert (type(built).__name__, built.size) == ("Mine", 3)
     assert cells["mine_first"].config["renderer"]["size"] == 4
     assert cells["mine_on_keinert"].config["renderer"]["alpha"] == 1.1
-    assert row_name(cells["mine_on_keinert"].config, "mine_on_keinert") == "Keinert, 1.1" + one_loss
     assert not any({"_rows_", "_look_"} & {*cell.config["renderer"]} for cell in plan.cells)
     register_rows()
-    assert "mine_on_keinert" not in group_choices("renderer")  # of another command alone
+    assert "mine_on_keinert" not in group_choices("renderer")  # another command had it
 
 
 def test_the_command_line_narrows_and_replaces_the_rows():
-    plan = swept("+experiment=table1", "renderer=dvr,dist")
-    assert rows(plan) == ["dvr", "dist"]
-    own = ("renderer=custom", "renderer._target_=renderers.IDR")
-    plan = swept("+experiment=table1", *own)
+    assert rows(swept("+experiment=table1", "renderer=dvr,dist")) == ["dvr", "dist"]
+    plan = swept("+experiment=table1", "renderer=custom", "renderer._target_=renderers.IDR")
     assert [(cell.renderer, row_name(cell.config, cell.renderer)) for cell in plan.cells] == [("custom", "IDR")]
 
 
-def test_a_method_is_a_part_of_what_a_run_is_called():
+def test_the_name_of_a_run_has_its_method():
     plan = swept("+experiment=table3", "index=0", "dataset=car")
     methods = [cell.method for cell in plan.cells]
     names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "encoder", "mesh_encoder")
     assert methods == [f"multiview_{name}" for name in names]
-    assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == [
-        "multiview-dist_paper-car-multiview_paper",
-        "multiview-dist-car-multiview_dist",
-    ]
+    ids = ["multiview-dist_paper-car-multiview_paper", "multiview-dist-car-multiview_dist"]
+    assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == ids
     plan = swept("seed=0,1")
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells] == ["completion-dist-sofa"] * 2
     assert [cell.method for cell in plan.cells] == ["", ""]
 
 
-def test_of_two_values_of_one_key_the_later_counts_at_the_place_of_the_first():
+def test_the_later_of_two_values_of_a_key_counts_at_the_position_of_the_first():
     plan = swept("seed=0,1", "dataset=glob(c*,exclude=car)", "index=3", "seed=range(5,7)")
     cells = [cell.config for cell in plan.cells]
     assert [(config["dataset"]["name"], config["index"], config["seed"]) for config in cells] == [
@@ -108,23 +101,21 @@ def test_of_two_values_of_one_key_the_later_counts_at_the_place_of_the_first():
 
 MINE = "# @package _global_\ndefaults: [tuning, _self_]\nhydra: {sweeper: {params: {+method: '${spaces:neus}'}}}\n"
 SLOW = {f"{name}_mask" for name in ("neus", "range_analysis", "unisurf", "volsdf")}
-
-
-OWN_ROWS = {
+USER_ROWS = {
     "methods": "mine_row: &mine {renderer: dist, label: Mine, space: {renderer.alpha: '${drawn:3,1.0,2.0}'}}\n"
     "mine_untuned: *mine\n",
     "tuned": "mine_row: {base: /method/mine_row, label: 'Mine, tuned', renderer.alpha: 1.25}\n",
 }
 
 
-def test_methods_of_ones_own_join_the_tuning_which_slow_ones_do_not(tmp_path):
+def test_user_methods_join_the_tuning_and_slow_ones_do_not(tmp_path):
     (tmp_path / "own").mkdir()
-    for table, text in OWN_ROWS.items():
+    for table, text in USER_ROWS.items():
         (tmp_path / f"own/{table}.yaml").write_text(text)
-    spaces, own = {*names("method/space")}, {"mine_row", "mine_untuned"}
+    spaces, user_methods = {*names("method/space")}, {"mine_row", "mine_untuned"}
     plan = swept("+experiment=tuning", "draw=3", "split=test", folder=tmp_path / "own")
     cells = {cell.method.removeprefix("space/"): cell for cell in plan.cells}
-    assert {*cells} == (spaces - SLOW) | own
+    assert {*cells} == (spaces - SLOW) | user_methods
     mine = cells["mine_row"].config
     assert mine["label"] == "Mine" and 1 < mine["renderer"]["alpha"] < 2
     plan = swept("+method=mine_row,tuned/mine_row", folder=tmp_path / "own")
@@ -151,10 +142,10 @@ def test_a_sweep_composes_each_combination_of_choices_once(monkeypatch):
     composed, do = [], compose.compose_choices
     monkeypatch.setattr(compose, "compose_choices", lambda choices: (composed.append(choices), do(choices))[1])
     plan = swept("seed=0,1,2", "renderer=dist,dvr", "task.points=20,30")
-    assert len(plan.cells) == 12 and len(composed) == 1 + 2  # the first says what is swept over
+    assert len(plan.cells) == 12 and len(composed) == 1 + 2  # the first composition reads what is swept over
 
 
-def test_a_choice_of_a_user_takes_no_name_of_ours(tmp_path):
+def test_a_users_choice_takes_no_shipped_name(tmp_path):
     for number, (file, text) in enumerate(
         {"variants.yaml": "dist: {base: idr}\n", "renderer/dist_aggressive.yaml": "defaults: [dist, _self_]\n"}.items()
     ):

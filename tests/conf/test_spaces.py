@@ -1,4 +1,4 @@
-"""Search spaces: every method of the tuning has one, and a draw is the same Sobol point for all of them."""
+"""Search spaces: every tuned method has one, and a draw is the same Sobol point for all methods."""
 
 from math import log
 
@@ -18,8 +18,8 @@ SPACES = names("method/space")
 
 
 def ranges(space: str) -> dict[str, tuple[int, float, float]]:
-    """The drawn keys of a space's file, and of what all share: dimension and ends."""
-    found = {}
+    """The drawn keys of a space and of all spaces: the dimension, and the ends of the range."""
+    drawn = {}
 
     def walk(node, prefix=""):
         for key, value in node.items():
@@ -27,35 +27,35 @@ def ranges(space: str) -> dict[str, tuple[int, float, float]]:
                 walk(value, f"{prefix}{key}.")
             elif str(value).startswith("${drawn:"):
                 dimension, least, most = str(value)[len("${drawn:") : -1].split(",")
-                found[f"{prefix}{key}"] = (int(dimension), float(least), float(most))
+                drawn[f"{prefix}{key}"] = (int(dimension), float(least), float(most))
 
     walk(choice("method", "_drawn"))
     walk(choice("method/space", space))
-    return found
+    return drawn
 
 
 def test_the_points_fill_the_cube_evenly():
     points = np.array(sobol_points())
     assert points.shape == (SOBOL_DRAWS, SOBOL_DIMENSIONS)
-    for dimension in range(SOBOL_DIMENSIONS):  # a point in each sixteenth, also of the first sixteen alone
+    for dimension in range(SOBOL_DIMENSIONS):  # the first sixteen points are in different sixteenths
         assert sorted((16 * points[:16, dimension]).astype(int)) == list(range(16))
 
 
 def test_no_two_settings_are_drawn_alike():
     used = max(len(ranges(space)) for space in SPACES)
-    alike = np.abs(np.corrcoef(np.array(sobol_points())[:16, :used].T) - np.eye(used))
-    assert alike.max() < 0.1  # else the effect of the one would be taken for that of the other
+    correlation = np.abs(np.corrcoef(np.array(sobol_points())[:16, :used].T) - np.eye(used))
+    assert correlation.max() < 0.1  # else the effects of two settings could be confused
 
 
 @each("space", SPACES)
 def test_a_space_has_its_own_dimension_for_each_setting_and_contains_the_default(space):
-    known = ranges(space)
-    assert sorted(dimension for dimension, *_ in known.values()) == list(range(len(known)))
-    assert "task.optimiser.learning_rate" in known and "task.silhouette_weight" in known
+    drawn = ranges(space)
+    assert sorted(dimension for dimension, *_ in drawn.values()) == list(range(len(drawn)))
+    assert "task.optimiser.learning_rate" in drawn and "task.silhouette_weight" in drawn
     default = composed(f"+method={space}")
-    for key, (_, least, most) in known.items():
-        place = log(OmegaConf.select(default, key) / least) / log(most / least)
-        assert 0.35 <= place <= 0.65, key  # as many draws below as above it
+    for key, (_, least, most) in drawn.items():
+        fraction = log(OmegaConf.select(default, key) / least) / log(most / least)
+        assert 0.35 <= fraction <= 0.65, key  # as many draws below as above it
 
 
 @each("space, draw", [("newton_mask", 31), ("newton_mask", SOBOL_DRAWS - 1), *((space, 0) for space in SPACES)])
@@ -63,14 +63,15 @@ def test_a_draw_is_its_sobol_point_even_in_the_logarithm(space, draw):
     config = composed(f"+method=space/{space}", f"draw={draw}")
     for key, (dimension, least, most) in ranges(space).items():
         value = OmegaConf.select(config, key)
-        share = log(value / least) / log(most / least)
-        rounded = 0.5 / value if isinstance(value, int) else 0.005  # the most by which rounding changes a logarithm
-        assert share == pytest.approx(np.array(sobol_points())[draw, dimension], abs=1.02 * rounded / log(most / least))
+        fraction = log(value / least) / log(most / least)
+        rounded = 0.5 / value if isinstance(value, int) else 0.005  # the largest change of the logarithm by rounding
+        point, tolerance = sobol_points()[draw][dimension], 1.02 * rounded / log(most / least)
+        assert fraction == pytest.approx(point, abs=tolerance)
     build(config.renderer, "renderer")
     assert config.label == composed(f"+method={space}").label
 
 
-def test_settings_that_all_methods_have_get_the_same_values_in_a_draw():
+def test_shared_settings_have_the_same_values_in_a_draw():
     shared = set.intersection(*(set(ranges(space)) for space in SPACES))
     assert shared == {"task.silhouette_weight", "task.code.weight", "task.optimiser.learning_rate"}
     for key in shared:
@@ -78,7 +79,7 @@ def test_settings_that_all_methods_have_get_the_same_values_in_a_draw():
         assert len({OmegaConf.select(composed(f"+method=space/{space}", "draw=0"), key) for space in SPACES}) == 1
 
 
-def test_a_draw_or_a_range_that_is_none_is_an_error():
+def test_an_invalid_draw_or_range_is_an_error():
     for draw in ("null", "64"):
         with pytest.raises((InterpolationResolutionError, HydraException), match="needs draw=0 to draw=63"):
             OmegaConf.to_container(composed("+method=space/dist_mask", f"draw={draw}"), resolve=True)

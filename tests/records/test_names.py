@@ -1,4 +1,4 @@
-"""Runs are named by what differs among them, and by nothing else."""
+"""The name of a run is what differs among the runs, and nothing else."""
 
 from bench.records.metrics import better_direction
 from bench.records.names import differences
@@ -6,7 +6,7 @@ from tests.looped import each
 
 
 def run(renderer: str = "dist", label: str = "DIST", **config) -> dict:
-    """The parts of a record that names are made of; keys of the configuration are dotted by `__`."""
+    """The fields of a record that a name depends on; `__` in a key of the configuration stands for a dot."""
     nested: dict = {"renderer": {"_label_": label}, "seed": 0, "index": 0}
     for key, value in config.items():
         outer, _, inner = key.partition("__")
@@ -14,7 +14,7 @@ def run(renderer: str = "dist", label: str = "DIST", **config) -> dict:
     return {"task": "completion", "method": "", "renderer": renderer, "dataset": "sofa", "config": nested}
 
 
-def own(path: str) -> dict:
+def custom_run(path: str) -> dict:
     return run("custom", path.rpartition(".")[2], renderer___target_=path)
 
 
@@ -38,23 +38,23 @@ def test_a_name_is_what_differs(records, names):
     assert differences(records) == names
 
 
-def test_renderers_of_ones_own_are_named_by_their_classes():
+def test_user_renderers_are_named_by_their_classes():
     classes = [f"bad.{letter * 3}" for letter in "ABCDEFGHIJKL"]
-    assert differences([own(path) for path in classes]) == [path[4:] for path in classes]
-    assert differences([own("mine.Net"), own("yours.Net")]) == ["mine.Net", "yours.Net"]
+    assert differences([custom_run(path) for path in classes]) == [path[4:] for path in classes]
+    assert differences([custom_run("mine.Net"), custom_run("yours.Net")]) == ["mine.Net", "yours.Net"]
 
 
-def test_what_keeps_runs_apart_is_not_in_their_names():
+def test_what_a_caption_distinguishes_is_not_in_names():
     records = [run(seed=seed, renderer__alpha=alpha) for seed in (0, 1) for alpha in (1.0, 1.5)]
     names = differences(records, distinguished_by=lambda record: record["config"]["seed"])
     assert names == ["alpha 1", "alpha 1.5"] * 2
 
 
-def test_a_key_is_named_as_the_sweep_asked_for_it():
+def test_a_key_is_named_as_in_the_sweep():
     records = [run(renderer__steps=n, renderer__budget=2 * n) for n in (4, 8)]
     assert differences(records) == ["steps 4", "steps 8"]
-    asked = [{"renderer.budget": "8.0"}, {"renderer.budget": "1e1"}]
-    assert differences(records, swept=asked) == ["budget 8.0", "budget 1e1"]
+    overrides = [{"renderer.budget": "8.0"}, {"renderer.budget": "1e1"}]
+    assert differences(records, swept=overrides) == ["budget 8.0", "budget 1e1"]
 
 
 @each(

@@ -1,4 +1,4 @@
-"""Run folders are claimed once, and their record is whole whatever happens."""
+"""A record of a run is complete whatever happens, and its code depends on what the run reads."""
 
 import errno
 import json
@@ -31,9 +31,7 @@ def test_a_new_record_says_killed_until_the_run_ends(tmp_path):
     record = make_record()
     record.write(folder)
     (read,), problems = read_records(tmp_path)
-    assert problems == []
-    assert (read["status"], read["folder"]) == ("killed", "run")
-    assert read["reason"]
+    assert (read["status"], read["folder"], problems) == ("killed", "run", []) and read["reason"]
     record.status, record.reason = RunStatus.OK, ""
     record.write(folder)
     assert json.loads((folder / "record.json").read_text())["status"] == "ok"
@@ -47,11 +45,11 @@ def test_records_and_plans_without_a_method_are_read(tmp_path):
     cell = {"id": "a", "overrides": [], "task": "pose", "renderer": "dist", "dataset": "car", "seed": 0, "config": {}}
     write_text(folder / "plan.json", to_json({"schema": 1, "name": "old", "asked": "2026-01-01", "cells": [cell]}))
     planned, problems = read_records(tmp_path)
-    assert ([one["method"] for one in planned], problems) == ([""], [])
+    assert ([record["method"] for record in planned], problems) == ([""], [])
     assert Record.of({key: value for key, value in make_record().__dict__.items() if key != "method"}).method == ""
 
 
-def test_a_row_is_named_by_its_loss_of_the_mask_unless_it_has_no_masks():
+def test_a_record_is_named_by_its_silhouette_loss_unless_it_has_no_masks():
     config = {"label": "Newton, RGB", "silhouette": {"_label_": "IDR's mask loss"}, "task": {"masks": False}}
     assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, without masks"
     config["task"]["masks"] = True
@@ -78,15 +76,15 @@ def test_a_write_that_fails_leaves_the_old_record(tmp_path, monkeypatch, functio
     assert json.loads((folder / "record.json").read_text())["status"] == "ok"
 
 
-def test_a_reader_never_meets_half_of_a_record(tmp_path):
+def test_a_reader_never_reads_half_of_a_record(tmp_path):
     path = tmp_path / "record.json"
     texts = [to_json({"number": number, "filler": "x" * 20_000 * number}) for number in (1, 2)]
     write_text(path, texts[0])
     with ThreadPoolExecutor(1) as pool:
         writing = pool.submit(lambda: [write_text(path, texts[turn % 2]) for turn in range(60)])
-        seen = {path.read_text() for _ in iter(lambda: writing.done(), True)}
+        contents = {path.read_text() for _ in iter(lambda: writing.done(), True)}
         writing.result()
-    assert seen <= set(texts)
+    assert contents <= set(texts)
 
 
 def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
@@ -99,7 +97,7 @@ def test_numbers_that_json_lacks_come_back_as_they_were(tmp_path):
     assert written["metrics"] == {"chamfer_l2": "inf", "depth_mae": "nan", "psnr": "-inf", "fscore": 0.5}
     (read,), problems = read_records(tmp_path)
     assert problems == []
-    assert str([read["metrics"], read["metrics_start"]]) == str([odd, odd])  # where nan is equal to nan
+    assert str([read["metrics"], read["metrics_start"]]) == str([odd, odd])  # nan is equal to nan as text
     assert math.isnan(read["gemm_fraction"]) and read["flops"] is None
 
 
@@ -109,7 +107,7 @@ def test_a_logarithm_and_a_word_may_be_metrics():
 
 
 @each("key", ["path", "image_path", "mask_path"])
-def test_a_run_is_another_one_where_a_file_that_it_reads_has_changed(tmp_path, key):
+def test_a_run_is_another_one_if_a_file_that_it_reads_has_changed(tmp_path, key):
     file, other = tmp_path / "file", tmp_path / "other"
     file.write_text("before")
     other.write_text("before")
@@ -125,7 +123,7 @@ def test_a_run_is_another_one_where_a_file_that_it_reads_has_changed(tmp_path, k
     assert code() != before
 
 
-def test_a_package_is_in_the_identity_of_runs_that_use_a_class_of_the_users_alone():
+def test_a_package_is_in_the_identity_of_runs_with_a_class_of_the_user():
     names = {"task": "completion", "renderer": "dist", "dataset": "sofa"}
 
     def identity(target: str, *packages: str) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Command lines in this process and in processes of their own, and the small runs that the tests of runs start."""
+"""Command lines in this process and in other processes, and the small runs that tests start."""
 
 import contextlib
 import io
@@ -6,6 +6,7 @@ import json
 import multiprocessing.forkserver
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -32,21 +33,21 @@ SMALLEST = (
     "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=16", "evaluation.points=100", "evaluation.every=null",
     "evaluation.picture=null",
 )  # fmt: skip
-PATIENCE = 120.0  # seconds that a test waits for what must come; it is there to end a test that hangs
+PATIENCE = 120.0  # seconds until a test that hangs is ended
 
 
 def errors(err: str) -> list[str]:
-    """The lines of an output of errors, without that by which a sweep says what it does."""
+    """The lines of standard error, without the first line of a sweep."""
     return [line for line in err.splitlines() if not line.startswith("sweep: ")]
 
 
 def record_of(out: str) -> dict:
-    """The record in the run folder that is the last line of an output."""
+    """The record of the run folder that the last line of an output names."""
     return json.loads((Path(out.splitlines()[-1]) / "record.json").read_text())
 
 
 def stored(results: Path, name: str, status: str = "ok", **changed: Any) -> Path:
-    """Writes a run folder with the record of a completion alone, and gives the folder."""
+    """Writes a run folder that holds only the record of a completion; gives the folder."""
     folder = results / "runs" / name
     folder.mkdir(parents=True)
     Record(name, "completion", "dist", "sofa", 0, {"seed": 0}, status=RunStatus(status), **changed).write(folder)
@@ -58,12 +59,21 @@ def planned(*names: str) -> list[PlannedCell]:
     return [PlannedCell(name, [], "completion", "dist", "sofa", 0, {"seed": 0}) for name in names]
 
 
+def by_program(*arguments: str, cwd: Path = ROOT, **environment: str) -> CommandResult:
+    """Runs Python with these arguments in a separate program, and with these environment variables."""
+    program, variables = [sys.executable, *arguments], os.environ | environment
+    completed = subprocess.run(
+        program, cwd=cwd, env=variables, capture_output=True, text=True, timeout=20 * PATIENCE, check=False
+    )
+    return CommandResult(completed.returncode, completed.stdout, completed.stderr)
+
+
 def command(*arguments: str, main: Callable[[], int] = main) -> CommandResult:
-    """A command line in this process; its runs have processes of their own, unless it says isolation=off."""
+    """Runs a command line in this process, and its runs in other processes, unless it has isolation=off."""
     out, err = io.StringIO(), io.StringIO()
     with (
         using_threads(torch.get_num_threads()),
-        mock.patch.dict(os.environ),  # what the command sets is put back
+        mock.patch.dict(os.environ),  # restores what the command sets
         mock.patch.object(sys, "argv", ["bench", *arguments]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
@@ -73,7 +83,7 @@ def command(*arguments: str, main: Callable[[], int] = main) -> CommandResult:
 
 
 class Driver:
-    """A command line in a process of its own, forked from the server of processes, which has loaded torch already."""
+    """A command line in a process forked from the server of processes, which has loaded torch already."""
 
     def __init__(self, output: Path, arguments: tuple[str, ...]) -> None:
         output.mkdir(parents=True)
@@ -82,14 +92,14 @@ class Driver:
         self.process.start()
 
     def send(self, number: signal.Signals) -> CommandResult:
-        """Sends a signal, unless it has ended, and waits for the end."""
+        """Sends a signal, unless the process has ended, and waits for the end."""
         assert self.process.pid is not None
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.process.pid, number)
         return self.ended()
 
     def ended(self) -> CommandResult:
-        """Waits for the end; the exit status is negative where a signal ended it."""
+        """Waits for the end; the exit status is negative if a signal ended the process."""
         self.process.join(PATIENCE)
         assert self.process.exitcode is not None, "the driver does not end"
         return CommandResult(self.process.exitcode, *((self.output / name).read_text() for name in ("out", "err")))
@@ -100,9 +110,8 @@ def _drive(output: Path, arguments: tuple[str, ...]) -> None:
     for number, name in ((1, "out"), (2, "err")):
         os.dup2(os.open(output / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND), number)
     server = multiprocessing.forkserver._forkserver
-    multiprocessing.forkserver.ensure_running = server.ensure_running = lambda: (
-        None
-    )  # its runs come from the server that it came from; Python would start another
+    # Its runs come from the same server; Python would start another one.
+    multiprocessing.forkserver.ensure_running = server.ensure_running = lambda: None
     process.TERMINATION_GRACE_SECONDS = PATIENCE / 4  # a busy machine needs longer
     sys.argv = ["bench", *arguments]
     sys.exit(main())
@@ -110,11 +119,11 @@ def _drive(output: Path, arguments: tuple[str, ...]) -> None:
 
 @contextlib.contextmanager
 def driver(output: Path, *arguments: str) -> Iterator[Driver]:
-    """A driver, which is killed if it is still there at the end.
+    """A driver, which is killed if it still runs at the end.
 
     Args:
-        output: a folder that is made for its standard output and standard error.
-        arguments: of its command line.
+        output: the new folder for its standard output and standard error.
+        arguments: its command line.
     """
     started = Driver(output, arguments)
     try:
@@ -125,29 +134,29 @@ def driver(output: Path, *arguments: str) -> Iterator[Driver]:
 
 
 def wait_for(ready: Callable[[], object], running: Driver | None = None) -> None:
-    """Waits until something is so; fails where the driver that should see to it ends before."""
+    """Waits until `ready` gives a true value; fails if the driver ends before."""
     latest = time.monotonic() + PATIENCE
     while not ready():
         if running is not None and not running.process.is_alive():
             assert ready(), (running.output / "err").read_text()
             return
-        assert time.monotonic() < latest, "it does not come"
+        assert time.monotonic() < latest, "waited too long"
         time.sleep(0.02)
 
 
 def lines_of_curves(results: Path) -> int:
-    """How many iterations the runs of a results folder have done, those under way with them."""
+    """How many iterations the runs of a results folder have finished, also runs under way."""
     return sum(path.read_bytes().count(b"\n") for path in results.glob("runs/*/curve.jsonl"))
 
 
 def at_work(results: Path) -> list[int]:
-    """Processes that hold a log of a run open."""
-    found = []
-    for place in Path("/proc").glob("[0-9]*"):
+    """The processes that hold a log of a run open."""
+    processes = []
+    for process_folder in Path("/proc").glob("[0-9]*"):
         try:
-            links = [str(link.readlink()) for link in (place / "fd").iterdir()]
+            links = [str(link.readlink()) for link in (process_folder / "fd").iterdir()]
         except OSError:
             continue
         if any(link.startswith(str(results)) and link.endswith("log.txt") for link in links):
-            found.append(int(place.name))
-    return found
+            processes.append(int(process_folder.name))
+    return processes

@@ -1,6 +1,6 @@
-"""Imported by the server of processes that tests run in: its runs do not find out anew what the machine and git say.
+"""Imported by the server of test processes: its runs neither call git nor measure the machine.
 
-Half a second of each run is spared so. A run that is a program of its own does find out, such as that of test_run.
+This saves half a second per run. Runs in a separate program, such as that of test_run, do measure.
 """
 
 from bench.machine import environment

@@ -1,4 +1,4 @@
-"""Every mistake of a user's ends in one clear line that says what to do, before anything slow."""
+"""Every mistake of a user ends in one clear line with a remedy, before anything slow."""
 
 import json
 import signal
@@ -18,20 +18,20 @@ from bench.runner.plan import refusal_reason
 from bench.setup import priors
 from tests.composing import identified
 from tests.looped import each
-from tests.runner.driving import PATIENCE, ROOT, driver, errors, lines_of_curves, record_of, wait_for
+from tests.runner.driving import ROOT, by_program, driver, errors, lines_of_curves, record_of, wait_for
 
 TINY = ("scale=smoke", "view.resolution=16", "task.points=20", "evaluation.grid=16", "evaluation.points=100")
 
 
 @pytest.fixture
 def bench(isolated):
-    """A command line in this process, with its runs: its exit status, its standard output and its standard error."""
+    """Runs a command line and its runs in this process; gives its exit status and outputs."""
     return lambda *arguments: isolated(*arguments, "isolation=off")
 
 
 @pytest.fixture
 def no_prior(monkeypatch):
-    """A mistake must be told before a prior is looked for, which may mean minutes of training."""
+    """Fails if a prior is looked for, which may take minutes of training: a mistake must be reported before."""
 
     def slow(*_):
         raise AssertionError("the slow steps began")
@@ -40,14 +40,11 @@ def no_prior(monkeypatch):
 
 
 def assert_one_line(err: str, *words: str) -> None:
-    lines = errors(err)
-    assert len(lines) == 1, err
-    assert len(lines[0]) < 400
-    for word in words:
-        assert word in lines[0]
+    (line,) = errors(err)
+    assert len(line) < 400 and all(word in line for word in words), (line, words)
 
 
-@each("argument, words", [
+@each("arguments, words", [
     ("task=compleetion", ("unknown task 'compleetion'", "did you mean completion")),
     ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, idr, mesh_proxy, naive, neus", "and variants")),
     ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
@@ -67,13 +64,16 @@ def assert_one_line(err: str, *words: str) -> None:
     ("--renderer=dist", ("unknown option '--renderer=dist'", "write renderer=VALUE")),
     ("--seed", ("settings have no dashes, write seed=VALUE",)),
     ("renderer=[dist,dvr]", ("one renderer", "-m renderer=A,B")),
+    ("renderer=custom renderer.steps=3", ("+renderer.steps=VALUE",)),
+    ("task.colour_weight=1", ("set prior=textured field=prior",)),
+    ("task.colour_weight=1 prior=textured field=grid_8", ("set prior=textured field=prior",)),
 ])  # fmt: skip
-def test_an_invalid_command_line_is_an_error_with_the_nearest_name(monkeypatch, argument, words):
-    assert_one_line(explained(monkeypatch, argument), *words)
+def test_an_invalid_command_line_is_an_error_with_the_nearest_name(monkeypatch, arguments, words):
+    assert_one_line(explained(monkeypatch, *arguments.split()), *words)
 
 
 def explained(monkeypatch, *arguments: str) -> str:
-    """What is said of a command line that cannot be; empty where it can."""
+    """The message on an invalid command line; empty for a valid one."""
     monkeypatch.setattr(sys, "argv", ["bench", *arguments])
     try:
         return refusal_reason(identified(*arguments).config)
@@ -81,16 +81,13 @@ def explained(monkeypatch, *arguments: str) -> str:
         return message_of(error)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["index=0,1"], "index has several values: add -m for a run of each, write index=[0,1]"),
-        (["renderer.steps=0"], "steps must be at least 1, not 0"),
-        (["-m", "index=0,-1"], "cell 2 of 2 (index=-1): index must be at least 0"),
-        (["memory_limit=-1"], "memory_limit must be positive"),
-    ],
-)
-def test_the_command_says_so_in_a_line_and_leaves_nothing(bench, tmp_path, no_prior, arguments, words):
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["index=0,1"], "index has several values: add -m for a run of each, write index=[0,1]"),
+    (["renderer.steps=0"], "steps must be at least 1, not 0"),
+    (["-m", "index=0,-1"], "cell 2 of 2 (index=-1): index must be at least 0"),
+    (["memory_limit=-1"], "memory_limit must be positive"),
+])  # fmt: skip
+def test_the_command_reports_a_mistake_in_one_line_and_leaves_nothing(bench, tmp_path, no_prior, arguments, words):
     code, out, err = bench(*arguments)
     assert (code, out) == (2, "")
     assert_one_line(err, "error: ", words)
@@ -104,15 +101,6 @@ def test_unknown_kernels_are_refused_before_a_run(bench, tmp_path, no_prior, mon
     assert_one_line(err, "IMPLICIT_BENCH_KERNELS must be torch or compiled, not 'quick'")
 
 
-def test_an_argument_of_ones_own_renderer_takes_a_plus(monkeypatch):
-    assert_one_line(explained(monkeypatch, "renderer=custom", "renderer.steps=3"), "+renderer.steps=VALUE")
-
-
-@each("arguments", [("task.colour_weight=1",), ("task.colour_weight=1", "prior=textured", "field=grid_8")])
-def test_colours_are_asked_of_a_prior_that_has_some(monkeypatch, arguments):
-    assert_one_line(explained(monkeypatch, *arguments), "set prior=textured field=prior")
-
-
 def test_a_mistyped_key_in_a_row_of_the_users_names_its_file(bench, tmp_path, no_prior):
     (tmp_path / "my conf").mkdir()
     table = tmp_path / "my conf" / "methods.yaml"
@@ -124,7 +112,7 @@ def test_a_mistyped_key_in_a_row_of_the_users_names_its_file(bench, tmp_path, no
 
 
 @pytest.mark.parametrize("text", ["task: {points: 20}", "defaults: [override /task: completion]"])
-def test_an_experiment_without_its_first_line_is_told_what_it_is(bench, tmp_path, text):
+def test_an_experiment_without_its_first_line_is_an_error_that_names_the_line(bench, tmp_path, text):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text(text)
     code, _, err = bench("--config-dir", str(tmp_path), "+experiment=mine")
@@ -133,7 +121,7 @@ def test_an_experiment_without_its_first_line_is_told_what_it_is(bench, tmp_path
 
 
 @pytest.mark.parametrize("word", ["list", "help"])
-def test_a_word_lists_what_there_is(bench, word):
+def test_a_word_lists_the_choices(bench, word):
     code, out, err = bench(word)
     assert (code, err) == (0, "")
     for name in ("completion", "newton", "sofa", *(["table1", "dist_mask"] if word == "list" else ["-m +experiment="])):
@@ -146,8 +134,8 @@ def test_a_word_lists_what_there_is(bench, word):
     ("a=1 --config-dir=x --cfg job", {"config_dir": "x", "cfg": "job"}, ["a=1"]),
 ])  # fmt: skip
 def test_options_may_stand_anywhere(typed, options, overrides):
-    found = vars(options_of(typed.split()))
-    assert found["overrides"] == overrides and options.items() <= found.items()
+    parsed = vars(options_of(typed.split()))
+    assert parsed["overrides"] == overrides and options.items() <= parsed.items()
 
 
 @each("text, label", [
@@ -163,7 +151,7 @@ def test_the_command_keeps_labels_as_typed_in_a_sweep_too(bench, no_prior):
     assert code == 0 and all(f"completion, {label}, sofa" in out for label in ("Nan", "1e3", "Mine")), out
 
 
-def test_a_number_stays_one_where_the_key_asks_for_one():
+def test_a_number_stays_one_if_the_key_takes_one():
     for argument in ("seed=1", "time_limit=1e3", "verbose=true", "renderer.label=1", "label=", "-m"):
         assert quote_text(argument) == argument
 
@@ -196,8 +184,8 @@ def test_an_invalid_value_is_an_error_before_anything_slow(monkeypatch, no_prior
     ("packages=[torch]", ("error: field_path: there is nothing at 'none.pth'",)),
 ])  # fmt: skip
 def test_keys_of_a_network_are_named_as_typed(bench, argument, words):
-    of = "mynet.Net" if "width" in argument else "torch.nn.Identity"
-    code, _, err = bench("field=file", "field_path=none.pth", f"field._target_={of}", argument)
+    target = "mynet.Net" if "width" in argument else "torch.nn.Identity"
+    code, _, err = bench("field=file", "field_path=none.pth", f"field._target_={target}", argument)
     assert code == 2
     assert_one_line(err, *words)
 
@@ -209,7 +197,7 @@ def test_more_points_than_pixels_are_an_error(bench):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_a_gpu_that_is_not_there_is_an_error(bench, no_prior):
+def test_a_missing_gpu_is_an_error(bench, no_prior):
     code, _, err = bench("device=cuda")
     assert code == 2
     assert_one_line(err, "device=cuda", "set device=cpu")
@@ -228,13 +216,12 @@ def test_a_mesh_that_cannot_be_used_is_an_error(bench, no_prior, tmp_path):
         assert code == 2 and list((tmp_path / "r" / "runs").iterdir()) == []
 
 
-def test_what_was_repaired_is_told_where_the_run_fails_later(bench, no_prior, tmp_path):
+def test_repairs_are_reported_also_if_the_run_fails_later(bench, no_prior, tmp_path):
     ball = trimesh.creation.icosphere(2)
     half = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] > 0])
     half.export(tmp_path / "half.ply")
     code, out, err = bench(*TINY, "dataset=mesh", f"dataset.path={tmp_path / 'half.ply'}", "split=train")
-    assert code == 1
-    assert "the slow steps began" in err
+    assert code == 1 and "the slow steps began" in err
     notes = [line for line in out.splitlines() if line.startswith("note: ")]
     assert any(note.startswith("note: warning: repair changed the area from ") for note in notes)
     assert "note: 1 hole closed" in notes
@@ -247,10 +234,10 @@ def test_a_path_that_hydra_cannot_read_bare_must_be_quoted(monkeypatch, name):
 
 def test_a_results_folder_that_cannot_be_written_is_an_error(bench, tmp_path):
     (tmp_path / "file").write_text("")
-    for place in (tmp_path / "file" / "results", Path("/proc/results")):
-        code, out, err = bench(f"results_dir={place}")
+    for results in (tmp_path / "file" / "results", Path("/proc/results")):
+        code, out, err = bench(f"results_dir={results}")
         assert (code, out) == (1, "")
-        named = f"({tmp_path / 'file'})" if place.parent.name == "file" else str(place)
+        named = f"({tmp_path / 'file'})" if results.parent.name == "file" else str(results)
         assert_one_line(err, "error: ", named, "set results_dir to a folder you can write")
 
 
@@ -262,14 +249,13 @@ def test_a_disk_that_fills_up_during_a_run_is_an_error(bench, monkeypatch):
 
     monkeypatch.setattr(run_folder, "_reserve_bytes", fill_up)
     code, out, err = bench(*TINY, "task.optimiser.iterations=2")
-    assert code == 1
-    assert "Traceback" not in out + err
+    assert code == 1 and "Traceback" not in out + err
     assert_one_line(err, "No space left on device")
     record = record_of(out)
     assert record["status"] == "crashed" and f"({Path(out.splitlines()[-1])}): free space" in record["reason"]
 
 
-def test_verbose_shows_where_a_mistake_was_found(bench, no_prior):
+def test_verbose_shows_the_traceback_of_a_mistake(bench, no_prior):
     _, out, err = bench("renderer.steps=0", "verbose=true")
     assert "Traceback (most recent call last)" in err and "steps must be" in err.strip().splitlines()[-1]
     _, out, err = bench("renderer.steps=0")
@@ -277,29 +263,23 @@ def test_verbose_shows_where_a_mistake_was_found(bench, no_prior):
 
 
 def test_a_typo_and_help_are_answered_before_anything_slow_is_loaded(tmp_path):
-    code = [
-        "import sys, bench.runner.run",
-        "from bench.__main__ import main",
-        "code = main()",
-        "sys.argv = ['bench', '--help']",
-        "main()",
-        "print(*(name for name in ('numpy', 'torch', 'open3d', 'pandas') if name in sys.modules))",
-        "sys.exit(code)",
-    ]
-    program = [sys.executable, "-c", "\n".join(code), "renderer.alhpa=1", f"results_dir={tmp_path}"]
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    *text, loaded = done.stdout.split("\n")[:-1]
-    assert (done.returncode, loaded) == (2, "")
-    assert_one_line(done.stderr, "unknown key", "did you mean renderer.alpha")
+    code = (
+        "import sys, bench.runner.run; from bench.__main__ import main; code = main(); sys.argv = ['bench', '--help']; "
+        "main(); print(*{'numpy', 'torch', 'open3d', 'pandas'} & {*sys.modules}); sys.exit(code)"
+    )
+    result = by_program("-c", code, "renderer.alhpa=1", f"results_dir={tmp_path}")
+    *text, loaded = result.out.split("\n")[:-1]
+    assert (result.code, loaded) == (2, "")
+    assert_one_line(result.err, "unknown key", "did you mean renderer.alpha")
     assert all(word in "\n".join(text) for word in ("renderer", "dist", "naive", "completion", "sofa", "smoke"))
 
 
-def test_help_may_be_read_in_part():
-    done = subprocess.run(f"{sys.executable} -m bench --help | head -n 1", shell=True, cwd=ROOT, capture_output=True)
-    assert done.returncode == 0 and done.stdout.startswith(b"`python -m bench") and done.stderr == b""
+def test_help_may_be_read_partly():
+    process = subprocess.run(f"{sys.executable} -m bench --help | head -n 1", shell=True, cwd=ROOT, capture_output=True)
+    assert process.returncode == 0 and process.stdout.startswith(b"`python -m bench") and process.stderr == b""
 
 
-def test_a_run_that_is_stopped_keeps_what_it_had(tmp_path):
+def test_a_stopped_run_keeps_its_record_and_curve(tmp_path):
     arguments = (*TINY, "task.optimiser.iterations=1000000", f"results_dir={tmp_path}")
     with driver(tmp_path / "output", *arguments) as running:
         wait_for(lambda: lines_of_curves(tmp_path) > 3, running)
@@ -309,9 +289,6 @@ def test_a_run_that_is_stopped_keeps_what_it_had(tmp_path):
     lines = (folder / "curve.jsonl").read_text().splitlines()
     assert (stopped.code, record["status"]) == (130, "killed")
     assert_one_line(stopped.err, "stopped by SIGTERM")
-    assert "stopped by SIGTERM" in record["reason"]
-    assert len(lines) > 3
-    assert [json.loads(line)["iteration"] for line in lines] == list(range(len(lines)))
-    counted = record["evaluations"]["iterations"]  # an iteration counts just before its line is written
-    assert counted in (len(lines), len(lines) + 1)
-    assert record["metrics_start"]
+    assert "stopped by SIGTERM" in record["reason"] and record["metrics_start"]
+    assert [json.loads(line)["iteration"] for line in lines] == list(range(len(lines))) and len(lines) > 3
+    assert record["evaluations"]["iterations"] - len(lines) in (0, 1)  # an iteration counts before its line is written

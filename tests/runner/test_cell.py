@@ -1,4 +1,4 @@
-"""A configuration becomes objects in one place: each node once, whatever asks for it; and a run takes its threads."""
+"""A configuration becomes objects, each node once; and a run takes its threads."""
 
 from collections import Counter
 
@@ -20,7 +20,7 @@ def as_before():
 
 @pytest.fixture
 def built(monkeypatch) -> Counter[str]:
-    """How often each part was built."""
+    """How often each node was built."""
     counts: Counter[str] = Counter()
     build = config_module.build
 
@@ -32,17 +32,17 @@ def built(monkeypatch) -> Counter[str]:
     return counts
 
 
-def test_a_run_builds_each_part_once(compose_config, built):
+def test_a_run_builds_each_node_once(compose_config, built):
     build_cell(plain(compose_config("scale=smoke")))
     assert set(built.values()) == {1}
     assert {"task", "renderer", "view", "dataset", "evaluation", "prior", "models"} <= set(built)
 
 
-def test_a_part_that_cells_share_is_built_once_also_one_that_cannot_be(compose_config, built):
+def test_a_node_that_cells_share_is_built_once_also_an_invalid_one(compose_config, built):
     shared, reasons = {}, []
-    one = plain(compose_config("scale=smoke"))
-    wrong = one | {"renderer": one["renderer"] | {"steps": 0}}
-    for config in (one, wrong, one | {"index": 3}, wrong):
+    valid = plain(compose_config("scale=smoke"))
+    wrong = valid | {"renderer": valid["renderer"] | {"steps": 0}}
+    for config in (valid, wrong, valid | {"index": 3}, wrong):
         try:
             build_cell(config, shared)
         except ValueError as error:
@@ -51,7 +51,7 @@ def test_a_part_that_cells_share_is_built_once_also_one_that_cannot_be(compose_c
     assert (built["renderer"], built["task"], built["dataset"], built["prior"]) == (2, 1, 1, 1)
 
 
-def test_a_shape_has_a_code_of_the_prior_where_its_training_had_the_shape(compose_config):
+def test_a_shape_has_a_code_of_the_prior_if_its_training_had_the_shape(compose_config):
     cells = [cell_from(compose_config("split=train", "prior.shapes=2", f"index={index}")) for index in range(3)]
     assert [cell.inputs.prior_choice.scene_code for cell in cells] == [0, 1, None]
     with pytest.raises(BadInput, match="at the shape that it was fitted to"):
@@ -66,7 +66,7 @@ def test_a_narrow_network_takes_one_thread_and_a_wide_one_all(compose_config, mo
         assert torch.get_num_threads() == threads
 
 
-def test_the_threads_that_are_asked_for_are_taken_by_the_run_and_not_by_its_check(compose_config):
+def test_the_run_takes_its_threads_and_its_check_does_not(compose_config):
     torch.set_num_threads(1)
     cell = cell_from(compose_config("scale=smoke", "threads=2"))
     assert torch.get_num_threads() == 1

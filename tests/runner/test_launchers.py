@@ -1,4 +1,4 @@
-"""Sweeps are planned before they start, and have a row for every cell under every launcher."""
+"""Sweeps are planned before they start, and have a record for every cell under every launcher."""
 
 import json
 import signal
@@ -18,10 +18,11 @@ from bench.runner.jobs import group_by_duration
 from tests.composing import identified
 from tests.looped import each
 from tests.report.page_data import Page
-from tests.runner.driving import FAILING, PATIENCE, ROOT, CommandResult, command, driver, errors, wait_for
+from tests.runner.driving import FAILING, PATIENCE, ROOT, CommandResult, by_program, command, driver, errors, wait_for
 from tests.runner.test_process import CASES
 
-LAUNCHERS = {  # with the package that each needs, and its settings
+# The package that a launcher needs, and its settings.
+LAUNCHERS = {
     "basic": ("", ()),
     "workers": ("", ("hydra.launcher.n_jobs=3",)),
     "slurm": ("submitit", ("hydra.launcher.cluster=local",)),
@@ -30,17 +31,17 @@ LAUNCHERS = {  # with the package that each needs, and its settings
 # The cells of a sweep; `terminate` stands for a cell whose run folder cannot be made.
 NO_FOLDER = "terminate"
 HOWS = ("not", "loop", NO_FOLDER)
-# A limit of its own for each: a short one for work that never ends, a generous one for work that ends at once.
+# Seconds: a short limit for work that never ends, a long one for work that ends at once.
 LIMITS = {how: 1 if CASES[how][1] == "timeout" else PATIENCE for how in CASES} | {"not": PATIENCE}
 LIMITED = (
     f"+renderer.limits={{{','.join(f'{how}:{seconds}' for how, seconds in LIMITS.items())}}}",
-    "time_limit='${renderer.limits.${oc.select:renderer.how,not}}'",  # a sweep is planned from what has no `how` yet
+    "time_limit='${renderer.limits.${oc.select:renderer.how,not}}'",  # the first composition of a sweep has no `how`
 )
 
 
 @dataclass(frozen=True)
 class Swept:
-    """A sweep that has ended: its results and what it printed."""
+    """A sweep that has ended: its results and its outputs."""
 
     results: Path
     outcome: CommandResult
@@ -56,13 +57,6 @@ def need(launcher: str) -> None:
         pytest.skip(f"the package of {launcher} is not installed: pip install -e '.[submitit,ray]'")
 
 
-def by_program(*arguments: str) -> CommandResult:
-    """A command line in a program of its own, which has ended."""
-    program = [sys.executable, "-m", "bench", *arguments]
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=8 * PATIENCE, check=False)
-    return CommandResult(done.returncode, done.stdout, done.stderr)
-
-
 def plan_of(results: Path) -> dict:
     (path,) = results.glob("sweeps/*/plan.json")
     return json.loads(path.read_text())
@@ -70,7 +64,7 @@ def plan_of(results: Path) -> dict:
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory) -> Swept:
-    """A sweep by workers: a run that ends by itself, one that hangs, one without a folder."""
+    """A sweep by workers over a run that ends by itself, one that hangs and one without a folder."""
     need("workers")
     results = tmp_path_factory.mktemp("workers")
     arguments = ("hydra/launcher=workers", *LIMITED, "threads=null")
@@ -79,29 +73,27 @@ def swept(tmp_path_factory) -> Swept:
     blocked.parent.mkdir()
     blocked.symlink_to(results / "nowhere")
     cells = f"+renderer.how={','.join(HOWS)}"
-    return Swept(results, by_program("-m", *FAILING, *arguments, cells, f"results_dir={results}"))
+    return Swept(results, by_program("-m", "bench", "-m", *FAILING, *arguments, cells, f"results_dir={results}"))
 
 
-def test_every_planned_cell_is_a_row_whatever_becomes_of_it(swept):
+def test_every_planned_cell_has_a_record_whatever_its_outcome(swept):
     planned = [cell["id"] for cell in plan_of(swept.results)["cells"]]
     records, problems = read_records(swept.results)
-    assert problems == []
-    assert sorted(record["id"] for record in records) == sorted(planned)
+    assert problems == [] and sorted(record["id"] for record in records) == sorted(planned)
     assert swept.statuses == {"not": swept.statuses["not"], NO_FOLDER: "not_run", "loop": "timeout"}
     assert swept.statuses["not"] in ("ok", "not_reached")
     page = Page(swept.results)
     assert all(name in page.folders for name in planned)
 
 
-def test_a_sweep_says_what_it_does_prints_a_line_for_each_cell_and_its_folder_last(swept):
+def test_a_sweep_prints_its_plan_a_line_for_each_cell_and_its_folder_last(swept):
     code, out, err = swept.outcome
-    assert code == 1, err
-    assert "Traceback" not in out + err
+    assert code == 1 and "Traceback" not in out + err, err
     assert err.splitlines()[0] == "sweep: 3 runs, 2 at a time (hydra/launcher=workers); a line follows as each ends"
     lines = out.splitlines()
     assert Path(lines[-1]) == next(swept.results.glob("sweeps/*/plan.json")).parent
     of_cells = [line for line in lines if not line.startswith("first failure: ")]
-    assert sum(str(swept.results / "runs") in line for line in of_cells) == len(HOWS) - 1  # all but NO_FOLDER
+    assert sum(str(swept.results / "runs") in line for line in of_cells) == len(HOWS) - 1  # all except NO_FOLDER
     assert "3 planned: " in out and "1 not_run" in out
     assert err.count("set results_dir to a folder you can write") == 1
 
@@ -112,38 +104,32 @@ def test_its_runs_have_the_threads_that_the_launcher_pins(swept):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", LAUNCHERS)
-def test_every_way_to_fail_is_a_row_under_every_launcher(tmp_path, launcher):
+def test_every_way_to_fail_has_a_record_under_every_launcher(tmp_path, launcher):
     need(launcher)
-    cells = (
-        f"hydra/launcher={launcher}",
-        *LAUNCHERS[launcher][1],
-        f"+renderer.how={','.join(CASES)}",
-        *LIMITED,
-        "memory_limit=1.5",
-    )
-    by_program("-m", *FAILING, *cells, f"results_dir={tmp_path}")
+    settings = (f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1], *LIMITED, "memory_limit=1.5")
+    cells = (*settings, f"+renderer.how={','.join(CASES)}")
+    by_program("-m", "bench", "-m", *FAILING, *cells, f"results_dir={tmp_path}")
     records, problems = read_records(tmp_path)
     assert problems == []
-    found = {record["config"]["renderer"]["how"]: record["status"] for record in records}
-    assert found == {how: status for how, (_, status, _) in CASES.items()}
+    statuses = {record["config"]["renderer"]["how"]: record["status"] for record in records}
+    assert statuses == {how: status for how, (_, status, _) in CASES.items()}
     assert len(plan_of(tmp_path)["cells"]) == len(records) == len(CASES)
 
 
 def stopped(tmp_path: Path, number: signal.Signals) -> CommandResult:
-    """A sweep of three cells that is sent a signal when the first one is under way, which goes on for long."""
+    """Sends a signal to a sweep of three cells while its first cell runs, which takes long."""
     arguments = ("-m", *FAILING, "+renderer.how=not", "+renderer.pause=900", "seed=0,1,2", f"results_dir={tmp_path}")
     with driver(tmp_path / "output", *arguments) as running:
         wait_for(lambda: list(tmp_path.glob("runs/*/record.json")), running)
         return running.send(number)
 
 
-def test_the_plan_stands_before_the_first_cell_and_shows_what_was_not_run(tmp_path):
+def test_the_plan_is_written_before_the_first_cell_and_shows_what_was_not_run(tmp_path):
     assert stopped(tmp_path, signal.SIGKILL).code == -signal.SIGKILL
     cells = plan_of(tmp_path)["cells"]
     assert [cell["seed"] for cell in cells] == [0, 1, 2]
     records, problems = read_records(tmp_path)
-    assert problems == []
-    assert {record["id"] for record in records} == {cell["id"] for cell in cells}
+    assert problems == [] and {record["id"] for record in records} == {cell["id"] for cell in cells}
     assert sorted(record["status"] for record in records) == ["killed", "not_run", "not_run"]
     reasons = {record["status"]: record["reason"] for record in records}
     assert "the same command runs it" in reasons["not_run"] and "before it could say why" in reasons["killed"]
@@ -151,15 +137,14 @@ def test_the_plan_stands_before_the_first_cell_and_shows_what_was_not_run(tmp_pa
     assert Page(tmp_path).text("status").count("not_run") == 2
 
 
-def test_a_sweep_that_is_stopped_says_what_it_came_to(tmp_path):
+def test_a_stopped_sweep_prints_its_summary(tmp_path):
     code, out, _ = stopped(tmp_path, signal.SIGINT)
-    assert code == 130
-    assert "3 planned: 2 not_run, 1 killed" in out
+    assert code == 130 and "3 planned: 2 not_run, 1 killed" in out
     assert Path(out.splitlines()[-1]) == next(tmp_path.glob("sweeps/*/plan.json")).parent
     assert (tmp_path / "index.html").is_file()
 
 
-def test_workers_that_are_stopped_write_the_records_of_their_runs(tmp_path):
+def test_stopped_workers_write_the_records_of_their_runs(tmp_path):
     cells = ("-m", *FAILING, "+renderer.how=not", "+renderer.pause=900", "seed=0,1,2", f"results_dir={tmp_path}")
     program = [sys.executable, "-m", "bench", *cells, "hydra/launcher=workers"]
     with subprocess.Popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
@@ -174,7 +159,7 @@ def test_workers_that_are_stopped_write_the_records_of_their_runs(tmp_path):
 
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("error", [AttributeError("a list was half made"), None], ids=["replaced", "swallowed"])
-def test_a_sweep_stops_also_where_a_library_makes_something_else_of_the_interrupt(tmp_path, monkeypatch, error):
+def test_a_sweep_stops_also_if_a_library_replaces_or_swallows_the_interrupt(tmp_path, monkeypatch, error):
     def interrupted(text: str) -> None:
         try:
             signal.raise_signal(signal.SIGINT)
@@ -184,53 +169,39 @@ def test_a_sweep_stops_also_where_a_library_makes_something_else_of_the_interrup
 
     monkeypatch.setattr("bench.runner.run.run_progress", lambda name: nullcontext(interrupted(name)))
     code, out, err = command("-m", *FAILING, "+renderer.how=not", "seed=0,1,2", f"results_dir={tmp_path}")
-    assert code == 130
-    assert "3 planned: 2 not_run, 1 killed" in out
+    assert code == 130 and "3 planned: 2 not_run, 1 killed" in out
     assert errors(err)[0] == "error: killed: stopped by Ctrl-C; the same command starts it anew"
 
 
 def test_a_sweep_of_nothing_is_an_error(isolated):
     code, _, err = isolated("-m", *FAILING, "seed=range(0,0)")
-    assert code == 2
-    assert "error: the sweep has no cell" in err
-    assert len(err.splitlines()) == 1
+    assert code == 2 and err.startswith("error: the sweep has no cell") and len(err.splitlines()) == 1
 
 
-@each(
-    "seconds, places",
-    [
-        ([], []),
-        ([60.0, 60.0, 60.0], [[0], [1], [2]]),
-        ([30.0, 30.0, 30.0], [[0, 1], [2]]),
-        ([90.0, 10.0, 10.0, 41.0], [[0], [1, 2], [3]]),  # the first takes longer than a job is to take
-    ],
-)
-def test_a_job_has_as_many_runs_as_its_minutes_hold(seconds, places):
-    assert group_by_duration(seconds, 60.0) == places
+@each("seconds, jobs", [
+    ([], []), ([60.0, 60.0, 60.0], [[0], [1], [2]]), ([30.0, 30.0, 30.0], [[0, 1], [2]]),
+    ([90.0, 10.0, 10.0, 41.0], [[0], [1, 2], [3]]),  # the first run takes longer than a job
+])  # fmt: skip
+def test_a_job_has_as_many_runs_as_its_minutes_hold(seconds, jobs):
+    assert group_by_duration(seconds, 60.0) == jobs
 
 
-@pytest.mark.parametrize(
-    "wrong, words",
-    [
-        (
-            ("time_limit=601", "hydra.launcher.timeout_min=10", "hydra.launcher.minutes_per_job=5"),
-            "hydra.launcher.timeout_min=10 ends a job before time_limit=601 seconds end its run: "
-            "set hydra.launcher.timeout_min=11 or more, or time_limit=600 or less",
-        ),
-        (("hydra.launcher.timeout_min=40",), "minutes_per_job=60 is more than hydra.launcher.timeout_min=40, "),
-        (("hydra.launcher.array_size=0",), "hydra.launcher.array_size must be positive, not 0: leave it out"),
-        (("hydra.launcher.cluster=locl",), "hydra.launcher.cluster must be slurm or local, not 'locl'"),
-    ],
-)
-def test_what_a_job_cannot_do_is_refused_before_anything_is_written(tmp_path, wrong, words):
+@pytest.mark.parametrize("settings, words", [
+    ("timeout_min=10 minutes_per_job=5", "seconds end its run: set hydra.launcher.timeout_min=11 or more, or time_l"),
+    ("timeout_min=40", "minutes_per_job=60 is more than hydra.launcher.timeout_min=40, "),
+    ("array_size=0", "hydra.launcher.array_size must be positive, not 0: leave it out"),
+    ("cluster=locl", "hydra.launcher.cluster must be slurm or local, not 'locl'"),
+])  # fmt: skip
+def test_what_a_job_cannot_do_is_refused_before_anything_is_written(tmp_path, settings, words):
     need("slurm")
+    wrong = ("time_limit=601", *(f"hydra.launcher.{setting}" for setting in settings.split()))
     for more in ((), ("plan=true",)):
-        done = command("-m", *FAILING, "hydra/launcher=slurm", *wrong, *more, f"results_dir={tmp_path / 'r'}")
-        assert done.code == 2 and words in errors(done.err)[0] and len(errors(done.err)) == 1
+        result = command("-m", *FAILING, "hydra/launcher=slurm", *wrong, *more, f"results_dir={tmp_path / 'r'}")
+        assert result.code == 2 and words in errors(result.err)[0] and len(errors(result.err)) == 1
     assert not (tmp_path / "r").exists()
 
 
-def test_where_no_slurm_is_nothing_runs_and_the_plan_stays(tmp_path, monkeypatch):
+def test_without_slurm_nothing_runs_and_the_plan_stays(tmp_path, monkeypatch):
     need("slurm")
     monkeypatch.setattr("bench.runner.executors.which", lambda _: None)
     code, out, err = command("-m", *FAILING, "+renderer.how=not", "hydra/launcher=slurm", f"results_dir={tmp_path}")
@@ -254,7 +225,7 @@ def test_a_job_that_a_signal_ends_loses_no_run(tmp_path, number, words):
 
     with driver(tmp_path / "output", *arguments) as running:
         wait_for(lambda: by_end()[0], running)
-        first, *others = tmp_path.glob("sweeps/.hydra/.submitit/[0-9]*")  # named by the processes that hold jobs
+        first, *others = tmp_path.glob("sweeps/.hydra/.submitit/[0-9]*")  # named by the processes of jobs
         assert others == []
         psutil.Process(int(first.name)).children()[0].send_signal(number)
         code, _, err = running.ended()
@@ -262,7 +233,7 @@ def test_a_job_that_a_signal_ends_loses_no_run(tmp_path, number, words):
     assert code == 1 and f"error: job {first.name}{words}" in err, err
     assert "12 runs in 2 jobs, 2 at a time in each, by hydra.launcher.minutes_per_job=3" in err
     assert "not_run" in left and 5 < len(before) < 12
-    again = by_program(*arguments)
+    again = by_program("-m", "bench", *arguments)
     assert again.code == 1 and "error: job" not in again.err
     after, left = by_end()
     assert len(after) == 12 and all(after[name]["started"] == record["started"] for name, record in before.items())

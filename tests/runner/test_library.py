@@ -1,8 +1,6 @@
-"""Runs from Python: `bench.run` and `bench.load`, as their examples show them."""
+"""Runs from Python: `bench.run` and `bench.load`, as in their examples."""
 
 import doctest
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +8,7 @@ import pytest
 import bench
 from bench.report.data import frame
 from bench.runner import library
-from tests.runner.driving import ROOT, CommandResult, command
+from tests.runner.driving import ROOT, CommandResult, by_program, command
 
 SMALL = (
     "isolation=off", "threads=1", "task.points=20", "task.optimiser.iterations=8", "view.resolution=16",
@@ -31,24 +29,21 @@ assert callable(bench.run)
 
 @pytest.fixture
 def within(tmp_path, monkeypatch):
-    """The working directory is an empty folder, and a run of the library is made in this process."""
+    """Makes an empty folder the working directory; `bench.run` runs in this process."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(library, "_command", lambda arguments: command(*arguments, *SMALL))
     return tmp_path
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_examples_do_what_they_say(within, name):
+def test_the_examples_run(within, name):
     if name == "load":
         bench.run(scale="smoke", renderer="newton")
     globs = {"bench": bench, "load": bench.load}
-    found = doctest.DocTestParser().get_doctest(EXAMPLES[name], globs, name, None, 0)
-    assert len(found.examples) >= 2
-    said: list[str] = []
-    failed = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE).run(
-        found, out=said.append
-    )
-    assert failed.failed == 0, "".join(said)
+    examples = doctest.DocTestParser().get_doctest(EXAMPLES[name], globs, name, None, 0)
+    assert len(examples.examples) >= 2
+    runner, output = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE), []
+    assert runner.run(examples, out=output.append).failed == 0, "".join(output)
 
 
 def test_a_keyword_is_typed_as_on_the_command_line(compose_config):
@@ -62,7 +57,7 @@ def test_a_keyword_is_typed_as_on_the_command_line(compose_config):
 
 
 @pytest.mark.parametrize(("code", "error"), [(2, ValueError), (1, OSError)])
-def test_what_is_no_run_is_an_error_with_the_line_of_the_command(monkeypatch, code, error):
+def test_a_refused_run_is_an_error_with_the_line_of_the_command(monkeypatch, code, error):
     result = CommandResult(code, "", "a note\nerror: unknown renderer 'dits'\n")
     monkeypatch.setattr(library, "_command", lambda _: result)
     with pytest.raises(error, match=r"^unknown renderer 'dits'$"):
@@ -85,5 +80,5 @@ def test_a_run_that_failed_is_a_record(within):
 
 
 def test_importing_bench_imports_nothing_that_is_slow():
-    done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
+    result = by_program("-c", LIGHT)
+    assert result.code == 0, result.err

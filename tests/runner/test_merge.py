@@ -1,4 +1,4 @@
-"""Results of several machines become one folder: whatever the order, and however often."""
+"""The results of several machines become one folder, in any order, also repeatedly."""
 
 import json
 from itertools import permutations
@@ -25,7 +25,7 @@ def write_run(
 
 
 def content(results: Path) -> dict[str, bytes]:
-    """All files but the page, whose folder's name stands in it, and locks."""
+    """All files, except the page, which contains the name of its folder, and locks."""
     return {
         str(path.relative_to(results)): path.read_bytes()
         for path in results.rglob("*")
@@ -39,26 +39,25 @@ def test_runs_of_different_cells_are_joined(tmp_path, capsys):
     assert main([*(str(tmp_path / name) for name in "abc"), "--into", str(tmp_path / "d")]) == 0
     assert capsys.readouterr().out.splitlines() == [str(tmp_path / "d" / "index.html")]
     records, problems = read_records(tmp_path / "d")
-    assert problems == []
-    assert {record["id"] for record in records} == set(CELLS)
+    assert problems == [] and {record["id"] for record in records} == set(CELLS)
     for name, cell in zip("abc", CELLS, strict=True):
         assert content(tmp_path / name / "runs" / cell) == content(tmp_path / "d" / "runs" / cell)
 
 
 @st.composite
 def machines(draw):
-    """What three machines have of two cells: nothing, or a run with one of a few ends and times."""
+    """Three machines with two cells each: no run, or a run with one of a few statuses and times."""
     ends = st.sampled_from(["ok", "timeout", "killed", "crashed", "refused"])
     times = st.sampled_from(["2026-01-01T00:00:00+00:00", "2026-01-02T00:00:00+00:00"])
     run = st.none() | st.tuples(ends, times, st.sampled_from([1.0, 2.0]))
     return [[draw(run) for _ in range(2)] for _ in range(3)]
 
 
-@settings(max_examples=10)  # each merges in all orders, twice
+@settings(max_examples=10)  # each example merges in all orders, twice
 @given(machines())
-def test_the_order_does_not_matter_and_a_second_time_changes_nothing(tmp_path_factory, found):
+def test_the_order_does_not_matter_and_a_second_time_changes_nothing(tmp_path_factory, cells_of_machines):
     base = tmp_path_factory.mktemp("merge")
-    for name, cells in zip("abc", found, strict=True):
+    for name, cells in zip("abc", cells_of_machines, strict=True):
         (base / name / "runs").mkdir(parents=True)
         for cell, run in zip(CELLS, cells, strict=False):
             if run is not None:
@@ -75,7 +74,7 @@ def test_the_order_does_not_matter_and_a_second_time_changes_nothing(tmp_path_fa
         merge([base / name], stepwise)
     assert all(result == results[0] for result in [*results, content(stepwise)])
     for number, cell in enumerate(CELLS[:2]):
-        runs = {cells[number] for cells in found if cells[number] is not None}
+        runs = {cells[number] for cells in cells_of_machines if cells[number] is not None}
         assert len([name for name in results[0] if name.endswith("record.json") and cell in name]) == len(runs)
         for ends in ({"ok"}, {"ok", "timeout"}):  # finished runs rank above others
             if any(run[0] in ends for run in runs):
@@ -93,7 +92,7 @@ def test_a_cell_that_was_run_twice_is_reported_and_both_are_kept(tmp_path, capsy
     assert merge([tmp_path / "d"], tmp_path / "e") == ([], []) and content(tmp_path / "e") == content(tmp_path / "d")
 
 
-def test_of_two_runs_that_ended_alike_the_later_one_is_kept(tmp_path):
+def test_the_later_of_two_runs_with_one_status_is_kept(tmp_path):
     for name, day in (("a", 1), ("b", 2), ("c", 3)):
         write_run(tmp_path / name, CELLS[0], "ok", f"2026-01-0{day}T00:00:00+00:00", metrics={"chamfer_l2": float(day)})
     for order in permutations("abc"):
@@ -112,27 +111,27 @@ def test_plans_are_joined_so_that_cells_of_no_machine_show(tmp_path):
     assert statuses == {CELLS[0]: "ok", CELLS[1]: "ok", CELLS[2]: "not_run"}
 
 
-def test_of_two_requests_of_one_run_or_sweep_the_later_one_is_kept(tmp_path):
+def test_the_later_of_two_requests_of_one_run_or_sweep_is_kept(tmp_path):
     for name, day in (("a", 1), ("b", 2)):
-        asked = f"2026-02-0{day}T00:00:00+00:00"
-        write_run(tmp_path / name, CELLS[0], asked=asked)
-        Plan("table-1", tmp_path / name, planned(CELLS[0]), asked).write()
+        requested = f"2026-02-0{day}T00:00:00+00:00"
+        write_run(tmp_path / name, CELLS[0], asked=requested)
+        Plan("table-1", tmp_path / name, planned(CELLS[0]), requested).write()
     for into, order in (("ab", "ab"), ("ba", "ba")):
         merge([tmp_path / name for name in order], tmp_path / into)
-        found = [*(tmp_path / into).glob("*/*/record.json"), *(tmp_path / into).glob("*/*/plan.json")]
-        assert [json.loads(path.read_text())["asked"] for path in found] == ["2026-02-02T00:00:00+00:00"] * 2
+        paths = [*(tmp_path / into).glob("*/*/record.json"), *(tmp_path / into).glob("*/*/plan.json")]
+        assert [json.loads(path.read_text())["asked"] for path in paths] == ["2026-02-02T00:00:00+00:00"] * 2
 
 
-def test_a_damaged_record_is_kept_but_never_before_a_whole_one(tmp_path):
+def test_a_damaged_record_is_kept_but_never_before_a_complete_one(tmp_path):
     for number, damage in enumerate(("", "{", "[1]", '{"schema": 99}')):
-        here = tmp_path / str(number)
-        folder = write_run(here / "a", CELLS[0])
+        folder_of_case = tmp_path / str(number)
+        folder = write_run(folder_of_case / "a", CELLS[0])
         (folder / "record.json").write_text(damage)
-        write_run(here / "b", CELLS[0], "killed")
-        merge([here / "a", here / "b"], here / "d")
-        assert [record["status"] for record in read_records(here / "d")[0]] == ["killed"]
-        (kept,) = (here / "d" / "earlier").iterdir()
-        assert (kept / "record.json").read_text() == damage
+        write_run(folder_of_case / "b", CELLS[0], "killed")
+        merge([folder_of_case / "a", folder_of_case / "b"], folder_of_case / "d")
+        assert [record["status"] for record in read_records(folder_of_case / "d")[0]] == ["killed"]
+        (earlier,) = (folder_of_case / "d" / "earlier").iterdir()
+        assert (earlier / "record.json").read_text() == damage
 
 
 @each("damage, words", [
@@ -176,7 +175,7 @@ def test_attempts_at_the_suite_that_cannot_be_read_are_named(tmp_path):
     assert problem.startswith(f"{tmp_path / 'a'}: not copied: newton.csv: ")
 
 
-def test_what_cannot_be_joined_is_an_error_and_changes_nothing(tmp_path, capsys):
+def test_a_folder_that_cannot_be_joined_is_an_error_and_changes_nothing(tmp_path, capsys):
     assert main([str(tmp_path), "--into", str(tmp_path / "d")]) == 2
     assert "is not a results folder" in capsys.readouterr().err
     write_run(tmp_path / "a", CELLS[0])

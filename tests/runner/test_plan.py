@@ -1,4 +1,4 @@
-"""What is planned is checked before anything runs; plan=true lists it, and leaves nothing behind."""
+"""A plan is checked before anything runs; plan=true lists it, and writes nothing."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -64,46 +64,40 @@ def write(results: Path, cell: PlannedCell, seconds: float) -> None:
     record.write(results / "runs" / cell.id)
 
 
-def test_a_sweep_is_listed_and_nothing_is_left(results):
-    done = command(*SWEEP, "plan=true", f"results_dir={results}")
-    assert (done.code, done.err) == (0, "")
-    *cells, whole = done.out.splitlines()
+def test_a_sweep_is_listed_and_nothing_is_written(results):
+    result = command(*SWEEP, "plan=true", f"results_dir={results}")
+    assert (result.code, result.err) == (0, "")
+    *cells, summary = result.out.splitlines()
     assert [line.split("  ")[-1] for line in cells] == ["time unknown"] * 4
     assert "renderer=dvr seed=1  completion, DVR, n = 128, sofa" in cells[3]
-    assert whole == "4 planned: 4 to run, 4 of unknown time (no run like them has finished here)"
+    assert summary == "4 planned: 4 to run, 4 of unknown time (no run like them has finished here)"
     assert not results.exists()
 
 
-def test_what_is_there_is_reused_and_tells_of_like_runs(results):
+def test_finished_runs_are_reused_and_give_the_times_of_similar_runs(results):
     cells = planned(results)
     write(results, cells[0], 30.0)
     before = sorted(results.rglob("*"))
-    *lines, whole = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
-    assert [line.split("  ")[-1] for line in lines] == [
-        "reused",
-        "about 30.0 s (median of 1 finished run)",
-        *["time unknown"] * 2,
-    ]
-    assert whole == (
-        "4 planned: 3 to run, 1 reused, 2 of unknown time (no run like them has finished here); about 30.0 s, "
-        "1 at a time, without the 2 of unknown time; "
-        "the training of a missing prior is not counted"
-    )
+    *lines, summary = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
+    times = ["reused", "about 30.0 s (median of 1 finished run)", *["time unknown"] * 2]
+    assert [line.split("  ")[-1] for line in lines] == times
+    assert summary.startswith("4 planned: 3 to run, 1 reused, 2 of unknown time (no run like them has finished here);")
+    assert "; about 30.0 s, 1 at a time, without the 2 of unknown time; the training of a missing prior is " in summary
     assert sorted(results.rglob("*")) == before
     again = command(*SWEEP, "plan=true", "rerun=all", "hydra/launcher=workers", f"results_dir={results}").out
     assert "; about 30.0 s, 2 at a time, without" in again.splitlines()[-1]
 
 
-def test_a_plan_says_in_how_many_jobs_the_runs_are(results):
+def test_a_plan_has_the_number_of_jobs(results):
     pytest.importorskip("submitit")
     cells, jobs = planned(results), ("hydra/launcher=slurm", "plan=true", f"results_dir={results}")
     for cell in cells[:2]:
-        write(results, cell, 1000.0)  # so much do others of that renderer take, but for the limit
-    told = ("rerun=all", "time_limit=900", "hydra.launcher.minutes_per_job=30", "hydra.launcher.minutes_per_run=20")
-    assert command(*SWEEP, *jobs, *told).out.splitlines()[-1].startswith("4 runs in 2 jobs, by ")
-    done = command(*SWEEP, *jobs, "hydra.launcher.tasks_per_node=4").out.splitlines()
-    assert done[-1] == "2 runs in 1 job, 4 at a time in each, by hydra.launcher.minutes_per_job=60"
-    assert done[-2].startswith("4 planned: 2 to run, 2 reused")
+        write(results, cell, 1000.0)  # others of that renderer take as long, up to the limit
+    limits = ("rerun=all", "time_limit=900", "hydra.launcher.minutes_per_job=30", "hydra.launcher.minutes_per_run=20")
+    assert command(*SWEEP, *jobs, *limits).out.splitlines()[-1].startswith("4 runs in 2 jobs, by ")
+    lines = command(*SWEEP, *jobs, "hydra.launcher.tasks_per_node=4").out.splitlines()
+    assert lines[-1] == "2 runs in 1 job, 4 at a time in each, by hydra.launcher.minutes_per_job=60"
+    assert lines[-2].startswith("4 planned: 2 to run, 2 reused")
 
 
 @pytest.mark.parametrize("arguments", [
@@ -112,15 +106,15 @@ def test_a_plan_says_in_how_many_jobs_the_runs_are(results):
     ("-m", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
     ("-m", "seed=1,2", "index=0,3", "label='${index}',b"),
 ])  # fmt: skip
-def test_a_cell_is_what_hydra_makes_of_it(arguments):
+def test_a_cell_is_as_hydra_composes_it(arguments):
     with composing():
         composer = Composer(arguments[1:])
         swept = composer.swept(composer.shared_config())
         cells = composer.cells(swept)
         for cell, overrides in zip(cells, swept, strict=True):
-            whole = compose("config", overrides, return_hydra_config=True)
-            choices = dict(whole.hydra.runtime.choices)
-            assert cell == identify(resolve_config(without_hydra(whole), choices), choices, overrides)
+            config = compose("config", overrides, return_hydra_config=True)
+            choices = dict(config.hydra.runtime.choices)
+            assert cell == identify(resolve_config(without_hydra(config), choices), choices, overrides)
     assert len({cell.name for cell in cells}) == len(cells)
 
 
@@ -139,8 +133,8 @@ def test_a_value_goes_to_the_cells_that_have_its_key():
 
 
 def test_a_sweep_says_which_keys_go_to_some_cells(results):
-    done = command("-m", "renderer=dist,dvr", "renderer.alpha=2", "plan=true", f"results_dir={results}")
-    assert done.err == "sweep: renderer.alpha goes to 1 of 2 runs, which have this key\n"
+    result = command("-m", "renderer=dist,dvr", "renderer.alpha=2", "plan=true", f"results_dir={results}")
+    assert result.err == "sweep: renderer.alpha goes to 1 of 2 runs, which have this key\n"
 
 
 def test_a_value_may_refer_to_the_seed_of_its_cell(results):
@@ -148,33 +142,32 @@ def test_a_value_may_refer_to_the_seed_of_its_cell(results):
     assert [cell.config["label"] for cell in cells] == ["of 1", "of 2"]
 
 
-def test_a_value_that_cannot_be_set_is_an_error_as_of_a_whole_cell(results):
+def test_a_value_that_cannot_be_set_is_an_error_as_for_a_single_run(results):
     for arguments, words in (
         (("seed=0,1,x",), "seed must be a whole number, not 'x'"),
         (("renderer.steps=3", "renderer.stebs=1,2"), "unknown key 'renderer.stebs'"),
     ):
-        done = command("-m", *arguments, "plan=true", f"results_dir={results}")
-        assert done.code == 2 and words in done.err and len(done.err.splitlines()) == 1
+        result = command("-m", *arguments, "plan=true", f"results_dir={results}")
+        assert result.code == 2 and words in result.err and len(result.err.splitlines()) == 1
 
 
-def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(results, monkeypatch):
+def test_a_sweep_that_is_stopped_during_planning_says_that_nothing_was_run(results, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sweep, "check_plan", stopped)
-    done = command(*SWEEP, f"results_dir={results}")
-    assert done.code == 130 and done.err.endswith("error: stopped by Ctrl-C; nothing was run\n")
+    result = command(*SWEEP, f"results_dir={results}")
+    assert result.code == 130 and result.err.endswith("error: stopped by Ctrl-C; nothing was run\n")
     assert not results.exists()
 
 
 def test_a_single_run_is_planned_too(results):
-    one = ("scale=smoke", "isolation=off", "threads=1", "renderer=dist", "plan=true", f"results_dir={results}")
-    done = command(*one)
-    assert (done.code, done.err) == (0, "")
-    assert "completion, DIST, our default, sofa  time unknown" in done.out
-    assert not results.exists()
+    arguments = ("scale=smoke", "isolation=off", "threads=1", "renderer=dist", "plan=true", f"results_dir={results}")
+    result = command(*arguments)
+    assert (result.code, result.err) == (0, "")
+    assert "completion, DIST, our default, sofa  time unknown" in result.out and not results.exists()
     write(results, planned(results)[0], 30.0)
-    assert "reused" in command(*one).out
+    assert "reused" in command(*arguments).out
 
 
 def run(total=10.0, *, status="ok", renderer="dist", task="completion", scale="smoke", **more):
@@ -186,23 +179,27 @@ def run(total=10.0, *, status="ok", renderer="dist", task="completion", scale="s
 
 @pytest.fixture
 def times_of(tmp_path, monkeypatch):
-    """The times of finished runs that are like one that is planned, and how many records were read for them."""
+    """The times of finished runs that are similar to a planned one, and the number of records read for them."""
 
-    def of(runs: list[dict], **like) -> tuple[list[float], int]:
+    def similar_times(runs: list[dict], **like) -> tuple[list[float], int]:
         folders, read = {}, []
-        for number, one in enumerate(runs):
-            named = [one["task"], one["renderer"], "sofa", one["method"].replace("/", "_")]
-            folders["-".join([*filter(None, named), f"{number:012x}"])] = one
+        for number, record in enumerate(runs):
+            named = [record["task"], record["renderer"], "sofa", record["method"].replace("/", "_")]
+            folders["-".join([*filter(None, named), f"{number:012x}"])] = record
         monkeypatch.setattr(plan_module, "run_folders", lambda _: [tmp_path / name for name in folders])
-        monkeypatch.setattr(plan_module, "read_run", lambda at, _: (read.append(at), (folders[at.name], ""))[1])
-        one = run(**like)
-        cells = [PlannedCell("c", [], one["task"], one["renderer"], "sofa", 0, one["config"], one["method"])]
-        return durations_of_similar_runs(Plan("p", tmp_path, cells), set())[duration_group(one)], len(read)
+        monkeypatch.setattr(
+            plan_module, "read_run", lambda folder, _: (read.append(folder), (folders[folder.name], ""))[1]
+        )
+        record = run(**like)
+        cells = [
+            PlannedCell("c", [], record["task"], record["renderer"], "sofa", 0, record["config"], record["method"])
+        ]
+        return durations_of_similar_runs(Plan("p", tmp_path, cells), set())[duration_group(record)], len(read)
 
-    return of
+    return similar_times
 
 
-def test_like_runs_have_the_same_task_renderer_and_scale_and_took_their_whole_time(times_of):
+def test_similar_runs_have_the_same_task_renderer_and_scale_and_ended_by_themselves(times_of):
     other = [run(1.0, task="pose"), run(1.0, renderer="dvr"), run(1.0, renderer="dist_k_3")]
     unlike = [run(1.0, scale="desk"), run(1.0, method="dist_mask")]
     broken = [run(1.0, status=status) for status in ("crashed", "killed", "oom", "refused", "not_run")]
@@ -218,17 +215,17 @@ def test_a_plan_names_the_file_of_a_dataset(tmp_path, capsys):
     assert "ablation, dist, module net.pth  reused" in capsys.readouterr().out
 
 
-def test_of_many_like_runs_a_part_is_read(times_of):
+def test_only_some_of_many_similar_runs_are_read(times_of):
     many = [run(1.0, scale="desk")] * 50 + [run(2.0)] * 200
     assert times_of(many) == ([2.0] * plan_module.MAX_SIMILAR_RUNS, 50 + plan_module.MAX_SIMILAR_RUNS)
     assert times_of([run(1.0, scale="desk")] * 900) == ([], plan_module.MAX_RECORDS_READ)
 
 
-def test_the_cells_of_a_sweep_are_no_runs_and_a_prior_is_of_whom_it_is_asked(tmp_path):
+def test_a_sweep_of_priors_has_no_plan_and_a_prior_is_of_the_dataset_in_the_command(tmp_path):
     where = f"results_dir={tmp_path / 'r'}"
-    for asked in (["dataset=sofa,plane"], ["dataset=photos", f"dataset.path={tmp_path}", "prior.of=sofa,plane"]):
-        done = command("-m", *asked, where, main=prior_main)
-        assert [Path(line).name.split("-")[0] for line in done.out.splitlines()] == ["sofa", "plane"], done.err
+    for arguments in (["dataset=sofa,plane"], ["dataset=photos", f"dataset.path={tmp_path}", "prior.of=sofa,plane"]):
+        result = command("-m", *arguments, where, main=prior_main)
+        assert [Path(line).name.split("-")[0] for line in result.out.splitlines()] == ["sofa", "plane"], result.err
     assert not list((tmp_path / "r").rglob("plan.json"))
     assert "set prior.of=sofa" in command("dataset=photos", f"dataset.path={tmp_path}", where, main=prior_main).err
 
@@ -239,8 +236,8 @@ def test_a_training_is_not_planned_and_refuses_what_is_invalid(tmp_path, main):
         (("plan=true",), "plan=true lists runs"),
         (("dataset=mesh", "dataset.path=none.ply"), "none.ply"),
     ):
-        done = command("+method=single_view", "scale=smoke", *wrong, f"results_dir={tmp_path / 'r'}", main=main)
-        assert (done.code, done.out) == (2, "") and words in done.err and len(done.err.splitlines()) == 1
+        result = command("+method=single_view", "scale=smoke", *wrong, f"results_dir={tmp_path / 'r'}", main=main)
+        assert (result.code, result.out) == (2, "") and words in result.err and len(result.err.splitlines()) == 1
 
 
 @pytest.fixture
@@ -258,11 +255,11 @@ def test_a_task_on_a_fitted_network_is_refused_without_one(plain):
 
 def test_an_experiment_without_m_says_that_it_is_one_run(tmp_path):
     for options, experiment in (([], "fig10_start"), ([], "[fitted,gradients]"), (["-m"], "fig10_start")):
-        done = command(*options, f"+experiment={experiment}", "plan=true", *SMALL, f"results_dir={tmp_path}")
-        assert done.code == 0 and ("this is one run; with -m" in done.err) is (not options)
+        result = command(*options, f"+experiment={experiment}", "plan=true", *SMALL, f"results_dir={tmp_path}")
+        assert result.code == 0 and ("this is one run; with -m" in result.err) is (not options)
 
 
-def test_a_class_that_fails_otherwise_is_left_to_its_run_and_prints_nothing(plain, tmp_path, monkeypatch, capsys):
+def test_a_class_that_raises_another_error_is_left_to_its_run_and_prints_nothing(plain, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(tmp_path)
     lacks = "renderer Mine lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
     acts = {"raise RuntimeError": "", "raise SystemExit(3)": "", "raise ValueError('no')": "no", "print('made')": lacks}
@@ -285,8 +282,8 @@ def test_a_folder_of_the_users_may_say_that_an_experiment_is_a_sweep(results, tm
     (tmp_path / "experiment").mkdir()
     text = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {seed: '0,1'}}}\n"
     (tmp_path / "experiment" / "mine.yaml").write_text(text)
-    done = command("--config-dir", str(tmp_path), "+experiment=mine", "plan=true", *SMALL, f"results_dir={results}")
-    assert (done.code, done.out.splitlines()[-1][:9]) == (0, "2 planned"), done.err
+    result = command("--config-dir", str(tmp_path), "+experiment=mine", "plan=true", *SMALL, f"results_dir={results}")
+    assert (result.code, result.out.splitlines()[-1][:9]) == (0, "2 planned"), result.err
 
 
 @pytest.fixture
@@ -294,26 +291,26 @@ def plan_of(plain, tmp_path):
     """A plan of one cell for each list of overrides."""
 
     def plan(*cells: tuple[str, ...]) -> Plan:
-        made = []
+        planned_cells = []
         for number, overrides in enumerate(cells):
             config = plain(*overrides, "isolation=off")
-            made.append(PlannedCell(f"c-{number}", list(overrides), "completion", "dist", "sofa", 0, config))
-        return Plan("p", Path(tmp_path), made)
+            planned_cells.append(PlannedCell(f"c-{number}", list(overrides), "completion", "dist", "sofa", 0, config))
+        return Plan("p", Path(tmp_path), planned_cells)
 
     return plan
 
 
-def test_a_sweep_is_told_which_cell_cannot_be(plan_of):
+def test_the_message_on_a_sweep_names_the_invalid_cell(plan_of):
     plan = plan_of(("seed=0", "renderer.steps=9"), ("seed=0", "renderer.steps=0"), ("seed=0", "renderer.steps=-1"))
     with pytest.raises(ValueError, match=r"^cell 2 of 3 \(renderer.steps=0\): steps must be at least 1, not 0: .*"
                        r"; 2 of 3 cells are invalid; nothing was run$"):  # fmt: skip
         check_plan(plan, "basic", set())
-    check_plan(plan, "basic", {"c-1", "c-2"})  # what is there already is not checked
-    with pytest.raises(ValueError, match=r"^steps must be"):  # all of them: no cell is worth naming
+    check_plan(plan, "basic", {"c-1", "c-2"})  # finished runs are not checked
+    with pytest.raises(ValueError, match=r"^steps must be"):  # all cells are invalid, so none is named
         check_plan(plan_of(("renderer.steps=0", "seed=0"), ("renderer.steps=0", "seed=1")), "basic", set())
 
 
-def test_a_gpu_is_looked_for_where_the_runs_are(plan_of, monkeypatch):
+def test_a_gpu_is_looked_for_on_the_machine_of_the_runs(plan_of, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     plan = plan_of(("device=cuda",))
     with pytest.raises(ValueError, match="PyTorch sees no GPU"):

@@ -1,4 +1,4 @@
-"""A run that ends badly leaves a record that says how; it is stopped at its limit, and costs no other run."""
+"""A failed run has a record with its reason, is stopped at its limit, and costs no other run."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ from bench.runner.process import Job, Step
 from tests.runner.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
-# How it fails, with which limits; the status that must come of it, and words of the reason.
+# The way to fail: limits, the expected status, words of the reason.
 CASES = {
     "raise": ((), "crashed", "it failed on request"),
     "not_a_number": ((), "nan", "not a number"),
@@ -33,7 +33,7 @@ CASES = {
 
 @pytest.fixture
 def hour_later(monkeypatch, tmp_path):
-    """The clock of limits goes on by an hour when the run is at work: what never ends is at its limit, however slow."""
+    """Moves the clock of limits by an hour when the run iterates: a run that never ends reaches its limit at once."""
 
     def read() -> float:
         return time.perf_counter() + (3600.0 if lines_of_curves(tmp_path / "r") else 0.0)
@@ -42,25 +42,22 @@ def hour_later(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("how", CASES)
-def test_a_run_that_ends_badly_says_how(request, isolated, tmp_path, how):
+def test_a_failed_run_has_its_reason(request, isolated, tmp_path, how):
     more, status, words = CASES[how]
     if status == "timeout":
         request.getfixturevalue("hour_later")
     code, out, err = isolated(*FAILING, f"+renderer.how={how}", *more)
     record = record_of(out)
-    assert code == 1
-    assert (record["status"], words in record["reason"]) == (status, True), record["reason"]
-    assert record["ended"]
-    assert record["scene"] == "sofa test 0"  # what was known before it failed is kept
-    assert record["environment"]["threads"] == 1
+    assert code == 1 and record["ended"]
+    assert record["status"] == status and words in record["reason"], record["reason"]
+    assert (record["scene"], record["environment"]["threads"]) == ("sofa test 0", 1)  # the failure keeps these
     assert record["metrics_start"] == {} or "chamfer_l2" in record["metrics_start"]
-    assert "Traceback" not in err
-    assert record["reason"] in " ".join(err.split())
-    assert at_work(tmp_path) == []  # its process is gone, whatever it was busy with
+    assert "Traceback" not in err and record["reason"] in " ".join(err.split())
+    assert at_work(tmp_path) == []  # its process has ended
     assert how != "raise" or "RuntimeError: it failed on request" in "\n".join(record["log"])
 
 
-def test_a_step_says_in_which_phase_a_limit_was_reached():
+def test_a_step_names_its_phase():
     assert Step("training the prior", 100, 6500, None).phase_text == "while training the prior (100 of 6500)"
     assert Step("optimising", 20, 20, None).phase_text == "after optimising (20 of 20)"
 
@@ -70,42 +67,40 @@ def test_a_step_says_in_which_phase_a_limit_was_reached():
     ("short", "Failing.render: distance must have the shape [12, 12], not [11, 12]"),
     ("detached_loss", "Failing.capabilities.field_gradient is True, but its silhouette loss carries no gradient"),
 ])  # fmt: skip
-def test_without_isolation_it_fails_in_this_process_and_says_how(isolated, how, words):
+def test_without_isolation_a_run_fails_in_this_process_with_its_reason(isolated, how, words):
     code, out, _ = isolated(*FAILING, f"+renderer.how={how}", "isolation=off")
     record = record_of(out)
-    assert code == 1
-    assert (record["status"], words in record["reason"]) == ("crashed", True), record["reason"]
-    assert record["metrics_start"]["chamfer_l2"] > 0  # what was known before is kept
+    assert code == 1 and record["status"] == "crashed" and words in record["reason"], record["reason"]
+    assert record["metrics_start"]["chamfer_l2"] > 0  # the failure keeps it
 
 
 def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
     arguments = (*FAILING, "+renderer.how=native_loop", f"results_dir={tmp_path / 'r'}")
     with driver(tmp_path / "output", *arguments) as forked:
         wait_for(lambda: lines_of_curves(tmp_path / "r"), forked)
-        assert at_work(tmp_path)
-        assert forked.send(signal.SIGKILL).code == -signal.SIGKILL
+        assert at_work(tmp_path) and forked.send(signal.SIGKILL).code == -signal.SIGKILL
     wait_for(lambda: not at_work(tmp_path))
 
 
-def test_what_the_server_has_not_loaded_is_loaded_before_the_run_says_that_it_is_ready(tmp_path, monkeypatch):
-    done = []
-    monkeypatch.setattr(process, "import_module", done.append)
-    monkeypatch.setattr("bench.runner.execute.main", lambda *_: done.append("main"))
+def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(process, "import_module", calls.append)
+    monkeypatch.setattr("bench.runner.execute.main", lambda *_: calls.append("main"))
     job = Job(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
     process._run_job(job, *Pipe())
-    assert done == [*process.preloaded_modules(), "main"] and "open3d" in done
+    assert calls == [*process.preloaded_modules(), "main"] and "open3d" in calls
 
 
 def test_the_server_has_what_runs_need_and_no_more():
-    found = process.run_in_child(eval, "{name.partition('.')[0] for name in __import__('sys').modules}")
-    assert found >= {"torch", "open3d", "matplotlib"} and not found & {"hydra", "pandas"}
+    loaded = process.run_in_child(eval, "{name.partition('.')[0] for name in __import__('sys').modules}")
+    assert loaded >= {"torch", "open3d", "matplotlib"} and not loaded & {"hydra", "pandas"}
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_while_the_server_loads_what_runs_need_is_told_in_one_line(tmp_path):
+def test_ctrl_c_while_the_server_loads_modules_is_reported_in_one_line(tmp_path):
     command = [sys.executable, "-m", "bench", f"results_dir={tmp_path}", "scale=smoke"]
     with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True) as running:
         parent = psutil.Process(running.pid)
         wait_for(lambda: any("forkserver" in " ".join(child.cmdline()) for child in parent.children()))
-        os.killpg(running.pid, signal.SIGINT)  # as a terminal does: all of its processes get it
+        os.killpg(running.pid, signal.SIGINT)  # to all processes, as a terminal does
         assert running.communicate()[1].splitlines() == ["error: stopped by Ctrl-C; nothing was run"]

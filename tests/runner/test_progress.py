@@ -1,4 +1,4 @@
-"""What is said of the progress where there is no terminal."""
+"""The reports of progress without a terminal, and the width of a line on one."""
 
 import io
 
@@ -12,33 +12,33 @@ from tests.looped import each
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds that the progress believes in, where no variable asks for a terminal."""
+    """The seconds of the progress's clock; no variable asks for a terminal."""
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     now = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     return now
 
 
-def test_a_phase_that_takes_long_says_now_and_then_how_far_it_is(clock, capsys):
+def test_a_long_phase_reports_its_progress_now_and_then(clock, capsys):
     with progress.run_progress("DIST") as report:
-        for done in range(1, 101):
+        for step in range(1, 101):
             clock[0] += 0.5
-            report("training the prior", done, 100, 0.25)
-    said = capsys.readouterr()
-    assert said.out == "" and all(letter.isprintable() or letter == "\n" for letter in said.err)
-    assert said.err.splitlines() == [
+            report("training the prior", step, 100, 0.25)
+    printed = capsys.readouterr()
+    assert printed.out == "" and all(letter.isprintable() or letter == "\n" for letter in printed.err)
+    assert printed.err.splitlines() == [
         "DIST: training the prior, 31%, about 33 s left",
         "DIST: training the prior, 61%, about 19 s left",
         "DIST: training the prior, 91%, about 4 s left",
     ]
 
 
-def test_short_phases_say_nothing(clock, capsys):
+def test_short_phases_report_nothing(clock, capsys):
     with progress.run_progress("DIST") as report:
         for phase in range(20):
-            for done in range(1, 5):
+            for step in range(1, 5):
                 clock[0] += 2.0
-                report(f"phase {phase}", done, 4)
+                report(f"phase {phase}", step, 4)
     assert capsys.readouterr().err == ""
 
 

@@ -1,4 +1,4 @@
-"""A sweep that is cut short goes on where it was; what is finished is reused, and nothing is lost or run twice."""
+"""An interrupted sweep resumes: finished runs are reused, and no run is lost or run twice."""
 
 import json
 import random
@@ -15,7 +15,7 @@ from tests.runner.driving import FAILING, ROOT, command, driver, record_of, wait
 
 
 def results_of(results: Path) -> dict[str, dict]:
-    """All that a sweep came to, but for times and machines, by cell."""
+    """The results of a sweep by cell, without times and machines."""
     records, problems = read_records(results)
     assert problems == []
     timeless = ("id", "task", "renderer", "dataset", "seed", "status", "reason", "config_hash", "code")
@@ -24,26 +24,25 @@ def results_of(results: Path) -> dict[str, dict]:
 
 
 def ended(results: Path) -> int:
-    """How many cells of a sweep have come to an end."""
+    """How many cells of a sweep have ended."""
     return sum(bool(record.get("ended")) for record in read_records(results)[0]) if under_way(results) else 0
 
 
 def killed_and_resumed(tmp_path: Path, cells: int, kills: int, seed: int) -> None:
-    """A sweep that is killed again and again, each time when one cell more has ended or is under way."""
-    whole, broken, draw = tmp_path / "whole", tmp_path / "broken", random.Random(seed)
+    """Kills a sweep several times, each time when one more cell has ended or is under way, and resumes it."""
+    uninterrupted, broken, draw = tmp_path / "uninterrupted", tmp_path / "broken", random.Random(seed)
     arguments = ("-m", *FAILING, "+renderer.how=not,raise", f"seed={','.join(map(str, range(cells // 2)))}")
-    command(*arguments, f"results_dir={whole}")
+    command(*arguments, f"results_dir={uninterrupted}")
     for number in range(kills):
-        begun = ended(broken)
+        already_ended = ended(broken)
         with driver(tmp_path / f"driver {number}", *arguments, f"results_dir={broken}") as running:
-            moment, most = draw.choice([ended, under_way]), begun + cells // (kills + 1)
+            moment, most = draw.choice([ended, under_way]), already_ended + cells // (kills + 1)
             wait_for(lambda moment=moment, most=most: moment(broken) > min(most, cells - 1), running)
             time.sleep(draw.uniform(0.0, 0.3))  # anywhere within a cell
             running.send(draw.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT]))
-    done = command(*arguments, f"results_dir={broken}")
-    assert f"{cells} planned" in done.out
-    assert len(results_of(whole)) == cells
-    assert results_of(broken) == results_of(whole)
+    resumed = command(*arguments, f"results_dir={broken}")
+    assert f"{cells} planned" in resumed.out and len(results_of(uninterrupted)) == cells
+    assert results_of(broken) == results_of(uninterrupted)
 
 
 def under_way(results: Path) -> int:
@@ -51,7 +50,7 @@ def under_way(results: Path) -> int:
     return len(list(results.glob("runs/*/record.json")))
 
 
-def test_a_sweep_whose_driver_is_killed_goes_on_where_it_was(tmp_path):
+def test_a_sweep_whose_driver_is_killed_resumes(tmp_path):
     killed_and_resumed(tmp_path, cells=4, kills=1, seed=0)
 
 
@@ -60,25 +59,21 @@ def test_a_sweep_of_30_killed_at_20_moments_ends_as_one_that_was_not(tmp_path):
     killed_and_resumed(tmp_path, cells=30, kills=20, seed=1)
 
 
-def test_what_is_finished_is_reused_and_failures_are_tried_again_on_request(isolated, tmp_path):
-    times = []
+def test_finished_runs_are_reused_and_failed_ones_are_run_again_on_request(isolated, tmp_path):
+    times, reused = [], []
     for more in ((), (), ("rerun=failed",), ("rerun=all",)):
         isolated("-m", *FAILING, "+renderer.how=not,raise", "isolation=off", *more)
         records = {r["config"]["renderer"]["how"]: r for r in read_records(tmp_path / "r")[0]}
-        times.append(
-            {how: (record["ended"], record["seconds"]["total"], record["reused"]) for how, record in records.items()}
-        )
+        times.append({how: (record["ended"], record["seconds"]["total"]) for how, record in records.items()})
+        reused.append((records["not"]["reused"], records["raise"]["reused"]))
     first, again, failed, everything = times
-    assert [first["not"][2], first["raise"][2]] == [False, False]
-    assert {how: value[:2] for how, value in again.items()} == {how: value[:2] for how, value in first.items()}
-    assert [again["not"][2], again["raise"][2]] == [True, True]
-    assert failed["not"][:2] == first["not"][:2]
-    assert failed["raise"][1] != first["raise"][1]
+    assert reused[:2] == [(False, False), (True, True)] and again == first
+    assert failed["not"] == first["not"] and failed["raise"][1] != first["raise"][1]
     assert everything["not"][1] != first["not"][1]
-    assert len(list((tmp_path / "r" / "earlier").iterdir())) == 3  # what was run again is kept
+    assert len(list((tmp_path / "r" / "earlier").iterdir())) == 3  # runs before they were run again
 
 
-def test_other_code_is_no_reason_to_reuse(isolated, tmp_path, monkeypatch):
+def test_a_run_of_other_code_is_not_reused(isolated, tmp_path, monkeypatch):
     package = tmp_path / "theirs"
     package.mkdir()
     shutil.copy(ROOT / "tests" / "failing.py", package / "mypkg.py")
@@ -87,7 +82,7 @@ def test_other_code_is_no_reason_to_reuse(isolated, tmp_path, monkeypatch):
     for change in ("", "", "\n# another line\n"):
         with (package / "mypkg.py").open("a") as file:
             file.write(change)
-        _package_hash.cache_clear()  # a command looks at the code once
+        _package_hash.cache_clear()  # a command reads the code once
         outputs.append(isolated(*FAILING, "renderer._target_=mypkg.Failing", "isolation=off").out)
     assert ["reused: the run of" in output for output in outputs] == [False, True, False]
     assert len({output.splitlines()[-1] for output in outputs}) == 1
@@ -102,15 +97,14 @@ def test_two_launches_at_once_run_a_cell_once(tmp_path):
     assert len(read_records(tmp_path / "r")[0]) == 1
 
 
-def test_what_had_not_quite_ended_is_not_reused(isolated, tmp_path):
-    """The driver may be killed after a run's last word, and before it wrote what that came to."""
+def test_a_run_without_its_end_time_is_not_reused(isolated, tmp_path):
+    """The driver may be killed after a run's last output, before it writes the end of the run."""
     isolated(*FAILING, "isolation=off")
     (path,) = (tmp_path / "r").glob("runs/*/record.json")
     record = json.loads(path.read_text())
     path.write_text(json.dumps(record | {"ended": ""}))
     _, out, _ = isolated(*FAILING, "isolation=off")
-    assert "reused" not in out
-    assert json.loads(path.read_text())["ended"]
+    assert "reused" not in out and json.loads(path.read_text())["ended"]
 
 
 def test_a_damaged_record_is_set_aside_and_the_cell_run(isolated, tmp_path):
@@ -127,21 +121,21 @@ def test_a_damaged_record_is_set_aside_and_the_cell_run(isolated, tmp_path):
 
 
 def test_a_run_that_failed_by_a_limit_is_run_again_under_another(isolated):
-    found = []
+    outcomes = []
     for limit in (0.2, 0.2, 0.3):
         record = record_of(isolated(*FAILING, "+renderer.how=loop", f"time_limit={limit}").out)
         assert f"more than time_limit={limit} s" in record["reason"]
-        found.append((record["status"], record["reused"]))
-    assert found == [("timeout", False), ("timeout", True), ("timeout", False)]
+        outcomes.append((record["status"], record["reused"]))
+    assert outcomes == [("timeout", False), ("timeout", True), ("timeout", False)]
 
 
-def test_code_that_a_package_without_an_init_holds_is_seen(tmp_path, monkeypatch):
+def test_the_code_of_a_package_without_an_init_file_is_read(tmp_path, monkeypatch):
     (tmp_path / "space" / "inner").mkdir(parents=True)
     module = tmp_path / "space" / "inner" / "mine.py"
     monkeypatch.syspath_prepend(str(tmp_path))
-    found = set()
+    hashes = set()
     for text in ("a = 1", "a = 2"):
         module.write_text(text)
         _package_hash.cache_clear()
-        found.add(_package_hash("space"))
-    assert len(found - {""}) == 2
+        hashes.add(_package_hash("space"))
+    assert len(hashes - {""}) == 2

@@ -1,10 +1,7 @@
-"""Real runs: what a run folder holds, that its numbers agree with each other, and how a run that fails ends."""
+"""Real runs: the files of a run folder, the consistency of its numbers, and the end of a failed run."""
 
 import json
-import os
 import shlex
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import Mock
@@ -31,7 +28,7 @@ from datasets.scene import Scene
 from renderers.rendering import Unsupported
 from tests.looped import each
 from tests.report.page_data import Page
-from tests.runner.driving import PATIENCE, ROOT, CommandResult
+from tests.runner.driving import CommandResult, by_program
 from tests.solve.test_optimise import POINTS, Toy
 from tests.tiny import ball_prior, cell_from, curve_of
 
@@ -49,7 +46,7 @@ PICTURES = {"summary", "curve"}
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that has ended: its command's outputs, its folder and what the folder says."""
+    """A run that has ended: its command's outputs, its folder, record and curve."""
 
     outcome: CommandResult
     results: Path
@@ -60,16 +57,13 @@ class Finished:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Finished:
-    """A run by a program of its own, with results where spaces, brackets and other letters are."""
+    """A run by a separate program, in a folder whose name has spaces, brackets and other letters."""
     results = tmp_path_factory.mktemp("results") / "of [today] ü"
-    program, columns = [sys.executable, "-m", "bench", *COMMAND, f'results_dir="{results}"'], {"COLUMNS": "80"}
-    done = subprocess.run(
-        program, capture_output=True, text=True, cwd=ROOT, timeout=4 * PATIENCE, env=os.environ | columns, check=False
-    )
-    assert done.stdout, done.stderr
-    folder = Path(done.stdout.splitlines()[-1])
+    outcome = by_program("-m", "bench", *COMMAND, f'results_dir="{results}"', COLUMNS="80")
+    assert outcome.out, outcome.err
+    folder = Path(outcome.out.splitlines()[-1])
     record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
-    return Finished(CommandResult(done.returncode, done.stdout, done.stderr), results, folder, record, curve_of(folder))
+    return Finished(outcome, results, folder, record, curve_of(folder))
 
 
 def test_it_ends_well_and_its_last_line_is_its_folder(finished):
@@ -79,8 +73,7 @@ def test_it_ends_well_and_its_last_line_is_its_folder(finished):
     assert finished.folder.parent == finished.results / "runs"
     assert not [note for note in record["notes"] if not note.startswith("loaded machine")]
     assert f"page and tables: python -m bench.report results_dir='{finished.results}'" in out.splitlines()
-    assert "Chamfer" in out
-    assert record["overrides"] == [*COMMAND, f'results_dir="{finished.results}"']
+    assert "Chamfer" in out and record["overrides"] == [*COMMAND, f'results_dir="{finished.results}"']
     write_index(finished.results)
     page = Page(finished.results)
     assert page.folders == [finished.folder.name] and page.text("thumb") == ["summary.png"]
@@ -88,7 +81,7 @@ def test_it_ends_well_and_its_last_line_is_its_folder(finished):
     assert page.read("mesh", page.runs["key"][0])["shown"][0] > 0
 
 
-def test_its_log_says_what_was_run_where_and_how_it_ended(finished):
+def test_its_log_has_the_command_the_machine_and_the_outcome(finished):
     record, log = finished.record, (finished.folder / "log.txt").read_text(encoding="utf-8")
     command, *lines = log[log.index("command: ") :].splitlines()
     assert shlex.split(command)[1:] == ["python", "-m", "bench", *record["overrides"]]
@@ -100,7 +93,7 @@ def test_its_log_says_what_was_run_where_and_how_it_ended(finished):
     assert lines[-1] == "status: ok"
 
 
-def test_the_folder_holds_what_others_script_against(finished):
+def test_the_folder_has_the_files_that_scripts_rely_on(finished):
     names = {path.name for path in finished.folder.iterdir()}
     assert {"record.json", "curve.jsonl", "config.yaml", "log.txt", "mesh.ply"} <= names
     assert names >= {f"{name}.png" for name in PICTURES}
@@ -113,12 +106,11 @@ def test_the_folder_holds_what_others_script_against(finished):
     assert np.linalg.norm(mesh.vertices, axis=1).max() < 1.01
 
 
-def test_the_record_says_what_was_run_on_what(finished):
+def test_the_record_has_the_settings_and_the_machine(finished):
     record = finished.record
     written = OmegaConf.to_container(OmegaConf.load(finished.folder / "config.yaml"))
     assert written == record["config"] and written["results_dir"] == str(finished.results)
-    assert written["task"]["optimiser"]["iterations"] == ITERATIONS
-    assert record["schema"] == 1
+    assert written["task"]["optimiser"]["iterations"] == ITERATIONS and record["schema"] == 1
     assert (record["task"], record["renderer"], record["dataset"]) == ("completion", "dist", "sofa")
     assert (record["seed"], record["scene"], record["reused"]) == (0, "sofa test 0", False)
     environment = record["environment"]
@@ -127,7 +119,7 @@ def test_the_record_says_what_was_run_on_what(finished):
     assert {"commit", "dirty", "cpu", "cores", "device", "platform"} <= set(environment)
 
 
-def test_every_metric_is_there_before_and_after_with_its_definition(finished):
+def test_every_metric_has_an_initial_value_a_final_value_and_a_definition(finished):
     record = finished.record
     assert set(record["metrics"]) == set(record["metrics_start"]) == METRICS
     costs = {f"evaluations.{name}" for name in ("value", "gradient", "per_ray", "work_over_bound")}
@@ -138,8 +130,7 @@ def test_every_metric_is_there_before_and_after_with_its_definition(finished):
 
 def test_metrics_agree_with_each_other_and_are_better_than_at_the_start(finished):
     before, after = finished.record["metrics_start"], finished.record["metrics"]
-    assert after["chamfer_l2"] < 0.5 * before["chamfer_l2"]
-    assert after["depth_mae"] < 0.5 * before["depth_mae"]
+    assert all(after[name] < 0.5 * before[name] for name in ("chamfer_l2", "depth_mae"))
     assert after["mask_iou"] > before["mask_iou"]
     for metrics in (before, after):
         assert metrics["chamfer_l1"] == pytest.approx((metrics["accuracy"] + metrics["completeness"]) / 2)
@@ -152,20 +143,18 @@ def test_the_curve_has_a_line_an_iteration_and_falls(finished):
     assert [line["iteration"] for line in finished.curve] == list(range(ITERATIONS))
     for line in finished.curve:
         assert line["total"] == pytest.approx(line["depth"] + line["silhouette"] + line["code"], rel=1e-4)
-    assert finished.curve[-1]["total"] < finished.curve[0]["total"]
-    assert finished.curve[0]["code"] == 0.0
+    assert finished.curve[-1]["total"] < finished.curve[0]["total"] and finished.curve[0]["code"] == 0.0
 
 
 def test_evaluations_add_up(finished):
     evaluations, last = finished.record["evaluations"], finished.curve[-1]
-    assert evaluations["rays_per_iteration"] == PIXELS**2
-    assert evaluations["iterations"] == ITERATIONS
+    assert (evaluations["rays_per_iteration"], evaluations["iterations"]) == (PIXELS**2, ITERATIONS)
     assert evaluations["value"] == last["value_evaluations"] > 0
     assert evaluations["gradient"] == last["gradient_evaluations"] > 0
     assert evaluations["per_ray"] == pytest.approx(evaluations["value"] / PIXELS**2 / ITERATIONS)
     assert evaluations["per_ray"] < 10
     hits = (evaluations["value"] + evaluations["gradient"]) / 2 / evaluations["work_over_bound"]
-    assert hits == pytest.approx(round(hits))  # a value and a gradient of the network take as many operations
+    assert hits == pytest.approx(round(hits))  # a value and a gradient of the network take equally many operations
     assert 0 < hits < evaluations["rays_per_iteration"] * ITERATIONS
     width = 128  # the shipped network: 4 layers with a skip; the code is folded into the biases
     weights = 3 * width + width * width + (width + 3) * width + width * width + width
@@ -185,7 +174,7 @@ def test_seconds_add_up(finished):
 
 @pytest.fixture
 def bench(isolated):
-    """A command line in this process, with its runs: its exit status, its outputs, and its run folder."""
+    """Runs a command line and its runs in this process; gives its exit status, outputs and run folder."""
 
     def run(*arguments):
         code, out, err = isolated(*arguments, "isolation=off")
@@ -194,31 +183,25 @@ def bench(isolated):
     return run
 
 
-def test_the_same_command_run_again_gives_the_same_numbers_and_sets_the_first_aside(bench, tmp_path):
+def test_a_repeated_command_gives_the_same_numbers_and_keeps_the_first_run(bench, tmp_path):
     command = ("renderer=dist", *TINY, "evaluation.picture=null", "threads=1", "dataset=table", "rerun=all")
     folders = [bench(*command)[3] for _ in range(2)]
     assert folders[0] == folders[1]
     folders[0] = next((tmp_path / "r" / "earlier").iterdir())
     first, second = (json.loads((folder / "record.json").read_text()) for folder in folders)
-    assert first["scene"] == "table test 0"
-    assert first["environment"]["threads"] == 1
-    for part in ("metrics", "metrics_start", "evaluations", "flops", "config", "status"):
-        assert first[part] == second[part], part
+    assert (first["scene"], first["environment"]["threads"]) == ("table test 0", 1)
+    for key in ("metrics", "metrics_start", "evaluations", "flops", "config", "status"):
+        assert first[key] == second[key], key
     curves = [[line["total"] for line in curve_of(folder)] for folder in folders]
     assert curves[0] == curves[1]
 
 
-@pytest.mark.parametrize(
-    ("error", "status", "code"),
-    [
-        (RuntimeError("a bug\nover two lines"), "crashed", 1),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), "oom", 1),
-        (MemoryError(), "oom", 1),
-        (Unsupported("Fake has no gradient"), "unsupported", 1),
-        (KeyboardInterrupt(), "killed", 130),
-    ],
-)
-def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, error, status, code):
+@pytest.mark.parametrize(("error", "status", "code"), [
+    (RuntimeError("a bug\nover two lines"), "crashed", 1), (MemoryError(), "oom", 1),
+    (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), "oom", 1),
+    (Unsupported("Fake has no gradient"), "unsupported", 1), (KeyboardInterrupt(), "killed", 130),
+])  # fmt: skip
+def test_the_error_that_ends_a_run_is_in_its_record(bench, monkeypatch, tmp_path, error, status, code):
     meanwhile = []
 
     def fail(config, progress):
@@ -226,22 +209,17 @@ def test_whatever_ends_a_run_stands_in_its_record(bench, monkeypatch, tmp_path, 
         raise error
 
     monkeypatch.setattr(execute, "build_cell", fail)
-    found, out, err, folder = bench()
+    exit_code, out, err, folder = bench()
     record = json.loads((folder / "record.json").read_text())
-    assert found == code
+    assert (exit_code, record["status"]) == (code, status) and record["seconds"]["total"] > 0
     assert [before["status"] for before in meanwhile] == ["killed"]
-    assert record["status"] == status
-    assert record["reason"]
-    assert "\n" not in record["reason"]
-    assert record["seconds"]["total"] > 0
-    assert "Traceback" not in out + err
-    assert len(err.strip().splitlines()) == 1
-    assert record["reason"] in err
-    assert status in (folder / "log.txt").read_text()
-    assert ("Traceback" in (folder / "log.txt").read_text()) is isinstance(error, RuntimeError)
+    assert record["reason"] and "\n" not in record["reason"] and record["reason"] in err
+    assert "Traceback" not in out + err and len(err.strip().splitlines()) == 1
+    log = (folder / "log.txt").read_text()
+    assert status in log and ("Traceback" in log) is isinstance(error, RuntimeError)
 
 
-def test_each_line_of_the_curve_is_json_and_on_the_disk_as_it_comes(tmp_path):
+def test_each_line_of_the_curve_is_json_and_written_at_once(tmp_path):
     with curve_file(tmp_path) as write:
         for number, total in enumerate((1.0, float("inf"), float("nan")), 1):
             write({"total": total})
@@ -252,10 +230,10 @@ def test_each_line_of_the_curve_is_json_and_on_the_disk_as_it_comes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("every", "iterations", "looks"),
+    ("interval", "iterations", "checkpoints"),
     [(None, 5, []), (3, 7, [0, 3, 6]), ("doubling", 9, [0, 1, 2, 4, 8]), ("doubling", 1, [0])],
 )
-def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(clock, tmp_path, every, iterations, looks):
+def test_checkpoints_have_the_chamfer_distance_and_cost_no_runtime(clock, tmp_path, interval, iterations, checkpoints):
     class Slow(Toy):
         def loss(self, iteration):
             clock.sleep(1.0)
@@ -269,40 +247,39 @@ def test_the_chamfer_distance_is_looked_at_every_so_often_and_off_the_clock(cloc
         radii.append(toy.radius.item())
         return {"chamfer_l2": radii[-1]}
 
-    stage = Mock(spec=RunInputs, device=torch.device("cpu"), evaluation=EvaluationSettings(every=every))
+    stage = Mock(spec=RunInputs, device=torch.device("cpu"), evaluation=EvaluationSettings(every=interval))
     record = Record("id", "task", "renderer", "dataset", 0, {}, seconds={"evaluation": 1.0})
     record.environment = {"gemm_peak_flops": 1e10}
     settings = OptimiserSettings(iterations, 0.05, "constant")
     history = solve.run_optimisation(toy, settings, RunContext(stage, tmp_path, record, lambda *_: None), see)
     curve = curve_of(tmp_path)
     assert [line["iteration"] for line in curve] == list(range(iterations))
-    assert [line["iteration"] for line in curve if "chamfer_l2" in line] == looks
-    if every is not None:  # of the parameters that the line's loss is of
+    assert [line["iteration"] for line in curve if "chamfer_l2" in line] == checkpoints
+    if interval is not None:  # for the same parameters as the loss of the line
         assert [line["chamfer_l2"] for line in curve if "chamfer_l2" in line] == radii
-        assert [(3 - r) ** 2 for r in radii] == pytest.approx([curve[i]["total"] for i in looks])
-    assert sorted(radii) == radii
-    assert history.curve == curve
+        assert [(3 - r) ** 2 for r in radii] == pytest.approx([curve[i]["total"] for i in checkpoints])
+    assert sorted(radii) == radii and history.curve == curve
     assert curve[-1]["seconds"] == history.seconds["forward"] + history.seconds["backward"]
     assert history.seconds == pytest.approx({"warmup": 1.0, "forward": iterations, "backward": 0.0}, abs=0.01)
-    assert record.seconds["evaluation"] - 1.0 == pytest.approx(100.0 * len(looks), abs=0.01)
+    assert record.seconds["evaluation"] - 1.0 == pytest.approx(100.0 * len(checkpoints), abs=0.01)
     assert curve[-1]["value_evaluations"] == iterations * POINTS
 
 
-def test_a_run_that_looks_on_the_way_ends_as_one_that_does_not(bench):
+def test_a_run_with_checkpoints_ends_as_one_without(bench):
     folders = [
-        bench("renderer=dist", *TINY, "evaluation.picture=null", f"evaluation.every={every}")[3]
-        for every in ("null", 4)
+        bench("renderer=dist", *TINY, "evaluation.picture=null", f"evaluation.every={interval}")[3]
+        for interval in ("null", 4)
     ]
-    plain, looked = (json.loads((folder / "record.json").read_text()) for folder in folders)
+    plain, checked = (json.loads((folder / "record.json").read_text()) for folder in folders)
     curve = curve_of(folders[1])
     assert [line["iteration"] for line in curve if "chamfer_l2" in line] == [0, 4, 5]
-    assert curve[0]["chamfer_l2"] == looked["metrics_start"]["chamfer_l2"]
-    assert looked["metrics"]["chamfer_l2"] == plain["metrics"]["chamfer_l2"]
-    assert looked["evaluations"] == plain["evaluations"]
+    assert curve[0]["chamfer_l2"] == checked["metrics_start"]["chamfer_l2"]
+    assert checked["metrics"]["chamfer_l2"] == plain["metrics"]["chamfer_l2"]
+    assert checked["evaluations"] == plain["evaluations"]
 
 
-def test_what_is_drawn_in_a_run_does_not_depend_on_whether_its_prior_was_there(compose_config, monkeypatch):
-    """DVR draws points: a prior that is trained first uses up random numbers of its own."""
+def test_random_numbers_of_a_run_do_not_depend_on_whether_its_prior_was_cached(compose_config, monkeypatch):
+    """DVR draws points, and the training of a prior also draws random numbers."""
     prior, drawn = ball_prior(), []
     monkeypatch.setattr(inputs_module, "make_scene", lambda *_, **__: Mock(spec=Scene))
     for used in (0, 1000):
@@ -317,19 +294,14 @@ def test_what_is_drawn_in_a_run_does_not_depend_on_whether_its_prior_was_there(c
     assert torch.rand(4).tolist() != drawn[0]
 
 
-@each(
-    "history, mesh, status",
-    [
-        (History(curve=[{"total": 2.0}, {"total": 1.0}]), True, RunStatus.OK),
-        (History(curve=[{"total": 2.0}]), True, RunStatus.OK),
-        (History(curve=[{"total": 1.0}, {"total": 2.0}]), True, RunStatus.NOT_REACHED),
-        (History(curve=[{"total": 2.0}, {"total": 1.0}]), False, RunStatus.EMPTY),
-        (History(RunStatus.NAN, "why", curve=[{"total": 2.0}, {"total": float("nan")}]), False, RunStatus.NAN),
-        (History(RunStatus.DIVERGED, "why", curve=[{"total": 1.0}, {"total": 200.0}]), True, RunStatus.DIVERGED),
-    ],
-)
-def test_a_run_is_judged_by_its_own_loss_and_surface(history, mesh, status):
+@each("ended, losses, mesh, status", [
+    ((), [2.0, 1.0], True, RunStatus.OK), ((), [2.0], True, RunStatus.OK),
+    ((), [1.0, 2.0], True, RunStatus.NOT_REACHED), ((), [2.0, 1.0], False, RunStatus.EMPTY),
+    ((RunStatus.NAN, "why"), [2.0, float("nan")], False, RunStatus.NAN),
+    ((RunStatus.DIVERGED, "why"), [1.0, 200.0], True, RunStatus.DIVERGED),
+])  # fmt: skip
+def test_a_run_is_judged_by_its_loss_and_surface(ended, losses, mesh, status):
+    history = History(*ended, curve=[{"total": loss} for loss in losses])
     after = Evaluation({}, failure=None if mesh else (RunStatus.EMPTY, "nothing is there"))
-    found, reason = solve.failure_of(history, after) or (RunStatus.OK, "")
-    assert found is status
-    assert bool(reason) is (status is not RunStatus.OK)
+    result, reason = solve.failure_of(history, after) or (RunStatus.OK, "")
+    assert result is status and bool(reason) is (status is not RunStatus.OK)

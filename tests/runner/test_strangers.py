@@ -1,4 +1,4 @@
-"""Somebody else's configurations and results run nothing, and lead to no file outside of the results folder."""
+"""Configurations and results of others run no code, and open no file outside the results folder."""
 
 import json
 import sys
@@ -40,26 +40,28 @@ def stranger(tmp_path, monkeypatch):
     sys.modules.pop(name, None)
 
 
-@each("part, key", [
+@each("node, key", [
     ("renderer", "renderer._target_"), ("task", "task._target_"), ("prior", "+prior._target_"),
     ("view", "+view._target_"), ("task", "+task.code._target_"), ("tracker", "tracker._target_"),
 ])  # fmt: skip
-def test_a_package_that_is_not_named_is_not_imported(compose_config, stranger, tmp_path, part, key):
+def test_a_package_that_is_not_named_is_not_imported(compose_config, stranger, tmp_path, node, key):
     config = compose_config(f"{key}={stranger}.Renderer")
     with pytest.raises(ValueError, match=rf"_target_ names '{stranger}.Renderer': type packages=\[{stranger}\]"):
-        build(config[part], part, [], PARTS.get(part, ""))
+        build(config[node], node, [], PARTS.get(node, ""))
     assert not (tmp_path / "imported").exists() and stranger not in sys.modules
 
 
-def test_the_command_refuses_it_before_anything_runs(stranger, tmp_path):
+def test_the_command_refuses_an_unnamed_package_before_anything_runs(stranger, tmp_path):
     for multirun in ((), ("-m",)):
-        done = command(*multirun, f"renderer._target_={stranger}.Renderer", "scale=smoke", f"results_dir={tmp_path}/r")
-        assert (done.code, done.out) == (2, "") and len(errors(done.err)) == 1
-        assert "if you trust it" in done.err and not (tmp_path / "imported").exists()
+        result = command(
+            *multirun, f"renderer._target_={stranger}.Renderer", "scale=smoke", f"results_dir={tmp_path}/r"
+        )
+        assert (result.code, result.out) == (2, "") and len(errors(result.err)) == 1
+        assert "if you trust it" in result.err and not (tmp_path / "imported").exists()
         assert not (tmp_path / "r").exists()
 
 
-def test_a_class_of_a_package_that_is_named_must_be_what_its_place_asks_for(compose_config, stranger):
+def test_a_class_of_a_named_package_must_be_of_the_kind_of_its_node(compose_config, stranger):
     config = compose_config("renderer=custom", f"renderer._target_={stranger}.Renderer")
     assert type(build(config.renderer, "renderer")).__name__ == "Renderer"
     assert type(load("renderer", "custom", _target_=f"{stranger}.Renderer")).__name__ == "Renderer"
@@ -74,7 +76,7 @@ def test_a_class_of_a_package_that_is_named_must_be_what_its_place_asks_for(comp
 
 @pytest.fixture
 def theirs(tmp_path) -> Path:
-    """A results folder of somebody else's with a sound run, and beside it a folder that is none of theirs."""
+    """The results folder of another user with a valid run, and a folder of this user."""
     stored(tmp_path / "theirs", "sound")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "secret.png").write_text("secret")
@@ -105,13 +107,10 @@ def test_a_link_within_the_results_folder_is_followed(theirs):
     assert len(read_records(theirs)[0]) == 2
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("runs", "paper", "sweeps", "earlier", ".locks", "page", "page/data/run"),
-        *("index.html", "paper/table1.csv", "sweeps/p/table.csv"),
-    ],
-)
+@pytest.mark.parametrize("name", [
+    "runs", "paper", "sweeps", "earlier", ".locks", "page", "page/data/run", "index.html", "paper/table1.csv",
+    "sweeps/p/table.csv",
+])  # fmt: skip
 def test_nothing_is_written_through_a_link(theirs, tmp_path, name):
     outside = tmp_path / "mine"
     if name == "runs":
@@ -129,12 +128,12 @@ def test_nothing_is_written_through_a_link(theirs, tmp_path, name):
         check_links(theirs)
 
 
-@pytest.mark.parametrize("place", ["runs/{}", ".locks/{}", "runs/{}/record.json"])
-def test_a_run_is_not_resumed_through_a_link(theirs, tmp_path, place):
+@pytest.mark.parametrize("pattern", ["runs/{}", ".locks/{}", "runs/{}/record.json"])
+def test_a_run_is_not_resumed_through_a_link(theirs, tmp_path, pattern):
     identity = run_folder.Identity({"task": "completion", "renderer": "dist", "dataset": "sofa"}, {"seed": 0})
-    link = theirs / place.format(identity.name)
+    link = theirs / pattern.format(identity.name)
     link.parent.mkdir(parents=True, exist_ok=True)
-    link.symlink_to(tmp_path / "mine" / ("" if place == "runs/{}" else "secret.png"))
+    link.symlink_to(tmp_path / "mine" / ("" if pattern == "runs/{}" else "secret.png"))
     with (
         pytest.raises(ValueError, match="is a link out of the results folder"),
         run_folder.locked_folder(theirs, identity, run_folder.Rerun.none),
@@ -168,8 +167,7 @@ def test_a_configuration_in_a_run_folder_is_only_text(theirs, stranger, tmp_path
     (folder / "record.json").write_text(json.dumps(record))
     write_index(theirs)
     merge([theirs], tmp_path / "joined")
-    assert turntable([str(folder)]) == 2
-    assert not (tmp_path / "imported").exists()
+    assert turntable([str(folder)]) == 2 and not (tmp_path / "imported").exists()
 
 
 @pytest.mark.parametrize("name", ["turntable.webp", "mesh.ply"])

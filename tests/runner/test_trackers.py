@@ -1,4 +1,4 @@
-"""Finished runs are exported as they are; a tracker that fails, or is not installed, costs no run."""
+"""Finished runs are exported unchanged; a tracker that fails, or is not installed, costs no run."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from tests.runner.driving import FAILING, record_of
 
 @pytest.fixture
 def finished(tmp_path) -> Path:
-    """The folder of a run that ended with numbers, and with a curve of three lines, one of them not a number."""
+    """The folder of a run with metrics, and with a curve of three lines, one of them with a nan."""
     folder = tmp_path / "runs" / "completion-dist-sofa-1"
     folder.mkdir(parents=True)
     record = {
@@ -32,7 +32,7 @@ def finished(tmp_path) -> Path:
     return folder
 
 
-def test_content_is_what_the_run_folder_says(finished):
+def test_exported_values_are_the_values_of_the_run_folder(finished):
     record = read_record(finished)
     assert settings(record["config"]) == {"seed": "3", "renderer.steps": "50", "renderer.cap": "None"}
     assert values(record) == {
@@ -43,18 +43,16 @@ def test_content_is_what_the_run_folder_says(finished):
     assert curve(finished) == [(0, {"seconds": 0.1, "total": 3.0}), (1, {"seconds": 0.2}), (2, {"total": 1.0})]
 
 
-@pytest.mark.filterwarnings("ignore")  # of MLflow's own libraries
+@pytest.mark.filterwarnings("ignore")  # from MLflow's libraries
 def test_mlflow_has_the_run(finished, tmp_path):
     mlflow = pytest.importorskip("mlflow", reason="MLflow is not installed: pip install -e '.[mlflow]'")
     uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
     MLflow(uri, "ours", str(tmp_path / "pictures")).export(finished, read_record(finished))
     client = mlflow.MlflowClient(tracking_uri=uri)
     (run,) = client.search_runs([client.get_experiment_by_name("ours").experiment_id])
-    assert run.info.run_name == finished.name
-    assert run.info.status == "FINISHED"
+    assert (run.info.run_name, run.info.status) == (finished.name, "FINISHED")
     assert run.info.end_time - run.info.start_time == 12_500
-    assert run.data.tags["status"] == "ok"
-    assert run.data.params["renderer.steps"] == "50"
+    assert (run.data.tags["status"], run.data.params["renderer.steps"]) == ("ok", "50")
     assert run.data.metrics["metrics.chamfer_l2"] == 0.002
     assert [item.path for item in client.list_artifacts(run.info.run_id)] == ["summary.png"]
     assert list((tmp_path / "pictures").rglob("summary.png"))
@@ -62,7 +60,7 @@ def test_mlflow_has_the_run(finished, tmp_path):
     assert sorted((point.step, point.value) for point in history) == [(0, 3.0), (2, 1.0)]
 
 
-@pytest.mark.filterwarnings("ignore")  # of TensorBoard's own libraries
+@pytest.mark.filterwarnings("ignore")  # from TensorBoard's libraries
 def test_tensorboard_has_the_run(finished, tmp_path):
     pytest.importorskip("tensorboard", reason="TensorBoard is not installed: pip install -e '.[tensorboard]'")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
