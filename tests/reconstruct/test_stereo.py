@@ -14,7 +14,7 @@ from datasets.extras import install_command
 from datasets.scene import Truth
 from datasets.shot import Shot
 from renderers.checks import BadInput
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.reconstruct.test_losses import ball, shot_of
 from tests.tiny import camera_of, icosphere
@@ -23,7 +23,7 @@ RADIUS = 0.7
 PIXELS = 64
 NEAR = 0.03  # scene units
 ALL = Matching(3, 45.0)
-SETTINGS = replace(PLAINLY, texture_size=0.15)
+SETTINGS = replace(PHOTOGRAPHY, texture_size=0.15)
 
 
 @pytest.fixture(scope="module")

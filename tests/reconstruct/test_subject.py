@@ -21,14 +21,14 @@ from datasets.mesh import Mesh, concatenate_meshes
 from datasets.photographs import around
 from datasets.scene import Surface, sample_surface
 from renderers.checks import BadInput
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.reconstruct.test_losses import RENDERERS, ball, shot_of
 from tests.tiny import ball_prior, camera_of, icosphere, run_of, scene_of
 
 NO_DEPTHS = Depths("none", 0.0)
 CAMERA = camera_of(24, angles=(0.0, 20.0))
-IMAGES = replace(PLAINLY, places="sphere", views=9)
+IMAGES = replace(PHOTOGRAPHY, places="sphere", views=9)
 
 
 @pytest.fixture

@@ -18,12 +18,12 @@ from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.field import Counts
 from renderers.silhouette import CrossEntropy, Occupancy
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.tiny import CPU, icosphere, silent
 
 SAMPLER = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(10.0, 40.0), resolution=16)
-IMAGING = Imaging(replace(PLAINLY, views=3, texture_size=1.0), SAMPLER)
+IMAGING = Imaging(replace(PHOTOGRAPHY, views=3, texture_size=1.0), SAMPLER)
 NETWORK = SingleViewNetwork(channels=(8, 8), blocks=1, code_length=6, width=16, reads="distance", radius=0.5)
 LOSSES = Losses(
     colour=1.0, colour_gradient=0.0, depth=0.0, depth_loss="depth", silhouette=CrossEntropy(sharpness=30.0, weight=1.0),

@@ -18,7 +18,7 @@ from datasets.mesh import extract
 from datasets.meshes import read_mesh
 from datasets.scene import Scene, Truth
 from renderers.fields.analytic import sphere
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.made_photographs import CENTRE, RADIUS, idr
 from tests.runner.driving import command, record_of
@@ -28,7 +28,7 @@ RENDERER = load("renderer", "dist")
 CAMERA = camera_of(16, angles=(0.0, 20.0))
 PRIOR = ball_prior(radius=0.5)
 SETTINGS = Multiview(
-    images=PLAINLY, longest=24, held_out=5, masks=True, focal=1.0, views_per_step=4, neighbour=1,
+    images=PHOTOGRAPHY, longest=24, held_out=5, masks=True, focal=1.0, views_per_step=4, neighbour=1,
     visible=1e-3, photometric_weight=5.0, code=CodePenalty(0.0, "sum"), start_scale=0.0,
     starts=1, trial=3, coarse_blur=0.0,
     scale=1.0, degrees=0.0, shift=0.0, similarity=False, rotations=2,
@@ -149,7 +149,7 @@ def test_blurring_keeps_what_is_constant_and_the_mean():
 
 def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
     with pytest.raises(CannotContinue, match="no point of the shape is seen by two neighbouring views"):
-        level = replace(PLAINLY, views=2).take(Truth(scene.mesh), camera_of(32), seed=0)  # from opposite sides
+        level = replace(PHOTOGRAPHY, views=2).take(Truth(scene.mesh), camera_of(32), seed=0)  # from opposite sides
         PhotometricLoss(SETTINGS, RENDERER, level, CPU).compare(sphere(0.5), 0)
     with pytest.raises(CannotContinue):
         given(scene).compare(sphere(1e-3, (0.0, 0.0, 0.9)), 0)

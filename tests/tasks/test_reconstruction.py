@@ -26,7 +26,7 @@ from datasets.scene import Scene, sample_surface
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
@@ -36,7 +36,7 @@ from tests.tiny import Blind, altered, ball_prior, camera_of, curve_of, icospher
 
 PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")
 SETTINGS = Reconstruction(
-    images=replace(PLAINLY, places="sphere", views=7, texture_size=1.0),
+    images=replace(PHOTOGRAPHY, places="sphere", views=7, texture_size=1.0),
     longest=24,
     held_out=4,
     masks=True,

@@ -15,12 +15,12 @@ from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.tasks.test_reconstruction import assert_coloured_mesh, run_in, scene  # noqa: F401, a fixture
 from tests.tiny import altered
 
 SHARED = {
-    "images": replace(PLAINLY, places="sphere", views=9),
+    "images": replace(PHOTOGRAPHY, places="sphere", views=9),
     "longest": 24,
     "held_out": 4,
     "masks": True,
@@ -28,7 +28,7 @@ SHARED = {
 }
 HULL = Hull(**SHARED, samples=32)
 POISSON = Poisson(**SHARED | {"depths": Depths("dense", 0.0)}, fusing=Fusing(5, 0.0))
-NEAR = replace(PLAINLY, views=18, texture_size=0.15)  # on a circle, 20 degrees apart
+NEAR = replace(PHOTOGRAPHY, views=18, texture_size=0.15)  # on a circle, 20 degrees apart
 STEREO = Stereo(
     **SHARED | {"images": NEAR, "longest": 48, "held_out": 9}, matching=Matching(1, 30.0), fusing=Fusing(5, 0.0)
 )
