@@ -1,4 +1,4 @@
-"""What the harness costs: beside a run, per cell, for a large results folder, for a mistake on the command line."""
+"""The overhead of the harness: per run, for a large results folder, and for a mistake on the command line."""
 
 import json
 import statistics
@@ -19,7 +19,7 @@ RECORDS = 10_000
 
 
 def test_a_run_costs_little_more_than_its_work(tmp_path, capsys):
-    """Cells that take 10 s by themselves, in a sweep: what the sweep takes beyond them, a cell."""
+    """The overhead of a sweep per run, for runs of 10 s."""
     cells = 4
     arguments = (*FAILING, *CELL[2:], "task.optimiser.iterations=8", "+renderer.pause=1.0", "seed=0,1,2,3")
     inside, outside = {}, {}
@@ -32,7 +32,7 @@ def test_a_run_costs_little_more_than_its_work(tmp_path, capsys):
         inside[isolation] = spent / cells
         outside[isolation] = (time.perf_counter() - started - spent) / cells
     with capsys.disabled():
-        print(f"\na cell takes {inside} s, and beside its cells a sweep of {cells} takes {outside} s for each")
+        print(f"\na run takes {inside} s, and a sweep of {cells} takes {outside} s more for each run")
     assert inside["process"] - inside["off"] < 0.01 * inside["off"] + 0.5
     assert outside["process"] < 0.01 * inside["off"] + 0.5 + 2.0 / cells  # 2 s to start the program
 
@@ -63,7 +63,6 @@ def test_help_and_a_typo_are_answered_within_two_seconds(arguments, capsys):
         subprocess.run([sys.executable, "-m", "bench", *arguments], cwd=ROOT, check=False, capture_output=True)
         times.append(time.perf_counter() - started)
     with capsys.disabled():
-        print(
-            f"\n{arguments[0]}: {statistics.median(times):.2f} s ({min(times):.2f}-{max(times):.2f}, n = {len(times)})"
-        )
+        spread = f"({min(times):.2f}-{max(times):.2f}, n = {len(times)})"
+        print(f"\n{arguments[0]}: {statistics.median(times):.2f} s {spread}")
     assert statistics.median(times) < 2

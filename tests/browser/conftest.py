@@ -1,4 +1,4 @@
-"""Opens the page in Chromium, from a file, and notes what must not happen: errors, dialogs, requests elsewhere."""
+"""Opens the page in Chromium, from a file, and records errors, dialogs and requests to other addresses."""
 
 import os
 import shutil
@@ -16,9 +16,9 @@ FLAGS = (
     *("--disable-component-update", "--disable-sync"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # WebGL without a GPU
 )
-# Said of WebGL in software where a picture of it is taken, and of how Plotly measures letters.
+# Messages about screenshots of software WebGL, and about how Plotly measures letters.
 HARMLESS = ("GPU stall due to ReadPixels", "Canvas2D: Multiple readback operations")
-PATIENCE = 60_000  # milliseconds until something is given up, on a busy machine
+TIMEOUT_MILLISECONDS = 60_000  # for a busy machine
 
 
 @dataclass
@@ -37,18 +37,18 @@ class Tab:
 
     def watch(self) -> None:
         page, inside = self.page, self.results.as_uri()
-        page.on("console", lambda said: self._said(said))
+        page.on("console", lambda message: self._log(message))
         page.on("pageerror", lambda error: self.wrong.append(f"error: {error}"))
         page.on("dialog", lambda dialog: (self.wrong.append(f"dialog: {dialog.message}"), dialog.dismiss()))
         page.on("requestfailed", lambda request: self.wrong.append(f"failed: {request.url}"))
-        page.on("request", lambda request: self._asked(request.url, inside))
+        page.on("request", lambda request: self._request(request.url, inside))
         page.on("popup", lambda popup: self.wrong.append(f"popup: {popup.url}"))
 
-    def _said(self, said: Any) -> None:
-        if said.type in ("error", "warning") and not any(words in said.text for words in HARMLESS):
-            self.wrong.append(f"{said.type}: {said.text}")
+    def _log(self, message: Any) -> None:
+        if message.type in ("error", "warning") and not any(words in message.text for words in HARMLESS):
+            self.wrong.append(f"{message.type}: {message.text}")
 
-    def _asked(self, url: str, inside: str) -> None:
+    def _request(self, url: str, inside: str) -> None:
         if not url.startswith((inside, "data:", "blob:", "about:")):
             self.wrong.append(f"request: {url}")
 
@@ -61,7 +61,9 @@ def browser() -> Iterator[Any]:
     if chromium is None:
         pytest.skip("needs Chromium: `make test-browser` installs it, or CHROMIUM=/path/to/chromium names it")
     with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=chromium, args=list(FLAGS), headless=True, timeout=PATIENCE)
+        opened = driver.chromium.launch(
+            executable_path=chromium, args=list(FLAGS), headless=True, timeout=TIMEOUT_MILLISECONDS
+        )
         yield opened
         opened.close()
 
@@ -69,18 +71,18 @@ def browser() -> Iterator[Any]:
 @pytest.fixture
 def tab(browser) -> Iterator[Callable[..., Tab]]:
     """Makes a tab of a results folder; at the end of the test nothing may have gone wrong in it."""
-    made = []
+    opened = []
 
     def make(results: Path, *, width: int = 1400, height: int = 900, dark: bool = False) -> Tab:
         scheme = "dark" if dark else "light"
         context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-        context.set_default_timeout(PATIENCE)
-        one = Tab(context.new_page(), results)
-        one.watch()
-        made.append((one, context))
-        return one
+        context.set_default_timeout(TIMEOUT_MILLISECONDS)
+        opened_tab = Tab(context.new_page(), results)
+        opened_tab.watch()
+        opened.append((opened_tab, context))
+        return opened_tab
 
     yield make
-    for one, context in made:
+    for opened_tab, context in opened:
         context.close()
-        assert one.wrong == []
+        assert opened_tab.wrong == []

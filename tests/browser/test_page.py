@@ -97,7 +97,7 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     write_tables(tmp_path)
     for number in range(2):
         made.write(tmp_path, number)
-    lost = [replace(one, row="Other", status="nan", reason="lost") for one in SOLVED]
+    lost = [replace(solved, row="Other", status="nan", reason="lost") for solved in SOLVED]
     write_attempts([*SOLVED, *lost], tmp_path)
     assert main([f"results_dir={tmp_path}"]) == 0
     page = tab(tmp_path).open()
@@ -129,7 +129,7 @@ def test_a_renderer_of_a_run_has_the_picture_of_its_first_failure(tmp_path, tab)
     folder = write_completion(tmp_path, [0.8, 0.4, 0.05], status="diverged", reason="the loss rose")
     Image.new("RGB", (40, 30)).save(folder / "failure.png")
     (mine,) = attempts_of(read_records(tmp_path)[0], tmp_path)
-    write_attempts([replace(one, settings=mine.settings) for one in SOLVED], tmp_path)
+    write_attempts([replace(solved, settings=mine.settings) for solved in SOLVED], tmp_path)
     assert main([f"results_dir={tmp_path}"]) == 0
     page = tab(tmp_path).open("#/renderer/Mine")
     page.get_by_text("It fails in 1 of 1 run.").wait_for()
@@ -140,8 +140,8 @@ def test_a_renderer_of_a_run_has_the_picture_of_its_first_failure(tmp_path, tab)
 def test_a_sweep_stands_on_the_first_screen_with_its_verdict_and_its_chart(tmp_path, tab):
     cells = [cell(renderer, dataset=dataset) for renderer in ("dist", "dvr") for dataset in ("sofa", "plane")]
     swept(tmp_path, cells)
-    for number, one in enumerate(cells):
-        ran(tmp_path, one, 0.001 * (1 + number))
+    for number, planned in enumerate(cells):
+        ran(tmp_path, planned, 0.001 * (1 + number))
     assert main([f"results_dir={tmp_path}"]) == 0
     page = tab(tmp_path).open()
     assert "Median Chamfer (x1000): 1.50 (DIST) to 3.50 (DVR)" in page.locator(".answers").inner_text()
@@ -203,8 +203,8 @@ def test_methods_are_ranked_within_a_scale_on_the_scenes_that_all_have(tmp_path,
 
 
 def test_filters_sorting_and_search_stand_in_the_address_and_come_back(results, tab):
-    one = tab(results)
-    page = one.open("#/runs?view=runs")
+    first_tab = tab(results)
+    page = first_tab.open("#/runs?view=runs")
     assert rows_of(page).count() == RUNS + 1
     page.get_by_label("Shapes", exact=True).select_option("plane")
     assert rows_of(page).count() == 2
@@ -215,7 +215,7 @@ def test_filters_sorting_and_search_stand_in_the_address_and_come_back(results, 
     page.get_by_label("Search", exact=True).fill("NAI")
     assert names_of(page) == ["NAIVE"]
     address = page.evaluate("location.hash")
-    again = one.open(address)
+    again = first_tab.open(address)
     assert names_of(again) == ["NAIVE"] and again.get_by_label("Search", exact=True).input_value() == "NAI"
     assert again.get_by_label("Shapes", exact=True).input_value() == "plane"
     again.get_by_role("button", name="Clear all").click()
@@ -391,13 +391,13 @@ def test_two_runs_are_compared(results, tab):
 
 def test_the_keyboard_reaches_all_and_the_focus_is_seen(results, tab):
     page = tab(results).open("#/runs?view=runs")
-    seen = set()
+    focused = set()
     for _ in range(45):
         page.keyboard.press("Tab")
-        seen.add(page.evaluate("document.activeElement.tagName + '.' + (document.activeElement.type || '')"))
+        focused.add(page.evaluate("document.activeElement.tagName + '.' + (document.activeElement.type || '')"))
         outline = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
         assert outline != "none" or page.evaluate("document.activeElement === document.body")  # after the last one
-    assert {"A.", "BUTTON.button", "SELECT.select-one", "INPUT.search", "INPUT.checkbox"} <= seen
+    assert {"A.", "BUTTON.button", "SELECT.select-one", "INPUT.search", "INPUT.checkbox"} <= focused
     links = page.locator("#board-list tbody th a")
     links.nth(0).focus()
     page.keyboard.press("ArrowDown")
@@ -414,10 +414,10 @@ def test_the_colours_are_chosen_and_kept(results, tab):
 
 
 def test_every_link_leads_somewhere_and_a_phone_scrolls_down_alone(results, tab):
-    one, phone = tab(results), tab(results, width=420, height=800)
+    first_tab, phone = tab(results), tab(results, width=420, height=800)
     tables = ("#/tables", "#/table/speed_front", "#/table/stability")
     for address in ("", "#/runs", "#/runs?view=runs", "#/run/completion-0001", *tables):
-        page, small = one.open(address), phone.open(address)
+        page, small = first_tab.open(address), phone.open(address)
         page.wait_for_timeout(800)
         links = page.locator("a[href]").evaluate_all("all => all.map((each) => each.getAttribute('href'))")
         assert links
@@ -428,8 +428,8 @@ def test_every_link_leads_somewhere_and_a_phone_scrolls_down_alone(results, tab)
 
 def test_numbers_are_written_as_in_tables(results, tab):
     page = tab(results).open()
-    whole = [value for value in NUMBERS if value is None or float(value).is_integer()]
-    for name, values in {"number": NUMBERS, "seconds": NUMBERS, "count": whole, "size": whole}.items():
+    integers = [value for value in NUMBERS if value is None or float(value).is_integer()]
+    for name, values in {"number": NUMBERS, "seconds": NUMBERS, "count": integers, "size": integers}.items():
         wanted = [getattr(format, name)(value) for value in values]
         shown = page.evaluate(f"values => values.map((value) => implicitBench.format.{name}(value))", list(values))
         assert shown == wanted
@@ -441,8 +441,7 @@ def test_many_runs_are_a_hundred_rows_at_a_time(tmp_path, tab):
     write_index(tmp_path)
     size = (tmp_path / "page" / "data" / "list" / "runs.js").stat().st_size
     page = tab(tmp_path).open("#/runs?task=all&view=runs")
-    assert rows_of(page).count() == 100
-    assert page.evaluate("document.getElementsByTagName('*').length") < 6000
+    assert rows_of(page).count() == 100 and page.evaluate("document.getElementsByTagName('*').length") < 6000
     assert size < 1_500_000 and (tmp_path / "index.html").stat().st_size < 10_000
     page.locator('[data-column="renderer"]').select_option("idr")
     assert rows_of(page).count() == 100 and "of 3,000" in page.locator(".count").inner_text()

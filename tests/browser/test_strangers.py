@@ -1,4 +1,4 @@
-"""A results folder of somebody else: no text in it runs, no network is asked, and nothing leaves the folder."""
+"""A results folder of another person: its texts are not executed, and nothing leaves the folder."""
 
 import json
 
@@ -99,7 +99,7 @@ def write_tables(results):
     }
     for name in ("table1", "stability", "stability_curves", '"><img src=x onerror=window.hacked=1>', "javascript:1"):
         (paper / f"{name}.csv").write_text(f"{MALICE!r},status\n{MALICE!r},ok\n")
-        shown = {part: MALICE for part in ("title", "caption", "question", "verdict")} | {"notes": [MALICE]}
+        shown = {key: MALICE for key in ("title", "caption", "question", "verdict")} | {"notes": [MALICE]}
         shown |= {"columns": [MALICE, "b"], "rows": [[MALICE, "1"]], "experiments": [MALICE], "chart": chart}
         shown |= {"atlas": atlas} if name == "stability" else {}
         (paper / f"{name}.json").write_text(json.dumps(shown))
@@ -120,10 +120,10 @@ def addresses(page) -> list[str]:
 
 
 def test_no_text_of_a_stranger_runs_or_leads_away(strange, tab):
-    one = tab(strange)
-    page = one.open()
+    first_tab = tab(strange)
+    page = first_tab.open()
     for address in addresses(page):
-        page = one.open(address)
+        page = first_tab.open(address)
         page.wait_for_timeout(250)
         assert page.evaluate("window.hacked") is None, address
         assert page.evaluate("({}).polluted") is None
@@ -142,25 +142,25 @@ def test_no_text_of_a_stranger_runs_or_leads_away(strange, tab):
 
 
 def test_each_run_of_a_stranger_is_shown_as_text(strange, tab):
-    one = tab(strange)
-    page = one.open("#/runs?task=all&view=runs")
+    first_tab = tab(strange)
+    page = first_tab.open("#/runs?task=all&view=runs")
     assert page.locator("#board-list tbody tr").count() == len(ATTACKS)
     text = page.locator("#board-list").text_content()
     for attack in ATTACKS:
         assert attack in text
     unread = page.locator("#not-read").text_content()
     assert unread.count("status in record.json must be one of") == len(ATTACKS) and "hacked" in unread
-    page = one.open(page.evaluate("implicitBench.runs.link(0)"))
+    page = first_tab.open(page.evaluate("implicitBench.runs.link(0)"))
     page.get_by_role("heading", name="Make it again").wait_for()
     assert "hacked" in page.locator("main").text_content()
 
 
 def test_a_script_within_the_page_is_refused_by_its_policy(tmp_path, tab):
-    """The second lock: were markup to come through after all, the browser would not run it."""
+    """The second protection: the browser does not execute markup that reaches the page."""
     made.write(tmp_path, 0)
     write_index(tmp_path)
-    one = tab(tmp_path)
-    page = one.open()
+    first_tab = tab(tmp_path)
+    page = first_tab.open()
     page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.hacked=1\">')")
     page.evaluate(
         "const made = document.createElement('script'); made.textContent = 'window.hacked = 1'; "
@@ -169,9 +169,9 @@ def test_a_script_within_the_page_is_refused_by_its_policy(tmp_path, tab):
     page.evaluate("document.body.append(Object.assign(new Image(), {src: 'http://127.0.0.1:9/asked.png'}))")
     page.wait_for_timeout(300)
     assert page.evaluate("window.hacked") is None
-    refused = [said for said in one.wrong if "Content Security Policy" in said]
+    refused = [message for message in first_tab.wrong if "Content Security Policy" in message]
     assert len(refused) >= 3  # the handler, the script and the picture
-    one.wrong.clear()
+    first_tab.wrong.clear()
 
 
 def test_numbers_beyond_a_float_and_odd_meshes_are_words(tmp_path, tab):

@@ -1,4 +1,4 @@
-"""Photographs of a ball, written in each format: the ball is found where it is, however people write it."""
+"""Photographs of a sphere, written in each format and in the variants that people write."""
 
 import json
 import re
@@ -48,7 +48,7 @@ from tests.made_photographs import (
 from tests.tiny import camera_of
 
 FEW = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=5, deadline=None)
-SPHERES = {"IDR/NeuS": (CENTRE + 0.05, 0.5), "DVR": (CENTRE, 0.9 * 0.75**0.5)}  # of their scale_mat
+SCALE_MAT_SPHERES = {"IDR/NeuS": (CENTRE + 0.05, 0.5), "DVR": (CENTRE, 0.9 * 0.75**0.5)}
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -57,46 +57,45 @@ def test_cameras_are_those_that_were_written(tmp_path, name):
     capture = read_capture(tmp_path, READ)
     middle = (SIZE[1] / 2, SIZE[0] / 2) if name == "LLFF" else MIDDLE
     assert (capture.format, len(capture.shots)) == (name, 10) and off(capture, middle) < 0.01
-    assert capture.notes == ()
-    assert name in capture.summary and "48 x 40 pixels, masks from" in capture.summary
+    assert capture.notes == () and name in capture.summary and "48 x 40 pixels, masks from" in capture.summary
     expected = torch.tensor([[FOCAL, 0, middle[0]], [0, FOCAL, middle[1]], [0, 0, 1]])
     for shot in capture.shots:
         torch.testing.assert_close(shot.camera.intrinsics, expected, rtol=0, atol=1e-3)
-    if name in SPHERES:
-        centre, radius = SPHERES[name]
+    if name in SCALE_MAT_SPHERES:
+        centre, radius = SCALE_MAT_SPHERES[name]
         assert [*capture.sphere.centre, capture.sphere.radius] == pytest.approx([*centre, radius])
     if name == "DVR":
         assert capture.shots[2].depth.unique().tolist() == pytest.approx([1.25 / capture.sphere.radius])
 
 
-def test_the_ball_is_where_it_is_and_its_hull_no_smaller(tmp_path):
+def test_the_hull_contains_the_sphere_closely(tmp_path):
     nerf(tmp_path)
     capture = read_capture(tmp_path, READ)
     hull = hull_mesh(capture.shots, 64)
     assert hull is not None and hull.watertight
     vertices = hull.vertices * capture.sphere.radius + capture.sphere.centre - CENTRE
     distances = np.linalg.norm(vertices, axis=1)
-    assert np.abs(distances - RADIUS).max() < 0.06  # a pixel is .025 wide there
+    assert np.abs(distances - RADIUS).max() < 0.06  # a pixel is 0.025 wide there
     assert distances.min() > RADIUS - 0.02 and np.abs(vertices.mean(axis=0)).max() < 0.02
     assert np.linalg.norm(capture.sphere.centre - CENTRE) + RADIUS < capture.sphere.radius < 1.4 * RADIUS
-    for shot, seen in zip(capture.shots, capture.fit.silhouettes, strict=True):
-        assert (torch.from_numpy(seen) & shot.mask).sum() > 0.9 * shot.mask.sum()
+    for shot, silhouette in zip(capture.shots, capture.fit.silhouettes, strict=True):
+        assert (torch.from_numpy(silhouette) & shot.mask).sum() > 0.9 * shot.mask.sum()
 
 
-@each("share", [0.005, 0.3, 0.7])
-def test_the_hull_is_half_less_the_least_mask_between_pixels(share):
-    """Four photographs from one place show one half; a point lies between the last column of it and the next."""
+@each("offset", [0.005, 0.3, 0.7])
+def test_the_hull_interpolates_masks_between_pixels(offset):
+    """Four equal masks show the left half. The point lies between the last column of the mask and the next column."""
     camera = camera_of(16)
     mask = torch.arange(16).expand(16, 16) < 8
-    shots = [Shot(str(place), camera, torch.zeros(16, 16, 3), mask) for place in range(4)]
+    shots = [Shot(str(number), camera, torch.zeros(16, 16, 3), mask) for number in range(4)]
     focal, middle = camera.intrinsics[0, 0], camera.intrinsics[0, 2]
-    across = (8.5 - share - middle) / focal  # of a point at depth 1
-    seen = torch.tensor([across, 0.0, 1.0])
-    point = camera.camera_to_world[:3, :3] @ seen + camera.camera_to_world[:3, 3]
-    assert carve(shots, point[None]).item() == pytest.approx(0.5 - share, abs=1e-5)
+    across = (8.5 - offset - middle) / focal  # at depth 1
+    in_camera = torch.tensor([across, 0.0, 1.0])
+    point = camera.camera_to_world[:3, :3] @ in_camera + camera.camera_to_world[:3, 3]
+    assert carve(shots, point[None]).item() == pytest.approx(0.5 - offset, abs=1e-5)
 
 
-def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):
+def test_without_masks_the_sphere_is_around_the_common_target_of_the_cameras(tmp_path):
     middlebury(tmp_path)
     capture = read_capture(tmp_path, PLAIN)
     assert all(shot.mask is None for shot in capture.shots) and capture.masks == "" and "no masks" in capture.summary
@@ -104,7 +103,7 @@ def test_without_masks_the_sphere_is_about_what_the_cameras_look_at(tmp_path):
     assert capture.sphere.radius == pytest.approx(1.5 * 20 / FOCAL, rel=1e-3)
 
 
-def test_cameras_in_parallel_have_their_sphere_in_the_range_of_depths(tmp_path):
+def test_parallel_cameras_have_their_sphere_in_the_range_of_depths(tmp_path):
     llff(tmp_path)
     rows = np.load(tmp_path / "poses_bounds.npy")
     for i, row in enumerate(rows):
@@ -120,19 +119,18 @@ def test_cameras_in_parallel_have_their_sphere_in_the_range_of_depths(tmp_path):
 
 @FEW
 @given(st.floats(-7e6, 7e6))
-def test_a_far_world_is_read_as_exactly_and_led_back_to(tmp_path, away):
+def test_a_world_far_from_the_origin_is_read_exactly(tmp_path, away):
     nerf(tmp_path)
     moved(tmp_path, lambda matrix: matrix + away * np.outer((1, 1, 1, 0), (0, 0, 0, 1)))
     capture = read_capture(tmp_path, READ if abs(away) > 1e6 else PLAIN)
-    assert off(capture, away=away) < 0.01
-    assert np.abs(capture.to_world[:3, 3] - away - CENTRE).max() < 0.1
+    assert off(capture, away=away) < 0.01 and np.abs(capture.to_world[:3, 3] - away - CENTRE).max() < 0.1
     assert ", ".join(str(float(value)) for value in capture.sphere.centre) in capture.summary
 
 
 # Pictures
 
 
-def test_a_photograph_is_made_smaller_with_its_camera_and_never_larger(tmp_path):
+def test_photographs_are_reduced_with_their_cameras_and_never_enlarged(tmp_path):
     nerf(tmp_path)
     small, large = (read_capture(tmp_path, ReadSettings(longest)) for longest in (24, 4096))
     assert large.notes == ("the photographs have at most 48 pixels, not 4096",) and small.notes == ()
@@ -141,29 +139,29 @@ def test_a_photograph_is_made_smaller_with_its_camera_and_never_larger(tmp_path)
     assert large.shots[0].colours[0, 0].tolist() == [1.0, 1.0, 1.0]  # transparent is white
 
 
-BENT = (
+DISTORTIONS = (
     {"k1": 0.15, "k2": -0.08, "p1": 0.03, "p2": -0.05},
     {"k1": 0.1, "k2": 0.05, "k3": -0.1, "k4": 0.2, "k5": 0.05, "k6": 0.01, "camera_model": "FULL_OPENCV"},
     {"k1": 0.05, "k2": -0.01, "k3": 0.02, "k4": 0.01, "is_fisheye": True},
 )
 
 
-@each("bent", BENT)
-def test_distortion_is_taken_out(tmp_path, bent):
-    """Each pixel of a ramp says where it was taken from; test_lenses.py has the places against OpenCV."""
+@each("distortion", DISTORTIONS)
+def test_distortion_is_removed(tmp_path, distortion):
+    """The colours of a ramp encode their positions; test_lenses.py compares the distortion with OpenCV."""
     side = 60
     rows, columns = np.mgrid[:side, :side] + 0.5
     ramp = np.dstack([4 * columns, 4 * rows, 0 * rows]).astype(np.uint8)
     Image.fromarray(ramp).save(tmp_path / "0.png")
-    stored = {"fl_x": 50.0, "fl_y": 48.0, "cx": 31.0, "cy": 28.0, "w": side, "h": side, **bent}
+    stored = {"fl_x": 50.0, "fl_y": 48.0, "cx": 31.0, "cy": 28.0, "w": side, "h": side, **distortion}
     frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({**stored, "frames": [frame]}))
     read = find_layout(tmp_path).frames[0]
-    found = read_shot(read, side).colours.numpy()[..., :2] * 255 / 4
-    places = np.dstack(read.lens.distort((columns - 31) / 50, (rows - 28) / 48)) * [50, 48] + [31, 28]
-    inside = ((places > 1) & (places < side - 1)).all(axis=-1)
-    assert inside.mean() > 0.7 and np.abs(places - np.dstack([columns, rows]))[inside].max() > 1
-    np.testing.assert_allclose(found[inside], places[inside], atol=0.01)
+    sampled = read_shot(read, side).colours.numpy()[..., :2] * 255 / 4
+    distorted = np.dstack(read.lens.distort((columns - 31) / 50, (rows - 28) / 48)) * [50, 48] + [31, 28]
+    inside = ((distorted > 1) & (distorted < side - 1)).all(axis=-1)
+    assert inside.mean() > 0.7 and np.abs(distorted - np.dstack([columns, rows]))[inside].max() > 1
+    np.testing.assert_allclose(sampled[inside], distorted[inside], atol=0.01)
 
 
 def test_images_of_16_bits_and_of_floats_are_read(tmp_path):
@@ -171,14 +169,14 @@ def test_images_of_16_bits_and_of_floats_are_read(tmp_path):
     plain = read_capture(tmp_path, READ)
     picture = Image.open(tmp_path / "image" / "000002.png")
     Image.fromarray(np.asarray(picture.convert("L")).astype(np.uint16) * 257).save(tmp_path / "image" / "000002.png")
-    found = read_capture(tmp_path, READ)
+    capture = read_capture(tmp_path, READ)
     grey = plain.shots[2].colours @ torch.tensor([0.299, 0.587, 0.114])
-    torch.testing.assert_close(found.shots[2].colours[..., 0], grey, rtol=0, atol=0.01)
+    torch.testing.assert_close(capture.shots[2].colours[..., 0], grey, rtol=0, atol=0.01)
     Image.fromarray(np.full(SIZE, 0.5, np.float32)).save(tmp_path / "a.tiff")
     assert np.abs(read_image(tmp_path / "a.tiff", None, 48)[0] - 0.5).max() < 0.01
 
 
-def test_an_alpha_channel_that_is_opaque_is_no_mask(tmp_path):
+def test_an_opaque_alpha_channel_is_no_mask(tmp_path):
     nerf(tmp_path)
     repainted([*(tmp_path / "train").iterdir()], lambda pixels: np.dstack([pixels[..., :3], np.full(SIZE, 255)]))
     assert read_capture(tmp_path, READ).masks == ""
@@ -189,15 +187,15 @@ COLOUR = st.just((255, 255, 255)) | st.tuples(*[st.sampled_from([0, 90, 180, 255
 
 @FEW
 @given(st.lists(COLOUR, min_size=2, max_size=2), st.booleans())
-def test_a_mask_is_all_that_is_not_background(tmp_path, colours, alpha):
+def test_a_mask_is_each_colour_except_the_background(tmp_path, colours, alpha):
     mask = image(cameras()[0])[1]
     inside, left = np.asarray(mask) > 0, np.arange(SIZE[1])[None] < SIZE[1] / 2
     painted = np.where(left[..., None], colours[0], colours[1]) * inside[..., None]
     painted = np.dstack([painted, np.full(SIZE, 255)]) if alpha else painted
     Image.fromarray(painted.astype(np.uint8)).save(tmp_path / "mask.png")
     image(cameras()[0])[0].save(tmp_path / "image.png")
-    found = read_image(tmp_path / "image.png", tmp_path / "mask.png", 48)[1]
-    assert found is not None and ((found[..., 0] > 0.5) == inside).all()
+    mask_read = read_image(tmp_path / "image.png", tmp_path / "mask.png", 48)[1]
+    assert mask_read is not None and ((mask_read[..., 0] > 0.5) == inside).all()
 
 
 def test_images_of_two_sizes_each_have_their_camera(tmp_path):
@@ -205,7 +203,7 @@ def test_images_of_two_sizes_each_have_their_camera(tmp_path):
     for name in ("image/000003.png", "mask/003.png"):
         Image.open(tmp_path / name).resize((24, 20)).save(tmp_path / name)
     half = np.diag([0.5, 0.5, 1.0, 1.0])
-    rewritten(tmp_path / "cameras_sphere.npz", lambda known: known | {"world_mat_3": half @ known["world_mat_3"]})
+    rewritten(tmp_path / "cameras_sphere.npz", lambda arrays: arrays | {"world_mat_3": half @ arrays["world_mat_3"]})
     assert "24 x 20 and 48 x 40 pixels" in read_capture(tmp_path, READ).summary
 
 
@@ -213,24 +211,27 @@ def test_images_of_two_sizes_each_have_their_camera(tmp_path):
     "size, same",
     [((400, 300), True), ((401, 300), True), ((133, 100), True), ((400, 297), False), ((4000, 2975), False)],
 )
-def test_a_cropped_image_is_no_smaller_one(size, same):
+def test_a_cropped_image_has_another_aspect(size, same):
     assert _same_aspect(size, (3000, 4000)) == same
 
 
 @each("tag, turn", [*((tag, None) for tag in range(2, 9)), (6, Image.Transpose.ROTATE_90)])
-def test_pixels_are_used_as_stored_or_turned_where_cameras_have_that_size(tmp_path, tag, turn):
-    """A tag of 6 says "turn it by 90 degrees clockwise"."""
+def test_pixels_are_used_as_stored_or_rotated_if_cameras_have_that_size(tmp_path, tag, turn):
+    """A tag of 6 means "rotate by 90 degrees clockwise"."""
     nerf(tmp_path)
     plain, exif = read_capture(tmp_path, PLAIN), Image.Exif()
     exif[ExifTags.Base.Orientation] = tag
     for file in (tmp_path / "train").iterdir():
         picture = Image.open(file)
         (picture if turn is None else picture.transpose(turn)).save(file, exif=exif)
-    found = read_capture(tmp_path, PLAIN)
-    assert all(torch.equal(one.colours, other.colours) for one, other in zip(found.shots, plain.shots, strict=True))
+    capture = read_capture(tmp_path, PLAIN)
+    assert all(
+        torch.equal(actual.colours, expected.colours)
+        for actual, expected in zip(capture.shots, plain.shots, strict=True)
+    )
     stored = "have a tag of orientation (EXIF), and are used as stored, as cameras are"
-    told = "are turned by their tag (EXIF), since their cameras have that size" if turn is not None else stored
-    assert found.notes == (f"10 photographs {told}",)
+    action = "are turned by their tag (EXIF), since their cameras have that size" if turn is not None else stored
+    assert capture.notes == (f"10 photographs {action}",)
 
 
 # Names and pairs
@@ -255,16 +256,16 @@ def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
     assert (tmp_path / "a" / "b.png").is_file()
 
 
-def test_photographs_that_show_a_part_of_the_hull_are_told(tmp_path, capsys, monkeypatch):
+def test_photographs_that_show_a_part_of_the_hull_have_a_note(tmp_path, capsys, monkeypatch):
     nerf(tmp_path)
     monkeypatch.setattr(
-        own_photographs, "measure_mask_fit", lambda *given: replace(measure_mask_fit(*given), shown=(0.7,))
+        own_photographs, "measure_mask_fit", lambda *arguments: replace(measure_mask_fit(*arguments), shown=(0.7,))
     )
     assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
     assert "note: the photographs show 70% of the object (median): cameras" in capsys.readouterr().out
 
 
-def test_cameras_of_other_images_are_refused_unless_that_is_asked_for(tmp_path):
+def test_cameras_of_other_images_are_refused_except_with_unchecked(tmp_path):
     idr(tmp_path)
     for i, file in enumerate(sorted((tmp_path / "mask").iterdir())):
         repainted([file], lambda mask, i=i: np.roll(mask, 11 * (-1) ** i, axis=1))
@@ -274,13 +275,13 @@ def test_cameras_of_other_images_are_refused_unless_that_is_asked_for(tmp_path):
     assert "cameras may be those of other images" in capture.notes[-1]
 
 
-def test_other_cameras_in_the_folder_do_not_matter_and_are_told(tmp_path):
+def test_other_cameras_in_the_folder_are_named_in_a_note(tmp_path):
     nerf(tmp_path)
-    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))  # broken ones
-    np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))  # without images
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))  # broken cameras
+    np.savez(tmp_path / "cameras.npz", world_mat_0=np.eye(4))  # cameras without images
     layout = find_layout(tmp_path)
-    told = "other cameras in the folder are not used: cameras.npz, poses_bounds.npy"
-    assert layout.format == "NeRF" and layout.notes == (told,)
+    note = "other cameras in the folder are not used: cameras.npz, poses_bounds.npy"
+    assert layout.format == "NeRF" and layout.notes == (note,)
 
 
 # NeRF's files
@@ -292,9 +293,9 @@ def test_masks_that_transforms_json_does_not_name_are_used(tmp_path):
     white[:, :2] = 0
     shutil.copytree(tmp_path / "train", tmp_path / "masks")
     repainted([*(tmp_path / "masks").iterdir()], lambda _: white)
-    own = read_capture(tmp_path, READ)
-    assert any("does not name it" in note for note in own.notes)
-    assert all(shot.mask.float().mean() > 0.9 for shot in own.shots)
+    capture = read_capture(tmp_path, READ)
+    assert any("does not name it" in note for note in capture.notes)
+    assert all(shot.mask.float().mean() > 0.9 for shot in capture.shots)
 
 
 def test_fields_of_view_and_matrices_give_focal_lengths(tmp_path):
@@ -302,24 +303,24 @@ def test_fields_of_view_and_matrices_give_focal_lengths(tmp_path):
     angles = [2 * np.arctan(SIZE[1 - i] / 2 / FOCAL) for i in (0, 1)]
     matrix = [[FOCAL, 0, MIDDLE[0], 0], [0, FOCAL, MIDDLE[1], 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     plain = json.loads((tmp_path / "transforms.json").read_text())
-    for way in (
+    for focal_keys in (
         {"camera_angle_x": angles[0], "camera_angle_y": angles[1]},
         {"camera_angle_y": angles[1]},
         {"x_fov": np.degrees(angles[0])},
         {"intrinsic_matrix": matrix},
         {"fl_x": FOCAL, "fl_y": None, "w": None, "h": None},
     ):
-        stored = {key: value for key, value in plain.items() if key not in ("fl_x", "fl_y")} | way
+        stored = {key: value for key, value in plain.items() if key not in ("fl_x", "fl_y")} | focal_keys
         (tmp_path / "transforms.json").write_text(json.dumps(stored))
         capture = read_capture(tmp_path, PLAIN)
         assert off(capture) < 0.01
-        assert any("transforms.json states no w and h" in note for note in capture.notes) == ("w" in way)
+        assert any("transforms.json states no w and h" in note for note in capture.notes) == ("w" in focal_keys)
 
 
 def test_each_frame_has_its_own_camera(tmp_path):
     nerf(tmp_path)
-    own = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-    changed(tmp_path, lambda stored: [frame.update({key: stored[key] for key in own}) for frame in stored["frames"]])
+    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    changed(tmp_path, lambda stored: [frame.update({key: stored[key] for key in keys}) for frame in stored["frames"]])
     top = {"fl_x": 1.0, "fl_y": 1.0, "camera_angle_x": 1.0, "y_fov": 9.0, "intrinsic_matrix": np.eye(3).tolist()}
     changed(tmp_path, lambda stored: stored.update(top, cx=0.0, cy=0.0))
     assert off(read_capture(tmp_path, PLAIN)) < 0.01
@@ -338,14 +339,14 @@ MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])  # x left, y up, z forward
 
 
 @each("axes, flag", [(np.eye(4), {}), (OPENGL, {"from_na": True}), (MITSUBA, {"from_mitsuba": True})])
-def test_flags_tell_of_other_axes(tmp_path, axes, flag):
+def test_flags_of_other_axes_are_read(tmp_path, axes, flag):
     nerf(tmp_path)
     moved(tmp_path, lambda matrix: matrix @ axes)
     changed(tmp_path, lambda stored: stored.update(flag))
     assert off(read_capture(tmp_path, PLAIN)) < 0.01
 
 
-def test_flipped_axes_are_told_and_can_be_turned(tmp_path, capsys):
+def test_flipped_axes_are_reported_and_can_be_set(tmp_path, capsys):
     nerf(tmp_path)
     moved(tmp_path, lambda matrix: matrix @ OPENGL)
     picture = ("--into", str(tmp_path / "photos.png"))
@@ -358,7 +359,7 @@ def test_flipped_axes_are_told_and_can_be_turned(tmp_path, capsys):
 
 @FEW
 @given(st.integers(3, 6))
-def test_few_digits_are_the_nearest_rotation(tmp_path, digits):
+def test_rounded_matrices_become_the_nearest_rotation(tmp_path, digits):
     nerf(tmp_path)
     moved(tmp_path, lambda matrix: matrix.round(digits))
     assert off(read_capture(tmp_path, PLAIN)) < 0.1
@@ -367,11 +368,11 @@ def test_few_digits_are_the_nearest_rotation(tmp_path, digits):
 # Other formats
 
 
-def test_one_scale_is_that_of_all(tmp_path):
+def test_a_single_scale_matrix_holds_for_all_cameras(tmp_path):
     idr(tmp_path)
     rewritten(
         tmp_path / "cameras_sphere.npz",
-        lambda known: {key: one for key, one in known.items() if key[:5] == "world" or key[-2:] == "_0"},
+        lambda arrays: {key: matrix for key, matrix in arrays.items() if key[:5] == "world" or key[-2:] == "_0"},
     )
     capture = read_capture(tmp_path, READ)
     assert off(capture) < 0.01 and "scale_mat_0 is that of all cameras: 9 have none" in capture.notes[0]
@@ -380,16 +381,16 @@ def test_one_scale_is_that_of_all(tmp_path):
 def test_matrices_that_are_not_read_are_named_in_a_note(tmp_path):
     idr(tmp_path)
     more = {"dist_coeffs": [0.1], "world_mat_inv_0": np.eye(4)}
-    rewritten(tmp_path / "cameras_sphere.npz", lambda known: known | more)
+    rewritten(tmp_path / "cameras_sphere.npz", lambda arrays: arrays | more)
     (note,) = read_capture(tmp_path, READ).notes
     assert note.startswith("cameras_sphere.npz has keys that are not read, dist_coeffs: if they describe a lens")
 
 
-def test_intrinsics_beside_whole_cameras_are_neus_own(tmp_path):
+def test_intrinsics_in_a_file_of_neus_are_accepted(tmp_path):
     idr(tmp_path)
     file = tmp_path / "cameras_sphere.npz"
-    own = {f"camera_mat_{i}": np.diag([FOCAL, FOCAL, 1.0, 1.0]) for i in range(10)}
-    rewritten(file, lambda known: known | own)
+    intrinsics = {f"camera_mat_{i}": np.diag([FOCAL, FOCAL, 1.0, 1.0]) for i in range(10)}
+    rewritten(file, lambda arrays: arrays | intrinsics)
     for name in (file.name, "cameras.npz"):
         file = file.rename(tmp_path / name)
         capture = read_capture(tmp_path, READ)
@@ -405,8 +406,8 @@ def test_middlebury_needs_no_count(tmp_path):
 
 @FEW
 @given(st.floats(0, 360), st.floats(-80, 80), st.floats(0.5, 2))
-def test_choys_cameras_are_those_of_his_renderer(azimuth, elevation, distance):
-    """Against the steps of the code that came with the renderings."""
+def test_cameras_of_choy_follow_from_angles(azimuth, elevation, distance):
+    """The reference repeats the steps of the code published with the renderings."""
     across, up = np.radians([-azimuth, -elevation])
     sa, ca, se, ce = np.sin(across), np.cos(across), np.sin(up), np.cos(up)
     world_to_object = np.array([[ca * ce, -sa, ca * se], [sa * ce, ca, sa * se], [-se, 0, ce]]).T
@@ -417,13 +418,13 @@ def test_choys_cameras_are_those_of_his_renderer(azimuth, elevation, distance):
     np.testing.assert_allclose(_from_angles(azimuth, elevation, distance), OPENGL @ expected, atol=1e-12)
 
 
-def test_the_largest_model_is_taken_and_images_without_a_camera_are_named(tmp_path):
+def test_the_largest_model_is_used_and_images_without_a_camera_are_named(tmp_path):
     colmap(tmp_path)
     shutil.copytree(tmp_path / "sparse" / "0", tmp_path / "sparse" / "1")
     lines = (tmp_path / "sparse" / "0" / "images.txt").read_text().splitlines()
     (tmp_path / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:8]) + "\n")
-    for place in ("images", "mask"):
-        shutil.copy(tmp_path / place / "003.png", tmp_path / place / "100.png")
+    for folder in ("images", "mask"):
+        shutil.copy(tmp_path / folder / "003.png", tmp_path / folder / "100.png")
     capture = read_capture(tmp_path, READ)
     assert off(capture) < 0.01 and len(capture.shots) == 10
     assert capture.notes == (
@@ -432,7 +433,7 @@ def test_the_largest_model_is_taken_and_images_without_a_camera_are_named(tmp_pa
     )
 
 
-def test_lines_with_points_quaternions_of_any_length_and_other_ends_of_lines(tmp_path):
+def test_lines_of_points_scaled_quaternions_and_other_line_ends_are_read(tmp_path):
     colmap(tmp_path)
     file = tmp_path / "sparse" / "0" / "images.txt"
     text = file.read_text()

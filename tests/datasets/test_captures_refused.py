@@ -1,4 +1,4 @@
-"""Photographs that cannot be used are refused with the true cause: of each format, what people do wrong."""
+"""Photographs that cannot be used are refused with their cause: common mistakes in each format."""
 
 import re
 import shutil
@@ -29,7 +29,7 @@ from tests.made_photographs import (
 )
 
 Spoil = Callable[[Path], object]
-ONE = slice(4, 5)  # of the files of a folder
+FIFTH = slice(4, 5)
 
 
 def removed(name: str) -> Spoil:
@@ -40,8 +40,8 @@ def copied(name: str, other: str) -> Spoil:
     return lambda folder: shutil.copy(folder / name, folder / other)
 
 
-def written(name: str, content: bytes) -> Spoil:
-    return lambda folder: (folder / name).write_bytes(content)
+def written(name: str, data: bytes) -> Spoil:
+    return lambda folder: (folder / name).write_bytes(data)
 
 
 def cameras(change: Callable[[dict], dict]) -> Spoil:
@@ -52,29 +52,29 @@ def stored(change: Callable[[dict], object]) -> Spoil:
     return lambda folder: changed(folder, change)
 
 
-def fourth(**values) -> Spoil:
-    return stored(lambda known: known["frames"][3].update(values))
+def frame_3(**values) -> Spoil:
+    return stored(lambda data: data["frames"][3].update(values))
 
 
-def every(**values) -> Spoil:
-    return stored(lambda known: [frame.update(values) for frame in known["frames"]])
+def each_frame(**values) -> Spoil:
+    return stored(lambda data: [frame.update(values) for frame in data["frames"]])
 
 
-def placed(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+def poses(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
     return lambda folder: moved(folder, change)
 
 
-def masks(change: Callable[[np.ndarray], np.ndarray], some: slice = slice(None)) -> Spoil:
-    return lambda folder: repainted(sorted((folder / "mask").iterdir())[some], change)
+def masks(change: Callable[[np.ndarray], np.ndarray], selected: slice = slice(None)) -> Spoil:
+    return lambda folder: repainted(sorted((folder / "mask").iterdir())[selected], change)
 
 
 def text(name: str, old: str, new: str) -> Spoil:
-    """Replaces what a pattern matches."""
+    """Replaces the matches of a pattern."""
     return lambda folder: (folder / name).write_text(re.sub(old, new, (folder / name).read_text()))
 
 
-def turned(folder: Path) -> None:
-    """Turns the images, and says so by their tag."""
+def rotated(folder: Path) -> None:
+    """Rotates the images and sets their orientation tag."""
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 8
     for file in (folder / "image").iterdir():
@@ -96,44 +96,44 @@ REFUSED = {
         (written("image/000003.png", POINTER), FETCH),
         (written(MATRICES, POINTER), FETCH),
         (removed("image/000004.png"), r"10 cameras, number 0 to 9, and there are 9 images \(000000.png, .*missing"),
-        (masks(lambda mask: mask > 0, ONE), "mask/004.png has values up to 1, as labels do: write 255"),
+        (masks(lambda mask: mask > 0, FIFTH), "mask/004.png has values up to 1, as labels do: write 255"),
         (masks(lambda mask: mask // 2), "mask/000.png has values up to 127, as labels do"),
         (removed("mask/004.png"), r"000004.png has no mask in.*9 masks \(000.png.*add it"),
         (lambda f: Image.new("L", (10, 10)).save(f / "mask/004.png"), "004.png has 10 x 10 pixels, its image 48 x 40"),
-        (turned, r"a mask has the size of its image; the image's tag of orientation \(EXIF\)"),
-        (masks(np.zeros_like, ONE), "the mask of 000004.png is empty.*use no masks"),
-        (masks(lambda mask: 255 - mask, ONE), "1 of the masks, such as that of 000004.png.* white along the border"),
+        (rotated, r"a mask has the size of its image; the image's tag of orientation \(EXIF\)"),
+        (masks(np.zeros_like, FIFTH), "the mask of 000004.png is empty.*use no masks"),
+        (masks(lambda mask: 255 - mask, FIFTH), "1 of the masks, such as that of 000004.png.* white along the border"),
         (masks(lambda mask: 255 - mask), "10 of the masks.* are white along the border, as inverted ones"),
         (masks(lambda mask: 0 * mask + 255), "the masks are white everywhere"),
-        (cameras(lambda known: dict.fromkeys(known, np.full((4, 4), np.nan))), "world_mat_0 must have finite numbers"),
-        (cameras(lambda known: {key: known[key] for key in [*known][1:]}), f"{MATRICES} has no world_mat_0.*export"),
-        (cameras(lambda known: known | {"scale_mat_0": FLAT}), "scale_mat_0 must scale all axes alike"),
-        (cameras(lambda known: known | {"scale_mat_3": np.eye(4)}), "scale_mat_3 differs from scale_mat_0"),
-        (cameras(lambda known: {key: WIDE @ one if key[0] == "w" else one for key, one in known.items()}), "2.1 times"),
+        (cameras(lambda data: dict.fromkeys(data, np.full((4, 4), np.nan))), "world_mat_0 must have finite numbers"),
+        (cameras(lambda data: {key: data[key] for key in [*data][1:]}), f"{MATRICES} has no world_mat_0.*export"),
+        (cameras(lambda data: data | {"scale_mat_0": FLAT}), "scale_mat_0 must scale all axes alike"),
+        (cameras(lambda data: data | {"scale_mat_3": np.eye(4)}), "scale_mat_3 differs from scale_mat_0"),
+        (cameras(lambda data: {key: WIDE @ m if key[0] == "w" else m for key, m in data.items()}), "2.1 times"),
     ],
     llff: [(written("poses_bounds.npy", POINTER), FETCH)],
     nerf: [
         (written("transforms.json", POINTER), FETCH),
-        (every(mask_path="train/r_0.png"), "train/r_0.png is the mask of several images"),
-        (stored(lambda known: known.pop("frames")), "transforms.json has no frames"),
-        (stored(lambda known: known["frames"].append(known["frames"][0])), "has ./train/r_0 twice"),
-        (stored(lambda known: known["frames"][3].pop("file_path")), "a frame has no file_path"),
-        (fourth(file_path=None), "a frame has no file_path"),
-        (fourth(transform_matrix=None), "r_3 has no transform_matrix"),
-        (fourth(transform_matrix=np.zeros((4, 4)).tolist()), "r_3: transform_matrix must be invertible"),
-        (fourth(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()), "r_3.png must have a rotation, but .* mirrors"),
-        (fourth(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "r_3.png must .* its axes have lengths 0.5"),
-        (placed(lambda matrix: matrix[:2, :2]), "must be 4 x 4, not 2 x 2"),
-        (placed(np.transpose), "r_0: transform_matrix must have 0 0 0 1 as its .*: it may be transposed; export it"),
-        (placed(lambda matrix: np.vstack([np.c_[matrix[:3, :3], [2.0] * 3], matrix[3]])),
+        (each_frame(mask_path="train/r_0.png"), "train/r_0.png is the mask of several images"),
+        (stored(lambda data: data.pop("frames")), "transforms.json has no frames"),
+        (stored(lambda data: data["frames"].append(data["frames"][0])), "has ./train/r_0 twice"),
+        (stored(lambda data: data["frames"][3].pop("file_path")), "a frame has no file_path"),
+        (frame_3(file_path=None), "a frame has no file_path"),
+        (frame_3(transform_matrix=None), "r_3 has no transform_matrix"),
+        (frame_3(transform_matrix=np.zeros((4, 4)).tolist()), "r_3: transform_matrix must be invertible"),
+        (frame_3(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()), "r_3.png must have a rotation, but .* mirrors"),
+        (frame_3(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "r_3.png must .* its axes have lengths 0.5"),
+        (poses(lambda matrix: matrix[:2, :2]), "must be 4 x 4, not 2 x 2"),
+        (poses(np.transpose), "r_0: transform_matrix must have 0 0 0 1 as its .*: it may be transposed; export it"),
+        (poses(lambda matrix: np.vstack([np.c_[matrix[:3, :3], [2.0] * 3], matrix[3]])),
          r"all 10 cameras, of r_0.png to r_9.png, are at one place, \(2, 2, 2\)"),
-        (stored(lambda known: known.update(w=0, h=0)), r"must be of one pixel or more, not \(0, 0\)"),
-        (stored(lambda known: known.pop("h")), "r_0 has no h"),
-        (stored(lambda known: [known.pop(key) for key in ("fl_x", "fl_y")]), "r_0 has no focal length: give fl_x"),
-        (fourth(fl_x=60.0, camera_angle_x=0.5), r"r_3: focal lengths differ, 60 pixels by fl_x, 93\.9\d* pixels by c"),
-        (every(camera_angle_x=39.6), "between 0 and pi, not 39.6: it is in radians"),
-        (every(intrinsic_matrix=TRANSPOSED), "transposed"),
-        (every(intrinsic_matrix=np.ravel(TRANSPOSED).tolist()), "must be 3 x 3"),
+        (stored(lambda data: data.update(w=0, h=0)), r"must be of one pixel or more, not \(0, 0\)"),
+        (stored(lambda data: data.pop("h")), "r_0 has no h"),
+        (stored(lambda data: [data.pop(key) for key in ("fl_x", "fl_y")]), "r_0 has no focal length: give fl_x"),
+        (frame_3(fl_x=60.0, camera_angle_x=0.5), r"r_3: focal lengths differ, 60 pixels by fl_x, 93\.9\d* pixels by c"),
+        (each_frame(camera_angle_x=39.6), "between 0 and pi, not 39.6: it is in radians"),
+        (each_frame(intrinsic_matrix=TRANSPOSED), "transposed"),
+        (each_frame(intrinsic_matrix=np.ravel(TRANSPOSED).tolist()), "must be 3 x 3"),
     ],
     middlebury: [
         (lambda folder: renamed(folder / "mask", "mask{}.png".format),
@@ -148,15 +148,15 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("write, spoil, words", [(write, *row) for write, rows in REFUSED.items() for row in rows])
-def test_what_cannot_be_used_is_told_in_one_line(tmp_path, write, spoil, words):
+def test_unusable_photographs_are_refused_in_one_line(tmp_path, write, spoil, words):
     write(tmp_path)
     spoil(tmp_path)
-    with pytest.raises(BadInput, match=words) as caught:
+    with pytest.raises(BadInput, match=words) as error:
         read_capture(tmp_path, READ)
-    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(error.value).splitlines()) == 1
 
 
-def test_without_masks_nothing_is_said_of_them_and_less_can_be_known(tmp_path):
+def test_without_masks_missing_masks_are_accepted_and_parallel_cameras_refused(tmp_path):
     idr(tmp_path)
     (tmp_path / "mask" / "004.png").unlink()
     assert read_capture(tmp_path, PLAIN).masks == ""

@@ -1,4 +1,4 @@
-"""Colours of mesh files: textures, materials and vertices, on the file's shape and on its deformations."""
+"""Colours of mesh files: textures, materials and vertices, on the shape and on its deformations."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ RAMP = np.linspace(0, 255, 256).round().astype(np.uint8)
 
 
 def textured(folder: Path, suffix: str) -> Path:
-    """A box whose texture gives red by u, which is x, and green by v, which is y; vertices are split as at a seam."""
+    """A box whose texture is red by u, which is x, and green by v, which is y. Vertices are split as at a seam."""
     box = trimesh.creation.box((1.0, 0.8, 0.6))
     corners = np.asarray(box.vertices)[np.asarray(box.faces)].reshape(-1, 3)
     image = np.zeros((256, 256, 3), np.uint8)
@@ -36,7 +36,7 @@ def shapes(path: Path) -> LocalMeshes:
 
 
 @each("suffix", ["obj", "glb"])
-def test_a_texture_is_seen_on_the_shape_and_goes_with_its_deformations(tmp_path, suffix):
+def test_a_texture_follows_the_shape_and_its_deformations(tmp_path, suffix):
     dataset = shapes(textured(tmp_path, suffix))
     rest = dataset.mesh(Split.TRAIN, 0)
     surface = sample_surface(rest, 300, seed=0)
@@ -47,8 +47,8 @@ def test_a_texture_is_seen_on_the_shape_and_goes_with_its_deformations(tmp_path,
     assert texture.texels == 256 * 256
     bent = dataset.mesh(Split.TEST, 3)
     centres, moved = (mesh.vertices[mesh.faces].mean(axis=1) for mesh in (rest, bent))
-    own = dataset.texture(Split.TEST, 3)(moved, moved)
-    assert np.abs(own - texture(centres, centres)).max() < 0.01
+    bent_colours = dataset.texture(Split.TEST, 3)(moved, moved)
+    assert np.abs(bent_colours - texture(centres, centres)).max() < 0.01
     assert np.abs(moved - centres).max() > 0.02
 
 
@@ -67,7 +67,7 @@ def test_without_an_image_the_colours_are_those_of_vertices_or_of_the_material(t
         assert texture.texels == 0
 
 
-def test_an_obj_has_each_face_in_its_material_also_where_polygons_are_concave(tmp_path):
+def test_each_face_of_an_obj_has_its_material_also_concave_polygons(tmp_path):
     image = np.zeros((256, 256, 3), np.uint8)
     image[..., 0], image[..., 1] = RAMP, RAMP[::-1, None]
     Image.fromarray(image).save(tmp_path / "map #1.png")
@@ -76,27 +76,27 @@ def test_an_obj_has_each_face_in_its_material_also_where_polygons_are_concave(tm
     arrow = "v 0 0 0\nv 1 1 0\nv 0 .25 0\nv -1 1 0\n"  # concave at its third corner
     pinned = "vt .5 0\nvt 1 1\nvt .5 .25\nvt 0 1\n"
     lines = ["mtllib a.mtl", "mtllib b.mtl", arrow, pinned, "usemtl Paint #2", "f -4/-4 -3/-3 -2/-2 -1/-1"]
-    lines += ["vt 0 0"]  # numbers below zero count back from the last one so far
-    for number, name in enumerate(("Paint #1", "blue", "Paint #2")):  # the last has no texture coordinates
+    lines += ["vt 0 0"]  # negative numbers count back from the last line before
+    for number, name in enumerate(("Paint #1", "blue", "Paint #2")):  # the last face has no texture coordinates
         lines += [arrow.replace(" 0\n", f" {number + 1}\n"), f"usemtl {name}", "f -4 -3 -2 -1"]
     path = tmp_path / "arrows.obj"
     path.write_text("\n".join(lines))
     mesh = read_mesh(path)
     texture = FileColours(path, mesh, mesh)
-    places = np.array([(0.0, 0.1, 0), (0.5, 0.6, 0), (-0.5, 0.6, 0), (-0.9, 0.92, 0)])
-    across = np.c_[places[:, 0] / 2 + 0.5, places[:, 1], np.zeros(4)]
-    assert texture(places, places) == pytest.approx(across, abs=0.005)
+    points = np.array([(0.0, 0.1, 0), (0.5, 0.6, 0), (-0.5, 0.6, 0), (-0.9, 0.92, 0)])
+    across = np.c_[points[:, 0] / 2 + 0.5, points[:, 1], np.zeros(4)]
+    assert texture(points, points) == pytest.approx(across, abs=0.005)
     for height, colour in enumerate([(0, 1, 0), (0, 0, 1), (1, 1, 1)], start=1):
-        assert texture(places + np.array([0, 0, height]), places) == pytest.approx(np.tile(colour, (4, 1)))
+        assert texture(points + np.array([0, 0, height]), points) == pytest.approx(np.tile(colour, (4, 1)))
     assert texture.texels == 256 * 256
 
 
-def test_what_has_no_colours_or_lacks_a_file_is_an_error_that_says_so(tmp_path):
+def test_missing_colours_and_missing_files_are_errors(tmp_path):
     trimesh.creation.box().export(tmp_path / "plain.ply")
     with pytest.raises(BadInput, match=r"plain.ply' has no colours.* export it with its materials"):
         shapes(tmp_path / "plain.ply").texture(Split.TRAIN, 0)
     path = textured(tmp_path, "obj")
-    whole = shapes(path).identity()
+    identity = shapes(path).identity()
     (image,) = tmp_path.glob("*.png")
     content = image.read_bytes()
     image.write_bytes(content[:100])
@@ -106,7 +106,7 @@ def test_what_has_no_colours_or_lacks_a_file_is_an_error_that_says_so(tmp_path):
     image.rename(tmp_path / "elsewhere")
     with pytest.raises(BadInput, match=f"names '{image.name}', which is not there: put it at"):
         shapes(path).texture(Split.TRAIN, 0)
-    assert shapes(path).identity() != whole
+    assert shapes(path).identity() != identity
 
 
 def test_a_changed_texture_is_another_run(tmp_path):

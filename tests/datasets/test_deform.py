@@ -1,4 +1,4 @@
-"""Deformations: seeded, the identity at strength 0, smooth and never folding."""
+"""Deformations: seeded, the identity at strength 0, smooth and without folds."""
 
 import numpy as np
 import pytest
@@ -12,30 +12,27 @@ BALL = icosphere(1.0, subdivisions=2).vertices
 
 def jacobians(deformation: Deformation, points: np.ndarray) -> np.ndarray:
     step = 1e-5
-    moves = step * np.eye(3)
-    columns = [(deformation.apply(points + move) - deformation.apply(points - move)) / (2 * step) for move in moves]
+    steps = step * np.eye(3)
+    columns = [(deformation.apply(points + shift) - deformation.apply(points - shift)) / (2 * step) for shift in steps]
     return np.stack(columns, axis=-1)
 
 
 def test_strength_zero_is_the_identity_and_strength_scales_the_same_kind():
     assert np.array_equal(Deformation.draw(5, 0.0).apply(BALL), BALL)
     weak, strong = Deformation.draw(5, 0.5), Deformation.draw(5, 1.0)
-    assert strong == Deformation.draw(5, 1.0)
-    assert 0.05 < np.abs(strong.apply(BALL) - BALL).max() < 1
-    assert weak.twist == pytest.approx(strong.twist / 2)
-    assert weak.twist_axis == strong.twist_axis
+    assert strong == Deformation.draw(5, 1.0) and 0.05 < np.abs(strong.apply(BALL) - BALL).max() < 1
+    assert weak.twist == pytest.approx(strong.twist / 2) and weak.twist_axis == strong.twist_axis
 
 
 def test_the_parameters_fill_their_ranges():
     drawn = [Deformation.draw(seed) for seed in range(200)]
     for values, limit in [
-        ([one.stretch for one in drawn], MAX_LOG_SCALE),
-        ([one.taper for one in drawn], MAX_TAPER),
-        ([one.twist for one in drawn], MAX_TWIST_RADIANS),
+        ([deformation.stretch for deformation in drawn], MAX_LOG_SCALE),
+        ([deformation.taper for deformation in drawn], MAX_TAPER),
+        ([deformation.twist for deformation in drawn], MAX_TWIST_RADIANS),
     ]:
-        assert 0.95 * limit < np.max(values) <= limit
-        assert -limit <= np.min(values) < -0.95 * limit
-    assert {one.twist_axis for one in drawn} == {0, 1, 2}
+        assert 0.95 * limit < np.max(values) <= limit and -limit <= np.min(values) < -0.95 * limit
+    assert {deformation.twist_axis for deformation in drawn} == {0, 1, 2}
 
 
 def test_orientation_is_kept_in_the_unit_sphere():

@@ -1,4 +1,4 @@
-"""The procedural families as they are shipped in conf/shapes.yaml."""
+"""The procedural families in conf/shapes.yaml."""
 
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -29,11 +29,11 @@ def sofa() -> Family:
 
 
 def inside(family: Family, parameters: dict[str, float], points: torch.Tensor) -> torch.Tensor:
-    """Which points are inside the shape, before it is scaled."""
+    """The points inside the shape before it is scaled, as booleans."""
     return BUILDERS[family.name](SimpleNamespace(**parameters))(points) < 0
 
 
-def test_every_builder_is_configured_under_its_own_name():
+def test_each_builder_is_configured_under_its_name():
     assert sorted(BUILDERS) == NAMES
 
 
@@ -41,8 +41,7 @@ def test_every_builder_is_configured_under_its_own_name():
 def test_shapes_are_closed_solids_that_touch_their_sphere_and_always_the_same(family):
     meshes = [family.mesh(split, 0) for split in Split]
     for mesh in meshes:
-        assert mesh.watertight
-        assert mesh.volume > 0.02
+        assert mesh.watertight and mesh.volume > 0.02
         assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(family.radius, abs=1e-9)
         assert (mesh.vertices.max(0) + mesh.vertices.min(0)) == pytest.approx([0, 0, 0], abs=1e-9)
     assert len({round(mesh.volume, 9) for mesh in meshes}) == 3
@@ -53,10 +52,9 @@ def test_shapes_are_closed_solids_that_touch_their_sphere_and_always_the_same(fa
 def test_draws_fill_their_ranges_and_no_two_are_alike(family):
     drawn = [family.draw(split, index) for split in Split for index in range(100)]
     for name, (low, high) in family.ranges.items():
-        values = np.array([one[name] for one in drawn])
+        values = np.array([parameters[name] for parameters in drawn])
         assert low <= values.min() < low + 0.05 * (high - low)
-        assert high >= values.max() > high - 0.05 * (high - low)
-        assert len(np.unique(values)) == len(drawn)
+        assert high >= values.max() > high - 0.05 * (high - low) and len(np.unique(values)) == len(drawn)
 
 
 @by_family
@@ -79,7 +77,7 @@ def test_shapes_stay_clear_of_the_sampled_cube(family):
 
 
 def corners(family: Family, n: int) -> list[dict[str, float]]:
-    """Parameters at random ends of their ranges; the first has all at their largest values."""
+    """Parameters at random ends of their ranges; the first set has the largest values."""
     draw = np.random.default_rng(0)
     ends = [np.ones(len(family.ranges), dtype=int), *draw.integers(0, 2, (n - 1, len(family.ranges)))]
     return [{name: family.ranges[name][end] for name, end in zip(family.ranges, row, strict=True)} for row in ends]
@@ -97,19 +95,19 @@ def test_a_formula_is_nowhere_steeper_than_its_bound(family):
         assert field.lipschitz <= 1 or field.kind is Kind.LEVEL
 
 
-def test_parts_share_no_seed():
+def test_splits_share_no_seed():
     first_and_last = [seed_of(split, index) for split in Split for index in (0, 1, SPLIT_STRIDE - 1)]
     assert len(set(first_and_last)) == len(first_and_last)
     ordered = sorted(first_and_last)
     for split in Split:
         low, high = seed_of(split, 0), seed_of(split, SPLIT_STRIDE - 1)
-        assert ordered.index(high) - ordered.index(low) == 2  # no seed of another part lies between
+        assert ordered.index(high) - ordered.index(low) == 2  # no seed of another split lies between
     with pytest.raises(ValueError, match=f"index must lie between 0 and {SPLIT_STRIDE - 1}, not {SPLIT_STRIDE}"):
         seed_of(Split.TEST, SPLIT_STRIDE)
 
 
 @by_family
-def test_identity_is_plain_and_changes_with_all_that_decides_the_shapes(family):
+def test_the_identity_changes_with_each_setting_of_the_shapes(family):
     def key(**changed):
         return digest(replace(family, **changed).identity())
 
@@ -121,8 +119,7 @@ def test_identity_is_plain_and_changes_with_all_that_decides_the_shapes(family):
         key(radius=0.9),
         key(name=next(other for other in NAMES if other != family.name)),
     ]
-    assert key() == digest(Family(**asdict(family)).identity())
-    assert len({key(), *others}) == 5
+    assert key() == digest(Family(**asdict(family)).identity()) and len({key(), *others}) == 5
 
 
 def test_an_invalid_family_is_an_error(sofa):

@@ -1,4 +1,4 @@
-"""The field that a run leaves is the same when it is read, and nothing else in its file has an effect."""
+"""The saved field of a run is the same after reading, and its file cannot have other effects."""
 
 import json
 import shutil
@@ -62,36 +62,35 @@ FIELDS = {
     "occupancy_at_code": lambda: ScaledOccupancyOf(OccupancyNetwork(width=8, code_length=3).at(numbers(3))),
     **{
         name: lambda n=name: formula(n, numbers(PRIMITIVES[n].size), Flops(1, 2))
-        for name in FORMULAS
-        if name != "union"
+        for name in sorted({*FORMULAS} - {"union"})
     },
     "union": lambda: formula("union", numbers(3, 10), Flops(3, 6)),
 }
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_a_field_that_is_read_has_the_same_values_and_says_the_same_of_itself(name, tmp_path):
+def test_a_loaded_field_has_the_same_values_and_attributes(name, tmp_path):
     field = FIELDS[name]()
     assert save_field(field, tmp_path / FIELD_FILE) is None
-    found = bench.load_field(tmp_path)
-    assert type(found) is type(field)
-    torch.testing.assert_close(found(POINTS), field(POINTS).detach(), rtol=0, atol=1e-6)
-    assert (found.kind, found.lipschitz) == (field.kind, field.lipschitz) and not found(POINTS).requires_grad
+    loaded = bench.load_field(tmp_path)
+    assert type(loaded) is type(field)
+    torch.testing.assert_close(loaded(POINTS), field(POINTS).detach(), rtol=0, atol=1e-6)
+    assert (loaded.kind, loaded.lipschitz) == (field.kind, field.lipschitz) and not loaded(POINTS).requires_grad
     if hasattr(field, "colours"):
-        given = POINTS, nn.functional.normalize(POINTS, dim=-1), nn.functional.normalize(POINTS, dim=-1)
-        torch.testing.assert_close(found.colours(*given), field.colours(*given).detach(), rtol=0, atol=1e-6)
+        inputs = POINTS, nn.functional.normalize(POINTS, dim=-1), nn.functional.normalize(POINTS, dim=-1)
+        torch.testing.assert_close(loaded.colours(*inputs), field.colours(*inputs).detach(), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["decoder", "coloured", "union"])
-def test_it_is_a_network_whose_code_is_its_place(name, tmp_path):
+def test_a_loaded_network_has_a_translation_as_its_code(name, tmp_path):
     field = FIELDS[name]()
     save_field(field, tmp_path / FIELD_FILE)
     network = load_network(tmp_path)
-    place = torch.tensor([0.1, 0.0, -0.1])
-    torch.testing.assert_close(network.at(place)(POINTS), field(POINTS - place).detach(), rtol=0, atol=1e-5)
+    code = torch.tensor([0.1, 0.0, -0.1])
+    torch.testing.assert_close(network.at(code)(POINTS), field(POINTS - code).detach(), rtol=0, atol=1e-5)
 
 
-class Own(nn.Module):
+class UserField(nn.Module):
     kind, lipschitz, flops = Kind.DISTANCE, 1.0, None
 
     def forward(self, points):
@@ -99,24 +98,23 @@ class Own(nn.Module):
 
 
 @pytest.mark.parametrize("field, words", [
-    (Own(), "test_field_files.Own is no class"),
+    (UserField(), "test_field_files.UserField is no class"),
     (sphere(0.5), "function is no class"),
     (FIELDS["coloured"](), "0 MB are the most"),
 ])  # fmt: skip
-def test_a_class_of_the_users_or_a_large_field_is_told_and_left_out(field, words, tmp_path, monkeypatch):
+def test_a_user_class_or_a_large_field_is_not_saved_with_a_reason(field, words, tmp_path, monkeypatch):
     monkeypatch.setattr(field_files, "MAX_FIELD_BYTES", 1000)
-    assert words in (save_field(field, tmp_path / FIELD_FILE) or "")
-    assert not [*tmp_path.iterdir()]
+    assert words in (save_field(field, tmp_path / FIELD_FILE) or "") and not [*tmp_path.iterdir()]
 
 
 def changed(path: Path, old: str, new: str) -> None:
-    """The file with another text in its description of the field."""
+    """Replaces a text in the field description of a file."""
     tree = json.dumps(field_files._read(path)[0])
     assert old in tree
     save_file(load_file(path), path, {"version": field_files.VERSION, "field": tree.replace(old, new)})
 
 
-def test_the_name_of_a_run_is_enough_where_runs_are_by_default(tmp_path, monkeypatch):
+def test_the_name_of_a_run_is_enough_in_the_default_results_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = Path(RESULTS, "runs", "one")
     folder.mkdir(parents=True)
@@ -136,7 +134,7 @@ def test_the_name_of_a_run_is_enough_where_runs_are_by_default(tmp_path, monkeyp
     (lambda path: changed(path, '"octaves": 1', '"octaves": 2'), "its parts do not fit"),
     (lambda path: changed(path, '"t0"', '"t99"'), "its parts do not fit"),
 ])  # fmt: skip
-def test_a_file_that_will_not_do_is_refused_with_the_cause(spoil, words, tmp_path):
+def test_an_invalid_file_is_refused_with_the_cause(spoil, words, tmp_path):
     save_field(FIELDS["coloured"](), tmp_path / FIELD_FILE)
     spoil(tmp_path / FIELD_FILE)
     with pytest.raises(BadInput, match=words):

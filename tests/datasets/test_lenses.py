@@ -1,4 +1,4 @@
-"""Lenses bend rays as OpenCV and COLMAP have them, or are refused by name."""
+"""Lens models distort rays as in OpenCV and COLMAP, or are refused by name."""
 
 import numpy as np
 import pytest
@@ -9,42 +9,42 @@ from datasets.captures.lenses import FISHEYE_MODELS, PERSPECTIVE_MODELS, colmap_
 from renderers.checks import BadInput
 from tests.looped import each
 
-PLACES = np.stack(np.meshgrid(np.linspace(-0.7, 0.7, 9), np.linspace(-0.6, 0.6, 7)), axis=-1).reshape(-1, 2)
-RAYS = np.concatenate([PLACES, np.ones_like(PLACES[:, :1])], axis=1)
+POINTS = np.stack(np.meshgrid(np.linspace(-0.7, 0.7, 9), np.linspace(-0.6, 0.6, 7)), axis=-1).reshape(-1, 2)
+RAYS = np.concatenate([POINTS, np.ones_like(POINTS[:, :1])], axis=1)
 SMALL = st.floats(-0.05, 0.05, allow_subnormal=False)
-NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FEW = settings(max_examples=20)
 
 
-def bent(lens) -> np.ndarray:
-    return np.stack(lens.distort(*PLACES.T), axis=-1)
+def distorted(lens) -> np.ndarray:
+    return np.stack(lens.distort(*POINTS.T), axis=-1)
 
 
 @FEW
 @given(st.lists(SMALL, min_size=8, max_size=8), st.sampled_from([4, 5, 8]))
-def test_numbers_of_a_file_are_those_of_opencv(numbers, count):
+def test_distortion_keys_give_the_distortion_of_opencv(numbers, count):
     cv2 = pytest.importorskip("cv2", reason="OpenCV is an extra: pip install -e '.[stereo]'")
-    known = dict(zip(NAMES[:count], numbers[:count], strict=True))
+    keys = dict(zip(OPENCV_ORDER[:count], numbers[:count], strict=True))
     expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), np.eye(3), np.array(numbers[:count]))[0][:, 0]
-    np.testing.assert_allclose(bent(nerf_lens(known, "file")), expected, atol=1e-9)
+    np.testing.assert_allclose(distorted(nerf_lens(keys, "file")), expected, atol=1e-9)
 
 
 @FEW
 @given(
     st.lists(SMALL, min_size=4, max_size=4), st.sampled_from([{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}])
 )
-def test_a_fisheye_is_that_of_opencv(numbers, flag):
+def test_a_fisheye_gives_the_distortion_of_opencv(numbers, flag):
     cv2 = pytest.importorskip("cv2", reason="OpenCV is an extra: pip install -e '.[stereo]'")
-    known = dict(zip(("k1", "k2", "k3", "k4"), numbers, strict=True)) | flag
+    keys = dict(zip(("k1", "k2", "k3", "k4"), numbers, strict=True)) | flag
     expected = cv2.fisheye.projectPoints(RAYS[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(numbers))[0][:, 0]
-    np.testing.assert_allclose(bent(nerf_lens(known, "file")), expected, atol=1e-9)
+    np.testing.assert_allclose(distorted(nerf_lens(keys, "file")), expected, atol=1e-9)
 
 
 @FEW
 @given(st.data())
-def test_each_model_of_colmap_is_read_as_colmap_has_it_or_refused(data):
+def test_each_model_of_colmap_gives_its_distortion_or_is_refused(data):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra: pip install -e '.[colmap]'")
-    name = data.draw(st.sampled_from([one for one in pycolmap.CameraModelId.__members__ if one != "INVALID"]))
+    name = data.draw(st.sampled_from([model for model in pycolmap.CameraModelId.__members__ if model != "INVALID"]))
     camera = pycolmap.Camera.create_from_model_id(1, getattr(pycolmap.CameraModelId, name), 50.0, 40, 30)
     if name not in PERSPECTIVE_MODELS | FISHEYE_MODELS:
         with pytest.raises(BadInput, match=f"of the model {name}, which is not understood"):
@@ -55,11 +55,11 @@ def test_each_model_of_colmap_is_read_as_colmap_has_it_or_refused(data):
     camera.params = plain + data.draw(st.lists(SMALL, min_size=extra, max_size=extra))
     focal, middle = camera.calibration_matrix()[[0, 1], [0, 1]], camera.calibration_matrix()[:2, 2]
     expected = (camera.img_from_cam(RAYS) - middle) / focal
-    np.testing.assert_allclose(bent(colmap_lens(name, list(camera.params), "sparse/0")), expected, atol=1e-9)
+    np.testing.assert_allclose(distorted(colmap_lens(name, list(camera.params), "sparse/0")), expected, atol=1e-9)
 
 
 @each(
-    "known, words",
+    "keys, words",
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not understood"),
         ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye does not fit"),
@@ -69,9 +69,9 @@ def test_each_model_of_colmap_is_read_as_colmap_has_it_or_refused(data):
         ({"camera_model": "PERSPECTIVE", "is_fisheye": True}, "is_fisheye does not fit"),
     ],
 )
-def test_other_lenses_are_refused_by_name(known, words):
+def test_other_lenses_are_refused_by_name(keys, words):
     with pytest.raises(BadInput, match=words):
-        nerf_lens(known, "transforms.json")
+        nerf_lens(keys, "transforms.json")
 
 
 def test_a_list_of_numbers_is_in_the_order_of_nerfstudio():
@@ -80,15 +80,15 @@ def test_a_list_of_numbers_is_in_the_order_of_nerfstudio():
     )
 
 
-@each("known", [{"distortion_params": [0.1, 0, 0, 0, 0.01]}, {"distortion_params": [0.1, 0, 0, 0]}])
-def test_a_list_of_another_length_is_refused(known):
+@each("keys", [{"distortion_params": [0.1, 0, 0, 0, 0.01]}, {"distortion_params": [0.1, 0, 0, 0]}])
+def test_a_list_of_another_length_is_refused(keys):
     with pytest.raises(BadInput, match=r"distortion_params must be .* not \d numbers: give them by name"):
-        nerf_lens(known, "file")
+        nerf_lens(keys, "file")
     assert nerf_lens({"distortion_params": [0.1, 0, 0, 0], "is_fisheye": True}, "file").fisheye
 
 
 @each(
-    "known",
+    "keys",
     [
         {"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False},
         {"distortion": [0, 0], "distortion_params": [0] * 6, "K1": None, "camera_type": "perspective", "lens": {}},
@@ -96,5 +96,5 @@ def test_a_list_of_another_length_is_refused(known):
         {"applied_scale": 2.0, "aabb_scale": 16, "offset": [0.5] * 3, "sharpness": 30.1, "k": 5, "camera_angle_x": 0.7},
     ],
 )
-def test_what_says_nothing_of_a_lens_is_none(known):
-    assert not nerf_lens(known, "file").has_distortion
+def test_keys_without_a_lens_give_no_distortion(keys):
+    assert not nerf_lens(keys, "file").has_distortion

@@ -26,7 +26,7 @@ def local(path, *, strength=1.0) -> LocalMeshes:
 
 
 def proportions(mesh) -> tuple[float, ...]:
-    """Area and volume in scene units: what tells these shapes apart."""
+    """Area and volume in scene units, which differ between these shapes."""
     return round(mesh.area, 6), round(mesh.volume, 6)
 
 
@@ -46,8 +46,7 @@ def test_the_first_training_shape_of_one_file_is_the_mesh_itself(tmp_path):
     sides = np.array([1.0, 0.6, 0.4])
     sides *= 2 * 0.97 / np.linalg.norm(sides)
     assert np.ptp(mesh.vertices, axis=0) == pytest.approx(sides, rel=1e-6)
-    assert mesh.volume == pytest.approx(sides.prod(), rel=1e-6)
-    assert dataset.name == "box"
+    assert mesh.volume == pytest.approx(sides.prod(), rel=1e-6) and dataset.name == "box"
 
 
 def test_all_other_shapes_of_one_file_differ_and_stay_closed_in_the_sphere(tmp_path):
@@ -55,40 +54,37 @@ def test_all_other_shapes_of_one_file_differ_and_stay_closed_in_the_sphere(tmp_p
     shapes = [dataset.mesh(split, index) for split in Split for index in range(4)]
     assert len({proportions(mesh) for mesh in shapes}) == 12
     for mesh in shapes:
-        assert mesh.watertight
-        assert mesh.volume > 0
+        assert mesh.watertight and mesh.volume > 0
         assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(0.97, abs=1e-9)
 
 
-def test_shapes_are_always_the_same_wherever_the_file_lies(tmp_path):
+def test_shapes_do_not_depend_on_the_folder_of_the_file(tmp_path):
     first = local(write_box(tmp_path / "box.ply"))
     second = local(shutil.copy(tmp_path / "box.ply", tmp_path / "elsewhere.ply"))
     for split, index in ((Split.TRAIN, 0), (Split.TRAIN, 3), (Split.TEST, 0)):
         assert np.array_equal(first.mesh(split, index).vertices, second.mesh(split, index).vertices)
 
 
-def test_a_folder_is_dealt_out_whole_and_no_part_shares_a_file(folder):
+def test_each_file_of_a_folder_is_in_one_split(folder):
     dataset = local(folder)
-    parts = {split: dataset.files(split) for split in Split}
-    dealt = [file for files in parts.values() for file in files]
+    splits = {split: dataset.files(split) for split in Split}
+    dealt = [file for files in splits.values() for file in files]
     assert sorted(dealt) == sorted(file for file in folder.iterdir() if file.suffix != ".txt")
-    assert len(dealt) == len(set(dealt)) == 6
-    assert min(len(files) for files in parts.values()) >= 1
-    assert len(parts[Split.TRAIN]) == 4
-    assert parts == {split: local(folder).files(split) for split in Split}
+    assert len(dealt) == len(set(dealt)) == 6 and min(len(files) for files in splits.values()) >= 1
+    assert len(splits[Split.TRAIN]) == 4 and splits == {split: local(folder).files(split) for split in Split}
 
 
-def test_a_folder_gives_its_meshes_as_they_are_and_then_deforms_them(folder):
+def test_a_folder_gives_unchanged_meshes_first_and_deformed_meshes_after_them(folder):
     dataset = local(folder)
     plain = {proportions(local(file).mesh(Split.TRAIN, 0)) for file in folder.iterdir() if file.suffix != ".txt"}
-    as_they_are = [dataset.mesh(split, index) for split in Split for index in range(len(dataset.files(split)))]
-    assert {proportions(mesh) for mesh in as_they_are} == plain
+    unchanged = [dataset.mesh(split, index) for split in Split for index in range(len(dataset.files(split)))]
+    assert {proportions(mesh) for mesh in unchanged} == plain
     beyond = [proportions(dataset.mesh(split, len(dataset.files(split)))) for split in Split]
     assert not plain & set(beyond)
 
 
 @each("count", [1, 2, 3])
-def test_few_files_are_enough(tmp_path, count):
+def test_one_file_is_enough(tmp_path, count):
     for index in range(count):
         write_box(tmp_path / f"{index}.ply", (1.0, 0.3 + 0.2 * index, 0.4))
     dataset = local(tmp_path)
@@ -100,8 +96,7 @@ def test_few_files_are_enough(tmp_path, count):
 
 def test_paths_with_spaces_and_other_letters_work_and_name_the_dataset(tmp_path):
     path = write_box(tmp_path / ODD_NAME / "Stuhl für Ümit.ply")
-    assert local(path).name == "Stuhl für Ümit"
-    assert local(path).mesh(Split.TEST, 0).watertight
+    assert local(path).name == "Stuhl für Ümit" and local(path).mesh(Split.TEST, 0).watertight
     assert local(path.parent).mesh(Split.TEST, 0).watertight
 
 
@@ -140,22 +135,22 @@ def test_invalid_settings_are_errors_at_once(tmp_path):
         LocalMeshes(str(path), radius=0.0, strength=1.0)
 
 
-def test_a_mesh_that_took_long_to_repair_is_kept_until_its_file_changes(tmp_path, monkeypatch):
-    asked = []
+def test_a_slow_repair_is_cached_until_the_file_changes(tmp_path, monkeypatch):
+    loaded = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(module, "load_mesh", lambda path: asked.append(path) or load_mesh(path))
+    monkeypatch.setattr(module, "load_mesh", lambda path: loaded.append(path) or load_mesh(path))
     path = write_box(tmp_path / "box.ply")
     module.load_repaired(path)
-    assert not (tmp_path / "cache").exists()  # as that was quick
+    assert not (tmp_path / "cache").exists()  # since the repair was fast
     monkeypatch.setattr(module, "MIN_CACHED_SECONDS", -1.0)
     half = trimesh.creation.box((1.0, 0.6, 0.4))
     half.update_faces(range(10))
     half.export(path)
     first, again = module.load_repaired(path), module.load_repaired(path)
     assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
-    assert first.repairs == again.repairs != () and len(asked) == 2
-    (kept,) = (tmp_path / "cache").rglob("*.npz")
-    kept.write_bytes(kept.read_bytes()[:200])
-    assert np.array_equal(module.load_repaired(path).faces, first.faces) and len(asked) == 3
+    assert first.repairs == again.repairs != () and len(loaded) == 2
+    (cached,) = (tmp_path / "cache").rglob("*.npz")
+    cached.write_bytes(cached.read_bytes()[:200])
+    assert np.array_equal(module.load_repaired(path).faces, first.faces) and len(loaded) == 3
     write_box(path)
-    assert module.load_repaired(path).repairs == () and len(asked) == 4
+    assert module.load_repaired(path).repairs == () and len(loaded) == 4

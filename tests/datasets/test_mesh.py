@@ -15,10 +15,8 @@ def box(extents=(1.0, 2.0, 3.0)) -> Mesh:
 
 def test_a_box_has_its_closed_form_measures():
     mesh = box()
-    assert mesh.watertight
-    assert mesh.volume == pytest.approx(6)
-    assert mesh.area == pytest.approx(22)
-    assert mesh.diagonal == pytest.approx(np.sqrt(14))
+    assert mesh.watertight and mesh.volume == pytest.approx(6)
+    assert mesh.area == pytest.approx(22) and mesh.diagonal == pytest.approx(np.sqrt(14))
 
 
 def test_volume_is_negative_inside_out_and_does_not_move_with_the_mesh():
@@ -29,22 +27,19 @@ def test_volume_is_negative_inside_out_and_does_not_move_with_the_mesh():
 def test_two_boxes_are_two_parts():
     mesh = box((1, 1, 1))
     both = concatenate_meshes([mesh, Mesh(2 * mesh.vertices + 9, mesh.faces)])
-    assert both.parts.tolist() == [0] * 12 + [1] * 12
-    assert both.part_volumes == pytest.approx([1, 8])
+    assert both.parts.tolist() == [0] * 12 + [1] * 12 and both.part_volumes == pytest.approx([1, 8])
 
 
 @each("spoil", [lambda f: f[1:], lambda f: np.concatenate([f[:1, ::-1], f[1:]])])
 def test_a_rim_or_a_wrong_winding_is_not_watertight(spoil):
     mesh = box()
     spoilt = Mesh(mesh.vertices, spoil(mesh.faces))
-    assert not spoilt.watertight
-    assert 0 < spoilt.open_faces.sum() <= 4
+    assert not spoilt.watertight and 0 < spoilt.open_faces.sum() <= 4
 
 
 def test_holes_are_counted_by_their_rims():
     mesh = box()
-    assert mesh.holes == 0
-    assert Mesh(mesh.vertices, mesh.faces[1:]).holes == 1
+    assert mesh.holes == 0 and Mesh(mesh.vertices, mesh.faces[1:]).holes == 1
     opposite = np.abs(mesh.vertices[mesh.faces].mean(axis=1)[:, 0]) < 0.49  # without the two sides across x
     assert Mesh(mesh.vertices, mesh.faces[opposite]).holes == 2
 
@@ -52,13 +47,12 @@ def test_holes_are_counted_by_their_rims():
 def test_compact_drops_only_unused_vertices():
     mesh = box()
     padded = Mesh(np.concatenate([[[9.0, 9.0, 9.0]], mesh.vertices]), mesh.faces + 1)
-    assert len(padded.compact().vertices) == 8
-    assert padded.compact().volume == pytest.approx(6)
+    assert len(padded.compact().vertices) == 8 and padded.compact().volume == pytest.approx(6)
     assert padded.diagonal == pytest.approx(mesh.diagonal)
 
 
 @each("bad", [np.nan, np.inf, 1e30])
-def test_numbers_that_are_no_positions_are_refused(bad):
+def test_invalid_positions_are_refused(bad):
     vertices = np.zeros((3, 3))
     vertices[1, 2] = bad
     with pytest.raises(ValueError, match=r"vertices: must be numbers below 1e\+12.* with 1 NaN, infinite or too large"):
@@ -73,26 +67,25 @@ def test_numbers_that_are_no_positions_are_refused(bad):
         (np.zeros((0, 3), dtype=int), "faces: must be one or more triangles"),
     ],
 )
-def test_faces_that_are_no_triangles_of_the_vertices_are_refused(faces, message):
+def test_invalid_faces_are_refused(faces, message):
     with pytest.raises(ValueError, match=message):
         Mesh(np.eye(3), np.array(faces))
 
 
-def test_save_writes_what_others_read(tmp_path):
+def test_other_libraries_read_saved_meshes(tmp_path):
     mesh = box()
     path = tmp_path / "a böx.ply"
     mesh.save(path)
     read = trimesh.load_mesh(path, process=False)
-    assert np.array_equal(read.vertices, mesh.vertices)
-    assert np.array_equal(read.faces, mesh.faces)
+    assert np.array_equal(read.vertices, mesh.vertices) and np.array_equal(read.faces, mesh.faces)
     with pytest.raises(ValueError, match=r"name it 'a\.ply'"):
         mesh.save(tmp_path / "a.obj")
 
 
 def coloured(mesh: Mesh) -> Mesh:
-    """The mesh with another colour for each vertex."""
-    shares = np.linspace(0, 1, len(mesh.vertices))
-    return Mesh(mesh.vertices, mesh.faces, colours=np.stack([shares, 1 - shares, shares**2], axis=1))
+    """The mesh with a different colour for each vertex."""
+    fractions = np.linspace(0, 1, len(mesh.vertices))
+    return Mesh(mesh.vertices, mesh.faces, colours=np.stack([fractions, 1 - fractions, fractions**2], axis=1))
 
 
 def test_colours_are_saved_with_their_vertices(tmp_path):
@@ -106,8 +99,8 @@ def test_colours_are_saved_with_their_vertices(tmp_path):
     assert (read.visual.vertex_colors[:, 3] == 255).all()
     beyond = Mesh(mesh.vertices, mesh.faces, colours=3 * mesh.colours - 1)
     beyond.save(tmp_path / "b.ply")
-    found = trimesh.load_mesh(tmp_path / "b.ply", process=False).visual.vertex_colors[:, :3]
-    assert np.array_equal(found, np.round(255 * (3 * mesh.colours - 1).clip(0, 1)))
+    saved_colours = trimesh.load_mesh(tmp_path / "b.ply", process=False).visual.vertex_colors[:, :3]
+    assert np.array_equal(saved_colours, np.round(255 * (3 * mesh.colours - 1).clip(0, 1)))
     box().save(tmp_path / "c.ply")
     assert trimesh.load_mesh(tmp_path / "c.ply", process=False).visual.kind is None
 
@@ -123,8 +116,8 @@ def test_compact_keeps_colours_with_their_vertices():
     )
     small = padded.compact()
     assert small.colours is not None and small.colours.shape == (8, 3)
-    known = {tuple(vertex): tuple(colour) for vertex, colour in zip(mesh.vertices, mesh.colours, strict=True)}
-    assert {tuple(v): tuple(c) for v, c in zip(small.vertices, small.colours, strict=True)} == known
+    by_vertex = {tuple(vertex): tuple(colour) for vertex, colour in zip(mesh.vertices, mesh.colours, strict=True)}
+    assert {tuple(v): tuple(c) for v, c in zip(small.vertices, small.colours, strict=True)} == by_vertex
     assert box().compact().colours is None
 
 

@@ -1,4 +1,4 @@
-"""Local mesh files: what is found, read, refused and repaired."""
+"""Local mesh files: search, reading, refusal and repair."""
 
 import re
 import sys
@@ -11,8 +11,7 @@ import pytest
 import trimesh
 
 from bench.reconstruct.surfaces import poisson
-from datasets.mesh import Mesh
-from datasets.mesh import concatenate_meshes as as_one
+from datasets.mesh import Mesh, concatenate_meshes
 from datasets.meshes import find_meshes, load_mesh, read_mesh, read_pieces, read_points, repair
 from datasets.repair import NOT_CHECKED_NOTE
 from datasets.scene import Truth, sample_surface
@@ -21,16 +20,16 @@ from tests.looped import each
 from tests.tiny import mesh_of
 
 
-def box(at=(0.0, 0.0, 0.0), size=1.0, inverted=False) -> trimesh.Trimesh:
-    made = trimesh.creation.box((size, size, size))
-    made.apply_translation(at)
+def box(centre=(0.0, 0.0, 0.0), size=1.0, inverted=False) -> trimesh.Trimesh:
+    solid = trimesh.creation.box((size, size, size))
+    solid.apply_translation(centre)
     if inverted:
-        made.invert()
-    return made
+        solid.invert()
+    return solid
 
 
-def joined(*parts: trimesh.Trimesh) -> Mesh:
-    return as_one([mesh_of(part) for part in parts])
+def joined(*solids: trimesh.Trimesh) -> Mesh:
+    return concatenate_meshes([mesh_of(solid) for solid in solids])
 
 
 def sheet(height) -> Mesh:
@@ -76,10 +75,9 @@ def test_paths_that_hold_no_mesh_are_refused_with_a_remedy(tmp_path, name, messa
 
 @each("name", ["a.obj", "a.ply", "a.stl", "a.off", "a.glb", "with space ü 網.obj"])
 def test_a_closed_mesh_keeps_its_surface_in_every_format(name, tmp_path):
-    box(at=(3, 0, 0)).export(tmp_path / name)
+    box(centre=(3, 0, 0)).export(tmp_path / name)
     mesh = load_mesh(tmp_path / name)
-    assert mesh.watertight
-    assert mesh.volume == pytest.approx(1)
+    assert mesh.watertight and mesh.volume == pytest.approx(1)
     assert (len(mesh.vertices), len(mesh.faces), mesh.repairs) == (8, 12, ())
     assert mesh.vertices.mean(axis=0) == pytest.approx([3, 0, 0])
 
@@ -102,8 +100,7 @@ def test_a_scene_is_placed_by_its_transforms_and_its_lines_ignored(tmp_path):
     scene.add_geometry(trimesh.load_path([[[0, 0, 0], [99, 0, 0]]]))
     scene.export(tmp_path / "scene.glb")
     mesh = load_mesh(tmp_path / "scene.glb")
-    assert mesh.volume == pytest.approx(1 + 8)
-    assert mesh.part_volumes.min() > 0
+    assert mesh.volume == pytest.approx(1 + 8) and mesh.part_volumes.min() > 0
     assert mesh.vertices[:, 0].max() == pytest.approx(6)
 
 
@@ -116,7 +113,7 @@ def test_whether_a_mesh_has_an_area_does_not_depend_on_its_scale(tmp_path, scale
             assert len(read_mesh(path).faces) == 1
 
 
-def test_the_pieces_of_a_folder_are_all_of_one_mesh(tmp_path):
+def test_the_meshes_of_a_folder_are_read_as_one_mesh(tmp_path):
     for name, size in (("a.ply", 1), ("b.obj", 2), ("c.stl", 3)):
         box(size=size).export(tmp_path / name)
     assert read_pieces(tmp_path).area == pytest.approx(6 * (1 + 4 + 9))
@@ -124,7 +121,7 @@ def test_the_pieces_of_a_folder_are_all_of_one_mesh(tmp_path):
 
 
 BALL = trimesh.creation.icosphere(2)  # 162 vertices, 320 faces
-WHOLE = {
+COMPLETE = {
     "ply": BALL.export(file_type="ply"),
     "ascii.ply": BALL.export(file_type="ply", encoding="ascii"),
     "stl": BALL.export(file_type="stl"),
@@ -134,39 +131,39 @@ WHOLE = {
 }
 
 
-@each("name", WHOLE)
-def test_a_file_without_its_end_is_refused_wherever_it_was_cut(tmp_path, name):
-    path, whole = tmp_path / f"ball.{name}", WHOLE[name]
-    path.write_bytes(whole)
+@each("name", COMPLETE)
+def test_a_truncated_file_is_refused(tmp_path, name):
+    path, content = tmp_path / f"ball.{name}", COMPLETE[name]
+    path.write_bytes(content)
     assert load_mesh(path).repairs == ()
-    for length in (*(int(share * len(whole)) for share in (0.02, 0.3, 0.5, 0.8, 0.99)), len(whole) - 5):
-        path.write_bytes(whole[:length])
+    for length in (*(int(fraction * len(content)) for fraction in (0.02, 0.3, 0.5, 0.8, 0.99)), len(content) - 5):
+        path.write_bytes(content[:length])
         with pytest.raises(ValueError, match=r"must be a whole.*; .*copy it again"):
             load_mesh(path)
 
 
 def with_faces(faces: np.ndarray) -> Mesh:
-    """A box that has these faces too."""
+    """A box with additional faces."""
     return Mesh(box().vertices, np.concatenate([box().faces, faces]))
 
 
 JUMBLED = np.where(np.arange(12)[:, None] % 3 == 0, box().faces[:, ::-1], box().faces)
 DROPPED = "with the same faces as another dropped"
-REPAIRED = {  # a mesh, its volume then, and the notes, without a warning
+REPAIRED = {  # a mesh, its volume after repair, and the notes without a warning
     "inverted": (joined(box(inverted=True)), 1, ("1 part turned outward",)),
     "jumbled": (Mesh(box().vertices, JUMBLED), 1, ("faces wound consistently", "1 part turned outward")),
     "open": (Mesh(box().vertices, box().faces[2:]), 1, ("1 hole closed",)),
     "doubled": (with_faces(box().faces[:, ::-1]), 1, ("12 doubled faces dropped",)),
     "two faces twice": (with_faces(box().faces[:2]), 1, ("2 doubled faces dropped",)),
-    "a part twice": (joined(box(), box(at=(2, 0, 0)), box()), 2, (f"1 part {DROPPED}",)),
-    "thrice, and one beside": (joined(box(), box(), box(), box(at=(1, 0, 0))), 2, (f"2 parts {DROPPED}",)),
-    "a part twice, and two of its faces thrice": (
+    "a part twice": (joined(box(), box(centre=(2, 0, 0)), box()), 2, (f"1 part {DROPPED}",)),
+    "three times, and another part": (joined(box(), box(), box(), box(centre=(1, 0, 0))), 2, (f"2 parts {DROPPED}",)),
+    "a part twice, and two of its faces three times": (
         with_faces(np.concatenate([box().faces, box().faces[:2]])),
         1,
         (f"1 part {DROPPED}", "2 doubled faces dropped"),
     ),
-    "apart": (joined(box(), box(at=(2, 0, 0))), 2, ()),
-    "overlapping": (joined(box(), box(at=(0.1, 0.1, 0.1))), 2 - 0.9**3, ("2 overlapping parts merged into 1",)),
+    "separate": (joined(box(), box(centre=(2, 0, 0))), 2, ()),
+    "overlapping": (joined(box(), box(centre=(0.1, 0.1, 0.1))), 2 - 0.9**3, ("2 overlapping parts merged into 1",)),
     "nested": (joined(box(), box(size=0.4)), 1, ("2 overlapping parts merged into 1",)),
     "hollow": (joined(box(), box(size=0.4, inverted=True)), 1 - 0.064, ()),
     "hollow, inside out": (joined(box(inverted=True), box(size=0.4)), 1 - 0.064, ("2 parts turned outward",)),
@@ -174,11 +171,10 @@ REPAIRED = {  # a mesh, its volume then, and the notes, without a warning
 
 
 @each("name", REPAIRED)
-def test_a_repair_gives_the_solid_that_was_meant_and_a_note(name):
+def test_a_repair_gives_the_intended_solid_and_a_note(name):
     mesh, volume, notes = REPAIRED[name]
     repaired = repair(mesh)
-    assert repaired.watertight and repaired.volume == pytest.approx(volume)
-    assert repaired.repairs == notes
+    assert repaired.watertight and repaired.volume == pytest.approx(volume) and repaired.repairs == notes
 
 
 @each("scale", [1e-6, 1e3])
@@ -191,7 +187,7 @@ def test_a_repair_does_not_depend_on_the_scale(name, scale):
 
 @each("backend", ["pymeshlab", None])
 @each("scale", [1e-3, 1e3])
-def test_corners_less_than_a_millionth_of_the_diagonal_apart_are_one(scale, backend, monkeypatch):
+def test_corners_within_a_millionth_of_the_diagonal_are_merged(scale, backend, monkeypatch):
     if backend is None:
         pytest.importorskip("manifold3d")
         monkeypatch.setitem(sys.modules, "pymeshlab", None)
@@ -210,21 +206,23 @@ def test_without_pymeshlab_open3d_and_manifold3d_give_the_same_solids(name, monk
     mesh, volume, notes = REPAIRED[name]
     repaired = repair(mesh)
     assert repaired.watertight and repaired.volume == pytest.approx(volume)
-    assert {note for note in notes if "outward" not in note} < {*repaired.repairs}  # Open3D may turn the other side
+    assert {note for note in notes if "outward" not in note} < {
+        *repaired.repairs
+    }  # Open3D may turn the other side outward
     assert repaired.repairs[-1].startswith("without PyMeshLab, faces ")
 
 
-def test_what_pymeshlab_alone_does_names_it_where_it_is_not_installed(monkeypatch):
+def test_functions_that_need_pymeshlab_name_it_if_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
     points = np.random.default_rng(0).normal(size=(50, 3))
-    for ask in (lambda: repair(sheet(np.sin)), lambda: poisson(points, points, depth=3, trim=0)):
+    for call in (lambda: repair(sheet(np.sin)), lambda: poisson(points, points, depth=3, trim=0)):
         with pytest.raises(BadInput, match=r"needs PyMeshLab \(GPL-3\).*: pip install pymeshlab"):
-            ask()
+            call()
 
 
 @each("inverted", [False, True])
 def test_overlapping_boxes_are_inside_where_either_is(inverted):
-    mesh = repair(joined(box(), box(at=(0.5, 0.1, 0.2), inverted=inverted)))
+    mesh = repair(joined(box(), box(centre=(0.5, 0.1, 0.2), inverted=inverted)))
     assert mesh.volume == pytest.approx(2 - 0.5 * 0.9 * 0.8)
     assert mesh.repairs[-1] == "2 overlapping parts merged into 1"
     points = np.random.default_rng(0).uniform(-0.8, 1.3, (2000, 3))
@@ -235,18 +233,17 @@ def test_overlapping_boxes_are_inside_where_either_is(inverted):
 
 def test_a_sheet_is_wrapped_closely_with_a_note_and_a_warning():
     thin = sheet(lambda x: 0.1 * np.sin(9 * x))
-    mesh = repair(replace(thin, vertices=0.01 * thin.vertices))  # shares of the diagonal are not units of the file
+    mesh = repair(replace(thin, vertices=0.01 * thin.vertices))  # tolerances are fractions of the diagonal
     mesh = replace(mesh, vertices=100 * mesh.vertices)
-    assert mesh.watertight
-    assert 0 < mesh.volume < 0.01
+    assert mesh.watertight and 0 < mesh.volume < 0.01
     assert mesh.repairs[-1].startswith("wrapped: ") and "cut away" in mesh.repairs[-1]
-    assert mesh.repairs[:-1] == tuple(warnings_of(mesh)) != ()  # wrapped on both sides: its area doubles
+    assert mesh.repairs[:-1] == tuple(warnings_of(mesh)) != ()  # the wrap covers both sides, so that the area doubles
     points = sample_surface(thin, 500, seed=0).points
     assert np.abs(Truth(mesh).signed_distance(points)).max() < 0.005
 
 
 def test_walls_around_a_room_have_a_volume_and_a_torn_sphere_is_not_hollow():
-    sides = box().triangles + 0.02 * box().face_normals[:, None]  # they do not touch
+    sides = box().triangles + 0.02 * box().face_normals[:, None]  # the walls do not touch
     ball = trimesh.creation.icosphere(2)
     ball.apply_scale(0.01)
     torn = ball.faces[np.random.default_rng(0).random(len(ball.faces)) < 0.7]
@@ -262,27 +259,25 @@ def test_a_mesh_without_volume_is_an_error():
         repair(Mesh(np.eye(3), np.array([[0, 1, 2]])))
     flat = sheet(lambda x: 0 * x)
     twice = Mesh(flat.vertices, np.concatenate([flat.faces, flat.faces[:, ::-1]]))
-    with pytest.raises(
-        ValueError, match=r"found 288 faces in flat sheets \(after 288 doubled faces dropped\); .*export a"
-    ):
+    with pytest.raises(ValueError, match=r"found 288 faces in flat sheets \(after 288 doubled faces .*; .*export a"):
         repair(twice)
 
 
 def warnings_of(mesh: Mesh) -> list[str]:
-    return [told for told in mesh.repairs if told.startswith("warning: repair changed the ")]
+    return [note for note in mesh.repairs if note.startswith("warning: repair changed the ")]
 
 
-def test_a_repair_that_changes_area_or_volume_much_says_by_how_much():
+def test_a_large_change_of_area_or_volume_is_in_a_warning():
     ball = trimesh.creation.icosphere(3)
     half = Mesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] > 0])
     (warning,) = warnings_of(repair(half))
     area, volume = (r"from ([\d.]+) to ([\d.]+) \(([+-]\d+)%\)",) * 2
-    found = re.fullmatch(
+    match = re.fullmatch(
         f"warning: repair changed the area {area} and volume {volume}, in the file's units: .*", warning
     )
-    numbers = [float(number) for number in found.groups()]
+    numbers = [float(number) for number in match.groups()]
     assert numbers[0] == pytest.approx(half.area, rel=1e-3)
-    assert numbers[1] == pytest.approx(half.area + np.pi, rel=0.02)  # the disc that closes it
+    assert numbers[1] == pytest.approx(half.area + np.pi, rel=0.02)  # the area of the disc that closes the half sphere
     assert numbers[2] == pytest.approx(100 * (numbers[1] / numbers[0] - 1), abs=1)
     assert numbers[4] == pytest.approx(2 / 3 * np.pi, rel=0.03)
 
@@ -300,12 +295,12 @@ def test_points_that_are_not_finite_are_refused(tmp_path, odd):
             read_points(tmp_path / name)
 
 
-def test_the_clouds_of_dvrs_data_are_points_and_its_occupancies_are_not(tmp_path):
+def test_point_clouds_of_dvr_are_read_and_its_occupancies_are_refused(tmp_path):
     points = np.arange(12).reshape(4, 3) / 16
     np.savez(tmp_path / "pointcloud.npz", points=points.astype(np.float16), normals=points)
     assert np.array_equal(read_points(tmp_path / "pointcloud.npz"), points)
     np.savez(tmp_path / "points.npz", points=points, occupancies=np.zeros(1, np.uint8))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "points.npz").read_bytes()[:100])
-    for name, found in {"points": "found points, occupancies; take `pointcloud.npz`", "cut": "cannot be read"}.items():
-        with pytest.raises(ValueError, match=rf"{name}.npz': must have `points` on the surface, .*{found}"):
+    for name, cause in {"points": "found points, occupancies; take `pointcloud.npz`", "cut": "cannot be read"}.items():
+        with pytest.raises(ValueError, match=rf"{name}.npz': must have `points` on the surface, .*{cause}"):
             read_points(tmp_path / f"{name}.npz")

@@ -1,4 +1,4 @@
-"""Names of images, cameras and masks of each kind, made anew: the pairs are those of the rule, or none are given."""
+"""Random names of images, cameras and masks: the pairs follow the rules, or the names are refused."""
 
 import re
 from dataclasses import replace
@@ -35,12 +35,12 @@ def test_cameras_are_those_of_the_names_in_string_order(prefix, width, start, co
 
 
 @given(PREFIXES, WIDTHS, st.integers(3, 30), st.integers(1, 40))
-def test_images_and_cameras_of_other_numbers_are_refused_with_five_names(prefix, width, count, images):
+def test_different_numbers_of_images_and_cameras_are_refused_with_five_names(prefix, width, count, images):
     names = sorted(f"{prefix}{str(i).zfill(width)}.png" for i in range(images))
     if images == count:
         return
-    some = ", ".join(names[:5]) + (", ..." if images > 5 else "")
-    words = f"file has {count} cameras, number 0 to {count - 1}, and there are {images} images ({some})"
+    first = ", ".join(names[:5]) + (", ..." if images > 5 else "")
+    words = f"file has {count} cameras, number 0 to {count - 1}, and there are {images} images ({first})"
     with pytest.raises(BadInput) as caught:
         pair_by_order(names, count, "file")
     assert str(caught.value).startswith(f"{names[count]} has no camera: {words}" if images > count else words)
@@ -61,19 +61,19 @@ MASKS = {
     st.randoms(),
 )
 def test_masks_are_those_of_their_images(stems, suffix, rule, random):
-    """Even where last numbers are the same."""
+    """The rule also holds if last numbers are equal."""
     pairs = {stem + suffix: MASKS[rule](stem, suffix) for stem in stems}
     masks = random.sample([*pairs.values()], len(pairs))
     assert pair_by_name([*pairs], masks) == ({} if rule == "another name" else pairs)
 
 
-def test_numbers_are_the_same_with_other_zeros_and_another_camera_is_not():
+def test_leading_zeros_are_ignored_and_camera_names_are_not():
     assert pair_by_name(["0.png", "9.png", "10.png"], ["010.png", "009.png", "000.png"])["9.png"] == "009.png"
     assert pair_by_name(["cam1_0.png", "cam1_1.png"], ["cam2_0.png", "cam2_1.png"]) == {}
 
 
 @each("images, masks", [(["a.png", "a.jpg"], ["a.tif"]), (["1.png", "2.png"], ["01.png", "001.png", "2.png"])])
-def test_several_of_one_name_are_no_pairs(images, masks):
+def test_ambiguous_names_give_no_pairs(images, masks):
     assert pair_by_name(images, masks) == {}
 
 
@@ -89,33 +89,32 @@ def test_masks_that_are_not_one_to_one_are_refused_with_both_lists(tmp_path):
     assert masks["b_0.png"].name == "n_0.png" and notes == ("4 images; 4 masks by the order of their names",)
 
 
-FOUND = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+MANY_EXAMPLES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
 
 
-@FOUND
+@MANY_EXAMPLES
 @given(
     st.sampled_from(["", "./", "images/", "C:\\scans\\me\\images\\", "/home/me/images/", "..\\images\\"]),
     st.booleans(),
     st.sampled_from([".png", ".PNG", ".jpg", ""]),
 )
-def test_images_are_found_by_paths_of_other_machines(tmp_path, before, windows, suffix):
+def test_images_are_matched_to_paths_of_other_machines(tmp_path, before, windows, suffix):
     names = ["cam 1/0.1", "cam 1/1", "cam2/0.1"]
     base = tmp_path / "images" if "images" not in before or "." in before else tmp_path
     write(tmp_path, *(f"images/{name}.png" for name in names), "images/._1.png")
-    asked = {before + name + suffix: name for name in names}
-    asked = {path.replace("/", "\\") if windows else path: name for path, name in asked.items()}
-    found, note = find_images([*asked], base)
-    assert {path: file.relative_to(tmp_path / "images").as_posix() for path, file in found.items()} == {
-        path: f"{name}.png" for path, name in asked.items()
-    } or (suffix == "" and len(found) < 3)
+    paths = {before + name + suffix: name for name in names}
+    paths = {path.replace("/", "\\") if windows else path: name for path, name in paths.items()}
+    files, note = find_images([*paths], base)
+    relative = {path: file.relative_to(tmp_path / "images").as_posix() for path, file in files.items()}
+    assert relative == {path: f"{name}.png" for path, name in paths.items()} or (suffix == "" and len(files) < 3)
     assert ("without" in str(note)) == (before[:1] in ("C", "/")) or suffix == ""
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
-def test_accents_of_a_mac_are_those_of_others(tmp_path, forms):
-    there, asked = (normalize(form, "\u00e9 1.png") for form in forms)
-    write(tmp_path, there, "e 1.png")
-    assert find_images([asked], tmp_path)[0] == {asked: tmp_path / there}
+def test_accents_match_in_each_unicode_form(tmp_path, forms):
+    stored, requested = (normalize(form, "\u00e9 1.png") for form in forms)
+    write(tmp_path, stored, "e 1.png")
+    assert find_images([requested], tmp_path)[0] == {requested: tmp_path / stored}
 
 
 def test_two_paths_to_one_file_are_refused(tmp_path):
@@ -133,12 +132,11 @@ def test_names_without_zeros_are_paired_in_string_order(tmp_path, format, folder
     tmp_path.mkdir()
     format(tmp_path)
     order = sorted(f"{i}.png" for i in range(8, 18))
-    for place in (folder, "mask"):
-        renamed(tmp_path / place, lambda i: order[i])
+    for subfolder in (folder, "mask"):
+        renamed(tmp_path / subfolder, lambda i: order[i])
     capture = read_capture(tmp_path, READ)
     assert [shot.name for shot in capture.shots] == order
-    told = "10 images, paired with cameras by name order: 17.png before 8.png"
-    assert capture.notes[0] == f"{told}; if cameras follow the numbers, give these leading zeros"
+    assert capture.notes[0].startswith("10 images, paired with cameras by name order: 17.png before 8.png; if cameras")
     (tmp_path / folder / "12.png").unlink()
     with pytest.raises(BadInput, match=r"10 cameras, .* 9 images \(10.png, 11.png, 13.png, 14.png, 15.png, \.\.\.\)"):
         read_capture(tmp_path, READ)
@@ -147,7 +145,7 @@ def test_names_without_zeros_are_paired_in_string_order(tmp_path, format, folder
 def test_photographs_that_show_less_than_half_of_the_hull_are_refused(tmp_path, monkeypatch):
     idr(tmp_path)
     monkeypatch.setattr(
-        own_photographs, "measure_mask_fit", lambda *given: replace(measure_mask_fit(*given), shown=(0.4,))
+        own_photographs, "measure_mask_fit", lambda *arguments: replace(measure_mask_fit(*arguments), shown=(0.4,))
     )
     with pytest.raises(BadInput, match=r"the photographs show 40% of the object"):
         read_capture(tmp_path, READ)
@@ -161,14 +159,14 @@ def test_files_of_a_mac_are_no_images(tmp_path):
 
 
 @pytest.mark.parametrize("named", ["a b (1)/{0}", "C:\\me\\images\\{0}", "/home/me/images/{0}", "left/{0}"])
-def test_names_with_folders_blanks_and_paths_of_elsewhere(tmp_path, named):
+def test_names_with_folders_blanks_and_paths_of_other_machines(tmp_path, named):
     colmap(tmp_path)
     inner = named.format("") if named[0] not in "C/" else ""
     if inner:
-        for place in ("images", "mask"):
-            (tmp_path / place).rename(tmp_path / "moved")
-            (tmp_path / place).mkdir()
-            (tmp_path / "moved").rename(tmp_path / place / inner.strip("/"))
+        for subfolder in ("images", "mask"):
+            (tmp_path / subfolder).rename(tmp_path / "moved")
+            (tmp_path / subfolder).mkdir()
+            (tmp_path / "moved").rename(tmp_path / subfolder / inner.strip("/"))
     file = tmp_path / "sparse" / "0" / "images.txt"
     file.write_text(re.sub(r"(\d{3}\.png)", lambda name: named.format(name[0]), file.read_text()))
     assert off(read_capture(tmp_path, PLAIN)) < 0.01

@@ -1,4 +1,4 @@
-"""Textures and photographs of a ball: a point has one colour from everywhere, and what cannot work is told."""
+"""Textures and photographs of a sphere: a point has one colour in all views, and invalid settings are errors."""
 
 from dataclasses import replace
 from math import pi
@@ -14,7 +14,7 @@ from datasets.textures import ONE_COLOUR, SKIMAGE_PHOTOGRAPHS, TEXTURES, make_te
 from tests.looped import each
 from tests.tiny import camera_of, icosphere
 
-PLAINLY = Photography(
+PHOTOGRAPHY = Photography(
     views=8,
     places="circle",
     texture="noise",
@@ -34,14 +34,13 @@ def ball() -> Truth:
 
 
 @each("name", TEXTURES)
-def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
+def test_colours_lie_between_0_and_1_and_depend_on_the_position(name):
     generator = np.random.default_rng(0)
     points = generator.uniform(-1, 1, (300, 3))
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     texture = make_texture(name, 0.5, seed=3)
     colours = texture(points, normals)
-    assert colours.shape == (300, 3)
-    assert colours.min() >= 0 and colours.max() <= 1
+    assert colours.shape == (300, 3) and colours.min() >= 0 and colours.max() <= 1
     assert np.array_equal(colours, make_texture(name, 0.5, seed=3)(points, normals))
     other = make_texture(name, 0.5, seed=4)(points, normals)
     assert (np.abs(other - colours).mean() > 0.1) == (name in ("noise", "banded", "painted"))
@@ -50,12 +49,12 @@ def test_colours_lie_between_0_and_1_and_are_a_function_of_the_place(name):
     assert (colours.std(axis=0).max() > 0.05) == (name not in ONE_COLOUR)
 
 
-def test_each_axis_sees_its_own_projection():
+def test_each_axis_has_a_separate_projection():
     texture = make_texture(SKIMAGE_PHOTOGRAPHS[0], 1.0, seed=0)
-    along = np.array([[0.9, 0.2, 0.3], [0.1, 0.2, 0.3]])  # the same place but for x, seen along x
-    same = texture(along, np.array([[1.0, 0, 0], [1, 0, 0]]))
-    assert same[0] == pytest.approx(same[1])
-    assert np.abs(texture(along[:1], np.array([[0, 1.0, 0]])) - same[0]).max() > 0.01
+    along = np.array([[0.9, 0.2, 0.3], [0.1, 0.2, 0.3]])  # the two points differ only in x, the viewing direction
+    colours = texture(along, np.array([[1.0, 0, 0], [1, 0, 0]]))
+    assert colours[0] == pytest.approx(colours[1])
+    assert np.abs(texture(along[:1], np.array([[0, 1.0, 0]])) - colours[0]).max() > 0.01
 
 
 def test_cameras_stand_on_a_circle_and_look_at_the_origin():
@@ -90,8 +89,8 @@ def test_cameras_all_around_look_at_the_origin_from_above_and_below(count):
     assert len(sides) == 4
 
 
-def test_an_arc_is_of_one_side_with_the_first_camera_in_its_middle(ball):
-    shots = replace(PLAINLY, places="arc", views=5).take(ball, CAMERA, seed=0)
+def test_an_arc_has_the_first_camera_in_its_middle(ball):
+    shots = replace(PHOTOGRAPHY, places="arc", views=5).take(ball, CAMERA, seed=0)
     centres = torch.stack([shot.camera.center for shot in shots])
     assert torch.allclose(centres[2], CAMERA.center) and torch.allclose(centres.norm(dim=1), CAMERA.center.norm())
     flat = torch.nn.functional.normalize(centres[:, [0, 2]], dim=1)
@@ -103,58 +102,59 @@ def test_an_arc_is_of_one_side_with_the_first_camera_in_its_middle(ball):
 @each("texture", ["noise", "astronaut"])
 def test_a_point_that_two_views_see_has_one_colour(ball, texture):
     size = 1.0 if texture == "noise" else 4.0
-    first, second, *_ = replace(PLAINLY, texture=texture, texture_size=size).take(ball, CAMERA, seed=0)
+    first, second, *_ = replace(PHOTOGRAPHY, texture=texture, texture_size=size).take(ball, CAMERA, seed=0)
     points = first.camera.rays().at(first.depth / first.camera.depth(torch.ones(32, 32)))
     pixels, depth = second.camera.project(points)
-    there, _ = sample(second.depth[..., None], pixels)
-    both = first.mask & ((there[..., 0] - depth).abs() < 0.01)
+    sampled_depth, _ = sample(second.depth[..., None], pixels)
+    both = first.mask & ((sampled_depth[..., 0] - depth).abs() < 0.01)
     colours, _ = sample(second.colours, pixels)
     right = (colours - first.colours)[both].abs().mean()
     wrong = (second.colours - first.colours)[both].abs().mean()
-    assert both.sum() > 100
-    assert right < 0.4 * wrong
+    assert both.sum() > 100 and right < 0.4 * wrong
 
 
 def test_the_background_is_grey_or_differs_from_view_to_view(ball):
-    first, second, *_ = PLAINLY.take(ball, CAMERA, seed=0)
+    first, second, *_ = PHOTOGRAPHY.take(ball, CAMERA, seed=0)
     outside = ~(first.mask | second.mask)
-    outside[1:-1, 1:-1] &= False  # the frame: no pixel there has a part of the ball
+    outside[1:-1, 1:-1] &= False  # the frame of the image, without pixels of the sphere
     assert (first.colours[outside] == 0.5).all()
-    first, second, *_ = replace(PLAINLY, background="noise").take(ball, CAMERA, seed=0)
+    first, second, *_ = replace(PHOTOGRAPHY, background="noise").take(ball, CAMERA, seed=0)
     assert (first.colours - second.colours)[outside].abs().mean() > 0.1
 
 
 def test_noise_blur_and_exposure_change_colours_by_their_amounts(ball):
-    plain = PLAINLY.take(ball, CAMERA, seed=0)
-    noisy = replace(PLAINLY, noise=0.03).take(ball, CAMERA, seed=0)
+    plain = PHOTOGRAPHY.take(ball, CAMERA, seed=0)
+    noisy = replace(PHOTOGRAPHY, noise=0.03).take(ball, CAMERA, seed=0)
     background = ~plain[0].mask
     assert (noisy[0].colours - plain[0].colours)[background].std().item() == pytest.approx(0.03, rel=0.2)
-    exposed = replace(PLAINLY, exposure=0.2).take(ball, CAMERA, seed=0)
+    exposed = replace(PHOTOGRAPHY, exposure=0.2).take(ball, CAMERA, seed=0)
     ratios = [(a.colours[0, 0, 0] / b.colours[0, 0, 0]).log().item() for a, b in zip(exposed, plain, strict=True)]
     assert 0.05 < np.std(ratios) < 0.5
-    soft = replace(PLAINLY, blur=2.0).take(ball, CAMERA, seed=0)
+    soft = replace(PHOTOGRAPHY, blur=2.0).take(ball, CAMERA, seed=0)
     assert soft[0].colours.diff(dim=0).abs().mean() < 0.7 * plain[0].colours.diff(dim=0).abs().mean()
 
 
 def test_lambertian_light_is_fixed(ball):
-    lit = replace(PLAINLY, texture="plain", shading="lambertian").take(ball, CAMERA, seed=0)
+    lit = replace(PHOTOGRAPHY, texture="plain", shading="lambertian").take(ball, CAMERA, seed=0)
     bright = [photograph.colours[photograph.mask].mean().item() for photograph in lit]
-    assert max(bright) > 1.2 * min(bright)  # the ball has a dark side, which some cameras see
+    assert max(bright) > 1.2 * min(bright)  # some cameras see the dark side of the sphere
     inner = [photograph.colours[12:20, 12:20] for photograph in lit]  # no outline pixels, which mix with the background
-    assert min(part.min() for part in inner) > 0.38 * max(part.max() for part in inner)  # which is not black
+    assert min(patch.min() for patch in inner) > 0.38 * max(
+        patch.max() for patch in inner
+    )  # the dark side is not black
 
 
 def test_a_surface_of_one_colour_is_refused(ball):
     with pytest.raises(ValueError, match=r"has nothing to compare: set shading=lambertian"):
-        replace(PLAINLY, texture="plain")
+        replace(PHOTOGRAPHY, texture="plain")
     with pytest.raises(ValueError, match=r"one colour in all images: choose another texture"):
-        replace(PLAINLY, texture_size=1e9).take(ball, CAMERA, seed=0)
+        replace(PHOTOGRAPHY, texture_size=1e9).take(ball, CAMERA, seed=0)
 
 
 def test_a_camera_that_sees_nothing_is_refused(ball):
     away = replace(CAMERA, world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ CAMERA.world_to_camera)
     with pytest.raises(ValueError, match="camera 0 sees nothing of the shape"):
-        PLAINLY.take(ball, away, seed=0)
+        PHOTOGRAPHY.take(ball, away, seed=0)
 
 
 @each(
@@ -168,4 +168,4 @@ def test_a_camera_that_sees_nothing_is_refused(ball):
 )
 def test_invalid_settings_are_errors(changed, message):
     with pytest.raises(ValueError, match=message):
-        replace(PLAINLY, **changed)
+        replace(PHOTOGRAPHY, **changed)

@@ -1,4 +1,4 @@
-"""Range scans of a made sphere: their poses, their depths in a camera, and folders that lack something."""
+"""Range scans of a sphere: poses, depths in a camera, and incomplete folders."""
 
 from dataclasses import replace
 from math import pi
@@ -20,7 +20,7 @@ from tests.runner.driving import SMALLEST, command, record_of
 
 VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=48)
 EMPTY = b"ply\nformat ascii 1.0\nelement vertex 0\nproperty int x\nproperty int y\nproperty int z\nend_header\n"
-FAR = replace(VIEWS, distance=20.0, field_of_view=6.2)  # as far as the scanner, whose rays are parallel
+PARALLEL_VIEWS = replace(VIEWS, distance=20.0, field_of_view=6.2)  # nearly parallel rays, like those of the scanner
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def scans(folder: Path, truth: str | None = None) -> RangeScans:
 
 
 @each("index, turn", [*enumerate(TURNS)])
-def test_the_camera_stands_where_the_scanner_did(folder, index, turn):
+def test_the_camera_has_the_direction_of_the_scanner(folder, index, turn):
     towards = scans(folder).towards_scanner(index)
     assert towards.numpy() == pytest.approx([np.sin(turn * pi / 180), 0.0, np.cos(turn * pi / 180)], abs=1e-6)
     scene = make_scene(scans(folder), VIEWS, split=Split.TEST, index=index)
@@ -41,51 +41,52 @@ def test_the_camera_stands_where_the_scanner_did(folder, index, turn):
 
 
 @each("index", range(len(TURNS)))
-def test_depths_are_those_of_the_surface_that_was_scanned(folder, index):
-    scene = make_scene(scans(folder), FAR, split=Split.TEST, index=index)
-    view, known = scene.observed_view()
+def test_depths_are_those_of_the_scanned_surface(folder, index):
+    scene = make_scene(scans(folder), PARALLEL_VIEWS, split=Split.TEST, index=index)
+    view, observed = scene.observed_view()
     exact, both = scene.observed_view(exact=True)
-    assert torch.equal(known, both) and not (known & ~scene.view.mask).any()
+    assert torch.equal(observed, both) and not (observed & ~scene.view.mask).any()
     assert torch.equal(exact.depth, scene.view.depth) and torch.equal(view.mask, scene.view.mask)
-    assert 0.9 * scene.view.mask.sum() < known.sum() <= scene.view.mask.sum()
+    assert 0.9 * scene.view.mask.sum() < observed.sum() <= scene.view.mask.sum()
     assert torch.equal(view.depth > 0, scene.measured > 0)
     facing = -(scene.view.normals * view.camera.rays().directions).sum(dim=-1)
-    off = (view.depth - exact.depth)[known & (facing > 0.5)]
-    assert float(off.abs().max()) < 2e-3  # of a sphere of radius .97; both are made of flat triangles
+    off = (view.depth - exact.depth)[observed & (facing > 0.5)]
+    assert float(off.abs().max()) < 2e-3  # the radius is 0.97; both surfaces are polyhedra
     assert float(off.mean()) == pytest.approx(0, abs=2e-4)
 
 
-def test_noise_stays_in_the_depths_and_is_told(tmp_path):
-    scene = make_scene(scans(write_scans(tmp_path, noise=0.002)), FAR, split=Split.TEST, index=0)
+def test_noise_stays_in_the_depths_and_is_noted(tmp_path):
+    scene = make_scene(scans(write_scans(tmp_path, noise=0.002)), PARALLEL_VIEWS, split=Split.TEST, index=0)
     _, both = scene.observed_view(exact=True)
     off = (scene.measured - scene.view.depth)[both].abs()
-    assert 0.4 < float(off.median()) / (0.6745 * 0.002 * 0.97 / RADIUS) < 1.3  # half of a Gaussian is within .6745 s.d.
+    assert (
+        0.4 < float(off.median()) / (0.6745 * 0.002 * 0.97 / RADIUS) < 1.3
+    )  # half of a Gaussian is within 0.6745 standard deviations
     (note,) = scene.measured_depth_notes
     assert note.startswith(f"measured: {int(both.sum())} of the shape's {int(scene.view.mask.sum())} pixels")
     half, most = off.quantile(torch.tensor([0.5, 0.95])).tolist()
     assert f"within {half:.2g} scene units of the mesh, 95 % within {most:.2g};" in note and most > 2 * half
-    beside = int(((scene.measured > 0) & ~scene.view.mask).sum())
-    assert note.endswith(f"{beside} beside its outline are left out")
+    outside_outline = int(((scene.measured > 0) & ~scene.view.mask).sum())
+    assert note.endswith(f"{outside_outline} beside its outline are left out")
 
 
 def test_points_across_a_gap_are_not_joined(folder):
     dataset = scans(folder)
-    one = dataset.scans[0]
-    whole = one.surface()
-    points = trimesh.load(one.file).vertices
+    scan = dataset.scans[0]
+    complete = scan.surface()
+    points = trimesh.load(scan.file).vertices
     middle = points.mean(axis=0)
-    kept = np.abs(points[:, 0] - middle[0]) > 0.04  # a strip of the ball, of a width of .08, is missing
-    gap = replace(one, file=one.file.with_name("gap.txt").with_suffix(".ply"))
+    kept = np.abs(points[:, 0] - middle[0]) > 0.04  # a strip of the sphere, 0.08 wide, is missing
+    gap = replace(scan, file=scan.file.with_name("gap.txt").with_suffix(".ply"))
     trimesh.PointCloud(points[kept]).export(gap.file)
     torn = gap.surface()
     gap.file.unlink()
     edges = torn.vertices[torn.faces] - np.roll(torn.vertices[torn.faces], 1, axis=1)
-    assert np.linalg.norm(edges, axis=2).max() < 0.04
-    assert torn.area < whole.area - 0.8 * 0.08 * 2 * RADIUS
+    assert np.linalg.norm(edges, axis=2).max() < 0.04 and torn.area < complete.area - 0.8 * 0.08 * 2 * RADIUS
 
 
 @pytest.mark.parametrize(
-    ("spoil", "says"),
+    ("spoil", "message"),
     [
         (lambda f: (f / "ball.conf").unlink(), "must have one .conf file"),
         (lambda f: (f / "ball.conf").write_text("camera 0 0 0"), "names no scan: it needs lines 'bmesh FILE"),
@@ -94,22 +95,22 @@ def test_points_across_a_gap_are_not_joined(folder):
         (lambda f: (f / "ball.conf").write_text("bmesh scan_0.ply 0 0 0 0 0 0 0"), "line 1, must be 'bmesh FILE"),
     ],
 )
-def test_a_folder_that_lacks_something_is_refused(tmp_path, spoil, says):
+def test_an_incomplete_folder_is_refused(tmp_path, spoil, message):
     spoil(write_scans(tmp_path))
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         scans(tmp_path)
 
 
 def test_a_scan_that_is_cut_short_or_has_no_points_is_refused(tmp_path):
     scan = write_scans(tmp_path) / "scan_0.ply"
     cut = f"scan '{scan}' must be a whole .ply file, but it is truncated"
-    for content, says in ((scan.read_bytes()[:9000], cut), (EMPTY, "has no points")):
+    for content, message in ((scan.read_bytes()[:9000], cut), (EMPTY, "has no points")):
         scan.write_bytes(content)
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             make_scene(scans(tmp_path), VIEWS, split=Split.TEST, index=0)
 
 
-def test_the_mesh_may_be_named_and_is_told(tmp_path):
+def test_the_ground_truth_may_be_set_and_is_noted(tmp_path):
     folder = write_scans(tmp_path)
     (folder / "ball_whole.ply").rename(folder / "small.ply")
     trimesh.creation.icosphere(subdivisions=6).export(folder / "larger.ply")
@@ -119,18 +120,17 @@ def test_the_mesh_may_be_named_and_is_told(tmp_path):
         scans(folder, "none.ply")
 
 
-def test_it_has_as_many_numbers_as_scans_and_no_prior(folder):
+def test_an_index_beyond_the_scans_and_the_train_split_are_refused(folder):
     with pytest.raises(ValueError, match="index must be at most 2, the last scan"):
         scans(folder).mesh(Split.TEST, 3)
     with pytest.raises(ValueError, match="of which there is no prior: take task=completion field=auto"):
         scans(folder).mesh(Split.TRAIN, 0)
 
 
-def test_a_run_takes_the_depths_that_it_is_told(folder, tmp_path):
+def test_a_run_uses_the_depths_of_its_setting(folder, tmp_path):
     arguments = ("dataset=scans", f"dataset.path={folder}", "index=1", "field=sphere", "view.resolution=16")
-    given = ("task.points=dense", "task.depths=exact", "task.optimiser.iterations=4")
-    done = command(*SMALLEST, *arguments, *given, f"results_dir={tmp_path}")
-    record = record_of(done.out)
+    task = ("task.points=dense", "task.depths=exact", "task.optimiser.iterations=4")
+    record = record_of(command(*SMALLEST, *arguments, *task, f"results_dir={tmp_path}").out)
     assert record["scene"] == f"{folder.name} test 1"
     (note,) = [note for note in record["notes"] if note.startswith("measured: ")]
     assert record["evaluations"]["observed"] == int(note.split()[1])
@@ -138,14 +138,14 @@ def test_a_run_takes_the_depths_that_it_is_told(folder, tmp_path):
 
 
 def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
-    """A ball with two faces joined by a tube that crosses over, so that the surface has one side only."""
-    one, other = ball.faces[first], ball.faces[second]
-    sides = [(one[i], one[i - 2], other[i - 2], other[i]) for i in range(3)]
+    """A sphere with two faces joined by a twisted tube, so that the surface has one side only."""
+    start, end = ball.faces[first], ball.faces[second]
+    sides = [(start[i], start[i - 2], end[i - 2], end[i]) for i in range(3)]
     tube = [corner for a, b, c, d in sides for corner in ([a, b, c], [a, c, d])]
     return Mesh(ball.vertices, np.concatenate([np.delete(ball.faces, [first, second], axis=0), tube]))
 
 
-def test_a_scan_with_a_tangle_keeps_its_surface():
+def test_a_scan_with_a_one_sided_tube_keeps_its_surface():
     ball = trimesh.creation.icosphere(5)
     near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]
     tangled = handled(ball, 0, near)

@@ -1,4 +1,4 @@
-"""What .obj, .off, .ply and .stl files hold, in every way to write it: of known volume."""
+"""Readers of .obj, .off, .ply and .stl files in each spelling, checked by the volume."""
 
 import struct
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ def star(draw: np.random.Generator) -> np.ndarray:
 
 
 def comb(draw: np.random.Generator) -> np.ndarray:
-    """A comb: no point sees all of it."""
+    """A comb: it is not star-shaped about any point."""
     teeth = draw.integers(2, 6)
     x, y = np.arange(2 * teeth), np.full(2 * teeth, 0.2)
     upper = np.stack([np.repeat(x, 2)[1:-1], np.tile([1, 1, 0.2, 0.2], teeth)[: 4 * teeth - 2]], axis=1)
@@ -46,16 +46,16 @@ def comb(draw: np.random.Generator) -> np.ndarray:
 
 
 def with_flat_corners(polygon: np.ndarray, draw: np.random.Generator) -> np.ndarray:
-    """Some edges get one to three more corners."""
+    """The polygon with up to three additional corners on each edge."""
     points = []
     for first, second in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        shares = np.sort(draw.random(draw.integers(0, 4)))[:, None]
-        points += [first[None], first + shares * (second - first)]
+        fractions = np.sort(draw.random(draw.integers(0, 4)))[:, None]
+        points += [first[None], first + fractions * (second - first)]
     return np.concatenate(points)
 
 
 def prism(seed: int) -> Solid:
-    """A prism over a random polygon that begins at any corner, turned in space. Its polygons are in any order."""
+    """A rotated prism over a random polygon, with its polygons in random order."""
     draw = np.random.default_rng(seed)
     polygon = (star, comb)[draw.integers(2)](draw)
     polygon = with_flat_corners(polygon, draw) if draw.integers(2) else polygon
@@ -75,16 +75,15 @@ def prism(seed: int) -> Solid:
 
 
 def check(read: Polygons, solid: Solid) -> None:
-    """What was read is the solid: closed, with its volume and its area, which folded triangles would exceed."""
+    """Checks that the polygons are the closed solid, with its volume and its area, which folds would exceed."""
     mesh = Mesh(read.vertices, read.triangles)
-    assert mesh.watertight
-    assert mesh.volume == pytest.approx(solid.volume, rel=1e-9)
+    assert mesh.watertight and mesh.volume == pytest.approx(solid.volume, rel=1e-9)
     assert mesh.area == pytest.approx(solid.area, rel=1e-9)
     assert len(mesh.faces) == sum(len(polygon) - 2 for polygon in solid.polygons)
 
 
 def obj_text(solids: list[Solid], draw: np.random.Generator) -> str:
-    """The solids one after the other, in one of the ways to write an .obj file."""
+    """The solids one after another, in a random spelling of .obj files."""
     gap, indent = draw.choice([" ", "\t", "  "]), draw.choice(["", " ", "\t"])
     corner = draw.choice(["{0}", "{0}/{0}", "{0}//{0}", "{0}/{0}/{0}"])
     relative, joint = draw.integers(2), draw.choice([gap, f"{gap}\\\n"])
@@ -102,7 +101,7 @@ def obj_text(solids: list[Solid], draw: np.random.Generator) -> str:
 
 
 def off_text(solid: Solid, draw: np.random.Generator) -> str:
-    """The solid in one of the ways to write an .off file."""
+    """The solid in a random spelling of .off files."""
     letters = draw.choice(["", "C", "N", "CN", "ST"])
     more = " 0 0 1" * ("N" in letters) + " 255 0 0 255" * ("C" in letters) + " 0.5 0.5" * ("T" in letters)
     numbers = f"{len(solid.vertices)} {len(solid.polygons)} 0"
@@ -117,7 +116,7 @@ def off_text(solid: Solid, draw: np.random.Generator) -> str:
 
 
 def ply_bytes(solid: Solid, draw: np.random.Generator) -> bytes:
-    """The solid in one of the ways to write a .ply file, with elements and properties that nobody asks for."""
+    """The solid in a random spelling of .ply files, with additional elements and properties."""
     kind, end = draw.choice(["ascii", "binary_little_endian", "binary_big_endian"]), draw.choice(["\n", "\r\n"])
     name, lengths = draw.choice(["vertex_index", "vertex_indices"]), draw.choice(["uchar", "int"])
     extra = draw.integers(2)
@@ -142,7 +141,7 @@ def ply_bytes(solid: Solid, draw: np.random.Generator) -> bytes:
 
 @FEW
 @given(seed=SEEDS)
-def test_polygons_are_filled_as_they_are_and_no_corner_is_lost(seed):
+def test_triangles_fill_a_polygon_with_all_of_its_corners(seed):
     draw = np.random.default_rng(seed)
     polygon = with_flat_corners((star, comb)[seed % 2](draw), draw)
     cut = ears(polygon[None])[0]
@@ -155,7 +154,7 @@ def test_polygons_are_filled_as_they_are_and_no_corner_is_lost(seed):
 
 @FEW
 @given(seed=SEEDS)
-def test_an_obj_is_read_however_it_is_written(seed):
+def test_an_obj_is_read_in_each_spelling(seed):
     draw = np.random.default_rng(seed)
     first, second = prism(seed), prism(seed + 1)
     shift = len(first.vertices)
@@ -170,26 +169,26 @@ def test_an_obj_is_read_however_it_is_written(seed):
 
 @FEW
 @given(seed=SEEDS)
-def test_an_off_is_read_however_it_is_written(seed):
+def test_an_off_is_read_in_each_spelling(seed):
     check(read_off(off_text(prism(seed), np.random.default_rng(seed)).encode()), prism(seed))
 
 
 @FEW
 @given(seed=SEEDS)
-def test_a_ply_is_read_however_it_is_written(seed):
+def test_a_ply_is_read_in_each_spelling(seed):
     check(read_ply(ply_bytes(prism(seed), np.random.default_rng(seed))), prism(seed))
 
 
-PLACES = "0 0 0", "1 0 0", "0 1 0", "0 0 1"
+POINTS = "0 0 0", "1 0 0", "0 1 0", "0 0 1"
 FACES = "0 2 1", "0 1 3", "1 2 3", "0 3 2"
-V, F = "".join(f"v {place}\n" for place in PLACES), "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
-ROWS = "\n".join([*PLACES, *(f"3 {face}" for face in FACES)])
+V, F = "".join(f"v {point}\n" for point in POINTS), "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+ROWS = "\n".join([*POINTS, *(f"3 {face}" for face in FACES)])
 HEAD = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-STRIPS = f"{HEAD}element tristrips 1\nproperty list int int vertex_indices\nend_header\n" + "\n".join(PLACES)
-CORNERS = [[PLACES[int(i)] for i in face.split()] for face in FACES]
-LOOPS = [" outer loop\n" + "".join(f"  vertex {place}\n" for place in corners) + " endloop\n" for corners in CORNERS]
+STRIPS = f"{HEAD}element tristrips 1\nproperty list int int vertex_indices\nend_header\n" + "\n".join(POINTS)
+CORNERS = [[POINTS[int(i)] for i in face.split()] for face in FACES]
+LOOPS = [" outer loop\n" + "".join(f"  vertex {point}\n" for point in corners) + " endloop\n" for corners in CORNERS]
 SOLID = "solid A #1\n" + "".join(f"facet normal nan 0 0\n{loop}endfacet\n" for loop in LOOPS) + "endsolid A\n"
-TRIANGLES = np.array([[place.split() for place in corners] for corners in CORNERS], np.float32)
+TRIANGLES = np.array([[point.split() for point in corners] for corners in CORNERS], np.float32)
 BINARY = b"".join(struct.pack("<12fH", 0, 0, 0, *corners.ravel(), 0) for corners in TRIANGLES)
 TETRAHEDRA = {
     "faces before their vertices": (read_obj, F + V),
@@ -197,7 +196,7 @@ TETRAHEDRA = {
     "a folder's name that ends in a backslash": (read_obj, "mtllib C:\\made\\\n" + V + F),
     "a mark of another line in a name": (read_obj, "o a\u2028f 1 2 3\x0bf 1 2 3\n" + V + F),
     "corners twice": (read_obj, V + F.replace("1 3 2", "1 3 2 2").replace("1 2 4", "1 2 4 4 4")),
-    "lines and points beside": (read_obj, V + F + "l 1 2\np 3\nf 1 2\n"),
+    "with lines and points": (read_obj, V + F + "l 1 2\np 3\nf 1 2\n"),
     "weights": (read_obj, V.replace("\n", " 1.0\n") + F),
     "utf-16": (read_obj, (V + F).encode("utf-16")),
     "a glued header": (read_off, "OFF4 4 6\n" + ROWS),
@@ -205,13 +204,15 @@ TETRAHEDRA = {
     "two counts": (read_off, "off\n4 4\n" + ROWS),
     "no header": (read_off, "4 4 6\n" + ROWS),
     "one line": (read_off, " ".join(f"OFF 4 4 6 {ROWS}".split())),
-    "normals, in one line": (read_off, " ".join(f"NOFF 4 4 6 {' 0 0 1 '.join(PLACES)} 0 0 1 {ROWS[23:]}".split())),
-    "textures, in one line": (read_off, " ".join(f"STOFF 4 4 6 {' 0 1 '.join(PLACES)} 0 1 {ROWS[23:]}".split())),
+    "normals, in one line": (read_off, " ".join(f"NOFF 4 4 6 {' 0 0 1 '.join(POINTS)} 0 0 1 {ROWS[23:]}".split())),
+    "textures, in one line": (read_off, " ".join(f"STOFF 4 4 6 {' 0 1 '.join(POINTS)} 0 1 {ROWS[23:]}".split())),
     "a binary .stl named solid": (read_stl, b"solid facet normal".ljust(80) + struct.pack("<I", 4) + BINARY),
     "a text of .stl": (read_stl, SOLID),
     "two solids, in one line of capitals": (
         read_stl,
-        " ".join(f"solid {one}{two} endsolid" for one, two in (LOOPS[:2], LOOPS[2:])).upper().replace("\n", " "),
+        " ".join(f"solid {first}{second} endsolid" for first, second in (LOOPS[:2], LOOPS[2:]))
+        .upper()
+        .replace("\n", " "),
     ),
     "a wide text of .stl": (read_stl, SOLID.encode("utf-16")),
     "a text with more in a line than its header says": (
@@ -219,7 +220,7 @@ TETRAHEDRA = {
         HEAD + "element face 4\nproperty list uchar int vertex_indices\nend_header\n" + ROWS.replace("\n", " 9 8 x\n"),
     ),
     "a strip": (read_ply, STRIPS + "\n6 0 2 1 3 0 2\n"),
-    "strips that begin anew": (read_ply, STRIPS + "\n13 0 2 1 -1 1 2 3 3 -1 1 3 0 2\n"),
+    "strips that restart": (read_ply, STRIPS + "\n13 0 2 1 -1 1 2 3 3 -1 1 3 0 2\n"),
 }
 
 
@@ -235,7 +236,7 @@ def test_a_tetrahedron_is_read_in_unusual_spellings(name):
 def ply_of(kind: str, numbers: str) -> str:
     bands = "".join(f"property {kind} {band}\n" for band in ("red", "green", "blue"))
     faces = "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
-    return HEAD + bands + faces + "\n".join([f"{place} {numbers}" for place in PLACES] + ROWS.split("\n")[4:])
+    return HEAD + bands + faces + "\n".join([f"{point} {numbers}" for point in POINTS] + ROWS.split("\n")[4:])
 
 
 COLOURED = {  # the same colours of four vertices
@@ -250,7 +251,7 @@ COLOURED = {  # the same colours of four vertices
 
 
 @each("name", COLOURED)
-def test_colours_are_shares_of_the_brightest_however_they_are_written(name):
+def test_colours_are_read_as_fractions_in_each_spelling(name):
     reader, content = COLOURED[name]
     assert reader(content.encode()).vertex_colours == pytest.approx(np.tile([1, 0.2, 0], (4, 1)))
 
@@ -265,15 +266,15 @@ def test_a_vertex_has_the_mean_colour_of_its_triangles():
     assert polygons.shaded == pytest.approx(np.array([red, both, of_three, red, (0, 0, 1), (0, 0, 0)]))
 
 
-def test_faces_have_no_colours_beside_strips_which_have_none():
+def test_face_colours_are_ignored_if_strips_have_none():
     face = "element face 1\nproperty list uchar int vertex_indices\nproperty uchar red\nproperty uchar green\n"
     strips = "property uchar blue\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
-    places = "\n".join(PLACES)
-    read = read_ply(f"{HEAD}{face}{strips}{places}\n3 0 2 1 255 0 0\n5 0 1 3 2 0\n".encode())
+    points = "\n".join(POINTS)
+    read = read_ply(f"{HEAD}{face}{strips}{points}\n3 0 2 1 255 0 0\n5 0 1 3 2 0\n".encode())
     assert len(read.triangles) == 4 and read.shaded is None
 
 
-REFUSED = {  # the name of a file, its content, and what is said of it
+REFUSED = {  # the name of a file, its content, and the message
     "longer.stl": ("x".ljust(80) + "\4\0\0\0" + "\0" * 201, "284 bytes for the 4 faces that it claims, found 285"),
     "endless.stl": (SOLID[:-11], "from 'solid' to 'endsolid', found 'solid a facet norma' to "),
     "commas.stl": (SOLID.replace("1 0 0", "1,0 0 0"), "'vertex x y z' .*'1,0'"),

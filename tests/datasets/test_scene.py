@@ -1,4 +1,4 @@
-"""What a camera sees of a mesh, against closed forms; and scenes that belong to their shape."""
+"""Views of a mesh, against closed forms, and scenes whose camera depends on the shape."""
 
 from dataclasses import dataclass, replace
 
@@ -24,20 +24,20 @@ class Boxes:
     repairs: tuple[str, ...] = ()
 
     def mesh(self, split, index):
-        made = trimesh.creation.box((0.4 + 0.05 * index, 0.3, 0.3))
-        return replace(mesh_of(made.apply_translation((0, self.moved, 0))), repairs=self.repairs)
+        solid = trimesh.creation.box((0.4 + 0.05 * index, 0.3, 0.3))
+        return replace(mesh_of(solid.apply_translation((0, self.moved, 0))), repairs=self.repairs)
 
     def identity(self):
         return {"moved": self.moved}
 
 
 def bearings(height, width, focal):
-    """Camera coordinates, on the plane z = 1, of the pixel centres, worked out apart from Camera."""
+    """Camera coordinates, on the plane z = 1, of the pixel centres, computed without Camera."""
     rows, columns = np.mgrid[:height, :width] + 0.5
     return np.stack([(columns - width / 2) / focal, (rows - height / 2) / focal, np.ones((height, width))], axis=-1)
 
 
-def test_a_sphere_beside_the_axis_in_an_oblong_image_has_the_depth_of_its_closed_form():
+def test_a_sphere_off_the_axis_in_an_oblong_image_has_its_closed_form_depth():
     radius, centre = 0.6, np.array([0.3, 0.2, -0.1])
     mesh = mesh_of(trimesh.creation.icosphere(subdivisions=5, radius=radius).apply_translation(centre))
     motion = look_at(torch.tensor([1.0, 1.5, 2.0]), torch.zeros(3))
@@ -48,26 +48,22 @@ def test_a_sphere_beside_the_axis_in_an_oblong_image_has_the_depth_of_its_closed
     middle = motion.numpy().astype(float)[:3, :3] @ centre + motion.numpy()[:3, 3]
     half, square = along @ middle, (along**2).sum(-1)
     chord = half**2 - square * (middle @ middle - radius**2)
-    sure = np.abs(chord) > 0.02  # the polyhedron's outline lies a little inside the sphere's
+    sure = np.abs(chord) > 0.02  # the outline of the polyhedron lies slightly inside that of the sphere
     hit = chord > 0
     depth = (half - np.sqrt(np.where(hit, chord, 0))) / square  # along the bearing, whose z is 1
-    assert view.mask.shape == (24, 40)
-    assert np.array_equal(view.mask.numpy()[sure], hit[sure])
+    assert view.mask.shape == (24, 40) and np.array_equal(view.mask.numpy()[sure], hit[sure])
     both = sure & hit
-    assert both.sum() > 100
-    assert view.depth.numpy()[both] == pytest.approx(depth[both], abs=2e-3)
+    assert both.sum() > 100 and view.depth.numpy()[both] == pytest.approx(depth[both], abs=2e-3)
     outward = (depth[..., None] * along - middle) @ motion.numpy()[:3, :3] / radius  # back to world axes
     assert (view.normals.numpy()[both] * outward[both]).sum(-1).min() > 0.995
     background = ~view.mask
-    assert view.depth[background].abs().sum() == 0
-    assert view.normals[background].abs().sum() == 0
+    assert view.depth[background].abs().sum() == 0 and view.normals[background].abs().sum() == 0
 
 
 def test_a_scene_is_always_the_same_and_its_camera_belongs_to_the_shape():
     scene = make_scene(Boxes(), VIEWS, split=Split.TEST, index=3)
     again = make_scene(Boxes(), VIEWS, split=Split.TEST, index=3)
-    assert scene.name == "box test 3"
-    assert torch.equal(scene.view.depth, again.view.depth)
+    assert scene.name == "box test 3" and torch.equal(scene.view.depth, again.view.depth)
     assert np.array_equal(scene.mesh.vertices, again.mesh.vertices)
     others = [(Split.TEST, 4), (Split.TRAIN, 3), (Split.VALIDATION, 3)]
     for split, index in others:

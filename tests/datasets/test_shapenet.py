@@ -1,4 +1,4 @@
-"""ShapeNetCore in its own layout, with the lists of DeepSDF, Choy and PMO."""
+"""ShapeNetCore in its published layout, with the lists of DeepSDF, Choy and PMO."""
 
 import json
 from dataclasses import replace
@@ -18,20 +18,20 @@ from datasets.scene import Split, Truth, see
 from datasets.shapenet import ShapeNet
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.runner.driving import SMALLEST, command, record_of
 
 SOFA, TABLE = "04256520", "04379243"
-IDS = [f"{number:02x}a9" for number in (11, 3, 7, 12, 5, 10)]  # on disk; in no order
+IDS = [f"{number:02x}a9" for number in (11, 3, 7, 12, 5, 10)]  # unsorted
 TINY = (*SMALLEST, "field=box", "view.resolution=12", "task.points=20", "task.optimiser.iterations=2")
 
 
 def write_shape(folder: Path, synset: str, name: str, version: int = 2, shape: trimesh.Trimesh | None = None) -> None:
-    """A shape as v1 or v2 of ShapeNetCore has it; a box whose second side is longer the larger its id."""
-    place = folder / synset / name / ("models" if version == 2 else "")
-    place.mkdir(parents=True)
+    """Writes a shape in the layout of ShapeNetCore v1 or v2: a box whose second side grows with its id."""
+    models = folder / synset / name / ("models" if version == 2 else "")
+    models.mkdir(parents=True)
     box = trimesh.creation.box((1.0, 0.3 + int(name[:2], 16) / 40, 0.4)).apply_translation((0.2, 0.1, -0.3))
-    (box if shape is None else shape).export(place / ("model_normalized.obj" if version == 2 else "model.obj"))
+    (box if shape is None else shape).export(models / ("model_normalized.obj" if version == 2 else "model.obj"))
 
 
 def write_shapenet(folder: Path, version: int = 2) -> Path:
@@ -48,10 +48,10 @@ def write_split(file: Path, names: list[str], synset: str = SOFA) -> Path:
 
 
 def write_renders(folder: Path, dataset: ShapeNet, sampler: ViewSampler, views: int = 3) -> Path:
-    """What NMR and DVR have of each shape: images, masks, and cameras onto an image from -1 to 1."""
+    """Writes the renderings of NMR and DVR for each shape: images, masks, and cameras onto an image from -1 to 1."""
     half = (sampler.resolution - 1) / 2
-    for split, index in ((one, index) for one in Split for index in range(len(dataset.files[one]))):
-        truth, place, stored = Truth(dataset.mesh(split, index)), folder / SOFA / ids(dataset, split)[index], {}
+    for split, index in [(s, index) for s in Split for index in range(len(dataset.files[s]))]:
+        truth, target, stored = Truth(dataset.mesh(split, index)), folder / SOFA / ids(dataset, split)[index], {}
         for view in range(views):
             camera = sampler.draw(view)
             intrinsics = np.eye(4)
@@ -60,16 +60,16 @@ def write_renders(folder: Path, dataset: ShapeNet, sampler: ViewSampler, views: 
             stored |= {f"camera_mat_{view}": intrinsics, f"world_mat_{view}": motion}
             stored |= {f"world_mat_inv_{view}": np.linalg.inv(motion)}
             for name, value in {"mask": 255, "image": 80 + 40 * view}.items():
-                (place / name).mkdir(parents=True, exist_ok=True)
+                (target / name).mkdir(parents=True, exist_ok=True)
                 pixels = (see(truth, camera).mask.numpy() * value).astype(np.uint8)
-                Image.fromarray(pixels).save(place / name / f"{view:04d}.png")
-        np.savez(place / "cameras.npz", **stored)
+                Image.fromarray(pixels).save(target / name / f"{view:04d}.png")
+        np.savez(target / "cameras.npz", **stored)
     return folder
 
 
 def shapenet(folder: Path, split: Path | None = None, **changes: str) -> ShapeNet:
-    given = {"path": str(folder), "synset": "sofa", "split": split and str(split), "normalised": "deepsdf"}
-    return ShapeNet(**given | changes)
+    settings = {"path": str(folder), "synset": "sofa", "split": split and str(split), "normalised": "deepsdf"}
+    return ShapeNet(**settings | changes)
 
 
 def ids(dataset: ShapeNet, split: Split) -> list[str]:
@@ -82,7 +82,7 @@ def v2(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_both_releases_are_found_and_all_shapes_dealt_out(tmp_path, version):
+def test_both_releases_are_read_and_each_shape_is_in_a_split(tmp_path, version):
     dataset = shapenet(write_shapenet(tmp_path, version))
     dealt = {split: ids(dataset, split) for split in Split}
     assert sorted(name for names in dealt.values() for name in names) == sorted(IDS) and all(dealt.values())
@@ -102,17 +102,17 @@ def test_shapes_are_placed_as_by_deepsdf_or_onet(v2, tmp_path):
     assert np.ptp(cube.vertices, axis=0).max() == pytest.approx(1)
 
 
-def test_a_shape_without_an_inside_has_a_warning_and_is_placed_by_the_file(tmp_path, monkeypatch):
+def test_a_shape_without_an_inside_has_a_warning_and_is_normalised_by_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(repair, "WRAP_ALPHAS", (8.0,))
     walls = trimesh.creation.box((1.0, 1.0, 1.0))
-    walls.update_faces([0, 1, 2, 3, 6, 7, 9])  # which do not close
+    walls.update_faces([0, 1, 2, 3, 6, 7, 9])  # these faces do not close
     write_shape(tmp_path, SOFA, "01aa", shape=walls)
     write_shape(tmp_path, SOFA, "02aa")
     dataset = shapenet(tmp_path, write_split(tmp_path / "split.json", ["01aa", "02aa"]))
     wrapped, box = (dataset.mesh(Split.TEST, index) for index in (0, 1))
-    told = [" ".join(mesh.repairs) for mesh in (wrapped, box)]
-    assert ["warning: the file does not say what is inside" in notes for notes in told] == [True, False]
-    assert 1 / 1.03 + 1e-3 < np.linalg.norm(wrapped.vertices, axis=1).max() < 1 / 1.03 + 1e-2  # a wrap lies outside
+    warned = ["warning: the file does not say what is inside" in " ".join(mesh.repairs) for mesh in (wrapped, box)]
+    assert warned == [True, False]
+    assert 1 / 1.03 + 1e-3 < np.linalg.norm(wrapped.vertices, axis=1).max() < 1 / 1.03 + 1e-2  # the wrap lies outside
 
 
 def test_the_split_of_deepsdf_gives_the_order_and_its_training_list_the_others(v2, tmp_path):
@@ -127,7 +127,7 @@ def test_the_split_of_deepsdf_gives_the_order_and_its_training_list_the_others(v
         assert ids(both, Split.TEST) == [IDS[2], IDS[0]]
         assert sorted([*ids(both, Split.TRAIN), *ids(both, Split.VALIDATION)]) == sorted(IDS[3:])
     assert both.identity() != alone.identity()
-    write_split(train, ["0dead"])  # of which none is on disk
+    write_split(train, ["0dead"])  # no shape of the list is on disk
     assert ids(shapenet(v2, test), Split.TEST) == [IDS[2], IDS[0]]
     with pytest.raises(BadInput, match=r"shapenet_sofa has 0 train .* put their list beside dataset\.split, .* prior="):
         shapenet(v2, test).mesh(Split.TRAIN, 0)
@@ -158,7 +158,7 @@ def test_shapes_that_are_not_on_disk_are_counted_and_left_out(v2, tmp_path):
     assert not any("left out" in note for note in dataset.mesh(Split.TRAIN, 0).repairs)
 
 
-@pytest.mark.parametrize(("given", "told"), [
+@pytest.mark.parametrize(("settings", "message"), [
     ({"synset": "sofas"}, "dataset.synset must be one of plane, .* sofa"),
     ({"synset": "car"}, "there is no folder .*02958343': give the folder of ShapeNetCore"),
     ({"synset": "lamp"}, "03636649' has no ID/models/model_normalized.obj .*: give the folder of ShapeNetCore"),
@@ -171,14 +171,14 @@ def test_shapes_that_are_not_on_disk_are_counted_and_left_out(v2, tmp_path):
     ({"split": "other.lst"}, "none of its 2 shapes is in .*04256520', such as 0bad: unpack them there"),
     ({"split": "empty.lst"}, "has nothing of sofa, but nothing"),
 ], ids=lambda value: " ".join(value.values()) if isinstance(value, dict) else "")  # fmt: skip
-def test_what_is_missing_is_named_with_a_remedy(v2, tmp_path, monkeypatch, given, told):
+def test_what_is_missing_is_named_with_a_remedy(v2, tmp_path, monkeypatch, settings, message):
     monkeypatch.chdir(tmp_path)
     (v2 / "03636649").mkdir(exist_ok=True)
     write_split(tmp_path / "tables.json", ["01ff"], TABLE)
     for name, text in {"broken.json": '{"ShapeNetV2": {', "other.lst": "0bad\n0dead\n", "empty.lst": "\n"}.items():
         (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=told):
-        shapenet(v2, **given)
+    with pytest.raises(ValueError, match=message):
+        shapenet(v2, **settings)
 
 
 def test_a_run_completes_a_shape_and_says_which(v2, tmp_path):
@@ -189,18 +189,18 @@ def test_a_run_completes_a_shape_and_says_which(v2, tmp_path):
     assert family(record) == "shapenet_sofa" and f"the shape is {IDS[1]}" in record["notes"]
 
 
-def test_a_run_is_another_one_where_the_list_or_the_shapes_on_disk_are_others(tmp_path):
+def test_another_list_or_other_shapes_on_disk_are_another_run(tmp_path):
     folder = write_shapenet(tmp_path / "ShapeNetCore.v2")
     split = write_split(tmp_path / "test.json", IDS[:2])
 
     def code() -> str:
-        _class_counts_hash.cache_clear()  # which is that of one command
+        _class_counts_hash.cache_clear()  # the cache holds for one command
         dataset = {"path": str(folder), "synset": "sofa", "split": str(split)}
         return Identity(dict.fromkeys(("task", "renderer", "dataset"), "x"), {"dataset": dataset}).code
 
     first = code()
     (folder / "02958343.zip").write_bytes(b"packed")
-    assert code() == first  # gigabytes that are not read
+    assert code() == first  # archives are not part of the identity
     write_shape(folder, SOFA, "14a9")
     second = code()
     write_split(split, IDS[1:3])
@@ -208,7 +208,7 @@ def test_a_run_is_another_one_where_the_list_or_the_shapes_on_disk_are_others(tm
 
 
 SAMPLER = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(10.0, 40.0), resolution=24)
-IMAGING = Imaging(replace(PLAINLY, views=3), SAMPLER)
+IMAGING = Imaging(replace(PHOTOGRAPHY, views=3), SAMPLER)
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +216,7 @@ def renders(v2, tmp_path_factory) -> Path:
     return write_renders(tmp_path_factory.mktemp("NMR"), shapenet(v2, normalised="onet"), SAMPLER)
 
 
-def test_images_of_others_take_the_place_of_rendered_ones(v2, renders, tmp_path):
+def test_published_images_replace_rendered_ones(v2, renders, tmp_path):
     dataset = shapenet(v2, normalised="onet", renders=str(renders))
     assert dataset.identity() != shapenet(v2, normalised="onet").identity()
     (first, *_) = IMAGING.images(dataset, Split.TRAIN, 2, tmp_path, lambda *_: None)
@@ -229,12 +229,12 @@ def test_images_of_others_take_the_place_of_rendered_ones(v2, renders, tmp_path)
         assert (first.colours[view][first.masks[view]] == 80 + 40 * view).all()
 
 
-@pytest.mark.parametrize(("changes", "imaging", "told"), [
+@pytest.mark.parametrize(("changes", "imaging", "message"), [
     ({"normalised": "deepsdf"}, IMAGING, "do not show its mesh: masks overlap by .*dataset.normalised=onet"),
-    ({}, replace(IMAGING, photography=replace(PLAINLY, views=4)), "has 3 images, .* not 4 of 24 x 24 with masks: set"),
+    ({}, replace(IMAGING, photography=replace(PHOTOGRAPHY, views=4)), "has 3 images, .* not 4 of 24 x 24 with masks"),
     ({}, replace(IMAGING, sampler=replace(SAMPLER, resolution=32)), "24 x 24 pixels, not 3 of 32 x 32 with masks: set"),
 ], ids=["another place", "few", "small"])  # fmt: skip
-def test_images_that_do_not_fit_are_refused(v2, renders, changes, imaging, told):
+def test_images_that_do_not_fit_are_refused(v2, renders, changes, imaging, message):
     dataset = shapenet(v2, **{"normalised": "onet", "renders": str(renders)} | changes)
-    with pytest.raises(BadInput, match=told):
+    with pytest.raises(BadInput, match=message):
         imaging.shape_images(dataset, Split.TRAIN, 0)

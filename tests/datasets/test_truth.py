@@ -24,8 +24,7 @@ def test_rays_hit_a_box_where_they_must(box):
     directions = np.array([[0.0, 0, 1], [0, 0, -1], [-3, 0, 0], [0, 5, 0]])  # ahead, away, not unit, from inside
     hits = Truth(box).cast(origins, directions)
     assert hits.hit.tolist() == [True, False, True, True]
-    assert hits.distance[hits.hit] == pytest.approx([1.5, 1.5, 0.3], abs=1e-6)
-    assert hits.distance[1] == np.inf
+    assert hits.distance[hits.hit] == pytest.approx([1.5, 1.5, 0.3], abs=1e-6) and hits.distance[1] == np.inf
     assert hits.normals[hits.hit] == pytest.approx(np.array([[0, 0, -1], [1, 0, 0], [0, 1, 0]]), abs=1e-6)
     assert {hits.distance.dtype, hits.normals.dtype} == {np.dtype(np.float32)}
 
@@ -39,8 +38,7 @@ def test_no_rays_give_no_hits_and_a_direction_of_no_length_is_refused(box):
 def test_signed_distance_of_a_box_is_exact_and_keeps_leading_shape(box):
     points = np.random.default_rng(0).uniform(-1, 1, (20, 50, 3))
     distance = Truth(box).signed_distance(points)
-    assert distance.dtype == np.float32
-    assert distance == pytest.approx(box_distance(points), abs=1e-5)
+    assert distance.dtype == np.float32 and distance == pytest.approx(box_distance(points), abs=1e-5)
 
 
 def test_the_sign_holds_where_rays_meet_edges_and_vertices(box):
@@ -59,8 +57,8 @@ def test_samples_lie_on_the_surface_evenly_by_area_with_outward_normals():
     points, normals = sampled.points, sampled.normals
     assert np.abs(Truth(mesh).signed_distance(points)).max() < 1e-6
     assert Truth(mesh).signed_distance(points + 0.01 * normals).min() > 0.009
-    shares = np.abs(normals).mean(axis=0)
-    assert shares == pytest.approx(np.array([8, 4, 2]) / 14, abs=0.02)
+    fractions = np.abs(normals).mean(axis=0)
+    assert fractions == pytest.approx(np.array([8, 4, 2]) / 14, abs=0.02)
     assert points.mean(axis=0) == pytest.approx([0, 0, 0], abs=0.05)
     assert points.std(axis=0)[2] == pytest.approx(np.sqrt((12 * 16 / 12 + 2 * 4) / 14), abs=0.03)
 
@@ -75,5 +73,5 @@ def test_samples_follow_the_seed(box):
 
 def test_the_distance_to_an_open_mesh_has_no_sign():
     square = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
-    found = Truth(square, closed=False).distance(np.array([[0.5, 0.5, 0.3], [0.5, 0.5, -0.3], [2.0, 0.5, 0.0]]))
-    assert found == pytest.approx([0.3, 0.3, 1.0], abs=1e-6)
+    distances = Truth(square, closed=False).distance(np.array([[0.5, 0.5, 0.3], [0.5, 0.5, -0.3], [2.0, 0.5, 0.0]]))
+    assert distances == pytest.approx([0.3, 0.3, 1.0], abs=1e-6)

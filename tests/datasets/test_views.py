@@ -1,4 +1,4 @@
-"""Where cameras stand and what they have up, against a worked example; and which pixels' depth is given."""
+"""Poses of sampled cameras, against a worked example, and the pixels with observed depths."""
 
 from dataclasses import replace
 from math import atan2, cos, pi, radians, sin, tan
@@ -51,7 +51,7 @@ def test_the_image_has_the_origin_in_its_middle_and_world_y_up(seed):
     assert torch.allclose(middle, -camera.center / 2.5, atol=1e-5)
 
 
-def test_the_unit_sphere_is_seen_whole():
+def test_the_whole_unit_sphere_is_in_the_image():
     rays = VIEWS.camera(37.0, 20.0).rays()
     least = torch.linalg.cross(rays.origins, rays.directions).norm(dim=-1)
     border = torch.cat([least[0], least[-1], least[:, 0], least[:, -1]])
@@ -94,14 +94,14 @@ def test_a_camera_above_or_at_its_target_is_an_error(eye):
 
 
 def test_the_view_of_a_shape_is_not_drawn_as_the_shape_is():
-    # Shapes draw their parameters from the same number; drawn alike, narrow ones would all be seen from one side.
+    # Shapes draw their parameters from the same seed. Equal draws would show all narrow shapes from one side.
     views = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 8)
-    shares = []
+    turns = []
     for seed in range(40):
         x, _, z = views.draw(seed).center.tolist()
-        shares.append((atan2(x, z) / (2 * pi)) % 1)
+        turns.append((atan2(x, z) / (2 * pi)) % 1)
     shapes = [np.random.default_rng(seed).random() for seed in range(40)]
-    assert abs(np.corrcoef(shares, shapes)[0, 1]) < 0.5
+    assert abs(np.corrcoef(turns, shapes)[0, 1]) < 0.5
 
 
 @each("direction", [(0.3, -0.4, 0.5), (0.0, 0.0, -2.0), (-1.0, 0.2, 0.0)])
@@ -112,16 +112,15 @@ def test_the_camera_towards_a_direction_stands_in_it(direction):
     assert project(camera, (0.0, 0.0, 0.0)) == pytest.approx([16.5, 16.5], abs=1e-4)
 
 
-def test_the_camera_straight_above_stands_a_degree_beside():
+def test_the_camera_straight_above_is_tilted_by_a_degree():
     above = VIEWS.towards(torch.tensor([0.0, 1.0, 0.0])).center.numpy()
     assert above == pytest.approx([0.0, 2.5 * cos(pi / 180), 2.5 * sin(pi / 180)], abs=1e-5)
 
 
 @each("points, count", [("dense", 200), ("2.5%", 5), ("0.01%", 1), (7, 7), (" 7 ", 7)])
-def test_an_amount_gives_so_many_pixels_of_the_foreground(points, count):
+def test_an_amount_gives_this_number_of_foreground_pixels(points, count):
     observed = observed_pixels(MASK, points, seed=0)
-    assert observed.dtype == torch.bool
-    assert observed.sum() == count
+    assert observed.dtype == torch.bool and observed.sum() == count
     assert not (observed & ~MASK).any()
 
 
@@ -141,9 +140,7 @@ def test_every_pixel_of_the_foreground_can_be_drawn():
 
 @each("points", [0, "101%", "abc", "5.5", "nan%"])
 def test_an_invalid_amount_is_an_error_with_a_remedy(points):
-    with pytest.raises(
-        ValueError, match=f'points must be "dense", a share up to "100%", or a number .*, not .{points}'
-    ):
+    with pytest.raises(ValueError, match=f'points must be "dense", a share up to "100%", or a .*, not .{points}'):
         observed_pixels(MASK, points, seed=0)
 
 

@@ -1,4 +1,4 @@
-"""Limits on work and memory: reached, told with their kind and number, and no hindrance below."""
+"""Limits of evaluations and memory: they end work with their kind and number, and change nothing below."""
 
 import ctypes
 import itertools
@@ -43,7 +43,7 @@ def test_values_are_limited_from_when_the_watch_begins():
         assert str(caught.value) == "more than 100 field values in a step"
 
 
-def test_a_call_for_few_points_counts_as_one_for_more():
+def test_a_call_with_few_points_counts_as_the_least_number():
     watched = Limits(values=10 * MIN_VALUES_PER_CALL, memory=8).watch(FIELD, CPU)
     for _ in range(10):
         watched(torch.zeros(1, 3))
@@ -52,14 +52,13 @@ def test_a_call_for_few_points_counts_as_one_for_more():
         watched(torch.zeros(1, 3))
 
 
-def test_values_are_limited_on_the_way_back_too():
+def test_evaluations_of_the_backward_pass_are_limited():
     points = torch.zeros(60, 3, requires_grad=True)
     watched = Limits(values=100, memory=8).watch(FIELD, CPU)
     values = watched(points + 1)
     with pytest.raises(LimitReached, match=r"more than 100 field values") as caught:
         values.sum().backward()
-    assert caught.value.status is RunStatus.TIMEOUT
-    assert points.grad is None
+    assert caught.value.status is RunStatus.TIMEOUT and points.grad is None
 
 
 def test_memory_is_limited(clock):
@@ -74,10 +73,10 @@ def test_memory_is_limited(clock):
             clock.sleep(1.1 * limits.MEMORY_CHECK_SECONDS)
             watched(POINTS)
     assert caught.value.status is RunStatus.OOM
-    assert 3 <= len(held) <= 6  # of 32 MiB each
+    assert 3 <= len(held) <= 6  # blocks of 32 MiB
 
 
-def test_where_memory_cannot_be_measured_work_is_still_limited(monkeypatch):
+def test_evaluations_are_limited_also_if_memory_cannot_be_measured(monkeypatch):
     monkeypatch.setattr(MemoryPeak, "growth", lambda self: None)
     watched = Limits(values=MIN_VALUES_PER_CALL, memory=1e-6).watch(FIELD, CPU)
     watched(POINTS)
@@ -98,16 +97,16 @@ def test_the_memory_is_not_checked_in_every_evaluation(clock, monkeypatch):
 
 
 def test_invalid_limits_are_errors():
-    for name, wrong in itertools.product(("values", "memory"), (0.0, -1.0, float("nan"), float("inf"))):
-        with pytest.raises(ValueError, match=rf"limits\.{name} must be positive, not {wrong}"):
-            Limits(**({"values": 1.0, "memory": 1.0} | {name: wrong}))
+    for name, invalid in itertools.product(("values", "memory"), (0.0, -1.0, float("nan"), float("inf"))):
+        with pytest.raises(ValueError, match=rf"limits\.{name} must be positive, not {invalid}"):
+            Limits(**({"values": 1.0, "memory": 1.0} | {name: invalid}))
 
 
 def held_but_free(mib: int) -> torch.Tensor:
-    """Leaves memory in the process that it does not use: many blocks too small to be mapped, freed behind a last one.
+    """Leaves unused memory in the process: many freed blocks, too small to be mapped, before a last block.
 
     Returns:
-        the last block, to be kept while the memory is to stay.
+        the last block, which keeps the memory in the process.
     """
     blocks = [torch.ones(16 * 1024) for _ in range(16 * mib)]  # of 64 KiB
     return blocks[-1]
@@ -122,8 +121,7 @@ def test_a_rise_shows_in_memory_that_the_process_still_holds():
     growth = memory.growth()
     if growth is None:
         pytest.skip("the memory of a process cannot be measured here")
-    assert 0.9 * 64 * MIB < growth < 1.3 * 64 * MIB
-    assert len(blocks) + last.numel() > 0
+    assert 0.9 * 64 * MIB < growth < 1.3 * 64 * MIB and len(blocks) + last.numel() > 0
 
 
 def test_pages_of_files_do_not_count(tmp_path):
@@ -150,5 +148,4 @@ def test_memory_within_a_pause_does_not_count():
         del paused
     assert 14 * MIB < memory.growth() < 40 * MIB
     again = torch.ones(48 * MIB // 4)
-    assert 44 * MIB < memory.growth() < 80 * MIB
-    assert again.numel()
+    assert 44 * MIB < memory.growth() < 80 * MIB and again.numel()

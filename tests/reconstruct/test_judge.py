@@ -1,4 +1,4 @@
-"""The judge of a reconstruction, by a coloured sphere that is known, and by errors of known size."""
+"""The evaluation of a reconstruction, for a coloured sphere and for errors of known size."""
 
 from dataclasses import replace
 from math import inf, log10
@@ -28,7 +28,7 @@ OF_HITS = set(COLOURED_DEFINITIONS) - set(WEIGHT)  # the metrics of a renderer t
 
 
 def painted(*, red: float = 0.0, radius: float = 0.6) -> Ball:
-    """A sphere of colours that change with the place, of which red is `red` more."""
+    """A sphere whose colours change with the position, with red larger by `red`."""
     paint = torch.zeros(3, 10)
     paint[0, 9], paint[1, 1], paint[2, 0] = torch.tensor(0.5 + red).logit(), 2.0, 2.0
     return cast(ball(radius, CENTRE, paint), torch.float32)
@@ -48,19 +48,19 @@ def inputs(tmp_path):
 
 
 def test_the_truth_scores_high(subject, inputs):
-    found = judge(State(painted(), inputs), subject)
-    assert found.failure is None and set(found.metrics) == OF_HITS
-    metrics = found.metrics
+    evaluation = judge(State(painted(), inputs), subject)
+    assert evaluation.failure is None and set(evaluation.metrics) == OF_HITS
+    metrics = evaluation.metrics
     assert metrics["own_psnr"] > 60 and metrics["own_ssim"] > 0.9999 and metrics["own_mask_iou"] == 1.0
     assert metrics["psnr"] > 25 and metrics["ssim"] > 0.95 and metrics["mask_iou_least"] > 0.94
     assert metrics["mask_iou_least"] <= metrics["mask_iou"] <= 1.0
     assert metrics["chamfer_l1"] < 0.03 and metrics["seen_chamfer_l1"] < 0.03
     assert metrics["normal_consistency"] > 0.99 and metrics["fscore"] > 0.4
-    assert found.mesh is not None and found.mesh.colours is not None
+    assert evaluation.mesh is not None and evaluation.mesh.colours is not None
 
 
 def test_vertices_have_the_fields_colours_seen_from_straight_above(subject, inputs):
-    shape = cast(ball(0.6, CENTRE), torch.float32)  # whose colours change with the direction
+    shape = cast(ball(0.6, CENTRE), torch.float32)  # its colours change with the direction
     mesh = judge(State(shape, inputs), subject).mesh
     assert mesh is not None and mesh.colours is not None
     points = torch.from_numpy(mesh.vertices).float()
@@ -72,14 +72,14 @@ def test_vertices_have_the_fields_colours_seen_from_straight_above(subject, inpu
 def test_a_wrong_colour_has_the_psnr_of_its_size(subject, inputs):
     metrics = judge(State(painted(red=0.2), inputs), subject).metrics
     shares = [shot.mask.float().mean().item() for shot in subject.held_out]
-    assert metrics["own_psnr"] == pytest.approx(-10 * log10(0.2**2 / 3), abs=0.01)  # of three colours one is wrong
+    assert metrics["own_psnr"] == pytest.approx(-10 * log10(0.2**2 / 3), abs=0.01)  # one of three channels is wrong
     expected = np.mean([-10 * log10(0.2**2 * share / 3) for share in shares])
     assert metrics["own_psnr_image"] == pytest.approx(expected, abs=0.01)
     assert metrics["own_ssim"] < 0.999 and metrics["own_mask_iou"] == 1.0
 
 
 def test_the_seen_part_is_judged_alone(subject, inputs):
-    """Photographs from one side do not see a dent of the other one."""
+    """Photographs from one side do not show a dent on the other side."""
     side = tuple(shot_of(painted(), camera_of(24, angles=(across, 0.0))) for across in (-30.0, 0.0, 30.0))
     vertices = subject.truth.vertices.copy()
     vertices[vertices[:, 2] < CENTRE[2], 2] -= 0.2
@@ -88,11 +88,10 @@ def test_the_seen_part_is_judged_alone(subject, inputs):
 
 
 def test_no_surface_is_empty_and_scores_worst(subject, inputs):
-    found = judge(State(painted(radius=-0.5), inputs), subject)
-    assert found.mesh is None and found.failure is not None and found.failure[0] is RunStatus.EMPTY
-    metrics = found.metrics
-    assert set(metrics) == OF_HITS
-    assert all(metrics[name] == inf for name in ROUGHNESS)
+    evaluation = judge(State(painted(radius=-0.5), inputs), subject)
+    assert evaluation.mesh is None and evaluation.failure is not None and evaluation.failure[0] is RunStatus.EMPTY
+    metrics = evaluation.metrics
+    assert set(metrics) == OF_HITS and all(metrics[name] == inf for name in ROUGHNESS)
     assert metrics["chamfer_l1"] == metrics["seen_chamfer_l1"] == inf and metrics["fscore"] == 0.0
     assert [metrics[prefix + name] for prefix in ("", OWN_PREFIX) for name in MASK_IOU] == [0.0] * 4
     assert 0 < metrics["psnr"] < 15 and metrics["psnr"] == pytest.approx(metrics["own_psnr"])
@@ -103,7 +102,7 @@ def test_images_are_compared_black_outside_of_their_masks():
     mask[:, :2] = True
     covered = mask.roll(1, 1)  # half of the mask
     image = 0.6 * covered[..., None].float().expand(-1, -1, 3)
-    larger = [part.repeat_interleave(4, 0).repeat_interleave(4, 1) for part in (mask, covered, image)]
+    larger = [array.repeat_interleave(4, 0).repeat_interleave(4, 1) for array in (mask, covered, image)]
     camera = camera_of(16).resized(8, 16)
     shot = Shot("0", camera, torch.full((8, 16, 3), 0.8), larger[0])
     view = View(camera, torch.zeros(8, 16), torch.zeros(8, 16, 3), larger[1])
@@ -115,7 +114,7 @@ def test_images_are_compared_black_outside_of_their_masks():
     blind = image_scores([view], [larger[2]], [replace(shot, mask=None)])
     assert set(blind) == {"psnr", "ssim"}
     meets = sphere_span(camera.rays())[2]
-    wrong = ((larger[2] - 0.8) ** 2)[meets].mean().item()  # what the shape does not cover is black, and wrong as well
+    wrong = ((larger[2] - 0.8) ** 2)[meets].mean().item()  # pixels without the shape are black, and wrong too
     assert meets.any() and not meets.all() and blind["psnr"] == pytest.approx(-10 * log10(wrong), abs=1e-4)
 
 
@@ -128,7 +127,7 @@ def test_means_and_the_least_are_over_photographs_of_any_size():
     views = [_view(shots[0]), replace(_view(shots[1]), mask=torch.zeros(12, 24, dtype=torch.bool))]
     images = [shots[0].colours * shots[0].mask[..., None], torch.zeros(12, 24, 3)]
     images[0] = images[0] + 0.1
-    for _ in range(5):  # types are checked of a part that is drawn
+    for _ in range(5):  # type checks sample the elements
         scores = image_scores(views, images, shots)
     lost = (shots[1].colours[shots[1].mask] ** 2).mean().item()
     assert scores["psnr"] == pytest.approx((20.0 - 10 * log10(lost)) / 2, abs=1e-4)
@@ -136,7 +135,7 @@ def test_means_and_the_least_are_over_photographs_of_any_size():
 
 
 def test_a_volume_is_judged_by_the_weighted_sum_that_it_shows(inputs):
-    """In one colour that is the colour times the opacity; at the colour of its mean depth it would be the colour."""
+    """For one colour the sum is the colour times the opacity. At the mean depth it would be the colour itself."""
     plain = cast(ball(0.6, CENTRE, torch.zeros(3, 10)), torch.float32)  # grey, 1/2
     volume = replace(inputs, renderer=load("renderer", "neus", sharpness=10.0))
     view, image = render_image(plain, camera_of(24), volume)
@@ -149,7 +148,7 @@ def test_a_volume_is_judged_by_the_weighted_sum_that_it_shows(inputs):
 
 
 def plane(tilt: float, *, count: int = 2000, side: float = 1.0) -> Surface:
-    """Points of a plane whose normals lean by so many degrees to one side or the other, in turn."""
+    """Points of a plane whose normals lean by `tilt` degrees to alternating sides."""
     points = np.random.default_rng(0).uniform(0, side, (count, 3)) * (1, 1, 0)
     lean = np.radians(tilt) * np.where(np.arange(count) % 2, 1, -1)
     return Surface(points, np.stack([np.sin(lean), 0 * lean, np.cos(lean)], axis=1))
@@ -166,23 +165,23 @@ def test_roughness_is_the_mean_angle_of_neighbours():
 
 def test_roughness_is_over_the_seen_and_the_unseen_part_and_less_that_of_the_truth():
     bumpy, smooth = plane(8), plane(2)
-    seen = bumpy.points[:, 0] < 0.5
-    normals = np.where(seen[:, None], smooth.normals, bumpy.normals)
-    scores = roughness_scores((replace(bumpy, normals=normals), seen), (smooth, seen))
+    visible = bumpy.points[:, 0] < 0.5
+    normals = np.where(visible[:, None], smooth.normals, bumpy.normals)
+    scores = roughness_scores((replace(bumpy, normals=normals), visible), (smooth, visible))
     assert scores["seen_roughness"] == pytest.approx(0, abs=1e-9)
     assert scores["unseen_roughness"] == pytest.approx(6, rel=0.05)
-    whole = np.ones_like(seen)  # without a side that is unseen
-    assert roughness_scores((smooth, whole), (smooth, seen))["unseen_roughness"] == np.inf
-    assert roughness_scores((smooth, whole), (smooth, whole))["unseen_roughness"] == 0
-    assert roughness_scores(None, (smooth, seen)) == {"seen_roughness": np.inf, "unseen_roughness": np.inf}
+    all_seen = np.ones_like(visible)  # without an unseen side
+    assert roughness_scores((smooth, all_seen), (smooth, visible))["unseen_roughness"] == np.inf
+    assert roughness_scores((smooth, all_seen), (smooth, all_seen))["unseen_roughness"] == 0
+    assert roughness_scores(None, (smooth, visible)) == {"seen_roughness": np.inf, "unseen_roughness": np.inf}
 
 
 @pytest.mark.parametrize(("sharpness", "least", "most"), [(400.0, 0.0, 0.01), (20.0, 0.2, 0.6)])
 def test_a_wide_blur_has_weight_before_the_surface(subject: Subject, inputs, sharpness, least, most):
     views = [see(Truth(subject.truth), subject.held_out[0].camera)]
     neus = load("renderer", "neus", sharpness=sharpness, sharpening=0)
-    found = early_weight(painted(), views, replace(inputs, renderer=neus))
-    assert least <= found["own_early_weight"] < most
+    scores = early_weight(painted(), views, replace(inputs, renderer=neus))
+    assert least <= scores["own_early_weight"] < most
 
 
 def test_a_renderer_of_hits_has_no_weight_before_the_surface(subject: Subject, inputs):

@@ -1,4 +1,4 @@
-"""The pixels of photographs of two sizes: which are drawn, that patches are neighbours, and what is known of them."""
+"""The pixels of photographs of two sizes: drawn pixels, patches of neighbours, and their observations."""
 
 from dataclasses import replace
 
@@ -26,52 +26,50 @@ def numbered(camera, photograph: int) -> Shot:
 SHOTS = [numbered(WIDE, 0), numbered(TALL, 1)]
 
 
-def places(pixels) -> torch.Tensor:
+def positions(pixels) -> torch.Tensor:
     """Photograph, row and column of pixels, from their colours."""
     return (100 * pixels.colours).round().long()
 
 
-def test_pixels_stand_in_one_row_with_their_own_rays():
+def test_pixels_are_in_one_row_with_their_rays():
     stack = Stack.build(SHOTS, None, CPU)
     assert len(stack.pixels.colours) == 12 * 20 + 18 * 8
     for shot, (photograph, row, column) in ((SHOTS[0], (0, 3, 7)), (SHOTS[1], (1, 11, 5))):
-        place = photograph * 12 * 20 + row * SIZES[photograph][1] + column
-        assert places(stack.pixels)[place].tolist() == [photograph, row, column]
-        assert stack.width[place] == SIZES[photograph][1]
+        index = photograph * 12 * 20 + row * SIZES[photograph][1] + column
+        assert positions(stack.pixels)[index].tolist() == [photograph, row, column]
+        assert stack.width[index] == SIZES[photograph][1]
         rays = shot.camera.rays()
-        assert torch.equal(stack.pixels.rays.directions[place], rays.directions[row, column])
-        assert torch.equal(stack.pixels.rays.origins[place], rays.origins[row, column])
-        assert stack.pixels.mask is not None and stack.pixels.mask[place] == ((row + column) % 3 == 0)
+        assert torch.equal(stack.pixels.rays.directions[index], rays.directions[row, column])
+        assert torch.equal(stack.pixels.rays.origins[index], rays.origins[row, column])
+        assert stack.pixels.mask is not None and stack.pixels.mask[index] == ((row + column) % 3 == 0)
         forward = shot.camera.world_to_camera[2, :3]
-        assert stack.pixels.depth_per_distance[place].item() == pytest.approx(
+        assert stack.pixels.depth_per_distance[index].item() == pytest.approx(
             (rays.directions[row, column] @ forward).item()
         )
 
 
 def test_patches_are_neighbours_in_one_photograph():
-    drawn = places(Stack.build(SHOTS, None, CPU).draw(2000, patches=True, seed=0)).view(-1, 4, 3)
+    drawn = positions(Stack.build(SHOTS, None, CPU).draw(2000, patches=True, seed=0)).view(-1, 4, 3)
     assert len(drawn) == 500 and set(drawn[:, 0, 0].tolist()) == {0, 1}
     offsets = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]])
     assert (drawn == drawn[:, :1] + offsets).all()
     for photograph, (height, width) in enumerate(SIZES):
-        there = drawn[drawn[:, 0, 0] == photograph]
-        assert (there[..., 1] < height).all() and (there[..., 2] < width).all()
+        inside = drawn[drawn[:, 0, 0] == photograph]
+        assert (inside[..., 1] < height).all() and (inside[..., 2] < width).all()
 
 
 def test_only_rays_that_meet_the_unit_sphere_are_drawn_and_all_of_them():
     wide = [numbered(camera_of(16, field_of_view=100.0), 0), numbered(camera_of(9, field_of_view=90.0), 1)]
     stack = Stack.build(wide, None, CPU)
     meets = sphere_span(stack.pixels.rays)[2]
-    assert 0.1 < meets.float().mean() < 0.5
-    assert torch.equal(stack.useful, meets.nonzero().squeeze(-1))
+    assert 0.1 < meets.float().mean() < 0.5 and torch.equal(stack.useful, meets.nonzero().squeeze(-1))
     drawn = stack.draw(4000, patches=False, seed=0)
-    assert sphere_span(drawn.rays)[2].all()
-    assert len(torch.unique(places(drawn), dim=0)) == int(meets.sum())
+    assert sphere_span(drawn.rays)[2].all() and len(torch.unique(positions(drawn), dim=0)) == int(meets.sum())
     patches = stack.draw(4000, patches=True, seed=0)
     assert sphere_span(patches.rays)[2][::4].all()  # the upper left pixel of each
 
 
-def test_cameras_that_look_away_are_told():
+def test_cameras_that_look_away_are_refused():
     camera = camera_of(8, field_of_view=30.0)
     turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     away = replace(camera, world_to_camera=turn @ camera.world_to_camera)
@@ -79,7 +77,7 @@ def test_cameras_that_look_away_are_told():
         Stack.build([numbered(away, 0)], None, CPU)
 
 
-def test_given_depths_are_distances_along_rays_and_nan_elsewhere():
+def test_observed_depths_become_distances_along_rays_or_nan():
     shape, cameras = ball(), (WIDE, TALL)
     shots = [shot_of(shape, camera) for camera in cameras]
     stack = Stack.build(shots, None, CPU)
@@ -91,11 +89,11 @@ def test_given_depths_are_distances_along_rays_and_nan_elsewhere():
     assert alone is not None and alone[12 * 20 :].isnan().all() and alone[: 12 * 20].isfinite().any()
 
 
-def test_a_guide_is_kept_in_its_order_and_what_is_not_known_is_none():
+def test_a_guide_keeps_its_order_and_unknown_observations_are_none():
     guide = [torch.full(size, 1.0 + number) for number, size in enumerate(SIZES)]
     pixels = Stack.build([replace(shot, mask=None) for shot in SHOTS], guide, CPU).pixels
     assert pixels.guide is not None and pixels.guide.tolist() == [1.0] * 240 + [2.0] * 144
     assert (pixels.mask, pixels.distance, pixels.normals) == (None, None, None)
-    some = pixels[torch.tensor([239, 240])]
-    assert some.guide is not None and some.guide.tolist() == [1.0, 2.0] and some.mask is None
+    subset = pixels[torch.tensor([239, 240])]
+    assert subset.guide is not None and subset.guide.tolist() == [1.0, 2.0] and subset.mask is None
     assert Stack.build(SHOTS, None, CPU).pixels.guide is None

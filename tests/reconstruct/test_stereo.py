@@ -1,4 +1,4 @@
-"""Points that photographs of a textured sphere agree on: they lie on it, and those outside of masks are left out."""
+"""Points that match between photographs of a textured sphere: they lie on it and within the masks."""
 
 import re
 import sys
@@ -14,16 +14,16 @@ from datasets.extras import install_command
 from datasets.scene import Truth
 from datasets.shot import Shot
 from renderers.checks import BadInput
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.reconstruct.test_losses import ball, shot_of
 from tests.tiny import camera_of, icosphere
 
 RADIUS = 0.7
 PIXELS = 64
-NEAR = 0.03  # scene units
+TOLERANCE = 0.03  # scene units
 ALL = Matching(3, 45.0)
-SETTINGS = replace(PLAINLY, texture_size=0.15)
+SETTINGS = replace(PHOTOGRAPHY, texture_size=0.15)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def sphere() -> Truth:
 
 def taken(sphere: Truth, *angles: tuple[float, float]) -> list[Shot]:
     """Photographs from these angles in degrees, about the vertical axis and above the horizon."""
-    cameras = [camera_of(PIXELS, angles=one) for one in angles]
+    cameras = [camera_of(PIXELS, angles=pair) for pair in angles]
     return SETTINGS.take_from(sphere, cameras, seed=0)
 
 
@@ -49,22 +49,22 @@ def test_points_lie_on_the_sphere_where_photographs_see_it(sphere):
     assert [cloud.camera.center.tolist() for cloud in clouds] == expected
     for cloud in clouds:
         off = np.abs(np.linalg.norm(cloud.points, axis=1) - RADIUS)
-        assert len(off) > 1000 and (off < NEAR).mean() > 0.9, (len(off), (off < NEAR).mean())
+        assert len(off) > 1000 and (off < TOLERANCE).mean() > 0.9, (len(off), (off < TOLERANCE).mean())
         towards = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
         facing = towards @ cloud.camera.center.double().numpy() / 2.5
-        assert (facing > 0.2).mean() > 0.95  # on the side that the camera sees
-        assert np.median(facing) < 0.97  # not its middle alone
+        assert (facing > 0.2).mean() > 0.95  # on the visible side
+        assert np.median(facing) < 0.97  # not only the middle
 
 
-def test_what_one_of_two_photographs_does_not_show_is_not_matched(sphere):
-    """The sphere is larger than either photograph, and what lies beyond a border was matched with black."""
+def test_points_outside_one_of_two_photographs_are_not_matched(sphere):
+    """The sphere is larger than either photograph. Once, points beyond a border were matched with black."""
     cameras = [camera_of(PIXELS, field_of_view=20.0, angles=(turn, 20.0)) for turn in (100.0, 115.0)]
     shots = SETTINGS.take_from(sphere, cameras, seed=0)
     for cloud in stereo_clouds(shots, ALL):
-        places = torch.from_numpy(cloud.points).float()
-        assert len(places) > 1000
+        points = torch.from_numpy(cloud.points).float()
+        assert len(points) > 1000
         for camera in cameras:
-            pixels, depth = camera.project(places)
+            pixels, depth = camera.project(points)
             assert (depth > 0).all() and pixels.min() > -1e-3 and pixels.max() < PIXELS + 1e-3
 
 
@@ -79,22 +79,22 @@ def test_what_one_of_two_photographs_does_not_show_is_not_matched(sphere):
 )
 def test_neighbours_are_the_nearest_by_angle_within_bounds(sphere, monkeypatch, matching, pairs):
     shots = [shot_of(ball(), camera_of(8, angles=(turn, 0.0)), f"{turn:g}") for turn in (0.0, 1.0, 10.0, 25.0, 60.0)]
-    found = []
+    matched_pairs = []
 
     def matched(shot: Shot, other: Shot) -> Cloud:
-        found.append(f"{shot.name}-{other.name}")
+        matched_pairs.append(f"{shot.name}-{other.name}")
         return Cloud(np.zeros((0, 3)), shot.camera)
 
     monkeypatch.setattr(stereo, "_match", matched)
     clouds = stereo_clouds(shots, matching)
-    assert found == pairs and len(clouds) == len(pairs)
+    assert matched_pairs == pairs and len(clouds) == len(pairs)
 
 
-def test_a_photograph_that_is_turned_by_nothing_is_itself(sphere):
-    """OpenCV has the first pixel's centre at (0, 0): half a pixel less."""
+def test_a_photograph_is_unchanged_by_the_identity(sphere):
+    """The centre of the first pixel is at (0, 0) in OpenCV, half a pixel less than here."""
     (shot,) = taken(sphere, (10.0, 20.0))
-    own = shot.camera.intrinsics.double().numpy() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    turned = stereo._rectify(shot, shot.camera.world_to_camera.double().numpy()[:3, :3], own, PIXELS)
+    pinhole = shot.camera.intrinsics.double().numpy() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    turned = stereo._rectify(shot, shot.camera.world_to_camera.double().numpy()[:3, :3], pinhole, PIXELS)
     np.testing.assert_allclose(turned.astype(float), 255 * shot.colours.numpy(), atol=2)
 
 
@@ -115,7 +115,7 @@ def test_points_outside_of_the_unit_sphere_are_left_out(sphere):
     assert all((np.linalg.norm(cloud.points, axis=1) < 1).all() for cloud in stereo_clouds(shots, ALL))
 
 
-def test_without_opencv_the_remedy_is_told(monkeypatch):
+def test_without_opencv_the_error_has_a_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     shots = [shot_of(ball(), camera_of(8, angles=(turn, 0.0))) for turn in (0.0, 10.0)]
     with pytest.raises(BadInput, match=re.escape(f"task=stereo needs OpenCV: type {install_command('stereo')}")):

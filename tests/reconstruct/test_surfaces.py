@@ -28,7 +28,7 @@ def directions(count: int) -> np.ndarray:
 
 
 def halves(points: np.ndarray, front=FRONT, back=BACK) -> list[Cloud]:
-    """The points of either side with the camera of their side."""
+    """The points of each side with the camera of their side."""
     return [Cloud(points[points[:, 2] > 0], front), Cloud(points[points[:, 2] <= 0], back)]
 
 
@@ -36,12 +36,12 @@ def off_sphere(points: np.ndarray) -> np.ndarray:
     return np.abs(np.linalg.norm(points, axis=1) - RADIUS)
 
 
-def test_given_depths_become_points_of_the_surface():
+def test_observed_depths_become_points_of_the_surface():
     shot = shot_of(ball(), camera_of(24, angles=(30.0, 20.0)))
-    known = replace(shot, depth=shot.depth * (torch.arange(24) < 12))
-    clouds = given_clouds([replace(shot, depth=None), known])
+    partial = replace(shot, depth=shot.depth * (torch.arange(24) < 12))
+    clouds = given_clouds([replace(shot, depth=None), partial])
     assert [cloud.camera for cloud in clouds] == [shot.camera]
-    assert len(clouds[0].points) == int((known.depth > 0).sum()) > 50
+    assert len(clouds[0].points) == int((partial.depth > 0).sum()) > 50
     assert off_sphere(clouds[0].points - np.array(CENTRE)).max() < 1e-4
 
 
@@ -68,31 +68,29 @@ def test_points_of_a_sphere_give_a_sphere():
     towards = directions(1500)
     centre = np.array(CENTRE)
     mesh = poisson(RADIUS * towards + centre, towards, depth=5, trim=0.0)
-    assert mesh is not None and mesh.watertight
-    assert off_sphere(mesh.vertices - centre).max() < 0.02
+    assert mesh is not None and mesh.watertight and off_sphere(mesh.vertices - centre).max() < 0.02
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)  # positive: wound outward
 
 
 def test_trimming_removes_what_no_point_supports():
     towards = directions(3000)
     upper = towards[towards[:, 2] > 0]
-    whole, trimmed = (poisson(RADIUS * upper, upper, depth=5, trim=trim) for trim in (0.0, 4.0))
-    assert whole is not None and trimmed is not None
-    assert whole.vertices[:, 2].min() < -0.2 and trimmed.vertices[:, 2].min() > -0.15
+    untrimmed, trimmed = (poisson(RADIUS * upper, upper, depth=5, trim=trim) for trim in (0.0, 4.0))
+    assert untrimmed is not None and trimmed is not None
+    assert untrimmed.vertices[:, 2].min() < -0.2 and trimmed.vertices[:, 2].min() > -0.15
     assert set(np.unique(trimmed.faces)) == set(range(len(trimmed.vertices)))  # no vertex is left unused
     assert trimmed.vertices[:, 2].max() == pytest.approx(RADIUS, abs=0.02)
     above = trimmed.vertices[:, 2] > 0.05
     assert off_sphere(trimmed.vertices[above]).max() < 0.03
     area = trimmed.area / (2 * np.pi * RADIUS**2)
-    assert 0.9 < area < 1.3
-    assert poisson(RADIUS * upper, upper, depth=5, trim=99.0) is None
+    assert 0.9 < area < 1.3 and poisson(RADIUS * upper, upper, depth=5, trim=99.0) is None
 
 
-def test_vertices_have_the_colours_of_photographs_and_are_grey_where_none_sees_them():
+def test_vertices_have_the_colours_of_photographs_or_are_grey_if_unseen():
     shape, mesh = coloured_ball(), icosphere(RADIUS, CENTRE)
     cameras = [camera_of(96, angles=(across, 0.0)) for across in (-40.0, 0.0, 40.0)]
-    found = with_colours(mesh, [shot_of(shape, camera) for camera in cameras])
-    assert found.colours is not None and found.faces is mesh.faces
+    coloured = with_colours(mesh, [shot_of(shape, camera) for camera in cameras])
+    assert coloured.colours is not None and coloured.faces is mesh.faces
     points, normals = torch.from_numpy(mesh.vertices).float(), (mesh.vertices - CENTRE) / RADIUS
     expected = shape.colours(points, points, points).numpy()
     cosines = []
@@ -100,11 +98,11 @@ def test_vertices_have_the_colours_of_photographs_and_are_grey_where_none_sees_t
         towards = camera.center.numpy() - mesh.vertices
         cosines.append((normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1))
     best = np.max(cosines, axis=0)
-    seen, unseen = best > 0.3, best < -0.1
-    assert seen.sum() > 1000 and unseen.sum() > 400
-    assert expected[seen].std(axis=0)[1:].min() > 0.1  # so that a wrong place would be a wrong colour
-    assert np.abs(found.colours - expected)[seen].max() < 0.02
-    assert (found.colours[unseen] == DEFAULT_VERTEX_COLOUR).all()
+    visible, unseen = best > 0.3, best < -0.1
+    assert visible.sum() > 1000 and unseen.sum() > 400
+    assert expected[visible].std(axis=0)[1:].min() > 0.1  # a wrong position would have a wrong colour
+    assert np.abs(coloured.colours - expected)[visible].max() < 0.02
+    assert (coloured.colours[unseen] == DEFAULT_VERTEX_COLOUR).all()
 
 
 def test_a_photograph_that_a_vertex_faces_counts_most():

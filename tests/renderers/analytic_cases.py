@@ -1,6 +1,6 @@
-"""Rays with closed-form truth, in float64: where they hit, the normal there, and how the hit moves.
+"""Rays with closed-form hits, normals and derivatives of the hit distance, in float64.
 
-Every field here is a distance that falls by 1 as its parameter grows by 1, so that implicit differentiation gives
+Each field is a distance that falls by 1 as its parameter grows by 1. Implicit differentiation then gives
     d distance / d parameter = -1 / cosine,    d distance / d origin = normal / cosine,
 with the cosine of the angle between the ray and the inward normal.
 """
@@ -17,15 +17,15 @@ from renderers.fields.analytic import Shape, box, plane, sphere, torus
 
 @dataclass(frozen=True)
 class Case:
-    """One ray and one shape of one parameter. The hit lies in the unit sphere, the ray begins outside it.
+    """One ray and one shape with one parameter. The hit lies in the unit sphere, and the ray begins outside it.
 
     Args:
-        shape: the field of the parameter.
-        parameter: its value.
-        origin, direction: of the ray; the direction is made a unit vector.
-        distance: to the hit.
-        normal: outward at the hit, a unit vector.
-        cosine: of the angle of incidence.
+        shape: gives the field for a value of the parameter.
+        parameter: the value of the parameter.
+        origin, direction: those of the ray; the direction is normalised.
+        distance: the distance along the ray to the hit.
+        normal: the outward unit normal at the hit.
+        cosine: the cosine of the angle of incidence.
     """
 
     name: str
@@ -42,23 +42,23 @@ class Case:
         return self.shape(self.parameter)
 
     def rays(self, dtype: torch.dtype = torch.float64) -> Rays:
-        """The ray, as one of shape [1]."""
+        """The ray, with the leading shape [1]."""
         direction = torch.nn.functional.normalize(vector(self.direction), dim=0)
         return Rays(vector(self.origin).to(dtype)[None], direction.to(dtype)[None])
 
     @property
     def parameter_rate(self) -> float:
-        """The derivative of the distance towards the parameter."""
+        """The derivative of the distance with respect to the parameter."""
         return -1 / self.cosine
 
     @property
     def origin_rate(self) -> Tensor:
-        """The derivative [3] of the distance towards the ray's origin."""
+        """The derivative [3] of the distance with respect to the ray's origin."""
         return vector(self.normal) / self.cosine
 
 
 def vector(numbers: tuple[float, ...]) -> Tensor:
-    """Numbers in float64."""
+    """A tensor of numbers in float64."""
     return torch.tensor(numbers, dtype=torch.float64)
 
 
@@ -74,7 +74,7 @@ def along_z(*heights: float) -> Rays:
 
 
 def ground(offset: float | Tensor) -> Shape:
-    """All below y = offset."""
+    """The half space below y = offset."""
     return plane((0.0, 1.0, 0.0), offset)
 
 
@@ -85,7 +85,7 @@ def brick(half: float | Tensor) -> Shape:
 
 
 def ring(minor: float | Tensor) -> Shape:
-    """A torus about the y axis, of major radius 0.5."""
+    """A torus about the y axis, with the major radius 0.5."""
     return torus(0.5, minor)
 
 
@@ -96,18 +96,18 @@ CASES = (
     # 0.48 off the axis: half a chord is (0.25 - 0.2304)^(1/2) = 0.14.
     Case("sphere-grazing", sphere, 0.5, (0, 0.48, -2), (0, 0, 1), 1.86, (0, 0.96, -0.28), 0.28),
     Case("plane-frontal", ground, -0.1, (0.2, 2, 0), (0, -1, 0), 2.1, (0, 1, 0), 1),
-    # 1.6 down, at 4/5 a unit.
+    # 1.6 down, at 4/5 per unit of distance.
     Case("plane-oblique", ground, 0.2, (-1, 1.8, 0), (3, -4, 0), 2, (0, 1, 0), 0.8),
-    # 0.56 down, at 7/25 a unit.
+    # 0.56 down, at 7/25 per unit of distance.
     Case("plane-grazing", ground, 0.0, (-2, 0.56, 0), (24, -7, 0), 2, (0, 1, 0), 0.28),
     Case("box-frontal", brick, 0.35, (0.1, -0.2, -2), (0, 0, 1), 1.65, (0, 0, -1), 1),
-    # From z = -1.55 to -0.35, at 4/5 a unit; x goes from -0.8 to 0.1.
+    # From z = -1.55 to -0.35, at 4/5 per unit of distance; x goes from -0.8 to 0.1.
     Case("box-oblique", brick, 0.35, (-0.8, 0, -1.55), (3, 0, 4), 1.5, (0, 0, -1), 0.8),
-    # From z = -0.77 to -0.35, at 7/25 a unit; x goes from -1.4 to 0.04.
+    # From z = -0.77 to -0.35, at 7/25 per unit of distance; x goes from -1.4 to 0.04.
     Case("box-grazing", brick, 0.35, (-1.4, 0, -0.77), (24, 0, 7), 1.5, (0, 0, -1), 0.28),
-    # Down on the top of the tube.
+    # The ray goes down to the top of the tube.
     Case("torus-frontal", ring, 0.2, (0.5, 2, 0), (0, -1, 0), 1.8, (0, 1, 0), 1),
-    # Level, at height 0.12: half a chord of the tube is (0.04 - 0.0144)^(1/2) = 0.16, and 2 - 0.5 - 0.16 = 1.34.
+    # A level ray at height 0.12: half a chord of the tube is (0.04 - 0.0144)^(1/2) = 0.16, and 2 - 0.5 - 0.16 = 1.34.
     Case("torus-oblique", ring, 0.2, (2, 0.12, 0), (-1, 0, 0), 1.34, (0.8, 0.6, 0), 0.8),
     # At height 0.192: half a chord is 0.056.
     Case("torus-grazing", ring, 0.2, (2, 0.192, 0), (-1, 0, 0), 1.444, (0.28, 0.96, 0), 0.28),
@@ -115,14 +115,14 @@ CASES = (
 
 
 def sphere_hits(rays: Rays, radius: float) -> tuple[Tensor, Tensor]:
-    """Distance to the sphere about the origin, and whether the ray, from outside it, meets it."""
+    """The distance to the sphere about the origin, and whether the ray, which begins outside, hits it."""
     middle = -(rays.origins * rays.directions).sum(-1)
     square = radius**2 - rays.origins.square().sum(-1) + middle**2
     return middle - square.clamp_min(0).sqrt(), (square > 0) & (middle > 0)
 
 
 def box_hits(rays: Rays, half_sizes: tuple[float, ...]) -> tuple[Tensor, Tensor]:
-    """Distance to the box about the origin, by its three slabs, and whether the ray, from outside it, meets it."""
+    """The distance to the box about the origin, by its slabs, and whether the ray, which begins outside, hits it."""
     half = torch.tensor(half_sizes, dtype=rays.origins.dtype)
     ends = torch.stack([(-half - rays.origins) / rays.directions, (half - rays.origins) / rays.directions])
     entry, leave = ends.amin(0).amax(-1), ends.amax(0).amin(-1)

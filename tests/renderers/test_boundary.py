@@ -1,4 +1,4 @@
-"""What a renderer returns is checked where it is taken: a broken part is one sentence, a sound one costs nothing."""
+"""The check of what a renderer returns: a broken rendering is an error, and a valid one costs no evaluations."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,30 +18,30 @@ from tests.tiny import camera_of
 IDR = load("renderer", "idr")
 RAYS = camera_of(8).rays()
 MASK = torch.ones(RAYS.shape, dtype=torch.bool)
-SEEN = RayObservation(MASK)
-BOTH = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
-NEITHER = Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=False)
+OBSERVATION = RayObservation(MASK)
+BOTH_GRADIENTS = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=True)
+NO_GRADIENT = Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=False)
 
 
-def changed(rendering: Any, **parts: Any) -> Any:
-    """A rendering with other parts, which do not pass through the checks of types that tests alone have."""
-    made = replace(rendering)
-    for name, value in parts.items():
-        object.__setattr__(made, name, value)
-    return made
+def changed(rendering: Any, **attributes: Any) -> Any:
+    """A copy with other attributes, set without the type checks that only tests have."""
+    copy = replace(rendering)
+    for name, value in attributes.items():
+        object.__setattr__(copy, name, value)
+    return copy
 
 
-def as_it_is(returned: Any) -> Any:
+def unchanged(returned: Any) -> Any:
     return returned
 
 
 @dataclass
 class Mine:
-    """IDR, but for what `change` makes of its rendering and `loss` of its loss."""
+    """IDR, with `change` applied to its rendering and `loss` to its silhouette loss."""
 
-    change: Any = as_it_is
-    loss: Any = as_it_is
-    capabilities: Capabilities = BOTH
+    change: Any = unchanged
+    loss: Any = unchanged
+    capabilities: Capabilities = BOTH_GRADIENTS
 
     def render(self, field, rays):
         return self.change(IDR.render(field, rays))
@@ -90,13 +90,13 @@ BROKEN = {
 
 
 @each("name", BROKEN)
-def test_a_broken_rendering_is_an_error_that_names_renderer_and_part(name):
+def test_a_broken_rendering_is_an_error_that_names_the_renderer_and_the_attribute(name):
     change, message = BROKEN[name]
     with pytest.raises(BrokenContract, match=message):
         render_checked(Mine(change), ball(), RAYS)
 
 
-def test_a_graph_where_none_is_wanted_is_an_error():
+def test_a_graph_while_gradients_are_off_is_an_error():
     bound = Mine(lambda r: changed(r, residual=r.residual.clone().requires_grad_()))
     render_checked(bound, ball(), RAYS)
     with torch.no_grad(), pytest.raises(BrokenContract, match="residual has a graph although gradients are off"):
@@ -114,14 +114,14 @@ def test_a_claimed_gradient_that_is_missing_is_an_error():
 @each(
     "renderer, field, rays",
     [
-        (Mine(detached, capabilities=NEITHER), ball(free=True), RAYS),  # it claims none
-        (Mine(detached, capabilities=NEITHER), ball(), free_rays()),
-        (Mine(detached), ball(), RAYS),  # none is wanted
+        (Mine(detached, capabilities=NO_GRADIENT), ball(free=True), RAYS),  # the renderer claims no gradient
+        (Mine(detached, capabilities=NO_GRADIENT), ball(), free_rays()),
+        (Mine(detached), ball(), RAYS),  # nothing requires a gradient
         (Mine(detached), ball(0.001, free=True).translate((0.0, 0.9, 0.0)), RAYS),  # nothing is hit
-        (Mine(), ball(free=True), free_rays()),  # it is there
+        (Mine(), ball(free=True), free_rays()),  # the gradient exists
     ],
 )
-def test_no_gradient_is_missed_where_there_need_be_none(renderer, field, rays):
+def test_a_gradient_that_is_not_needed_may_be_missing(renderer, field, rays):
     render_checked(renderer, field, rays)
 
 
@@ -138,58 +138,62 @@ def test_a_broken_silhouette_loss_is_an_error(name):
     field = ball(free=True)
     rendering = IDR.render(field, RAYS)
     with pytest.raises(BrokenContract, match=message):
-        silhouette_loss(Mine(loss=change), field, RAYS, rendering, SEEN)
-    assert silhouette_loss(Mine(loss=lambda loss: torch.zeros(())), field, RAYS, rendering, SEEN) == 0  # needs none
+        silhouette_loss(Mine(loss=change), field, RAYS, rendering, OBSERVATION)
+    assert silhouette_loss(Mine(loss=lambda loss: torch.zeros(())), field, RAYS, rendering, OBSERVATION) == 0
 
 
 @dataclass
-class Told(Mine):
-    """IDR, with a loss that takes the given distances: their mean."""
+class TakesDistances(Mine):
+    """IDR, with the mean of the observed distances as its loss."""
 
     def observed_loss(self, field, rays, rendering, observed):
         return self.loss(observed.distance.mean())
 
 
-def test_given_distances_reach_a_renderer_that_takes_them_and_no_other():
-    field, seen = ball(), RayObservation(MASK, torch.full(RAYS.shape, 1.25))
+def test_observed_distances_reach_only_a_renderer_that_takes_them():
+    field, observation = ball(), RayObservation(MASK, torch.full(RAYS.shape, 1.25))
     rendering = IDR.render(field, RAYS)
-    assert silhouette_loss(Told(), field, RAYS, rendering, seen) == 1.25
-    assert silhouette_loss(Mine(), field, RAYS, rendering, seen) == IDR.silhouette_loss(field, RAYS, rendering, MASK)
-    with pytest.raises(BrokenContract, match=r"Told\.observed_loss must return a tensor with one number, not None"):
-        silhouette_loss(Told(loss=lambda loss: None), field, RAYS, rendering, seen)
+    assert silhouette_loss(TakesDistances(), field, RAYS, rendering, observation) == 1.25
+    assert silhouette_loss(Mine(), field, RAYS, rendering, observation) == IDR.silhouette_loss(
+        field, RAYS, rendering, MASK
+    )
+    with pytest.raises(
+        BrokenContract, match=r"TakesDistances\.observed_loss must return a tensor with one number, not None"
+    ):
+        silhouette_loss(TakesDistances(loss=lambda loss: None), field, RAYS, rendering, observation)
 
 
 def test_observations_of_a_wrong_shape_or_type_are_errors():
     with pytest.raises(ValueError, match=r"mask must be boolean, not torch\.float32: compare a picture with"):
-        changed(SEEN, mask=MASK.float()).__post_init__()
+        changed(OBSERVATION, mask=MASK.float()).__post_init__()
     with pytest.raises(ValueError, match=r"distance must have the mask's shape \[8, 8\], not \[3\]: give NaN where no"):
-        changed(SEEN, distance=torch.ones(3)).__post_init__()
+        changed(OBSERVATION, distance=torch.ones(3)).__post_init__()
 
 
-def test_missing_gradients_of_a_hit_are_errors_where_they_are_claimed():
-    some = torch.ones(2)
-    check_gradients(Mine(), some, some)
-    check_gradients(Mine(capabilities=NEITHER), None, None)
+def test_missing_gradients_of_a_hit_are_errors_if_they_are_claimed():
+    gradient = torch.ones(2)
+    check_gradients(Mine(), gradient, gradient)
+    check_gradients(Mine(capabilities=NO_GRADIENT), None, None)
     with pytest.raises(BrokenContract, match="field_gradient is True"):
-        check_gradients(Mine(), None, some)
+        check_gradients(Mine(), None, gradient)
     with pytest.raises(BrokenContract, match="ray_gradient is True"):
-        check_gradients(Mine(), some, None)
+        check_gradients(Mine(), gradient, None)
 
 
 @each("name", ["dist", "dvr"])
 @each("free", [True, False])
 def test_a_valid_rendering_passes_unchanged_without_evaluations(name, free):
     renderer, counts = load("renderer", name), (Counts(), Counts())
-    plain, checked = (Meter(ball(free=free), count) for count in counts)
+    plain, checked_field = (Meter(ball(free=free), count) for count in counts)
     torch.manual_seed(0)
     expected = renderer.render(plain, RAYS)
     expected_loss = renderer.silhouette_loss(plain, RAYS, expected, MASK)
     torch.manual_seed(0)
-    found = render_checked(renderer, checked, RAYS)
-    found_loss = silhouette_loss(renderer, checked, RAYS, found, SEEN)
-    assert torch.equal(found.distance, expected.distance) and found_loss.item() == expected_loss.item()
+    rendering = render_checked(renderer, checked_field, RAYS)
+    loss = silhouette_loss(renderer, checked_field, RAYS, rendering, OBSERVATION)
+    assert torch.equal(rendering.distance, expected.distance) and loss.item() == expected_loss.item()
     if free:
         (expected.distance.sum() + expected_loss).backward()
-        (found.distance.sum() + found_loss).backward()
+        (rendering.distance.sum() + loss).backward()
         assert counts[0].gradient > 0
     assert counts[0] == counts[1] and counts[0].value > 0

@@ -1,4 +1,4 @@
-"""The first crossing between samples, and how a bracket about a root is narrowed."""
+"""The first crossing between samples, and the refinement of a bracket around a root."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ def rays(count: int) -> Rays:
 
 
 def bracket(*ends: tuple[float, float]) -> Bracket:
-    """Of the wall, between distances."""
+    """The bracket of the wall between two distances for each ray."""
     near, far = vector(tuple(end[0] for end in ends)), vector(tuple(end[1] for end in ends))
     return Bracket(near, far, 2 - near, 2 - far)
 
@@ -35,15 +35,15 @@ def bracket(*ends: tuple[float, float]) -> Bracket:
         ((3, 2, 1, 0.5), None),
         ((-3, -2, -1, -1), None),
         ((-1, 1, 2, 3), None),  # leaving is no crossing
-        ((0, -1, -1, -1), None),  # it was never free
-        ((3, NAN, -1, -1), None),  # nobody knows what lies between
+        ((0, -1, -1, -1), None),  # no sample is free
+        ((3, NAN, -1, -1), None),  # a crossing may lie between, or none
         ((3, NAN, 1, -1), 2),
     ],
 )
 def test_the_first_fall_from_free_to_occupied(values, first):
     distances = vector((0, 10, 20, 30))[None]
-    found, ends = first_crossing(distances, vector(values)[None])
-    assert found.tolist() == [first is not None]
+    crosses, ends = first_crossing(distances, vector(values)[None])
+    assert crosses.tolist() == [first is not None]
     if first is not None:
         assert (ends.near.item(), ends.far.item()) == (10 * first, 10 * first + 10)
         assert (ends.near_value.item(), ends.far_value.item()) == (values[first], values[first + 1])
@@ -51,31 +51,30 @@ def test_the_first_fall_from_free_to_occupied(values, first):
 
 def test_rays_with_a_crossing_have_a_bracket():
     values = torch.stack([vector((1, -1)), vector((1, 1)), vector((2, -3))])
-    found, ends = first_crossing(vector((0, 1)).expand(3, 2), values)
-    assert found.tolist() == [True, False, True]
-    assert ends.select(found.nonzero().squeeze(-1)).far_value.tolist() == [-1, -3]
-    none, empty = first_crossing(torch.zeros(0, 4), torch.zeros(0, 4))
-    assert (none.shape, empty.near.shape) == ((0,), (0,))
+    crosses, ends = first_crossing(vector((0, 1)).expand(3, 2), values)
+    assert crosses.tolist() == [True, False, True]
+    assert ends.select(crosses.nonzero().squeeze(-1)).far_value.tolist() == [-1, -3]
+    crosses_empty, empty = first_crossing(torch.zeros(0, 4), torch.zeros(0, 4))
+    assert (crosses_empty.shape, empty.near.shape) == ((0,), (0,))
 
 
 @each("steps", [0, 1, 5])
-def test_bisection_halves_the_bracket_at_a_value_a_step(steps):
+def test_bisection_halves_the_bracket_with_one_evaluation_per_step(steps):
     meter = Meter(WALL)
     closer = narrow(meter, rays(2), bracket((1, 2.5), (0.5, 2.25)), method="bisection", steps=steps)
     assert (closer.far - closer.near).tolist() == pytest.approx([1.5 / 2**steps, 1.75 / 2**steps])
-    assert meter.counts.value == 2 * steps
-    assert ((closer.near < 2) & (closer.far >= 2)).all()
+    assert meter.counts.value == 2 * steps and ((closer.near < 2) & (closer.far >= 2)).all()
     assert torch.equal(closer.near_value, 2 - closer.near)
 
 
 def test_the_secant_of_a_line_is_its_root():
     meter = Meter(WALL)
-    distance, left = refine(meter, rays(1), bracket((0.7, 2.9)), method="secant", steps=0)
+    distance, residual = refine(meter, rays(1), bracket((0.7, 2.9)), method="secant", steps=0)
     assert distance.item() == pytest.approx(2, abs=1e-15)
-    assert left.item() == pytest.approx(2 - 2.9)  # the nearer end, since nothing was asked
+    assert residual.item() == pytest.approx(2 - 2.9)  # at the nearer end, since the field was not evaluated
     assert meter.counts.value == 0
-    _, left = refine(WALL, rays(1), bracket((0.7, 2.9)), method="secant", steps=1)
-    assert abs(left.item()) < 1e-15
+    _, residual = refine(WALL, rays(1), bracket((0.7, 2.9)), method="secant", steps=1)
+    assert abs(residual.item()) < 1e-15
 
 
 @each("method", REFINEMENTS)
@@ -90,14 +89,12 @@ def test_the_root_stays_in_the_bracket_and_comes_closer(method):
         distance, _ = refine(ball, rays(1), start, method=method, steps=steps)
         assert 1.3 <= distance.item() <= 1.9
         errors.append(abs(distance.item() - 1.5))
-    assert errors[-1] < 1e-3
-    assert errors[-1] <= errors[0]
+    assert errors[-1] < 1e-3 and errors[-1] <= errors[0]
 
 
 @each("method", REFINEMENTS)
 def test_a_hole_in_the_field_counts_as_occupied(method):
     holed = Shape(lambda p: torch.where(p[..., 2] > -0.5, NAN, -p[..., 2]), Kind.LEVEL, None)
-    distance, left = refine(holed, rays(1), bracket((1.0, 3.0)), method=method, steps=40)
-    assert distance.isfinite().all()
-    assert left.isfinite().all()
+    distance, residual = refine(holed, rays(1), bracket((1.0, 3.0)), method=method, steps=40)
+    assert distance.isfinite().all() and residual.isfinite().all()
     assert distance.item() == pytest.approx(1.5, abs=0.05 if method == "bisection" else 0.6)

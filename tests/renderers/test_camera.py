@@ -1,4 +1,4 @@
-"""Cameras and rays: axes and pixel centres by worked examples, spans of the sphere by closed forms, coarser images."""
+"""Cameras and rays: axes, pixel centres, spans of the sphere, and coarser images, against closed forms."""
 
 from dataclasses import replace
 from math import cos, pi, sin, sqrt
@@ -17,7 +17,7 @@ INTRINSICS = torch.tensor([[100.0, 0, 32], [0, 50, 20], [0, 0, 1]], dtype=torch.
 
 
 def motion(angle: float = 0.0, translation: tuple[float, ...] = (0, 0, 0)) -> torch.Tensor:
-    """A rigid motion: a turn about an oblique axis, then a translation."""
+    """A rigid motion: a rotation about an oblique axis, then a translation."""
     x, y, z = axis = torch.nn.functional.normalize(vector((1, 2, -2)), dim=0)
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     matrix = torch.eye(4, dtype=torch.float64)
@@ -34,9 +34,7 @@ def camera(world_to_camera: torch.Tensor | None = None, height: int = 40, width:
 def test_axes_are_x_right_y_down_z_forward_with_pixel_centres_at_a_half():
     # Column 56: (56.5 - 32) / 100 = 0.245 to the right; row 7: (7.5 - 20) / 50 = -0.25, above the middle.
     rays = camera().rays()
-    assert rays.image
-    assert rays.shape == (40, 64)
-    assert rays.origins[7, 56].tolist() == [0, 0, 0]
+    assert rays.image and rays.shape == (40, 64) and rays.origins[7, 56].tolist() == [0, 0, 0]
     length = sqrt(0.245**2 + 0.25**2 + 1)
     assert rays.directions[7, 56].tolist() == pytest.approx([0.245 / length, -0.25 / length, 1 / length])
     # The four pixels about the principal point lie evenly about the axis.
@@ -56,8 +54,8 @@ def test_points_along_the_rays_project_back_to_their_pixels_and_depth_is_camera_
     rows, columns = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     centres = torch.stack([columns, rows], -1).double()
     torch.testing.assert_close(pixels[..., :2] / pixels[..., 2:], centres, rtol=0, atol=1e-9)
-    found, depth = view.project(rays.at(distance))
-    torch.testing.assert_close(found, centres, rtol=0, atol=1e-9)
+    projected, depth = view.project(rays.at(distance))
+    torch.testing.assert_close(projected, centres, rtol=0, atol=1e-9)
     torch.testing.assert_close(depth, view.depth(distance), rtol=0, atol=1e-12)
     assert torch.equal(rays.origins, view.center.expand(40, 64, 3))
 
@@ -76,7 +74,7 @@ def test_gradients_reach_intrinsics_and_extrinsics():
     assert torch.autograd.gradcheck(project, (intrinsics, translation))
 
 
-REFUSED = {  # what a camera is made of, and what is said
+INVALID_CAMERAS = {  # arguments of a camera, and the message
     "focal length": (
         {"intrinsics": INTRINSICS - torch.diag(vector((100, 0, 0)))},
         "focal lengths must be positive and",
@@ -90,13 +88,13 @@ REFUSED = {  # what a camera is made of, and what is said
 }
 
 
-@each("changed, message", REFUSED.values())
-def test_a_camera_that_cannot_be_is_refused(changed, message):
+@each("changed, message", INVALID_CAMERAS.values())
+def test_an_invalid_camera_is_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         replace(camera(), **changed)
 
 
-def test_rays_that_cannot_be_are_refused():
+def test_invalid_rays_are_refused():
     ahead = vector((0, 0, 1))
     with pytest.raises(ValueError, match=r"must both have shape \[\*rays, 3\]"):  # without the type checker
         Rays.__post_init__(SimpleNamespace(origins=torch.zeros(2, 3), directions=torch.zeros(3, 3)))
@@ -144,21 +142,18 @@ def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
     ],
 )
 def test_spans_of_the_sphere_by_closed_form(origin, direction, radius, entry, leave, meets):
-    found_entry, found_leave, found_meets = sphere_span(ray(origin, direction), radius)
-    assert found_meets.item() is meets
-    if entry is not None:
-        assert found_entry.item() == pytest.approx(entry)
-        assert found_leave.item() == pytest.approx(leave)
-    assert found_entry >= 0
+    first, last, intersects = sphere_span(ray(origin, direction), radius)
+    assert intersects.item() is meets and first >= 0
+    assert entry is None or (first.item(), last.item()) == pytest.approx((entry, leave))
 
 
-def test_the_least_distance_to_the_origin_is_that_of_samples():
+def test_the_least_distance_to_the_origin_agrees_with_samples():
     origins, directions = torch.randn(2, 200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     rays = Rays(origins, torch.nn.functional.normalize(directions, dim=-1))
     least = distance_to_origin(rays)
     assert torch.equal(sphere_span(rays, 0.7)[2], least < 0.7)
     sampled = rays.at_each(torch.linspace(0, 8, 2000, dtype=torch.float64)).norm(dim=-1).amin(1)
-    assert (least <= sampled + 1e-12).all() and (least >= sampled - 4e-3).all()  # the samples' spacing
+    assert (least <= sampled + 1e-12).all() and (least >= sampled - 4e-3).all()  # the spacing of the samples
 
 
 def test_gradients_of_spans_and_distances_are_exact_and_finite():
@@ -170,32 +165,32 @@ def test_gradients_of_spans_and_distances_are_exact_and_finite():
         return (*sphere_span(rays)[:2], distance_to_origin(rays))
 
     assert torch.autograd.gradcheck(spans, (origins, directions))
-    # On a tangent, and through the centre, where a root and a length have no derivative: still finite.
+    # On a tangent and through the centre a root or a length has no derivative. The gradient must still be finite.
     edge = torch.stack([vector((1, 0, -2)), vector((0, 0, -2)), vector((0, 0, 0))]).requires_grad_(True)
-    total = sum(part.sum() for part in spans(edge, directions))
+    total = sum(output.sum() for output in spans(edge, directions))
     assert torch.autograd.grad(total, edge)[0].isfinite().all()
 
 
 @each(
-    "twist, seen",
+    "twist, origin_in_camera",
     [
         ((0.1, 0, 0, 0, 0, 0), (0.1, 0, 2)),  # the world moves to the right of the camera
         ((0, 0, 0.5, 0, 0, 0), (0, 0, 2.5)),  # and away from it
         ((0, 0, 0, 0, torch.pi / 2, 0), (2, 0, 0)),  # a quarter turn about y, down: from ahead to the right
         ((0, 0, 0, torch.pi / 2, 0, 0), (0, -2, 0)),
-        ((0, 0, 0, 0, 0, 1.0), (0, 0, 2)),  # about the line of sight
+        ((0, 0, 0, 0, 0, 1.0), (0, 0, 2)),  # a rotation about the line of sight
     ],
 )
-def test_a_twist_moves_the_world_in_the_cameras_axes(twist, seen):
+def test_a_twist_moves_the_world_in_the_cameras_axes(twist, origin_in_camera):
     motion = torch.eye(4, dtype=torch.float64)
     motion[2, 3] = 2.0  # the origin lies 2 ahead
     moved = Camera(torch.eye(3, dtype=torch.float64), motion, 4, 4).moved(torch.tensor(twist, dtype=torch.float64))
     torch.testing.assert_close(
-        moved.world_to_camera[:3, 3], torch.tensor(seen, dtype=torch.float64), rtol=0, atol=1e-12
+        moved.world_to_camera[:3, 3], torch.tensor(origin_in_camera, dtype=torch.float64), rtol=0, atol=1e-12
     )
 
 
-def test_resized_sees_the_same_in_other_pixels():
+def test_a_resized_camera_has_the_same_view():
     plain = camera(motion(0.4, (0.1, -0.2, 2.5)))
     fine = plain.resized(3 * 40, 3 * 64)  # the middle of a block is its pixel
     torch.testing.assert_close(fine.rays().directions[1::3, 1::3], plain.rays().directions)
@@ -203,18 +198,17 @@ def test_resized_sees_the_same_in_other_pixels():
 
 
 def test_a_moved_object_is_seen_as_by_the_camera_that_stays():
-    """Seen by `with_object_moved`, an unmoved point lies where the old camera sees the moved one, also off the axis."""
+    """`with_object_moved` projects a point to where the old camera projects the moved point, also off the axis."""
     twist = torch.tensor([0.1, -0.2, 0.05, 0.3, 0.2, -0.4], dtype=torch.float64)
     old = camera(motion(0.4, (0.1, 0.2, 3.0))).double()
     point = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
     moved = rigid(twist) @ torch.cat([point, torch.ones(1, dtype=torch.float64)])
-    for seen, expected in zip(old.with_object_moved(twist).project(point), old.project(moved[:3]), strict=True):
-        torch.testing.assert_close(seen, expected)
+    for projected, expected in zip(old.with_object_moved(twist).project(point), old.project(moved[:3]), strict=True):
+        torch.testing.assert_close(projected, expected)
 
 
 def test_a_camera_shows_what_lies_in_front_of_it_and_within_its_image():
     camera = Camera(torch.tensor([[10.0, 0, 8], [0, 10.0, 4], [0, 0, 1]]), torch.eye(4), 8, 16)
     corners = torch.tensor([[-0.79, -0.39, 1.0], [0.79, 0.39, 1.0]])
     beyond = torch.tensor([[-0.81, 0.0, 1.0], [0.81, 0.0, 1.0], [0.0, -0.41, 1.0], [0.0, 0.41, 1.0], [0.0, 0.0, -1.0]])
-    assert camera.shows(corners).all() and camera.shows(2 * corners).all()
-    assert not camera.shows(beyond).any()
+    assert camera.shows(corners).all() and camera.shows(2 * corners).all() and not camera.shows(beyond).any()

@@ -1,4 +1,4 @@
-"""The decoder with its code folded in against the plain network on concatenated inputs, in float64."""
+"""The decoder with its code folded in, against the plain network on concatenated inputs, in float64."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def in_sevens(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def plain(decoder: Decoder, code: Tensor, points: Tensor) -> Tensor:
-    """The network as the paper draws it: code and point side by side, given to the first layer and to the skip."""
+    """The network of the paper: code and point, concatenated, are the input of the first layer and of the skip."""
     inputs = torch.cat([code.expand(*points.shape[:-1], -1), points], dim=-1)
     features = inputs
     for index, layer in enumerate(decoder.hidden):
@@ -53,7 +53,7 @@ def draw(decoder: Decoder, *shape: int) -> tuple[Tensor, Tensor]:
 
 @each("name", NETWORKS)
 @each("shape", [(5,), (), (0,), (2, 3)])
-def test_a_folded_code_gives_the_plain_network(name, shape):
+def test_values_with_a_folded_code_are_those_of_the_plain_network(name, shape):
     decoder = make(name)
     code, points = draw(decoder, *shape)
     torch.testing.assert_close(decoder.at(code)(points), plain(decoder, code, points), rtol=0, atol=1e-13)
@@ -74,31 +74,30 @@ def test_gradients_are_those_of_the_plain_network(name):
 
 @each("name", NETWORKS)
 @each("batch", [(3,), (2, 3)])
-def test_a_batch_of_codes_is_each_code_by_itself(name, batch):
+def test_a_batch_of_codes_has_the_values_of_each_code(name, batch):
     decoder = make(name)
     codes = torch.randn(*batch, decoder.code_length, dtype=torch.float64)
     points = torch.randn(*batch, 5, 3, dtype=torch.float64)
     values = decoder.at(codes)(points)
     assert values.shape == (*batch, 5)
     for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
-        one = tuple(index)
-        torch.testing.assert_close(values[one], plain(decoder, codes[one], points[one]), rtol=0, atol=1e-13)
+        index = tuple(index)
+        torch.testing.assert_close(values[index], plain(decoder, codes[index], points[index]), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("count", [0, 7, 20])
 def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
     decoder = make("skip")
     code, points = draw(decoder, count)
-    whole = decoder.at(code)(points)
+    unchunked = decoder.at(code)(points)
     sizes = []
     decoder_pass = mlp.BoundDecoder._forward
     monkeypatch.setattr(mlp.BoundDecoder, "_forward", lambda self, p: (sizes.append(len(p)), decoder_pass(self, p))[1])
     in_sevens(monkeypatch)
     chunked = decoder.at(code)(points)
-    torch.testing.assert_close(chunked, whole, rtol=0, atol=1e-14)
-    assert sum(sizes) == count
-    assert max(sizes) <= 7
-    gradients = [torch.autograd.grad(values.square().sum(), (code, points)) for values in (whole, chunked)]
+    torch.testing.assert_close(chunked, unchunked, rtol=0, atol=1e-14)
+    assert sum(sizes) == count and max(sizes) <= 7
+    gradients = [torch.autograd.grad(values.square().sum(), (code, points)) for values in (unchunked, chunked)]
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=1e-13)
 
 
@@ -119,10 +118,10 @@ def test_a_pass_back_takes_the_memory_of_one_gradient_however_many_chunks_it_has
     values = decoder.at(torch.zeros(4, dtype=torch.float64))(points)
     with Operations() as counted:
         values.sum().backward()
-    assert counted.made[700 * 3] <= 2  # and the leaf's own
+    assert counted.made[700 * 3] <= 2  # and the gradient of the leaf
 
 
-def test_flops_are_two_a_weight_without_the_code():
+def test_flops_are_two_per_weight_without_the_code():
     # Layers 3 -> 8, 8 -> 8, (8 + 3) -> 8, 8 -> 8, 8 -> 1: 24 + 64 + 88 + 64 + 8 = 248 weights.
     assert make("skip").at(torch.zeros(4, dtype=torch.float64)).flops == Flops(496, 2 * 496)
     frozen = make("skip").requires_grad_(False).at(torch.zeros(4, dtype=torch.float64))
@@ -149,7 +148,7 @@ def test_impossible_networks_are_refused(change, message):
 
 
 def pair(dtype: torch.dtype) -> tuple[Decoder, Decoder]:
-    """A decoder whose weights are fixed, and the same one whose weights are not."""
+    """A decoder with fixed weights, and the same decoder with trainable weights."""
     torch.manual_seed(3)
     frozen = Decoder(layers=4, width=24, code_length=5, skip=2, narrow=True).to(dtype)
     free = Decoder(layers=4, width=24, code_length=5, skip=2, narrow=True).to(dtype)
@@ -158,7 +157,7 @@ def pair(dtype: torch.dtype) -> tuple[Decoder, Decoder]:
 
 
 def through(decoder: Decoder, upstream: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """Values, and the gradients towards points and code."""
+    """Values, and their gradients with respect to points and code."""
     generator = torch.Generator().manual_seed(4)
     points = torch.randn(len(upstream), 3, generator=generator).to(dtype).requires_grad_(True)
     code = torch.randn(5, generator=generator).to(dtype).requires_grad_(True)
@@ -166,17 +165,19 @@ def through(decoder: Decoder, upstream: Tensor, dtype: torch.dtype) -> tuple[Ten
     return values.detach(), *torch.autograd.grad(values, (points, code), upstream)
 
 
-@each("dtype, close", [(torch.float32, 1e-5), (torch.float64, 1e-13)])
-@each("share", [1.0, 0.0])
-def test_fixed_weights_change_nothing_but_the_cost(monkeypatch, dtype, close, share):
+@each("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-13)])
+@each("scale", [1.0, 0.0])
+def test_fixed_weights_change_nothing_but_the_cost(monkeypatch, dtype, tolerance, scale):
     in_sevens(monkeypatch)
-    upstream = share * torch.linspace(-1, 2, 50, dtype=dtype) * (torch.arange(50) % 3 > 0)  # a third are zero, or all
-    for one, other in zip(*(through(decoder, upstream, dtype) for decoder in pair(dtype)), strict=True):
-        torch.testing.assert_close(one, other, rtol=close, atol=close)
+    upstream = (
+        scale * torch.linspace(-1, 2, 50, dtype=dtype) * (torch.arange(50) % 3 > 0)
+    )  # a third of them is zero, or all
+    for frozen, free in zip(*(through(decoder, upstream, dtype) for decoder in pair(dtype)), strict=True):
+        torch.testing.assert_close(frozen, free, rtol=tolerance, atol=tolerance)
 
 
-def test_a_network_of_fixed_weights_keeps_a_byte_a_neuron():
-    kept = []
+def test_a_network_of_fixed_weights_keeps_one_byte_per_neuron():
+    kept_bytes = []
     for decoder in pair(torch.float32):
         size = [0]
 
@@ -186,19 +187,19 @@ def test_a_network_of_fixed_weights_keeps_a_byte_a_neuron():
 
         with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
             decoder.at(torch.zeros(5, requires_grad=True))(torch.zeros(1000, 3))
-        kept.append(size[0])
+        kept_bytes.append(size[0])
     neurons = 24 * 3 + 24 - 8
-    assert kept[0] <= 1000 * neurons + 20_000  # and what the code's fold keeps
-    assert kept[1] > 3 * kept[0]
+    assert kept_bytes[0] <= 1000 * neurons + 20_000  # and what the folding of the code keeps
+    assert kept_bytes[1] > 3 * kept_bytes[0]
 
 
 def test_the_slope_of_a_network_of_fixed_weights_has_a_gradient_of_zero():
-    # Piecewise linear: the slope does not change within a piece. A smoothness loss may still ask.
+    # The network is piecewise linear, so its slope is constant within a piece. A smoothness loss may need its gradient.
     decoder, _ = pair(torch.float64)
     code = torch.ones(5, dtype=torch.float64, requires_grad=True)
     points = torch.full((6, 3), 0.3, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(decoder.at(code)(points).sum(), points, create_graph=True)
     assert slope.abs().sum() > 0
     loss = slope.square().sum() + code.square().sum()
-    (found,) = torch.autograd.grad(loss, code)
-    torch.testing.assert_close(found, 2 * code.detach())
+    (gradient,) = torch.autograd.grad(loss, code)
+    torch.testing.assert_close(gradient, 2 * code.detach())

@@ -1,4 +1,4 @@
-"""No tensor is made without a device: with another default device, everything still stays where its inputs are."""
+"""Each tensor is created on the device of its inputs, whatever the default device is."""
 
 from collections.abc import Iterator
 
@@ -16,13 +16,13 @@ from renderers.silhouette import DEPTH, CrossEntropy, Hinge, Occupancy, Own
 
 CPU = torch.device("cpu")
 NAMES = [name for name in names("renderer") if "defaults" not in choice("renderer", name) and name != "custom"]
-NAMES += ["naive_practical", "dist_slope_bound", "dist_dynamic", "dvr_early_stop"]  # variants with code of their own
+NAMES += ["naive_practical", "dist_slope_bound", "dist_dynamic", "dvr_early_stop"]  # presets with separate code
 SILHOUETTES = (Own(), Hinge(5e-5, True, "violating"), CrossEntropy(50.0, 100.0), Occupancy(0.02, 3.0, 1.0, DEPTH))
 
 
 @pytest.fixture
-def elsewhere() -> Iterator[None]:
-    """A default device that holds no data: whatever is made on it by mistake cannot meet the inputs."""
+def meta_default_device() -> Iterator[None]:
+    """The default device holds no data: a tensor created on it by mistake cannot be combined with the inputs."""
     torch.set_default_device("meta")
     yield
     torch.set_default_device(None)
@@ -37,10 +37,10 @@ def camera(size: int) -> Camera:
 
 
 def fields() -> dict[str, Field]:
-    """One of each kind, on the CPU."""
+    """One field of each class, on the CPU."""
     axis = torch.linspace(-1.05, 1.05, 9, device=CPU)
-    places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
-    distances = torch.linalg.vector_norm(places, dim=-1) - 0.5
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    distances = torch.linalg.vector_norm(points, dim=-1) - 0.5
     with torch.device(CPU):
         decoder = Decoder(layers=2, width=8, code_length=2, skip=0, narrow=False)
     torch.nn.init.constant_(decoder.last.bias, 0.05)
@@ -54,7 +54,7 @@ def fields() -> dict[str, Field]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_renderer_stays_on_the_device_of_its_rays(elsewhere, name):
+def test_a_renderer_stays_on_the_device_of_its_rays(meta_default_device, name):
     renderer = load("renderer", name)
     size = 4 if name.startswith("naive") else 12  # pixels per side; with a default device all operations are slow
     for field in fields().values():
@@ -67,10 +67,9 @@ def test_a_renderer_stays_on_the_device_of_its_rays(elsewhere, name):
         total = torch.stack([rendering.distance.sum(), *losses]).sum()
         assert total.device == CPU
         total.backward()
-        assert rays.origins.grad is not None
-        assert rays.origins.grad.device == CPU
+        assert rays.origins.grad is not None and rays.origins.grad.device == CPU
 
 
-def test_the_steepest_gradient_is_measured_where_the_field_is(elsewhere):
-    found = estimate_lipschitz(fields()["grid"], radius=1.0, samples=64, like=torch.zeros(1, device=CPU))
-    assert 0.9 < found < 1.5
+def test_the_steepest_gradient_is_measured_where_the_field_is(meta_default_device):
+    steepest = estimate_lipschitz(fields()["grid"], radius=1.0, samples=64, like=torch.zeros(1, device=CPU))
+    assert 0.9 < steepest < 1.5

@@ -1,4 +1,4 @@
-"""DVR and IDR: what is found, what is missed, gradients and mask losses, by hand."""
+"""DVR and IDR: hits, misses, gradients and silhouette losses, worked out by hand."""
 
 from dataclasses import replace
 from math import exp, log, log1p, nan
@@ -33,10 +33,10 @@ def slab(thickness: float) -> Shape:
 
 
 @each("samples", [8, 17, 64])
-def test_a_slab_thinner_than_the_spacing_is_met_only_by_luck(samples):
+def test_a_slab_thinner_than_the_spacing_may_be_missed(samples):
     spacing = 2 / (samples - 1)
     renderer = replace(DVR, n_ray_samples=samples)
-    # Slabs beside the middle of an interval, a little thinner and a little thicker than the spacing.
+    # Two slabs in the middle of an interval: slightly thinner and slightly thicker than the spacing.
     middle = -1 + spacing * (samples // 2 - 0.5)
     thin, thick = (slab(share * spacing).translate((0.0, 0.0, middle)) for share in (0.98, 1.02))
     assert renderer.render(thin, along_z(0.0)).status.tolist() == [Status.MISS]
@@ -49,14 +49,14 @@ def test_stopping_early_changes_nothing():
     inside = Rays(origins, rays.directions[:1].expand_as(origins))
     plain, early = (replace(DVR, early_stop=stop).render(sphere(0.5), inside) for stop in (False, True))
     assert set(plain.status.tolist()) == {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
-    for part in ("distance", "status", "points", "residual", "closest"):
-        assert torch.equal(getattr(plain, part), getattr(early, part)), part
+    for name in ("distance", "status", "points", "residual", "closest"):
+        assert torch.equal(getattr(plain, name), getattr(early, name)), name
 
 
-def test_what_a_step_keeps_does_not_grow_with_n():
-    """DVR, Sec. 3.3: the samples of the search need no memory. NeuS keeps all of its own, so that the test can fail."""
+def test_the_memory_of_a_step_of_dvr_does_not_grow_with_the_samples():
+    """DVR, Sec. 3.3: the samples of the search need no memory. NeuS keeps its samples, so that the test can fail."""
 
-    def kept(name: str, **settings) -> int:
+    def kept_bytes(name: str, **settings) -> int:
         """The bytes of all tensors that a rendering keeps for its backward pass."""
         storages: dict[int, int] = {}
 
@@ -72,9 +72,9 @@ def test_what_a_step_keeps_does_not_grow_with_n():
             rendering.distance[rendering.hit].sum()
         return sum(storages.values())
 
-    few, many = (kept("dvr", n_ray_samples=n, doublings=[]) for n in (16, 128))
+    few, many = (kept_bytes("dvr", n_ray_samples=n, doublings=[]) for n in (16, 128))
     assert many == pytest.approx(few, rel=0.01)
-    assert kept("neus", samples=64) > 1.1 * kept("neus", samples=16)
+    assert kept_bytes("neus", samples=64) > 1.1 * kept_bytes("neus", samples=16)
 
 
 def test_samples_double_on_schedule_up_to_all():
@@ -84,7 +84,7 @@ def test_samples_double_on_schedule_up_to_all():
     ]  # fmt: skip
     assert at_iteration(renderer, 0).n_ray_samples == 16
     assert at_iteration(replace(renderer, doublings=()), 0).n_ray_samples == 128
-    assert at_iteration(IDR, 0) is IDR  # it has no schedule
+    assert at_iteration(IDR, 0) is IDR  # IDR has no schedule
     for wrong in ((3, 3), (5, 2), (-1,)):
         with pytest.raises(ValueError, match="doublings must be rising iterations from 0"):
             replace(renderer, doublings=wrong)
@@ -100,7 +100,7 @@ def test_the_implicit_gradient_is_exact(name, case: Case):
     by_parameter, by_origin, by_direction = torch.autograd.grad(distance.sum(), (parameter, origins, directions))
     assert by_parameter.item() == pytest.approx(case.parameter_rate, rel=1e-7)
     torch.testing.assert_close(by_origin[0], case.origin_rate, rtol=1e-7, atol=1e-7)
-    # A turn of the ray moves its end by the distance times what an origin moves it by.
+    # A rotation of the ray moves its end by the distance times the effect of the origin.
     torch.testing.assert_close(by_direction[0], case.distance * case.origin_rate, rtol=1e-7, atol=1e-7)
 
 
@@ -109,12 +109,12 @@ def test_a_flat_slope_keeps_its_sign(slope, used):
     offset = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
     field = Shape(lambda p: slope * p[..., 2] + offset, Kind.LEVEL, None)
     distance = attach_implicit_gradient(field, along_z(0.0), vector((2.0,)), least_slope=1e-3)
-    (found,) = torch.autograd.grad(distance.sum(), offset)
-    assert found.item() == pytest.approx(-1 / used)  # Eq. 8
+    (gradient,) = torch.autograd.grad(distance.sum(), offset)
+    assert gradient.item() == pytest.approx(-1 / used)  # Eq. 8
 
 
 def masks(renderer, field, rays: Rays, mask: list[bool], seed: int = 0) -> tuple[Tensor, Rendering, Tensor]:
-    """The silhouette loss of a seed, the rendering, and the shares of the rays' chords that the seed draws."""
+    """The silhouette loss for a seed, the rendering, and the fractions of the rays' chords that the seed draws."""
     rendering = renderer.render(field, rays)
     torch.manual_seed(seed)
     loss = renderer.silhouette_loss(field, rays, rendering, torch.tensor(mask))
@@ -123,54 +123,54 @@ def masks(renderer, field, rays: Rays, mask: list[bool], seed: int = 0) -> tuple
 
 
 def test_dvr_mask_losses_by_hand():
-    # A hit that is wanted costs nothing; a hit on the background log 2, at the surface (Eq. 14); a ray that misses is
-    # judged at the drawn point, as free (Eq. 14) or as occupied (Eq. 15); one that misses the sphere is not judged.
+    # A correct hit costs nothing. A spurious hit costs log 2, at the surface (Eq. 14). A missed ray is evaluated at the
+    # drawn point, as free (Eq. 14) or as occupied (Eq. 15). A ray that misses the unit sphere costs nothing.
     width, rays = 0.1, along_z(0.0, 0.0, 0.8, 0.8, 1.5, 1.5)
     renderer = replace(DVR, occupancy_width=width, refinement_steps=40)
-    loss, rendering, shares = masks(renderer, sphere(0.5), rays, [True, False, False, True, True, False])
+    loss, rendering, fractions = masks(renderer, sphere(0.5), rays, [True, False, False, True, True, False])
     assert rendering.hit.tolist() == [True, True, False, False, False, False]
     values = []
-    for share in shares[2:4].tolist():
-        z = 0.6 * (2 * share - 1)  # the chord at height 0.8 goes from -0.6 to 0.6
+    for fraction in fractions[2:4].tolist():
+        z = 0.6 * (2 * fraction - 1)  # the chord at height 0.8 goes from -0.6 to 0.6
         values.append((0.64 + z**2) ** 0.5 - 0.5)
     free, occupied = (softplus(torch.tensor(sign * v / width)).item() for sign, v in ((-1, values[0]), (1, values[1])))
     assert loss.item() == pytest.approx((log(2) + free + occupied) / 6, rel=1e-6)
 
 
 @each("name", ["own", "occupancy"])
-def test_a_shrunk_sphere_grows_where_depth_is_given(name):
-    """A ray through the mask that passes the sphere by is judged exactly at its given distance, by hand."""
+def test_a_missed_pixel_with_a_depth_makes_the_sphere_grow(name):
+    """The loss of a missed pixel is the cross entropy at its observed distance, worked out by hand."""
     width, rays = 0.1, along_z(0.6)
     dvr = replace(DVR, occupancy_width=width, occupied_at="depth")
     loss = Own() if name == "own" else load("silhouette", name, width=width, weight=1.0, occupied_at="depth")
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     rendering = dvr.render(sphere(radius), rays)
-    seen = RayObservation(torch.tensor([True]), torch.tensor([1.9], dtype=torch.float64))
-    found = loss(dvr, sphere(radius), rays, rendering, seen)
+    observation = RayObservation(torch.tensor([True]), torch.tensor([1.9], dtype=torch.float64))
+    cost = loss(dvr, sphere(radius), rays, rendering, observation)
     value = ((0.6**2 + 0.1**2) ** 0.5 - 0.5) / width  # at z = -0.1
-    assert found.item() == pytest.approx(log1p(exp(value)), rel=1e-9)
-    (slope,) = torch.autograd.grad(found, radius)
+    assert cost.item() == pytest.approx(log1p(exp(value)), rel=1e-9)
+    (slope,) = torch.autograd.grad(cost, radius)
     assert slope.item() == pytest.approx(-1 / (1 + exp(-value)) / width, rel=1e-9)
 
 
-def observed_losses(renderer, mask: list[bool], given: list[float], *heights: float) -> list[float]:
-    """The loss of each ray with the distances that are given, and of the mask alone, from the same draws."""
-    rays, found = along_z(*heights), []
+def observed_losses(renderer, mask: list[bool], distances: list[float], *heights: float) -> list[float]:
+    """The loss with observed distances and the loss of the mask alone, from the same random numbers."""
+    rays, losses = along_z(*heights), []
     rendering = renderer.render(sphere(0.5), rays)
-    seen = RayObservation(torch.tensor(mask), torch.tensor(given, dtype=torch.float64))
-    for observed in (seen, RayObservation(seen.mask)):
+    observation = RayObservation(torch.tensor(mask), torch.tensor(distances, dtype=torch.float64))
+    for observed in (observation, RayObservation(observation.mask)):
         torch.manual_seed(0)
-        found.append(renderer.observed_loss(sphere(0.5), rays, rendering, observed).item())
+        losses.append(renderer.observed_loss(sphere(0.5), rays, rendering, observed).item())
     torch.manual_seed(0)
-    assert renderer.silhouette_loss(sphere(0.5), rays, rendering, seen.mask).item() == found[1]
-    return found
+    assert renderer.silhouette_loss(sphere(0.5), rays, rendering, observation.mask).item() == losses[1]
+    return losses
 
 
-def test_a_point_is_drawn_where_no_distance_is_given_in_the_sphere_and_at_random_everywhere():
+def test_a_point_is_drawn_if_no_distance_within_the_sphere_is_observed():
     """A chord at height 0.6 goes from distance 1.2 to 2.8."""
-    at_depth, at_random = (replace(DVR, occupied_at=place) for place in ("depth", "random"))
-    for mask, given in ((True, nan), (True, 1.0), (True, 3.0), (False, 2.0)):  # unknown, before, behind, background
-        with_depth, without = observed_losses(at_depth, [mask], [given], 0.6)
+    at_depth, at_random = (replace(DVR, occupied_at=choice) for choice in ("depth", "random"))
+    for mask, distance in ((True, nan), (True, 1.0), (True, 3.0), (False, 2.0)):  # unknown, before, behind, background
+        with_depth, without = observed_losses(at_depth, [mask], [distance], 0.6)
         assert with_depth == without
     with_depth, without = observed_losses(at_random, [True, True, False], [1.5, 2.0, 2.0], 0.0, 0.6, 0.8)
     assert with_depth == without
@@ -187,23 +187,25 @@ def test_idr_mask_loss_by_hand():
     assert loss.item() == pytest.approx(sum(e.item() for e in entropies) / (20 * 4), rel=1e-9)
 
 
-def test_naive_is_the_same_one_by_one_and_its_practical_gradient_is_that_of_dist():
+def test_naive_is_the_same_ray_by_ray_and_its_practical_gradient_is_that_of_dist():
     rays = along_z(0.0, 0.2, 0.45, 0.6, 1.2)
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     shared = {"n_gradient_samples": 2, "epsilon": 1e-6, "silhouette_average": "all"}
     dist = load("renderer", "dist", alpha=1.0, extra_step_cap=None, coarse_to_fine=False, active_only=False, **shared)
-    found = {}
+    results = {}
     for gradient in ("unrolled", "practical"):
         for serial in (False, True):
             renderer = load("renderer", "naive", gradient=gradient, serial=serial, **shared)
             rendering = renderer.render(sphere(radius), rays)
             (rate,) = torch.autograd.grad(rendering.distance[rendering.hit].sum(), radius)
-            found[gradient, serial] = rendering, rate
-        for part in ("distance", "status", "residual", "closest"):
-            assert torch.equal(getattr(found[gradient, False][0], part), getattr(found[gradient, True][0], part)), part
-        assert found[gradient, False][1] == pytest.approx(found[gradient, True][1].item())
+            results[gradient, serial] = rendering, rate
+        for name in ("distance", "status", "residual", "closest"):
+            assert torch.equal(getattr(results[gradient, False][0], name), getattr(results[gradient, True][0], name)), (
+                name
+            )
+        assert results[gradient, False][1] == pytest.approx(results[gradient, True][1].item())
     other = dist.render(sphere(radius), rays)
     (rate,) = torch.autograd.grad(other.distance[other.hit].sum(), radius)
-    assert torch.equal(other.distance, found["practical", False][0].distance)
-    assert rate.item() == pytest.approx(found["practical", False][1].item())
-    assert rate.item() != pytest.approx(found["unrolled", False][1].item(), rel=0.01)
+    assert torch.equal(other.distance, results["practical", False][0].distance)
+    assert rate.item() == pytest.approx(results["practical", False][1].item())
+    assert rate.item() != pytest.approx(results["unrolled", False][1].item(), rel=0.01)

@@ -1,4 +1,4 @@
-"""Fields: distances worked out by hand, bounds against sampled surfaces, kinds, normals, and what the Meter counts."""
+"""Fields: distances by hand, bounds, kinds, normals, gradients, and the counts of the Meter."""
 
 from math import sqrt
 
@@ -38,7 +38,7 @@ def value(shape: Field, *point: float) -> float:
     return shape(vector(point)).item()
 
 
-BOX, ROUND, TORUS, CYLINDER = box((1, 2, 3)), rounded_box((1, 2, 3), 0.5), torus(1, 0.25), cylinder(1, 2)
+BOX, ROUNDED, TORUS, CYLINDER = box((1, 2, 3)), rounded_box((1, 2, 3), 0.5), torus(1, 0.25), cylinder(1, 2)
 CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
 
 
@@ -47,13 +47,13 @@ CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
     [
         (sphere(0.5, (1, 0, 0)), (1, 0, 0), -0.5),
         (sphere(), (3, 4, 0), 4),
-        (BOX, (0, 1.75, 0), -0.25),  # inside, nearest to a face that is not the nearest of the centre
+        (BOX, (0, 1.75, 0), -0.25),  # inside, closest to a face that is not the closest face to the centre
         (BOX, (-4, -6, 0), 5),  # off an edge by 3 and 4
         (BOX, (2, -4, 5), 3),  # off a corner by 1, 2 and 2
         (BOX, (-1, 2, -3), 0),  # on a corner
-        (ROUND, (3, 0, 0), 2),  # the size over all is that of the sharp box
-        (ROUND, (3.5, 5.5, 0), 4.5),  # 3 and 4 off the core's edge, less the rounding
-        (ROUND, (1, 2, 3), sqrt(0.75) - 0.5),  # the corner that was rounded away
+        (ROUNDED, (3, 0, 0), 2),  # rounding does not change the overall size
+        (ROUNDED, (3.5, 5.5, 0), 4.5),  # 3 and 4 off the core's edge, less the rounding
+        (ROUNDED, (1, 2, 3), sqrt(0.75) - 0.5),  # the corner that was rounded away
         (TORUS, (0, 0, 0), 0.75),
         (TORUS, (1, 0, 0), -0.25),
         (TORUS, (4, 4, 0), 4.75),  # 3 and 4 off the ring
@@ -67,18 +67,17 @@ CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
         (CYLINDER, (4, -6, 0), 5),  # 3 and 4 off the rim
         (CYLINDER, (0, 2, 1), 0),  # on the rim
         (plane((0, 1, 0), 0.5), (7, -1, 3), -1.5),
-        (plane((3, 0, 4)), (1, 5, 1), 1.4),  # the normal is made a unit vector
-        (plane((0, 2, 0), 1), (3, 2.5, 4), 2),  # and the offset is that of the normal as given
+        (plane((3, 0, 4)), (1, 5, 1), 1.4),  # the normal is normalised
+        (plane((0, 2, 0), 1), (3, 2.5, 4), 2),  # the offset belongs to the normal before it is normalised
     ],
 )
 def test_distances_worked_out_by_hand(shape, point, distance):
-    assert value(shape, *point) == pytest.approx(distance, abs=1e-12)
-    assert shape.kind is Kind.DISTANCE
+    assert value(shape, *point) == pytest.approx(distance, abs=1e-12) and shape.kind is Kind.DISTANCE
 
 
 @each("shape", [*PRIMITIVES.values(), *COMBINATIONS.values()])
 @each("size", [1e-4, 1e-2, 1.0])
-def test_no_field_changes_faster_than_distance(shape, size):
+def test_the_lipschitz_constant_of_each_shape_is_at_most_1(shape, size):
     generator = torch.Generator().manual_seed(0)
     first = torch.rand(2000, 3, dtype=torch.float64, generator=generator) * 3 - 1.5
     second = first + size * torch.randn(2000, 3, dtype=torch.float64, generator=generator)
@@ -86,8 +85,8 @@ def test_no_field_changes_faster_than_distance(shape, size):
     assert ((shape(first) - shape(second)).abs() <= (first - second).norm(dim=-1) + 1e-12).all()
 
 
-def test_the_inside_of_a_combination_is_that_of_its_parts():
-    """With no field that changes faster than distance, none overshoots its surface."""
+def test_the_inside_of_a_combination_follows_from_its_shapes():
+    """Together with a Lipschitz constant of 1, no step overshoots the surface of a combination."""
     points = 3 * torch.rand(2000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 1.5
     in_box, in_sphere = A(points) < 0, B(points) < 0
     assert torch.equal((A | B)(points) < 0, in_box | in_sphere)
@@ -105,13 +104,13 @@ def test_a_smooth_union_fills_the_seam_by_a_quarter_of_its_radius_and_is_the_uni
 
 def test_every_shape_states_its_kind():
     def changed(shape: Shape, other: Shape) -> tuple[list[Shape], list[Shape]]:
-        """Moves, which keep the kind, and what makes a bound of a distance."""
-        moves = [shape.translate((1.0, 0, 0)), shape.rotate(QUARTER_TURN), shape.scale(2.0)]
+        """Motions, which keep the kind, and combinations, which make a bound of a distance."""
+        motions = [shape.translate((1.0, 0, 0)), shape.rotate(QUARTER_TURN), shape.scale(2.0)]
         smooth = smooth_union(shape, other, radius=0.1)
-        return moves, [shape | other, other & shape, other - shape, smooth, shape.stretch((1, 2, 3))]
+        return motions, [shape | other, other & shape, other - shape, smooth, shape.stretch((1, 2, 3))]
 
-    moves, combinations = changed(A, B)
-    assert {shape.kind for shape in (*PRIMITIVES.values(), *moves)} == {Kind.DISTANCE}
+    motions, combinations = changed(A, B)
+    assert {shape.kind for shape in (*PRIMITIVES.values(), *motions)} == {Kind.DISTANCE}
     assert {shape.kind for shape in combinations} == {Kind.BOUND} == {(A - B).scale(2.0).kind}
     levels = [shape for shapes in changed(LEVEL, A) for shape in shapes]
     assert {(shape.kind, shape.lipschitz) for shape in levels} == {(Kind.LEVEL, None)}
@@ -151,7 +150,7 @@ def tensor(*numbers: float) -> torch.Tensor:
         (lambda offset: A.translate(offset), (tensor(0.1, 0.2, 0.3),)),
         (lambda factor: A.scale(factor), (tensor(1.5),)),
         (lambda factors: B.stretch(factors), (tensor(0.5, 1.5, 2.0),)),
-        (lambda angle: A.rotate(turn(angle)), (tensor(0.3),)),
+        (lambda angle: A.rotate(rotation(angle)), (tensor(0.3),)),
         (lambda radius: smooth_union(A, B, radius=radius), (tensor(0.4),)),
         (lambda radius: A - sphere(radius), (tensor(0.4),)),
     ],
@@ -163,9 +162,9 @@ def test_gradients_flow_to_tensor_parameters(make, parameters):
     assert all(gradient.abs().sum() > 0 for gradient in gradients)
 
 
-def turn(angle: torch.Tensor) -> torch.Tensor:
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    return torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one]).view(3, 3)
+def rotation(angle: torch.Tensor) -> torch.Tensor:
+    zero, ones = torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, ones]).view(3, 3)
 
 
 @each("name", [*PRIMITIVES, *COMBINATIONS])
@@ -185,10 +184,10 @@ def test_fields_agree_with_the_closed_form_cases(case):
     values = case.shape(parameter)(point)
     assert values.item() == pytest.approx(0, abs=1e-12)
     (gradient,) = torch.autograd.grad(values.sum(), parameter)
-    assert gradient.item() == pytest.approx(-1)  # as `analytic_cases` says of every field
+    assert gradient.item() == pytest.approx(-1)  # as `analytic_cases` states for each field
     assert -(rays.directions @ vector(case.normal)).item() == pytest.approx(case.cosine)
     before = rays.at(torch.linspace(0, case.distance - 1e-6, 500, dtype=torch.float64)[:, None])
-    assert (case.field()(before) > 0).all()  # it is the first surface on the ray
+    assert (case.field()(before) > 0).all()  # the hit is the first surface on the ray
     assert autograd_normals(case.field(), point)[0].tolist() == pytest.approx(list(case.normal))
     # Central differences are off by the third derivative times delta squared.
     ahead, behind = (case.field()(point + side * 1e-4 * torch.eye(3, dtype=point.dtype)) for side in (1, -1))
@@ -214,11 +213,10 @@ def test_the_meter_counts_points_and_leaves_values_and_gradients_as_they_are(sha
     assert meter.counts == Counts(value=count)
     (metered,) = torch.autograd.grad(values.square().sum(), points)
     (plain,) = torch.autograd.grad(B(points).square().sum(), points)
-    assert torch.equal(metered, plain)
-    assert meter.counts == Counts(value=count, gradient=count)
+    assert torch.equal(metered, plain) and meter.counts == Counts(value=count, gradient=count)
 
 
-def test_the_meter_counts_every_backward_pass_once_and_none_where_there_is_none():
+def test_the_meter_counts_each_backward_pass_once():
     meter, points = Meter(B), torch.randn(5, 3, requires_grad=True)
     values = meter(points)
     (values.sum() + values.square().mean()).backward(retain_graph=True)  # two uses of the values, one pass
@@ -230,24 +228,23 @@ def test_the_meter_counts_every_backward_pass_once_and_none_where_there_is_none(
     meter(points.detach())
     assert meter.counts == Counts(15, 7)
     radius = torch.tensor(0.5, requires_grad=True)
-    Meter(sphere(radius), meter.counts)(points.detach()).sum().backward()  # counts can be shared
+    Meter(sphere(radius), meter.counts)(points.detach()).sum().backward()  # meters can share counts
     assert meter.counts == Counts(20, 12)
 
 
-def test_the_meter_is_the_field_that_it_wraps_and_tells_its_cost():
+def test_the_meter_has_the_attributes_of_its_field_and_gives_its_cost():
     shape = Shape(A.function, Kind.LEVEL, 2.5, flops=Flops(10, 20))
     meter = Meter(shape)
     assert (meter.kind, meter.lipschitz, meter.flops) == (Kind.LEVEL, 2.5, Flops(10, 20))
-    # A value with its gradient costs three values.
-    assert Counts(value=5, gradient=2).flops(meter) == 10 * 5 + 20 * 2
-    assert Counts(5, 2).flops(A) is None
+    # A value with its gradient costs as much as three values.
+    assert Counts(value=5, gradient=2).flops(meter) == 10 * 5 + 20 * 2 and Counts(5, 2).flops(A) is None
     assert Counts(5, 7) - Counts(1, 2) == Counts(4, 5)
 
 
-def test_work_over_the_bound_is_that_over_one_value_and_one_gradient_a_hit():
+def test_cost_is_relative_to_one_evaluation_and_one_gradient_per_hit():
     shape = Shape(A.function, Kind.LEVEL, 2.5, flops=Flops(10, 20))
     assert Counts(12, 3, hits=3).over_bound(shape) == (12 * 10 + 3 * 20) / (3 * 30)
-    assert Counts(12, 3, hits=3).over_bound(A) == 15 / 6  # where operations are not stated, a gradient is as a value
+    assert Counts(12, 3, hits=3).over_bound(A) == 15 / 6  # without stated operations a gradient costs one evaluation
     assert Counts(12, 3, hits=3, coarse=6).over_bound(shape) == ((12 + 6) * 10 + 3 * 20) / (3 * 30)
     assert Counts(12, 3).over_bound(shape) is None
     assert (Counts(12, 3, hits=9) - Counts(2, 1, hits=4)).hits == 5

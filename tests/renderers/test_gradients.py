@@ -21,7 +21,7 @@ by_case = each("case", CASES)
 
 
 def render(renderer, case: Case, *, parameter: float | None = None, shift: Tensor | None = None):
-    """The rendering of a case, its parameter and its ray's origin as leaves."""
+    """The rendering of a case, with its parameter and the origin of its ray as leaves."""
     leaf = torch.tensor(case.parameter if parameter is None else parameter, dtype=torch.float64, requires_grad=True)
     rays = case.rays()
     origins = (rays.origins + (torch.zeros(3) if shift is None else shift)).requires_grad_(True)
@@ -29,7 +29,7 @@ def render(renderer, case: Case, *, parameter: float | None = None, shift: Tenso
 
 
 def rates(renderer, case: Case) -> tuple[float, Tensor]:
-    """The derivatives of the distance, by backward."""
+    """The derivatives of the distance with respect to the parameter and the origin, by automatic differentiation."""
     rendering, parameter, origins = render(renderer, case)
     assert rendering.status.item() == Status.HIT
     assert rendering.distance.item() == pytest.approx(case.distance, abs=1e-9)
@@ -53,12 +53,12 @@ def test_naive_is_exact_towards_the_field_and_the_ray(case):
 
 @each("steps", [1, 5])
 @each("name", ["plane-oblique", "plane-grazing"])
-def test_naive_falls_short_by_the_stated_factor_when_steps_are_few(name, steps):
+def test_the_gradient_of_naive_is_low_by_the_stated_factor_with_few_steps(name, steps):
     case = next(case for case in CASES if case.name == name)
     rendering, parameter, _ = render(replace(NAIVE, steps=steps), case)
-    (found,) = torch.autograd.grad(rendering.distance.sum(), parameter)
+    (gradient,) = torch.autograd.grad(rendering.distance.sum(), parameter)
     assert rendering.status.item() == Status.OUT_OF_STEPS
-    assert found.item() == pytest.approx(case.parameter_rate * (1 - (1 - case.cosine) ** steps))
+    assert gradient.item() == pytest.approx(case.parameter_rate * (1 - (1 - case.cosine) ** steps))
 
 
 @by_case
@@ -66,7 +66,7 @@ def test_naive_falls_short_by_the_stated_factor_when_steps_are_few(name, steps):
 def test_dist_is_biased_by_alpha_samples_and_cosine(case, alpha, samples):
     renderer = replace(DIST_PLAIN, alpha=alpha, n_gradient_samples=samples)
     by_parameter, by_origin = rates(renderer, case)
-    bias = alpha * samples * case.cosine  # the kept samples lie so near the hit that the normal there is the same
+    bias = alpha * samples * case.cosine  # the kept samples lie so near the hit that their normals are equal
     assert by_parameter == pytest.approx(bias * case.parameter_rate, rel=1e-4)
     torch.testing.assert_close(by_origin, bias * case.origin_rate, rtol=1e-4, atol=1e-4)
     # The direction is right at each pixel.
@@ -75,23 +75,22 @@ def test_dist_is_biased_by_alpha_samples_and_cosine(case, alpha, samples):
 
 @each("steps", [30, 300])
 @each("samples", [1, 3])
-def test_dist_back_propagates_one_value_a_sample_whatever_the_steps(steps, samples):
+def test_dist_differentiates_one_value_per_sample_for_any_number_of_steps(steps, samples):
     case = CASES[2]
     parameter = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     meter = Meter(sphere(parameter))
     dist = replace(DIST_PLAIN, epsilon=1e-3, steps=steps, n_gradient_samples=samples)
     rendering = dist.render(meter, case.rays())
-    assert rendering.hit.all()
-    assert meter.counts.value > 10 + samples
+    assert rendering.hit.all() and meter.counts.value > 10 + samples
     rendering.distance.sum().backward()
     assert meter.counts.gradient == samples
     naive = Meter(sphere(parameter))
     replace(NAIVE, steps=steps).render(naive, case.rays()).distance.sum().backward()
     assert naive.counts.value == steps
-    assert samples < naive.counts.gradient <= steps  # none goes through the steps behind the last
+    assert samples < naive.counts.gradient <= steps  # steps after the last have no gradient
 
 
-BESIDE = Rays(vector((0.7, 0, -2))[None], vector((0, 0, 1))[None])  # passes a ball of radius 0.5 by 0.2
+PASSING_RAY = Rays(vector((0.7, 0, -2))[None], vector((0, 0, 1))[None])  # passes a sphere of radius 0.5 by 0.2
 
 
 @each("alpha", [1.0, 1.5])
@@ -100,51 +99,51 @@ def test_the_soft_silhouette_of_dist_moves_as_the_field_does_at_its_fixed_sample
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     shape, points = sphere(radius, center), []
     recording = Shape(lambda p: points.append(p.detach()) or shape(p))
-    rendering = replace(DIST_PLAIN, alpha=alpha).render(recording, BESIDE)
+    rendering = replace(DIST_PLAIN, alpha=alpha).render(recording, PASSING_RAY)
     assert rendering.status.item() == Status.MISS
     by_radius, by_center = torch.autograd.grad(rendering.closest.sum(), (radius, center))
-    asked = torch.cat(points)
-    sample = asked[shape(asked).abs().argmin()]
+    evaluated = torch.cat(points)
+    sample = evaluated[shape(evaluated).abs().argmin()]
     assert rendering.closest.item() == pytest.approx(shape(sample).item())
     assert by_radius.item() == pytest.approx(-1)
-    torch.testing.assert_close(by_center, -sample / sample.norm())  # the centre moves the value by the negative normal
+    torch.testing.assert_close(
+        by_center, -sample / sample.norm()
+    )  # the derivative with respect to the centre is the negative normal
 
 
 def test_the_soft_silhouette_of_naive_moves_with_its_sample():
     def closest(radius: Tensor) -> Tensor:
-        return NAIVE.render(sphere(radius), BESIDE).closest[0]
+        return NAIVE.render(sphere(radius), PASSING_RAY).closest[0]
 
     radius, h = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), 1e-6
-    (found,) = torch.autograd.grad(closest(radius), radius)
+    (gradient,) = torch.autograd.grad(closest(radius), radius)
     numeric = (closest(radius.detach() + h) - closest(radius.detach() - h)).item() / (2 * h)
-    assert found.item() == pytest.approx(numeric, rel=1e-6)
-    assert found.item() < -1  # a fixed sample would give -1
+    assert gradient.item() == pytest.approx(numeric, rel=1e-6)
+    assert gradient.item() < -1  # a fixed sample would give -1
 
 
 @each("renderer", [NAIVE, DIST_PLAIN, replace(DIST_PLAIN, coarse_to_fine=True)])
-def test_rays_that_pass_the_unit_sphere_tell_the_camera_by_how_much(renderer):
+def test_the_closest_value_of_rays_that_miss_the_unit_sphere_moves_the_camera(renderer):
     # DIST, A.3: the distance from the origin to the ray, less the radius.
     origin = vector((1.5, 0.5, -2)).requires_grad_(True)
     rays = Rays(origin.expand(4, 4, 3), vector((0, 0, 1)).expand(4, 4, 3), image=True)
     rendering = renderer.render(sphere(0.5), rays)
-    far = (1.5**2 + 0.5**2) ** 0.5
+    offset = (1.5**2 + 0.5**2) ** 0.5
     assert (rendering.status == Status.MISS).all()
-    torch.testing.assert_close(rendering.closest, torch.full((4, 4), far - 1, dtype=torch.float64))
+    torch.testing.assert_close(rendering.closest, torch.full((4, 4), offset - 1, dtype=torch.float64))
     (gradient,) = torch.autograd.grad(rendering.closest[0, 0], origin)
-    torch.testing.assert_close(gradient, vector((1.5, 0.5, 0)) / far)
+    torch.testing.assert_close(gradient, vector((1.5, 0.5, 0)) / offset)
 
 
 def test_the_approximate_rule_counts_the_samples_that_exist():
-    # Three rays down on the ground y = h, with 2, 1 and no samples; alpha 1.5.
+    # Three rays go down to the ground y = h. They have 2, 1 and no samples, and alpha is 1.5.
     offset = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
     rays = Rays(vector((0, 2, 0)).expand(3, 3), vector((0, -1, 0)).expand(3, 3))
-    at = vector((1.5, 1.0, 1.75, 9, 9, 9)).view(3, 2)
+    sample_distance = vector((1.5, 1.0, 1.75, 9, 9, 9)).view(3, 2)
     values = vector((0.5, 1.0, 0.25, torch.inf, torch.inf, torch.inf)).view(3, 2)
-    distance, first = attach_approximate_gradient(
-        ground(offset), rays, vector((1.9, 1.8, 1.7)), alpha=1.5, sample_distance=at, sample_value=values
+    distance, closest = attach_approximate_gradient(
+        ground(offset), rays, vector((1.9, 1.8, 1.7)), alpha=1.5, sample_distance=sample_distance, sample_value=values
     )
-    assert distance.tolist() == [1.9, 1.8, 1.7]
-    assert first.tolist() == [0.5, 0.25, 0]
-    slopes = [torch.autograd.grad(part, offset, retain_graph=True)[0].item() for part in distance]
-    assert slopes == [-3, -1.5, 0]
-    assert torch.autograd.grad(first[0], offset)[0].item() == -1
+    assert distance.tolist() == [1.9, 1.8, 1.7] and closest.tolist() == [0.5, 0.25, 0]
+    slopes = [torch.autograd.grad(ray_distance, offset, retain_graph=True)[0].item() for ray_distance in distance]
+    assert slopes == [-3, -1.5, 0] and torch.autograd.grad(closest[0], offset)[0].item() == -1

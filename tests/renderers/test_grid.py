@@ -1,4 +1,4 @@
-"""Trilinear fields and moved shapes, against shapes whose distances are known."""
+"""Trilinear fields and moved shapes, against shapes with closed-form distances."""
 
 import math
 
@@ -25,7 +25,7 @@ def points(count: int, reach: float) -> torch.Tensor:
 
 
 @each("samples", [17, 33])
-def test_inside_it_is_off_by_the_square_of_the_spacing(samples):
+def test_the_error_inside_falls_with_the_square_of_the_spacing(samples):
     near = points(2000, 0.9)
     near = near[(near.norm(dim=-1) - 0.6).abs() < 0.2]
     spacing = 2 * REACH / (samples - 1)
@@ -33,7 +33,7 @@ def test_inside_it_is_off_by_the_square_of_the_spacing(samples):
     assert worst < 0.4 * spacing**2 / 0.4  # 3/8 of the square, times the curvature 1 / 0.4 at the innermost point
 
 
-def test_it_is_exact_where_distances_are_linear():
+def test_linear_distances_are_exact():
     flat = grid_of(lambda p: p[..., 0] - 0.5 * p[..., 1] + 0.25 * p[..., 2] - 0.1, 5)
     inside = points(100, REACH)
     expected = inside @ torch.tensor([1.0, -0.5, 0.25]) - 0.1
@@ -41,7 +41,7 @@ def test_it_is_exact_where_distances_are_linear():
     assert torch.allclose(autograd_gradients(flat, inside), torch.tensor([1.0, -0.5, 0.25]).expand(100, 3), atol=1e-5)
 
 
-def test_outside_it_is_a_bound_of_the_distance_and_continuous():
+def test_the_field_outside_is_a_continuous_bound_of_the_distance():
     shape = box((0.4, 0.3, 0.2))
     field = grid_of(shape, 65)
     far = points(4000, 3.0)
@@ -62,14 +62,14 @@ SIMILARITY = torch.tensor([0.1, -0.2, 0.05, 0.3, 0.2, -0.4, math.log(1.25)])
 
 def test_a_moved_shape_has_true_distances():
     moved = Moved(sphere(0.5, (0.2, 0.0, 0.0)), SIMILARITY.double())
-    where = points(200, 1.0).double()
+    locations = points(200, 1.0).double()
     motion = rigid(SIMILARITY[:6].double())
     centre = 1.25 * motion[:3, :3] @ torch.tensor([0.2, 0.0, 0.0]).double() + motion[:3, 3]
-    assert torch.allclose(moved(where), (where - centre).norm(dim=-1) - 0.625)
+    assert torch.allclose(moved(locations), (locations - centre).norm(dim=-1) - 0.625)
     assert moved.kind is Kind.DISTANCE
 
 
 def test_gradients_flow_to_all_seven_numbers():
     free = SIMILARITY.double().requires_grad_()
-    where = points(50, 1.0).double()
-    assert torch.autograd.gradcheck(lambda s: Moved(box((0.4, 0.3, 0.2)), s)(where), free)
+    locations = points(50, 1.0).double()
+    assert torch.autograd.gradcheck(lambda s: Moved(box((0.4, 0.3, 0.2)), s)(locations), free)

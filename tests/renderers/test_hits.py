@@ -1,4 +1,4 @@
-"""What hits must be: every shipped renderer holds to it, and wrong distances are found, in any kind of field."""
+"""The check of hits: hits of shipped renderers pass, and wrong distances are reported for each kind of field."""
 
 from dataclasses import replace
 
@@ -23,8 +23,8 @@ PLATE = box((0.45, 0.5, 0.1))  # thin, with edges
 NETWORK = ball_prior().decoder.at(torch.zeros(4))
 
 
-class Other(WrongHits):
-    """A shipped renderer whose renderings a function changes."""
+class Changed(WrongHits):
+    """A shipped renderer with a function applied to its renderings."""
 
     def __init__(self, name: str, change) -> None:
         super().__init__(name=name)
@@ -35,31 +35,30 @@ class Other(WrongHits):
 
 
 def hits_of(renderer: Renderer, field: Field, rays=RAYS) -> Hits:
-    with collect_hits() as kept, torch.no_grad():
+    with collect_hits() as collected, torch.no_grad():
         render_checked(renderer, field, rays)
-    (hits,) = kept
+    (hits,) = collected
     return hits
 
 
 @pytest.mark.parametrize("name", [name for name in names("renderer") if name != "custom"])
 def test_the_hits_of_no_shipped_renderer_are_flagged(name):
-    """At the first iteration, where volumes are most blurred, and sharp."""
+    """Volumes are checked at their greatest blur, in the first iteration, and at their least."""
     renderer = load("renderer", name)
     rays = camera_of(4, angles=(30.0, 20.0)).rays() if getattr(renderer, "serial", False) else RAYS
     fields = [stated(shape, kind) for kind in renderer.capabilities.needs for shape in (PLATE, sphere(0.5))]
     first = at_iteration(renderer, 0)
-    for made in [renderer] if first == renderer else [first, renderer]:
+    for variant in [renderer] if first == renderer else [first, renderer]:
         for field in [*fields, *([NETWORK] if NETWORK.kind in renderer.capabilities.needs else [])]:
-            hits = hits_of(made, field, rays)
+            hits = hits_of(variant, field, rays)
             hits.check()
             assert bool(hits.hit.any()) and hits.off_surface() == ""
 
 
 def test_hits_within_the_largest_shipped_epsilon_are_not_flagged():
-    """That of Figure 7: such a hit is as far off as its residual says."""
+    """The epsilon of Figure 7: the residual accounts for the distance of such a hit from the surface."""
     hits = hits_of(replace(load("renderer", "dist"), epsilon=0.05), PLATE)
-    assert float(PLATE(RAYS.at(hits.distance)[hits.hit]).max()) > 0.02
-    assert hits.off_surface() == ""
+    assert float(PLATE(RAYS.at(hits.distance)[hits.hit]).max()) > 0.02 and hits.off_surface() == ""
 
 
 @each("name", ["dist", "dvr", "newton", "mesh_proxy", "relaxed_boundary", "neus", "unisurf", "volsdf"])
@@ -78,50 +77,44 @@ def test_how_far_off_hits_are_does_not_depend_on_the_fields_scale(factor):
     assert short.off_surface() == hits_of(WrongHits("short", "dvr"), PLATE).off_surface() != ""
 
 
-def test_a_note_says_how_many_hits_are_off_by_how_much():
+def test_a_note_has_the_number_of_wrong_hits_and_their_median_distance():
     facing, ball = camera_of(20).rays(), sphere(0.5)
     hits = hits_of(WrongHits("short"), ball, facing)
     off, count = float(ball(facing.at(hits.distance))[hits.hit].median()), int(hits.hit.sum())
     note = hits.off_surface()
     assert off == pytest.approx(0.08, abs=0.02)
-    assert note == (
-        f"WrongHits.render: {count} of {count} hits are not on the surface at origin + distance * direction. Their "
-        f"median distance from it is {off:.2g} scene units, and 0.02 beyond the residual is allowed. Return the "
-        "distance along the unit direction, in scene units"
-    )
+    assert note.startswith(f"WrongHits.render: {count} of {count} hits are not on the surface ")
+    assert f"median distance from it is {off:.2g} scene units, and 0.02 beyond the residual is allowed. Return" in note
 
 
 @each("kind", [Kind.DISTANCE, Kind.BOUND])
-def test_a_surface_that_admits_its_error_is_noted_all_the_same(kind):
-    """The residual is the field's value where the hit is: it accounts for the blur of a volume alone."""
+def test_a_large_residual_does_not_excuse_a_surface_renderer(kind):
+    """A residual equal to the value at the hit is an excuse only for a volume, which is blurred."""
 
     def admits(field, rays, rendering):
         short = 0.92 * rendering.distance
         return replace(rendering, distance=short, residual=field(rays.at(short)))
 
-    assert "hits are not on the surface" in hits_of(Other("idr", admits), stated(PLATE, kind)).off_surface()
-    assert hits_of(Other("neus", admits), stated(PLATE, kind)).off_surface() == ""
+    assert "hits are not on the surface" in hits_of(Changed("idr", admits), stated(PLATE, kind)).off_surface()
+    assert hits_of(Changed("neus", admits), stated(PLATE, kind)).off_surface() == ""
 
 
 @each("missed, noted", [(0.05, False), (0.3, True)])
-def test_a_few_hits_may_lie_off(missed, noted):
+def test_a_few_hits_may_be_off_the_surface(missed, noted):
     def change(field, rays, rendering):
         wrong = torch.arange(rendering.distance.numel()).view_as(rendering.distance) % 100 < 100 * missed
         return replace(rendering, distance=torch.where(wrong, 0.9 * rendering.distance, rendering.distance))
 
     rays = camera_of(60).rays()
-    assert bool(hits_of(Other("idr", change), sphere(0.5), rays).off_surface()) is noted
+    assert bool(hits_of(Changed("idr", change), sphere(0.5), rays).off_surface()) is noted
 
 
 def test_a_negative_distance_breaks_the_contract():
     hits = hits_of(WrongHits("behind"), PLATE)
     count, least = int(hits.hit.sum()), float(hits.distance[hits.hit].min())
-    with pytest.raises(BrokenContract) as error:
+    message = f"WrongHits.render: {count} of {count} hits have a negative distance, down to {least:.3g},.* return the"
+    with pytest.raises(BrokenContract, match=message):
         hits.check()
-    assert str(error.value) == (
-        f"WrongHits.render: {count} of {count} hits have a negative distance, down to {least:.3g}, so they lie behind "
-        "the camera: return the distance from the origin along the direction, or another Status"
-    )
 
 
 @each("value", [torch.nan, torch.inf])
@@ -129,16 +122,16 @@ def test_a_hit_without_a_finite_distance_breaks_the_contract(value):
     def change(field, rays, rendering):
         return replace(rendering, distance=WRONG["endless"](rendering).nan_to_num(value))
 
-    words = rf"{ENDLESS} of 400 rays have a hit without a finite distance \(the field is finite on them, so the "
-    with pytest.raises(BrokenContract, match=rf"Other\.render: {words}renderer is at fault\): return a finite"):
-        hits_of(Other("dist", change), PLATE).check()
+    cause = rf"{ENDLESS} of 400 rays have a hit without a finite distance \(the field is finite on them, so the "
+    with pytest.raises(BrokenContract, match=rf"Changed\.render: {cause}renderer is at fault\): return a finite"):
+        hits_of(Changed("dist", change), PLATE).check()
 
 
 def test_a_field_without_finite_values_is_named():
     broken = Shape(lambda p: torch.where(p[..., 0] > 0, torch.nan, PLATE(p)))
     hits = replace(hits_of(WrongHits("endless"), PLATE), field=broken)
-    said = missing_distance_message([hits])
-    assert "the field has values that are not finite on" in said and "the renderer is at fault" not in said
+    message = missing_distance_message([hits])
+    assert "the field has values that are not finite on" in message and "the renderer is at fault" not in message
     assert missing_distance_message([hits_of(load("renderer", "dist"), PLATE)]) == missing_distance_message([]) == ""
 
 
@@ -146,7 +139,7 @@ def test_a_miss_may_have_any_distance():
     def change(field, rays, rendering):
         return replace(rendering, distance=rendering.distance.where(rendering.hit, -torch.inf))
 
-    hits = hits_of(Other("idr", change), PLATE)
+    hits = hits_of(Changed("idr", change), PLATE)
     hits.check()
     assert hits.off_surface() == ""
     nothing = hits_of(load("renderer", "idr"), sphere(0.5).translate((5.0, 0.0, 0.0)))
@@ -155,15 +148,15 @@ def test_a_miss_may_have_any_distance():
 
 
 def test_a_check_evaluates_the_field_once_and_is_not_counted():
-    asked = []
-    field = Shape(lambda p: (asked.append(p.numel() // 3), PLATE(p))[1])
+    evaluated = []
+    field = Shape(lambda p: (evaluated.append(p.numel() // 3), PLATE(p))[1])
     counts = Counts()
     hits = hits_of(load("renderer", "idr"), Meter(field, counts), camera_of(200, angles=(30.0, 20.0)).rays())
     before = counts.value
-    asked.clear()
+    evaluated.clear()
     hits.check()
     assert hits.off_surface() == ""
-    assert len(asked) == 1 and MAX_CHECKED_HITS / 2 < asked[0] <= MAX_CHECKED_HITS < hits.hit.sum()
+    assert len(evaluated) == 1 and MAX_CHECKED_HITS / 2 < evaluated[0] <= MAX_CHECKED_HITS < hits.hit.sum()
     assert counts.value == before
 
 
@@ -176,4 +169,4 @@ def test_hits_are_kept_within_the_innermost_block_alone():
         render_checked(renderer, PLATE, RAYS)
     render_checked(renderer, PLATE, RAYS)
     assert (len(outer), len(inner)) == (2, 1)
-    assert not any(part.requires_grad for part in (inner[0].distance, inner[0].residual))
+    assert not any(tensor.requires_grad for tensor in (inner[0].distance, inner[0].residual))

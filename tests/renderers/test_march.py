@@ -1,4 +1,4 @@
-"""The stepping loops: queries, steps and statuses counted by hand, and the samples that are kept."""
+"""The stepping loops: evaluations, steps and statuses counted by hand, and the kept samples."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ COARSE = replace(FINE, coarse_to_fine=True)
 
 
 def sheet(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
-    """An image of rays along z from z = -2, so far apart; by default all run through the centre."""
+    """An image of rays along z from z = -2, `pitch` apart; with the default pitch all rays run through the centre."""
     rows = (torch.arange(height, dtype=torch.float64) - (height - 1) / 2) * pitch
     columns = (torch.arange(width, dtype=torch.float64) - (width - 1) / 2) * pitch
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -34,7 +34,7 @@ def sheet(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
 
 
 def trace(field: Shape, rays: Rays, stepping: Stepping, *, steps: int = 50, samples: int = 1) -> tuple[RayFront, int]:
-    """The front, and how many values it cost; coarse to fine for an image."""
+    """The front and its number of evaluations. An image is marched coarse to fine."""
     meter = Meter(field)
     if rays.image:
         front = march_coarse_to_fine(meter, rays, stepping, steps=steps, radius=1.0, samples=samples)
@@ -51,24 +51,21 @@ def constant(value: float) -> Shape:
 
 HEAD_ON = beam((0, 0, -2))
 VIEW = camera_of(64).double().rays()  # an image of the whole unit sphere
-UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # turns the axis of a torus from y to z
+UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # rotates the axis of a torus from y to z
 
 
-def test_a_wall_head_on_takes_two_queries():
-    # In at z = -1, where the value is 1; then z = 0, where it is 0.
+def test_a_wall_head_on_takes_two_evaluations():
+    # The ray enters at z = -1, where the value is 1. The next point is z = 0, where the value is 0.
     front, count = trace(WALL, HEAD_ON, PLAIN, samples=3)
-    assert count == 2
-    assert front.distance.item() == 2
-    assert front.status.item() == Status.HIT
-    assert front.sample_value.tolist() == [[0, 1, torch.inf]]
+    assert count == 2 and front.distance.item() == 2
+    assert front.status.item() == Status.HIT and front.sample_value.tolist() == [[0, 1, torch.inf]]
     assert front.sample_distance[0, :2].tolist() == [2, 1]
 
 
 def test_aggressive_steps_halve_the_distance_and_change_side():
     # Values 1, -1/2, 1/4, ...: the first below 5e-5 is 2^-15, the 16th. The last moves without alpha (Eq. 1).
     front, count = trace(WALL, HEAD_ON, AGGRESSIVE, samples=4)
-    assert count == 16
-    assert front.distance.item() == 2
+    assert count == 16 and front.distance.item() == 2
     assert front.value.item() == -(2**-15)
     assert front.sample_value.tolist() == [[-(2**-15), 2**-14, -(2**-13), 2**-12]]
 
@@ -88,20 +85,20 @@ def test_a_step_by_cap_and_clamp(alpha, cap, clamp, expected):
     assert stepping.length(vector((1, 0.1, 0, -0.1, -1))).tolist() == pytest.approx(expected)
 
 
-THREE = beam((0, 0, -2), (0.6, 0, -2), (2, 0, -2), (0, 0, 2))  # head on, 2 queries, in at z = -0.8; two pass by
+FOUR_RAYS = beam((0, 0, -2), (0.6, 0, -2), (2, 0, -2), (0, 0, 2))  # head on; in at z = -0.8; two misses
 
 
-def test_finished_rays_are_asked_only_where_every_ray_is():
-    active, count = trace(WALL, THREE, PLAIN, steps=20, samples=2)
+def test_finished_rays_are_evaluated_only_without_active_only():
+    active, count = trace(WALL, FOUR_RAYS, PLAIN, steps=20, samples=2)
     assert count == 2 + 2
-    every, count = trace(WALL, THREE, replace(PLAIN, active_only=False), steps=20, samples=2)
-    assert count == 2 * 20  # never those that miss the sphere
+    all_rays, count = trace(WALL, FOUR_RAYS, replace(PLAIN, active_only=False), steps=20, samples=2)
+    assert count == 2 * 20  # rays that miss the sphere are never evaluated
     for name in ("distance", "status", "value", "sample_distance", "sample_value"):
-        torch.testing.assert_close(getattr(active, name), getattr(every, name), rtol=0, atol=0)
+        torch.testing.assert_close(getattr(active, name), getattr(all_rays, name), rtol=0, atol=0)
     assert active.status.tolist() == [Status.HIT, Status.HIT, Status.MISS, Status.MISS]
 
 
-def test_rays_that_have_ended_are_asked_within_the_sphere():
+def test_finished_rays_are_evaluated_within_the_sphere():
     def strict(points):
         assert points.norm(dim=-1).max() < 1.01
         return WALL(points)
@@ -110,12 +107,11 @@ def test_rays_that_have_ended_are_asked_within_the_sphere():
     trace(Shape(strict, WALL.kind), within, replace(PLAIN, active_only=False), steps=20)
 
 
-@each("steps, queries", [(2, 2 * 4), (4, 12 + 16), (10, 12 + 48 + 4 * 64)])
-def test_coarse_to_fine_asks_blocks_of_16_then_of_4_then_pixels(steps, queries):
-    # 8 x 8 pixels: 2 x 2 rays for three steps, 4 x 4 for three, then 8 x 8. At 0.01 a step none of them ends.
+@each("steps, evaluations", [(2, 2 * 4), (4, 12 + 16), (10, 12 + 48 + 4 * 64)])
+def test_coarse_to_fine_marches_blocks_of_16_then_of_4_then_pixels(steps, evaluations):
+    # 8 x 8 pixels: 2 x 2 rays for three steps, 4 x 4 for three, then 8 x 8. With steps of 0.01 no ray ends.
     front, count = trace(constant(0.01), sheet(8, 8), PLAIN, steps=steps)
-    assert count == queries
-    assert (front.status == Status.OUT_OF_STEPS).all()
+    assert count == evaluations and (front.status == Status.OUT_OF_STEPS).all()
     torch.testing.assert_close(front.distance, torch.full((64,), 1 + 0.01 * steps, dtype=torch.float64))
 
 
@@ -132,14 +128,13 @@ def test_a_ray_continues_the_coarse_ray_that_covers_it():
 
 
 def test_coarse_to_fine_on_a_sphere_head_on():
-    # 4 rays hit after 2 queries (values 0.5, 0). Their children begin at the hit: one query each, 16 and 64.
+    # 4 rays hit after 2 evaluations (0.5, 0). Their children begin at the hit, with one evaluation each: 16 and 64.
     front, count = trace(sphere(0.5), sheet(8, 8), PLAIN)
-    assert count == 2 * 4 + 16 + 64
-    assert front.distance.tolist() == [1.5] * 64
+    assert count == 2 * 4 + 16 + 64 and front.distance.tolist() == [1.5] * 64
     assert (front.status == Status.HIT).all()
 
 
-def test_a_careful_split_keeps_the_outline_that_a_plain_one_loses():
+def test_a_careful_split_keeps_the_outline_that_a_plain_split_loses():
     shape = torus(0.6, 0.1).rotate(UPRIGHT)
     fine = FINE.render(shape, VIEW).status
     assert torch.equal(COARSE.render(shape, VIEW).status, fine)
@@ -151,7 +146,7 @@ def test_a_careful_split_keeps_the_outline_that_a_plain_one_loses():
     "apart, careful, start",
     [
         (0.02, True, 2.0),  # 0.05 is more than twice 0.02: the coarse ray passed at a safe distance
-        (0.03, True, 1.2),  # it may have passed what the finer ray meets: back to where it was closest
+        (0.03, True, 1.2),  # the finer ray may hit what the coarse ray passed: back to its closest sample
         (0.03, False, 2.0),
     ],
 )
@@ -162,44 +157,40 @@ def test_where_a_split_ray_goes_on(apart, careful, start):
     front.sample_distance, front.sample_value = vector((1.2, 1.9))[None], vector((-0.05, 0.07))[None]
     rays = beam((apart, 0, -2), (0.8, 0, -2))
     child = front.split(torch.zeros(2, dtype=torch.long), HEAD_ON, rays, radius=1.0, careful=careful)
-    assert child.distance[0].item() == start
-    assert child.active.all()
-    assert not child.not_evaluated.any()
+    assert child.distance[0].item() == start and child.active.all() and not child.not_evaluated.any()
     # A ray far apart enters the sphere at 1.4 only.
     assert child.distance[1].item() == pytest.approx(1.4 if careful else 2.0)
 
 
 def test_coarse_to_fine_keeps_the_soft_silhouette():
-    # A field of distance differs by less than 0.15 between a coarse ray and the rays of its block: their gap there.
+    # The distance differs by less than 0.15 between a coarse ray and the rays of its block, which is their spacing.
     shape, rays = sphere(0.5), VIEW
     coarse, fine = COARSE.render(shape, rays), FINE.render(shape, rays)
     missed = ~coarse.hit & ~fine.hit
     assert (coarse.closest - fine.closest)[missed].abs().max() < 0.15
 
 
-def test_rays_begin_anew_where_their_coarse_ray_missed_the_sphere():
-    # 4 x 4 rays at x of 0.7, 1.1, 1.5 and 1.9: their coarse ray, at 1.3, passes the unit sphere by, the first do not.
+def test_rays_begin_at_the_sphere_if_their_coarse_ray_missed_it():
+    # 4 x 4 rays at x of 0.7, 1.1, 1.5 and 1.9: their coarse ray, at 1.3, misses the unit sphere; the first does not.
     rays = sheet(4, 4, pitch=0.4)
     rays = Rays(rays.origins + vector((1.3, 0, 0)), rays.directions, image=True)
     coarse, fine = COARSE.render(sphere(0.95), rays), FINE.render(sphere(0.95), rays)
-    assert fine.hit.any()
-    assert torch.equal(coarse.status, fine.status)
+    assert fine.hit.any() and torch.equal(coarse.status, fine.status)
     torch.testing.assert_close(coarse.distance[fine.hit], fine.distance[fine.hit], rtol=0, atol=4e-4)  # cosine 1/4
 
 
-def test_rays_that_start_inside_say_so_in_coarse_to_fine_too():
-    # Parallel rays from z = -0.3, at x of -0.45, -0.15, 0.15 and 0.45: the middle two start inside the ball.
+def test_rays_that_start_inside_have_that_status_also_coarse_to_fine():
+    # Parallel rays from z = -0.3, at x of -0.45, -0.15, 0.15 and 0.45: the middle two start inside the sphere.
     rays = sheet(4, 4, pitch=0.3)
     origins = rays.origins * vector((1, 0.01, 0)) + vector((0, 0, -0.3))
     rays = Rays(origins, rays.directions, image=True)
     coarse, fine = COARSE.render(sphere(0.4), rays), FINE.render(sphere(0.4), rays)
     assert fine.status[0].tolist() == [Status.MISS, Status.STARTED_INSIDE, Status.STARTED_INSIDE, Status.MISS]
-    assert torch.equal(coarse.status, fine.status)
-    assert (coarse.distance >= 0).all()
+    assert torch.equal(coarse.status, fine.status) and (coarse.distance >= 0).all()
 
 
-def stuck(limit: float) -> Shape:
-    """A wall that is NaN beyond a plane z = limit."""
+def nan_beyond(limit: float) -> Shape:
+    """A wall whose values are NaN beyond the plane z = limit."""
     return Shape(lambda p: torch.where(p[..., 2] > limit, torch.nan, WALL(p)))
 
 
@@ -214,7 +205,7 @@ def stuck(limit: float) -> Shape:
         (sphere(0.5), (0.49, 0, -2), 3, Status.OUT_OF_STEPS, None),  # grazing, with few steps
         (constant(0.001), (0, 0, -2), 50, Status.OUT_OF_STEPS, None),
         (plane((0, 0, -1), -1.5), (0, 0, -2), 50, Status.MISS, 3),  # the wall is behind the unit sphere
-        (stuck(-5.0), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),  # NaN from the start
+        (nan_beyond(-5.0), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),  # NaN from the start
         (constant(torch.inf), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),
     ],
 )  # fmt: skip
@@ -222,17 +213,16 @@ def test_how_rays_end(renderer, field, origin, steps, status, distance):
     rays = beam(*[origin] * 16)
     rays = Rays(rays.origins.view(4, 4, 3), rays.directions.view(4, 4, 3), image=True)
     rendering = replace(renderer, steps=steps).render(field, rays)
-    assert rendering.status.unique().tolist() == [status]
-    assert rendering.hit.all() == (status == Status.HIT)
+    assert rendering.status.unique().tolist() == [status] and rendering.hit.all() == (status == Status.HIT)
     if distance is not None:
         assert rendering.distance[0, 0].item() == pytest.approx(distance, abs=1e-9)
-    for part in (rendering.distance, rendering.points, rendering.residual, rendering.closest):
-        assert part.isfinite().all()
+    for tensor in (rendering.distance, rendering.points, rendering.residual, rendering.closest):
+        assert tensor.isfinite().all()
     torch.testing.assert_close(rendering.points, rays.at(rendering.distance))
 
 
-def test_a_ray_that_hits_on_its_first_query_has_hit_and_not_started_inside():
-    for offset in (-1 + 2e-5, -1 - 2e-5):  # the wall crosses the unit sphere's near end, just behind and just before
+def test_a_hit_at_the_first_evaluation_is_a_hit_and_not_started_inside():
+    for offset in (-1 + 2e-5, -1 - 2e-5):  # the wall is just behind and just before the entry into the unit sphere
         for renderer in (NAIVE, FINE):
             rendering = renderer.render(plane((0, 0, -1), -offset), HEAD_ON)
             assert rendering.status.item() == Status.HIT
@@ -241,7 +231,7 @@ def test_a_ray_that_hits_on_its_first_query_has_hit_and_not_started_inside():
 
 @each("renderer", [NAIVE, replace(FINE, alpha=1.0)])
 def test_closest_is_the_value_of_least_magnitude_with_its_sign(renderer):
-    """Of uneven values that change sign at z = 0.2 without coming near zero; of a rod that is passed; from inside."""
+    """The fields are a rod, uneven values that jump across zero at z = 0.2, and a sphere from inside."""
 
     def bumpy(p: Tensor) -> Tensor:
         return (0.08 + 0.05 * torch.sin(17 * p[..., 2] + 5 * p[..., 0])) * torch.sign(0.2 - p[..., 2])
@@ -257,8 +247,8 @@ def test_closest_is_the_value_of_least_magnitude_with_its_sign(renderer):
     assert renderer.render(sphere(0.5), beam((0.3, 0, 0))).closest.item() == pytest.approx(-0.2)
 
 
-def test_the_field_is_asked_for_the_kept_samples_again_and_no_more():
-    # Two queries to hit, then K with a graph, of those that exist; one for a ray that missed.
+def test_only_the_kept_samples_are_evaluated_again():
+    # A hit has two evaluations and up to K with a graph. A miss has one evaluation with a graph.
     for samples, again in ((1, 1), (2, 2), (5, 2)):
         meter = Meter(WALL)
         replace(FINE, alpha=1.0, n_gradient_samples=samples).render(meter, HEAD_ON)
@@ -274,62 +264,63 @@ def marched(field: Shape, rays: Rays, stepping: Stepping, steps: int = 50) -> Ra
     return front
 
 
-def plate(at: float, thickness: float) -> Shape:
-    """A plate across z."""
-    return plane((0, 0, -1), thickness / 2 - at) & plane((0, 0, 1), thickness / 2 + at)
+def plate(middle: float, thickness: float) -> Shape:
+    """A plate across z, about its middle."""
+    return plane((0, 0, -1), thickness / 2 - middle) & plane((0, 0, 1), thickness / 2 + middle)
 
 
-@each("at", [0.0, -0.5, 0.85])
-def test_a_step_over_a_plate_is_taken_back(at):
-    rays, thin = beam((0, 0, -2)), plate(at, 0.04)
+@each("middle", [0.0, -0.5, 0.85])
+def test_a_step_over_a_plate_is_taken_back(middle):
+    rays, thin = beam((0, 0, -2)), plate(middle, 0.04)
     assert marched(thin, rays, AGGRESSIVE).status.item() == Status.MISS
     kept = marched(thin, rays, replace(AGGRESSIVE, step_back=True))
     assert kept.status.item() == Status.HIT
-    assert kept.distance.item() == pytest.approx(2 + at - 0.02, abs=1e-4)
+    assert kept.distance.item() == pytest.approx(2 + middle - 0.02, abs=1e-4)
 
 
-def test_a_step_that_jumped_nothing_is_not_taken_back():
+def test_a_step_that_passed_no_surface_is_not_taken_back():
     rays, counts = beam((0, 0, -2)), [0, 0]
-    for place, stepping in enumerate((AGGRESSIVE, replace(AGGRESSIVE, step_back=True))):
-        shape = Meter(plate(0.0, 1.9))  # thick: what overshoots lands within, and the balls of both ends meet
+    for index, stepping in enumerate((AGGRESSIVE, replace(AGGRESSIVE, step_back=True))):
+        shape = Meter(
+            plate(0.0, 1.9)
+        )  # thick: a step that overshoots ends inside, and the empty spheres of its ends meet
         assert marched(shape, rays, stepping).status.item() == Status.HIT
-        counts[place] = shape.counts.value
+        counts[index] = shape.counts.value
     assert counts[0] == counts[1]
 
 
 def test_a_least_step_brings_a_grazing_ray_to_its_surface():
     direction = torch.nn.functional.normalize(vector((1.0, -0.05, 0.0)), dim=-1)
     origin = -1.5 * direction
-    rays = Rays(origin[None], direction[None])  # meets the plane y = 0 at the origin, at 2.9 degrees
+    rays = Rays(origin[None], direction[None])  # hits the plane y = 0 at the origin, at 2.9 degrees
     ground = plane((0, 1, 0), 0.0)
     assert marched(ground, rays, PLAIN).status.item() == Status.OUT_OF_STEPS
     floored = marched(ground, rays, replace(PLAIN, least_step=0.05))
-    assert floored.status.item() == Status.HIT
-    assert floored.distance.item() == pytest.approx(1.5, abs=2e-3)
+    assert floored.status.item() == Status.HIT and floored.distance.item() == pytest.approx(1.5, abs=2e-3)
 
 
-def test_values_are_divided_by_the_slope_before_a_step_is_made_of_them():
+def test_a_step_is_the_value_divided_by_the_slope():
     steep = Shape(lambda points: 4 * sphere(0.5)(points))
     assert marched(steep, HEAD_ON, replace(PLAIN, slope=4.0)).distance.item() == pytest.approx(1.5, abs=1e-4)
     assert marched(steep, HEAD_ON, PLAIN).status.item() != Status.HIT
 
 
-def test_relaxed_steps_are_fewer_and_find_the_same():
-    """Also next to an outline, where most steps are spent."""
+def test_relaxed_steps_are_fewer_and_have_the_same_hits():
+    """The image includes the outline, where most steps are spent."""
     rays, counts = camera_of(48).double().rays(), {}
     truth, hit = sphere_hits(rays, 0.6)
     for name in ("dist_dynamic", "dist_keinert", "dist_auto_relaxed"):
         meter = Meter(sphere(0.6))
-        found = load("renderer", name, steps=400).render(meter, rays)
-        assert torch.equal(found.hit, hit), name
-        assert (found.distance - truth)[hit].abs().median() < 1e-4
+        rendering = load("renderer", name, steps=400).render(meter, rays)
+        assert torch.equal(rendering.hit, hit), name
+        assert (rendering.distance - truth)[hit].abs().median() < 1e-4
         counts[name] = meter.counts.value
     assert counts["dist_keinert"] < counts["dist_dynamic"]
     assert counts["dist_auto_relaxed"] < 0.9 * counts["dist_dynamic"]
 
 
 def test_a_relaxed_step_towards_a_plane_touches_its_next_empty_sphere():
-    """On a plane at 60 degrees the slope is -1/2: the steps become 4/3 of the value."""
+    """On a plane at 60 degrees the slope is -1/2, and the steps become 4/3 of the value."""
     field, ray = plane((0.0, 1.0, 0.0), -0.5), Rays(vector((-1.4, 0.3, 0))[None], vector((3**0.5 / 2, -0.5, 0))[None])
     front = RayFront.on_sphere(ray, radius=2.0, samples=1)
     front.distance[:] = 0.0

@@ -1,4 +1,4 @@
-"""A mesh in place of the field: how far its hits and gradients are from the field's own, and what it loses."""
+"""A mesh in place of the field: the errors of its hits and gradients, and what it loses."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -26,21 +26,22 @@ def aimed(count: int) -> Rays:
     return Rays(origins, normalize(targets - origins, dim=-1))
 
 
-def test_its_gradients_are_those_of_the_field_up_to_the_grid(steep=5.0):
-    """Also of a field that is no distance: the gradient of a vertex is divided by the field's slope."""
-    leaf, rays = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), aimed(60)
+def test_gradients_are_those_of_the_field_up_to_the_grid(steep=5.0):
+    """The field is a level set: the gradient of a vertex must be divided by the slope of the field."""
+    radius, rays = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), aimed(60)
     origins = rays.origins.requires_grad_(True)
-    field = Shape(lambda p: steep * sphere(leaf)(p), Kind.LEVEL, None)
-    found, exact = (
-        one.render(field, Rays(origins, rays.directions))
-        for one in (RENDERER, load("renderer", "dvr", n_ray_samples=400, doublings=[]))
+    field = Shape(lambda p: steep * sphere(radius)(p), Kind.LEVEL, None)
+    rendering, exact = (
+        renderer.render(field, Rays(origins, rays.directions))
+        for renderer in (RENDERER, load("renderer", "dvr", n_ray_samples=400, doublings=[]))
     )
-    assert found.hit.all()
-    assert (found.distance - exact.distance).abs().max() < 0.2 * RENDERER.accuracy
-    for wanted in (leaf, origins):
-        one, other = (torch.autograd.grad(r.distance.sum(), wanted, retain_graph=True)[0] for r in (found, exact))
-        assert torch.cosine_similarity(one.flatten(), other.flatten(), dim=0) > 0.999
-        assert float(one.norm() / other.norm()) == pytest.approx(1, abs=0.01)
+    assert rendering.hit.all() and (rendering.distance - exact.distance).abs().max() < 0.2 * RENDERER.accuracy
+    for leaf in (radius, origins):
+        gradient, truth = (
+            torch.autograd.grad(r.distance.sum(), leaf, retain_graph=True)[0].flatten() for r in (rendering, exact)
+        )
+        assert torch.cosine_similarity(gradient, truth, dim=0) > 0.999
+        assert float(gradient.norm() / truth.norm()) == pytest.approx(1, abs=0.01)
 
 
 def test_a_finer_grid_is_closer():
@@ -54,36 +55,34 @@ def test_a_finer_grid_is_closer():
 
 def test_what_is_thinner_than_the_grid_is_lost():
     ray = Rays(vector((0.01, 0.02, -2))[None], normalize(vector((0.02, 0.03, 1))[None], dim=-1))
-    thin = box((0.5, 0.5, 0.02))  # cells of 0.02 see it, cells of 0.09 do not
+    thin = box((0.5, 0.5, 0.02))  # cells of 0.02 resolve the box, and cells of 0.09 do not
     assert replace(RENDERER, grid=101).render(thin, ray).hit.item()
     assert not replace(RENDERER, grid=22).render(thin, ray).hit.item()
 
 
 def test_a_grazing_hit_stays_where_it_is(slope=5e-4):
-    """Only its derivative is limited."""
+    """Only the derivative of a grazing hit is limited."""
     ray = Rays(vector((-1.5, 0, 0.5 * slope + 1e-9))[None], normalize(vector((1, 0, -slope))[None], dim=-1))
     rendering = RENDERER.render(Shape(lambda p: p[..., 2], Kind.DISTANCE, 1.0), ray)
-    assert rendering.hit.item()
-    assert rendering.points[0, 0].item() == pytest.approx(-1.0, abs=0.05)
+    assert rendering.hit.item() and rendering.points[0, 0].item() == pytest.approx(-1.0, abs=0.05)
 
 
-def test_a_ray_that_passes_a_shape_is_closest_where_it_is_and_one_behind_the_sphere_is_not_there():
-    ball, generator = sphere(0.2, (0.5, -0.1, 0.3)), torch.Generator().manual_seed(0)
+def test_closest_values_of_misses_are_right_and_a_shape_behind_the_camera_is_missed():
+    shape, generator = sphere(0.2, (0.5, -0.1, 0.3)), torch.Generator().manual_seed(0)
     origins = 2 * normalize(torch.randn(200, 3, dtype=torch.float64, generator=generator), dim=-1)
     targets = 0.7 * normalize(torch.randn(200, 3, dtype=torch.float64, generator=generator), dim=-1)
     rays = Rays(origins, normalize(targets - origins, dim=-1))
-    found = RENDERER.render(ball, rays)
+    rendering = RENDERER.render(shape, rays)
     entry, leave, _ = sphere_span(rays)
-    least = ball(rays.at_each(entry[:, None] + torch.linspace(0, 1, 2000) * (leave - entry)[:, None])).amin(dim=1)
-    passes = ~found.hit & (least > 0.01)
-    assert passes.sum() > 100
-    assert (found.closest - least)[passes].min() >= -1e-4
-    assert (found.closest - least)[passes].max() < 2 / RENDERER.ray_samples
+    least = shape(rays.at_each(entry[:, None] + torch.linspace(0, 1, 2000) * (leave - entry)[:, None])).amin(dim=1)
+    passes = ~rendering.hit & (least > 0.01)
+    assert passes.sum() > 100 and (rendering.closest - least)[passes].min() >= -1e-4
+    assert (rendering.closest - least)[passes].max() < 2 / RENDERER.ray_samples
     beyond = RENDERER.render(sphere(0.1, (0.8, 0.8, 0.0)), Rays(origins, normalize(vector((0.8, 0.8, 0)) - origins)))
     assert not beyond.hit.any()
 
 
-def test_the_cost_is_that_of_the_grid_whatever_the_rays():
+def test_the_cost_is_that_of_the_grid_for_any_number_of_rays():
     for count in (1, 100):
         counts = Counts()
         RENDERER.render(Meter(sphere(0.5), counts), aimed(count))

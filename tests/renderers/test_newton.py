@@ -1,4 +1,4 @@
-"""Newton's hits, gradients and evaluations, on what the march alone would get wrong."""
+"""Hits, gradients and evaluations of Newton, also in cases that the march alone would get wrong."""
 
 from dataclasses import replace
 from functools import cache
@@ -35,32 +35,31 @@ def camera(size: int = 64) -> Camera:
 
 @cache
 def exact(shape: Shape, size: int = 64) -> Rendering:
-    """DIST in float64 with plain steps to 1e-12: the same hits, as exact as the field."""
+    """The rendering of DIST in float64 with plain steps to 1e-12: its hits are as exact as the field."""
     steady = replace(DIST, epsilon=1e-12, alpha=1.0, extra_step_cap=None, coarse_to_fine=False, steps=2000)
     return steady.render(shape, camera(size).double().rays())
 
 
 @by_shape
-def test_its_hits_are_exact_and_cost_no_more_values_than_those_of_dist(shape):
-    truth, found = exact(shape), {}
+def test_hits_are_exact_and_cost_no_more_evaluations_than_those_of_dist(shape):
+    truth, renderings, meters = exact(shape), {}, {}
     for name, renderer in (("newton", NEWTON), ("dist", DIST)):
-        meter = Meter(shape)
+        meters[name] = Meter(shape)
         with torch.no_grad():
-            found[name] = renderer.render(meter, camera().rays()), meter.counts
-    rendering, counts = found["newton"]
+            renderings[name] = renderer.render(meters[name], camera().rays())
+    rendering, counts = renderings["newton"], meters["newton"].counts
     both = truth.hit & rendering.hit
     error = (rendering.distance - truth.distance)[both].abs()
     hits = int(truth.hit.sum())
-    assert int((truth.hit ^ rendering.hit).sum()) <= max(1, int((truth.hit ^ found["dist"][0].hit).sum()))
-    assert error.median() < 5e-7  # of float32 at distances about 2
-    assert error.quantile(0.99) < 2e-4
-    assert hits <= counts.gradient <= 1.25 * hits
-    assert counts.value <= 1.05 * (found["dist"][1].value + counts.gradient)
+    assert int((truth.hit ^ rendering.hit).sum()) <= max(1, int((truth.hit ^ renderings["dist"].hit).sum()))
+    assert error.median() < 5e-7  # the precision of float32 at distances near 2
+    assert error.quantile(0.99) < 2e-4 and hits <= counts.gradient <= 1.25 * hits
+    assert counts.value <= 1.05 * (meters["dist"].counts.value + counts.gradient)
 
 
 @each("near, relative", [(1e-3, 0.04), (1e-6, 1e-4)])
 @each("case", CASES)
-def test_its_gradient_is_that_of_the_hit_up_to_the_newton_step(case, near, relative):
+def test_the_gradient_is_that_of_the_hit_up_to_the_newton_step(case, near, relative):
     parameter = torch.tensor(case.parameter, dtype=torch.float64, requires_grad=True)
     rays = case.rays()
     origins = rays.origins.requires_grad_(True)
@@ -73,21 +72,19 @@ def test_its_gradient_is_that_of_the_hit_up_to_the_newton_step(case, near, relat
 
 def test_a_ray_that_passes_an_edge_by_less_than_near_hits_what_is_behind():
     ball_and_wall = sphere(0.3, (0.0, 0.0, -0.3)) | plane((0, 0, -1), -0.4)
-    beside = [0.3 + NEWTON.march_epsilon * share for share in (0.05, 0.2, 0.5, 0.9)]
-    rays = beam(*((x, 0.0, -2.0) for x in beside))
+    offsets = [0.3 + NEWTON.march_epsilon * share for share in (0.05, 0.2, 0.5, 0.9)]
+    rays = beam(*((x, 0.0, -2.0) for x in offsets))
     rendering = NEWTON.render(ball_and_wall, rays)
-    assert rendering.hit.all()
-    assert rendering.distance.tolist() == pytest.approx([2.4] * 4, abs=1e-6)
+    assert rendering.hit.all() and rendering.distance.tolist() == pytest.approx([2.4] * 4, abs=1e-6)
 
 
 def test_a_ray_that_passes_a_surface_by_less_than_near_does_not_hit_it():
     rays = beam(*((0.5 + NEWTON.march_epsilon * share, 0.0, -2.0) for share in (0.05, 0.2, 0.5, 0.9)))
     rendering = NEWTON.render(sphere(0.5), rays)
-    assert (rendering.status == Status.MISS).all()
-    assert (rendering.closest > 0).all()
+    assert (rendering.status == Status.MISS).all() and (rendering.closest > 0).all()
 
 
-def test_grazing_rays_are_found_by_the_dense_search():
+def test_the_dense_search_hits_at_a_grazing_angle():
     ground, angle = plane((0, 1, 0), 0.0), torch.tensor(2.0, dtype=torch.float64).deg2rad()
     direction = torch.stack([angle.cos(), -angle.sin(), torch.zeros_like(angle)])
     rays = Rays((-0.9 * direction)[None], direction[None])
@@ -100,7 +97,7 @@ def test_grazing_rays_are_found_by_the_dense_search():
     assert meter.counts.value <= 2 * SLOPE_PAIR_COUNT + 6 + searched + NEWTON.newton_steps
 
 
-def test_what_hides_between_two_samples_is_found_beside_the_least():
+def test_a_sheet_between_two_samples_is_hit_near_the_least_sample():
     sheet = box((0.9, 0.9, 0.004)) | plane((0, 0, -1), -0.9)
     tilted = sheet.rotate(torch.linalg.matrix_exp(torch.tensor([[0, 0, 0.6], [0, 0, 0], [-0.6, 0, 0]]).double()))
     rays = beam((0.01, 0.0, -0.99), (0.05, 0.1, -0.98), (-0.07, 0.1, -0.98))
@@ -112,18 +109,18 @@ def test_what_hides_between_two_samples_is_found_beside_the_least():
 
 
 @each("share", [0.3, 0.45])
-def test_a_plate_between_two_samples_of_the_search_is_found_where_values_are_less_than_half_their_spacing(share):
+def test_the_search_brackets_a_plate_between_samples_if_values_are_below_half_their_spacing(share):
     rays, number = beam((0.0, 0.0, -2.0)), torch.tensor([0])
     spacing = 2 / (NEWTON.search_samples - 1)
     middle = -1 + 7.5 * spacing
     plate = Shape(lambda p: (p[..., 2] - middle).abs() - (0.5 - share) * spacing, Kind.DISTANCE, 1.0)
-    found, bracket = NEWTON.tracer._search(plate, rays, RayTable.on_sphere(rays, 1.0), number)
-    assert found.tolist() == [0]
+    found_rays, bracket = NEWTON.tracer._search(plate, rays, RayTable.on_sphere(rays, 1.0), number)
+    assert found_rays.tolist() == [0]
     front = 2 + middle - (0.5 - share) * spacing
     assert bracket.near.item() < front < bracket.far.item() < front + spacing / 8
 
 
-WRONG = {  # fields with the zero set of a distance d, and the most values that they take per ray
+WRONG_FIELDS = {  # fields with the zero set of a distance d, and the most evaluations per ray
     "weak": (lambda d: 0.25 * d, 18),
     "strong": (lambda d: 1.5 * d, 4.5),
     "far too strong": (lambda d: 20 * d, 4.5),
@@ -131,10 +128,10 @@ WRONG = {  # fields with the zero set of a distance d, and the most values that 
 }
 
 
-@each("of, most", WRONG.values())
-def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most):
+@each("change, most", WRONG_FIELDS.values())
+def test_values_that_are_wrong_by_a_factor_lose_few_hits(change, most):
     ring = SHAPES["ring"]
-    truth, wrong = exact(ring), Meter(Shape(lambda p: of(ring(p))))
+    truth, wrong = exact(ring), Meter(Shape(lambda p: change(ring(p))))
     rendering = NEWTON.render(wrong, camera().rays())
     both = truth.hit & rendering.hit
     assert (truth.hit ^ rendering.hit).sum() <= 0.01 * truth.hit.sum()
@@ -143,8 +140,8 @@ def test_values_that_are_wrong_by_a_factor_lose_few_hits(of, most):
 
 
 @each("share, most", [(0.5, 24), (0.2, 50)])
-def test_a_bound_that_is_a_part_of_the_distance_needs_no_search(share, most):
-    """All rays meet the plate; a march that ran out of steps would sample the rest of the ray."""
+def test_a_bound_that_is_a_fraction_of_the_distance_needs_no_search(share, most):
+    """All rays hit the plate. A march that ran out of steps would sample the rest of the ray."""
     plate, generator = box((0.5, 0.5, 0.01)), torch.Generator().manual_seed(0)
     origins = torch.nn.functional.normalize(torch.randn(6000, 3, generator=generator), dim=-1)
     targets = torch.rand(6000, 3, generator=generator) - 0.5
@@ -155,18 +152,18 @@ def test_a_bound_that_is_a_part_of_the_distance_needs_no_search(share, most):
     assert bound.counts.value <= most * len(origins)
 
 
-def test_residuals_and_closest_values_of_a_steep_field_are_its_own():
+def test_residuals_and_closest_values_of_a_steep_field_are_not_normalised():
     ring, rays = SHAPES["ring"], camera().rays()
     plain, steep = (NEWTON.render(Shape(lambda p, k=times: k * ring(p)), rays) for times in (1, 4))
-    beside = ~plain.hit & ~steep.hit & sphere_span(rays)[2] & (plain.closest < 0.1)
-    ratio = (steep.closest / plain.closest)[beside]
+    missed = ~plain.hit & ~steep.hit & sphere_span(rays)[2] & (plain.closest < 0.1)
+    ratio = (steep.closest / plain.closest)[missed]
     assert len(ratio) > 100 and ratio.median().item() == pytest.approx(4.0, rel=0.05)
     inside = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]))
     ball = Shape(lambda p: 4 * SHAPES["ball"](p))
     assert NEWTON.render(ball, inside).residual.item() == pytest.approx(4 * -0.6)
 
 
-def test_a_field_that_jumps_has_no_hit_and_one_that_is_nan_keeps_the_others():
+def test_a_field_that_jumps_has_no_hit_and_nan_values_leave_other_rays_alone():
     ball = sphere(0.5)
     jump = Shape(lambda p: 0 * ball(p) + torch.where(ball(p) > 0, 0.2, -0.2), Kind.BOUND)
     rays = beam((0.0, 0.0, -2.0), (0.2, 0.1, -2.0))
@@ -178,18 +175,17 @@ def test_a_field_that_jumps_has_no_hit_and_one_that_is_nan_keeps_the_others():
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     for field in (half, lambda p: torch.where(p[..., 2] > -0.6, torch.nan, sphere(radius)(p))):
         rendering = NEWTON.render(Shape(field, Kind.BOUND), beam((0.2, 0.0, -2.0), (-0.2, 0.0, -2.0)))
-        for part in (rendering.distance, rendering.closest, rendering.residual):
-            assert part.isfinite().all()
+        for tensor in (rendering.distance, rendering.closest, rendering.residual):
+            assert tensor.isfinite().all()
         assert rendering.status[1] == Status.OUT_OF_STEPS
     rendering = NEWTON.render(Shape(half, Kind.BOUND), beam((0.2, 0.0, -2.0), (-0.2, 0.0, -2.0)))
     assert rendering.hit.tolist() == [True, False]
 
 
-def test_a_hit_is_on_its_own_rendering_and_its_closest_value_moves_with_the_field():
+def test_the_closest_value_of_a_hit_is_zero_and_moves_with_the_field():
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     rendering = NEWTON.render(sphere(radius), beam((0.1, 0.0, -2.0), (0.8, 0.0, -2.0)))
-    assert rendering.closest[0].item() == 0
-    assert rendering.closest[1].item() > 0.25
+    assert rendering.closest[0].item() == 0 and rendering.closest[1].item() > 0.25
     rays = beam((0.1, 0.0, -2.0), (0.8, 0.0, -2.0))
     meter = Meter(sphere(radius))
     for wanted, rate in (([True, False], -1.0), ([True, True], -2.0)):
@@ -197,10 +193,10 @@ def test_a_hit_is_on_its_own_rendering_and_its_closest_value_moves_with_the_fiel
         torch.testing.assert_close(closest.detach(), rendering.closest.detach())
         (gradient,) = torch.autograd.grad(closest.sum(), radius, retain_graph=True)
         assert gradient.item() == pytest.approx(rate)
-    assert meter.counts.value == 1  # of the ray that misses, the second time
+    assert meter.counts.value == 1  # of the ray that misses, in the second iteration of the loop
 
 
-def test_the_silhouette_asks_values_only_where_a_ray_is_wrong():
+def test_the_silhouette_loss_evaluates_only_missed_rays():
     rays, radius = camera(24).rays(), torch.tensor(0.6, requires_grad=True)
     meter = Meter(sphere(radius))
     rendering = NEWTON.render(meter, rays)
@@ -212,11 +208,11 @@ def test_the_silhouette_asks_values_only_where_a_ray_is_wrong():
         assert bool((mask & ~rendering.hit).any()) == missed
         if sign:
             (gradient,) = torch.autograd.grad(loss, radius, retain_graph=True)
-            assert gradient.item() == pytest.approx(sign)  # the mean over rays that violate it
+            assert gradient.item() == pytest.approx(sign)  # the mean over rays that violate the mask
 
 
 @each("steps", [1, 7])
-def test_in_an_image_few_steps_leave_all_hits_to_the_search(steps):
+def test_with_few_steps_the_search_has_the_same_hits_in_an_image(steps):
     rays, few = camera(48).rays(), replace(NEWTON, steps=steps)
     apart, together = few.render(sphere(0.6), rays.flat()), few.render(sphere(0.6), rays)
     assert int((apart.hit ^ together.hit.flatten()).sum()) <= 1
@@ -225,15 +221,14 @@ def test_in_an_image_few_steps_leave_all_hits_to_the_search(steps):
 
 @each("shape", [sphere(0.995), plane((0, 0, -1), -0.9), plane((0, 0, -1), -0.95)])
 @each("unseen", [NEWTON.unseen, 1e-4])
-def test_in_an_image_surfaces_near_the_bounding_sphere_are_found(shape, unseen):
+def test_surfaces_near_the_bounding_sphere_are_hit_in_an_image(shape, unseen):
     rays, renderer, truth = camera(48).rays(), replace(NEWTON, unseen=unseen), exact(shape, 48)
     together, apart = renderer.render(shape, rays), renderer.render(shape, rays.flat())
-    assert torch.equal(together.hit.flatten(), apart.hit)
-    assert not (truth.hit & ~together.hit).any()
+    assert torch.equal(together.hit.flatten(), apart.hit) and not (truth.hit & ~together.hit).any()
     assert not ((together.status == Status.MISS) & (together.closest < 0)).any()
 
 
-def test_a_ray_that_begins_inside_has_started_inside_however_little():
+def test_a_ray_that_begins_just_inside_has_started_inside():
     depths = (5e-4, 2e-3, 0.1)
     for side in (1.0, -1.0):
         rays = beam(*((0.0, 0.0, side * (0.5 - depth)) for depth in depths))
@@ -242,22 +237,22 @@ def test_a_ray_that_begins_inside_has_started_inside_however_little():
         torch.testing.assert_close(rendering.distance, torch.zeros(3, dtype=torch.float64))
 
 
-def test_images_of_rays_that_meet_in_a_point_lose_nothing_small():
+def test_an_image_of_converging_rays_loses_no_small_sphere():
     y, x = torch.meshgrid(*[torch.linspace(-0.8, 0.8, 16, dtype=torch.float64)] * 2, indexing="ij")
     origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
     focus = torch.tensor([0.0, 0.0, 0.98], dtype=torch.float64)
     rays = Rays(origins, torch.nn.functional.normalize(focus - origins, dim=-1), image=True)
     draw, hits = torch.Generator().manual_seed(0), 0
-    places = torch.rand(6, 3, generator=draw) * torch.tensor([0.6, 0.6, 0.3]) - torch.tensor([0.3, 0.3, 0.7])
-    for place in places.tolist():
-        image, alone = (NEWTON.render(sphere(0.04, place), some) for some in (rays, rays.flat()))
+    centres = torch.rand(6, 3, generator=draw) * torch.tensor([0.6, 0.6, 0.3]) - torch.tensor([0.3, 0.3, 0.7])
+    for centre in centres.tolist():
+        image, alone = (NEWTON.render(sphere(0.04, centre), batch) for batch in (rays, rays.flat()))
         assert torch.equal(image.hit.flatten(), alone.hit)
         hits += int(alone.hit.sum())
     assert hits > 6
 
 
 @by_shape
-def test_up_to_its_anchor_the_field_is_large(shape):
+def test_the_field_is_large_up_to_the_restart_distance(shape):
     rays = camera().rays()
     table, _ = NEWTON.tracer.trace(shape, rays)
     assert ((table.restart_distance >= table.entry) & (table.restart_distance <= table.leave)).all()
@@ -267,78 +262,78 @@ def test_up_to_its_anchor_the_field_is_large(shape):
     assert shape(before).min() > CLEARANCE_THRESHOLD - 0.01
 
 
-def test_a_root_lies_between_where_its_ray_begins_and_ends():
+def test_a_root_lies_within_the_span_of_its_ray():
     rays = beam((0.0, 0.0, -2.0))
     table, guess = RayTable.on_sphere(rays, 1.0), torch.tensor([2.0]).double()
-    for offset, place, converged in [(1.0005, 1.0, True), (-1.0005, None, False), (-0.9995, 2.9995, True)]:
+    for offset, distance, converged in [(1.0005, 1.0, True), (-1.0005, None, False), (-0.9995, 2.9995, True)]:
         wall = plane((0.0, 0.0, -1.0), offset)
         start = guess - (1.0 if offset > 0 else -0.9995)
         solved = NEWTON.tracer.solve(wall, rays, table, torch.tensor([0]), start)
         assert solved.converged.item() == converged
-        assert place is None or solved.distance.item() == pytest.approx(place)
+        assert distance is None or solved.distance.item() == pytest.approx(distance)
 
 
-def test_the_value_where_the_first_step_began_is_kept_where_all_roots_take_a_second():
+def test_the_first_value_is_kept_if_all_roots_take_a_second_step():
     rays, guess = beam((0.0, 0.0, -2.0), (0.1, 0.0, -2.0)), torch.tensor([1.99, 1.992]).double()
     table = RayTable.on_sphere(rays, 1.0)
     solved = NEWTON.tracer.solve(plane((0.0, 0.0, -1.0), 0.0), rays, table, torch.arange(2), guess)
-    assert solved.converged.all()
-    assert solved.first_value.tolist() == pytest.approx([0.01, 0.008], abs=1e-6)
+    assert solved.converged.all() and solved.first_value.tolist() == pytest.approx([0.01, 0.008], abs=1e-6)
 
 
 def marched(*values: float) -> RayTable:
-    """Where a ray is that begins in the sphere's centre and finds these values."""
-    rays, left = beam((0.0, 0.0, 0.0)), iter(values)
+    """The state of a ray that begins in the centre of the sphere and evaluates to these values."""
+    rays, remaining = beam((0.0, 0.0, 0.0)), iter(values)
     table, stride = RayTable.on_sphere(rays, 1.0), NEWTON.tracer.stride()
-    march_table(lambda points: points.new_full(points.shape[:-1], next(left)), rays, table, stride, len(values))
+    march_table(lambda points: points.new_full(points.shape[:-1], next(remaining)), rays, table, stride, len(values))
     return table
 
 
 def advance(table: RayTable, value: float, stride: Stride) -> None:
-    """Moves a ray that begins in the sphere's centre by one value."""
+    """Moves a ray that begins in the centre of the sphere by one step, with this value."""
     march_table(lambda points: points.new_full((1,), value), beam((0.0, 0.0, 0.0)), table, stride, 1)
 
 
-def test_a_ray_leaves_where_its_empty_sphere_reaches_the_end_and_nothing_is_unseen_before():
-    assert marched(0.4, 0.58).stopped(Stop.MARCHING).item()  # at 0.4025: its step would lead behind the end
+def test_a_ray_leaves_if_its_empty_sphere_reaches_the_end_of_its_span():
+    assert marched(0.4, 0.58).stopped(Stop.MARCHING).item()  # at 0.4025: the step would end behind the span
     assert marched(0.4, 0.6).stopped(Stop.LEFT).item()
     taken_back = marched(0.4, 0.58, 0.005)
     assert taken_back.stopped(Stop.MARCHING).item()
     assert taken_back.distance.item() == pytest.approx(0.4025 + 0.58)
-    assert marched(-NEWTON.march_epsilon / 2).stopped(Stop.INSIDE).item()  # however little
+    assert marched(-NEWTON.march_epsilon / 2).stopped(Stop.INSIDE).item()  # however close to the surface
 
 
-def test_what_a_step_was_taken_back_from_is_no_closest_sample():
-    taken_back = marched(0.4, 0.39, -0.005, 0.3)  # the third at 0.8225, a gap of 0.025 behind the second's sphere
-    assert taken_back.stopped(Stop.MARCHING).item()
-    assert taken_back.least.item() == pytest.approx(0.3)
-    assert taken_back.distance.item() == pytest.approx(0.8225)  # and no further
+def test_the_point_of_a_step_that_was_taken_back_is_no_closest_sample():
+    taken_back = marched(
+        0.4, 0.39, -0.005, 0.3
+    )  # the third point at 0.8225 is 0.025 behind the empty sphere of the second
+    assert taken_back.stopped(Stop.MARCHING).item() and taken_back.least.item() == pytest.approx(0.3)
+    assert taken_back.distance.item() == pytest.approx(0.8225)  # the step ends at that sphere
     assert marched(0.4, 0.39, -0.005, 0.3, -0.005).stopped(Stop.CROSSED).item()
 
 
 def test_a_step_of_no_length_has_no_slope():
-    at = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
-    advance(at, 0.4, NEWTON.tracer.stride())
-    first = at.distance.item()
-    at.distance = at.free
-    advance(at, 0.4, NEWTON.tracer.stride())
-    assert at.distance.item() == first
+    table = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
+    advance(table, 0.4, NEWTON.tracer.stride())
+    first = table.distance.item()
+    table.distance = table.free
+    advance(table, 0.4, NEWTON.tracer.stride())
+    assert table.distance.item() == first
 
 
-def test_a_finer_ray_begins_where_the_spheres_of_its_coarse_ray_end():
+def test_a_finer_ray_begins_at_the_end_of_the_empty_spheres_of_its_coarse_ray():
     parent, apart, fine = torch.tensor([0]), torch.tensor([0.03]).double(), beam((0.03, 0.0, 0.0))
     for values, end in [((0.4, -0.1), 0.4), ((0.4, 5e-5), 0.4025), ((0.4, 0.2), 0.6025)]:
         table = marched(*values)
         finer = table.split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
         assert finer.distance.item() == pytest.approx(end - 0.03 - 0.002)
-    gone = marched(0.4, 0.62).split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
-    assert gone.distance.item() < 1.0 and gone.stopped(Stop.MARCHING).item()
-    gone = marched(0.4, 0.7).split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
-    assert gone.stopped(Stop.LEFT).item()
+    passed = marched(0.4, 0.62).split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
+    assert passed.distance.item() < 1.0 and passed.stopped(Stop.MARCHING).item()
+    passed = marched(0.4, 0.7).split(parent, apart, RayTable.on_sphere(fine, 1.0), error=0.002)
+    assert passed.stopped(Stop.LEFT).item()
 
 
 def test_a_finer_ray_inherits_no_sample_from_behind_a_surface():
-    """Its coarse ray, which continued one itself, began behind the surface and is on its way back."""
+    """The coarse ray began behind the surface, since it continued another coarse ray, and steps back."""
     behind, parent, fine = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0), torch.tensor([0]), beam((0.03, 0.0, 0.0))
     behind.distance = behind.entry + 0.5
     advance(behind, -0.1, NEWTON.tracer.stride())
@@ -347,47 +342,47 @@ def test_a_finer_ray_inherits_no_sample_from_behind_a_surface():
     assert finer.least.isinf().item() and finer.stopped(Stop.MARCHING).item()
 
 
-def test_a_step_whose_spheres_lie_apart_is_taken_back():
-    at = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
-    advance(at, 0.4, Stride(1e-3, 0.005))
-    assert at.distance.item() == pytest.approx(0.4025)  # (2 0.4 + 0.005) / (1 + 1)
-    advance(at, 0.2, Stride(1e-3, 0.005))
-    assert at.distance.item() == pytest.approx(0.4025 + 0.2 + MAX_OVERSTEP)
-    free, free_value = at.free.item(), at.free_value.item()
-    advance(at, 0.005, Stride(1e-3, 0.005))  # MAX_OVERSTEP - 0.005 is more than 1.5 0.005
-    assert at.distance.item() == pytest.approx(0.4025 + 0.2)
-    assert (at.free.item(), at.free_value.item()) == (free, free_value)
-    advance(at, 0.1, Stride(1e-3, 0.005))
+def test_a_step_whose_empty_spheres_do_not_meet_is_taken_back():
+    table = RayTable.on_sphere(beam((0.0, 0.0, 0.0)), 1.0)
+    advance(table, 0.4, Stride(1e-3, 0.005))
+    assert table.distance.item() == pytest.approx(0.4025)  # (2 0.4 + 0.005) / (1 + 1)
+    advance(table, 0.2, Stride(1e-3, 0.005))
+    assert table.distance.item() == pytest.approx(0.4025 + 0.2 + MAX_OVERSTEP)
+    free, free_value = table.free.item(), table.free_value.item()
+    advance(table, 0.005, Stride(1e-3, 0.005))  # MAX_OVERSTEP - 0.005 is more than 1.5 0.005
+    assert table.distance.item() == pytest.approx(0.4025 + 0.2)
+    assert (table.free.item(), table.free_value.item()) == (free, free_value)
+    advance(table, 0.1, Stride(1e-3, 0.005))
     slope = 0.1 / 0.2
-    assert at.distance.item() == pytest.approx(0.6025 + min(0.205 / (1 + slope), 0.1 + MAX_OVERSTEP))
+    assert table.distance.item() == pytest.approx(0.6025 + min(0.205 / (1 + slope), 0.1 + MAX_OVERSTEP))
 
 
 @each("thickness", [0.008, 0.02])
-def test_a_step_that_lands_in_a_wall_does_not_pass_the_plate_before_it(thickness):
-    """Rays over a floor take long steps; behind the plate across them stands a wall."""
-    for place in range(0, 12, 3):
-        front = 0.1 + 0.007 * place
+def test_a_step_into_a_wall_does_not_pass_the_plate_before_it(thickness):
+    """Rays over a floor take long steps towards a plate with a wall behind it."""
+    for index in range(0, 12, 3):
+        front = 0.1 + 0.007 * index
         plate = box((0.5, 0.5, thickness / 2)).translate((0.0, 0.0, front + thickness / 2))
         scene = plane((0, 1, 0), 0.0) | plate | plane((0, 0, -1), -(front + thickness + 0.005))
-        found = replace(NEWTON, steps=200).render(scene, beam(*((0.0, 0.03 + x / 400, -2.0) for x in range(20))))
-        torch.testing.assert_close(found.distance, torch.full((20,), 2.0 + front).double(), rtol=0, atol=1e-6)
+        rendering = replace(NEWTON, steps=200).render(scene, beam(*((0.0, 0.03 + x / 400, -2.0) for x in range(20))))
+        torch.testing.assert_close(rendering.distance, torch.full((20,), 2.0 + front).double(), rtol=0, atol=1e-6)
 
 
 @each("pitch", [0.001, 0.008])
-def test_finer_rays_do_not_pass_what_their_coarse_ray_left_unseen(pitch):
+def test_finer_rays_do_not_pass_a_plate_that_their_coarse_ray_missed(pitch):
     y, x = torch.meshgrid(*[pitch * torch.arange(32).double()] * 2, indexing="ij")
     origins = torch.stack([x, 0.03 + y, torch.full_like(x, -2.0)], dim=-1)
     rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0]).double().expand_as(origins), image=True)
-    for place in range(0, 8, 2):
-        front = 0.0137 * 5 * place - 0.4
+    for index in range(0, 8, 2):
+        front = 0.0137 * 5 * index - 0.4
         plate = box((0.5, 0.5, 0.006)).translate((0.0, 0.0, front + 0.006))
-        found = replace(NEWTON, steps=200).render(plane((0, 1, 0), 0.0) | plate | plane((0, 0, -1), -0.6), rays)
-        assert (found.distance - 2.0 - front).abs().max() < 1e-6
+        rendering = replace(NEWTON, steps=200).render(plane((0, 1, 0), 0.0) | plate | plane((0, 0, -1), -0.6), rays)
+        assert (rendering.distance - 2.0 - front).abs().max() < 1e-6
 
 
 @each("half_side", [0.02, 0.05, 0.2])
-def test_rays_that_cut_little_off_an_edge_hit_it(half_side):
-    """A ray at the depth d behind the edge is inside the box over 2.08 d."""
+def test_rays_that_cut_an_edge_closely_hit_it(half_side):
+    """The chord of a ray at the depth d behind the edge is 2.08 d."""
     turned = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]], dtype=torch.float64)
     edge, shape = 1.4 * half_side, box((half_side, half_side, half_side)).rotate(turned)
     rays = beam(*((edge - depth, 0.0, -2.0 - x / 977) for x in range(20) for depth in (0.0005, 0.0007, 0.001)))
@@ -402,7 +397,6 @@ def test_the_tip_of_a_cone_is_hit_and_spoils_no_gradient():
 
     rays = beam((0.0, 0.0, -2.0), (0.1, 0.0, -2.0), (0.0, 0.2, -2.0))
     rendering = NEWTON.render(Shape(cone, Kind.BOUND), rays)
-    assert rendering.hit.all()
-    assert rendering.distance.tolist() == pytest.approx([1.7, 1.775, 1.85], abs=1e-6)
+    assert rendering.hit.all() and rendering.distance.tolist() == pytest.approx([1.7, 1.775, 1.85], abs=1e-6)
     (gradient,) = torch.autograd.grad(rendering.distance[1:].sum(), height)
     assert gradient.item() == pytest.approx(-2.0)

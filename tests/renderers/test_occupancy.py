@@ -1,4 +1,4 @@
-"""The occupancy network against the plain computation, in float64, and the logits of fields."""
+"""The occupancy network against a plain computation in float64, and the logits of fields."""
 
 from math import log
 
@@ -27,7 +27,7 @@ def draw(code_length: int, *shape: int) -> tuple[Tensor, Tensor]:
 
 
 def plain(network: OccupancyNetwork, code: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Logits and colours with nothing bound: every point has its copy of the code, and the layers are matrices."""
+    """Logits and colours without binding: each point has a copy of the code, and the layers are matrices."""
     weights = dict(network.named_parameters())
     codes = code.expand(*points.shape[:-1], -1)
 
@@ -61,16 +61,16 @@ def test_a_bound_code_gives_the_unbound_network_in_any_leading_shape(code_length
 
 @each("batch", [(3,), (2, 3)])
 @each("code_length", [0, 4])
-def test_a_batch_of_codes_is_each_code_by_itself(code_length, batch):
+def test_a_batch_of_codes_has_the_outputs_of_each_code(code_length, batch):
     network = make(code_length)
     codes = torch.randn(*batch, code_length, dtype=torch.float64)
     points = torch.randn(*batch, 5, 3, dtype=torch.float64)
     logits, colours = both(network, codes, points)
     assert (logits.shape, colours.shape) == ((*batch, 5), (*batch, 5, 3))
     for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
-        one = tuple(index)
-        alone = plain(network, codes[one], points[one])
-        torch.testing.assert_close((logits[one], colours[one]), alone, rtol=0, atol=1e-13)
+        index = tuple(index)
+        expected = plain(network, codes[index], points[index])
+        torch.testing.assert_close((logits[index], colours[index]), expected, rtol=0, atol=1e-13)
 
 
 @each("output", [0, 1])
@@ -86,7 +86,7 @@ def test_gradients_flow_to_weights_code_and_points_as_in_the_unbound_network(cod
     assert all(gradient.abs().sum() > 0 for gradient in bound)
 
 
-def test_flops_are_two_a_weight_without_the_code_and_twice_that_back_to_weights():
+def test_flops_are_two_per_weight_without_the_code_and_twice_that_for_gradients():
     network = make()
     value = 2 * (3 * 8 + 10 * 8 * 8 + 8)
     assert network.at(torch.zeros(4, dtype=torch.float64)).flops == Flops(value, 2 * value)
@@ -124,7 +124,7 @@ def test_logits_of_a_fields_values_are_positive_inside_and_scaled_by_the_width_o
 
 @each("field", [sphere(), LEVEL])
 @each("width", [0.0, float("nan")])
-def test_a_width_that_is_no_length_is_refused(field, width):
+def test_a_width_that_is_not_positive_is_refused(field, width):
     with pytest.raises(ValueError, match=rf"width must be positive, not {width}: 0\.02 suits"):
         occupancy_logits(field, torch.zeros(3), width=width)
 

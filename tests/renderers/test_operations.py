@@ -1,6 +1,6 @@
-"""How many operations a step takes beside those of the field, and how often it waits for them, as a GPU feels it.
+"""The number of operations of a step without those of the field, and of its waits for results on a GPU.
 
-The limits are a few percent above what it takes today: a change that needs more says so here.
+The limits are a few percent above the present numbers: a change that needs more must raise them here.
 """
 
 import torch
@@ -15,7 +15,7 @@ from tests.looped import each
 from tests.operations import Operations
 from tests.tiny import camera_of
 
-MOST = {  # operations and waits of a rendering of 64 x 64 rays, its loss and its backward pass, as a GPU has them
+LIMITS = {  # operations and waits of a rendering of 64 x 64 rays, its loss and its backward pass
     "dist": (1650, 12),
     "idr": (1280, 9),
     "newton": (3550, 22),
@@ -28,7 +28,7 @@ MOST = {  # operations and waits of a rendering of 64 x 64 rays, its loss and it
 
 
 def step(name: str, warm: int) -> Operations:
-    """What a step of an optimisation takes; the first, or after some that a renderer may remember."""
+    """The operations of a step of an optimisation, after `warm` renderings that a renderer may remember."""
     count, radius = Operations(), torch.tensor(0.2, requires_grad=True)
 
     def ring(points: Tensor) -> Tensor:
@@ -44,11 +44,10 @@ def step(name: str, warm: int) -> Operations:
     return count
 
 
-@each("name", [*MOST])
+@each("name", [*LIMITS])
 @each("warm", [0, 3])
 def test_a_step_takes_no_more_operations_and_waits_than_it_did(name, warm, monkeypatch):
     monkeypatch.setitem(waits.COMPACTION_INTERVALS, "cpu", waits.DEFAULT_COMPACTION_INTERVAL)
-    operations, most = MOST[name]
+    most_operations, most_waits = LIMITS[name]
     count = step(name, warm)
-    assert count.launches <= operations
-    assert count.waits.total() <= most
+    assert count.launches <= most_operations and count.waits.total() <= most_waits

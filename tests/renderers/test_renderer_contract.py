@@ -1,8 +1,7 @@
-"""What every renderer in conf/renderer must hold to, built as the command line builds it.
+"""The contract of each renderer in conf/renderer, built as the command line builds it.
 
-A renderer is tested on fields of the kinds that it says it needs, and only for the gradients that it says it has.
-A variant, a row of conf/variants.yaml, may give up accuracy for speed, or safety as the paper does: it may find fewer
-hits, but those that it finds are right, and all else holds.
+A renderer is tested on fields of the kinds that it needs, and for the gradients that its capabilities claim.
+A preset of conf/variants.yaml may have fewer hits, for speed or as in its paper. Its hits must be right.
 """
 
 from dataclasses import replace
@@ -24,7 +23,7 @@ from renderers.rendering import Blurred, Renderer, Rendering, Status, Unsupporte
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
 
-# Those with code of their own; the others have other numbers.
+# The presets with separate code; the others differ in numbers only.
 VARIANTS = [
     "naive_practical",
     "dist_paper",
@@ -42,24 +41,24 @@ VARIANTS = [
 )
 def renderer(request, compose_config) -> Renderer:
     if request.param == "custom":
-        own = f"renderer._target_={request.config.getoption('--renderer')}"
-        return build(compose_config("renderer=custom", own).renderer, "renderer")
-    changed = {"mesh_proxy": {"grid": 48}}  # an eighth of the values; its accuracy is stated
+        target = f"renderer._target_={request.config.getoption('--renderer')}"
+        return build(compose_config("renderer=custom", target).renderer, "renderer")
+    changed = {"mesh_proxy": {"grid": 48}}  # an eighth of the evaluations; the renderer states its accuracy
     return load("renderer", request.param, **changed.get(request.param, {}))
 
 
 def tolerance(renderer: Renderer, cosine: float, dtype: torch.dtype = torch.float64) -> float:
-    """How far a hit may lie from the truth: where the field is below epsilon the surface is epsilon / cosine away.
+    """The accepted error of a hit: a field value of epsilon is epsilon / cosine from the surface.
 
-    Twice that, since fields that are bounds may be lower than the distance (see `stated`). A renderer without an
-    epsilon that blurs the surface says over which length, and one that replaces it how far off that may be.
+    The factor 2 allows for bounds, which are lower than the distance (see `stated`). A renderer without an epsilon
+    states its blur or its accuracy.
     """
     blur = 2 * renderer.blur if isinstance(renderer, Blurred) else getattr(renderer, "accuracy", 1e-4)
     return 2 * getattr(renderer, "epsilon", blur) / cosine + (2e-6 if dtype is torch.float32 else 1e-9)
 
 
 def stated(shape: Shape, kind: Kind) -> Shape:
-    """A field with the same surface that is no more than it says."""
+    """A field of the kind with the same surface."""
     if kind is Kind.DISTANCE:
         return shape
     if kind is Kind.BOUND:
@@ -67,27 +66,26 @@ def stated(shape: Shape, kind: Kind) -> Shape:
     return Shape(lambda p: (1.5 + torch.sin(3 * p[..., 0])) * shape(p), kind, None)
 
 
-def same(first: Rendering, second: Rendering, atol: float = 1e-12) -> None:
-    for part in RENDERING_TENSORS:
-        one, other = getattr(first, part), getattr(second, part)
-        torch.testing.assert_close(one.reshape(other.shape), other, rtol=0, atol=atol)
+def assert_same(first: Rendering, second: Rendering, atol: float = 1e-12) -> None:
+    for name in RENDERING_TENSORS:
+        actual, expected = getattr(first, name), getattr(second, name)
+        torch.testing.assert_close(actual.reshape(expected.shape), expected, rtol=0, atol=atol)
 
 
 def check_rendering(rendering: Rendering, rays: Rays) -> None:
-    """Shapes, dtypes, finite numbers, and that the parts agree with one another."""
-    for part in RENDERING_TENSORS:
-        wanted = (*rays.shape, 3) if part == "points" else rays.shape
-        assert getattr(rendering, part).shape == wanted, part
-        assert getattr(rendering, part).isfinite().all(), part
-        assert getattr(rendering, part).dtype == (torch.int8 if part == "status" else rays.origins.dtype), part
+    """Checks shapes, dtypes, finite numbers, and that the tensors agree with one another."""
+    for name in RENDERING_TENSORS:
+        tensor = getattr(rendering, name)
+        assert tensor.shape == ((*rays.shape, 3) if name == "points" else rays.shape), name
+        assert tensor.isfinite().all(), name
+        assert tensor.dtype == (torch.int8 if name == "status" else rays.origins.dtype), name
     assert set(rendering.status.unique().tolist()) <= set(Status)
-    assert torch.equal(rendering.hit, rendering.status == Status.HIT)
-    assert not rendering.residual.requires_grad
+    assert torch.equal(rendering.hit, rendering.status == Status.HIT) and not rendering.residual.requires_grad
     torch.testing.assert_close(rendering.points, rays.at(rendering.distance), rtol=0, atol=1e-6)
 
 
 def mixed(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Rays:
-    """Rays that hit a ball of radius 0.5, that miss it, that miss the unit sphere, that start in either, behind it."""
+    """Rays that hit or miss a sphere of radius 0.5, miss the unit sphere, or start in or behind one of them."""
     count = torch.Size(shape).numel()
     generator = torch.Generator().manual_seed(seed)
     origins = torch.randn(count, 3, dtype=torch.float64, generator=generator)
@@ -97,7 +95,7 @@ def mixed(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Ray
 
 
 def aimed(seed: int, count: int = 12) -> Rays:
-    """Rays from all around at what lies about the origin, so that none grazes it."""
+    """Rays from all directions to points near the origin, so that no ray is grazing."""
     generator = torch.Generator().manual_seed(seed)
     around = normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
     targets = 0.1 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
@@ -105,7 +103,7 @@ def aimed(seed: int, count: int = 12) -> Rays:
 
 
 def pinhole(height: int, width: int, dtype: torch.dtype = torch.float32) -> Camera:
-    """Sees the whole unit sphere from a corner of space, level."""
+    """A level camera that sees the whole unit sphere at an oblique angle."""
     size = min(height, width)
     intrinsics = torch.tensor([[1.0 * size, 0, width / 2], [0, 1.0 * size, height / 2], [0, 0, 1]], dtype=dtype)
     world_to_camera = torch.eye(4, dtype=dtype)
@@ -115,8 +113,7 @@ def pinhole(height: int, width: int, dtype: torch.dtype = torch.float32) -> Came
 
 
 def test_it_is_a_renderer_with_capabilities(renderer):
-    assert isinstance(renderer, Renderer)
-    assert renderer.capabilities.needs
+    assert isinstance(renderer, Renderer) and renderer.capabilities.needs
     text = type(renderer).__doc__ or ""
     for line in ("Source:", "Differentiable in:", "Needs:", "Deviates from the paper:"):
         assert line in text, f"the docstring of {type(renderer).__name__} lacks the line {line!r}: see renderers/idr.py"
@@ -135,8 +132,8 @@ def test_hits_are_those_of_the_closed_forms(renderer):
                 assert rendering.residual.abs().item() <= getattr(renderer, "epsilon", torch.inf)
 
 
-def test_a_field_of_a_kind_that_it_is_not_meant_for_is_refused(renderer):
-    """Not of a renderer of the user's, whose kind the tasks check."""
+def test_a_field_of_a_kind_that_the_renderer_does_not_need_is_refused(renderer):
+    """The tasks check the kind for a renderer of the user."""
     for kind in {*Kind} - {*renderer.capabilities.needs}:
         if type(renderer).__module__.startswith("renderers."):
             with pytest.raises(Unsupported, match=f"field, not a {kind.value} field"):
@@ -144,7 +141,7 @@ def test_a_field_of_a_kind_that_it_is_not_meant_for_is_refused(renderer):
 
 
 def test_images_are_those_of_the_closed_forms(renderer):
-    """In float32, of an odd size."""
+    """The images are in float32 and have odd sizes."""
     dtype, rays = torch.float32, pinhole(45, 51).rays()
     half = (0.45, 0.5, 0.4)
     for field, (distance, hit) in ((sphere(0.6), sphere_hits(rays, 0.6)), (box(half), box_hits(rays, half))):
@@ -153,8 +150,7 @@ def test_images_are_those_of_the_closed_forms(renderer):
         # Pixels near an outline are left out: there a renderer that shares steps between neighbours may differ.
         around = max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 9, stride=1, padding=4)[:, 0] > 0
         clear = ~(around[0] & around[1])
-        assert (clear & hit).sum() > 5
-        assert (clear & ~hit).sum() > 50
+        assert (clear & hit).sum() > 5 and (clear & ~hit).sum() > 50
         assert torch.equal(rendering.hit[clear], hit[clear])
         assert (rendering.distance - distance)[clear & hit].abs().max() < tolerance(renderer, 0.5, dtype)
 
@@ -165,21 +161,21 @@ def test_rays_may_have_any_leading_shape(renderer):
         rays = mixed(*shape, dtype=torch.float32 if shape == (2, 3, 5) else torch.float64)
         rendering = renderer.render(field, rays)
         check_rendering(rendering, rays)
-        same(rendering, renderer.render(field, rays.flat()))
+        assert_same(rendering, renderer.render(field, rays.flat()))
         if shape == (2, 3, 5):
             assert set(rendering.status.unique().tolist()) >= {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
 
 
 def test_images_may_have_any_size_and_come_in_batches(renderer, shapes=((1, 1), (5, 7), (2, 4, 6), (0, 4, 4))):
     for shape in shapes:
-        one = pinhole(*shape[-2:], dtype=torch.float64).rays()
-        rays = Rays(one.origins.expand(*shape, 3), one.directions.expand(*shape, 3), image=True)
+        single = pinhole(*shape[-2:], dtype=torch.float64).rays()
+        rays = Rays(single.origins.expand(*shape, 3), single.directions.expand(*shape, 3), image=True)
         rendering = renderer.render(sphere(0.5), rays)
         check_rendering(rendering, rays)
-        alone = renderer.render(sphere(0.5), one)
-        for part in RENDERING_TENSORS:
-            expected = getattr(alone, part).expand_as(getattr(rendering, part))
-            torch.testing.assert_close(expected, getattr(rendering, part))
+        expected = renderer.render(sphere(0.5), single)
+        for name in RENDERING_TENSORS:
+            tensor = getattr(rendering, name)
+            torch.testing.assert_close(getattr(expected, name).expand_as(tensor), tensor)
 
 
 def test_inputs_are_left_as_they_are(renderer):
@@ -187,19 +183,19 @@ def test_inputs_are_left_as_they_are(renderer):
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     before = rays.origins._version, rays.directions._version, radius._version
     for image in (False, True):
-        given_rays = Rays(rays.origins, rays.directions, image)
-        rendering = renderer.render(sphere(radius), given_rays)
-        renderer.silhouette_loss(sphere(radius), given_rays, rendering, torch.ones(5, 8, dtype=torch.bool))
+        used_rays = Rays(rays.origins, rays.directions, image)
+        rendering = renderer.render(sphere(radius), used_rays)
+        renderer.silhouette_loss(sphere(radius), used_rays, rendering, torch.ones(5, 8, dtype=torch.bool))
         assert before == (rays.origins._version, rays.directions._version, radius._version)
         assert not rays.origins.requires_grad and radius.grad is None
 
 
 def test_the_same_input_gives_the_same_output(renderer):
     for rays in (mixed(50), pinhole(9, 9, torch.float64).rays()):
-        same(renderer.render(sphere(0.5), rays), renderer.render(sphere(0.5), rays), atol=0)
+        assert_same(renderer.render(sphere(0.5), rays), renderer.render(sphere(0.5), rays), atol=0)
 
 
-def test_rays_that_find_nothing_miss(renderer):
+def test_rays_without_a_surface_miss(renderer):
     starts = vector((2, 0, -2, 0, 0, 2, 0.8, 0, -2)).view(3, 1, 3)  # aside, behind, through
     for image in (False, True):
         rays = Rays(starts.expand(3, 2, 3), vector((0, 0, 1)).expand(3, 2, 3), image)
@@ -211,21 +207,21 @@ def test_rays_that_find_nothing_miss(renderer):
 
 def test_splitting_the_rays_changes_nothing(renderer):
     rays, field = mixed(15), box((0.4, 0.3, 0.5))
-    whole = renderer.render(field, rays)
+    expected = renderer.render(field, rays)
     for size in (1, 7):
-        parts = [
-            renderer.render(field, Rays(*some))
-            for some in zip(rays.origins.split(size), rays.directions.split(size), strict=True)
-        ]
-        same(whole, Rendering(*(torch.cat([getattr(part, name) for part in parts]) for name in RENDERING_TENSORS)))
+        batches = zip(rays.origins.split(size), rays.directions.split(size), strict=True)
+        chunks = [renderer.render(field, Rays(*batch)) for batch in batches]
+        assert_same(
+            expected, Rendering(*(torch.cat([getattr(chunk, name) for chunk in chunks]) for name in RENDERING_TENSORS))
+        )
 
 
 def leaves() -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
-    """A radius and rays that end in every way, tangents and a ray through the centre among them."""
-    some = mixed(30)
+    """A radius and rays with each status, also tangents and a ray through the centre."""
+    rays = mixed(30)
     edge = vector((0, 0, -2, 0.5, 0, -2, 1, 0, -2, 0, 0, 0, 0.499999, 0, -2)).view(5, 3)
-    origins = torch.cat([some.origins, edge]).requires_grad_(True)
-    directions = torch.cat([some.directions, vector((0, 0, 1)).expand(5, 3)]).requires_grad_(True)
+    origins = torch.cat([rays.origins, edge]).requires_grad_(True)
+    directions = torch.cat([rays.directions, vector((0, 0, 1)).expand(5, 3)]).requires_grad_(True)
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     return radius, Rays(origins, directions), (radius, origins, directions)
 
@@ -235,9 +231,7 @@ def test_gradients_are_finite_on_every_kind_of_ray(renderer):
     rendering = renderer.render(sphere(radius), rays)
     assert set(rendering.status.unique().tolist()) >= {Status.HIT, Status.MISS, Status.STARTED_INSIDE}
     loss = renderer.silhouette_loss(sphere(radius), rays, rendering, torch.arange(35) % 2 == 0)
-    assert loss.shape == ()
-    assert loss.isfinite()
-    assert loss > 0
+    assert loss.shape == () and loss.isfinite() and loss > 0
     for output in (rendering.distance.sum(), rendering.closest.sum(), rendering.points.sum(), loss):
         for gradient in torch.autograd.grad(output, wanted, retain_graph=True, allow_unused=True):
             assert gradient is None or gradient.isfinite().all()
@@ -270,26 +264,26 @@ def test_gradients_of_hits_point_the_right_way(renderer):
         if renderer.capabilities.field_gradient:
             assert torch.autograd.grad(distance, parameter, retain_graph=True)[0] < -0.2
         if renderer.capabilities.ray_gradient:
-            (found,) = torch.autograd.grad(distance, origins)
-            assert torch.cosine_similarity(found[0], case.origin_rate, dim=0) > 0.99
+            (gradient,) = torch.autograd.grad(distance, origins)
+            assert torch.cosine_similarity(gradient[0], case.origin_rate, dim=0) > 0.99
 
 
 def test_points_move_as_distances_do(renderer):
     radius, rays, wanted = leaves()
     rendering = renderer.render(sphere(radius), rays)
-    found = torch.autograd.grad(rendering.points.sum(), wanted, retain_graph=True, allow_unused=True)
+    gradients = torch.autograd.grad(rendering.points.sum(), wanted, retain_graph=True, allow_unused=True)
     expected = torch.autograd.grad(rays.at(rendering.distance).sum(), wanted, allow_unused=True)
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(gradients, expected)
 
 
-def test_no_graph_is_built_where_none_is_wanted(renderer):
+def test_no_graph_is_built_if_no_input_requires_a_gradient(renderer):
     radius, rays, _ = leaves()
     with torch.no_grad():
         rendering = renderer.render(sphere(radius), rays)
     plain = renderer.render(sphere(0.5), Rays(rays.origins.detach(), rays.directions.detach()))
-    for quiet in (rendering, plain):
-        assert not any(getattr(quiet, part).requires_grad for part in RENDERING_TENSORS)
-    same(rendering, plain)
+    for result in (rendering, plain):
+        assert not any(getattr(result, name).requires_grad for name in RENDERING_TENSORS)
+    assert_same(rendering, plain)
 
 
 def test_closest_values_follow_the_field_where_a_ray_misses(renderer):
@@ -302,7 +296,7 @@ def test_closest_values_follow_the_field_where_a_ray_misses(renderer):
     torch.testing.assert_close(closest.detach(), rendering.closest.detach())
     (gradient,) = torch.autograd.grad(closest[missed].sum(), radius)
     assert missed.sum() > 5
-    assert gradient.item() == pytest.approx(-int(missed.sum()), rel=0.01)  # an unrolled sample moves a little
+    assert gradient.item() == pytest.approx(-int(missed.sum()), rel=0.01)  # an unrolled sample moves slightly
 
 
 def test_the_right_mask_costs_less_than_its_opposite(renderer):
@@ -311,9 +305,7 @@ def test_the_right_mask_costs_less_than_its_opposite(renderer):
     rendering = renderer.render(field, rays)
     _, truth = sphere_hits(rays, 0.5)
     right, wrong = (renderer.silhouette_loss(field, rays, rendering, mask) for mask in (truth, ~truth))
-    assert right >= 0  # its scale is the renderer's own
-    assert wrong > 10 * right
-    assert wrong > 1e-5
+    assert right >= 0 and wrong > max(10 * right, 1e-5)  # the scale of the loss depends on the renderer
 
 
 @pytest.fixture(scope="module", params=VARIANTS)
@@ -321,15 +313,15 @@ def variant(request) -> Renderer:
     return load("renderer", request.param)
 
 
-def test_a_variant_gives_what_a_renderer_gives_and_what_it_hits_is_there(variant):
+def test_a_variant_holds_the_contract_and_its_hits_are_right(variant):
     test_it_is_a_renderer_with_capabilities(variant)
     test_images_may_have_any_size_and_come_in_batches(variant, ((2, 3, 5),))
-    test_rays_that_find_nothing_miss(variant)
+    test_rays_without_a_surface_miss(variant)
     rays = aimed(0)
     truth, hit = sphere_hits(rays, 0.5)
     rendering = variant.render(sphere(0.5), rays)
     check_rendering(rendering, rays)
-    same(rendering, variant.render(sphere(0.5), rays), atol=0)
+    assert_same(rendering, variant.render(sphere(0.5), rays), atol=0)
     assert hit.all() and not (rendering.status == Status.MISS).any()
     wrong = (rendering.distance - truth).abs()[rendering.hit]
     assert wrong.numel() == 0 or wrong.max() < tolerance(variant, 0.9)
@@ -368,14 +360,13 @@ def test_a_rigid_motion_moves_the_hit_with_the_ray_and_scaling_scales_its_distan
 @given(seed=st.integers(0, 2**32))
 def test_a_tighter_epsilon_never_raises_the_residual(renderer, seed):
     if not hasattr(renderer, "epsilon"):
-        pytest.skip("it has no epsilon")
+        pytest.skip("the renderer has no epsilon")
     rays, loose = aimed(seed), None
     truth, _ = sphere_hits(rays, 0.5)
     for epsilon in (1e-2, 1e-3, 1e-4, 1e-5):
         tight = replace(renderer, epsilon=epsilon)
         rendering = tight.render(sphere(0.5), rays)
-        assert rendering.hit.all()
-        assert (rendering.residual.abs() < epsilon).all()
+        assert rendering.hit.all() and (rendering.residual.abs() < epsilon).all()
         assert ((rendering.distance - truth).abs() < tolerance(tight, 0.9)).all()
         assert loose is None or (rendering.residual.abs() <= loose).all()
         loose = rendering.residual.abs()

@@ -1,4 +1,4 @@
-"""Silhouette losses: DIST's, Eq. 11, against values worked out by hand, and all of them with every renderer."""
+"""Silhouette losses: that of DIST, Eq. 11, against values by hand, and all losses with several renderers."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -66,12 +66,12 @@ def test_no_rays_cost_nothing(average):
 
 
 LOSSES = names("silhouette")
-# Along z past a sphere of radius .5: through the middle, just inside of the edge, just outside, far outside, no sphere.
+# Rays along z at a sphere of radius 0.5: the middle, just inside the edge, just outside, far outside, no unit sphere.
 HEIGHTS = torch.tensor([0.0, 0.495, 0.505, 0.9, 1.2], dtype=torch.float64)
 
 
 def of_sphere(renderer: Renderer, loss: SilhouetteLoss, mask: list[bool]) -> tuple[float, float]:
-    """The loss of a sphere of radius .5, and its slope towards the radius."""
+    """The loss of a sphere of radius 0.5, and its derivative with respect to the radius."""
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     origins = torch.stack([HEIGHTS, torch.zeros_like(HEIGHTS), torch.full_like(HEIGHTS, -2.0)], dim=-1)
     rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(5, 3))
@@ -84,24 +84,29 @@ def of_sphere(renderer: Renderer, loss: SilhouetteLoss, mask: list[bool]) -> tup
 
 
 @each("renderer, loss", [("dist", "hinge"), ("naive", "hinge"), ("idr", "cross_entropy"), ("dvr", "occupancy")])
-def test_the_loss_of_a_paper_is_that_of_its_renderer_to_the_last_digit(renderer, loss):
-    mine, own, named = load("renderer", renderer), load("silhouette", "own"), load("silhouette", loss)
+def test_the_loss_of_a_paper_equals_that_of_its_renderer(renderer, loss):
+    instance, renderer_loss, chosen_loss = (
+        load("renderer", renderer),
+        load("silhouette", "own"),
+        load("silhouette", loss),
+    )
     for mask in ([True] * 4 + [False], [False] * 5, [True, False, True, False, False]):
-        assert of_sphere(mine, named, mask) == of_sphere(mine, own, mask)
+        assert of_sphere(instance, chosen_loss, mask) == of_sphere(instance, renderer_loss, mask)
 
 
 @each("loss", LOSSES)
 @each("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
 def test_every_loss_grows_a_sphere_that_is_too_small_and_shrinks_one_that_is_too_large(renderer, loss):
-    mine, given = load("renderer", renderer), load("silhouette", loss)
-    small, large = of_sphere(mine, given, [True] * 4 + [False]), of_sphere(mine, given, [False] * 5)
-    assert small[0] > 0
-    assert large[0] > 0
-    assert small[1] < 0 < large[1]
+    instance, silhouette_loss = load("renderer", renderer), load("silhouette", loss)
+    small, large = (
+        of_sphere(instance, silhouette_loss, [True] * 4 + [False]),
+        of_sphere(instance, silhouette_loss, [False] * 5),
+    )
+    assert small[0] > 0 and large[0] > 0 and small[1] < 0 < large[1]
 
 
 @each("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
-def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
+def test_under_one_loss_renderers_agree(renderer):
     hinge, mask = load("silhouette", "hinge"), [True] * 4 + [False]
     expected = of_sphere(load("renderer", "idr", steps=500), hinge, mask)
     assert of_sphere(load("renderer", renderer), hinge, mask) == pytest.approx(expected, rel=0.05)
@@ -116,21 +121,21 @@ def test_under_one_loss_renderers_differ_by_what_they_see_alone(renderer):
         ("occupancy", {"occupied_at": "hull"}, "occupied_at must be one of random, depth, not 'hull'"),
     ],
 )
-def test_what_cannot_be_is_told(loss, values, message):
+def test_invalid_settings_are_refused(loss, values, message):
     with pytest.raises(ValueError, match=message):
         load("silhouette", loss, **values)
 
 
-def test_a_right_hit_costs_nothing_whatever_the_renderers_own_threshold():
-    """A hit within a threshold of .05 has a value far above the loss's; a missed ray must weigh no less for it."""
-    rough = load("renderer", "idr", epsilon=0.05)  # hits what is .005 outside as well
+def test_a_correct_hit_costs_nothing_for_any_threshold_of_the_renderer():
+    """A hit may have a value far above the threshold of the loss. The weight of a spurious hit must not change."""
+    rough = load("renderer", "idr", epsilon=0.05)  # also rays that pass the sphere by 0.005 are hits
     assert of_sphere(rough, load("silhouette", "hinge"), [True] * 3 + [False] * 2)[0] == 0
     assert of_sphere(rough, load("silhouette", "hinge"), [True] * 2 + [False] * 3) == (5e-5, 1.0)
 
 
 @each("name", ["neus", "volsdf", "unisurf"])
-def test_every_hit_on_the_background_shrinks_the_shape_whatever_its_least_value(name):
-    """The least value that a volume renderer knows may be in front of the surface: at a hit it would cost nothing."""
+def test_each_spurious_hit_shrinks_the_shape_whatever_its_closest_value(name):
+    """The least value of a volume renderer may lie in front of the surface, and would cost nothing at a hit."""
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     side = torch.linspace(-0.45, 0.45, 12, dtype=torch.float64)
     x, y = torch.meshgrid(side, side, indexing="xy")
@@ -161,6 +166,6 @@ class Detached:
 
 
 @each("loss", ["hinge", "cross_entropy"])
-def test_a_renderer_whose_closest_values_lack_the_gradient_that_it_claims_is_told(loss):
+def test_closest_values_without_the_claimed_gradient_are_an_error(loss):
     with pytest.raises(BrokenContract, match="its closest field values carry no gradient towards the field's param"):
         of_sphere(Detached(), load("silhouette", loss), [True] * 4 + [False])

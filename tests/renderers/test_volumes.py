@@ -1,4 +1,4 @@
-"""Renderers that see a volume or a band: the claim of each one's paper, in numbers, and what their users report."""
+"""Volume and band renderers: the claims of their papers, in numbers, and reported faults."""
 
 from dataclasses import dataclass, replace
 from math import pi
@@ -21,8 +21,10 @@ from tests.renderers.analytic_cases import CASES, Case, vector
 
 NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "unisurf"))
 BAND = load("renderer", "relaxed_boundary")
-VOLUMES = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF], ids=lambda one: type(one).__name__)
-BLURRED = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF, BAND], ids=lambda one: type(one).__name__)
+VOLUMES = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF], ids=lambda renderer: type(renderer).__name__)
+BLURRED = pytest.mark.parametrize(
+    "renderer", [NEUS, VOLSDF, UNISURF, BAND], ids=lambda renderer: type(renderer).__name__
+)
 PLANES = [case for case in CASES if case.name.startswith("plane")]
 
 
@@ -35,7 +37,7 @@ def parallel(side: int, half: float = 0.8) -> Rays:
 
 
 def error(renderer: Blurred, case: Case, blur: float) -> float:
-    """How far a hit lies behind the surface, in blurs."""
+    """The distance of a hit behind the surface, in units of the blur."""
     rendering = renderer.with_blur(blur).render(case.field(), case.rays())
     assert rendering.status.item() == Status.HIT
     return (rendering.distance.item() - case.distance) / blur
@@ -44,11 +46,11 @@ def error(renderer: Blurred, case: Case, blur: float) -> float:
 @pytest.mark.parametrize("case", PLANES, ids=lambda case: case.name)
 def test_neus_is_unbiased_and_volsdf_is_not(case):
     """NeuS, Sec. 3.1: the weight of a plane is greatest at the surface; here also its mean lies there."""
-    fine = replace(NEUS, samples=4000, rounds=0)  # equally spaced, so that weights are as densities
+    fine = replace(NEUS, samples=4000, rounds=0)  # equally spaced, so that weights are densities
     assert abs(error(fine, case, 0.01)) < 5e-4
     weight = fine.with_blur(0.01).render(case.field(), case.rays()).volume
     assert weight.distance[weight.weight.argmax()].item() == pytest.approx(case.distance, abs=2.5e-4)
-    off = error(replace(VOLSDF, fine_samples=512), case, 0.01)  # behind the surface; at a slant, in front of it
+    off = error(replace(VOLSDF, fine_samples=512), case, 0.01)  # positive behind the surface; in front of it at a slant
     assert off == pytest.approx({1.0: 0.36, 0.8: 0.06, 0.28: -4.06}[case.cosine], abs=0.02)
 
 
@@ -62,35 +64,35 @@ def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
     entry, leave, meets = sphere_span(rays)
     rays, entry, leave = rays[meets], entry[meets], leave[meets]
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
-        sharp, places = 0, []
-        for index, found, reached in renderer.bounded_samples(field, rays, entry, leave):
+        sharp, indices = 0, []
+        for index, samples, reached in renderer.bounded_samples(field, rays, entry, leave):
             dense = Samples.of(field, rays[index], equally_spaced(entry[index], leave[index], 20_000))
             truth, opacity = (
-                1 - _log_transmittance(one.value, one.distance, reached)[:, :-1].cumsum(dim=1).exp()
-                for one in (dense, found)
+                1 - _log_transmittance(s.value, s.distance, reached)[:, :-1].cumsum(dim=1).exp()
+                for s in (dense, samples)
             )
-            place = torch.searchsorted(dense.distance, found.distance[:, 1:].contiguous()).clamp_max(19_999) - 1
-            off = (opacity - truth.gather(1, place.clamp_min(0))).abs()
+            rank = torch.searchsorted(dense.distance, samples.distance[:, 1:].contiguous()).clamp_max(19_999) - 1
+            off = (opacity - truth.gather(1, rank.clamp_min(0))).abs()
             assert off.numel() == 0 or off.max() <= error_bound
             sharp += int((reached == width).sum())
-            places += index.tolist()
-        assert sorted(places) == list(range(len(entry)))
-        assert sharp / len(entry) > (0.9 if error_bound == 0.1 else 0.5)  # others are sampled for more
+            indices += index.tolist()
+        assert sorted(indices) == list(range(len(entry)))
+        assert sharp / len(entry) > (0.9 if error_bound == 0.1 else 0.5)  # the other rays have a greater width
 
 
 def test_the_width_at_which_volsdf_begins_bounds_the_error_of_any_field():
-    """Lemma 2: of few samples, whatever the values; here those of a field that has no space for a large step."""
+    """Lemma 2 holds for few samples and any values; this field leaves no space for a large step."""
     renderer, rays = replace(VOLSDF, samples=3, rounds=0, error=0.1), parallel(6).flat()
     entry, leave, meets = sphere_span(rays)
     field = Shape(lambda p: torch.where((20 * p[..., 2]).round() % 2 == 0, 0.7, -0.001), sphere(0.5).kind)
-    for _, found, width in renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets]):
-        assert (OpacityErrorBound.of(found).max_error(width) <= renderer.error).all()
+    for _, samples, width in renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets]):
+        assert (OpacityErrorBound.of(samples).max_error(width) <= renderer.error).all()
 
 
 def test_the_least_width_of_volsdf_is_within_ten_halvings_of_that_which_bounds_the_error():
     @dataclass(frozen=True)
     class Falling:
-        """Its error is 0.1 at the width `least`."""
+        """A bound whose error is 0.1 at the width `least`."""
 
         least: Tensor
 
@@ -102,59 +104,61 @@ def test_the_least_width_of_volsdf_is_within_ten_halvings_of_that_which_bounds_t
 
     renderer = replace(VOLSDF, error=0.1).with_blur(0.001)
     bound, first = Falling(vector((0.123, 0.0005, 2.0))[:, None]), vector((1.001, 1.001, 1.001))[:, None]
-    # Of 1024 steps of 1 / 1024 from 0.001 on the first that is at least 0.123; the least width; the greatest.
+    # The first of 1024 steps of 1 / 1024 from 0.001 that is at least 0.123; the least width; the greatest width.
     expected = vector((0.001 + 125 / 1024, 0.001, 1.001))[:, None]
     torch.testing.assert_close(renderer._least_width(bound, first), expected, rtol=0, atol=1e-12)
 
 
 def test_the_clearance_of_volsdf_is_that_of_the_empty_spheres_about_both_ends():
-    """VolSDF, Eq. 12, against a dense search of the outline of two circles for the place nearest to the segment."""
+    """VolSDF, Eq. 12, against a dense search on the outline of two circles for the point closest to the segment."""
     for side, first, second in ((1.0, 0.9, 0.6), (0.3, 0.7, 0.5), (0.5, 0.8, 0.35), (1.0, 0.4, 0.5)):
         for radii in ((first, second), (second, first)):
-            found = Samples(vector((0.0, side))[None], vector(radii)[None])
+            samples = Samples(vector((0.0, side))[None], vector(radii)[None])
             angle = torch.linspace(0, pi, 200_001, dtype=torch.float64)
             ends = zip((0.0, side), radii, strict=True)
             circles = [torch.stack([end + radius * angle.cos(), radius * angle.sin()]) for end, radius in ends]
             across, up = torch.cat(circles, dim=1)
             outside = (across.hypot(up) >= radii[0] - 1e-9) & ((across - side).hypot(up) >= radii[1] - 1e-9)
             truth = (across - across.clamp(0, side)).hypot(up)[outside].min().item()
-            assert _clearance(found).item() == pytest.approx(truth, abs=1e-5), (side, radii)
+            assert _clearance(samples).item() == pytest.approx(truth, abs=1e-5), (side, radii)
 
 
 @pytest.mark.slow
-def test_a_grazing_ray_of_volsdf_asks_for_five_rounds_of_samples_at_most():
-    """The official code: 128 in each of five rounds, 64 and 32 of the integral, and the two ends."""
+def test_a_grazing_ray_of_volsdf_has_at_most_five_rounds_of_samples():
+    """The official code has 128 samples in each of five rounds, 64 and 32 for the integral, and the two ends."""
     meter = Meter(sphere(0.5))
     VOLSDF.render(meter, Rays(torch.tensor([[0.4995, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])))
     assert 5 * 128 + 64 + 32 <= meter.counts.value <= 5 * 128 + 64 + 32 + 2
 
 
 @pytest.mark.parametrize(("renderer", "least"), [(VOLSDF, 1.0), (load("renderer", "volsdf_budget"), 0.6)])
-def test_the_presets_of_volsdf_bound_the_error_at_their_width_on_so_many_rays(renderer, least):
+def test_the_presets_of_volsdf_bound_the_error_on_a_fraction_of_the_rays(renderer, least):
     rays = parallel(12).flat()
     entry, leave, meets = sphere_span(rays)
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
-        found = renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets])
-        reached = torch.cat([(width == renderer.width).flatten() for _, _, width in found])
+        batches = renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets])
+        reached = torch.cat([(width == renderer.width).flatten() for _, _, width in batches])
         assert len(reached) == int(meets.sum()) and reached.double().mean() >= least
 
 
 def area_rates(renderer, radius: float, side: int) -> tuple[float, float, float]:
-    """The area that is seen of a sphere, its derivative towards the radius, and the noise of a ray's."""
+    """The visible area of a sphere, its derivative with respect to the radius, and the noise per ray."""
     leaf = torch.tensor(radius, dtype=torch.float64, requires_grad=True)
     rays = parallel(side)
     opacity = renderer.render(sphere(leaf), rays).opacity.flatten()
     weights = torch.ones_like(opacity).requires_grad_(True)
     (rate,) = torch.autograd.grad(opacity, leaf, weights, create_graph=True)
-    (each,) = torch.autograd.grad(rate, weights)
+    (ray_rates,) = torch.autograd.grad(rate, weights)
     cell = (1.6 / side) ** 2
-    return cell * opacity.sum().item(), cell * rate.item(), each.std().item()
+    return cell * opacity.sum().item(), cell * rate.item(), ray_rates.std().item()
 
 
 @pytest.mark.parametrize(("blur", "side"), [(0.1, 200), pytest.param(0.01, 400, marks=pytest.mark.slow)])
 def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_width(blur, side):
-    """A circle's area grows by its circumference; the mean over a band outside of it is that of a radius half a band
-    larger (Wang et al. 2024, Sec. 4), and the noise grows as the band gets thinner."""
+    """The area of a circle grows by its circumference, at a radius half a band larger (Wang et al. 2024, Sec. 4).
+
+    The noise grows as the band gets thinner.
+    """
     area, rate, noise = area_rates(BAND.with_blur(blur), 0.5, side)
     assert area == pytest.approx(pi * 0.25, rel=0.01)
     assert rate == pytest.approx(2 * pi * (0.5 + blur / 2), rel=0.01)
@@ -163,49 +167,48 @@ def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_wi
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("renderer", "share", "margin"),
+    ("renderer", "ratio", "margin"),
     [(NEUS, 1.0, 0.01), (VOLSDF, 1.05, 2.9), (UNISURF, 1.08, 2.97)],
-    ids=lambda one: type(one).__name__,
+    ids=lambda renderer: type(renderer).__name__,
 )
-def test_opacity_carries_the_gradient_of_a_silhouette_that_density_outside_makes_larger(renderer, share, margin):
-    """By how many blurs: light is lost along the whole of a ray that passes close by, but not by NeuS."""
+def test_opacity_carries_the_gradient_of_a_silhouette_that_density_outside_makes_larger(renderer, ratio, margin):
+    """The margin is in units of the blur: except for NeuS, density outside absorbs light along a close ray."""
     area, rate, _ = area_rates(renderer.with_blur(0.01), 0.5, side=120)
-    assert rate / (2 * pi * 0.5) == pytest.approx(share, abs=0.01)
+    assert rate / (2 * pi * 0.5) == pytest.approx(ratio, abs=0.01)
     assert (area - pi * 0.25) / (pi * 0.01) == pytest.approx(margin, abs=0.02)
 
 
-def test_what_is_seen_behind_gives_way_to_what_comes_into_view():
-    """A ray close by a sphere in front of a wall: the sphere's weight grows by as much as the wall's falls."""
+def test_the_weight_of_a_surface_that_enters_the_view_replaces_that_of_the_wall():
+    """A ray passes close to a sphere in front of a wall: the weight of the sphere grows as that of the wall falls."""
     leaf = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
     field = Shape(lambda p: torch.minimum(sphere(leaf)(p), plane((0.0, 0.0, -1.0), -0.6)(p)), sphere(0.3).kind, 1.0)
     ray = Rays(vector((0.304, 0, -2))[None], vector((0, 0, 1))[None])
     rendering = BAND.render(field, ray)
-    assert rendering.hit.item()
-    assert rendering.distance.item() == pytest.approx(2.6, abs=1e-3)
+    assert rendering.hit.item() and rendering.distance.item() == pytest.approx(2.6, abs=1e-3)
     assert rendering.volume is not None
     for weight, rate in zip(rendering.volume.weight, (1, -1), strict=True):
-        (found,) = torch.autograd.grad(weight, leaf, retain_graph=True)
-        assert found.item() == pytest.approx(rate / BAND.band, rel=1e-6)
+        (gradient,) = torch.autograd.grad(weight, leaf, retain_graph=True)
+        assert gradient.item() == pytest.approx(rate / BAND.band, rel=1e-6)
     (opacity,) = torch.autograd.grad(rendering.opacity.sum(), leaf)
     assert opacity.item() == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("iteration", [0, None])
-@pytest.mark.parametrize("renderer", [NEUS, VOLSDF], ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize("renderer", [NEUS, VOLSDF], ids=lambda renderer: type(renderer).__name__)
 def test_distances_have_the_gradient_of_the_surface_at_every_sharpness(renderer, iteration):
-    """Away from the outline the distance to a sphere falls as it grows by 1 / cosine, and all weights have a part."""
+    """Away from the outline the distance to a sphere falls by 1 / cosine as its radius grows."""
     now = renderer if iteration is None else at_iteration(renderer, iteration)
     leaf = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
     rays = parallel(14, half=0.5).flat()
     rendering = now.render(sphere(leaf), rays)
     cosine = (0.36 - rays.origins[:, :2].square().sum(-1)).clamp_min(0).sqrt() / 0.6
-    seen = rendering.hit & (cosine > 0.5)
-    assert seen.sum() > 100
-    (rate,) = torch.autograd.grad(rendering.distance[seen].sum(), leaf)
-    assert rate.item() == pytest.approx(-(1 / cosine[seen]).sum().item(), rel=0.12)
+    clear = rendering.hit & (cosine > 0.5)
+    assert clear.sum() > 100
+    (rate,) = torch.autograd.grad(rendering.distance[clear].sum(), leaf)
+    assert rate.item() == pytest.approx(-(1 / cosine[clear]).sum().item(), rel=0.12)
 
 
-def test_a_surface_near_the_sphere_has_a_gradient_where_free_samples_of_unisurf_have_no_room():
+def test_a_surface_near_the_unit_sphere_has_a_gradient_in_unisurf():
     leaf = torch.tensor(0.95, dtype=torch.float64, requires_grad=True)
     ray = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None])
     rendering = at_iteration(UNISURF, 0).render(sphere(leaf), ray)
@@ -214,29 +217,28 @@ def test_a_surface_near_the_sphere_has_a_gradient_where_free_samples_of_unisurf_
 
 
 @VOLUMES
-def test_hits_lie_on_a_surface_where_a_ray_passes_another_one(renderer):
-    """At the outline of a sphere in front of a wall what is seen is a mixture, but a hit is one or the other."""
+def test_hits_lie_on_a_surface_also_at_an_outline_before_a_wall(renderer):
+    """At the outline the weights are a mixture of sphere and wall, but a hit lies on one of them."""
     both = Shape(lambda p: torch.minimum(sphere(0.3)(p), plane((0.0, 0.0, -1.0), -0.6)(p)), sphere(0.3).kind, 1.0)
     across = torch.linspace(0.29, 0.31, 41).double()
     origins = torch.stack([across, torch.zeros_like(across), torch.full_like(across, -2.0)], -1)
     rays = Rays(origins, vector((0, 0, 1)).expand_as(origins))
     rendering = renderer.render(both, rays)
-    assert rendering.hit.all()
-    assert (both(rendering.points).abs() < 0.03).all()
+    assert rendering.hit.all() and (both(rendering.points).abs() < 0.03).all()
     mixed = (rendering.opacity > 0.99) & (rendering.volume.weighted_sum(rendering.volume.distance, 41) < 2.5)
     assert (mixed & (rendering.volume.weighted_sum(rendering.volume.distance, 41) > 2.1)).any()
 
 
 @VOLUMES
-def test_in_one_solid_the_mean_is_of_all_that_is_seen_also_behind_a_ridge_within(renderer):
-    """Between two balls that overlap a value rises and falls again, below 0: that is no second surface."""
+def test_the_distance_in_one_solid_is_the_weighted_mean_also_behind_a_ridge(renderer):
+    """Between two overlapping spheres the values rise and fall again below 0, without a second surface."""
     rays = Rays(vector((0.01, 0.02, -2))[None], vector((0, 0, 1))[None])
     pair = replace(sphere(0.3, (0.0, 0.0, -0.2)) | sphere(0.3, (0.0, 0.0, 0.2)), kind=sphere(0.3).kind)
     rendering = renderer.with_blur(0.3).render(pair, rays)
-    seen = rendering.volume
+    volume = rendering.volume
     assert rendering.hit.item()
     assert rendering.distance.item() == pytest.approx(
-        ((seen.weight * seen.distance).sum() / seen.weight.sum()).item(), abs=1e-4
+        ((volume.weight * volume.distance).sum() / volume.weight.sum()).item(), abs=1e-4
     )
 
 
@@ -249,9 +251,9 @@ def test_of_two_surfaces_within_the_band_the_first_counts():
 
     ray = Rays(vector((0.207, 0, -2))[None], vector((0, 0, 1))[None])
     opacity = BAND.render(Shape(both, sphere(0.2).kind, 1.0), ray).opacity.sum()
-    found = torch.autograd.grad(opacity, (front, behind), allow_unused=True)
-    assert found[0].item() == pytest.approx(1 / BAND.band, rel=1e-3)
-    assert found[1] is None or found[1].item() == 0
+    gradients = torch.autograd.grad(opacity, (front, behind), allow_unused=True)
+    assert gradients[0].item() == pytest.approx(1 / BAND.band, rel=1e-3)
+    assert gradients[1] is None or gradients[1].item() == 0
 
 
 @BLURRED
@@ -263,23 +265,20 @@ def test_a_narrower_blur_brings_the_image_closer_to_the_hits(renderer):
         assert rendering.opacity.shape == rays.shape
         assert ((rendering.opacity >= 0) & (rendering.opacity <= 1 + 1e-9)).all()
         errors.append(l1_loss(rendering.opacity, truth.hit.double()).item())
-    assert errors[-1] < 0.02
-    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.02 and errors == sorted(errors, reverse=True)
 
 
 @VOLUMES
 def test_a_sharpening_ends_at_the_setting(renderer):
     blurs = [at_iteration(renderer, iteration).blur for iteration in (0, 20, 100, 1000)]
-    assert blurs == sorted(blurs, reverse=True)
-    assert blurs[0] > 10 * blurs[-1]
-    assert blurs[-1] == blurs[-2] == renderer.blur
-    assert renderer.with_blur(0.02).blur == pytest.approx(0.02)
+    assert blurs == sorted(blurs, reverse=True) and blurs[0] > 10 * blurs[-1]
+    assert blurs[-1] == blurs[-2] == renderer.blur and renderer.with_blur(0.02).blur == pytest.approx(0.02)
     assert at_iteration(renderer.with_blur(0.02), 0).blur == pytest.approx(0.02)
 
 
 @VOLUMES
-def test_most_values_need_no_graph(renderer):
-    """Samples without a part in what a ray sees have none in the gradient: few of the values are differentiated."""
+def test_few_values_need_a_graph(renderer):
+    """Samples without weight have no gradient, so that few values are differentiated."""
     counts, leaf = Counts(), torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     rendering = renderer.render(Meter(sphere(leaf), counts), parallel(20))
     rendering.volume.weight.sum().backward()
@@ -289,18 +288,18 @@ def test_most_values_need_no_graph(renderer):
 @VOLUMES
 def test_leaving_out_faint_samples_changes_no_gradient(renderer, monkeypatch):
     leaf = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    found = []
+    gradients = []
     for faint in (1e-5, 1e-12):
         monkeypatch.setattr("renderers.volumes.integrate.MIN_LIGHT", faint)
         rendering = renderer.with_blur(0.01).render(sphere(leaf), parallel(20))
         loss = rendering.opacity.sum() + rendering.distance[rendering.hit].sum()
-        found.append(torch.autograd.grad(loss, leaf)[0])
-    torch.testing.assert_close(found[0], found[1], rtol=2e-3, atol=0)
+        gradients.append(torch.autograd.grad(loss, leaf)[0])
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=2e-3, atol=0)
 
 
 @VOLUMES
 def test_the_residual_is_the_field_where_the_ray_ends(renderer):
-    """Of a plane it is linear along the ray, as between two samples."""
+    """The field of a plane is linear along the ray, like the interpolation between two samples."""
     case = PLANES[1]  # at a slant
     rendering = renderer.render(case.field(), case.rays())
     assert rendering.residual.item() == pytest.approx(case.field()(rendering.points).item(), abs=1e-12)
@@ -318,14 +317,14 @@ def test_weights_importance_and_sums_worked_out_by_hand():
     torch.testing.assert_close(volume.weighted_sum(channels, 3), vector((0, 1, 0, 0, 0.75, 0.25)).view(3, 2))
 
 
-def test_the_band_looks_where_the_parabola_through_three_samples_is_lowest():
-    places = vector((0.0, 0.3, 0.9, 0.1, 0.3, 0.35)).view(2, 3).T
+def test_the_band_samples_the_vertex_of_the_parabola_through_three_samples():
+    distances = vector((0.0, 0.3, 0.9, 0.1, 0.3, 0.35)).view(2, 3).T
     lowest = vector((0.37, 0.28))
-    torch.testing.assert_close(_parabola_vertex(places, 3 * (places - lowest) ** 2 + 0.1), lowest)
+    torch.testing.assert_close(_parabola_vertex(distances, 3 * (distances - lowest) ** 2 + 0.1), lowest)
 
 
-def test_settings_that_cannot_be_are_refused():
+def test_invalid_settings_are_refused():
     for renderer, setting in ((NEUS, "sharpness"), (VOLSDF, "error"), (UNISURF, "interval"), (BAND, "band")):
-        for wrong in (setting, "sphere_radius"):
-            with pytest.raises(ValueError, match=f"{wrong} must be positive, not 0"):
-                replace(renderer, **{wrong: 0})
+        for name in (setting, "sphere_radius"):
+            with pytest.raises(ValueError, match=f"{name} must be positive, not 0"):
+                replace(renderer, **{name: 0})

@@ -1,4 +1,4 @@
-"""Marches that leave out the rays that have ended only now and then, as on a device that is waited for."""
+"""Marches that remove finished rays only now and then, as on a GPU, which has to be waited for."""
 
 import torch
 from torch import Tensor
@@ -12,9 +12,9 @@ from renderers.rendering import Renderer, Rendering, with_empty_memory
 from tests.looped import each
 from tests.tiny import camera_of
 
-ERROR = 0.002
+COARSE_ERROR = 0.002
 MARCHED = ("dist", "dist_keinert", "dist_auto_relaxed", "idr", "relaxed_boundary", "newton")
-MORE = {
+SETTINGS = {
     "dist_keinert": {"n_gradient_samples": 3},
     "idr": {"steps": 13},
     "relaxed_boundary": {"sphere_radius": 0.7, "band": 0.05},
@@ -22,32 +22,34 @@ MORE = {
 
 
 class Ring:
-    """A torus that shakes and has no values in a part of space; counts the points at which it is asked."""
+    """A rippled torus that is NaN in a region of space; it counts its evaluated points."""
 
     kind = Kind.DISTANCE
     lipschitz: float | None = None
     flops: Flops | None = None
 
     def __init__(self) -> None:
-        self.asked, self.furthest, self.radius = 0, 0.0, torch.tensor(0.2, requires_grad=True)
+        self.evaluated, self.furthest, self.radius = 0, 0.0, torch.tensor(0.2, requires_grad=True)
 
     def __call__(self, points: Tensor) -> Tensor:
-        self.asked += points.numel() // 3
+        self.evaluated += points.numel() // 3
         self.furthest = max(self.furthest, *points.detach().norm(dim=-1).reshape(-1).tolist(), 0.0)
         shaking = torus(0.5, self.radius)(points) + 0.02 * torch.sin(20 * points[..., 0])
         return torch.where(points[..., 1] > 0.55, torch.nan, shaking)
 
 
-class Coarsely(Ring):
-    """The same, with coarse values."""
+class CoarseRing(Ring):
+    """The same torus, with coarse values."""
 
     @property
     def coarse(self) -> Coarse:
-        return Coarse(lambda points: self(points).detach() + ERROR * torch.cos(90 * points[..., 1]), ERROR)
+        return Coarse(
+            lambda points: self(points).detach() + COARSE_ERROR * torch.cos(90 * points[..., 1]), COARSE_ERROR
+        )
 
 
-def found(renderer: Renderer, field: Ring) -> tuple[Rendering, Counts, Tensor]:
-    """A rendering of 32 x 32 rays, what it counts, and a gradient."""
+def measured(renderer: Renderer, field: Ring) -> tuple[Rendering, Counts, Tensor]:
+    """A rendering of 32 x 32 rays, its counts, and a gradient."""
     meter = Meter(field)
     rendering = render_checked(with_empty_memory(renderer), meter, camera_of(32, angles=(30.0, 25.0)).rays())
     loss = torch.where(rendering.hit, rendering.distance, 0.0).sum() + rendering.closest.sum()
@@ -55,18 +57,18 @@ def found(renderer: Renderer, field: Ring) -> tuple[Rendering, Counts, Tensor]:
 
 
 @each("name", [*MARCHED, "coarse dist_coarse", "coarse newton"])
-def test_when_ended_rays_are_left_out_changes_no_number(name, monkeypatch):
-    field = Coarsely if name.startswith("coarse ") else Ring
-    renderer = load("renderer", name.removeprefix("coarse "), **MORE.get(name, {}))
+def test_the_interval_of_removing_finished_rays_changes_no_number(name, monkeypatch):
+    field = CoarseRing if name.startswith("coarse ") else Ring
+    renderer = load("renderer", name.removeprefix("coarse "), **SETTINGS.get(name, {}))
     plain, shape = field(), field()
-    one, counts, gradient = found(renderer, plain)
-    with monkeypatch.context() as elsewhere:
-        elsewhere.setitem(waits.COMPACTION_INTERVALS, "cpu", 8)
-        other, seldom, same = found(renderer, shape)
-    for part in RENDERING_TENSORS:
-        assert torch.equal(getattr(one, part), getattr(other, part)), part
-    assert torch.equal(gradient, same)
-    assert counts == seldom and counts.hits == seldom.hits > 100
-    assert counts.masked == 0 < seldom.masked
-    assert shape.asked == seldom.value + seldom.coarse + seldom.masked
-    assert shape.furthest <= plain.furthest + 1e-4  # a field may have no values outside of the sphere
+    first, counts, gradient = measured(renderer, plain)
+    with monkeypatch.context() as patch:
+        patch.setitem(waits.COMPACTION_INTERVALS, "cpu", 8)
+        second, second_counts, second_gradient = measured(renderer, shape)
+    for tensor in RENDERING_TENSORS:
+        assert torch.equal(getattr(first, tensor), getattr(second, tensor)), tensor
+    assert torch.equal(gradient, second_gradient)
+    assert counts == second_counts and counts.hits == second_counts.hits > 100
+    assert counts.masked == 0 < second_counts.masked
+    assert shape.evaluated == second_counts.value + second_counts.coarse + second_counts.masked
+    assert shape.furthest <= plain.furthest + 1e-4  # a field may be undefined outside the sphere

@@ -1,4 +1,4 @@
-"""The warm start: what a rendering finds that begins where the last one ended is what one from the beginning finds."""
+"""The warm start: a rendering that begins at the hits of the last one has the same hits as a cold rendering."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -20,7 +20,7 @@ from tests.tiny import camera_of
 SIZE = 48  # pixels per side
 RAYS = camera_of(SIZE, angles=(30.0, 25.0)).rays()
 COLD = load("renderer", "newton", warm=False)
-NOTHING = sphere(0.01, (0.0, 0.9, 0.0))
+SMALL_SPHERE = sphere(0.01, (0.0, 0.9, 0.0))
 
 
 @pytest.fixture
@@ -29,29 +29,28 @@ def warm():
 
 
 def in_turn(renderer, fields, rays: Rays = RAYS) -> list[tuple[Rendering, int]]:
-    """Each field's rendering in an optimisation, and the values that it took."""
-    found = []
+    """The rendering of each field in an optimisation, and its evaluations."""
+    renderings = []
     for iteration, field in enumerate(fields):
         meter = Meter(field)
-        found.append((render_checked(at_iteration(renderer, iteration), meter, rays), meter.counts.value))
-    return found
+        renderings.append((render_checked(at_iteration(renderer, iteration), meter, rays), meter.counts.value))
+    return renderings
 
 
-def differing(found: Rendering, field: Field, rays: Rays = RAYS) -> int:
-    """Rays that end otherwise when they are marched from the beginning."""
+def differing(rendering: Rendering, field: Field, rays: Rays = RAYS) -> int:
+    """The number of rays with another hit in a cold rendering."""
     cold = COLD.render(field, rays)
-    apart = (found.distance - cold.distance).abs() > 2e-4
-    return int(((found.hit != cold.hit) | (found.hit & apart)).sum())
+    apart = (rendering.distance - cold.distance).abs() > 2e-4
+    return int(((rendering.hit != cold.hit) | (rendering.hit & apart)).sum())
 
 
-def most_differing(renderer, fields) -> int:
-    """In how many rays the worst of renderings in turn differs from one that begins anew."""
-    renderings = in_turn(renderer, fields, RAYS)
-    return max(differing(found, field, RAYS) for (found, _), field in zip(renderings, fields, strict=True))
+def most_differing(renderings, fields) -> int:
+    """The largest number of rays in which a rendering of an optimisation differs from a cold one."""
+    return max(differing(rendering, field) for (rendering, _), field in zip(renderings, fields, strict=True))
 
 
-def begun() -> int:
-    """The values that an optimisation's first rendering of the ball takes."""
+def first_evaluations() -> int:
+    """The evaluations of the first rendering of the sphere in an optimisation."""
     return in_turn(with_empty_memory(load("renderer", "newton", warm=True)), [ball(0.5)])[0][1]
 
 
@@ -59,101 +58,99 @@ def ball(radius: float, x: float = 0.0) -> Shape:
     return sphere(radius, (x, 0.0, 0.0))
 
 
-def test_a_shape_that_moves_is_found_with_fewer_values(warm):
+def test_a_shape_that_moves_takes_fewer_evaluations(warm):
     fields = [ball(0.5 + 0.0005 * i, x=0.001 * i) for i in range(8)]
     renderings = in_turn(warm, fields)
-    assert max(differing(found, field) for (found, _), field in zip(renderings, fields, strict=True)) <= 1
+    assert most_differing(renderings, fields) <= 1
     cold = sum(values for _, values in in_turn(COLD, fields))
     assert sum(values for _, values in renderings) < 0.7 * cold
 
 
 def test_rays_go_on_along_a_bound_without_a_search(warm):
-    """A fifth of the distance takes five times the steps; a ray that ran out of them would be sampled densely."""
+    """A fifth of the distance needs five times the steps. A ray that ran out of steps would be sampled densely."""
     balls = [ball(0.5 + 0.002 * i) for i in range(6)]
-    fields = [Shape(lambda p, one=one: 0.2 * one(p), Kind.BOUND) for one in balls]
+    fields = [Shape(lambda p, shape=shape: 0.2 * shape(p), Kind.BOUND) for shape in balls]
     renderings = in_turn(warm, fields)
-    assert max(differing(found, field) for (found, _), field in zip(renderings, fields, strict=True)) <= 1
+    assert most_differing(renderings, fields) <= 1
     assert max(values for _, values in renderings[1:]) < 0.6 * renderings[0][1]
 
 
 def test_a_field_that_becomes_steep_loses_nothing(warm):
     rod = capsule((-0.5, 0.5, 0.0), (0.5, 0.5, 0.0), 0.03) | box((0.3, 0.01, 0.3))
     fields = [Shape(lambda p, k=k: k * rod(p)) for k in torch.linspace(1, 4, 48).tolist()]
-    hits = [int(found.hit.sum()) for found, _ in in_turn(warm, fields)]
-    assert min(hits[16:]) >= 0.9 * hits[0] > 28  # from where it is twice as steep; before, it is taken for a distance
+    hits = [int(rendering.hit.sum()) for rendering, _ in in_turn(warm, fields)]
+    assert min(hits[16:]) >= 0.9 * hits[0] > 28  # from a slope of 2 on; a smaller slope counts as a distance
 
 
-def test_what_enters_where_nothing_was_hit_is_seen_and_hits_that_leave_become_misses(warm):
+def test_a_shape_that_enters_the_view_is_hit_and_a_shape_that_leaves_is_missed(warm):
     entering = [ball(0.4, x=-0.4) | sphere(0.2, (0.3, 1.3 - 0.03 * i, 0.2)) for i in range(16)]
-    assert most_differing(warm, entering) <= 1
-    assert most_differing(with_empty_memory(warm), [ball(0.4 - 0.04 * i) for i in range(10)]) <= 1
+    shrinking = [ball(0.4 - 0.04 * i) for i in range(10)]
+    assert most_differing(in_turn(warm, entering), entering) <= 1
+    assert most_differing(in_turn(with_empty_memory(warm), shrinking), shrinking) <= 1
 
 
-@pytest.mark.parametrize("second", [box((0.6, 0.3, 0.4)), NOTHING, ball(0.3) | ball(0.3, x=-0.6)])
-def test_a_field_that_jumps_is_found_at_once(warm, second):
-    _, (found, _) = in_turn(warm, [ball(0.5), second])
-    assert differing(found, second) == 0
+@pytest.mark.parametrize("second", [box((0.6, 0.3, 0.4)), SMALL_SPHERE, ball(0.3) | ball(0.3, x=-0.6)])
+def test_a_field_that_jumps_has_the_hits_of_a_cold_rendering(warm, second):
+    _, (rendering, _) = in_turn(warm, [ball(0.5), second])
+    assert differing(rendering, second) == 0
 
 
-def test_where_values_move_too_far_nothing_is_asked_of_the_last_hits(warm):
+def test_after_a_large_movement_the_last_hits_are_not_evaluated(warm):
     fields = [ball(0.4, x=0.3 * i - 0.3) for i in range(3)]
     *_, (_, values) = in_turn(warm, fields)
     cold = in_turn(COLD, fields[-1:])[0][1]
     assert cold <= values <= cold + SIZE * SIZE / PROBE_STRIDE + 1
 
 
-def test_what_appears_where_no_value_moved_is_found_by_the_audit(warm, monkeypatch):
+def test_the_audit_detects_a_surface_that_appears_without_measured_movement(warm, monkeypatch):
     monkeypatch.setattr("renderers.warm.PROBE_STRIDE", SIZE * SIZE)  # movement is measured on the first ray only
     plate = ball(0.5) | box((0.9, 0.9, 0.01)).translate((0.0, 0.0, 0.7))
 
     def values(points):
-        """The ball, and the plate, whose values show only close to it."""
+        """The sphere and the plate, whose values show only near the plate."""
         return torch.where(points[..., 2] > 0.6, plate(points), ball(0.5)(points))
 
     field = Shape(values, Kind.BOUND, None)
     flat, through_the_middle = RAYS.flat(), SIZE * SIZE // 2 + SIZE // 2
     rays = Rays(flat.origins.roll(-through_the_middle, 0), flat.directions.roll(-through_the_middle, 0))
     at_iteration(warm, 0).render(ball(0.5), rays)
-    found = at_iteration(warm, 1).render(field, rays)
-    assert differing(found, field, rays) == 0
-    assert "had another answer" in final_notes(warm)[0]
+    rendering = at_iteration(warm, 1).render(field, rays)
+    assert differing(rendering, field, rays) == 0 and "had another answer" in final_notes(warm)[0]
 
 
 def test_after_too_many_disagreements_nothing_is_taken_from_memory(warm):
     in_turn(warm, [ball(0.5)] * 2)
     warm.memory.audited, warm.memory.differed = MIN_AUDITED_RAYS, MIN_AUDITED_RAYS
-    assert warm.memory.disabled
-    assert "nothing was taken from memory" in final_notes(warm)[0]
+    assert warm.memory.disabled and "nothing was taken from memory" in final_notes(warm)[0]
     meter = Meter(ball(0.5))
     at_iteration(warm, 2).render(meter, RAYS)
-    assert meter.counts.value == begun()
+    assert meter.counts.value == first_evaluations()
 
 
-def test_the_audit_takes_one_ray_in_a_hundred_and_another_one_each_time(warm, monkeypatch):
+def test_the_audit_takes_another_hundredth_of_the_rays_each_time(warm, monkeypatch):
     taken, compare = torch.zeros(SIZE * SIZE), warm_module._differing
 
-    def recorded(kept, found, audited):
+    def recorded(kept, marched, audited):
         taken.add_(audited)
-        return compare(kept, found, audited)
+        return compare(kept, marched, audited)
 
     monkeypatch.setattr(warm_module, "_differing", recorded)
     in_turn(warm, [ball(0.5)] * 11)
     assert taken.max() == 1 and taken.sum() == warm.memory.audited
     assert 9.5 < warm.memory.audited / (SIZE * SIZE / AUDIT_STRIDE) < 10.5
-    assert final_notes(warm) == [
-        f"renderer.warm: 0 of {warm.memory.audited} audited rays had another answer when marched anew"
-    ]
+    (note,) = final_notes(warm)
+    assert note.startswith(f"renderer.warm: 0 of {warm.memory.audited} audited rays had another answer")
 
 
 def test_another_optimisation_remembers_nothing(warm):
     in_turn(warm, [ball(0.5)] * 3)
-    assert in_turn(warm, [ball(0.5)])[0][1] == begun()
+    assert in_turn(warm, [ball(0.5)])[0][1] == first_evaluations()
     in_turn(warm, [ball(0.5)] * 2)
     assert with_empty_memory(warm).memory == Memory(thread=warm.memory.thread) != warm.memory
     assert final_notes(with_empty_memory(warm)) == final_notes(COLD) == []
 
 
-def test_renderings_outside_of_an_optimisation_neither_use_nor_change_what_is_remembered(warm):
+def test_renderings_outside_an_optimisation_neither_use_nor_change_the_memory(warm):
     in_turn(warm, [ball(0.5)] * 2)
     before = [cache.renderings for *_, cache in warm.memory.cached.values()]
     meter, cold = Meter(ball(0.5)), Meter(ball(0.5))
@@ -163,19 +160,18 @@ def test_renderings_outside_of_an_optimisation_neither_use_nor_change_what_is_re
     assert [cache.renderings for *_, cache in warm.memory.cached.values()] == before == [2]
 
 
-def test_a_camera_that_moves_is_another_image_and_rays_that_are_gone_are_forgotten(warm):
+def test_a_moved_camera_is_another_image_and_deleted_rays_are_forgotten(warm):
     at_iteration(warm, 0).render(ball(0.5), RAYS)
     moved = camera_of(SIZE, angles=(40.0, 25.0)).rays()
-    found = at_iteration(warm, 1).render(ball(0.5), moved)
-    assert differing(found, ball(0.5), moved) == 0
-    assert len(warm.memory.cached) == 2
-    del moved, found
+    rendering = at_iteration(warm, 1).render(ball(0.5), moved)
+    assert differing(rendering, ball(0.5), moved) == 0 and len(warm.memory.cached) == 2
+    del moved, rendering
     assert len(warm.memory.cached) == 1
 
 
 def test_rays_with_a_gradient_are_not_remembered(warm):
     rays = replace(RAYS, origins=RAYS.origins.clone().requires_grad_(True))
-    assert all(found.distance.requires_grad for found, _ in in_turn(warm, [ball(0.5)] * 2, rays))
+    assert all(rendering.distance.requires_grad for rendering, _ in in_turn(warm, [ball(0.5)] * 2, rays))
     assert not warm.memory.cached
 
 
@@ -185,9 +181,8 @@ def test_a_batch_of_views(warm):
         torch.stack([RAYS.origins, other.origins]), torch.stack([RAYS.directions, other.directions]), image=True
     )
     fields = [ball(0.5, x=0.01 * i) for i in range(4)]
-    for (found, _), field in zip(in_turn(warm, fields, views), fields, strict=True):
-        assert found.distance.shape == (2, SIZE, SIZE)
-        assert differing(found, field, views) <= 1
+    for (rendering, _), field in zip(in_turn(warm, fields, views), fields, strict=True):
+        assert rendering.distance.shape == (2, SIZE, SIZE) and differing(rendering, field, views) <= 1
 
 
 def test_a_field_that_is_nan_somewhere(warm):
@@ -197,10 +192,10 @@ def test_a_field_that_is_nan_somewhere(warm):
 
     broken = Shape(values, Kind.BOUND, None)
     for field in (broken, ball(0.5), broken, broken, ball(0.5)):
-        found = render_checked(at_iteration(warm, 1), field, RAYS)
-        for part in (found.distance, found.closest, found.residual):
-            assert part.isfinite().all()
-    assert differing(found, ball(0.5)) == 0
+        rendering = render_checked(at_iteration(warm, 1), field, RAYS)
+        for tensor in (rendering.distance, rendering.closest, rendering.residual):
+            assert tensor.isfinite().all()
+    assert differing(rendering, ball(0.5)) == 0
 
 
 def test_in_another_thread_nothing_is_remembered(warm):
@@ -213,20 +208,20 @@ def test_in_another_thread_nothing_is_remembered(warm):
 
     cold = in_turn(COLD, [ball(0.5)])[0][1]
     with ThreadPoolExecutor(1) as pool:
-        elsewhere = pool.submit(values).result()
-    assert values() < elsewhere == cold
+        in_thread = pool.submit(values).result()
+    assert values() < in_thread == cold
 
 
-def test_its_gradient_is_that_of_a_rendering_from_the_beginning(warm):
+def test_the_gradient_is_that_of_a_cold_rendering(warm):
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     mask[8:38, 9:45] = True
     loss = Hinge(5e-5, signed=True, average="violating")
     for iteration in range(4):
-        by = []
+        gradients = []
         for renderer in (at_iteration(warm, iteration), COLD):
             radius = torch.tensor(0.4 + 0.004 * iteration, requires_grad=True)
             field = Shape(lambda points, radius=radius: points.norm(dim=-1) - radius, Kind.DISTANCE, None)
-            found = renderer.render(field, RAYS)
-            (found.distance[found.hit].sum() + loss.of_rendering(field, RAYS, found, mask)).backward()
-            by.append(radius.grad.item())
-        assert by[0] == pytest.approx(by[1], rel=0.01)
+            rendering = renderer.render(field, RAYS)
+            (rendering.distance[rendering.hit].sum() + loss.of_rendering(field, RAYS, rendering, mask)).backward()
+            gradients.append(radius.grad.item())
+        assert gradients[0] == pytest.approx(gradients[1], rel=0.01)

@@ -1,4 +1,4 @@
-"""Settings that follow from the camera: each is its equation, and stands in the record."""
+"""Settings computed from the camera: each follows its equation and is in the record."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ FAMILIES = ("sofa", "plane", "table", "car")
 
 
 def formula(family: Family) -> Shape:
-    """The formula of the first validation shape where its mesh is, divided by its slope to be a bound."""
+    """The formula of the first validation shape, normalised like its mesh, and divided by its slope to be a bound."""
     raw = BUILDERS[family.name](SimpleNamespace(**family.draw(Split.VALIDATION, 0)))
     steepest = max(raw.lipschitz, 1.0)
     centre, factor = fit_in_sphere(
@@ -35,14 +35,14 @@ def formula(family: Family) -> Shape:
     return Shape(lambda p: raw(p) / steepest, Kind.BOUND).translate(tuple(-centre)).scale(factor)
 
 
-def test_epsilon_is_that_of_the_papers_example():
+def test_epsilon_agrees_with_the_example_of_the_paper():
     # DIST, A.2: f = 60 mm, S = 32 mm, d = 100 mm, R = 512: about 0.05 mm. In scene units, with d = 1 from 2 away:
     field_of_view = 2 * torch.rad2deg(torch.atan(torch.tensor(16 / 60))).item()
     view = ViewSampler(2.0, field_of_view, (0.0, 0.0), (0.0, 0.0), 512)
     assert epsilon(view, {}, TEN) * 100 == pytest.approx(0.0521, rel=1e-3)
 
 
-def test_steps_are_those_of_the_papers_example():
+def test_steps_agree_with_the_example_of_the_paper():
     # DIST, A.1: 52 steps at alpha 1 and 33 at 1.5, at 10 degrees and epsilon 5e-5.
     assert steps(VIEW, {"epsilon": 5e-5, "alpha": 1.0}, TEN) == 52
     assert steps(VIEW, {"epsilon": 5e-5, "alpha": 1.5}, TEN) == 33
@@ -52,7 +52,7 @@ def test_steps_are_those_of_the_papers_example():
     "alpha, grazing, expected",
     [(1.5, 30.0, 15), (1.5, 41.81, 15), (1.0, 90.0, 1), (1.0, 30.0, 15), (0.5, 90.0, 15), (1.0, 89.9, 1)],
 )
-def test_steps_reach_every_surface_that_is_met_at_the_angle_or_above(alpha, grazing, expected):
+def test_steps_reach_each_surface_at_the_grazing_angle_or_above(alpha, grazing, expected):
     node = {"epsilon": 5e-5, "alpha": alpha}
     assert steps(VIEW, node, replace(TEN, grazing=grazing)) == expected
 
@@ -66,16 +66,15 @@ def test_steps_that_cannot_be_computed_are_errors():
 
 def test_epsilon_and_steps_are_resolved_in_order_with_notes():
     node, notes = resolve_auto_settings({"epsilon": "auto", "steps": "auto", "alpha": 1.5}, VIEW, TEN)
-    assert node["epsilon"] == pytest.approx(7e-4)
-    assert node["steps"] == steps(VIEW, node, TEN) < 33
-    seen = "for 128 pixels from 2.5 away (view)"
+    assert node["epsilon"] == pytest.approx(7e-4) and node["steps"] == steps(VIEW, node, TEN) < 33
+    views = "for 128 pixels from 2.5 away (view)"
     numbers = {"epsilon": f"{node['epsilon']:.4g}", "steps": str(node["steps"])}
     angle = {
         "epsilon": ", with at most 1% spurious hits around outlines (auto.spurious) of true distances whose area over "
         "perimeter is 0.07 or more (auto.area_over_perimeter)",
         "steps": ", for surfaces met at 10 degrees or more (auto.grazing)",
     }
-    assert notes == [f"renderer.{name}=auto is {number}, {seen}{angle[name]}" for name, number in numbers.items()]
+    assert notes == [f"renderer.{name}=auto is {number}, {views}{angle[name]}" for name, number in numbers.items()]
 
 
 def test_auto_without_an_equation_is_an_error():
@@ -95,7 +94,7 @@ def test_a_run_has_the_resolved_number_and_a_note(compose_config):
 
 
 def hits(name: str, shape: Field, resolution: int, **settings: float) -> tuple[Tensor, int]:
-    """The pixels that a renderer hits, and the field values that it computed."""
+    """The pixels that a renderer hits, and its field evaluations."""
     meter = Meter(shape)
     rays = replace(VIEW, resolution=resolution).camera(30.0, 25.0).rays()
     return load("renderer", name, **settings).render(meter, rays).hit, meter.counts.value
@@ -104,14 +103,13 @@ def hits(name: str, shape: Field, resolution: int, **settings: float) -> tuple[T
 @each("name, shape, resolution", [
     ("dist", sphere(0.6), 128), ("dist", BOX, 48), ("idr", BOX, 48), ("naive", sphere(0.6), 48),
 ])  # fmt: skip
-def test_epsilon_auto_misses_no_hit_adds_one_in_a_hundred_and_saves_a_tenth(name, shape, resolution):
+def test_epsilon_auto_loses_no_hit_adds_at_most_one_percent_and_saves_a_tenth(name, shape, resolution):
     fine, values = hits(name, shape, resolution)
     auto = epsilon(replace(VIEW, resolution=resolution), {}, TEN)
-    found, fewer = hits(name, shape, resolution, epsilon=auto)
+    coarse, fewer = hits(name, shape, resolution, epsilon=auto)
     exact, _ = hits("idr", shape, resolution, steps=300)
-    assert int((fine & ~found).sum()) == 0
-    assert int((found & ~exact).sum()) <= 0.01 * int(exact.sum())
-    if name != "naive":  # which asks every ray at every step
+    assert int((fine & ~coarse).sum()) == 0 and int((coarse & ~exact).sum()) <= 0.01 * int(exact.sum())
+    if name != "naive":  # naive evaluates each ray at each step
         assert fewer <= 0.9 * values
 
 
@@ -119,14 +117,12 @@ def test_epsilon_auto_misses_no_hit_adds_one_in_a_hundred_and_saves_a_tenth(name
 def test_epsilon_auto_holds_on_the_families(family):
     shape = formula(load("dataset", family))
     exact, _ = hits("idr", shape, 64, steps=300)
-    found, _ = hits("dist", shape, 64, epsilon=epsilon(replace(VIEW, resolution=64), {}, TEN))
-    own, _ = hits("dist", shape, 64)
-    assert int((own & ~found).sum()) == 0
-    assert int((found & ~exact).sum()) <= 0.01 * int(exact.sum())
-    half_a_pixel, _ = hits(
-        "dist", shape, 64, epsilon=footprint(replace(VIEW, resolution=64).focal_length, VIEW.distance)
-    )
-    assert int((half_a_pixel & ~exact).sum()) > 0.01 * int(exact.sum())  # why it is no more than that
+    coarse, _ = hits("dist", shape, 64, epsilon=epsilon(replace(VIEW, resolution=64), {}, TEN))
+    fine, _ = hits("dist", shape, 64)
+    assert int((fine & ~coarse).sum()) == 0 and int((coarse & ~exact).sum()) <= 0.01 * int(exact.sum())
+    width = footprint(replace(VIEW, resolution=64).focal_length, VIEW.distance)
+    half_a_pixel, _ = hits("dist", shape, 64, epsilon=width)
+    assert int((half_a_pixel & ~exact).sum()) > 0.01 * int(exact.sum())  # half a pixel would be too much
 
 
 def test_no_more_precision_than_a_pixel():

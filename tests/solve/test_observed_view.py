@@ -1,4 +1,4 @@
-"""The term of the normals: its value by closed forms, its gradient by differences in float64."""
+"""The loss of the normals: its value against closed forms, its gradient against differences in float64."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ RENDERERS = {
     "idr": load("renderer", "idr", steps=300, epsilon=1e-11),
     "newton": load("renderer", "newton", warm=False, march_epsilon=1e-6),
 }
-CAMERA = camera_of(6, field_of_view=18.0).double()  # all rays hit, away from the outline, so that all go on to do so
+CAMERA = camera_of(6, field_of_view=18.0).double()  # all rays hit, away from the outline, also after a step
 WIDTH = 1e-4  # scene units: its square is about the error of the slopes
 FACTORS, OFFSET = torch.tensor([0.7, 0.5, 0.6]).double(), torch.tensor([0.03, -0.02, 0.05]).double()
 
@@ -36,74 +36,74 @@ def normals_of(points: Tensor, factors: Tensor, offset: Tensor) -> Tensor:
 
 
 def hits(factors: Tensor, offset: Tensor) -> Tensor:
-    """Where the camera's rays meet the ellipsoid first, by the quadratic equation."""
+    """The first hits of the rays of the camera on the ellipsoid, by the quadratic equation."""
     rays = CAMERA.rays()
     start, along = (rays.origins - offset) / factors, rays.directions / factors
     a, b, c = (along * along).sum(-1), (along * start).sum(-1), (start * start).sum(-1) - 1
     return rays.at((-b - (b * b - a * c).sqrt()) / a)
 
 
-def given(normals: Tensor, observed: Tensor, renderer: str = "idr", weight: float = 2.0) -> ObservedView:
+def observed_view(normals: Tensor, observed: Tensor, renderer: str = "idr", weight: float = 2.0) -> ObservedView:
     blank = torch.zeros(6, 6, dtype=torch.float64)
     view = View(CAMERA, blank, blank[..., None].expand(-1, -1, 3), torch.ones(6, 6, dtype=torch.bool))
-    seen = ObservedView.of(view, WEIGHTS, RENDERERS[renderer], observed=observed, mask=None, device=CPU)
-    return replace(seen, normals=normals, normal_weight=weight, normal_width=WIDTH)
+    base = ObservedView.of(view, WEIGHTS, RENDERERS[renderer], observed=observed, mask=None, device=CPU)
+    return replace(base, normals=normals, normal_weight=weight, normal_width=WIDTH)
 
 
 ALL = torch.ones(6, 6, dtype=torch.bool)
 SOME = torch.arange(36).view(6, 6) % 3 == 0
-OTHER = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET).roll(1, 0)  # those of the pixels above
+OTHER = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET).roll(1, 0)  # the normals of the pixels above
 
 
 @each("observed", [ALL, SOME])
 def test_the_term_is_one_less_the_cosine_over_observed_pixels(observed):
-    found = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET)
-    expected = 2.0 * (1 - (found * OTHER).sum(-1))[observed].mean()
+    normals = normals_of(hits(FACTORS, OFFSET), FACTORS, OFFSET)
+    expected = 2.0 * (1 - (normals * OTHER).sum(-1))[observed].mean()
     assert expected > 0.01
-    terms = given(OTHER, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
+    terms = observed_view(OTHER, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
     torch.testing.assert_close(terms["normals"], expected, rtol=1e-5, atol=0)
-    exact = given(found, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
+    exact = observed_view(normals, observed).compare(ellipsoid(FACTORS, OFFSET), 0)
     assert abs(exact["normals"].item()) < 1e-9
     shape, points = ellipsoid(FACTORS, OFFSET), hits(FACTORS, OFFSET).view(-1, 3)
-    at_points = torch.nn.functional.normalize(gradients_at(shape, points).detach(), dim=-1)  # as reconstruction has it
+    at_points = torch.nn.functional.normalize(gradients_at(shape, points).detach(), dim=-1)  # as in reconstruction
     same = normal_error(at_points, OTHER.view(-1, 3))
-    torch.testing.assert_close(same, (1 - (found * OTHER).sum(-1)).mean(), rtol=1e-9, atol=0)
+    torch.testing.assert_close(same, (1 - (normals * OTHER).sum(-1)).mean(), rtol=1e-9, atol=0)
 
 
-def test_rays_without_a_hit_have_no_part_and_none_at_all_costs_nothing():
+def test_rays_without_a_hit_have_no_loss():
     far = torch.tensor([0.0, 3.0, 0.0]).double()
     leaves = FACTORS.clone().requires_grad_()
-    terms = given(OTHER, ALL).compare(ellipsoid(leaves, far), 0)
+    terms = observed_view(OTHER, ALL).compare(ellipsoid(leaves, far), 0)
     assert terms["normals"].item() == 0
-    half = torch.tensor([-0.72, 0.0, 0.0]).double()  # of which a part of the rays hit
+    half = torch.tensor([-0.72, 0.0, 0.0]).double()  # some of the rays hit it
     points = hits(FACTORS, half)
     hit = points.isfinite().all(-1)
     assert 6 <= int(hit.sum()) <= 30
     expected = 2.0 * (1 - (normals_of(points, FACTORS, half) * OTHER).sum(-1))[hit].mean()
-    found = given(OTHER, ALL).compare(ellipsoid(FACTORS, half), 0)["normals"]
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+    loss = observed_view(OTHER, ALL).compare(ellipsoid(FACTORS, half), 0)["normals"]
+    torch.testing.assert_close(loss, expected, rtol=1e-5, atol=0)
 
 
 @each("renderer", RENDERERS)
-def test_the_gradient_is_that_of_differences(renderer):
-    """Through the field's gradient at a point, and through the point, which moves along its ray."""
-    seen = given(OTHER, SOME, renderer)
+def test_the_gradient_agrees_with_differences(renderer):
+    """The gradient depends on the field gradient at a point and on the point, which moves along its ray."""
+    view = observed_view(OTHER, SOME, renderer)
 
     def loss(numbers: Tensor) -> Tensor:
-        return seen.compare(ellipsoid(numbers[:3], numbers[3:]), 0)["normals"]
+        return view.compare(ellipsoid(numbers[:3], numbers[3:]), 0)["normals"]
 
     start = torch.cat([FACTORS, OFFSET]).requires_grad_()
-    (found,) = torch.autograd.grad(loss(start), start)
+    (gradient,) = torch.autograd.grad(loss(start), start)
     step = 1e-5
-    moves = step * torch.eye(6, dtype=torch.float64)
+    shifts = step * torch.eye(6, dtype=torch.float64)
     with torch.no_grad():
-        ends = [[loss(start + sign * move) for sign in (1, -1)] for move in moves]
+        ends = [[loss(start + sign * shift) for sign in (1, -1)] for shift in shifts]
     expected = torch.stack([(up - down) / (2 * step) for up, down in ends])
     assert expected.abs().min() > 1e-3
-    torch.testing.assert_close(found, expected, rtol=1e-4 if renderer == "newton" else 1e-6, atol=1e-8)
+    torch.testing.assert_close(gradient, expected, rtol=1e-4 if renderer == "newton" else 1e-6, atol=1e-8)
 
 
-def test_slopes_over_a_width_move_a_code_that_those_at_a_point_do_not():
+def test_slopes_over_a_width_have_a_gradient_to_the_code_and_slopes_at_a_point_have_none():
     """The gradient of a ReLU network is piecewise constant."""
     torch.manual_seed(0)
     decoder = Decoder(layers=3, width=64, code_length=8, skip=1, narrow=False).double()
@@ -118,18 +118,18 @@ def test_slopes_over_a_width_move_a_code_that_those_at_a_point_do_not():
     assert not at_a_point.any() and over_a_width.norm() > 1e-4
 
 
-def test_views_without_normals_have_no_such_term_and_parts_keep_theirs():
-    view = given(OTHER, ALL)
+def test_views_without_normals_have_no_normal_loss_and_selections_keep_normals():
+    view = observed_view(OTHER, ALL)
     flat = concatenate_views([view])
-    some = flat.select(torch.tensor([0, 7]))
-    assert torch.equal(some.normals, OTHER.flatten(0, 1)[[0, 7]])
-    assert set(some.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth", "normals"}
+    subset = flat.select(torch.tensor([0, 7]))
+    assert torch.equal(subset.normals, OTHER.flatten(0, 1)[[0, 7]])
+    assert set(subset.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth", "normals"}
     plain = ObservedView(WEIGHTS, RENDERERS["idr"], CAMERA.rays(), view.depth, view.depth_per_distance, ALL, None)
     assert set(plain.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth"}
     assert concatenate_views([plain]).normals is None
 
 
-def test_normals_that_are_not_given_have_no_part():
-    found = torch.tensor([[0.0, 0, 1], [0, 1, 0]])
-    assert normal_error(found, torch.tensor([[0.0, 0, 0], [0, 0.6, 0.8]])).item() == pytest.approx(0.4)
-    assert normal_error(found, torch.zeros(2, 3)).item() == 0
+def test_pixels_without_observed_normals_have_no_loss():
+    normals = torch.tensor([[0.0, 0, 1], [0, 1, 0]])
+    assert normal_error(normals, torch.tensor([[0.0, 0, 0], [0, 0.6, 0.8]])).item() == pytest.approx(0.4)
+    assert normal_error(normals, torch.zeros(2, 3)).item() == 0

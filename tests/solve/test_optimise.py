@@ -1,4 +1,4 @@
-"""The optimisation loop on problems small enough to know the answer."""
+"""The optimisation loop on problems with a known solution."""
 
 from dataclasses import dataclass, field, replace
 from math import isnan
@@ -29,15 +29,15 @@ from tests.tiny import camera_of
 from tests.wrong_hits import WrongHits
 
 CPU = torch.device("cpu")
-POINTS = 7  # evaluations that a toy's loss makes
+POINTS = 7  # field evaluations of the loss of a toy
 RAYS = camera_of(16).rays()
 
 
 @dataclass
 class Toy:
-    """A radius to be found: the field at a point 3 from the origin is to be zero there.
+    """A problem with a radius as its parameter. Its solution is 3, where the field at a fixed point is zero.
 
-    `spoil` multiplies the loss of the call of that number, from 0, which is the warm-up.
+    `spoil` maps the number of a call to a factor of its loss. Call 0 is the warm-up.
     """
 
     spoil: dict[int, float] = field(default_factory=dict)
@@ -85,31 +85,30 @@ def go(problem, iterations=10, *, rate=0.05, on_step=lambda line: None) -> Histo
     return history
 
 
-def test_it_finds_the_answer():
+def test_the_loop_converges_to_the_solution():
     toy = Toy()
     history = go(toy, 200, rate=0.1)
     assert toy.radius.item() == pytest.approx(3.0, abs=1e-2)
     assert (history.status, history.reason) == (RunStatus.OK, "")
-    assert history.curve[0]["total"] == pytest.approx(4.0)
-    assert history.curve[-1]["total"] < 1e-3
+    assert history.curve[0]["total"] == pytest.approx(4.0) and history.curve[-1]["total"] < 1e-3
 
 
 @dataclass
-class Two(Toy):
-    """Two unknowns, of which the second one has no gradient in every other iteration."""
+class TwoParameters(Toy):
+    """Two parameters. The second one has no gradient in each second iteration."""
 
     def __post_init__(self):
         super().__post_init__()
-        self.place = torch.tensor([0.5, -0.5], requires_grad=True)
-        self.parameters = [self.radius, self.place]
+        self.offset = torch.tensor([0.5, -0.5], requires_grad=True)
+        self.parameters = [self.radius, self.offset]
 
     def loss(self, iteration):
         terms = super().loss(iteration)
-        return terms if iteration % 2 else {"total": terms["total"] + (self.place**4).sum()}
+        return terms if iteration % 2 else {"total": terms["total"] + (self.offset**4).sum()}
 
 
-def test_a_step_is_that_of_torchs_adam():
-    ours, theirs = Two(), Two()
+def test_a_step_equals_that_of_adam_in_torch():
+    ours, theirs = TwoParameters(), TwoParameters()
     settings = OptimiserSettings(20, 0.1, "cosine")
     optimise(ours, settings, CPU, history=History(), on_step=lambda line: None)
     adam = torch.optim.Adam(theirs.parameters)
@@ -118,27 +117,26 @@ def test_a_step_is_that_of_torchs_adam():
         adam.zero_grad()
         theirs.loss(iteration)["total"].backward()
         adam.step()
-    assert all(torch.equal(one, other) for one, other in zip(ours.parameters, theirs.parameters, strict=True))
+    assert all(
+        torch.equal(actual, expected) for actual, expected in zip(ours.parameters, theirs.parameters, strict=True)
+    )
 
 
-def test_the_curve_has_a_line_per_iteration_passed_on_at_once():
-    given = []
-    history = go(Toy(), 5, on_step=lambda line: given.append(dict(line)))
-    assert history.curve == given
-    assert [line["iteration"] for line in given] == [0, 1, 2, 3, 4]
-    seconds = [line["seconds"] for line in given]
-    assert seconds == sorted(seconds)
-    assert seconds[0] > 0
+def test_the_curve_has_a_line_per_iteration_that_is_passed_on_at_once():
+    lines = []
+    history = go(Toy(), 5, on_step=lambda line: lines.append(dict(line)))
+    assert history.curve == lines and [line["iteration"] for line in lines] == [0, 1, 2, 3, 4]
+    seconds = [line["seconds"] for line in lines]
+    assert seconds == sorted(seconds) and seconds[0] > 0
     assert seconds[-1] == pytest.approx(history.seconds["forward"] + history.seconds["backward"])
-    assert all(line["total"] == line["square"] for line in given)
-    assert given[-1]["value_evaluations"] == history.counts.value
+    assert all(line["total"] == line["square"] for line in lines)
+    assert lines[-1]["value_evaluations"] == history.counts.value
 
 
 def test_the_warm_up_is_neither_counted_nor_part_of_the_first_step():
     toy, gradients = Toy(), []
     history = go(toy, 4, on_step=lambda line: gradients.append(toy.radius.grad.item()))
-    assert toy.calls == 5
-    assert (history.counts.value, history.counts.gradient) == (4 * POINTS, 4 * POINTS)
+    assert toy.calls == 5 and (history.counts.value, history.counts.gradient) == (4 * POINTS, 4 * POINTS)
     assert [line["value_evaluations"] for line in history.curve] == [POINTS * n for n in (1, 2, 3, 4)]
     assert [line["gradient_evaluations"] for line in history.curve] == [POINTS * n for n in (1, 2, 3, 4)]
     assert history.seconds["warmup"] > 0
@@ -158,7 +156,7 @@ def test_terms_are_read_in_one_wait_and_parameters_in_another():
     problem = Many()
     with Operations() as counted:
         history = go(problem, 3)
-    steps = 3 * len(problem.parameters)  # Adam's own counters of them, which are on the CPU wherever parameters are
+    steps = 3 * len(problem.parameters)  # Adam has a counter per parameter, which is always on the CPU
     assert counted.waits == {"_local_scalar_dense": steps}
     assert history.curve[0]["total"] == history.curve[0]["term 0"] == 1.0
 
@@ -173,40 +171,35 @@ def test_the_time_of_on_step_is_not_counted(clock):
     assert history.seconds == pytest.approx({"warmup": 1.0, "forward": 3.0, "backward": 0.0}, abs=0.01)
 
 
-def test_a_loss_that_is_no_number_ends_the_loop_and_says_where():
+def test_a_loss_that_is_nan_ends_the_loop_with_its_iteration():
     history = go(Toy(spoil={4: float("nan")}))
     assert history.status is RunStatus.NAN
-    assert history.reason == "the square term is not a number at iteration 3"
-    assert len(history.curve) == 4
+    assert history.reason == "the square term is not a number at iteration 3" and len(history.curve) == 4
 
 
 @each(
-    "spoilt, what",
-    [
-        ((), "the loss is"),
-        (("depth",), "the depth term is"),
-        (("depth", "mask"), "the depth and the mask terms are"),
-    ],
+    "nan_terms, subject",
+    [((), "the loss is"), (("depth",), "the depth term is"), (("depth", "mask"), "the depth and the mask terms are")],
 )
-def test_a_loss_that_is_no_number_names_its_terms_and_no_step_is_taken(spoilt, what):
+def test_a_loss_that_is_nan_names_its_terms_and_no_step_is_taken(nan_terms, subject):
     class Spoilt(Toy):
         def loss(self, iteration):
             terms = {name: self.radius.square() for name in ("depth", "code", "mask")}
             if iteration == 2:
-                terms |= {name: term * torch.nan for name, term in terms.items() if name in spoilt}
+                terms |= {name: term * torch.nan for name, term in terms.items() if name in nan_terms}
                 return {"total": self.radius * torch.nan, **terms}
             return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
     toy, radii = Spoilt(), []
     history = go(toy, on_step=lambda line: radii.append(toy.radius.item()))
-    assert (history.status, history.reason) == (RunStatus.NAN, f"{what} not a number at iteration 2")
+    assert (history.status, history.reason) == (RunStatus.NAN, f"{subject} not a number at iteration 2")
     assert radii[0] > radii[1] == radii[2] == toy.radius.item()
     assert [line["iteration"] for line in history.curve] == [0, 1, 2] and isnan(history.curve[-1]["total"])
 
 
 @dataclass
-class Seen(Toy):
-    """The radius of a sphere, by the mean distance of hits that a renderer gives."""
+class RenderedSphere(Toy):
+    """The radius of a sphere, fitted to the mean distance of rendered hits."""
 
     renderer: Any = None
 
@@ -218,30 +211,28 @@ class Seen(Toy):
         return {"total": depth, "depth": depth}
 
 
-def test_a_loss_without_a_number_says_how_many_hits_have_no_distance():
-    seen = Seen(renderer=WrongHits("endless"))
-    history = go(seen)
-    assert history.status is RunStatus.NAN and seen.radius.item() == 1.0
-    assert history.reason == (
-        "the depth term is not a number at iteration 0: 11 of 256 rays have a hit without a finite distance (the field "
-        "is finite on them, so the renderer is at fault)"
-    )
+def test_a_loss_that_is_nan_states_how_many_hits_have_no_distance():
+    problem = RenderedSphere(renderer=WrongHits("endless"))
+    history = go(problem)
+    assert history.status is RunStatus.NAN and problem.radius.item() == 1.0
+    assert history.reason.startswith("the depth term is not a number at iteration 0: 11 of 256 rays have a hit without")
+    assert history.reason.endswith("(the field is finite on them, so the renderer is at fault)")
 
 
-def checked(how: str, problem: type[Seen] = Seen) -> tuple[Seen, History, list[str]]:
-    """A loop whose first loss has its hits checked; the problem, the loop's history and its notes."""
+def checked(how: str, problem: type[RenderedSphere] = RenderedSphere) -> tuple[RenderedSphere, History, list[str]]:
+    """Runs a loop that checks the hits of its first loss; gives the problem, the history and the notes."""
     notes: list[str] = []
-    seen = problem(renderer=WrongHits(how) if how else load("renderer", "dist"))
-    return seen, go(FirstChecked(seen, notes), 3), notes
+    instance = problem(renderer=WrongHits(how) if how else load("renderer", "dist"))
+    return instance, go(FirstChecked(instance, notes), 3), notes
 
 
 def test_the_first_hits_are_checked_once_and_neither_counted_nor_changed():
-    seen, history, notes = checked("")
-    plain = Seen(renderer=seen.renderer)
+    problem, history, notes = checked("")
+    plain = RenderedSphere(renderer=problem.renderer)
     alone = go(plain, 3)
     assert notes == [] and history.counts == alone.counts and history.counts.value > 0
     assert [line["total"] for line in history.curve] == [line["total"] for line in alone.curve]
-    assert seen.radius.item() == plain.radius.item() and seen.calls == 4
+    assert problem.radius.item() == plain.radius.item() and problem.calls == 4
 
 
 def test_hits_off_the_surface_are_noted_once_and_the_loop_goes_on():
@@ -251,9 +242,9 @@ def test_hits_off_the_surface_are_noted_once_and_the_loop_goes_on():
     assert note.startswith("at the first iteration, WrongHits.render: ") and "not on the surface" in note
 
 
-def test_hits_that_break_the_contract_end_the_loop_unless_the_loss_says_more():
-    class Blind(Seen):
-        """Its loss does not look at the distances."""
+def test_hits_that_break_the_contract_end_the_loop_except_if_the_loss_is_nan():
+    class Blind(RenderedSphere):
+        """A problem whose loss does not depend on the distances."""
 
         def loss(self, iteration):
             super().loss(iteration)
@@ -267,15 +258,14 @@ def test_hits_that_break_the_contract_end_the_loop_unless_the_loss_says_more():
     assert (history.status, notes) == (RunStatus.NAN, [])
 
 
-def test_a_parameter_that_is_no_number_ends_the_loop():
+def test_a_parameter_that_is_nan_ends_the_loop():
     class Cornered(Toy):
         def loss(self, iteration):
             self.calls += 1
             return {"total": (self.radius - 1.0).abs().sqrt()}  # 0 with an infinite slope at the start
 
     history = go(Cornered())
-    assert history.status is RunStatus.NAN
-    assert history.reason == "a parameter is not a number at iteration 0"
+    assert history.status is RunStatus.NAN and history.reason == "a parameter is not a number at iteration 0"
     assert len(history.curve) == 1
 
 
@@ -285,11 +275,10 @@ def test_a_loss_far_above_its_first_value_has_diverged(factor, diverges):
     assert history.status is (RunStatus.DIVERGED if diverges else RunStatus.OK)
     assert len(history.curve) == (3 if diverges else 5)
     if diverges:
-        assert "the loss rose from 4 to" in history.reason
-        assert "by iteration 2" in history.reason
+        assert "the loss rose from 4 to" in history.reason and "by iteration 2" in history.reason
 
 
-def test_the_course_is_there_when_the_loop_is_cut_short():
+def test_the_history_is_complete_if_the_loop_is_interrupted():
     def stop(line):
         if line["iteration"] == 2:
             raise KeyboardInterrupt
@@ -297,17 +286,14 @@ def test_the_course_is_there_when_the_loop_is_cut_short():
     history = History()
     with pytest.raises(KeyboardInterrupt):
         optimise(Toy(), OptimiserSettings(10, 0.1, "constant"), CPU, history=history, on_step=stop)
-    assert [line["iteration"] for line in history.curve] == [0, 1, 2]
-    assert history.counts.value == 3 * POINTS
+    assert [line["iteration"] for line in history.curve] == [0, 1, 2] and history.counts.value == 3 * POINTS
     assert history.seconds["forward"] > 0
 
 
 def test_a_cosine_falls_from_the_rate_to_nearly_zero():
     rates = [OptimiserSettings(10, 0.2, "cosine").rate(iteration) for iteration in range(10)]
-    assert rates[0] == 0.2
-    assert rates[5] == pytest.approx(0.1)
-    assert rates == sorted(rates, reverse=True)
-    assert 0 < rates[-1] < 0.01
+    assert rates[0] == 0.2 and rates[5] == pytest.approx(0.1)
+    assert rates == sorted(rates, reverse=True) and 0 < rates[-1] < 0.01
     assert {OptimiserSettings(10, 0.2, "constant").rate(iteration) for iteration in range(10)} == {0.2}
     steps = [OptimiserSettings(10, 0.2, "steps").rate(iteration) for iteration in range(10)]
     assert steps == pytest.approx([0.2] * 6 + [0.04] * 2 + [0.008] * 2)
@@ -323,39 +309,37 @@ def play(count: int, trial: int, iterations: int, loss) -> list[tuple[int, int]]
     starts = Starts(StartSettings(count, trial))
     turns = []
     for iteration in range(iterations):
-        start, own = starts.assignment(iteration)
-        starts.note(start, own, torch.tensor(float(loss(start, own))))
-        turns.append((start, own))
+        start, step = starts.assignment(iteration)
+        starts.note(start, step, torch.tensor(float(loss(start, step))))
+        turns.append((start, step))
     return turns
 
 
-def test_they_take_turns_and_the_best_goes_on():
-    turns = play(3, 2, 9, lambda start, own: (5.0, 1.0, 3.0)[start])
+def test_starts_take_turns_and_the_best_start_continues():
+    turns = play(3, 2, 9, lambda start, step: (5.0, 1.0, 3.0)[start])
     assert turns == [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (1, 2), (1, 3), (1, 4)]
 
 
-def test_a_quarter_stays_after_each_round():
-    assert StartSettings(48, 4).rounds == [48, 12, 3]
-    assert StartSettings(48, 4).trials == 4 * 63
-    assert StartSettings(1, 8).rounds == []
-    assert StartSettings(5, 1).rounds == [5, 2]
-    turns = play(5, 1, 10, lambda start, own: 10 - start if own == 0 else 100 * start)
-    assert [start for start, _ in turns] == [0, 1, 2, 3, 4, 4, 3, 3, 3, 3]  # 4 and 3 stay, then 3 is the better one
-    assert [own for _, own in turns[5:]] == [1, 1, 2, 3, 4]
+def test_a_quarter_of_the_starts_remains_after_each_round():
+    assert StartSettings(48, 4).rounds == [48, 12, 3] and StartSettings(48, 4).trials == 4 * 63
+    assert StartSettings(1, 8).rounds == [] and StartSettings(5, 1).rounds == [5, 2]
+    turns = play(5, 1, 10, lambda start, step: 10 - start if step == 0 else 100 * start)
+    assert [start for start, _ in turns] == [0, 1, 2, 3, 4, 4, 3, 3, 3, 3]  # 4 and 3 remain, and then 3 is better
+    assert [step for _, step in turns[5:]] == [1, 1, 2, 3, 4]
 
 
 def test_a_start_is_scored_by_the_end_of_its_round():
-    turns = play(2, 6, 20, lambda start, own: 100 - 30 * own if start else 10)
+    turns = play(2, 6, 20, lambda start, step: 100 - 30 * step if start else 10)
     assert turns[-1] == (1, 6 + 20 - 12 - 1)
 
 
-def test_until_all_were_tried_it_is_the_first_one():
+def test_the_first_start_is_best_until_all_were_tried():
     starts = Starts(StartSettings(2, 1))
     starts.note(1, 0, torch.tensor(0.0))
     assert starts.best() == 0
 
 
-def test_in_a_later_round_it_is_the_better_one_of_the_round_before():
+def test_the_best_start_is_that_of_the_last_complete_round():
     starts = Starts(StartSettings(5, 1))
     for start, loss in enumerate((5.0, 4.0, 1.0, 3.0, 2.0)):
         starts.note(start, 0, torch.tensor(loss))
@@ -366,8 +350,8 @@ def test_in_a_later_round_it_is_the_better_one_of_the_round_before():
     assert starts.best() == 4
 
 
-def test_a_start_that_is_not_a_number_is_never_kept():
-    assert play(2, 1, 3, lambda start, own: 7.0 if start else float("nan"))[-1][0] == 1
+def test_a_start_that_is_nan_is_never_kept():
+    assert play(2, 1, 3, lambda start, step: 7.0 if start else float("nan"))[-1][0] == 1
 
 
 def test_rounds_must_leave_something_of_the_budget():
@@ -387,7 +371,7 @@ def test_the_step_that_reaches_the_budget_is_the_last_one():
         replace(settings, budget=0.0)
 
 
-def test_a_coarse_value_counts_as_an_eighth():
+def test_a_coarse_evaluation_counts_as_an_eighth():
     counts = Counts()
     counts.value, counts.gradient, counts.coarse = 10, 3, 16
     assert counts.cost == 18

@@ -1,11 +1,11 @@
-"""When the state of a run is evaluated."""
+"""The iterations at which the state of a run is evaluated."""
 
 from bench.solve.solve import checkpoints_of
 from tests.looped import each
 
 
 @each(
-    "every, iterations, expected",
+    "interval, iterations, expected",
     [
         (5, 12, {0, 5, 10, 11}),
         (5, 11, {0, 5, 10}),
@@ -17,5 +17,5 @@ from tests.looped import each
         (None, 12, set()),
     ],
 )
-def test_checkpoints_begin_with_the_first_iteration_and_end_with_the_last(every, iterations, expected):
-    assert checkpoints_of(every, iterations) == expected
+def test_checkpoints_begin_with_the_first_iteration_and_end_with_the_last(interval, iterations, expected):
+    assert checkpoints_of(interval, iterations) == expected

@@ -1,4 +1,4 @@
-"""Scenes of the atlas: closed-form truth, what counts as success, distortions, and what is done to a fit."""
+"""Scenes of the stress atlas: closed-form ground truth, success criteria, distortions, and disturbed fits."""
 
 from dataclasses import replace
 
@@ -74,15 +74,14 @@ def test_the_closed_form_agrees_with_the_reference_tracer(name):
     judged = reference.trace(solid.field, rays, lipschitz=1.0, least_step=2e-4, radius=1.0)
     assert (first.hit != judged.hit).sum() <= 2  # rays that touch an edge
     both = first.hit & judged.hit
-    assert both.sum() > 100
-    assert (first.distance - judged.distance)[both].abs().max() < 1e-5
+    assert both.sum() > 100 and (first.distance - judged.distance)[both].abs().max() < 1e-5
     assert torch.equal(first.inside, judged.status == Status.STARTED_INSIDE)
 
 
 @each("name", [name for name in NAMES if stress_named(name).measure != "fit"])
-def test_every_stress_begins_where_a_careful_renderer_succeeds(name):
+def test_a_careful_renderer_succeeds_at_the_mild_end_of_each_stress(name):
     stress = stress_named(name)
-    dist = stress.setting == "alpha" or stress.group == "network"  # where IDR has too few steps for outlines
+    dist = stress.setting == "alpha" or stress.group == "network"  # IDR has too few steps for outlines
     renderer = load("renderer", "dist" if dist else "idr")
     if stress.setting == "n_ray_samples":
         renderer = load("renderer", "dvr")
@@ -93,23 +92,23 @@ def test_every_stress_begins_where_a_careful_renderer_succeeds(name):
 def test_every_stress_has_the_same_trial_for_every_renderer(name):
     stress = stress_named(name)
     severity = stress.sweep.severity(0.3)
-    one, same = (stress.exam_generator(conditions())(severity, drawn(0), 24) for _ in range(2))
-    assert torch.equal(one.camera.world_to_camera, same.camera.world_to_camera)
-    first, again = truth(one)[0], truth(same)[0]
+    first_exam, second_exam = (stress.exam_generator(conditions())(severity, drawn(0), 24) for _ in range(2))
+    assert torch.equal(first_exam.camera.world_to_camera, second_exam.camera.world_to_camera)
+    first, again = truth(first_exam)[0], truth(second_exam)[0]
     assert torch.equal(first.hit, again.hit)
 
 
-def test_a_floater_is_seen_by_samples_and_not_by_a_march():
-    """A ball of radius .9 x .03 in front of a cube, of .09 of the picture: 1.8 of 5.4 widths across."""
+def test_a_floater_is_hit_by_samples_and_missed_by_a_march():
+    """A sphere of radius 0.9 x 0.03 in front of a cube covers 0.09 of the image."""
     exam = SCENES["floaters"](0.03, drawn(), 48)
-    found = truth(exam)[0]
-    in_front = found.distance < CAMERA_DISTANCE - 0.81 + 0.03
+    exact = truth(exam)[0]
+    in_front = exact.distance < CAMERA_DISTANCE - 0.81 + 0.03
     assert in_front.double().mean() == pytest.approx(np.pi / 4 / 9, rel=0.3)
     rays = exam.camera.rays().flat()
     share = {}
     for name in ("dist", "newton", "dvr"):
         rendering = load("renderer", name).render(exam.field, rays)
-        near = (rendering.distance - found.distance).abs() < 0.01
+        near = (rendering.distance - exact.distance).abs() < 0.01
         share[name] = float((rendering.hit & near)[in_front].double().mean())
     assert share["dist"] < 0.1 and share["newton"] < 0.1 and share["dvr"] > 0.9
 
@@ -117,14 +116,14 @@ def test_a_floater_is_seen_by_samples_and_not_by_a_march():
 def test_errors_of_a_mask_are_of_both_kinds():
     mask = torch.zeros(40, 40, dtype=torch.bool)
     mask[:, :20] = True
-    given = fit.Observation(camera_of(40), torch.ones(40, 40), mask, mask)
-    wrong = fit.mask_errors(given, 0.3, drawn()).mask ^ mask
+    observation = fit.Observation(camera_of(40), torch.ones(40, 40), mask, mask)
+    wrong = fit.mask_errors(observation, 0.3, drawn()).mask ^ mask
     assert wrong[:, :20].double().mean() == pytest.approx(0.3, abs=0.08)
     assert wrong[:, 20:].double().mean() == pytest.approx(0.3, abs=0.08)
 
 
 def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
-    """The numbers of a trial that its success depends on."""
+    """The numbers that decide the success of a trial."""
     renderer = load("renderer", "dvr" if stress.setting == "n_ray_samples" else "dist")
     tiny = replace(conditions(), fit=replace(FIT, resolution=8, iterations=1))
     numbers = stress.trial(renderer, level, repeat, tiny).numbers
@@ -152,7 +151,7 @@ MOVED = {
 
 
 @each("name, severity", MOVED.items())
-def test_a_moved_surface_is_where_the_disturbed_field_first_is_zero_in_float64(name, severity):
+def test_the_ground_truth_of_a_moved_surface_is_the_zero_of_the_disturbed_field(name, severity):
     before = {key: tensor.clone() for key, tensor in BALL.decoder.state_dict().items()}
     exam = stress_named(name).exam_generator(conditions())(severity, drawn(), 20)
     assert all(torch.equal(tensor, before[key]) for key, tensor in BALL.decoder.state_dict().items())
@@ -162,9 +161,9 @@ def test_a_moved_surface_is_where_the_disturbed_field_first_is_zero_in_float64(n
     field = exam.field if name in SCENES else exam.truth.field  # a network takes float32
     inside = torch.stack([field(rays.at(step.expand(len(first.hit)))) <= 0 for step in steps], dim=1)
     hit, distance = inside.any(dim=1), steps[inside.to(torch.uint8).argmax(dim=1)]
-    seen = ~first.inside
-    assert (hit != first.hit)[seen].sum() <= 3  # thinner than the samples
-    behind = (distance - first.distance)[seen & hit & first.hit]
+    outside = ~first.inside
+    assert (hit != first.hit)[outside].sum() <= 3  # thinner than the samples
+    behind = (distance - first.distance)[outside & hit & first.hit]
     assert behind.quantile(0.95) <= 0.00101 and behind.quantile(0.05) >= -1e-6
 
 
@@ -173,11 +172,9 @@ def test_pixels_are_counted_by_kind_of_error():
     good = judge_rendering(exam, load("renderer", "idr"), conditions())
     assert good.success and good.numbers["hits"] > 200
     short = judge_rendering(exam, load("renderer", "idr", steps=3), conditions())
-    assert short.failure is Failure.LOST
-    assert short.numbers["lost"] == (short.images["kinds"] == 2).sum() > 200
+    assert short.failure is Failure.LOST and short.numbers["lost"] == (short.images["kinds"] == 2).sum() > 200
     wide = judge_rendering(exam, load("renderer", "idr", epsilon=0.05), conditions())
-    assert wide.failure is Failure.FALSE
-    assert wide.numbers["false"] == (wide.images["kinds"] == 3).sum() > 20
+    assert wide.failure is Failure.FALSE and wide.numbers["false"] == (wide.images["kinds"] == 3).sum() > 20
 
 
 def test_spurious_hits_are_judged_by_their_share_of_the_hits():
@@ -193,8 +190,7 @@ def test_spurious_hits_are_judged_by_their_share_of_the_hits():
 def test_gradients_are_those_of_the_closed_form():
     exam = SCENES["grazing_plane"](30.0, drawn(), 24)
     exact = judge_gradient(exam, load("renderer", "dvr"), conditions())
-    assert exact.success
-    assert exact.numbers["gradient_cosine"] == pytest.approx(1, abs=1e-6)
+    assert exact.success and exact.numbers["gradient_cosine"] == pytest.approx(1, abs=1e-6)
     biased = judge_gradient(exam, load("renderer", "dist"), conditions())
     assert biased.failure is Failure.SCALE
     assert biased.numbers["gradient_scale"] == pytest.approx(1.5 * np.sin(np.radians(30)), rel=0.05)  # alpha K cos
@@ -210,10 +206,12 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
     epsilon = stress_named("epsilon")
     assert epsilon.stressed(load("renderer", "idr"), 0.01).epsilon == 0.01
     assert stress_named("few_steps").stressed(load("renderer", "idr"), 12.4).steps == 12
-    assert stress_named("few_steps").stressed(load("renderer", "idr"), 0.3).steps == 1  # a renderer takes no 0
+    assert stress_named("few_steps").stressed(load("renderer", "idr"), 0.3).steps == 1  # 0 is invalid
     with pytest.raises(Unsupported, match="DVR has no epsilon, or it is null: choose another"):
         epsilon.stressed(load("renderer", "dvr"), 0.01)
-    with pytest.raises(Unsupported, match="Naive has no n_gradient_samples, or it is null"):  # its gradient is unrolled
+    with pytest.raises(
+        Unsupported, match="Naive has no n_gradient_samples, or it is null"
+    ):  # the gradient of naive is unrolled
         stress_named("gradient_samples").stressed(load("renderer", "naive"), 3.0)
     practical = load("renderer", "naive", gradient="practical", n_gradient_samples=1)
     assert stress_named("gradient_samples").stressed(practical, 2.6).n_gradient_samples == 3
@@ -226,8 +224,7 @@ def test_a_disturbed_fit_ends_further_off(scene):
         judge_fit(scene, severity, drawn(), renderer=renderer, conditions=few)
         for severity in (1e-6, 0.5 if scene != "wrong_pose" else 60.0)
     )
-    assert mild.success
-    assert severe.numbers["surface_error"] > mild.numbers["surface_error"]
+    assert mild.success and severe.numbers["surface_error"] > mild.numbers["surface_error"]
 
 
 def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
@@ -239,7 +236,7 @@ def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
     assert fits == [0.7, FIT.offset]
 
 
-def test_the_values_of_a_trial_are_limited_those_of_a_fit_over_all_its_iterations():
+def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
     held = replace(conditions(), limits=Limits(1, 8))
     assert stress_named("thin_plate").trial(load("renderer", "idr"), 0.0, 0, held).failure is Failure.TIMEOUT
     fit = replace(FIT, resolution=12, iterations=10)
@@ -287,11 +284,9 @@ def searched(settings: SearchSettings, succeeds) -> Search:
 @each("middle", [0.05, 0.31, 0.5, 0.77, 0.95])
 def test_a_sharp_breakdown_lies_in_a_short_interval(middle):
     search = searched(DESK, lambda level: level < middle)
-    found = search.result()
-    assert found.low <= middle <= found.high
-    assert found.low <= found.level <= found.high
-    assert found.high - found.low < 0.08
-    assert len(search.trials) < 25
+    result = search.result()
+    assert result.low <= middle <= result.high and result.low <= result.level <= result.high
+    assert result.high - result.low < 0.08 and len(search.trials) < 25
 
 
 @each("width, least", [(0.02, 0.9), (0.08, 0.8)])
@@ -303,8 +298,8 @@ def test_the_interval_of_a_noisy_breakdown_holds(width, least):
         search = searched(
             DESK, lambda level, m=middle: generator.random() < 1 / (1 + np.exp(np.clip((level - m) / width, -50, 50)))
         )
-        found = search.result()
-        holds += found.low <= middle <= found.high
+        result = search.result()
+        holds += result.low <= middle <= result.high
         assert len(search.trials) <= search.max_trials
     assert holds / 20 >= least
 
@@ -312,8 +307,8 @@ def test_the_interval_of_a_noisy_breakdown_holds(width, least):
 @each("succeeds, end", [(True, 32), (False, 0)])
 def test_an_end_without_a_breakdown_is_tried_repeatedly(succeeds, end):
     search = searched(DESK, lambda level: succeeds)
-    found = search.result()
-    assert found.low > 1 if succeeds else found.high < 0
+    result = search.result()
+    assert result.low > 1 if succeeds else result.high < 0
     assert search.trials.count((end, succeeds)) >= DESK.repeats
 
 
@@ -329,15 +324,15 @@ def bisected(succeeds, levels: int = 33) -> Bisection:
 @each("middle", [0.01, 0.31, 0.5, 0.77, 0.999])
 def test_without_repeats_the_breakdown_lies_between_neighbours_and_has_no_interval(middle, levels):
     search = bisected(lambda level: level < middle, levels)
-    found = search.result()
-    assert abs(found.level - middle) <= 0.5 / (levels - 1) + 1e-12
-    assert (found.low, found.high, found.width) == (None, None, None)
+    result = search.result()
+    assert abs(result.level - middle) <= 0.5 / (levels - 1) + 1e-12
+    assert (result.low, result.high, result.width) == (None, None, None)
     assert len(search.outcomes) <= search.max_trials < levels + 1 == search.grid_trials + 1
 
 
 def test_without_repeats_an_end_is_tried_once():
     for succeeds, level in ((True, 1 + 0.5 / 32), (False, -0.5 / 32)):
-        search = bisected(lambda at, succeeds=succeeds: succeeds)
+        search = bisected(lambda level_tried, succeeds=succeeds: succeeds)
         assert search.result().level == pytest.approx(level)
         assert search.outcomes == {0: succeeds, 32: succeeds}
     assert bisected(lambda level: level > 0.5).result().level < 0  # a failure at the mild end decides

@@ -56,7 +56,7 @@ def test_it_ends_well_with_all_its_files(dist):
 
 def defined(name: str, definition: str) -> bool:
     """Whether a definition is of a number: it may be of several, or of all that begin alike."""
-    return any(name == part or name.startswith(f"{part}_") for part in definition.split(", "))
+    return any(name == prefix or name.startswith(f"{prefix}_") for prefix in definition.split(", "))
 
 
 def test_every_number_has_a_definition_and_every_definition_a_number(dist):
@@ -65,7 +65,7 @@ def test_every_number_has_a_definition_and_every_definition_a_number(dist):
     assert record.definitions == DEFINITIONS
     assert [name for name in numbers if sum(defined(name, key) for key in DEFINITIONS) != 1] == []
     numbers.add("peak_memory_bytes")  # of a GPU alone
-    assert [part for key in DEFINITIONS for part in key.split(", ") if not any(defined(n, part) for n in numbers)] == []
+    assert [name for key in DEFINITIONS for name in key.split(", ") if not any(defined(n, name) for n in numbers)] == []
     assert all(len(text) > 15 for text in DEFINITIONS.values())
 
 
@@ -144,10 +144,8 @@ def test_costs_are_medians_with_least_and_largest():
 
 def test_the_renderer_is_near_the_reference(dist):
     metrics = dist.record.metrics
-    assert metrics["size"] == SIZE
-    assert metrics["rays"] == SIZE**2
-    assert metrics["hits"] == int(REFERENCE_HIT.sum()) > 20
-    assert metrics["lost"] + metrics["false"] <= 4
+    assert metrics["size"] == SIZE and metrics["rays"] == SIZE**2
+    assert metrics["hits"] == int(REFERENCE_HIT.sum()) > 20 and metrics["lost"] + metrics["false"] <= 4
     assert metrics["wrong"] == 0
     assert 0 < metrics["depth_error_median"] <= metrics["depth_error_p99"] <= metrics["depth_error_max"] < 1e-3
 
@@ -155,14 +153,12 @@ def test_the_renderer_is_near_the_reference(dist):
 def test_the_images_are_those_of_the_renderer_and_of_the_reference(dist):
     images = np.load(dist.folder / "images.npz")
     hit, true, metrics = images["hit"], images["reference_hit"], dist.record.metrics
-    assert true.sum() == metrics["hits"]
-    assert (true & ~hit).sum() == metrics["lost"]
+    assert true.sum() == metrics["hits"] and (true & ~hit).sum() == metrics["lost"]
     assert (np.isfinite(images["depth_error"]) == (hit & true)).all()
     assert np.nanmax(images["depth_error"]) == metrics["depth_error_max"]
     right, up, towards = images["reference_normals"].astype(float)[true].T
     rows, columns = np.nonzero(true)
-    assert (towards > 0).all()
-    assert np.corrcoef(right, columns)[0, 1] > 0.9
+    assert (towards > 0).all() and np.corrcoef(right, columns)[0, 1] > 0.9
     assert np.corrcoef(up, rows)[0, 1] < -0.9
     differ = np.abs(images["normals"] - images["reference_normals"])[hit & true].max(axis=-1)
     assert (differ < 0.01).mean() > 0.9  # others lie beside an edge of the polyhedron
@@ -197,9 +193,9 @@ class Fake:
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         values = field(rays.at(torch.full(rays.shape, 2.5)))
-        known = rays.shape == self.hit.shape  # all but the warm-up
-        hit = self.hit if known else torch.ones(rays.shape, dtype=torch.bool)
-        distance = self.distance if known else torch.ones(rays.shape)
+        measured = rays.shape == self.hit.shape  # all renderings except the warm-up
+        hit = self.hit if measured else torch.ones(rays.shape, dtype=torch.bool)
+        distance = self.distance if measured else torch.ones(rays.shape)
         status = torch.where(hit, Status.HIT, Status.MISS).to(torch.int8)
         return Rendering(
             distance + values - values.detach(), status, rays.at(distance), torch.zeros(rays.shape), values
@@ -211,14 +207,14 @@ class Fake:
 
 def test_lost_false_and_wrong_are_counted_against_the_reference(tmp_path, monkeypatch):
     cosine = camera_of(4).double().depth(torch.ones(4, 4).double())
-    true, found, error = torch.zeros(4, 4).bool(), torch.zeros(4, 4).bool(), torch.zeros(4, 4).double()
-    true[0], found[1] = True, True  # 4 lost, 4 false
-    true[2:], found[2:] = True, True
+    true, rendered, error = torch.zeros(4, 4).bool(), torch.zeros(4, 4).bool(), torch.zeros(4, 4).double()
+    true[0], rendered[1] = True, True  # 4 lost, 4 false
+    true[2:], rendered[2:] = True, True
     error[2], error[3, 0], error[3, 1] = 0.01, 0.019, 0.021
     error[3, 2:] = torch.tensor([-0.5, 0.0])
     reference = Reference(2.0 * true / cosine, torch.zeros(4, 4, 3).double(), true)
     monkeypatch.setattr(ablation, "reference_for", lambda *_: reference)
-    metrics = measured(tmp_path, Fake(found, ((2.0 + error) / cosine).float()), size=4).record.metrics
+    metrics = measured(tmp_path, Fake(rendered, ((2.0 + error) / cosine).float()), size=4).record.metrics
     assert {name: metrics[name] for name in ("rays", "hits", "lost", "false", "wrong")} == {
         "rays": 16, "hits": 12, "lost": 4, "false": 4, "wrong": 2,
     }  # fmt: skip
@@ -251,8 +247,7 @@ def test_where_the_work_is_done_a_smaller_image_is_measured(tmp_path):
     side = SIZE // SHRINK_FACTOR
     assert run.record.status is RunStatus.TIMEOUT
     assert run.record.reason == f"more than 9,000 field values in a step at 16 x 16; it finishes at {side} x {side}"
-    assert run.record.metrics["size"] == side
-    assert run.record.metrics["rays"] == side**2
+    assert run.record.metrics["size"] == side and run.record.metrics["rays"] == side**2
     assert np.load(run.folder / "images.npz")["hit"].shape == (side, side)
     # Each size begins with a warm-up. What is too much once is not tried again.
     assert costly.rendered[:4] == [WARM_UP_PIXELS**2, SIZE**2, WARM_UP_PIXELS**2, side**2]
@@ -270,8 +265,7 @@ def test_where_no_size_finishes_there_are_no_numbers(tmp_path, smallest):
 def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, values, times):
     costly = Costly(above=WARM_UP_PIXELS**2, values=values)
     run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
-    assert run.record.status is RunStatus.OK
-    assert run.record.metrics["repeats"] == times
+    assert run.record.status is RunStatus.OK and run.record.metrics["repeats"] == times
     assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
 
 
@@ -308,12 +302,11 @@ def test_every_renderer_in_turn_has_its_numbers_and_a_limit_names_the_one_that_r
     assert run.record.reason.startswith("more than 8,000 field values in a rendering of dvr at 16 x 16; ")
 
 
-def test_threads_are_those_asked_for_and_given_back(tmp_path, monkeypatch):
-    seen, before = [], torch.get_num_threads()
+def test_threads_follow_the_setting_and_are_restored(tmp_path, monkeypatch):
+    threads, before = [], torch.get_num_threads()
     clock = ablation.Workbench._clock
     monkeypatch.setattr(
-        ablation.Workbench, "_clock", lambda *given: seen.append(torch.get_num_threads()) or clock(*given)
+        ablation.Workbench, "_clock", lambda *arguments: threads.append(torch.get_num_threads()) or clock(*arguments)
     )
     measured(tmp_path, load("renderer", "dist"), replace(SETTINGS, threads=2))
-    assert set(seen) == {2}
-    assert torch.get_num_threads() == before
+    assert set(threads) == {2} and torch.get_num_threads() == before

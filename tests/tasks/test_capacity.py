@@ -55,8 +55,7 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     record = run(tmp_path, compose_config, "task=capacity", "dataset=capsule", ladder, *small, *better)
     assert (record.status, record.reason) == ("ok", "")
     metrics = record.metrics
-    assert metrics["recommended_field"] == "rounded_box"
-    assert metrics["recommended_by"] == "stored"
+    assert metrics["recommended_field"] == "rounded_box" and metrics["recommended_by"] == "stored"
     for size, number in (("free", 10), ("stored", 10), ("bytes", 40)):
         assert metrics[f"recommended_{size}"] == number == metrics[f"rounded_box.{size}"]
     assert metrics["recommended_error"] == metrics["rounded_box.error"] < metrics["footprint"]
@@ -64,8 +63,7 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert "saved_seconds" not in metrics  # the network was not fitted
     assert metrics["sphere.error"] > metrics["footprint"]
     assert metrics["sphere.seconds"] > 0 < metrics["sphere.evaluations"]
-    assert metrics["auto.field"] == "rounded_box"
-    assert metrics["auto.overhead"] > 1
+    assert metrics["auto.field"] == "rounded_box" and metrics["auto.overhead"] > 1
     assert metrics["auto.evaluations"] > metrics["rounded_box.evaluations"]
     assert metrics["frugal.evaluations"] < metrics["rounded_box.evaluations"]
     assert 0 <= metrics["held_out_seeds_within"] <= metrics["held_out_seeds_held"] == 1
@@ -80,8 +78,8 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
     lines = curve_of(tmp_path)
     assert {line["candidate"] for line in lines} == {"sphere", "rounded_box"}
-    shares = {part: {line["rays_share"] for line in lines if line["part"] == part and line["phase"] == "fit"}
-              for part in ("fit_all", "frugal")}  # fmt: skip
+    shares = {key: {line["rays_share"] for line in lines if line["part"] == key and line["phase"] == "fit"}
+              for key in ("fit_all", "frugal")}  # fmt: skip
     assert shares["fit_all"] == {1.0} and 0 < min(shares["frugal"]) < 1
     assert {path.name for path in tmp_path.iterdir()} >= {"mesh.ply", "ladder.png", "strip.png"}
     record.seconds["total"] = 1.0
@@ -101,8 +99,10 @@ def test_a_fit_as_good_as_its_start_is_ok_and_a_worse_one_is_not_reached():
 
 
 def test_a_users_renderer_without_epsilon_works(compose_config, tmp_path):
-    own = ("renderer=custom", "renderer._target_=tests.user_renderer.Mine", "+renderer.steps=40")
-    record = run(tmp_path, compose_config, "task=capacity", "dataset=sphere", "models.candidates=[sphere]", *own)
+    user_renderer = ("renderer=custom", "renderer._target_=tests.user_renderer.Mine", "+renderer.steps=40")
+    record = run(
+        tmp_path, compose_config, "task=capacity", "dataset=sphere", "models.candidates=[sphere]", *user_renderer
+    )
     assert (record.status, record.metrics["recommended_field"]) == ("ok", "sphere")
     assert not [note for note in record.notes if note.startswith("pixel precision: renderer.")]
 
@@ -138,8 +138,8 @@ def test_a_choice_is_checked_by_the_best_candidate_of_each_draw():
 
 def test_hits_off_the_surface_are_noted_once_of_all_candidates(compose_config, tmp_path):
     short = ("renderer=custom", "renderer._target_=tests.wrong_hits.WrongHits", "task.optimiser.iterations=4")
-    asked = ("task=completion", "dataset=sphere", "field=sphere", "task.points=50")
-    record = run(tmp_path, compose_config, *asked, *BETTER, *short)
+    overrides_of_task = ("task=completion", "dataset=sphere", "field=sphere", "task.points=50")
+    record = run(tmp_path, compose_config, *overrides_of_task, *BETTER, *short)
     (note,) = [note for note in record.notes if "hits are not on the surface" in note]
     assert note.startswith("at the first iteration, WrongHits.render: ")
 
@@ -153,18 +153,16 @@ def test_hits_off_the_surface_are_noted_once_of_all_candidates(compose_config, t
     ids=["auto", "one candidate, without a mask"],
 )
 def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
-    asked = () if any(part.startswith("field=") for part in overrides) else ("field=auto",)
-    record = run(tmp_path, compose_config, *overrides, *asked, *BETTER)
+    default_field = () if any(override.startswith("field=") for override in overrides) else ("field=auto",)
+    record = run(tmp_path, compose_config, *overrides, *default_field, *BETTER)
     assert record.status == "ok", record.reason
     assert record.metrics["field"] == ends
     assert record.metrics["field_free"] == record.metrics["field_stored"] == {"box": 9, "sphere": 4}[ends]
     assert record.metrics["field_bytes"] == 4 * record.metrics["field_stored"]
     assert record.metrics["field_error"] < 3 * record.metrics["field_footprint"]
-    assert record.evaluations["iterations"] >= 20
-    assert record.evaluations["observed"] >= 50
+    assert record.evaluations["iterations"] >= 20 and record.evaluations["observed"] >= 50
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
-    assert record.seconds["forward"] > 0 < record.seconds["backward"]
-    assert (tmp_path / "mesh.ply").is_file()
+    assert record.seconds["forward"] > 0 < record.seconds["backward"] and (tmp_path / "mesh.ply").is_file()
 
 
 def test_invalid_settings_are_told_with_their_reason(compose_config, tmp_path):

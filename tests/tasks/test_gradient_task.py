@@ -50,22 +50,22 @@ def test_an_exact_rule_is_found_exact(exact):
     for band in HITS:
         assert metrics[f"{band}.pixels"] + metrics[f"{band}.excluded"] == SETTINGS.pixels
         assert metrics[f"{band}.pixels"] >= SETTINGS.pixels - 3
-        for of in ("code", "camera"):
-            assert metrics[f"{band}.{of}_cosine"] == pytest.approx(1, abs=1e-9)
-            assert metrics[f"{band}.{of}_pooled_cosine"] == pytest.approx(1, abs=1e-9)
-            assert metrics[f"{band}.{of}_scale"] == pytest.approx(1, abs=1e-6)
-            assert metrics[f"{band}.{of}_pooled_scale"] == pytest.approx(1, abs=1e-6)
-            assert metrics[f"{band}.{of}_median_error"] < 1e-6
-            assert metrics[f"{band}.{of}_p99_error"] < 1e-5
+        for variable in ("code", "camera"):
+            assert metrics[f"{band}.{variable}_cosine"] == pytest.approx(1, abs=1e-9)
+            assert metrics[f"{band}.{variable}_pooled_cosine"] == pytest.approx(1, abs=1e-9)
+            assert metrics[f"{band}.{variable}_scale"] == pytest.approx(1, abs=1e-6)
+            assert metrics[f"{band}.{variable}_pooled_scale"] == pytest.approx(1, abs=1e-6)
+            assert metrics[f"{band}.{variable}_median_error"] < 1e-6
+            assert metrics[f"{band}.{variable}_p99_error"] < 1e-5
 
 
 def test_the_gradient_of_colours_is_exact_towards_shape_camera_and_texture(exact):
     metrics = exact.record.metrics
     assert metrics["colour.pixels"] >= SETTINGS.pixels - 3
-    for of in ("code", "camera", "texture"):
-        assert metrics[f"colour.{of}_pooled_cosine"] == pytest.approx(1, abs=1e-6)
-        assert metrics[f"colour.{of}_pooled_scale"] == pytest.approx(1, abs=1e-5)
-        assert metrics[f"colour.{of}_median_error"] < 1e-5
+    for variable in ("code", "camera", "texture"):
+        assert metrics[f"colour.{variable}_pooled_cosine"] == pytest.approx(1, abs=1e-6)
+        assert metrics[f"colour.{variable}_pooled_scale"] == pytest.approx(1, abs=1e-5)
+        assert metrics[f"colour.{variable}_median_error"] < 1e-5
 
 
 def test_away_from_the_outline_the_gradient_of_hits_is_that_of_the_image():
@@ -73,8 +73,8 @@ def test_away_from_the_outline_the_gradient_of_hits_is_that_of_the_image():
     numbers = {}
     for name, renderer in (("idr", EXACT["idr"]), ("dist", load("renderer", "dist", epsilon=1e-9, steps=600))):
         subject = Subject(renderer, prior.decoder, prior.codes[0], camera, Counts())
-        found = SETTINGS._evaluate_outline(subject, torch.arange(5, 40), torch.eye(3).double())
-        numbers[name] = {key.removeprefix("silhouette."): value for key, value in found.items()}
+        result = SETTINGS._evaluate_outline(subject, torch.arange(5, 40), torch.eye(3).double())
+        numbers[name] = {key.removeprefix("silhouette."): value for key, value in result.items()}
     assert numbers["idr"]["image_cosine"] == pytest.approx(1, abs=1e-6)
     assert numbers["idr"]["image_scale"] == pytest.approx(1, abs=1e-3)
     assert numbers["idr"]["image_error"] < 1e-3
@@ -109,11 +109,10 @@ def test_a_band_carries_the_gradient_of_the_image_at_the_outline_and_hits_do_not
 def test_every_number_has_a_definition_and_every_definition_a_number(exact):
     assert exact.record.definitions == DEFINITIONS
     names = {name.partition(".")[::2] for name in exact.record.metrics}
-    defined = [part for key in DEFINITIONS for part in key.split(", ")]
+    defined = [name for key in DEFINITIONS for name in key.split(", ")]
     assert {band for band, _ in names} == {*BANDS, "silhouette", "colour"}
     assert all(band in DEFINITIONS["BAND"] for band, _ in names)
-    assert {number for _, number in names} == {*defined} - {"BAND"}
-    assert len(defined) == len(set(defined))
+    assert {number for _, number in names} == {*defined} - {"BAND"} and len(defined) == len(set(defined))
     evaluations = exact.record.evaluations
     assert evaluations["value"] > 10 * evaluations["gradient"] > 0
     assert exact.record.metrics["frontal.pixels"] <= evaluations["gradient"] <= 200
@@ -131,11 +130,11 @@ def test_the_scale_of_dist_is_alpha_times_the_cosine_times_the_slope(tmp_path, a
     dist = load("renderer", "dist", alpha=ALPHA, extra_step_cap=None, epsilon=1e-9, steps=600)
     metrics = judged(tmp_path, dist, plane_prior(angle, slope), camera_of(8, field_of_view=0.5)).record.metrics
     assert metrics[f"{band}.pixels"] == SETTINGS.pixels
-    for of in ("code", "camera"):
+    for variable in ("code", "camera"):
         expected = ALPHA * cos(radians(angle)) * slope
-        assert metrics[f"{band}.{of}_scale"] == pytest.approx(expected, rel=0.03)  # the angle differs by pixel
-        assert metrics[f"{band}.{of}_median_error"] == pytest.approx(abs(1 - expected), abs=0.02)
-        assert metrics[f"{band}.{of}_cosine"] == pytest.approx(1, abs=1e-6)
+        assert metrics[f"{band}.{variable}_scale"] == pytest.approx(expected, rel=0.03)  # the angle differs by pixel
+        assert metrics[f"{band}.{variable}_median_error"] == pytest.approx(abs(1 - expected), abs=0.02)
+        assert metrics[f"{band}.{variable}_cosine"] == pytest.approx(1, abs=1e-6)
     if band == "oblique":  # a plane's normals do not turn with its code: colours move as far as the points do
         assert metrics["colour.code_pooled_scale"] == pytest.approx(ALPHA * cos(radians(angle)), rel=0.03)
         assert metrics["colour.texture_pooled_scale"] == pytest.approx(1, abs=1e-5)
@@ -162,9 +161,9 @@ class Changed:
     shift: float = 0.0  # of the distance on every other ray
 
     def render(self, field: Any, rays: Rays) -> Rendering:
-        found = self.inner.render(field, rays)
+        result = self.inner.render(field, rays)
         every_other = torch.arange(rays.shape.numel()) % 2
-        return replace(found, distance=found.distance + self.shift * every_other)
+        return replace(result, distance=result.distance + self.shift * every_other)
 
     def silhouette_loss(self, *arguments: Any) -> Any:
         return self.inner.silhouette_loss(*arguments)
@@ -173,8 +172,7 @@ class Changed:
 def test_a_renderer_without_a_gradient_for_rays_has_no_camera_numbers(tmp_path):
     able = Capabilities((Kind.DISTANCE,), field_gradient=True, ray_gradient=False)
     metrics = judged(tmp_path, Changed(EXACT["idr"], able)).record.metrics
-    assert "oblique.code_cosine" in metrics
-    assert not [name for name in metrics if "camera" in name]
+    assert "oblique.code_cosine" in metrics and not [name for name in metrics if "camera" in name]
 
 
 def test_pixels_whose_hit_lies_on_another_surface_are_excluded_and_counted(tmp_path):
@@ -207,8 +205,8 @@ def test_bands_are_of_the_angle_between_ray_and_inward_normal():
     normals[0, 0] *= 1 + 1e-15  # as rounding may leave it
     hit = torch.ones(3, 3, dtype=torch.bool)
     hit[2, 1] = False
-    found = _bands(Reference(torch.ones(3, 3).double(), normals, hit), camera)
-    assert {band: pixels.tolist() for band, pixels in found.items()} == {
+    result = _bands(Reference(torch.ones(3, 3).double(), normals, hit), camera)
+    assert {band: pixels.tolist() for band, pixels in result.items()} == {
         "frontal": [0, 1], "oblique": [2, 3], "grazing": [4, 5],
     }  # fmt: skip
 
@@ -223,6 +221,5 @@ def test_the_outline_is_beside_the_outline():
 def test_pixels_are_drawn_without_repetition_and_by_the_seed():
     pixels = torch.arange(100, 200)
     first, again, other = (_draw(pixels, 30, torch.Generator().manual_seed(seed)).tolist() for seed in (0, 0, 1))
-    assert first == again != other
-    assert first == sorted(set(first)) and len(first) == 30
+    assert first == again != other and first == sorted(set(first)) and len(first) == 30
     assert _draw(pixels[:5], 30, torch.Generator()).tolist() == pixels[:5].tolist()

@@ -18,7 +18,7 @@ from datasets.mesh import extract
 from datasets.meshes import read_mesh
 from datasets.scene import Scene, Truth
 from renderers.fields.analytic import sphere
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.made_photographs import CENTRE, RADIUS, idr
 from tests.runner.driving import command, record_of
@@ -28,7 +28,7 @@ RENDERER = load("renderer", "dist")
 CAMERA = camera_of(16, angles=(0.0, 20.0))
 PRIOR = ball_prior(radius=0.5)
 SETTINGS = Multiview(
-    images=PLAINLY, longest=24, held_out=5, masks=True, focal=1.0, views_per_step=4, neighbour=1,
+    images=PHOTOGRAPHY, longest=24, held_out=5, masks=True, focal=1.0, views_per_step=4, neighbour=1,
     visible=1e-3, photometric_weight=5.0, code=CodePenalty(0.0, "sum"), start_scale=0.0,
     starts=1, trial=3, coarse_blur=0.0,
     scale=1.0, degrees=0.0, shift=0.0, similarity=False, rotations=2,
@@ -47,30 +47,29 @@ def problem_of(scene, **changed):
     return replace(SETTINGS, **changed).problem(scene, PRIOR, RENDERER, seed=0, device=CPU)
 
 
-def given(scene, **changed) -> PhotometricLoss:
+def overrides(scene, **changed) -> PhotometricLoss:
     settings = replace(SETTINGS, **changed)
     return PhotometricLoss(settings, RENDERER, settings.images.take(Truth(scene.mesh), CAMERA, seed=0), CPU)
 
 
 def test_the_truth_costs_least(scene):
-    photographs = given(scene)
+    photographs = overrides(scene)
     losses = [photographs.compare(sphere(radius), 0)["photometric"].item() for radius in (0.35, 0.45, 0.5, 0.55, 0.65)]
-    assert losses.index(min(losses)) == 2
-    assert losses[2] < 0.5 * min(losses[0], losses[4])
+    assert losses.index(min(losses)) == 2 and losses[2] < 0.5 * min(losses[0], losses[4])
 
 
 def test_masks_are_compared_where_their_loss_has_a_weight_and_hold_what_a_shape_leaves_free(scene):
     smaller = sphere(0.4)
-    assert set(given(scene).compare(smaller, 0)) == {"photometric"}
-    masked = given(scene, silhouette_weight=10.0)
+    assert set(overrides(scene).compare(smaller, 0)) == {"photometric"}
+    masked = overrides(scene, silhouette_weight=10.0)
     assert masked.compare(smaller, 0)["silhouette"] > 3 * masked.compare(sphere(0.5), 0)["silhouette"]
 
 
 def test_views_move_on_and_are_spread_evenly(scene):
-    photographs = given(scene)
+    photographs = overrides(scene)
     assert photographs.pairs(0) == [(0, 1), (2, 3), (4, 5), (6, 7)]
     assert photographs.pairs(3) == [(3, 4), (5, 6), (7, 0), (1, 2)]
-    assert given(scene, views_per_step=99, neighbour=2).pairs(0) == [(i, (i + 2) % 8) for i in range(8)]
+    assert overrides(scene, views_per_step=99, neighbour=2).pairs(0) == [(i, (i + 2) % 8) for i in range(8)]
 
 
 def test_it_finds_the_ball(scene):
@@ -83,8 +82,7 @@ def test_it_finds_the_ball(scene):
 
 def test_random_starts_differ_and_share_the_budget(scene):
     problem = problem_of(scene, starts=3, start_scale=1.0)
-    assert len(problem.parameters) == 3
-    assert not torch.equal(problem.codes[0], problem.codes[1])
+    assert len(problem.parameters) == 3 and not torch.equal(problem.codes[0], problem.codes[1])
     before = [code.detach().clone() for code in problem.codes]
     history = History()
     optimise(problem, OptimiserSettings(14, 0.01, "constant"), CPU, history=history, on_step=lambda line: None)
@@ -99,9 +97,9 @@ def test_random_starts_differ_and_share_the_budget(scene):
 def test_an_encoder_is_trained_once_and_gives_the_code_about_which_starts_are_drawn(tmp_path):
     prior, camera = Prior(PRIOR.decoder, 3 * PRIOR.codes), camera_of(32, angles=(0.0, 20.0))
     encoder = EncoderSettings((8,), 1, 32, 6, 4, 8, OptimiserSettings(80, 0.01, "cosine"))
-    seen = scene_of(extract(prior.decoder.at(prior.codes[0]), grid=24, reach=1.0), camera)
+    scene = scene_of(extract(prior.decoder.at(prior.codes[0]), grid=24, reach=1.0), camera)
     task = replace(SETTINGS, optimiser=OptimiserSettings(1, 1e-9, "constant"))
-    run = run_of(tmp_path, RENDERER, prior, camera, make_scene=lambda: seen)
+    run = run_of(tmp_path, RENDERER, prior, camera, make_scene=lambda: scene)
     run = altered(run, {"inputs.evaluation.points": 1000})
     task.execute(run)
     at_zero = run.record.metrics_start["chamfer_l1"]
@@ -113,8 +111,7 @@ def test_an_encoder_is_trained_once_and_gives_the_code_about_which_starts_are_dr
 def test_a_misplaced_ball_is_put_back(scene):
     problem = problem_of(scene, shift=0.1, scale=1.1, degrees=5.0)
     first = problem.similarity.clone()
-    assert first[:3].norm().item() == pytest.approx(0.1)
-    assert first[6].exp().item() == pytest.approx(1.1)
+    assert first[:3].norm().item() == pytest.approx(0.1) and first[6].exp().item() == pytest.approx(1.1)
     problem.codes[0].requires_grad_(False)  # a ball that moves could be put back by its code as well
     optimise(problem, OptimiserSettings(24, 0.02, "cosine"), CPU, history=History(), on_step=lambda line: None)
     assert problem.similarity[:3].norm() < 0.3 * first[:3].norm()
@@ -129,7 +126,7 @@ def test_a_similarity_is_sought_in_place_where_that_is_asked_for(scene):
 
 
 def test_coarse_images_come_first(scene):
-    photographs = given(scene, coarse_blur=0.0625)
+    photographs = overrides(scene, coarse_blur=0.0625)
     roughness = [photographs.images_at(i).diff(dim=1).abs().mean().item() for i in (0, 8, 15, 29)]
     assert roughness[0] < roughness[1] < roughness[2] == roughness[3]
     assert torch.equal(photographs.images_at(15), photographs.colours)
@@ -149,10 +146,10 @@ def test_blurring_keeps_what_is_constant_and_the_mean():
 
 def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
     with pytest.raises(CannotContinue, match="no point of the shape is seen by two neighbouring views"):
-        level = replace(PLAINLY, views=2).take(Truth(scene.mesh), camera_of(32), seed=0)  # from opposite sides
+        level = replace(PHOTOGRAPHY, views=2).take(Truth(scene.mesh), camera_of(32), seed=0)  # from opposite sides
         PhotometricLoss(SETTINGS, RENDERER, level, CPU).compare(sphere(0.5), 0)
     with pytest.raises(CannotContinue):
-        given(scene).compare(sphere(1e-3, (0.0, 0.0, 0.9)), 0)
+        overrides(scene).compare(sphere(1e-3, (0.0, 0.0, 0.9)), 0)
 
 
 @each("changed", [{"neighbour": 8}, {"scale": 1.5}, {"shift": 0.5}, {"starts": 10}])
@@ -170,8 +167,7 @@ def test_a_linear_image_is_sampled_exactly_and_nothing_outside_is_read():
         inside, (pixels[:, 0] >= 0.5) & (pixels[:, 0] <= 7.5) & (pixels[:, 1] >= 0.5) & (pixels[:, 1] <= 5.5)
     )
     expected = 2 * pixels[:, 0] + 3 * pixels[:, 1] + 1
-    assert torch.allclose(colours[inside, 0], expected[inside], atol=1e-4)
-    assert (colours[~inside] == 0).all()
+    assert torch.allclose(colours[inside, 0], expected[inside], atol=1e-4) and (colours[~inside] == 0).all()
     assert not sample(image, torch.tensor([[float("nan"), 1.0]]))[1].any()
 
 
@@ -183,19 +179,21 @@ def test_gradients_reach_the_pixels():
 
 def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is_put_there(tmp_path):
     idr(tmp_path)
-    given = ("task=multiview", "dataset=photos", f"dataset.path={tmp_path}", "scale=smoke", "threads=1")
-    said = command(*given, f"results_dir={tmp_path}").err
-    assert "set prior.of=sofa" in said and "none with task=reconstruction" in said and "depth image" not in said
-    encoded = command(*given, "+method=multiview_encoder", "prior.of=car", f"results_dir={tmp_path}")
+    overrides = ("task=multiview", "dataset=photos", f"dataset.path={tmp_path}", "scale=smoke", "threads=1")
+    message = command(*overrides, f"results_dir={tmp_path}").err
+    assert (
+        "set prior.of=sofa" in message and "none with task=reconstruction" in message and "depth image" not in message
+    )
+    encoded = command(*overrides, "+method=multiview_encoder", "prior.of=car", f"results_dir={tmp_path}")
     assert "take +method=multiview_dist" in encoded.err
     small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=40", "evaluation.grid=24")
-    done = command(*given, *small, "prior.of=car", "isolation=off", f"results_dir={tmp_path}")
-    record, folder = record_of(done.out), Path(done.out.splitlines()[-1])
+    result = command(*overrides, *small, "prior.of=car", "isolation=off", f"results_dir={tmp_path}")
+    record, folder = record_of(result.out), Path(result.out.splitlines()[-1])
     assert record["metrics"]["mask_iou"] > record["metrics_start"]["mask_iou"]
-    found = np.loadtxt(folder / "to_world.txt")
-    radius = np.linalg.norm(found[:3, 0]) * HULL_RADIUS
-    assert found[:3, 3] == pytest.approx(CENTRE, abs=0.1 * RADIUS) and 1 < radius / RADIUS < 1.3
-    assert found[:3, 1] / np.linalg.norm(found[:3, 1]) == pytest.approx([0.0, 1.0, 0.0], abs=0.03)
+    to_world = np.loadtxt(folder / "to_world.txt")
+    radius = np.linalg.norm(to_world[:3, 0]) * HULL_RADIUS
+    assert to_world[:3, 3] == pytest.approx(CENTRE, abs=0.1 * RADIUS) and 1 < radius / RADIUS < 1.3
+    assert to_world[:3, 1] / np.linalg.norm(to_world[:3, 1]) == pytest.approx([0.0, 1.0, 0.0], abs=0.03)
     vertices = read_mesh(folder / "mesh_world.ply").vertices - CENTRE
     assert np.abs(vertices.mean(axis=0)).max() < 0.3 * RADIUS and np.linalg.norm(vertices, axis=1).max() < 1.5 * RADIUS
     assert (folder / "summary.png").is_file() and (folder / "curve.png").is_file()

@@ -64,20 +64,18 @@ def test_the_error_of_a_turn_is_its_angle_and_that_of_a_shift_its_length(angle):
 
 
 def test_the_first_start_is_off_by_what_is_asked_and_others_are_turned_from_it():
-    given, *others = START.cameras(CAMERA, seed=4)
-    rotation, _ = pose_error(given, CAMERA)
+    first, *others = START.cameras(CAMERA, seed=4)
+    rotation, _ = pose_error(first, CAMERA)
     assert rotation == pytest.approx(20.0, abs=1e-2)
     steep, shift = pose_error(replace(START, degrees=170.0).cameras(CAMERA, seed=4)[0], CAMERA)
-    assert (steep, shift) == pytest.approx((170.0, 0.1), abs=1e-2)
-    assert len(others) == 2
+    assert (steep, shift) == pytest.approx((170.0, 0.1), abs=1e-2) and len(others) == 2
     for other in others:
-        rotation, translation = pose_error(other, given)
-        assert 0 < rotation <= 40.0
-        assert translation == pytest.approx(0.0, abs=1e-5)
+        rotation, translation = pose_error(other, first)
+        assert 0 < rotation <= 40.0 and translation == pytest.approx(0.0, abs=1e-5)
     again = START.cameras(CAMERA, seed=4)
     assert torch.equal(again[2].world_to_camera, others[1].world_to_camera)
     alone = replace(START, starts=1).cameras(CAMERA, seed=4)
-    assert torch.equal(alone[0].world_to_camera, given.world_to_camera)  # more starts change nothing of the first
+    assert torch.equal(alone[0].world_to_camera, first.world_to_camera)  # more starts change nothing of the first
 
 
 def test_success_needs_both_errors_to_be_small():
@@ -90,8 +88,7 @@ def test_success_needs_both_errors_to_be_small():
 def test_the_true_pose_costs_nearly_nothing(scene):
     terms = problem_of(scene, degrees=0.0, shift=0.0, normal_weight=1.0).loss(0)
     off = problem_of(scene, normal_weight=1.0).loss(0)
-    assert terms["depth"] < 0.1 * off["depth"]
-    assert terms["normals"] < 0.1 * off["normals"]
+    assert terms["depth"] < 0.1 * off["depth"] and terms["normals"] < 0.1 * off["normals"]
     assert terms["total"] < 0.3 * off["total"]  # a pixel at an edge is off by a part of it
 
 
@@ -112,14 +109,11 @@ def test_it_finds_the_pose_and_leaves_a_record(run):
     record = run.record
     assert record.status is RunStatus.OK, record.reason
     assert record.metrics_start["rotation_error_deg"] == pytest.approx(12.0, abs=0.01)
-    assert record.metrics["rotation_error_deg"] < 3.0
-    assert record.metrics["success"] == 1.0
-    assert record.metrics["mask_iou"] > 0.93
-    assert set(record.metrics) <= set(record.definitions)
+    assert record.metrics["rotation_error_deg"] < 3.0 and record.metrics["success"] == 1.0
+    assert record.metrics["mask_iou"] > 0.93 and set(record.metrics) <= set(record.definitions)
     assert record.evaluations["value"] > 0 and record.evaluations["gradient"] > 0
     lines = curve_of(run.folder)
-    assert len(lines) == 40
-    assert {"depth", "silhouette", "total"} <= set(lines[0])
+    assert len(lines) == 40 and {"depth", "silhouette", "total"} <= set(lines[0])
     assert (run.folder / "strip.png").stat().st_size > 1000
 
 
@@ -158,21 +152,18 @@ def test_closest_points_find_a_near_pose(run, method):
     replace(ICP, method=method).execute(run)
     assert run.record.status is RunStatus.OK
     assert run.record.metrics_start["rotation_error_deg"] == pytest.approx(12.0, abs=0.01)
-    assert run.record.metrics["rotation_error_deg"] < 4.0
-    assert run.record.evaluations["value"] == 0
+    assert run.record.metrics["rotation_error_deg"] < 4.0 and run.record.evaluations["value"] == 0
     assert run.record.seconds["forward"] > 0
 
 
 def test_the_points_of_the_true_camera_lie_on_the_surface(scene):
     points = world_points(scene.view, CAMERA)
-    assert len(points) == int(scene.view.mask.sum())
-    assert box(SIZES)(points).abs().max() < 1e-4
+    assert len(points) == int(scene.view.mask.sum()) and box(SIZES)(points).abs().max() < 1e-4
 
 
 def test_points_that_never_come_near_are_told(run):
     replace(ICP, shift=3.0, reach=(1e-3,)).execute(run)
-    assert run.record.status is RunStatus.NOT_REACHED
-    assert run.record.metrics["success"] == 0.0
+    assert run.record.status is RunStatus.NOT_REACHED and run.record.metrics["success"] == 0.0
 
 
 @each(

@@ -26,7 +26,7 @@ from datasets.scene import Scene, sample_surface
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
@@ -36,7 +36,7 @@ from tests.tiny import Blind, altered, ball_prior, camera_of, curve_of, icospher
 
 PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")
 SETTINGS = Reconstruction(
-    images=replace(PLAINLY, places="sphere", views=7, texture_size=1.0),
+    images=replace(PHOTOGRAPHY, places="sphere", views=7, texture_size=1.0),
     longest=24,
     held_out=4,
     masks=True,
@@ -127,10 +127,10 @@ def test_photographs_on_disk_are_learnt(tmp_path, masks, margin):
     assert ("mask_iou" in record.metrics) == (masks != "none")
     assert not {"chamfer_l1", "seen_chamfer_l1"} & set(record.metrics)
     colours = assert_coloured_mesh(tmp_path)
-    there, back = (trimesh.load_mesh(tmp_path / f"mesh{name}.ply", process=False) for name in ("", "_world"))
+    in_scene, back = (trimesh.load_mesh(tmp_path / f"mesh{name}.ply", process=False) for name in ("", "_world"))
     to_world = np.loadtxt(tmp_path / "to_world.txt")
-    np.testing.assert_allclose(back.vertices, there.vertices @ to_world[:3, :3].T + to_world[:3, 3], rtol=1e-12)
-    assert (back.visual.vertex_colors == there.visual.vertex_colors).all()
+    np.testing.assert_allclose(back.vertices, in_scene.vertices @ to_world[:3, :3].T + to_world[:3, 3], rtol=1e-12)
+    assert (back.visual.vertex_colors == in_scene.visual.vertex_colors).all()
     assert any(", ".join(str(float(value)) for value in to_world[:3, 3]) in note for note in record.notes)
     assert masks == "none" or colours[:, 0].mean() > colours[:, 2].mean() + 15  # the ball is orange
     assert all((tmp_path / name).is_file() == (masks == "none") for name in PICTURES)
@@ -146,18 +146,17 @@ def test_fields_of_each_kind_are_learnt_by_renderers_that_take_them(scene, tmp_p
     line = curve_of(tmp_path)[0]
     terms = {"colour", "colour_gradient", "depth", "silhouette", "smoothness", "normals"}
     assert terms < set(line) and ("eikonal" in line) == (field != "occupancy_32")
-    assert record.evaluations["observed"] > 100
-    assert not list(tmp_path.glob("*.png"))
+    assert record.evaluations["observed"] > 100 and not list(tmp_path.glob("*.png"))
 
 
 def test_a_guide_reaches_the_loss_of_occupancy(scene, tmp_path):
     run = run_in(tmp_path, scene, renderer="dvr", field="occupancy_16")
-    for guide, known in (("none", None), ("hull", True), ("given", True)):
+    for guide, has_guide in (("none", None), ("hull", True), ("given", True)):
         settings = replace(SETTINGS, guide=guide, depths=Depths("dense", 0.0))
         problem = settings.problem(run.inputs.field.name, settings.subject(run.inputs), run)
-        found = problem.stack.pixels.guide
-        assert (found is None) == (known is None)
-        assert found is None or 0.05 < found.isfinite().float().mean() < 0.6
+        stored_guide = problem.stack.pixels.guide
+        assert (stored_guide is None) == (has_guide is None)
+        assert stored_guide is None or 0.05 < stored_guide.isfinite().float().mean() < 0.6
     with pytest.raises(BadInput, match="the visual hull needs a mask"):
         executed(run, guide="hull", masks=False)
 
@@ -188,8 +187,8 @@ def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
     ball(RADIUS, CENTRE).save(truth) if kind == "mesh" else trimesh.PointCloud(points).export(truth)
     if kind == "pieces":
         truth = folder(tmp_path, kind)
-        for place, faces in enumerate(np.array_split(ball(RADIUS, CENTRE).faces, 3)):
-            Mesh(ball(RADIUS, CENTRE).vertices, faces).compact().save(truth / f"{place}.ply")
+        for index, faces in enumerate(np.array_split(ball(RADIUS, CENTRE).faces, 3)):
+            Mesh(ball(RADIUS, CENTRE).vertices, faces).compact().save(truth / f"{index}.ply")
     if kind == "dtu":
         write_dtu(truth.with_suffix(""), points, plane=(0, 0, 1, 0), centre=CENTRE)
     truth = truth if kind != "dtu" else truth.with_suffix("")
@@ -236,18 +235,22 @@ def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
     assert name in ("network_1x8", "network_2x16") and record.metrics["fields_tried"] == 2
     assert any(note.startswith(f"field=auto: {name}, ") for note in record.notes)
     assert record.seconds["trials"] > 0 and record.metrics["field_overhead"] > 1
-    known = {part for key in record.definitions for part in key.split(", ")}
-    assert set(record.metrics) <= known
+    defined = {name for key in record.definitions for name in key.split(", ")}
+    assert set(record.metrics) <= defined
     named = executed(without_pictures(run_in(folder(tmp_path, "named"), scene, field=name)))
-    assert named.metrics["psnr"] == record.metrics["psnr"]
-    assert named.evaluations == record.evaluations
+    assert named.metrics["psnr"] == record.metrics["psnr"] and named.evaluations == record.evaluations
 
 
 def test_a_command_learns_photographs(tmp_path):
     nerf(tmp_path)
-    given = ("dataset=photos", f"dataset.path={tmp_path}", "dataset.masks=false", f"results_dir={tmp_path / 'results'}")
+    overrides = (
+        "dataset=photos",
+        f"dataset.path={tmp_path}",
+        "dataset.masks=false",
+        f"results_dir={tmp_path / 'results'}",
+    )
     small = (*SMALLEST, "task.optimiser.iterations=4", "task.rays=64", "field=grid_8", "task.longest=16")
-    code, out, err = command(*given, "task=reconstruction", "renderer=idr", *small)
+    code, out, err = command(*overrides, "task=reconstruction", "renderer=idr", *small)
     assert code == 0 or "did not fall" in err, err
     record = record_of(out)
     assert record["scene"] == tmp_path.name and record["task"] == "reconstruction"

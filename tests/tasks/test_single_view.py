@@ -29,7 +29,7 @@ from renderers.silhouette import Own
 from tests.looped import each
 from tests.reconstruct.test_losses import PAINT, Ball, shot_of
 from tests.runner.driving import CommandResult, command, record_of
-from tests.single_view.test_training import SAMPLER, Balls, images  # noqa: F401, a fixture
+from tests.single_view.test_training import SAMPLER, Spheres, images  # noqa: F401, a fixture
 from tests.tiny import ball_prior, camera_of, curve_of, run_of, silent
 
 TINY = (
@@ -61,18 +61,18 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def network(folder) -> Path:
-    done = trained(*TINY, f"results_dir={folder}")
-    assert done.code == 0, done.err
-    return Path(done.out.splitlines()[-1])
+    result = trained(*TINY, f"results_dir={folder}")
+    assert result.code == 0, result.err
+    return Path(result.out.splitlines()[-1])
 
 
 def test_it_is_trained_and_gives_a_shape_with_colours(folder, network):
     assert network.parent == folder / "priors" and network.is_file()
-    done = command(*TINY, f"results_dir={folder}")
-    assert done.code == 0, done.err
-    record, run = record_of(done.out), Path(done.out.splitlines()[-1])
-    known = {part for key in DEFINITIONS for part in key.split(", ")}
-    assert {"iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr"} < set(record["metrics"]) <= known
+    result = command(*TINY, f"results_dir={folder}")
+    assert result.code == 0, result.err
+    record, run = record_of(result.out), Path(result.out.splitlines()[-1])
+    defined = {name for key in DEFINITIONS for name in key.split(", ")}
+    assert {"iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr"} < set(record["metrics"]) <= defined
     assert set(record["metrics_start"]) == set(record["metrics"])
     assert any(
         note.startswith("the network was trained on 3 shapes of sphere, 3 images each, for 4 steps")
@@ -95,20 +95,20 @@ def test_a_run_trains_its_network_where_it_is_asked_to_and_judges_no_colours_tha
 
 
 def test_without_its_network_it_names_the_command(tmp_path):
-    done = command(*TINY, f"results_dir={tmp_path}")
-    assert done.code == 2
-    assert "no network was trained for sphere with these settings: add task.train=true" in done.err
+    result = command(*TINY, f"results_dir={tmp_path}")
+    assert result.code == 2
+    assert "no network was trained for sphere with these settings: add task.train=true" in result.err
     assert not list((tmp_path / "runs").glob("*"))
 
 
 def test_the_code_of_the_prior_is_found_by_the_mask(tmp_path):
-    small = [one for one in TINY[1:] if not one.startswith(("task.training", "dataset"))]
+    small = [override for override in TINY[1:] if not override.startswith(("task.training", "dataset"))]
     small += ["dataset=sofa", "task.search.optimiser.iterations=8", f"results_dir={tmp_path}"]
-    done = command("+method=single_view_code", *small)
-    assert done.code == 0, done.err
-    record = record_of(done.out)
+    result = command("+method=single_view_code", *small)
+    assert result.code == 0, result.err
+    record = record_of(result.out)
     assert 0 < record["metrics"]["iou"] <= 1 and record["evaluations"]["value"] > 0
-    assert len(curve_of(Path(done.out.splitlines()[-1]))) == 8
+    assert len(curve_of(Path(result.out.splitlines()[-1]))) == 8
 
 
 @each("factor, radius", [(0.8, 0.4), (1.25, 0.625)])
@@ -155,12 +155,11 @@ def picture(images, tmp_path_factory) -> Path:  # noqa: F811
 
 
 def test_a_picture_of_ones_own_has_a_shape(folder, network, picture):
-    given = (f"task.image_path={picture.with_name('opaque.png')}", f"task.mask_path={picture.with_name('mask.png')}")
-    done = command(*TINY, *given, f"results_dir={folder}")
-    assert done.code == 0, done.err
-    record, run = record_of(done.out), Path(done.out.splitlines()[-1])
-    assert record["scene"] == "opaque.png"
-    assert set(record["metrics"]) == {"fitted_mask_iou"}
+    files = (f"task.image_path={picture.with_name('opaque.png')}", f"task.mask_path={picture.with_name('mask.png')}")
+    result = command(*TINY, *files, f"results_dir={folder}")
+    assert result.code == 0, result.err
+    record, run = record_of(result.out), Path(result.out.splitlines()[-1])
+    assert record["scene"] == "opaque.png" and set(record["metrics"]) == {"fitted_mask_iou"}
     assert record["metrics"]["fitted_mask_iou"] > 0.7  # of 16 x 16 pixels
     assert "the network was trained on 3 shapes of sphere" in " ".join(record["notes"])
     assert (run / "mesh.ply").is_file() and (run / "summary.png").stat().st_size > 1000
@@ -168,10 +167,10 @@ def test_a_picture_of_ones_own_has_a_shape(folder, network, picture):
 
 def test_a_picture_that_changed_is_seen_anew(folder, network, picture, tmp_path):
     picture = Path(shutil.copy(picture, tmp_path))
-    given = (f"task.image_path={picture}", f"results_dir={folder}", "evaluation.picture=null")
-    assert not record_of(command(*TINY, *given).out)["reused"]
+    files = (f"task.image_path={picture}", f"results_dir={folder}", "evaluation.picture=null")
+    assert not record_of(command(*TINY, *files).out)["reused"]
     Image.open(picture).rotate(90).save(picture)
-    assert not record_of(command(*TINY, *given).out)["reused"]
+    assert not record_of(command(*TINY, *files).out)["reused"]
 
 
 @each(
@@ -190,7 +189,7 @@ def test_a_picture_that_cannot_be_is_told(picture, image, mask, says):
 
 
 def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
-    filled = filled_fraction(torch.cat([one.masks for one in images]))
+    filled = filled_fraction(torch.cat([shape.masks for shape in images]))
     sides = [max(np.ptp(np.flatnonzero(m.any(0))), np.ptp(np.flatnonzero(m.any(1)))) + 1 for m in images[1].masks]
     assert filled == pytest.approx(np.median(sides) / 16, abs=1 / 16)
     framed, doubts = read_picture(picture, None, 32, 0.5)
@@ -199,16 +198,16 @@ def test_a_picture_is_framed_as_the_images_are(picture, images):  # noqa: F811
         "the object touches the border (left): the network knows whole ones"
     ]
     rows, columns = framed[3].nonzero().T
-    for found in (rows, columns):
-        assert (found.min() + found.max()) / 2 == pytest.approx(15.5, abs=1)
-        assert np.ptp(found.numpy()) + 1 == pytest.approx(16, abs=1)
+    for indices in (rows, columns):
+        assert (indices.min() + indices.max()) / 2 == pytest.approx(15.5, abs=1)
+        assert np.ptp(indices.numpy()) + 1 == pytest.approx(16, abs=1)
     assert framed[:3, 16, 16].numpy() == pytest.approx(np.array([200, 90, 30]) / 255, abs=0.01)
     assert framed[:3, 0, 0].tolist() == [0.5] * 3
 
 
 def test_the_view_that_is_most_alike_is_that_of_the_mask():
-    mesh = Mesh(Balls().mesh(Split.TEST, 1).vertices * [1.5, 0.5, 0.8], Balls().mesh(Split.TEST, 1).faces)
-    cameras = [SAMPLER.draw(place) for place in range(6)]
+    mesh = Mesh(Spheres().mesh(Split.TEST, 1).vertices * [1.5, 0.5, 0.8], Spheres().mesh(Split.TEST, 1).faces)
+    cameras = [SAMPLER.draw(seed) for seed in range(6)]
     mask = see(Truth(mesh), cameras[4]).mask
     filled = filled_fraction(mask[None])
     camera, overlapping = best_view(mesh, cameras, mask, filled)
@@ -217,44 +216,43 @@ def test_the_view_that_is_most_alike_is_that_of_the_mask():
 
 @pytest.mark.parametrize("method", ["mean", "nearest"])
 def test_rows_without_a_network_are_judged_alike(folder, method):
-    small = [one for one in TINY[1:] if not one.startswith(("task.training", "task.shapes"))]
+    small = [override for override in TINY[1:] if not override.startswith(("task.training", "task.shapes"))]
     few = ("task.shapes=3", "evaluation.picture=null", f"results_dir={folder}")
-    done = command(f"+method=single_view_{method}", *small, *few)
-    assert done.code == 0, done.err
-    record = record_of(done.out)
+    result = command(f"+method=single_view_{method}", *small, *few)
+    assert result.code == 0, result.err
+    record = record_of(result.out)
     assert {"iou", "chamfer_l1", "mask_iou", "psnr"} < set(record["metrics"])
-    assert 0 < record["metrics"]["iou"] <= 1
-    assert "no network and no renderer took part" in record["notes"]
+    assert 0 < record["metrics"]["iou"] <= 1 and "no network and no renderer took part" in record["notes"]
     assert any(note.startswith("training shape ") for note in record["notes"]) == (method != "mean")
     assert read_records(folder)[1] == []
 
 
 def test_the_nearest_image_and_the_best_shape_are_those_of_the_same_shape(images):  # noqa: F811
-    for place, one in enumerate(images):
-        assert most_similar_shape(one.image(1), images) == place
-        assert most_similar_shape((one.image(2) + 0.01).clamp(0, 1), images) == place
-        assert best_shape(Balls().mesh(Split.TEST, place), Balls(), 3) == place
+    for index, shape in enumerate(images):
+        assert most_similar_shape(shape.image(1), images) == index
+        assert most_similar_shape((shape.image(2) + 0.01).clamp(0, 1), images) == index
+        assert best_shape(Spheres().mesh(Split.TEST, index), Spheres(), 3) == index
 
 
 def test_the_nearest_image_is_one_image_and_no_mean_over_a_shape(images):  # noqa: F811
-    """Of two shapes one has the very image beside others that differ, the other has all of them a little off."""
-    one = images[0]
-    given, colours = one.image(0), one.colours[:1]
-    same = replace(one, masks=one.masks[:1].repeat(3, 1, 1))
+    """The first shape has the exact image among different ones. All images of the second differ slightly."""
+    shape = images[0]
+    image, colours = shape.image(0), shape.colours[:1]
+    same = replace(shape, masks=shape.masks[:1].repeat(3, 1, 1))
     very = replace(same, colours=torch.cat([colours, torch.zeros_like(colours), torch.zeros_like(colours)]))
     near = (colours.int() + 20).clamp(0, 255).to(torch.uint8)
     all_near = replace(same, colours=near.repeat(3, 1, 1, 1))
-    assert most_similar_shape(given, [all_near, very]) == 1
+    assert most_similar_shape(image, [all_near, very]) == 1
 
 
 def test_the_mean_shape_has_the_mean_distance(tmp_path):
-    mesh = mean_shape(Balls(), 3, tmp_path, silent)
+    mesh = mean_shape(Spheres(), 3, tmp_path, silent)
     assert mesh is not None
     radii = np.linalg.norm(mesh.vertices, axis=1)
     assert radii.mean() == pytest.approx((0.35 + 0.55 + 0.8) / 3, abs=0.02)
     (kept,) = tmp_path.glob("mean-*.safetensors")
     changed = kept.stat().st_mtime_ns
-    mean_shape(Balls(), 3, tmp_path, silent)
+    mean_shape(Spheres(), 3, tmp_path, silent)
     assert kept.stat().st_mtime_ns == changed
-    mean_shape(Balls(), 2, tmp_path, silent)
+    mean_shape(Spheres(), 2, tmp_path, silent)
     assert len(list(tmp_path.glob("mean-*.safetensors"))) == 2

@@ -57,8 +57,7 @@ CLOSED_FORM = {  # axis and reason: renderer, and where it must break
 def test_the_breakdown_is_that_of_the_closed_form(tmp_path, case):
     renderer, severity = CLOSED_FORM[case]
     metrics = run(tmp_path, case[0], renderer)
-    assert within(case[0], metrics, severity)
-    assert metrics["trials"] <= metrics["grid_trials"] / 2
+    assert within(case[0], metrics, severity) and metrics["trials"] <= metrics["grid_trials"] / 2
     once = stress_named(case[0]).repeats == 1  # trial per level, which gives no interval
     assert (metrics["level_low"] is None) == (metrics["grid_trials"] == SEARCH.levels) == once
 
@@ -71,8 +70,7 @@ def test_an_exception_of_a_trial_is_a_failure_and_the_search_continues(tmp_path)
             return super().render(field, rays)
 
     metrics = run(tmp_path, "far_camera", Fragile(**vars(load("renderer", "idr"))))
-    assert within("far_camera", metrics, 50.0)
-    assert metrics["failed_crashed"] >= 3
+    assert within("far_camera", metrics, 50.0) and metrics["failed_crashed"] >= 3
     lines = curve_of(tmp_path)
     assert {line["message"] for line in lines if not line["success"]} == {"RuntimeError: too far"}
 
@@ -109,9 +107,9 @@ def test_success_that_rises_with_severity_is_noted(tmp_path):
     stress = stress_named("gap")
     turned = replace(stress, sweep=replace(stress.sweep, mild=stress.sweep.severe, severe=stress.sweep.mild))
     few = SearchSettings(levels=5, repeats=2)
-    for asked, doubted in ((stress, False), (turned, True)):
+    for used_stress, doubted in ((stress, False), (turned, True)):
         run = run_of(tmp_path, load("renderer", "idr"), ball_prior(), camera_of(8))
-        Stability(asked, few, few, CRITERIA, SHORT, 32, Limits(1e8, 8)).execute(run)
+        Stability(used_stress, few, few, CRITERIA, SHORT, 32, Limits(1e8, 8)).execute(run)
         assert any(note.startswith("success does not fall with severity") for note in run.record.notes) is doubted
 
 

@@ -15,12 +15,12 @@ from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
 from datasets.captures.hull import hull_mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
-from tests.datasets.test_photographs import PLAINLY
+from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.tasks.test_reconstruction import assert_coloured_mesh, run_in, scene  # noqa: F401, a fixture
 from tests.tiny import altered
 
 SHARED = {
-    "images": replace(PLAINLY, places="sphere", views=9),
+    "images": replace(PHOTOGRAPHY, places="sphere", views=9),
     "longest": 24,
     "held_out": 4,
     "masks": True,
@@ -28,9 +28,9 @@ SHARED = {
 }
 HULL = Hull(**SHARED, samples=32)
 POISSON = Poisson(**SHARED | {"depths": Depths("dense", 0.0)}, fusing=Fusing(5, 0.0))
-NEAR = replace(PLAINLY, views=18, texture_size=0.15)  # on a circle, 20 degrees apart
+TOLERANCE = replace(PHOTOGRAPHY, views=18, texture_size=0.15)  # on a circle, 20 degrees apart
 STEREO = Stereo(
-    **SHARED | {"images": NEAR, "longest": 48, "held_out": 9}, matching=Matching(1, 30.0), fusing=Fusing(5, 0.0)
+    **SHARED | {"images": TOLERANCE, "longest": 48, "held_out": 9}, matching=Matching(1, 30.0), fusing=Fusing(5, 0.0)
 )
 TASKS = {"hull": HULL, "poisson": POISSON, "stereo": STEREO}
 SEEN_AS = {"colours": (8, 8, 3), "normals": (8, 8, 3), "hit": (8, 8)}  # at the size of pictures
@@ -56,8 +56,10 @@ def test_a_surface_has_colours_metrics_and_pictures_and_no_evaluations(scene, tm
     )
     assert assert_coloured_mesh(tmp_path).std(axis=0).max() > 5
     count, size = task.images.views, task.longest
-    found = f"{count} rendered photographs of {size} x {size} pixels; {-(-count // task.held_out)} of them are held out"
-    assert {found, "no renderer took part"} <= set(record.notes)
+    summary = (
+        f"{count} rendered photographs of {size} x {size} pixels; {-(-count // task.held_out)} of them are held out"
+    )
+    assert {summary, "no renderer took part"} <= set(record.notes)
     for picture in ("summary.png", "input.png"):
         assert (tmp_path / picture).stat().st_size > 2000
     with np.load(tmp_path / "images.npz") as arrays:
@@ -107,9 +109,9 @@ def test_points_of_another_program_are_read_in_the_cameras_world(scene, tmp_path
     header = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n" + "".join(f"property float {x}\n" for x in "xyz")
     file.write_text(header + "end_header\n" + "".join(f"{x} {y} {z}\n" for x, y, z in lines))
     task = replace(POISSON, cloud=str(file))
-    found = task.surface(replace(subject, to_world=to_world))
-    assert found is not None and found.volume == pytest.approx(subject.truth.volume, rel=0.1)  # turned outward
-    assert Truth(subject.truth).distance(found.vertices).mean() < 0.02
+    surface = task.surface(replace(subject, to_world=to_world))
+    assert surface is not None and surface.volume == pytest.approx(subject.truth.volume, rel=0.1)  # turned outward
+    assert Truth(subject.truth).distance(surface.vertices).mean() < 0.02
     kept = np.concatenate([cloud.points for cloud in measured_clouds(str(file), replace(subject, to_world=to_world))])
     assert 7900 < len(kept) <= 8000 and kept[:, 1].max() < 0.85  # that beside the visual hull is left out
     with pytest.raises(BadInput, match=r"nothing of task\.cloud=.* lies in the unit sphere"):
