@@ -31,7 +31,7 @@ class Newton:
     Needs: a distance or a bound inside the sphere; a trained network is close enough to one. If a distance is steeper,
         its values are divided by its typical slope (`tracer.SlopeNormalised`); the values of a bound never are. The
         field's gradient towards points by automatic differentiation, even if no gradient is needed.
-    Deviates from the paper: there is none. It may miss: parts at most 1.5 `unseen` long on a ray, if the field is a
+    Deviates from the paper: it has no paper. It may miss: parts at most 1.5 `unseen` long on a ray, if the field is a
         distance; on rays of the dense search, parts thinner than the spacing of its samples, unless next to the
         smallest one; in an image, parts at the edge of the sphere, in front of where the coarse ray enters it. A ray
         that passes an edge closer than `march_epsilon` may hit it. `residual` is the value before the last step. With

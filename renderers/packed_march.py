@@ -1,6 +1,6 @@
 """A march that stops at the surface, or right behind it: if the field's magnitude is small, or its sign changes.
 
-The marching rays are rows of one table, so that a step costs few operations. Nothing here builds a graph; `newton.py`
+The marching rays are rows of one table, so that a step costs few operations. Nothing here builds a graph; `tracer.py`
 finds the surface from where the rays stopped.
 """
 

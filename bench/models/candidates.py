@@ -220,7 +220,7 @@ def _cluster_box(cluster: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) ->
 
 
 def _near_points(points: Float[Tensor, "n 3"], cell: float, resolution: int) -> Int[Tensor, " m"]:
-    """Indices of a grid's samples within `BAND` cells of a point, along each axis."""
+    """Indices of a grid's samples within `BAND_CELLS` cells of a point, along each axis."""
     reach = int(BAND_CELLS)
     steps = torch.arange(1 - reach, reach + 1, device=points.device)
     offsets = torch.cartesian_prod(steps, steps, steps)

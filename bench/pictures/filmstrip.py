@@ -32,7 +32,7 @@ class Shown:
     Args:
         view: with the mask for the comparison of silhouettes.
         colours: of all pixels.
-        masked: False where the mask is not known.
+        has_mask: whether the mask is known.
     """
 
     view: View

@@ -19,7 +19,7 @@ from bench.records.record import digest, row_name
 from bench.runner.job import reason_of
 from bench.runner.process import run_in_child
 
-# Statuses of runs that ended early.
+# Statuses of runs whose duration says nothing about similar runs.
 STATUSES_WITHOUT_DURATION = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 MAX_SIMILAR_RUNS, MAX_RECORDS_READ = 100, 300  # per group of similar runs
 LOCAL_EXECUTORS = ("basic", "workers")  # they run on this machine

@@ -60,7 +60,7 @@ class CodeProblem:
     Args:
         prior: has the unknown code.
         penalty: on the code.
-        compare: returns the weighted terms of the loss of a counted field at an iteration.
+        compare: returns the weighted terms of the loss of a field at an iteration.
         observed: pixels of the scene's view whose depth is observed.
         rays_per_iteration: number of rays.
         device: of all tensors.
@@ -68,7 +68,7 @@ class CodeProblem:
         initial_similarities: one per start, see `renderers.field.Moved`; None does not move the shape.
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the observed photographs, for pictures.
-        comparison_iteration: iteration whose settings the first and last loss use; None: each its own settings.
+        comparison_iteration: iteration whose settings the first and last loss use; None: each has the settings of its own iteration.
         progress_measure: returns the number of a field that must decrease; None: the loss must.
         mask, coloured: whether a mask and colours are observed, for pictures.
     """

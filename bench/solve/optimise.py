@@ -149,8 +149,8 @@ def optimise(
         device: synchronised when the clock is read.
         history: an empty one, filled during the loop, so that it is complete if the loop is stopped. A loss that
             becomes NaN or diverges ends the loop and sets the status. No step is taken if the loss is NaN.
-        least_reference: lower bound of the first loss in the divergence test, for starts that are almost correct.
         on_step: receives each line of the curve and may extend it. Its time and memory are not counted.
+        least_reference: lower bound of the first loss in the divergence test, for starts that are almost correct.
     """
     optimiser = _Adam(problem.parameters)
     history.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())

@@ -326,7 +326,7 @@ class Workbench:
             self._step(limits.watch(field, self.device, "a step"), self.rays, self.mask)
 
     def renderings(self, repeats: int, suffix: str = "") -> None:
-        """Times renderings without gradient; `of` names the renderer where a limit is reached."""
+        """Times renderings without gradient; `suffix` names the renderer if a limit is reached."""
 
         def work(field: Field) -> float:
             with torch.no_grad():

@@ -24,7 +24,7 @@ from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
 MEASURED, EXACT = "measured", "exact"
-HELD_OUT_FRACTION = 0.2  # a field without a prior does not learn from these observations, chosen by tiles of the view
+HELD_OUT_FRACTION = 0.2  # held out from a fit without a prior, by tiles of the view
 
 
 @dataclass(frozen=True)
