@@ -68,7 +68,8 @@ class CodeProblem:
         initial_similarities: one per start, see `renderers.field.Moved`; None does not move the shape.
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the observed photographs, for pictures.
-        comparison_iteration: iteration whose settings the first and last loss use; None: each has the settings of its own iteration.
+        comparison_iteration: iteration whose settings the first and last loss use; None: each has the settings of its
+            own iteration.
         progress_measure: returns the number of a field that must decrease; None: the loss must.
         mask, coloured: whether a mask and colours are observed, for pictures.
     """

@@ -140,8 +140,8 @@ CLAIMS = (
     ),
     Claim(
         "DIST, Fig. 12", "a wrong initial rotation is corrected (our test: 20 degrees)", None, "fig12",
-        "multiview_paper", "multiview_paper", "chamfer_gt_to_pred", NO_LARGER, {**FIG12, "task.degrees": 20.0},
-        FIG12,
+        "multiview_paper", "multiview_paper", "chamfer_gt_to_pred", NO_LARGER,
+        {**FIG12, "task.similarity": False, "task.degrees": 20.0}, FIG12,  # a misplaced run always optimises it
     ),
     Claim(
         "DIST, Sec. 4.2", "DIST generalises to another data set and to real photographs",
