@@ -186,7 +186,7 @@ def first_arguments(command: Command, placeholder_paths: dict[str, str]) -> list
     "command", [c for c in COMPOSED if c.module == "bench" and not re.search("NAME|plan=true", str(c))], ids=str
 )
 def test_every_command_runs(placeholder_paths, tmp_path, command):
-    if {"+method=stereo", documentation.DENSE} & set(command.words):
+    if {"+method=stereo", documentation.DENSE_DEPTHS} & set(command.words):
         pytest.importorskip("cv2", reason="stereo is an extra: pip install -e '.[stereo]'")
     fitted = {"+experiment=table1", "+experiment=gradients"} & set(command.words)
     small = SMALL_EVALUATION if "+method=single_view" in command.words else SMALL_FITTED_NETWORK if fitted else QUICK

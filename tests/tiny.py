@@ -27,7 +27,7 @@ from renderers.fields.network import FieldStatistics
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
-DISTANCE_FACTS = FieldStatistics(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, near=(1.0, 1.0, 1.0), nearly_all=1.0)
+DISTANCE_FACTS = FieldStatistics(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, (1.0, 1.0, 1.0), slope_p99=1.0)
 TRIANGLE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
 PEAK = 1e10  # operations per second of the machine in a record
 

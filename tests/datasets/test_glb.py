@@ -1,4 +1,4 @@
-"""The contents of .glb files: numbers in each encoding, with each kind of transform, for one or two tetrahedra."""
+"""What a .glb file may hold: numbers in every coding, placed in every way. Each file has one tetrahedron, or two."""
 
 import base64
 import io
@@ -22,11 +22,11 @@ CODES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
-def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), primitives=({},), **more) -> bytes:
-    """A file whose accessors are the arrays, each alone or with keys, and whose mesh has the given primitives.
+def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), parts=({},), **more) -> bytes:
+    """A file whose accessors are the arrays, each alone or with keys that it also has, and whose mesh has the parts.
 
-    Of the keys, `sparse` is a pair of indices and values, `empty` omits the array, and `stride` is in bytes. The array
-    begins at `byteOffset` in each row.
+    Of an array's keys, `sparse` is a pair of indices and values, `empty` leaves it out, and `stride` is in bytes, in
+    each row of which the array begins at `byteOffset`.
     """
     views, accessors, binary = [], [], bytearray()
 
@@ -40,8 +40,8 @@ def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), primi
         accessor = {"componentType": CODES[array.dtype.str[1:]], "count": len(array), "type": TYPES[array.shape[1:]]}
         if "sparse" in keys:
             index, values = keys["sparse"]
-            indices = {"bufferView": view(index), "componentType": CODES[index.dtype.str[1:]]}
-            accessor["sparse"] = {"count": len(index), "indices": indices, "values": {"bufferView": view(values)}}
+            places = {"bufferView": view(index), "componentType": CODES[index.dtype.str[1:]]}
+            accessor["sparse"] = {"count": len(index), "indices": places, "values": {"bufferView": view(values)}}
         if "stride" in keys:
             padded = np.zeros((len(array), keys["stride"]), np.uint8)
             start = keys.get("byteOffset", 0)
@@ -50,89 +50,83 @@ def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), primi
         elif "empty" not in keys:
             accessor["bufferView"] = view(array)
         accessors.append(accessor | {key: keys[key] for key in ("normalized", "count", "byteOffset") if key in keys})
-    stored_primitives = [{"attributes": {"POSITION": 0}, "indices": 1} | keys for keys in primitives]
+    primitives = [{"attributes": {"POSITION": 0}, "indices": 1} | part for part in parts]
     stored = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes}
-    stored |= {"meshes": [{"primitives": stored_primitives}], "accessors": accessors, "bufferViews": views}
+    stored |= {"meshes": [{"primitives": primitives}], "accessors": accessors, "bufferViews": views}
     stored |= {"buffers": [{"byteLength": len(binary)}], **more}
     return packed(stored, bytes(binary))
 
 
 def packed(stored: dict, binary: bytes) -> bytes:
-    """The file of a table of contents and binary data."""
+    """A file of a table of contents and the numbers."""
     text = json.dumps(stored).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-NORMALISED = {"normalized": True}
+SHARE = {"normalized": True}
 LARGE = (VERTICES * 32767 / 3).round().astype(np.int16)
 SMALL = ((VERTICES - 3) * 127 / 3).round().astype(np.int8)
 FLAT = np.float32([1, 1, 0]) * VERTICES
-ROTATION = Rotation.from_euler("xyz", (30, 40, 50), degrees=True)
-MOVED = {"translation": [5, 6, 7], "rotation": ROTATION.as_quat().tolist(), "scale": [2, 3, 0.5]}
+TURN = Rotation.from_euler("xyz", (30, 40, 50), degrees=True)
+MOVED = {"translation": [5, 6, 7], "rotation": TURN.as_quat().tolist(), "scale": [2, 3, 0.5]}
 MATRIX = np.eye(4)
-MATRIX[:3] = np.c_[ROTATION.as_matrix() * [2, 3, 0.5], [5, 6, 7]]
-MOVED_VERTICES = VERTICES @ MATRIX[:3, :3].T + MATRIX[:3, 3]
+MATRIX[:3] = np.c_[TURN.as_matrix() * [2, 3, 0.5], [5, 6, 7]]
+PLACES = VERTICES @ MATRIX[:3, :3].T + MATRIX[:3, 3]
 PARENT = [{"children": [1], **MOVED}, {"mesh": 0}]
 TARGET = ({"targets": [{"POSITION": 2}]},)
 INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 2, "ROTATION": 3}}}
-TRANSLATED_INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 2}}}
-INSTANCE_TRANSFORMS = np.float32([(0, 0, 0), (9, 0, 0)]), np.array([(0, 0, 0, 1), ROTATION.as_quat()], np.float32)
+SHIFTED = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 2}}}
+AT = np.float32([(0, 0, 0), (9, 0, 0)]), np.array([(0, 0, 0, 1), TURN.as_quat()], np.float32)
 BIND = np.stack([np.eye(4), np.eye(4)]).astype(np.float32)
 BIND[1, 3, :3] = -1, 0, 0  # a column
-SKIN_ARRAYS = np.array([(0, 1, 0, 0)] * 4, np.uint8), (np.array([(127, 128, 0, 0)] * 4, np.uint8), NORMALISED), BIND
+BONES = np.array([(0, 1, 0, 0)] * 4, np.uint8), (np.array([(127, 128, 0, 0)] * 4, np.uint8), SHARE), BIND
 SKINNED = [{"mesh": 0, "skin": 0, "translation": [50, 0, 0]}, {"translation": [0, 0, 4]}, {"translation": [3, 0, 4]}]
 SKIN = {"skins": [{"joints": [1, 2], "inverseBindMatrices": 4}], "scenes": [{"nodes": [0, 1, 2]}]}
-EIGHT_JOINT_ATTRIBUTES = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "JOINTS_1": 5, "WEIGHTS_1": 6}
-HALF_WEIGHTS = np.float32([(0.5, 0, 0, 0)] * 4)
-JOINT_SHIFT = np.array([2 * 128 / 255, 0, 4])  # one joint moves by (0, 0, 4), the other by (2, 0, 4)
+EXTRA = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "JOINTS_1": 5, "WEIGHTS_1": 6}
+HALF = np.float32([(0.5, 0, 0, 0)] * 4)
+BENT = np.array([2 * 128 / 255, 0, 4])  # one joint moves by (0, 0, 4), the other by (2, 0, 4)
 
-VALID = {  # a file, and the vertices of its tetrahedra
+READ = {  # a file, and the vertices of its tetrahedra
     "plain": (glb(), VERTICES),
     "bytes as indices": (glb(VERTICES, FACES.astype(np.uint8).ravel()), VERTICES),
     "bytes as positions": (glb(VERTICES.astype(np.uint8), extensionsRequired=["KHR_mesh_quantization"]), VERTICES),
-    "normalised": (glb((LARGE, NORMALISED)), LARGE / 32767),
-    "normalised bytes below zero": (glb((SMALL, NORMALISED | {"stride": 4})), SMALL / 127),
+    "normalised": (glb((LARGE, SHARE)), LARGE / 32767),
+    "normalised bytes below zero": (glb((SMALL, SHARE | {"stride": 4})), SMALL / 127),
     "with strides": (glb((VERTICES, {"stride": 32})), VERTICES),
     "interleaved with others": (glb((VERTICES, {"stride": 28, "byteOffset": 12})), VERTICES),
-    "normalised bytes below -1": (glb((np.where(SMALL == -127, -128, SMALL).astype(np.int8), NORMALISED)), SMALL / 127),
+    "normalised bytes below -1": (glb((np.where(SMALL == -127, -128, SMALL).astype(np.int8), SHARE)), SMALL / 127),
     "sparse": (glb((FLAT, {"sparse": (np.array([3], np.uint8), VERTICES[3:])})), VERTICES),
     "sparse over zeros": (
         glb((VERTICES, {"empty": True, "sparse": (np.arange(1, 4, dtype=np.uint16), VERTICES[1:])})),
         VERTICES,
     ),
-    "strip": (glb(VERTICES, np.array([0, 2, 1, 3, 0, 2], np.uint16), primitives=({"mode": 5},)), VERTICES),
+    "strip": (glb(VERTICES, np.array([0, 2, 1, 3, 0, 2], np.uint16), parts=({"mode": 5},)), VERTICES),
     "fan, and its base": (
-        glb(VERTICES, np.array([0, 1, 3, 2, 1], np.uint16), FACES[2], primitives=({"mode": 6}, {"indices": 2})),
+        glb(VERTICES, np.array([0, 1, 3, 2, 1], np.uint16), FACES[2], parts=({"mode": 6}, {"indices": 2})),
         VERTICES,
     ),
-    "with lines and points": (glb(primitives=({"mode": 0}, {"mode": 1}, {"mode": 3}, {})), VERTICES),
-    "moved by parts": (glb(nodes=[{"mesh": 0, **MOVED}]), MOVED_VERTICES),
-    "moved by a matrix": (glb(nodes=[{"mesh": 0, "matrix": MATRIX.T.ravel().tolist()}]), MOVED_VERTICES),
-    "moved by its parent": (glb(nodes=PARENT), MOVED_VERTICES),
+    "lines and points beside": (glb(parts=({"mode": 0}, {"mode": 1}, {"mode": 3}, {})), VERTICES),
+    "moved by parts": (glb(nodes=[{"mesh": 0, **MOVED}]), PLACES),
+    "moved by a matrix": (glb(nodes=[{"mesh": 0, "matrix": MATRIX.T.ravel().tolist()}]), PLACES),
+    "moved by its parent": (glb(nodes=PARENT), PLACES),
     "mirrored": (glb(nodes=[{"mesh": 0, "scale": [-1, 1, 1]}]), VERTICES * [-1, 1, 1]),
-    "twice": (glb(nodes=[{"mesh": 0, **MOVED}, {"mesh": 0}], scenes=[{"nodes": [0, 1]}]), MOVED_VERTICES, VERTICES),
+    "twice": (glb(nodes=[{"mesh": 0, **MOVED}, {"mesh": 0}], scenes=[{"nodes": [0, 1]}]), PLACES, VERTICES),
     "instances": (
-        glb(
-            VERTICES,
-            CORNERS,
-            *INSTANCE_TRANSFORMS,
-            nodes=[{"mesh": 0, "extensions": INSTANCES}],
-            extensionsRequired=[*INSTANCES],
-        ),
+        glb(VERTICES, CORNERS, *AT, nodes=[{"mesh": 0, "extensions": INSTANCES}], extensionsRequired=[*INSTANCES]),
         VERTICES,
-        ROTATION.apply(VERTICES) + INSTANCE_TRANSFORMS[0][1],
+        TURN.apply(VERTICES) + AT[0][1],
     ),
     "instances without a turn": (
-        glb(VERTICES, CORNERS, INSTANCE_TRANSFORMS[0], nodes=[{"mesh": 0, "extensions": TRANSLATED_INSTANCES}]),
-        *(VERTICES + translation for translation in INSTANCE_TRANSFORMS[0]),
+        glb(VERTICES, CORNERS, AT[0], nodes=[{"mesh": 0, "extensions": SHIFTED}]),
+        *(VERTICES + at for at in AT[0]),
     ),
     "a morph target": (
-        glb(VERTICES, CORNERS, VERTICES, nodes=[{"mesh": 0, "weights": [0.5]}], primitives=TARGET),
+        glb(VERTICES, CORNERS, VERTICES, nodes=[{"mesh": 0, "weights": [0.5]}], parts=TARGET),
         1.5 * VERTICES,
     ),
-    "a morph target at zero": (glb(VERTICES, CORNERS, VERTICES, primitives=TARGET), VERTICES),
+    "a morph target at zero": (glb(VERTICES, CORNERS, VERTICES, parts=TARGET), VERTICES),
     "a morph target by the node before the mesh": (
         glb(
             *(VERTICES, CORNERS, VERTICES),
@@ -143,54 +137,46 @@ VALID = {  # a file, and the vertices of its tetrahedra
     ),
     "a skin with weights of any sum": (
         glb(
-            *(VERTICES, CORNERS, SKIN_ARRAYS[0], 4 * np.float32([(127, 128, 0, 0)] * 4), BIND),
+            *(VERTICES, CORNERS, BONES[0], 4 * np.float32([(127, 128, 0, 0)] * 4), BIND),
             nodes=SKINNED,
-            primitives=({"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}},),
+            parts=({"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}},),
             **SKIN,
         ),
-        VERTICES + JOINT_SHIFT,
+        VERTICES + BENT,
     ),
     "a skin with more than four joints": (
         glb(
-            *(
-                VERTICES,
-                CORNERS,
-                np.zeros((4, 4), np.uint8),
-                HALF_WEIGHTS,
-                BIND,
-                np.ones((4, 4), np.uint8),
-                HALF_WEIGHTS,
-            ),
+            *(VERTICES, CORNERS, np.zeros((4, 4), np.uint8), HALF, BIND, np.ones((4, 4), np.uint8), HALF),
             nodes=SKINNED,
-            primitives=({"attributes": EIGHT_JOINT_ATTRIBUTES},),
+            parts=({"attributes": EXTRA},),
             **SKIN,
         ),
         VERTICES + np.array([1, 0, 4]),
     ),
     "a skin": (
         glb(
-            *(VERTICES, CORNERS, *SKIN_ARRAYS),
+            *(VERTICES, CORNERS, *BONES),
             nodes=SKINNED,
-            primitives=({"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}},),
+            parts=({"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}},),
             **SKIN,
         ),
-        VERTICES + JOINT_SHIFT,
+        VERTICES + BENT,
     ),
-    "with another scene": (glb(nodes=PARENT, scene=1, scenes=[{"nodes": [0]}, {"nodes": [1]}]), VERTICES),
-    "no scene": (glb(nodes=PARENT, scenes=[]), MOVED_VERTICES),
+    "another scene beside": (glb(nodes=PARENT, scene=1, scenes=[{"nodes": [0]}, {"nodes": [1]}]), VERTICES),
+    "no scene": (glb(nodes=PARENT, scenes=[]), PLACES),
 }
 
 
 def ordered(triangles: np.ndarray) -> np.ndarray:
-    """The triangles in lexical order, each beginning at its least corner."""
+    """Each triangle from its least corner on, in the order of their numbers."""
     least = triangles.sum(axis=2).round(4).argmin(axis=1)
     turned = np.take_along_axis(triangles, ((least[:, None] + np.arange(3)) % 3)[..., None], axis=1)
     return turned[np.lexsort(turned.reshape(-1, 9).round(4).T)]
 
 
-@each("name", [*VALID])
-def test_triangles_are_transformed_and_wind_outward(name):
-    content, *solids = VALID[name]
+@each("name", [*READ])
+def test_each_triangle_is_where_it_is_shown_and_winds_outward(name):
+    content, *solids = READ[name]
     read = read_glb(content)
     inward = [np.linalg.det(solid[1:] - solid[0]) < 0 for solid in solids]
     expected = [solid[FACES[:, ::-1] if turned else FACES] for solid, turned in zip(solids, inward, strict=True)]
@@ -201,7 +187,7 @@ COLOURS = np.float32([(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, 0.25, 1)])
 
 
 def coloured(content: bytes) -> bytes:
-    """The file with four vertex colours for each tetrahedron."""
+    """The file with four colours, of the vertices of each tetrahedron."""
     (size,) = struct.unpack_from("<I", content, 12)
     stored, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
     uri = "data:;base64," + base64.b64encode(COLOURS.tobytes()).decode()
@@ -214,17 +200,17 @@ def coloured(content: bytes) -> bytes:
     return packed(stored, binary)
 
 
-@each("name", [*VALID])
-def test_vertex_colours_follow_the_transform(tmp_path, name):
+@each("name", [*READ])
+def test_each_vertex_has_its_colour_where_it_is_shown(tmp_path, name):
     path = tmp_path / f"{name}.glb"
-    path.write_bytes(coloured(VALID[name][0]))
+    path.write_bytes(coloured(READ[name][0]))
     mesh = read_mesh(path)
     assert mesh.colours is not None and np.array_equal(mesh.colours[:4], COLOURS)
-    colours = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
-    assert colours == pytest.approx(mesh.colours, abs=1e-5)
+    seen = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
+    assert seen == pytest.approx(mesh.colours, abs=1e-5)
 
 
-def test_texture_coordinates_are_decoded_and_transformed(tmp_path):
+def test_a_texture_is_laid_on_as_its_coordinates_are_stored_and_transformed(tmp_path):
     ramp, picture = np.arange(256, dtype=np.uint8), io.BytesIO()
     across, down = np.meshgrid(ramp, ramp)
     Image.fromarray(np.stack([across, down, 0 * down], axis=2)).save(picture, "png")
@@ -234,10 +220,10 @@ def test_texture_coordinates_are_decoded_and_transformed(tmp_path):
     path = tmp_path / "textured.glb"
     path.write_bytes(
         glb(
-            (LARGE, NORMALISED),
+            (LARGE, SHARE),
             CORNERS,
-            ((stored * 65535).round().astype(np.uint16), NORMALISED),
-            primitives=({"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "material": 0},),
+            ((stored * 65535).round().astype(np.uint16), SHARE),
+            parts=({"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "material": 0},),
             materials=[{"pbrMetallicRoughness": {"baseColorTexture": texture}}],
             textures=[{"source": 0}],
             images=[{"uri": "data:image/png;base64," + base64.b64encode(picture.getvalue()).decode()}],
@@ -246,8 +232,8 @@ def test_texture_coordinates_are_decoded_and_transformed(tmp_path):
     mesh = read_mesh(path)
     turned = ((stored * transform["scale"]) @ (1, -1j)) * np.exp(1j * transform["rotation"])  # v points down
     expected = np.stack([turned.real + 0.1, 0.35 - turned.imag, np.zeros(4)], axis=1)
-    colours = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
-    assert colours == pytest.approx(expected, abs=0.005)
+    seen = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
+    assert seen == pytest.approx(expected, abs=0.005)
 
 
 def test_the_colour_of_a_material_multiplies_those_of_vertices(tmp_path):
@@ -256,31 +242,31 @@ def test_the_colour_of_a_material_multiplies_those_of_vertices(tmp_path):
     for content, expected in ((glb(**red), np.ones((4, 3))), (coloured(glb(**red)), COLOURS)):
         path.write_bytes(content)
         mesh = read_mesh(path)
-        colours = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
-        assert colours == pytest.approx(expected * factor[:3], abs=1e-5)
+        seen = FileColours(path, mesh, mesh)(mesh.vertices, mesh.vertices)
+        assert seen == pytest.approx(expected * factor[:3], abs=1e-5)
 
 
-def test_colours_are_between_0_and_1_and_primitives_without_are_grey():
+def test_colours_are_shares_of_1_and_parts_without_are_grey_beside_others():
     bytes_of = np.array([(255, 51, 0, 255)] * 4, np.uint8)
     painted = {"attributes": {"POSITION": 0, "COLOR_0": 2}}
-    for keys in ({}, NORMALISED):
-        read = read_glb(glb(VERTICES, CORNERS, (bytes_of, keys), primitives=(painted, {})))
+    for keys in ({}, SHARE):
+        read = read_glb(glb(VERTICES, CORNERS, (bytes_of, keys), parts=(painted, {})))
         expected = np.repeat([(1, 0.2, 0), (UNCOLOURED_GREY, UNCOLOURED_GREY, UNCOLOURED_GREY)], 4, axis=0)
         assert read.vertex_colours == pytest.approx(expected)
     assert read_glb(glb()).vertex_colours is None
 
 
-def test_vertices_without_indices_are_used_in_their_order():
-    corners, primitive = VERTICES[FACES].reshape(-1, 3), {"attributes": {"POSITION": 0}}
-    read = read_glb(glb(corners, meshes=[{"primitives": [primitive]}]))
+def test_without_indices_vertices_are_taken_in_their_order():
+    corners, part = VERTICES[FACES].reshape(-1, 3), {"attributes": {"POSITION": 0}}
+    read = read_glb(glb(corners, meshes=[{"primitives": [part]}]))
     assert (read.vertices[read.triangles] == VERTICES[FACES]).all()
 
 
 DRACO = ({"extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {}}}},)
 REFUSED = {
     "draco": (glb(extensionsRequired=["KHR_draco_mesh_compression"]), "without 'KHR_draco_mesh_compression'; export"),
-    "draco, named only in the primitive": (
-        glb((VERTICES, {"empty": True}), primitives=DRACO, extensionsUsed=["KHR_draco_mesh_compression"]),
+    "draco, told only where it is used": (
+        glb((VERTICES, {"empty": True}), parts=DRACO, extensionsUsed=["KHR_draco_mesh_compression"]),
         "accessor 0 has none .extensions: KHR_draco_mesh_compression",
     ),
     "meshopt": (glb(extensionsRequired=["EXT_meshopt_compression"]), "without 'EXT_meshopt_compression'"),
@@ -295,7 +281,7 @@ REFUSED = {
 
 
 @each("name", [*REFUSED])
-def test_unsupported_contents_are_named(name):
+def test_what_is_not_read_is_named(name):
     content, message = REFUSED[name]
     with pytest.raises(ValueError, match=message):
         read_glb(content)

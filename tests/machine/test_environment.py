@@ -1,4 +1,4 @@
-"""A run warns if its times are unreliable: on a loaded machine, or without synchronisation."""
+"""A run says where its times are not to be trusted: on a loaded machine, or where the clock did not wait."""
 
 import os
 import subprocess
@@ -20,12 +20,12 @@ HAS_COUNTS = environment.scheduled() is not None
 
 
 def record(**changed) -> Record:
-    result = Record("id", "task", "renderer", "dataset", 0, {})
-    result.environment = {"waited_share": changed.pop("share", 0.0), "load_at_start": changed.pop("load", 0.0)}
-    result.environment |= {"device": changed.pop("device", "cpu"), "runs_at_once": changed.pop("runs_at_once", 1)}
+    made = Record("id", "task", "renderer", "dataset", 0, {})
+    made.environment = {"waited_share": changed.pop("share", 0.0), "load_at_start": changed.pop("load", 0.0)}
+    made.environment |= {"device": changed.pop("device", "cpu"), "runs_at_once": changed.pop("beside", 1)}
     for name, value in changed.items():
-        setattr(result, name, value)
-    return result
+        setattr(made, name, value)
+    return made
 
 
 @each(
@@ -36,21 +36,21 @@ def record(**changed) -> Record:
         ({"share": 0.3}, ["loaded machine: threads waited 30% of their time"]),
         ({"share": None, "load": 99.0}, ["loaded machine: load 99.0 at the start"]),
         ({"share": None, "load": 0.1}, []),
-        ({"runs_at_once": 4}, []),  # each run has separate processors
+        ({"beside": 4}, []),  # each has processors of its own
         ({"device": "a GPU"}, []),
-        ({"runs_at_once": 4, "device": "a GPU"}, ["shared device: 4 runs at a time on it"]),
+        ({"beside": 4, "device": "a GPU"}, ["shared device: 4 runs at a time on it"]),
         ({"gemm_fraction": 3.0, "device": "a GPU"}, ["missing synchronisation: 3.0 times the machine's matrix"]),
         ({"share": 0.5, "gemm_fraction": 3.0, "device": "a GPU"}, ["loaded machine", "missing synchronisation"]),
-        ({"gemm_fraction": 3.0}, []),  # on a CPU compiled code is faster than the product of PyTorch
+        ({"gemm_fraction": 3.0}, []),  # of a CPU, whose compiled code is faster than PyTorch's product
     ],
 )
-def test_unreliable_times_have_a_warning(changed, words):
+def test_it_warns_where_there_is_a_reason(changed, words):
     lines = environment.doubts(record(**changed))
     assert [line.startswith(word) for line, word in zip(lines, words, strict=True)] == [True] * len(words)
 
 
 @pytest.mark.skipif(not HAS_COUNTS, reason="this system does not count how long threads wait")
-def test_a_busy_machine_is_detected():
+def test_a_busy_machine_is_seen():
     core = {sorted(os.sched_getaffinity(0))[0]}
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, core)
@@ -67,44 +67,45 @@ def test_a_busy_machine_is_detected():
         os.sched_setaffinity(0, before)
 
 
-def test_the_waiting_time_is_unknown_if_threads_have_ended(monkeypatch):
+def test_threads_that_ended_meanwhile_make_it_unknown(monkeypatch):
     monkeypatch.setattr(environment, "scheduled", lambda: (500, 20))
-    assert environment.waited_share((1000, 10)) is None and environment.waited_share((400, 15)) == 5 / 105
+    assert environment.waited_share((1000, 10)) is None
+    assert environment.waited_share((400, 15)) == 5 / 105
 
 
 def products() -> set[float]:
-    """The products of a denormal number and 1, in each thread of an operation."""
-    count = environment.PER_THREAD * torch.get_num_threads()
-    bits = torch.full((count,), environment.DENORMAL, dtype=torch.int32)
+    """Of a denormal number and one, in each thread of an operation."""
+    count = environment.NUMBERS_PER_THREAD * torch.get_num_threads()
+    bits = torch.full((count,), environment.DENORMAL_BITS, dtype=torch.int32)
     return set((bits.view(torch.float32) * 1.0).view(torch.int32).tolist())
 
 
 @pytest.mark.skipif(not torch.set_flush_denormal(False), reason="this processor does not round denormals to 0")
-def test_forward_and_backward_threads_flush_denormals_within_the_block():
-    results = {}
+def test_within_it_forward_and_backward_threads_take_denormals_as_0():
+    found = {}
 
     class Noting(torch.autograd.Function):
         @staticmethod
         def forward(ctx, x):
-            results["forward"] = products()
+            found["forward"] = products()
             return x.clone()
 
         @staticmethod
         def backward(ctx, *gradients):
-            results["backward"] = products()
+            found["backward"] = products()
             return gradients[0]
 
-    def work():  # the operations of this thread have no threads yet, as in the process of a run
+    def work():  # in a thread whose operations have no threads yet, as those of a run's process
         with environment.flushing_denormals():
             Noting.apply(torch.ones(1, requires_grad=True)).backward()
-            results["stated"] = environment.describe(CPU)["denormals_flushed"]
-        results["this thread after"] = sys.float_info.min / 2 > 0
+            found["said"] = environment.describe(CPU)["denormals_flushed"]
+        found["this thread after"] = sys.float_info.min / 2 > 0
 
     with environment.using_threads(2):
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
-    assert results == {"forward": {0}, "backward": {0}, "stated": True, "this thread after": True}
+    assert found == {"forward": {0}, "backward": {0}, "said": True, "this thread after": True}
     assert not environment.describe(CPU)["denormals_flushed"]
 
 
@@ -114,12 +115,12 @@ def test_the_description_can_be_read_without_torch():
 
 @dataclass
 class Device:
-    """Replaces a GPU whose work takes two seconds, and records its calls in order."""
+    """Stands in for a GPU whose work takes two seconds; notes what it is asked for, in order."""
 
-    calls: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
 
     def synchronize(self, device: torch.device) -> None:
-        self.calls.append(f"wait for {device}")
+        self.asked.append(f"wait for {device}")
 
     def current_stream(self, device: torch.device) -> str:
         return f"stream of {device}"
@@ -129,10 +130,10 @@ class Device:
         return self
 
     def record(self, stream: str) -> None:
-        self.calls.append(f"event in {stream}")
+        self.asked.append(f"event in {stream}")
 
     def elapsed_time(self, end: "Device") -> float:
-        self.calls.append("read")
+        self.asked.append("read")
         return 2000.0
 
 
@@ -145,12 +146,12 @@ def test_a_stopwatch_reads_the_clock_on_a_cpu_and_events_of_a_gpu(monkeypatch):
     for name in ("synchronize", "current_stream"):
         monkeypatch.setattr(torch.cuda, name, getattr(device, name))
     stopwatch = Stopwatch(torch.device("cuda:0"))
-    device.calls.append("work")
+    device.asked.append("work")
     assert stopwatch.seconds() == 2.0
     wait, event = "wait for cuda:0", "event in stream of cuda:0"
-    assert device.calls == [wait, event, "work", event, wait, "read"]
+    assert device.asked == [wait, event, "work", event, wait, "read"]
 
 
-def test_coarse_operations_have_the_rate_of_float32_if_bfloat16_has_none():
+def test_coarse_operations_take_float32s_rate_where_bfloat16_has_none():
     assert environment.seconds_at_peak({"gemm_peak_flops": 10.0, "bfloat16_peak_flops": 30.0}, 20, 30) == 3.0
     assert environment.seconds_at_peak({"gemm_peak_flops": 10.0, "bfloat16_peak_flops": None}, 20, 30) == 5.0

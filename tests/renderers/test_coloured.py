@@ -1,4 +1,4 @@
-"""Fields with colours: their initial state, values, and the gradients of distances and colours, in float64."""
+"""Fields with colours: their start, their values, their gradients in float64, and where their colours lead."""
 
 import pytest
 import torch
@@ -30,7 +30,7 @@ def draw(*shape: int) -> Tensor:
 
 
 @each("layers, width", [(2, 256), (6, 512)])
-def test_a_distance_network_begins_as_a_sphere(layers, width):
+def test_it_begins_as_a_sphere(layers, width):
     torch.manual_seed(0)
     network = ColouredDistance(layers=layers, width=width, octaves=5, radius=0.5, directional=True)
     points = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
@@ -52,7 +52,7 @@ def test_the_encoding_has_sine_and_cosine_of_each_octave():
 
 def test_values_without_a_graph_are_the_same_in_chunks_and_of_any_leading_shape(monkeypatch):
     network, points = make(), draw(3, 20)
-    monkeypatch.setattr(coloured, "passes", lambda points, width: points.split(7))
+    monkeypatch.setattr(coloured, "split_into_passes", lambda some, width: some.split(7))
     with torch.no_grad():
         values = network.field(points)
     torch.testing.assert_close(values, network.field(points).detach(), **EXACT)
@@ -61,22 +61,22 @@ def test_values_without_a_graph_are_the_same_in_chunks_and_of_any_leading_shape(
 
 
 @each("directional", [True, False])
-def test_colours_depend_on_the_direction_if_they_are_directional(directional):
+def test_colours_follow_the_direction_where_they_may(directional):
     network, points = make(directional=directional), 0.3 * draw(20)
     normals = autograd_gradients(network.field, points)
-    directions = torch.nn.functional.normalize(draw(20), dim=-1)
-    first, second = (network.colours(points, normals, sign * directions) for sign in (1, -1))
-    assert all(bool(((colours > 0) & (colours < 1)).all()) for colours in (first, second))
-    assert torch.equal(first, second) != directional
+    one, other = torch.nn.functional.normalize(draw(20), dim=-1), -torch.nn.functional.normalize(draw(20), dim=-1)
+    found = [network.colours(points, normals, directions) for directions in (one, other)]
+    assert all(bool(((colours > 0) & (colours < 1)).all()) for colours in found)
+    assert torch.equal(*found) != directional
 
 
-def test_colours_have_a_gradient_to_the_weights_of_the_distance_also_through_normals():
+def test_colours_lead_to_the_weights_of_the_distance_through_points_normals_and_features():
     network, points = make(), (0.3 * draw(20)).requires_grad_(True)
     directions = torch.nn.functional.normalize(draw(20), dim=-1)
     (normals,) = torch.autograd.grad(network.field(points).sum(), points, create_graph=True)
     sizes = []
-    for used_normals in (normals.detach(), normals):
-        colours = network.colours(points, used_normals, directions)
+    for which in (normals.detach(), normals):
+        colours = network.colours(points, which, directions)
         (gradient,) = torch.autograd.grad(colours.sum(), network.hidden[0].weight, retain_graph=True)
         sizes.append(gradient.abs().sum().item())
     assert min(sizes) > 0 and sizes[0] != sizes[1]
@@ -107,7 +107,7 @@ def test_an_occupancy_network_begins_as_a_sphere_and_is_negative_inside(width, r
     assert field(points.view(5, 100, 3)).shape == (5, 100)
 
 
-def test_colours_of_occupancy_depend_only_on_points_and_their_weights_have_a_gradient():
+def test_colours_of_occupancy_are_those_of_points_and_their_weights_have_a_gradient():
     torch.manual_seed(0)
     network = ColouredOccupancy(width=32, radius=0.5)
     points = 0.5 * on_sphere(20)
@@ -154,7 +154,7 @@ def test_a_grids_colours_are_interpolated_linearly_and_kept_outside():
     assert gradient[0].abs().sum() > 0 and not gradient[1:].any()
 
 
-def test_invalid_settings_are_refused():
+def test_settings_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match=r"layers must be .*4 suit"):
         ColouredDistance(layers=0, width=8, octaves=2, radius=0.5, directional=True)
     for make in (lambda radius: ColouredOccupancy(width=8, radius=radius), lambda radius: make_grid(8, radius=radius)):

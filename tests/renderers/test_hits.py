@@ -16,7 +16,7 @@ from renderers.rendering import Renderer, Rendering, at_iteration
 from tests.looped import each
 from tests.renderers.test_renderer_contract import stated
 from tests.tiny import ball_prior, camera_of
-from tests.wrong_hits import ENDLESS, WRONG, WrongHits
+from tests.wrong_hits import ENDLESS_HITS, WRONG, WrongHits
 
 RAYS = camera_of(20, angles=(30.0, 20.0)).rays()
 PLATE = box((0.45, 0.5, 0.1))  # thin, with edges
@@ -122,7 +122,7 @@ def test_a_hit_without_a_finite_distance_breaks_the_contract(value):
     def change(field, rays, rendering):
         return replace(rendering, distance=WRONG["endless"](rendering).nan_to_num(value))
 
-    cause = rf"{ENDLESS} of 400 rays have a hit without a finite distance \(the field is finite on them, so the "
+    cause = rf"{ENDLESS_HITS} of 400 rays have a hit without a finite distance \(the field is finite on them, so the "
     with pytest.raises(BrokenContract, match=rf"Changed\.render: {cause}renderer is at fault\): return a finite"):
         hits_of(Changed("dist", change), PLATE).check()
 

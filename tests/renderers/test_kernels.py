@@ -1,4 +1,4 @@
-"""Compiled field evaluations against those of torch, and the fallback to torch without a compiler."""
+"""Compiled values against their plain twin; and that runs without a compiler do the same more slowly."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ from datasets.views import ViewSampler
 from renderers.field import Counts, Meter
 from renderers.fields import mlp
 from renderers.fields.mlp import BoundDecoder, Decoder
-from renderers.kernels import decoder as decoder_kernels
+from renderers.kernels import decoder as of_decoders
 from renderers.kernels import library
 from renderers.kernels.library import kernels
 from tests.looped import each
@@ -31,20 +31,20 @@ NETWORKS = {
 }
 
 
-def default_kernels() -> library.Kernels:
-    """The kernels of a process without the environment variable."""
+def by_default() -> library.Kernels:
+    """What a process finds that asks for nothing."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv(library.KERNELS_VARIABLE, raising=False)
         return kernels.__wrapped__()
 
 
-KERNELS = default_kernels()
-with_compiler = pytest.mark.skipif(KERNELS.library is None, reason=f"nothing is compiled here: {KERNELS.said}")
+THERE = by_default()
+with_compiler = pytest.mark.skipif(THERE.library is None, reason=f"nothing is compiled here: {THERE.description}")
 
 
 @pytest.fixture(autouse=True)
 def compiled_code(monkeypatch):
-    monkeypatch.setattr(decoder_kernels, "kernels", lambda: KERNELS)
+    monkeypatch.setattr(of_decoders, "kernels", lambda: THERE)
 
 
 def make(name: str) -> Decoder:
@@ -53,8 +53,8 @@ def make(name: str) -> Decoder:
 
 
 def fresh(monkeypatch: pytest.MonkeyPatch, cache: Path, **environment: str) -> library.Kernels:
-    """The kernels of a new process."""
-    for name, value in {"XDG_CACHE_HOME": str(cache), library.VARIABLE: "", **environment}.items():
+    """What a new process would find."""
+    for name, value in {"XDG_CACHE_HOME": str(cache), library.KERNELS_VARIABLE: "", **environment}.items():
         monkeypatch.setenv(name, value)
     return kernels.__wrapped__()
 
@@ -74,8 +74,8 @@ def test_values_are_those_of_torch(name, count):
 
 
 @with_compiler
-def test_torch_evaluates_gradients_other_types_and_several_threads(monkeypatch):
-    monkeypatch.setattr(environment, "kernels", lambda: KERNELS)
+def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatch):
+    monkeypatch.setattr(environment, "kernels", lambda: THERE)
     monkeypatch.setattr(BoundDecoder, "_compiled", lambda self: pytest.fail("compiled code was asked"))
     points, code = torch.rand(5, 3), torch.zeros(4)
     with using_threads(1):
@@ -89,7 +89,7 @@ def test_torch_evaluates_gradients_other_types_and_several_threads(monkeypatch):
 
 
 @with_compiler
-def test_values_follow_weights_that_are_trained():
+def test_values_follow_weights_that_are_being_learnt():
     decoder, points = make("skip").requires_grad_(True), torch.rand(5, 3)
     field = decoder.at(torch.zeros(4))
     with using_threads(1), torch.no_grad():
@@ -119,28 +119,28 @@ def rendered(name: str) -> tuple[Tensor, Tensor, Counts]:
 
 @with_compiler
 @each("name", ["dist", "newton", "idr", "neus", "relaxed_boundary"])
-def test_a_rendering_differs_only_in_rays_at_a_threshold(name, monkeypatch):
+def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, monkeypatch):
     with using_threads(1):
         status, distance, counts = rendered(name)
         monkeypatch.setattr(mlp, "compile_decoder", lambda *_: None)
         status_of_torch, distance_of_torch, counts_of_torch = rendered(name)
         monkeypatch.undo()
-    same_status = status == status_of_torch
-    assert (~same_status).sum() <= 2 and len(status.unique()) > 1
+    alike = status == status_of_torch
+    assert (~alike).sum() <= 2 and len(status.unique()) > 1
     assert counts.value == pytest.approx(counts_of_torch.value, rel=2e-3)
-    assert (distance - distance_of_torch)[same_status].abs().quantile(0.99) < 1e-4
+    assert (distance - distance_of_torch)[alike].abs().quantile(0.99) < 1e-4
 
 
-def test_torch_can_be_chosen_and_an_unknown_choice_is_refused(monkeypatch, tmp_path):
-    assert fresh(monkeypatch, tmp_path, **{library.VARIABLE: "torch"}) == library.Kernels(None, "torch")
-    with pytest.raises(ValueError, match=f"{library.VARIABLE} must be torch or compiled, not 'cuda'"):
-        fresh(monkeypatch, tmp_path, **{library.VARIABLE: "cuda"})
+def test_torch_alone_is_left_to_torch_and_nothing_else_can_be_asked_for(monkeypatch, tmp_path):
+    assert fresh(monkeypatch, tmp_path, **{library.KERNELS_VARIABLE: "torch"}) == library.Kernels(None, "torch")
+    with pytest.raises(ValueError, match=f"{library.KERNELS_VARIABLE} must be torch or compiled, not 'cuda'"):
+        fresh(monkeypatch, tmp_path, **{library.KERNELS_VARIABLE: "cuda"})
     assert not list(tmp_path.iterdir())
 
 
-def test_torch_is_used_with_a_reason_if_compiler_cache_or_processor_do_not_suffice(monkeypatch, tmp_path):
-    monkeypatch.setattr(library, "NEEDED", set())
-    assert fresh(monkeypatch, tmp_path, PATH="").said == "torch: no compiler (g++ or clang++)"
+def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(monkeypatch, tmp_path):
+    monkeypatch.setattr(library, "REQUIRED_CPU_FLAGS", set())
+    assert fresh(monkeypatch, tmp_path, PATH="").description == "torch: no compiler (g++ or clang++)"
     broken = tmp_path / "bin" / "g++"
     broken.parent.mkdir()
     broken.write_text("#!/bin/sh\necho it is broken >&2\nexit 1\n")
@@ -154,14 +154,14 @@ def test_torch_is_used_with_a_reason_if_compiler_cache_or_processor_do_not_suffi
 
 
 @with_compiler
-def test_processes_that_build_at_once_share_one_file_and_a_damaged_file_is_rebuilt(tmp_path, monkeypatch):
-    program = "from renderers.kernels.library import kernels; print(kernels().said)"
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.VARIABLE: ""}
-    command = [sys.executable, "-c", program]
-    processes = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    assert [process.communicate()[0].strip() for process in processes] == ["compiled"] * 3
+def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
+    asked = "from renderers.kernels.library import kernels; print(kernels().description)"
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.KERNELS_VARIABLE: ""}
+    command = [sys.executable, "-c", asked]
+    several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    assert [one.communicate()[0].strip() for one in several] == ["compiled"] * 3
     (built,) = (tmp_path / "implicit-bench" / "kernels").iterdir()
-    content = built.read_bytes()
+    whole = built.read_bytes()
     built.unlink()
-    built.write_bytes(content[:100])
-    assert fresh(monkeypatch, tmp_path).said == "compiled" and built.stat().st_size > 1000
+    built.write_bytes(whole[:100])
+    assert fresh(monkeypatch, tmp_path).description == "compiled" and built.stat().st_size > 1000

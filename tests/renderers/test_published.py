@@ -1,4 +1,4 @@
-"""Networks in published formats against their forward passes, each written again in plain torch."""
+"""Networks of other people's formats against their forward passes, each written once more in plain torch."""
 
 from math import sqrt
 from typing import Any
@@ -24,25 +24,25 @@ def drawn(*shape: int) -> Tensor:
     return torch.randn(*shape) / sqrt(shape[-1])
 
 
-def weight_norm_2019(weight: Tensor) -> State:
-    """A weight as length and direction, with the names of torch in 2019; the direction has any length."""
+def as_of_2019(weight: Tensor) -> State:
+    """A weight by length and direction, as torch named them in 2019; the direction has any length."""
     length = weight.norm(dim=1, keepdim=True)
     return {"weight_g": length, "weight_v": weight / length * torch.rand(len(weight), 1).add(0.5)}
 
 
-def weight_norm_today(weight: Tensor) -> State:
-    old = weight_norm_2019(weight)
+def as_of_today(weight: Tensor) -> State:
+    old = as_of_2019(weight)
     return {f"parametrizations.weight.original{n}": old[key] for n, key in enumerate(("weight_g", "weight_v"))}
 
 
-def plain_weight(weight: Tensor) -> State:
+def directly(weight: Tensor) -> State:
     return {"weight": weight}
 
 
 def named(prefix: str, layers: dict[str, tuple[Tensor, Tensor]], written: Any) -> State:
     """The state of layers by name."""
-    by_layer = {name: written(weight) | {"bias": bias} for name, (weight, bias) in layers.items()}
-    return {f"{prefix}{name}.{key}": value for name, layer in by_layer.items() for key, value in layer.items()}
+    parts = {name: written(weight) | {"bias": bias} for name, (weight, bias) in layers.items()}
+    return {f"{prefix}{name}.{key}": value for name, part in parts.items() for key, value in part.items()}
 
 
 SPECS = {"dims": [16, 12, 16], "norm_layers": [0, 1, 2], "latent_in": [2], "weight_norm": True, "dropout": [0, 1]}
@@ -50,21 +50,21 @@ CODE = torch.tensor([0.3, -0.2])
 
 
 def deepsdf(specs: dict[str, Any], written: Any, prefix: str) -> tuple[State, dict[str, Any], Tensor]:
-    """The state of a DeepSDF decoder with 2 code numbers, its specs, and its values by the published computation."""
-    widths, inputs = [5, *specs["dims"], 1], torch.cat([CODE.expand(len(POINTS), -1), POINTS], dim=1)
-    skips, points_everywhere = specs.get("latent_in", []), specs.get("xyz_in_all", False)
-    layers, extra, x = {}, {}, inputs
+    """The state of a DeepSDF decoder of 2 code numbers, its specs, and its values, as its own code computes them."""
+    widths, given = [5, *specs["dims"], 1], torch.cat([CODE.expand(len(POINTS), -1), POINTS], dim=1)
+    again, every, norm = specs.get("latent_in", []), specs.get("xyz_in_all", False), not specs.get("weight_norm")
+    layers, extra, x = {}, {}, given
     for n in range(len(widths) - 1):
-        if n in skips:
-            x = torch.cat([x, inputs], dim=1)
-        elif n and points_everywhere:
+        if n in again:
+            x = torch.cat([x, given], dim=1)
+        elif n and every:
             x = torch.cat([x, POINTS], dim=1)
-        outputs = widths[n + 1] - (5 if n + 1 in skips else 3 if points_everywhere and n < len(widths) - 2 else 0)
+        outputs = widths[n + 1] - (5 if n + 1 in again else 3 if every and n < len(widths) - 2 else 0)
         layers[f"lin{n}"] = weight, bias = drawn(outputs, widths[n]), drawn(outputs)
         x = linear(x, weight, bias)
         if n == len(widths) - 2:
             break
-        if not specs.get("weight_norm") and n in specs["norm_layers"]:
+        if norm and n in specs["norm_layers"]:
             scale, shift = torch.rand(outputs), drawn(outputs)
             extra |= {f"{prefix}bn{n}.weight": scale, f"{prefix}bn{n}.bias": shift}
             x = layer_norm(x, (outputs,), scale, shift)
@@ -75,17 +75,17 @@ def deepsdf(specs: dict[str, Any], written: Any, prefix: str) -> tuple[State, di
 
 
 @each("specs, written, prefix, plain", [
-    (SPECS | {"geom_dimension": 3}, weight_norm_today, "module.", True),
-    (SPECS, weight_norm_2019, "", False),
-    (SPECS | {"use_tanh": True}, weight_norm_2019, "module.", False),
-    (SPECS | {"weight_norm": False}, plain_weight, "", False),
-    (SPECS | {"xyz_in_all": True, "latent_in": []}, weight_norm_2019, "", False),
-    (SPECS | {"xyz_in_all": True}, weight_norm_today, "", False),
-    (SPECS | {"latent_in": [1, 2], "geom_dimension": 3}, weight_norm_2019, "", False),
-    (SPECS | {"latent_in": [3], "dims": [16, 16, 16]}, weight_norm_2019, "", False),
-    (SPECS | {"latent_in": [], "geom_dimension": 3}, weight_norm_2019, "", True),
+    (SPECS | {"geom_dimension": 3}, as_of_today, "module.", True),
+    (SPECS, as_of_2019, "", False),
+    (SPECS | {"use_tanh": True}, as_of_2019, "module.", False),
+    (SPECS | {"weight_norm": False}, directly, "", False),
+    (SPECS | {"xyz_in_all": True, "latent_in": []}, as_of_2019, "", False),
+    (SPECS | {"xyz_in_all": True}, as_of_today, "", False),
+    (SPECS | {"latent_in": [1, 2], "geom_dimension": 3}, as_of_2019, "", False),
+    (SPECS | {"latent_in": [3], "dims": [16, 16, 16]}, as_of_2019, "", False),
+    (SPECS | {"latent_in": [], "geom_dimension": 3}, as_of_2019, "", True),
 ])  # fmt: skip
-def test_a_deepsdf_decoder_has_the_values_of_the_published_code(specs, written, prefix, plain):
+def test_a_deepsdf_decoder_has_the_values_of_its_own_code(specs, written, prefix, plain):
     torch.manual_seed(0)
     state, settings, values = deepsdf(specs, written, prefix)
     network = published.load_deepsdf(state, settings)
@@ -93,10 +93,10 @@ def test_a_deepsdf_decoder_has_the_values_of_the_published_code(specs, written, 
     assert isinstance(network.inner.at(CODE), BoundDecoder) or not plain
 
 
-def test_a_decoder_with_tanh_keeps_bounds_and_operation_counts():
+def test_a_tanh_keeps_what_a_decoder_offers():
     torch.manual_seed(0)
-    state, settings, _ = deepsdf(SPECS | {"use_tanh": True}, weight_norm_2019, "")
-    network = published.deepsdf(state, settings)
+    state, settings, _ = deepsdf(SPECS | {"use_tanh": True}, as_of_2019, "")
+    network = published.load_deepsdf(state, settings)
     network.factor.fill_(-2.0)
     network.level.fill_(0.1)
     field, half = network.at(CODE), 0.1 * POINTS.flip(0)
@@ -105,10 +105,10 @@ def test_a_decoder_with_tanh_keeps_bounds_and_operation_counts():
         values = field(POINTS + t * half)
         assert ((low <= values) & (values <= high)).all()
     assert (high - low).max() < 4 and field.flops == network.inner.at(CODE).flops
-    assert coarse_version(field) is None  # a narrow network has no coarse values
+    assert coarse_version(field) is None  # a narrow one has none
 
 
-def test_coarse_values_and_bounds_are_adjusted_like_values():
+def test_an_adjusted_field_has_coarse_values_and_bounds_that_are_adjusted_as_its_values():
     class Inner(Shape):
         coarse = Coarse(lambda points: points[..., 0] + 0.01, 0.01)
 
@@ -119,7 +119,8 @@ def test_coarse_values_and_bounds_are_adjusted_like_values():
         inner = Inner(lambda points: points[..., 0], Kind.LEVEL, None)
         field = Adjusted(inner, 0, torch.tensor(factor), torch.tensor(0.2), Kind.LEVEL, None)
         coarse = coarse_version(field)
-        assert coarse is not None and coarse.error == pytest.approx(0.03)
+        assert coarse is not None
+        assert coarse.error == pytest.approx(0.03)
         torch.testing.assert_close(coarse.values(POINTS), factor * (POINTS[:, 0] + 0.01 - 0.2))
         assert ((coarse.values(POINTS) - field(POINTS)).abs() <= coarse.error + 1e-6).all()
         low, high = field_bounds(field)(POINTS, 0.1 * POINTS.flip(0))
@@ -131,10 +132,10 @@ def test_coarse_values_and_bounds_are_adjusted_like_values():
 def implicit(prefix: str, frequencies: int, written: Any) -> tuple[State, Tensor]:
     """The state of IDR's network, four layers of 40 with a skip at the third and 7 outputs, and its values."""
     waves = [wave(POINTS * 2**n) for n in range(frequencies) for wave in (torch.sin, torch.cos)]
-    inputs_with_waves = torch.cat([POINTS, *waves], dim=1)
-    inputs, layers, x = inputs_with_waves.shape[1], {}, inputs_with_waves
+    given = torch.cat([POINTS, *waves], dim=1)
+    inputs, layers, x = given.shape[1], {}, given
     for n, (width, outputs) in enumerate([(inputs, 40), (40, 40 - inputs), (40, 40), (40, 7)]):
-        x = torch.cat([x, inputs_with_waves], dim=1) / sqrt(2) if n == 2 else x
+        x = torch.cat([x, given], dim=1) / sqrt(2) if n == 2 else x
         layers[f"lin{n}"] = weight, bias = drawn(outputs, width), drawn(outputs)
         x = linear(x, weight, bias)
         x = softplus(x, beta=100) if n < 3 else x
@@ -142,12 +143,12 @@ def implicit(prefix: str, frequencies: int, written: Any) -> tuple[State, Tensor
 
 
 @each("prefix, frequencies, written", [
-    ("model_state_dict.implicit_network.", 0, weight_norm_2019),
-    ("implicit_network.", 3, weight_norm_today),
-    ("sdf_network_fine.", 6, weight_norm_2019),
-    ("model.sdf_network.", 2, plain_weight),
+    ("model_state_dict.implicit_network.", 0, as_of_2019),
+    ("implicit_network.", 3, as_of_today),
+    ("sdf_network_fine.", 6, as_of_2019),
+    ("model.sdf_network.", 2, directly),
 ])  # fmt: skip
-def test_a_network_of_idr_neus_or_volsdf_has_the_values_of_the_published_code(prefix, frequencies, written):
+def test_a_network_of_idr_neus_or_volsdf_has_the_values_of_its_own_code(prefix, frequencies, written):
     torch.manual_seed(0)
     state, values = implicit(prefix, frequencies, written)
     others = {"rendering_network.lin0.weight": drawn(4, 9), "variance_network_fine.variance": torch.ones(())}
@@ -166,14 +167,14 @@ def occupancy(kind: str) -> tuple[State, Tensor]:
         return weight, bias
 
     def normed(key: str, x: Tensor) -> Tensor:
-        gamma, beta = (linear(code, *layer(f"{key}.conv_{output}", width, 2, 1)) for output in ("gamma", "beta"))
+        gamma, beta = (linear(code, *layer(f"{key}.conv_{one}", width, 2, 1)) for one in ("gamma", "beta"))
         mean, variance = drawn(width), torch.rand(width)
         stored = {"running_mean": mean, "running_var": variance, "num_batches_tracked": torch.tensor(7)}
-        state.update({f"{name}{key}.bn.{key_end}": value for key_end, value in stored.items()})
+        state.update({f"{name}{key}.bn.{part}": value for part, value in stored.items()})
         return gamma * batch_norm(x, mean, variance) + beta
 
-    extra_size, letters = (1,) if cbn else (), "conv" if kind == "cbn2" else "fc"
-    x = linear(POINTS, *layer(f"{letters}_p", width, 3, *extra_size))
+    one, letters = (1,) if cbn else (), "conv" if kind == "cbn2" else "fc"
+    x = linear(POINTS, *layer(f"{letters}_p", width, 3, *one))
     if kind == "cbn2":
         code = CODE + layer("fc_z", 2, 4)[1]
     elif kind != "dvr":
@@ -185,16 +186,16 @@ def occupancy(kind: str) -> tuple[State, Tensor]:
         if kind == "dvr":
             x = x + linear(CODE, *layer(f"fc_c.{n}", width, 2))
         inner = normed(f"{block}.bn_0", x) if cbn else x
-        inner = linear(inner.relu(), *layer(f"{block}.fc_0", width, width, *extra_size))
+        inner = linear(inner.relu(), *layer(f"{block}.fc_0", width, width, *one))
         inner = normed(f"{block}.bn_1", inner) if cbn else inner
-        x = x + linear(inner.relu(), *layer(f"{block}.fc_1", width, width, *extra_size))
+        x = x + linear(inner.relu(), *layer(f"{block}.fc_1", width, width, *one))
     x = normed("bn", x) if cbn else x
-    x = linear(x.relu(), *layer(f"{letters}_out", 4 if kind == "dvr" else 1, width, *extra_size))
+    x = linear(x.relu(), *layer(f"{letters}_out", 4 if kind == "dvr" else 1, width, *one))
     return state, x[:, 0]
 
 
 @each("kind", ["dvr", "shift", "cbn", "cbn2"])
-def test_an_occupancy_network_has_the_logits_of_the_published_code(kind):
+def test_an_occupancy_network_has_the_logits_of_its_own_code(kind):
     torch.manual_seed(0)
     state, logits = occupancy(kind)
     network = published.load_occupancy_network({"encoder.conv1.weight": drawn(4, 4)} | state)
@@ -228,14 +229,14 @@ def without(state: State, key: str) -> State:
 
 
 def deepsdf_with(state: Any, **changed: Any) -> Any:
-    """Reads a DeepSDF decoder with changed specs, and with a function applied to its state."""
-    state_dict, settings, _ = deepsdf(SPECS, weight_norm_2019, "")
-    return published.deepsdf(state(state_dict), settings | {"NetworkSpecs": SPECS | changed})
+    """Reads a DeepSDF decoder whose state is changed by a function, and its specs."""
+    found, settings, _ = deepsdf(SPECS, as_of_2019, "")
+    return published.load_deepsdf(state(found), settings | {"NetworkSpecs": SPECS | changed})
 
 
 def implicit_with(changed: State) -> Any:
-    state = implicit("sdf_network.", 0, plain_weight)[0]
-    return published.implicit(state | {f"sdf_network.{key}": weight for key, weight in changed.items()})
+    state = implicit("sdf_network.", 0, directly)[0]
+    return published.load_sdf_network(state | {f"sdf_network.{key}": one for key, one in changed.items()})
 
 
 def cbn_with(state: Any) -> Any:
@@ -260,7 +261,10 @@ def plain_with(state: Any) -> Any:
     (lambda: implicit_with({"lin0.weight": drawn(40, 2), "lin2.weight": drawn(40, 39)}), ("lin0 takes 2", "be 3")),
     (lambda: implicit_with({"lin0.weight": drawn(40, 81), "lin2.weight": drawn(40, 118)}), ("takes 81", "at most 12")),
     (lambda: implicit_with({"lin2.weight": drawn(40, 39)}), ("lin2 takes 39",)),
-    (lambda: published.implicit(implicit("module.", 0, plain_weight)[0]), ("no layers of this format", "module.lin0")),
+    (
+        lambda: published.load_sdf_network(implicit("module.", 0, directly)[0]),
+        ("no layers of this format", "module.lin0"),
+    ),
     (lambda: cbn_with(lambda s: s | {"decoder.fc_p.weight": drawn(8, 2, 1)}), ("fc_p.weight must be any x 3",)),
     (lambda: cbn_with(lambda s: without(s, "decoder.bn.bn.running_var")), ("lacks decoder.bn.bn.running_var",)),
     (lambda: plain_with(lambda s: s | {"0000.dense.A": drawn(2, 8)}), ("0000.dense.A must be 3 x any", "2 x 8")),
@@ -272,4 +276,5 @@ def test_a_network_of_another_shape_is_refused_by_the_names_of_its_weights(read,
     torch.manual_seed(0)
     with pytest.raises(BadInput) as error:
         read()
-    assert all(word in str(error.value) for word in words), error.value
+    for word in words:
+        assert word in str(error.value)

@@ -1,4 +1,4 @@
-"""Shared by the tests of the report: pictures are coarse, and one report serves all tests that read it."""
+"""Shared by the tests of the report: its pictures are coarse, and one report is written for all that read it."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +12,7 @@ from bench.report.write import paper
 
 @pytest.fixture(scope="session", autouse=True)
 def coarse_pictures() -> Iterator[None]:
-    """Writes coarse pictures: a picture takes longer than all other files together."""
+    """A picture takes longer to write than all else together."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(style.RC, "savefig.dpi", 50)
         yield
@@ -20,10 +20,10 @@ def coarse_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory) -> Path:
-    """A results folder with the report of a table and of a table with figures; read-only."""
-    from tests.report.test_report_paper import DYNAMIC, costs, write_gradients, write_run
+    """A results folder with the report of a table and of a table with figures; nothing is written to it."""
+    from tests.report.test_report_paper import DYNAMIC, costs, write_judged, write_run
 
-    results = write_gradients(tmp_path_factory.mktemp("reported"))
+    results = write_judged(tmp_path_factory.mktemp("reported"))
     write_run(results, "table1", DYNAMIC, metrics=costs())
     main([f"results_dir={results}"])
     return results
@@ -31,7 +31,7 @@ def reported(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def without_shipped(tmp_path_factory) -> Iterator[None]:
-    """Leaves the shipped tables out of reports: only the user's tables remain."""
+    """A report shows the user's own tables alone, not those that a checkout ships."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "SHIPPED", tmp_path_factory.getbasetemp() / "none")
         yield

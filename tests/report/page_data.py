@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-SCRIPT_HEAD = "implicitBench.receive("
+HEAD = "implicitBench.receive("
 
 
 class Shell(HTMLParser):
@@ -26,15 +26,15 @@ class Shell(HTMLParser):
 
 
 def script(path: Path) -> tuple[str, str, Any]:
-    """The kind, the key and the data of a script; asserts that it holds nothing else."""
+    """The kind, the key and the data of a script, which holds nothing else."""
     text = path.read_text(encoding="ascii")
-    assert text.startswith(SCRIPT_HEAD) and text.endswith(");\n") and text.count("\n") == 1
+    assert text.startswith(HEAD) and text.endswith(");\n") and text.count("\n") == 1
     assert not set("<>&\u2028\u2029") & set(text)
-    return tuple(json.loads(f"[{text[len(SCRIPT_HEAD) : -3]}]"))
+    return tuple(json.loads(f"[{text[len(HEAD) : -3]}]"))
 
 
 class Page:
-    """The page of a results folder, as data."""
+    """What the page of a results folder shows."""
 
     def __init__(self, results: Path, beginning: int = 2) -> None:
         self.results, self.data, self.beginning = results, results / "page" / "data", beginning
@@ -44,9 +44,9 @@ class Page:
         self.folders = self.runs["folder"]
 
     def read(self, kind: str, key: str) -> Any:
-        content = script(self.data / kind / f"{key}.js")
-        assert content[:2] == (kind, key)
-        return content[2]
+        found = script(self.data / kind / f"{key}.js")
+        assert found[:2] == (kind, key)
+        return found[2]
 
     def text(self, column: str) -> list[str]:
         """A column of texts."""
@@ -55,12 +55,12 @@ class Page:
 
     def run(self, folder: str) -> dict[str, Any]:
         """The details of a run."""
-        index = self.folders.index(folder)
-        key, address = (self.runs[column][index] for column in ("key", "address"))
-        script_data = self.read("run", key[: self.beginning])
-        texts, run = script_data["texts"], script_data["runs"][key]
+        place = self.folders.index(folder)
+        key, address = (self.runs[column][place] for column in ("key", "address"))
+        whole = self.read("run", key[: self.beginning])
+        texts, run = whole["texts"], whole["runs"][key]
         return run | {
-            "settings": [row for group in run["settings"] for row in texts[group]],
+            "settings": [row for part in run["settings"] for row in texts[part]],
             "environment": [texts[row] for row in run["environment"]],
             "metrics": [[texts[name], *values, texts[words]] for name, *values, words in run["metrics"]],
             "files": {name: address + name for name in texts[run["files"]]},

@@ -1,4 +1,4 @@
-"""A chart is drawn from the data that the page gets; a verdict is written from numbers."""
+"""A chart is drawn as a figure from the data that the page gets; a verdict is written of numbers."""
 
 import math
 
@@ -12,8 +12,8 @@ from bench.report.data.statistics import Interval
 from bench.report.write.chart import curve, draw, level, panel_data, series
 from tests.looped import each
 
-INTERVALS = [Interval(2.0, 1.0, 4.0), Interval(20.0, 10.0, math.inf)]
-FEW_SHAPES = [Interval(2.0, math.nan, math.nan, (1.0, 3.0))]
+KNOWN = [Interval(2.0, 1.0, 4.0), Interval(20.0, 10.0, math.inf)]
+FEW = [Interval(2.0, math.nan, math.nan, (1.0, 3.0))]
 
 
 def axis_of(*drawn, **panel):
@@ -22,21 +22,21 @@ def axis_of(*drawn, **panel):
 
 
 def test_a_row_has_its_preset_s_look_in_the_figure_and_on_the_page():
-    drawn = curve("DIST", "dist", [1, 2], [0, 5])
-    (line,) = axis_of(drawn).lines
-    assert drawn["colour"] == line.get_color() == style.look("dist").colour == "#0072b2"
-    assert drawn["symbol"] == line.get_marker() and drawn["dash"] == line.get_linestyle() == "-"
+    made = curve("DIST", "dist", [1, 2], [0, 5])
+    (line,) = axis_of(made).lines
+    assert made["colour"] == line.get_color() == style.look("dist").colour == "#0072b2"
+    assert made["symbol"] == line.get_marker() and made["dash"] == line.get_linestyle() == "-"
     assert line.get_label() == "DIST" and list(line.get_ydata()) == [0, 5]
 
 
-def test_positions_with_names_are_evenly_spaced_also_if_the_first_has_no_value():
+def test_positions_with_names_are_evenly_apart_also_where_the_first_has_no_value():
     drawn = [series("b", "dist", [2.0], [1]), series("c", "idr", [3.0], [8])]
     assert not panel_data("", "x", "", drawn, rows=list("abcdefghi"))["y"]["log"]
-    crossed = [series(line["name"], "dist", line["y"], line["x"]) for line in drawn]
+    crossed = [series(each["name"], "dist", each["y"], each["x"]) for each in drawn]
     assert not panel_data("", "", "y", crossed, ticks=list("abcdefghi"))["x"]["log"]
 
 
-def test_an_axis_is_logarithmic_if_its_values_are_positive_and_spread():
+def test_an_axis_is_logarithmic_where_its_values_are_positive_and_spread():
     panel = panel_data("", "x", "y", [series("a", "dist", [1, 100], [0, 5])])
     assert panel["x"] == {"title": "x", "log": True} and panel["y"] == {"title": "y", "log": False}
     (axis,) = draw([panel], 2.0).axes
@@ -44,7 +44,7 @@ def test_an_axis_is_logarithmic_if_its_values_are_positive_and_spread():
 
 
 def test_intervals_are_a_band_around_a_line_and_bars_of_points():
-    line, points = (axis_of(kind("a", "dist", [1, 2], INTERVALS)) for kind in (curve, series))
+    line, points = (axis_of(kind("a", "dist", [1, 2], KNOWN)) for kind in (curve, series))
     (band,), (bars,) = line.collections, points.collections
     assert isinstance(band, PolyCollection) and isinstance(bars, LineCollection)
     assert [segment[:, 1].tolist() for segment in bars.get_segments()] == [[1, 4], [10, 40]]  # ∞ is at the edge
@@ -52,16 +52,16 @@ def test_intervals_are_a_band_around_a_line_and_bars_of_points():
 
 
 def test_without_an_interval_the_points_of_the_shapes_are_drawn():
-    drawn = series("a", "dist", [7], FEW_SHAPES)
-    assert "low" not in drawn and drawn["shapes"] == [[7, 1], [7, 3]]
-    _, shapes = axis_of(drawn).lines
-    assert shapes.get_markersize() == 2 and np.transpose(shapes.get_data()).tolist() == drawn["shapes"]
+    made = series("a", "dist", [7], FEW)
+    assert "low" not in made and made["shapes"] == [[7, 1], [7, 3]]
+    _, shapes = axis_of(made).lines
+    assert shapes.get_markersize() == 2 and np.transpose(shapes.get_data()).tolist() == made["shapes"]
     far = series("a", "dist", [7], [Interval(2.0, math.nan, math.nan, (1.0, 30.0))])  # above twice the median
     assert axis_of(far).lines[1].get_ydata().tolist() == [1, 30]
 
 
 def test_in_a_panel_with_names_of_rows_intervals_and_shapes_are_along_x():
-    drawn = axis_of(series("a", "dist", INTERVALS, [0, 1]), series("b", "idr", FEW_SHAPES, [2]), rows=["p", "q", "r"])
+    drawn = axis_of(series("a", "dist", KNOWN, [0, 1]), series("b", "idr", FEW, [2]), rows=["p", "q", "r"])
     (bars,) = drawn.collections
     assert [segment.tolist() for segment in bars.get_segments()] == [[[1, 0], [4, 0]], [[10, 1], [40, 1]]]
     assert np.transpose(drawn.lines[-1].get_data()).tolist() == [[1, 2], [3, 2]]
@@ -73,7 +73,7 @@ def test_the_ticks_of_x_do_not_depend_on_the_intervals_of_y():
     assert {"2e7", "5e7"} <= {tick.get_text() for tick in ticks}
 
 
-def test_the_page_and_the_figure_have_the_same_looks():
+def test_looks_of_the_page_are_those_of_the_figure():
     hollow = series("a", "dist", [1], [1], hollow=True, size=10)
     step = curve("b", "idr", [1, 2], [1, 2], step=True, quiet=True)
     drawn = axis_of(hollow, step, series("c", "dvr", [1], [9], off=True), level("exact", [1, 2], 1.5), ticks=["p", "q"])
@@ -84,7 +84,7 @@ def test_the_page_and_the_figure_have_the_same_looks():
     assert [label.get_text() for label in drawn.get_xticklabels()] == ["p", "q"]
 
 
-def test_only_the_first_shared_axis_is_named_and_cells_without_a_panel_are_empty():
+def test_of_axes_that_are_shared_the_first_alone_is_named_and_places_without_a_panel_are_empty():
     panel = panel_data("", "x", "y", [series("a", "dist", [1], [1])])
     axes = draw([panel] * 3, 2.0, 2, sharey=True).axes
     assert [axis.get_ylabel() for axis in axes] == ["y", "", "y", ""] and not axes[3].axison
@@ -93,11 +93,11 @@ def test_only_the_first_shared_axis_is_named_and_cells_without_a_panel_are_empty
 @each("shared, edge", [({"sharey": "row"}, 8.0), ({"sharey": True}, 200.0), ({}, 2.0)])
 def test_what_is_infinite_is_above_all_that_its_axis_shows(shared, edge):
     values = [[1.0, math.inf], [1.0, 4.0], [1.0, 100.0]]
-    panels = [panel_data("", "x", "y", [curve("a", "dist", [1, 2], heights)]) for heights in values]
+    panels = [panel_data("", "x", "y", [curve("a", "dist", [1, 2], own)]) for own in values]
     assert draw(panels, 2.0, 2, **shared).axes[0].lines[0].get_ydata()[1] == edge
 
 
-def test_a_verdict_has_the_best_and_the_worst_row_and_is_empty_if_nothing_is_finite():
+def test_a_verdict_has_the_best_and_the_worst_row_and_none_where_nothing_is_finite():
     values = {"a": 2.0, "b": math.inf, "c": 1.0, "d": None, "e": math.nan}
     assert ends("Error", values, "3 shapes") == "Error: *1.00* (c) to ∞ (b); n = 3 shapes."
     assert ends("Score", {"a": 2.0, "c": 1.0}, "3 shapes", most=True) == "Score: *2.00* (a) to 1.00 (c); n = 3 shapes."

@@ -1,4 +1,4 @@
-"""Claims of the papers, aggressive marching over alpha, and DIST one change at a time, from synthetic runs."""
+"""Claims of the papers, aggressive marching over alpha, and DIST one change at a time, from runs of known numbers."""
 
 from math import inf, nan
 from pathlib import Path
@@ -14,21 +14,24 @@ from tests.report.test_report_paper import page_of, write_run
 SHAPES = tuple(range(6))
 
 
-@each("expected, published, low, value, high, verdict", [
-    (SMALLER, 0.5, 0.5, 0.8, 0.9, "holds"),  # half of the effect is 0.71
-    (SMALLER, 0.5, 0.75, 0.8, 0.9, "weaker"),
-    (SMALLER, 0.5, 0.75, 0.8, 1.1, "less than half the effect"),
-    (SMALLER, None, 0.5, 0.8, 0.9, "holds"),
-    (SMALLER, 0.5, 0.5, 0.6, 1.1, "not decided"),
-    (SMALLER, 0.5, 1.1, 1.2, 1.3, "does not hold"),
-    (NO_LARGER, None, 1.01, 1.1, 1.4, "larger (size not decided)"),
-    (NO_LARGER, None, 0.5, 0.6, 0.7, "holds"),
-    (NO_LARGER, None, 0.5, 1.0, 1.3, "not decided"),
-    (NO_LARGER, None, 1.3, 1.4, 1.5, "does not hold"),
-    (SMALLER, 0.5, nan, 0.6, nan, "as claimed, 4 shapes"),
-    (SMALLER, 0.5, nan, 1.6, nan, "against the claim, 4 shapes"),
-    (NO_LARGER, None, nan, 1.3, nan, "against the claim, 4 shapes"),
-])  # fmt: skip
+@each(
+    "expected, published, low, value, high, verdict",
+    [
+        (SMALLER, 0.5, 0.5, 0.8, 0.9, "holds"),  # half of the effect is 0.71
+        (SMALLER, 0.5, 0.75, 0.8, 0.9, "weaker"),
+        (SMALLER, 0.5, 0.75, 0.8, 1.1, "less than half the effect"),
+        (SMALLER, None, 0.5, 0.8, 0.9, "holds"),
+        (SMALLER, 0.5, 0.5, 0.6, 1.1, "not decided"),
+        (SMALLER, 0.5, 1.1, 1.2, 1.3, "does not hold"),
+        (NO_LARGER, None, 1.01, 1.1, 1.4, "larger (size not decided)"),
+        (NO_LARGER, None, 0.5, 0.6, 0.7, "holds"),
+        (NO_LARGER, None, 0.5, 1.0, 1.3, "not decided"),
+        (NO_LARGER, None, 1.3, 1.4, 1.5, "does not hold"),
+        (SMALLER, 0.5, nan, 0.6, nan, "as claimed, 4 shapes"),
+        (SMALLER, 0.5, nan, 1.6, nan, "against the claim, 4 shapes"),
+        (NO_LARGER, None, nan, 1.3, nan, "against the claim, 4 shapes"),
+    ],
+)
 def test_a_verdict_follows_the_rule(expected, published, low, value, high, verdict):
     claim = Claim("a paper", "a claim", published, expected=expected)
     assert verdict_of(claim, Interval(value, low, high, (value,) * 4)) == verdict
@@ -38,27 +41,35 @@ def test_every_claim_names_rows_and_tests_that_exist_or_says_what_it_needs():
     rows = {*names("renderer"), *names("method")}
     for claim in CLAIMS:
         if claim.experiment:
-            assert {claim.top, claim.bottom} <= rows, claim
-            assert (claim.command or claim.experiment) in names("experiment"), claim
+            assert {claim.top, claim.bottom} <= rows and (claim.command or claim.experiment) in names("experiment"), (
+                claim
+            )
         elif not claim.test:
             assert claim.why.startswith("needs"), claim
     tests = "".join(path.read_text() for path in Path(__file__).parents[1].rglob("test_*.py"))
     assert all(f"def {claim.test}(" in tests for claim in CLAIMS if claim.test)
 
 
-def dense_runs(results, method, errors, **changed):
-    """Writes completions of sofas from dense depth."""
+def dense(results, method, errors, **changed):
+    """Completions of sofas from dense depth."""
     for index, error in zip(SHAPES, errors, strict=True):
-        fields = {"task": "completion", "dataset": "sofa", "method": method, "index": index} | changed
-        experiment, settings = fields.pop("experiment", "table2"), {"task": {"points": "dense"}, "split": "test"}
-        write_run(results, experiment, method, settings=settings, metrics={"chamfer_l2": error}, **fields)
+        known = {"task": "completion", "dataset": "sofa", "method": method, "index": index} | changed
+        settings = {"task": {"points": "dense"}, "split": "test"} | known.pop("settings", {})
+        write_run(
+            results,
+            known.pop("experiment", "table2"),
+            method,
+            settings=settings,
+            **known,
+            metrics={"chamfer_l2": error},
+        )
 
 
 def test_claims_are_measured_on_shapes_that_both_rows_have(tmp_path):
-    dense_runs(tmp_path, "deepsdf_truncated", [1.0] * 6)
-    dense_runs(tmp_path, "dist_mask_official", [0.3, 0.4, 0.5, 0.6, 0.7, 9.0])
-    dense_runs(tmp_path, "dist_mask_paper", [2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
-    dense_runs(tmp_path, "dist_mask_paper", [0.1] * 6, dataset="car")  # the paper has no cars
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 6)
+    dense(tmp_path, "dist_mask_official", [0.3, 0.4, 0.5, 0.6, 0.7, 9.0])
+    dense(tmp_path, "dist_mask_paper", [2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
+    dense(tmp_path, "dist_mask_paper", [0.1] * 6, dataset="car")  # the paper has no cars
     page = page_of(tmp_path, "claims")
     lines = {line["claim"]: line for line in page.lines if line["shapes"]}
     assert {name: line["shapes"] for name, line in lines.items()} == dict.fromkeys(lines, 6) and len(lines) == 2
@@ -71,11 +82,11 @@ def test_claims_are_measured_on_shapes_that_both_rows_have(tmp_path):
 
 
 def test_what_failed_in_both_rows_says_nothing_and_a_failure_in_one_counts(tmp_path):
-    dense_runs(tmp_path, "deepsdf_truncated", [1.0] * 5 + [2.0])
-    dense_runs(tmp_path, "dist_mask_paper", [0.1] * 6, status="nan")
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 5 + [2.0])
+    dense(tmp_path, "dist_mask_paper", [0.1] * 6, status="nan")
     (line,) = [line for line in page_of(tmp_path, "claims").lines if line["shapes"]]
     assert line["ratio"].value == inf and line["verdict"] == "does not hold"
-    dense_runs(tmp_path, "deepsdf_truncated", [1.0] * 6, status="nan", minute=30)
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 6, status="nan", minute=30)
     assert not [line for line in page_of(tmp_path, "claims").lines if line["shapes"]]
 
 
@@ -85,18 +96,19 @@ def test_a_claim_is_not_tested_by_runs_of_other_settings_than_it_names(tmp_path)
             settings = {"renderer": {"step_clamp": clamp}, "view": {"resolution": 64}}
             about = {"renderer": preset, "settings": settings, "metrics": {"queries": queries}}
             write_run(tmp_path, "table1_large", preset, **about)
-    lines = page_of(tmp_path, "claims").lines
-    (line,) = [line for line in lines if line["claim"].startswith("aggressive marching saves")]
+    (line,) = [
+        line for line in page_of(tmp_path, "claims").lines if line["claim"].startswith("aggressive marching saves")
+    ]
     assert (line["verdict"], line["why"]) == ("not tested", NO_RUNS)
 
 
 def test_a_claim_is_not_tested_by_runs_that_are_only_planned(tmp_path):
-    dense_runs(tmp_path, "deepsdf_truncated", [1.0] * 6)
-    dense_runs(tmp_path, "dist_mask_paper", [2.0] * 6, status="not_run")
+    dense(tmp_path, "deepsdf_truncated", [1.0] * 6)
+    dense(tmp_path, "dist_mask_paper", [2.0] * 6, status="not_run")
     assert not any(line["shapes"] for line in page_of(tmp_path, "claims").lines)
 
 
-def marching_runs(results, alpha, *, truncation, clamp, wrong, queries):
+def marched(results, alpha, *, truncation, clamp, wrong, queries):
     for index in SHAPES:
         settings = {"renderer": {"alpha": alpha, "step_clamp": clamp}, "prior": {"truncation": truncation}}
         metrics = {"lost": wrong, "false": 0, "wrong": 0, "hits": 100, "queries": queries}
@@ -104,22 +116,23 @@ def marching_runs(results, alpha, *, truncation, clamp, wrong, queries):
 
 
 def test_aggressive_marching_is_measured_over_plain_marching_of_distances(tmp_path):
-    for alpha, truncation, clamp, wrong, queries in (
-        (1.0, None, None, 1, 1000), (1.0, None, 0.1, 1, 2000), (1.0, 0.1, 0.1, 1, 3000),
-        (1.5, None, None, 30, 700), (1.5, None, 0.1, 1, 1400), (1.5, 0.1, 0.1, 2, 2100),
-    ):  # fmt: skip
-        marching_runs(tmp_path, alpha, truncation=truncation, clamp=clamp, wrong=wrong, queries=queries)
+    marched(tmp_path, 1.0, truncation=None, clamp=None, wrong=1, queries=1000)
+    marched(tmp_path, 1.5, truncation=None, clamp=None, wrong=30, queries=700)
+    marched(tmp_path, 1.0, truncation=None, clamp=0.1, wrong=1, queries=2000)
+    marched(tmp_path, 1.5, truncation=None, clamp=0.1, wrong=1, queries=1400)
+    marched(tmp_path, 1.0, truncation=0.1, clamp=0.1, wrong=1, queries=3000)
+    marched(tmp_path, 1.5, truncation=0.1, clamp=0.1, wrong=2, queries=2100)
     page = page_of(tmp_path, "truncation")
-    shares_and_costs = {(line["kind"], line["alpha"]): (line["wrong"], line["cost"]) for line in page.lines}
-    assert shares_and_costs[(False, False), 1.5] == (0.3, 0.7)
-    assert shares_and_costs[(True, True), 1.5] == (0.02, 2.1)
+    found = {(line["kind"], line["alpha"]): (line["wrong"], line["cost"]) for line in page.lines}
+    assert found[(False, False), 1.5] == (0.3, 0.7)
+    assert found[(True, True), 1.5] == (0.02, 2.1)
     assert "*30.0 %* of the pixels" in page.verdict and "cost 1.40 and 2.10 times" in page.verdict
     assert page.figure is not None
 
 
 def test_each_change_is_divided_by_the_papers_setting(tmp_path):
     for method, error in {"deepsdf_truncated": 2.0, "as_printed_clamp": 3.0, "as_printed": 4.0}.items():
-        dense_runs(tmp_path, method, [error] * 6, experiment="as_printed")
+        dense(tmp_path, method, [error] * 6, experiment="as_printed")
     page = page_of(tmp_path, "as_printed")
     ratios = {line["preset"]: line["ratio"].ratio.value for line in page.lines if line["ratio"]}
     assert ratios == pytest.approx({"deepsdf_truncated": 0.5, "as_printed_clamp": 0.75})

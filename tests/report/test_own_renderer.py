@@ -1,4 +1,4 @@
-"""A renderer of one Python file and one YAML runs, and is in Table 1, the front and the atlas."""
+"""A renderer that is one Python file and one YAML runs, and stands in Table 1, in the front and in the atlas."""
 
 from pathlib import Path
 
@@ -16,25 +16,32 @@ NETWORK = (
     "prior.network.layers=2", "prior.network.width=16", "prior.network.code_length=4", "prior.network.skip=0",
     "prior.steps=20", "prior.samples=500", "view.resolution=16", "task.repeats=1",
 )  # fmt: skip
-SEARCH = ("scale.stability.search.levels=5", "scale.stability.search.repeats=2", "task.resolution=16")
 RUNS = (
     ("+experiment=table1", "dataset=sphere", *NETWORK),
     ("+experiment=speed_rendering", "dataset=sphere", "prior=fit", *NETWORK),
-    ("+experiment=stability", "stress=thin_plate", *SEARCH),
+    (
+        "+experiment=stability",
+        "stress=thin_plate",
+        "scale.stability.search.levels=5",
+        "scale.stability.search.repeats=2",
+        "task.resolution=16",
+    ),
 )
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory) -> Path:
-    """The results of runs of a user's renderer, with their report."""
+    """What the runs of a renderer of a user's own left, with its report."""
     folder = tmp_path_factory.mktemp("own")
     (folder / "conf" / "renderer").mkdir(parents=True)
     mine = "_target_: tests.user_renderer.Mine\n_label_: Mine\nsteps: 40\n"
     (folder / "conf" / "renderer" / "mine.yaml").write_text(mine)
     for overrides in RUNS:
-        chosen = ("renderer=mine", "packages=[tests]", f"results_dir={folder / 'results'}")
-        result = command(f"--config-dir={folder / 'conf'}", *overrides, *SMALL, *chosen)
-        assert result.code == 0, result.err
+        done = command(
+            f"--config-dir={folder / 'conf'}", *overrides, *SMALL, "renderer=mine", "packages=[tests]",
+            f"results_dir={folder / 'results'}",
+        )  # fmt: skip
+        assert done.code == 0, done.err
     report([f"results_dir={folder / 'results'}"])
     return folder / "results"
 

@@ -20,13 +20,14 @@ def rows(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_the_results_page_matches_the_committed_tables(tmp_path):
+def test_the_results_page_is_that_of_the_committed_tables(tmp_path):
     shutil.copytree(PAPER, tmp_path / "paper")
     text = write_readme(tmp_path).read_text()
     assert text == (ROOT / "results" / "README.md").read_text()
     links = [path for path, _ in LINK.findall(text)]
-    linked = sorted(path for path in links if path.endswith(".md") and path.startswith("paper/"))
-    assert linked == sorted(f"paper/{page.name}" for page in PAPER.glob("*.md"))
+    assert sorted(path for path in links if path.endswith(".md") and path.startswith("paper/")) == sorted(
+        f"paper/{page.name}" for page in PAPER.glob("*.md")
+    )
     assert all((ROOT / "results" / path).exists() for path in links)
 
 
@@ -44,12 +45,12 @@ def test_the_results_page_follows_its_tables(tmp_path):
     assert page.endswith("\n\n- A note\n")
 
 
-def test_the_answers_of_the_readme_match_the_committed_results():
+def test_the_answers_of_the_readme_are_those_of_the_committed_results():
     text = (ROOT / "README.md").read_text()
-    assert all(answer in text for answer in (readme.recommendation(), readme.table(), readme.hard_scenes()))
+    assert all(part in text for part in (readme.recommendation(), readme.table(), readme.hard_scenes()))
 
 
-def test_the_ranks_that_the_readme_names_match_the_kept_rows(tmp_path):
+def test_the_ranks_that_the_readme_names_are_those_of_the_kept_rows(tmp_path):
     rows = [row for row in read_rows(PAPER) if row["config"].get("experiment") == "stability"]
     write_paper(rows, tmp_path, only="stability_cost")
     drawn, committed = (read_shown(folder / "stability_cost.json") for folder in (tmp_path / "paper", PAPER))

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from urllib.parse import unquote
@@ -12,7 +14,6 @@ from bench.report.site.columns import machine
 from bench.report.write.html import write_index
 from tests.looped import each
 from tests.report.page_data import Page, script
-from tests.runner.driving import by_program
 
 ODD_NAME = "two words ünïcode 50% #1?"
 SHOWN = (format.number, format.count, format.size, format.seconds)
@@ -22,15 +23,28 @@ HOSTILE = "<script>alert('reason')</script> & \"quotes\""
 def record(name: str, **changed) -> dict:
     metrics = {"chamfer_l2": 0.00123, "fscore": 0.875, "depth_mae": "inf", "rotation_error_deg": 3.25}
     return {
-        "schema": 1, "id": name, "task": "completion", "renderer": "dist", "dataset": "sofa", "seed": 0,
-        "status": "ok", "reason": "", "started": "2025-03-01T10:00:00Z", "config": {"task": {"name": "completion"}},
-        "metrics": metrics, "metrics_start": {**metrics, "chamfer_l2": 0.0456}, "reused": False,
+        "schema": 1,
+        "id": name,
+        "task": "completion",
+        "renderer": "dist",
+        "dataset": "sofa",
+        "seed": 0,
+        "status": "ok",
+        "reason": "",
+        "started": "2025-03-01T10:00:00Z",
+        "config": {"task": {"name": "completion"}},
+        "metrics": metrics,
+        "metrics_start": {**metrics, "chamfer_l2": 0.0456},
         "definitions": {"chamfer_l2": "Sum of two means.", "fscore": "Harmonic mean."},
-        "evaluations": {"value": 1_430_000, "gradient": 999, "per_ray": 21.5}, "flops": 1e12, "gemm_fraction": None,
+        "evaluations": {"value": 1_430_000, "gradient": 999, "per_ray": 21.5},
         "seconds": {"warmup": 0.5, "forward": 10.0, "backward": 20.0, "evaluation": 1.0, "total": 31.5},
+        "peak_memory_bytes": 2_500_000_000,
+        "flops": 1e12,
+        "gemm_fraction": None,
         "environment": {"commit": "abc1234", "dirty": False, "cpu": "Some CPU", "threads": 2, "device": "cpu"},
-        "peak_memory_bytes": 2_500_000_000, **changed,
-    }  # fmt: skip
+        "reused": False,
+        **changed,
+    }
 
 
 def write_run(results: Path, content: dict | str | bytes, name: str, files: tuple[str, ...] = ()) -> Path:
@@ -108,20 +122,23 @@ def test_rows_are_newest_first_and_show_the_numbers(results):
     assert details["costs"]["peak_memory_bytes"] == 2_500_000_000
 
 
-def test_a_reason_stays_text_and_becomes_no_script(results):
+def test_reason_is_kept_as_text_and_no_script_can_come_of_it(results):
     page = page_of(results)
-    index = page.folders.index("broken")
-    assert page.runs["reason"][index] == page.run("broken")["reason"] == HOSTILE
+    place = page.folders.index("broken")
+    assert page.runs["reason"][place] == page.run("broken")["reason"] == HOSTILE
     for path in (results / "page" / "data").rglob("*.js"):
-        script(path)  # asserts that it holds data only, without < > & that could end it
+        script(path)  # holds data alone, and none of < > & that could end it
 
 
-@each("environment, named", [
-    ({"cpu": "Some CPU", "threads": 2, "device": "cpu"}, "Some CPU, 2 threads"),
-    ({"cpu": "Some CPU", "threads": 1, "device": "Some GPU"}, "Some CPU + Some GPU, 1 thread"),
-    ({}, ""),  # a run that ended in its set-up has no machine
-    ({"cpu": "Other CPU", "device": "cpu"}, ""),
-])  # fmt: skip
+@each(
+    "environment, named",
+    [
+        ({"cpu": "Some CPU", "threads": 2, "device": "cpu"}, "Some CPU, 2 threads"),
+        ({"cpu": "Some CPU", "threads": 1, "device": "Some GPU"}, "Some CPU + Some GPU, 1 thread"),
+        ({}, ""),  # a run that ended in its set-up has no machine
+        ({"cpu": "Other CPU", "device": "cpu"}, ""),
+    ],
+)
 def test_a_machine_is_named_by_what_times_depend_on(environment, named):
     assert machine(record("a", environment=environment)) == named
 
@@ -147,7 +164,7 @@ def test_foreign_records_are_named_and_not_fatal(tmp_path):
         write_run(tmp_path, content, f"foreign{number:02}")
     write_run(tmp_path, crashed("broken"), "broken")
     records, problems = read_records(tmp_path)
-    assert [record_read["folder"] for record_read in records] == ["broken"]
+    assert [found["folder"] for found in records] == ["broken"]
     for number, (problem, why) in enumerate(zip(problems, FOREIGN.values(), strict=True)):
         assert problem.startswith(f"foreign{number:02}: ") and why in problem
     page = page_of(tmp_path)
@@ -161,22 +178,27 @@ def test_no_runs_yet(tmp_path):
 
 def test_command_prints_the_page_last(results, capsys):
     main([f"results_dir={results}"])
-    printed = capsys.readouterr()
+    said = capsys.readouterr()
     unread = [["not read", name] for name in ("damaged", "future", "unfinished")]
-    assert [line.split(": ")[:2] for line in printed.err.splitlines()] == unread
-    assert printed.out.splitlines()[-1] == str(results / "index.html") and (results / "index.html").is_file()
+    assert [line.split(": ")[:2] for line in said.err.splitlines()] == unread
+    assert said.out.splitlines()[-1] == str(results / "index.html") and (results / "index.html").is_file()
 
 
-@each("argument, named", [
-    ("results_dir=/no/such/folder", "there is no such folder; name one that has runs, or make a run"),
-    ("result_dir=x", "argument must be one of results_dir=PATH"),
-    ("results_dir=", "results_dir has no value: type results_dir=PATH"), ("meshes=many", "a number of runs or all"),
-    ("columns=Step", "columns.PAGE=HEADING,HEADING, ship=PATH, found 'columns=Step'"),
-    ("columns.table1=", "columns.table1 has no value: type columns.PAGE=HEADING,HEADING"),
-])  # fmt: skip
-def test_command_refuses_unknown_arguments(argument, named, tmp_path, monkeypatch, capsys):
+@each(
+    "argument, named",
+    [
+        ("results_dir=/no/such/folder", "there is no such folder; name one that has runs, or make a run"),
+        ("result_dir=x", "argument must be one of results_dir=PATH"),
+        ("results_dir=", "results_dir has no value: type results_dir=PATH"),
+        ("meshes=many", "a number of runs or all"),
+        ("columns=Step", "columns.PAGE=HEADING,HEADING, ship=PATH, found 'columns=Step'"),
+        ("columns.table1=", "columns.table1 has no value: type columns.PAGE=HEADING,HEADING"),
+    ],
+)
+def test_command_refuses_what_it_does_not_know(argument, named, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main([argument]) == 2 and named in capsys.readouterr().err
+    assert main([argument]) == 2
+    assert named in capsys.readouterr().err
     assert not list(tmp_path.iterdir())  # nothing is written before all is known to be sound
 
 
@@ -185,19 +207,42 @@ def test_report_never_imports_torch():
         "import sys, bench.report.__main__; bench.report.write.paper.studies(); "
         "assert 'bench.studies.table1' in sys.modules and 'torch' not in sys.modules"
     )
-    result = by_program("-c", code)
-    assert result.code == 0, result.err
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
-@each("show, texts", [
-    (format.number, {0.0123456: "0.0123", 0.5: "0.500", 9.996: "10.0", 99.96: "100", 1234.5: "1230", 1389: "1389"}),
-    (format.number, {1_430_000: "1.43e6", -12.34: "-12.3", 0.00001234: "1.23e-5", 1.5e9: "1.50e9", 0: "0"}),
-    (format.number, {float("-inf"): "-∞", float("nan"): "nan"}),
-    (partial(format.number, scale=1000.0), {0.00123: "1.23"}),
-    (format.count, {0: "0", 999: "999", 999.6: "1.00k", 1_430_000: "1.43M", 999_999: "1.00M", 2e18: "2000P"}),
-    (format.size, {512: "512 B", 1_430_000_000: "1.43 GB"}),
-    (format.seconds, {0: "0 s", 0.0123: "12.3 ms", 31.5: "31.5 s", 600: "10.0 min", 9000: "2.50 h"}),
-    *((show, {None: "–", float("inf"): "∞"}) for show in SHOWN),
-])  # fmt: skip
-def test_numbers_have_three_digits_and_a_unit(show, texts):
-    assert {value: show(value) for value in texts} == texts
+@each(
+    "show, value, text",
+    [
+        (format.number, 0.0123456, "0.0123"),
+        (format.number, 0.5, "0.500"),
+        (format.number, 9.996, "10.0"),
+        (format.number, 99.96, "100"),
+        (format.number, 1234.5, "1230"),
+        (format.number, 1389, "1389"),
+        (format.number, 1_430_000, "1.43e6"),
+        (format.number, -12.34, "-12.3"),
+        (format.number, 0.00001234, "1.23e-5"),
+        (format.number, 1.5e9, "1.50e9"),
+        (format.number, 0, "0"),
+        (format.number, float("-inf"), "-∞"),
+        (format.number, float("nan"), "nan"),
+        (partial(format.number, scale=1000.0), 0.00123, "1.23"),
+        (format.count, 0, "0"),
+        (format.count, 999, "999"),
+        (format.count, 999.6, "1.00k"),
+        (format.count, 1_430_000, "1.43M"),
+        (format.count, 999_999, "1.00M"),
+        (format.count, 2e18, "2000P"),
+        (format.size, 512, "512 B"),
+        (format.size, 1_430_000_000, "1.43 GB"),
+        (format.seconds, 0, "0 s"),
+        (format.seconds, 0.0123, "12.3 ms"),
+        (format.seconds, 31.5, "31.5 s"),
+        (format.seconds, 600, "10.0 min"),
+        (format.seconds, 9000, "2.50 h"),
+        *((show, value, text) for show in SHOWN for value, text in ((None, "–"), (float("inf"), "∞"))),
+    ],
+)
+def test_numbers_have_three_digits_and_a_unit(show, value, text):
+    assert show(value) == text

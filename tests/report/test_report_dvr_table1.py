@@ -1,4 +1,4 @@
-"""The page on shapes from one image: medians by family and row, and ratios to the mean shape."""
+"""The page of shapes from one image: medians by family and row, and ratios to the mean shape."""
 
 from itertools import product
 
@@ -7,13 +7,18 @@ import pytest
 
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import page_of, write_run
-from tests.report.test_report_shapes import write_pictures
+from tests.report.test_report_shapes import images
 
-ROWS = {"RGB": "single_view", "Mean shape": "single_view_mean", "Nearest image": "single_view_nearest"}
-ROWS |= {"Depth": "single_view_depth", "Occupancy": "single_view_occupancy"}
+ROWS = {
+    "RGB": "single_view",
+    "Mean shape": "single_view_mean",
+    "Nearest image": "single_view_nearest",
+    "Depth": "single_view_depth",
+    "Occupancy": "single_view_occupancy",
+}
 
 
-def write_single_view(results, row, chamfer, *, status="ok", **more):
+def made(results, row, chamfer, *, status="ok", **more):
     metrics = {"iou": 1 - chamfer, "chamfer_l1": chamfer / 10, "normal_consistency": 0.9, "mask_iou": 0.8, "psnr": 20.0}
     return write_run(
         results, "dvr_table1", row, task="single_view", method=ROWS[row], status=status,
@@ -27,81 +32,77 @@ def lines(results):
 
 
 def test_a_line_has_medians_costs_and_ratios_to_both_baselines_over_the_same_shapes(tmp_path):
-    for index, (error, baseline, spent) in enumerate(((0.1, 0.4, 0.5), (0.2, 0.2, 0.7), (0.3, 0.6, 0.6))):
-        write_single_view(
-            tmp_path, "RGB", error, index=index, seconds={"forward": spent, "backward": 0.0, "training": 90.0}
-        )
-        write_single_view(tmp_path, "Mean shape", baseline, index=index)
-        write_single_view(tmp_path, "Nearest image", 2 * baseline, index=index)
-    write_single_view(tmp_path, "RGB", 0.25, dataset="sofa")
-    table = lines(tmp_path)
-    rgb, mean = table["car", "RGB"], table["car", "Mean shape"]
+    for index, (one, other, spent) in enumerate(((0.1, 0.4, 0.5), (0.2, 0.2, 0.7), (0.3, 0.6, 0.6))):
+        made(tmp_path, "RGB", one, index=index, seconds={"forward": spent, "backward": 0.0, "training": 90.0})
+        made(tmp_path, "Mean shape", other, index=index)
+        made(tmp_path, "Nearest image", 2 * other, index=index)
+    made(tmp_path, "RGB", 0.25, dataset="sofa")
+    found = lines(tmp_path)
+    rgb, mean = found["car", "RGB"], found["car", "Mean shape"]
     assert (rgb["IoU"], rgb["Chamfer-L1"], rgb["Failed"]) == ("0.800", "20.0", "0 of 3")
     assert (rgb["Trained in"], rgb["Inference"]) == ("90.0 s", "600 ms")
     assert (mean["Trained in"], mean["Inference"]) == ("–", "–")
     assert rgb["Over the mean shape"] == "0.500 (n = 3)"  # of 1/4, 1 and 1/2
     assert rgb["Over the nearest image"] == "0.250 (n = 3)"
     assert (mean["Over the mean shape"], mean["Over the nearest image"]) == ("", "0.500 (n = 3)")
-    assert table["sofa", "RGB"]["Chamfer-L1"] == "25.0" and table["sofa", "RGB"]["Over the mean shape"] == ""
-    assert table["car", "published: DVR, RGB"]["Published"] == "0.196"
-    assert table["sofa", "published: DVR, depth"]["Published"] == "0.221"
+    assert found["sofa", "RGB"]["Chamfer-L1"] == "25.0" and found["sofa", "RGB"]["Over the mean shape"] == ""
+    assert found["car", "published: DVR, RGB"]["Published"] == "0.196"
+    assert found["sofa", "published: DVR, depth"]["Published"] == "0.221"
 
 
 def test_several_trainings_of_a_row_are_one_row(tmp_path):
     for seed, index in product(range(3), range(2)):
-        write_single_view(
-            tmp_path, "RGB", 0.1 * (1 + seed), index=index, seed=seed, settings={"task": {"training": {"seed": seed}}}
-        )
-    write_single_view(tmp_path, "Mean shape", 0.4, index=0, settings={"task": {"training": {"seed": 0}}})
+        made(tmp_path, "RGB", 0.1 * (1 + seed), index=index, seed=seed, settings={"task": {"training": {"seed": seed}}})
+    made(tmp_path, "Mean shape", 0.4, index=0, settings={"task": {"training": {"seed": 0}}})
     rgb = lines(tmp_path)["car", "RGB"]
     assert (rgb["Chamfer-L1"], rgb["Failed"], rgb["Over the mean shape"]) == ("20.0", "0 of 6", "0.250 (n = 1)")
 
 
-def test_a_verdict_counts_its_shapes(tmp_path):
+def test_a_verdict_counts_the_shapes_that_it_is_of(tmp_path):
     for index in range(5):
-        write_single_view(tmp_path, "Mean shape", 0.3, index=index)
+        made(tmp_path, "Mean shape", 0.3, index=index)
     for index, row in product(range(3), ("RGB", "Depth", "Occupancy")):
-        write_single_view(tmp_path, row, 0.2, index=index, seconds={"forward": 1.0, "backward": 0.0, "training": 90.0})
+        made(tmp_path, row, 0.2, index=index, seconds={"forward": 1.0, "backward": 0.0, "training": 90.0})
     assert "n = 3 " in page_of(tmp_path, "dvr_table1").verdict
 
 
 def test_a_failed_run_is_infinite_in_the_ratio(tmp_path):
     for index in range(3):
-        write_single_view(tmp_path, "RGB", 0.3, index=index, status="ok" if index else "empty")
-        write_single_view(tmp_path, "Mean shape", 0.2, index=index)
+        made(tmp_path, "RGB", 0.3, index=index, status="ok" if index else "empty")
+        made(tmp_path, "Mean shape", 0.2, index=index)
     rgb = lines(tmp_path)["car", "RGB"]
     assert (rgb["Over the mean shape"], rgb["Failed"]) == ("1.50 (n = 3)", "1 of 3")
 
 
 def test_a_ratio_to_a_row_that_failed_alone_says_nothing(tmp_path):
     for index in range(2):
-        write_single_view(tmp_path, "Mean shape", 0.2, index=index, status="ok" if index else "empty")
-        write_single_view(tmp_path, "RGB", 0.3, index=index, status="empty" if index == 1 else "ok")
-        write_single_view(tmp_path, "Nearest image", 0.1, index=index)
-    table = lines(tmp_path)
-    ratios = [table["car", row]["Over the mean shape"] for row in ("RGB", "Mean shape", "Nearest image")]
+        made(tmp_path, "Mean shape", 0.2, index=index, status="ok" if index else "empty")
+        made(tmp_path, "RGB", 0.3, index=index, status="empty" if index == 1 else "ok")
+        made(tmp_path, "Nearest image", 0.1, index=index)
+    found = lines(tmp_path)
+    ratios = [found["car", row]["Over the mean shape"] for row in ("RGB", "Mean shape", "Nearest image")]
     assert ratios == ["– (n = 2)", "", "0 (n = 2)"]
 
 
 def test_pictures_are_of_the_best_and_the_worst_shape(tmp_path):
     for index, chamfer in enumerate((0.3, 0.1, 0.4, 0.2)):
-        folder = write_single_view(tmp_path, "RGB", chamfer, index=index)
-        write_pictures(folder, (1.0, 0.0, 0.0))
+        folder = made(tmp_path, "RGB", chamfer, index=index)
+        images(folder, (1.0, 0.0, 0.0))
         with np.load(folder / "images.npz") as file:
             np.savez(folder / "images.npz", **file, given=np.full((4, 4, 3), index / 4))
-        write_single_view(tmp_path, "Mean shape", 0.5 - chamfer, index=index)
+        made(tmp_path, "Mean shape", 0.5 - chamfer, index=index)
     result = page_of(tmp_path, "single_view_figures")
-    pictures = cells(result.figure.axes[0])
-    assert list(dict.fromkeys(row for row, _ in pictures)) == ["car 1, best", "car 2, worst"]
-    assert pictures["car 1, best", "given"] == (0.25,) * 3 and pictures["car 2, worst", "given"] == (0.5,) * 3
-    assert pictures["car 1, best", "another image"] == (0.75,) * 3 and pictures["car 1, best", "RGB"] == (0.5, 0.5, 1.0)
+    found = cells(result.figure.axes[0])
+    assert list(dict.fromkeys(row for row, _ in found)) == ["car 1, best", "car 2, worst"]
+    assert found["car 1, best", "given"] == (0.25,) * 3 and found["car 2, worst", "given"] == (0.5,) * 3
+    assert found["car 1, best", "another image"] == (0.75,) * 3 and found["car 1, best", "RGB"] == (0.5, 0.5, 1.0)
     assert notes(result.figure) == ["no picture"] * 2
     assert "No pictures of 2 runs: no images.npz." in result.shown().notes
 
 
 def test_its_figure_has_a_point_for_each_shape(tmp_path):
     for index in range(3):
-        write_single_view(tmp_path, "RGB", 0.1 * index, index=index)
+        made(tmp_path, "RGB", 0.1 * index, index=index)
     (axis,) = page_of(tmp_path, "dvr_table1").figure.axes
     points, middle = axis.get_lines()
     assert sorted(points.get_xdata()) == pytest.approx([0.8, 0.9, 1.0])

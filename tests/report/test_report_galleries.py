@@ -1,11 +1,11 @@
-"""The galleries, from run folders with given pictures."""
+"""The galleries, from run folders whose pictures are known."""
 
 import numpy as np
 import pytest
 
 from bench.report.gallery import Block, Cell, draw
 from bench.studies import fig8
-from tests.report.test_report_paper import page_of, page_text, write_run
+from tests.report.test_report_paper import page_of, told, write_run
 
 UP, RIGHT, TOWARDS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 COLOURS = {normal: tuple(np.array(normal) / 2 + 0.5) for normal in (UP, RIGHT, TOWARDS)}
@@ -14,59 +14,64 @@ SQUARE = np.zeros((8, 8), dtype=bool)
 SQUARE[2:6, 2:6] = True
 
 
-def save_pictures(folder, result):
-    """Writes squares with one normal each; None is an invisible shape."""
+def saved(folder, found):
+    """Writes squares with one normal each; None is a shape that nothing shows."""
     arrays = {"given": np.where(SQUARE, 2.0, np.nan).astype(np.float16)}
-    for name, normal in (("found", result), ("start", RIGHT), ("true", TOWARDS)):
+    for name, normal in (("found", found), ("start", RIGHT), ("true", TOWARDS)):
         hit = np.stack([SQUARE, SQUARE]) & (normal is not None)
         arrays |= {f"{name}_hit": hit, f"{name}_normals": (hit[..., None] * np.array(normal or UP)).astype(np.float16)}
     np.savez(folder / "images.npz", **arrays)
 
 
-def write_completion(results, row, points, normal=UP, *, pictures=True, **changed):
+def completed(results, row, points, found=UP, *, pictures=True, **changed):
     task = "deepsdf" if row.startswith("DeepSDF") else "completion"
-    fields = {"task": task, "method": NAMES[row], "dataset": "sofa", "settings": {"task": {"points": points}}}
-    folder = write_run(results, "table2", row, **fields | changed)
+    known = {"task": task, "method": NAMES[row], "dataset": "sofa", "settings": {"task": {"points": points}}}
+    folder = write_run(results, "table2", row, **known | changed)
     if pictures:
-        save_pictures(folder, normal)
+        saved(folder, found)
 
 
-def write_multiview(results, experiment, row, normal, *, index=0, status="ok", **task):
-    settings = {"task": {"shift": 0.0, "degrees": 0.0, "scale": 1.0, **task}}
-    fields = {"task": "multiview", "status": status, "method": f"multiview_{row[:4].lower()}", "index": index}
-    folder = write_run(results, experiment, row, settings=settings, **fields)
-    save_pictures(folder, normal)
+def many_views(results, experiment, row, found, *, index=0, status="ok", **task):
+    folder = write_run(
+        results,
+        experiment,
+        row,
+        **{"task": "multiview", "status": status, "method": f"multiview_{row[:4].lower()}"},
+        index=index,
+        settings={"task": {"shift": 0.0, "degrees": 0.0, "scale": 1.0, **task}},
+    )
+    saved(folder, found)
 
 
 def cells(axis, across=1):
-    """The colour in the middle of the first picture of each cell, by row and column; white without a picture."""
+    """The colour in the middle of the first picture of each cell; white without one; the names of rows and columns."""
     rows = [label.get_text().replace("\n", " ") for label in axis.get_yticklabels()]
     columns = [label.get_text().replace("\n", " ") for label in axis.get_xticklabels()]
-    colours = {(row, column): (1.0, 1.0, 1.0) for row in rows for column in columns}
+    found = {(row, column): (1.0, 1.0, 1.0) for row in rows for column in columns}
     for image in reversed(axis.get_images()):
         box = axis.transData.inverted().transform_bbox(image.get_clip_box())
         (x, y), (left, right, bottom, top) = (box.p0 + box.p1) / 2, image.get_extent()
         picture = image.get_array()
-        middle = (int((y - top) / (bottom - top) * len(picture)), int((x - left) / (right - left) * picture.shape[1]))
-        colours[rows[int(y)], columns[int(x // across)]] = tuple(picture[middle].tolist())
-    return colours
+        place = (int((y - top) / (bottom - top) * len(picture)), int((x - left) / (right - left) * picture.shape[1]))
+        found[rows[int(y)], columns[int(x // across)]] = tuple(picture[place].tolist())
+    return found
 
 
 def notes(figure):
     return [text.get_text() for axis in figure.axes for text in axis.texts if text.get_text()]
 
 
-def test_completed_shapes_are_in_the_order_of_points_with_the_truth_last(tmp_path):
+def test_completed_shapes_stand_over_the_points_with_the_truth_behind(tmp_path):
     for row, normal in (("DeepSDF samples", UP), ("DIST", RIGHT), ("DIST with mask", UP), ("IDR with mask", UP)):
         for points in ("dense", "20"):
-            write_completion(tmp_path, row, points, normal)
+            completed(tmp_path, row, points, found=normal)
     result = page_of(tmp_path, "completion_gallery")
-    colours = cells(result.figure.axes[0], across=2)
-    assert [column for row, column in colours if row == "DIST"] == ["dense", "20 pts", "truth"]
-    assert list(dict.fromkeys(row for row, _ in colours)) == ["given depths", *list(NAMES)[:3]]
-    assert colours["DIST", "20 pts"] == COLOURS[RIGHT] and colours["DIST with mask", "dense"] == COLOURS[UP]
-    assert colours["given depths", "truth"] == COLOURS[TOWARDS] and colours["DIST", "truth"] == (1, 1, 1)
-    assert notes(result.figure) == [] and "No pictures" not in page_text(result)
+    found = cells(result.figure.axes[0], across=2)
+    assert [column for row, column in found if row == "DIST"] == ["dense", "20 pts", "truth"]
+    assert list(dict.fromkeys(row for row, _ in found)) == ["given depths", *list(NAMES)[:3]]
+    assert found["DIST", "20 pts"] == COLOURS[RIGHT] and found["DIST with mask", "dense"] == COLOURS[UP]
+    assert found["given depths", "truth"] == COLOURS[TOWARDS] and found["DIST", "truth"] == (1, 1, 1)
+    assert notes(result.figure) == [] and "No pictures" not in told(result)
     assert "n = 6 runs (1 shape, 1 seed)" in result.caption and len(result.data) == 6
 
 
@@ -74,56 +79,61 @@ def test_the_first_shape_of_each_family_and_the_first_seed_are_shown(tmp_path):
     for dataset in ("sofa", "plane"):
         for index in (3, 1):
             for seed in (1, 0):
-                write_completion(tmp_path, "DIST", "20", dataset=dataset, index=index, seed=seed)
+                completed(tmp_path, "DIST", "20", dataset=dataset, index=index, seed=seed)
     result = page_of(tmp_path, "completion_gallery")
     assert [axis.get_title(loc="left") for axis in result.figure.axes] == ["sofa", "plane"]
     assert result.data[["index", "seed"]].to_numpy().tolist() == [[1, 0], [1, 0]]
-    assert "Not shown: 6 runs" in page_text(result)
+    assert "Not shown: 6 runs" in told(result)
 
 
-def test_a_failed_run_is_marked_with_its_picture_or_without(tmp_path):
-    write_completion(tmp_path, "DeepSDF samples", "20")
-    write_completion(tmp_path, "DIST", "20", status="not_reached", normal=RIGHT)
-    write_completion(tmp_path, "DIST with mask", "20", status="crashed", pictures=False)
-    write_completion(tmp_path, "DIST with mask", "50", status="empty", normal=None)
-    write_completion(tmp_path, "DIST", "50", pictures=False)
+def test_a_run_that_failed_is_shown_as_such_with_its_picture_or_without(tmp_path):
+    completed(tmp_path, "DeepSDF samples", "20")
+    completed(tmp_path, "DIST", "20", status="not_reached", found=RIGHT)
+    completed(tmp_path, "DIST with mask", "20", status="crashed", pictures=False)
+    completed(tmp_path, "DIST with mask", "50", status="empty", found=None)
+    completed(tmp_path, "DIST", "50", pictures=False)
     result = page_of(tmp_path, "completion_gallery")
     assert sorted(notes(result.figure)) == sorted(["not_reached", "crashed", "empty", "no picture", "no run"])
     assert cells(result.figure.axes[0], across=2)["DIST", "20 pts"] == COLOURS[RIGHT]
     assert "3 of 5 runs did not end ok" in result.caption
-    assert "No pictures of 2 runs: no images.npz." in page_text(result)
+    assert "No pictures of 2 runs: no images.npz." in told(result)
 
 
-def test_shapes_from_many_views_have_the_truth_and_the_start_in_their_row(tmp_path):
+def test_shapes_from_many_views_stand_beside_the_truth_and_the_start(tmp_path):
     for index in range(6):
-        write_multiview(tmp_path, "table3", "DIST", UP, index=index)
-        write_multiview(tmp_path, "table3", "Mesh, 48³", RIGHT, index=index, status="ok" if index else "diverged")
+        many_views(tmp_path, "table3", "DIST", UP, index=index)
+        many_views(tmp_path, "table3", "Mesh, 48³", RIGHT, index=index, status="ok" if index else "diverged")
     result = page_of(tmp_path, "multiview_gallery")
-    colours = cells(result.figure.axes[0])
-    assert list(dict.fromkeys(row for row, _ in colours)) == [f"car {index}" for index in range(4)]
-    normals = {"truth": TOWARDS, "start": RIGHT, "DIST": UP, "Mesh, 48³": RIGHT}
-    assert all(colours["car 0", column] == COLOURS[normal] for column, normal in normals.items())
-    assert notes(result.figure) == ["diverged"] and "n = 8 runs (4 shapes, 1 seed)" in result.caption
+    found = cells(result.figure.axes[0])
+    assert list(dict.fromkeys(row for row, _ in found)) == [f"car {index}" for index in range(4)]
+    assert [found["car 0", column] for column in ("truth", "start", "DIST", "Mesh, 48³")] == [
+        COLOURS[normal] for normal in (TOWARDS, RIGHT, UP, RIGHT)
+    ]
+    assert notes(result.figure) == ["diverged"]
+    assert "n = 8 runs (4 shapes, 1 seed)" in result.caption
 
 
-def test_misplaced_shapes_are_in_the_order_of_the_displacement(tmp_path):
+def test_misplaced_shapes_stand_over_the_displacement(tmp_path):
     for task in ({"degrees": 20.0}, {}, {"similarity": True}, {"shift": 0.1}, {"scale": 0.8}):
-        write_multiview(tmp_path, "fig12", "DIST", UP if task else RIGHT, **task)
+        many_views(tmp_path, "fig12", "DIST", UP if task else RIGHT, **task)
     result = page_of(tmp_path, "misplaced_gallery")
-    colours = cells(result.figure.axes[0])
-    columns = [column for row, column in colours if row == "DIST"]
+    found = cells(result.figure.axes[0])
+    columns = [column for row, column in found if row == "DIST"]
     assert columns == ["0.8 times as large", "in place", "known place", "turned by 20°", "shifted by 0.1", "truth"]
-    assert [colours["DIST", column] for column in columns[:3]] == [COLOURS[UP], COLOURS[UP], COLOURS[RIGHT]]
-    assert {colours["start", column] for column in columns[:-1]} == {COLOURS[RIGHT]}
-    assert colours["start", "truth"] == COLOURS[TOWARDS]
+    assert [found["DIST", column] for column in columns[:3]] == [COLOURS[UP], COLOURS[UP], COLOURS[RIGHT]]
+    assert {found["start", column] for column in columns[:-1]} == {COLOURS[RIGHT]}
+    assert found["start", "truth"] == COLOURS[TOWARDS]
 
 
-def write_colour_run(results, split, *, dataset="sofa", status="ok", kinds=()):
+def rendered(results, split, *, dataset="sofa", status="ok", kinds=()):
     folder = write_run(
-        results, "fig8", "DIST, one colour image", task="completion", dataset=dataset, method="dist_colour",
-        metrics=dict(zip(fig8.SIZES, (256, 3000, 500, 9000), strict=True)) if kinds else {}, status=status,
+        results,
+        "fig8",
+        "DIST, one colour image",
+        **{"task": "completion", "dataset": dataset, "method": "dist_colour", "status": status},
+        **({"metrics": dict(zip(fig8.SIZES, (256, 3000, 500, 9000), strict=True))} if kinds else {}),
         settings={"task": {"_target_": "completion"}, "split": split},
-    )  # fmt: skip
+    )
     arrays = {"photograph": np.ones((8, 8, 3), np.float16)}
     for prefix, length in (("size_0_", 2), ("size_1_", 4), ("size_2_", 8), ("turned_0_", 8), ("turned_1_", 8)):
         for kind, shade in kinds:
@@ -134,25 +144,25 @@ def write_colour_run(results, split, *, dataset="sofa", status="ok", kinds=()):
         np.savez(folder / "images.npz", **arrays)
 
 
-def test_codes_of_shape_and_colour_are_shown_with_the_mesh_and_its_bytes(tmp_path):
-    write_colour_run(tmp_path, "train", kinds=(("", 0.8), ("trained_", 0.6), ("true_", 0.4)))
-    write_colour_run(tmp_path, "test", kinds=(("", 0.8), ("true_", 0.4)))
-    write_colour_run(tmp_path, "test", dataset="car", status="crashed")
+def test_codes_of_shape_and_colour_are_shown_beside_the_mesh_and_its_bytes(tmp_path):
+    rendered(tmp_path, "train", kinds=(("", 0.8), ("trained_", 0.6), ("true_", 0.4)))
+    rendered(tmp_path, "test", kinds=(("", 0.8), ("true_", 0.4)))
+    rendered(tmp_path, "test", dataset="car", status="crashed")
     result = page_of(tmp_path, "rerendering")
-    trained, held_out, failed = (cells(axis) for axis in result.figure.axes)
-    assert {row for row, _ in trained} == {"mesh", "code of training", "code of the image"}
-    assert {row for row, _ in held_out} == {"mesh", "code of the image"}
+    known, unseen, failed = (cells(axis) for axis in result.figure.axes)
+    assert {row for row, _ in known} == {"mesh", "code of training", "code of the image"}
+    assert {row for row, _ in unseen} == {"mesh", "code of the image"}
     sizes, lights = list(fig8.SIDES), list(fig8.LIGHTS)
-    assert [column for row, column in trained if row == "mesh"] == ["given", *sizes, *lights]
+    assert [column for row, column in known if row == "mesh"] == ["given", *sizes, *lights]
     for row, shade in (("mesh", 0.4), ("code of training", 0.6), ("code of the image", 0.8)):
-        assert all(trained[row, column] == pytest.approx((shade,) * 3, abs=1e-3) for column in sizes)
-    left, above, right = (trained["code of the image", name][0] for name in lights)
+        assert all(known[row, column] == pytest.approx((shade,) * 3, abs=1e-3) for column in sizes)
+    left, above, right = (known["code of the image", name][0] for name in lights)
     assert left == pytest.approx(above) == pytest.approx(0.8 * fig8.AMBIENT, abs=1e-3)  # normals to the right
     cosine = 0.8 / np.sqrt(0.8**2 + 0.3**2 + 0.5**2)
     assert right == pytest.approx(0.8 * (fig8.AMBIENT + (1 - fig8.AMBIENT) * cosine), abs=1e-3)
     assert set(notes(result.figure)) == {"crashed"} and failed
-    assert "a code has 256 bytes" in result.verdict and "as they come 4 kB" in result.verdict
-    assert "No pictures of 1 run: no images.npz." in page_text(result)
+    assert "a code has 256 bytes" in result.verdict and "mesh and texture 4 kB" in result.verdict
+    assert "No pictures of 1 run: no images.npz." in told(result)
     assert "1 of 3 runs did not end ok" in result.caption
 
 

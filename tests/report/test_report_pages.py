@@ -1,4 +1,4 @@
-"""Pages, and how they distinguish rows: by presets, and in older records by labels."""
+"""What a page is, and how rows are told apart: by presets, and in older records by labels."""
 
 import math
 import sys
@@ -36,25 +36,33 @@ PAGES = {{"mine": make, "mine_again": make}}
 
 
 def record(**changed) -> dict:
-    """The fields of a record that decide its row."""
+    """The parts of a record of which its row is made."""
     return {"renderer": "dist", "method": "", "dataset": "car", "config": {}, **changed}
 
 
-@each("changed, preset, name", [
-    ({"renderer": "dist_aggressive"}, "dist_aggressive", "dist_aggressive"),
-    ({"renderer": "dist_capped", "config": {"renderer": {"_label_": "capped"}}}, "dist_capped", "capped"),
-    ({"config": {"label": "mine", "renderer": {"_label_": "DIST"}}}, "dist", "mine"),
-    ({"method": "dist_mask", "config": {"label": "DIST with mask"}}, "dist_mask", "DIST with mask"),
-    ({"method": "pose_icp_plane"}, "pose_icp_plane", "dist"),
-])  # fmt: skip
+@each(
+    "changed, preset, name",
+    [
+        ({"renderer": "dist_aggressive"}, "dist_aggressive", "dist_aggressive"),
+        ({"renderer": "dist_capped", "config": {"renderer": {"_label_": "capped"}}}, "dist_capped", "capped"),
+        ({"config": {"label": "mine", "renderer": {"_label_": "DIST"}}}, "dist", "mine"),
+        ({"method": "dist_mask", "config": {"label": "DIST with mask"}}, "dist_mask", "DIST with mask"),
+        ({"method": "pose_icp_plane"}, "pose_icp_plane", "dist"),
+    ],
+)
 def test_a_row_is_its_preset_under_a_name(changed, preset, name):
     assert row_of(record(**changed)) == Row(preset, name)
 
 
-@each("renderer, target, base", [
-    ("dist_aggressive", "renderers.DIST", "dist"), ("dvr", "renderers.DVR", "dvr"),
-    ("mine", "mypkg.rendering.Mine", "mine"), ("naive", None, "naive"),
-])  # fmt: skip
+@each(
+    "renderer, target, base",
+    [
+        ("dist_aggressive", "renderers.DIST", "dist"),
+        ("dvr", "renderers.DVR", "dvr"),
+        ("mine", "mypkg.rendering.Mine", "mine"),
+        ("naive", None, "naive"),
+    ],
+)
 def test_the_base_of_a_preset_is_its_class_or_a_users_preset(renderer, target, base):
     assert base_renderer(record(renderer=renderer, config={"renderer": {"_target_": target}})) == base
 
@@ -62,8 +70,8 @@ def test_the_base_of_a_preset_is_its_class_or_a_users_preset(renderer, target, b
 def test_two_presets_under_one_label_are_two_rows(tmp_path):
     for preset, queries in (("dist", 5), ("mine", 7)):
         write_run(tmp_path, "table1", "same", metrics=costs(queries), renderer=preset)
-    page = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path), None)
-    assert list(page.data["queries"]) == [5, 7] and list(page.data["row"]) == ["same, dist", "same, mine"]
+    made = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path), None)
+    assert list(made.data["queries"]) == [5, 7] and list(made.data["row"]) == ["same, dist", "same, mine"]
 
 
 def test_a_study_is_found_by_its_file_and_one_that_cannot_be_read_costs_no_other(tmp_path, monkeypatch):
@@ -82,7 +90,7 @@ def test_a_study_is_found_by_its_file_and_one_that_cannot_be_read_costs_no_other
         assert written == ["mine.csv", "mine_again.csv"] and len(problems) == 2
         assert problems[0].startswith("not made: bench/studies/broken.py (ModuleNotFoundError: ")
         assert problems[1].startswith("not made: bench/studies/twice.py (ValueError: another study has a page mine: ")
-        assert [page.name for page in find_paper(tmp_path) if not page.shipped] == ["mine", "mine_again"]
+        assert [found.name for found in find_paper(tmp_path) if not found.shipped] == ["mine", "mine_again"]
     finally:
         studies.cache_clear()
         for name in ("mine", "twice"):
@@ -94,24 +102,24 @@ def test_a_study_that_cannot_be_made_costs_no_other_table(tmp_path, monkeypatch,
     write_run(tmp_path, "table1", NAIVE, metrics=costs(3))
     write_run(tmp_path, "fig4", NAIVE, metrics=costs(3))
     broken = next(study for study in studies() if "fig4" in study.pages)
-    make = broken.pages["fig4"]
-    late = lambda runs: replace(make(runs), estimates=map({}.__getitem__, ["lost"]), interval="one")  # noqa: E731
+    made = broken.pages["fig4"]
+    late = lambda runs: replace(made(runs), estimates=map({}.__getitem__, ["lost"]), interval="one")  # noqa: E731
     monkeypatch.setitem(broken.pages, "fig4", late if caption else lambda runs: {}["lost"])
     problems: list[str] = []
     written = [path.name for path in write_paper(read_records(tmp_path)[0], tmp_path, problems=problems)]
     assert written == ["table1.csv"] and problems == ["not made: fig4 (KeyError: 'lost')"]
 
 
-def test_shipped_rows_are_below_the_users_if_the_columns_are_equal(tmp_path, monkeypatch):
-    users, shipped = tmp_path / "users" / "paper", tmp_path / "shipped" / "paper"
+def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path, monkeypatch):
+    own, shipped = tmp_path / "own" / "paper", tmp_path / "shipped" / "paper"
     monkeypatch.setattr(paper, "SHIPPED", shipped.parent)
-    for folder, row in ((users, "mine"), (shipped, "ours")):
+    for folder, row in ((own, "mine"), (shipped, "ours")):
         folder.mkdir(parents=True)
         for name, last in (("alike", "Error"), ("other", f"Error of {row}")):
             shown = Shown(title="T.", columns=["Row", last], rows=[[row, "1"]])
             (folder / f"{name}.json").write_text(shown.to_json())
-    entries, pages = papers(users.parent)
-    rows = {entry["name"]: pages[entry["key"]]["rows"] for entry in entries}
+    entries, wholes = papers(own.parent)
+    rows = {entry["name"]: wholes[entry["key"]]["rows"] for entry in entries}
     assert rows == {"alike": [["mine", "1"], ["shipped: ours", "1"]], "other": [["mine", "1"]]}
 
 
@@ -132,8 +140,10 @@ def test_a_run_that_failed_stays_a_row_and_the_newest_of_a_cell_counts(tmp_path)
 
 
 PAPER = Path(__file__).parents[2] / "results" / "paper"
-PICTURES = {"single_view_figures", "dvr_figures", "stability_curves"}
-PICTURES |= {"completion_gallery", "misplaced_gallery", "multiview_gallery"}
+PICTURES = {
+    *("single_view_figures", "dvr_figures", "completion_gallery", "misplaced_gallery", "multiview_gallery"),
+    "stability_curves",
+}
 
 
 def test_every_shipped_page_has_a_question_and_a_verdict_with_a_number():
@@ -145,11 +155,11 @@ def test_every_shipped_page_has_a_question_and_a_verdict_with_a_number():
             continue
         assert shown.question.endswith("?") and shown.verdict.endswith("."), name
         marked = shown.verdict.split("*")[1::2]
-        assert marked and all(any(c.isdigit() for c in phrase) for phrase in marked), name
+        assert marked and all(any(c.isdigit() for c in part) for part in marked), name
         assert shown.verdict.count("*") % 2 == 0 and "nan" not in shown.verdict and len(shown.verdict) < 400, name
 
 
-def test_a_verdict_at_scale_smoke_says_that_nothing_follows(tmp_path):
+def test_a_verdict_of_scale_smoke_is_that_nothing_follows(tmp_path):
     for label in ("quick", "slow"):
         write_run(tmp_path, "table1", label, metrics=costs(), settings={"scale": {"name": "smoke"}})
     write_paper(read_records(tmp_path)[0], tmp_path)
@@ -162,6 +172,6 @@ def test_a_verdict_at_scale_smoke_says_that_nothing_follows(tmp_path):
 
 
 @each("text", ["", "[1]", '{"verdict": 1, "chart": []}', "[" * 100_000])
-def test_an_odd_file_with_a_table_adds_nothing(tmp_path, text):
+def test_an_odd_file_beside_a_table_adds_nothing(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
     assert read_shown(tmp_path / "a.json") == Shown()

@@ -1,4 +1,4 @@
-"""The tables and figures of the experiments, from run folders with given numbers."""
+"""The tables and figures of the experiments, made from run folders whose numbers are known."""
 
 import json
 import shutil
@@ -29,11 +29,11 @@ PAGES = {"table1": table1, "fig4": fig4, "fig5": fig5, "fig7": fig7, "gradients"
 
 
 def write_run(results: Path, experiment: str | None, label: str | None, **changed) -> Path:
-    """Writes the run folder of a run of the experiment that ended ok; gives the folder.
+    """Writes a run folder whose record is an ok one of the experiment, and gives the folder.
 
-    `changed` are fields of the record; its configuration has also `index`, `seed` and the name of the dataset.
-    `settings` are settings of the configuration, and `minute` is the time of the start. The label has a preset: a
-    method if it ends in `_mask`, else a renderer.
+    `changed` are fields of the record; `settings` those of its configuration, where `index`, `seed` and the name of the
+    dataset stand as well; `minute` when it started. The label's preset is the renderer's, or, where it is a method, the
+    method's.
     """
     number = len(list((results / "runs").glob("*")))
     settings, minute = changed.pop("settings", {}), changed.pop("minute", number)
@@ -45,9 +45,13 @@ def write_run(results: Path, experiment: str | None, label: str | None, **change
     preset = PRESETS.get(label or "", "dist")
     record |= {"renderer": "dist", "method": preset} if preset.endswith("_mask") else {"renderer": preset, "method": ""}
     record |= {"seed": config["seed"], "status": "ok", "reason": "", "config": config, "environment": MACHINE}
-    record["started"] = f"2025-03-01T{10 + minute // 60}:{minute % 60:02}:00+00:00"
-    record |= {name: {} for name in ("metrics", "metrics_start", "definitions", "evaluations", "seconds")}
-    record |= {"peak_memory_bytes": None, "flops": None, "gemm_fraction": None, "reused": False, **changed}
+    record |= {
+        "started": f"2025-03-01T{10 + minute // 60}:{minute % 60:02}:00+00:00",
+        "metrics": {},
+        "metrics_start": {},
+    }
+    record |= {"definitions": {}, "evaluations": {}, "seconds": {}, "peak_memory_bytes": None, "flops": None}
+    record |= {"gemm_fraction": None, "reused": False, **changed}
     folder = results / "runs" / f"run{number:03}"
     folder.mkdir(parents=True)
     (folder / "record.json").write_text(json.dumps(record))
@@ -56,8 +60,14 @@ def write_run(results: Path, experiment: str | None, label: str | None, **change
 
 def costs(queries: int = 1000, **changed) -> dict:
     """The metrics of an ablation run."""
-    metrics = {"size": 64, "steps": 50, "queries": queries, "step_queries": 2 * queries}
-    metrics |= {"step_gradients": 9, "repeats": 5}
+    metrics = {
+        "size": 64,
+        "steps": 50,
+        "queries": queries,
+        "step_queries": 2 * queries,
+        "step_gradients": 9,
+        "repeats": 5,
+    }
     for name, seconds in (("forward", 0.5), ("backward", 0.25), ("step", 0.75)):
         spread = {"": seconds, "_low": seconds - 0.125, "_high": seconds + 0.125}
         metrics |= {f"{name}_seconds{end}": value for end, value in spread.items()}
@@ -66,14 +76,14 @@ def costs(queries: int = 1000, **changed) -> dict:
 
 
 def write_images(folder: Path, size: int = 24, shift: float = 0.0, tilt: float = 0.0) -> None:
-    """Writes a sphere, moved by `shift` in fractions of the picture, whose normals are turned by `tilt` degrees."""
-    reference, hit = sphere_normals(size, 0.0, 0.0)
-    normals, moved_hit = sphere_normals(size, shift, tilt)
-    arrays = {"normals": normals, "reference_normals": reference, "hit": moved_hit, "reference_hit": hit}
+    """A ball: the row's is moved by `shift` in shares of the picture, its normals turned by `tilt` degrees."""
+    reference, hit = ball(size, 0.0, 0.0)
+    normals, found = ball(size, shift, tilt)
+    arrays = {"normals": normals, "reference_normals": reference, "hit": found, "reference_hit": hit}
     np.savez(folder / "images.npz", **arrays, depth_error=np.zeros((size, size), np.float32))
 
 
-def sphere_normals(size: int, shift: float, tilt: float) -> tuple[np.ndarray, np.ndarray]:
+def ball(size: int, shift: float, tilt: float) -> tuple[np.ndarray, np.ndarray]:
     y, x = (np.mgrid[:size, :size] + 0.5) / size * 2 - 1
     x = x - 2 * shift
     hit = x**2 + y**2 < 0.5
@@ -89,7 +99,7 @@ def write_lines(folder: Path, lines: list[dict]) -> None:
 
 
 def write_curve(folder: Path, losses: list[float], chamfers: dict[int, float], seconds: float = 0.5) -> None:
-    """Writes a curve with these losses, and the errors of iterations; an iteration costs 100 field evaluations."""
+    """Writes a curve with these losses, and errors of some iterations; an iteration computes 100 field values."""
     lines = [
         {"iteration": i, "seconds": seconds * (i + 1), "value_evaluations": 100 * (i + 1), "total": x}
         for i, x in enumerate(losses)
@@ -104,14 +114,14 @@ def chosen(results: Path, name: str) -> Runs | None:
 
 
 def page_of(results: Path, name: str) -> Result:
-    """A page of the runs of a results folder."""
+    """A page as it is made of the runs of a results folder."""
     records, study = read_records(results)[0], next(study for study in studies() if name in study.pages)
     return study.pages[name](*(choose(records, selection, results) for selection in study.reads))
 
 
-def page_text(page: Result) -> str:
-    """The caption of a page and its notes."""
-    return " ".join([page.caption, *page.notes])
+def told(made: Result) -> str:
+    """All that a page says in words: its caption, and the notes below it."""
+    return " ".join([made.caption, *made.notes])
 
 
 def test_old_records_and_other_experiments_are_ignored(tmp_path):
@@ -124,7 +134,7 @@ def test_old_records_and_other_experiments_are_ignored(tmp_path):
     assert chosen(tmp_path, "fig4").names() == [NAIVE]
 
 
-def test_the_newest_run_counts_and_a_row_keeps_its_position(tmp_path):
+def test_newest_wins_and_a_row_keeps_its_place(tmp_path):
     write_run(tmp_path, "table1", "b", metrics=costs(1), minute=30)
     write_run(tmp_path, "table1", "a", metrics=costs(2), minute=20)
     write_run(tmp_path, "table1", "a", metrics=costs(3), minute=40)
@@ -133,19 +143,24 @@ def test_the_newest_run_counts_and_a_row_keeps_its_position(tmp_path):
     assert [(r["config"]["label"], r["metrics"]["queries"]) for r in records] == [("a", 3), ("b", 1), ("c", 4)]
 
 
-@each("changed, merged", [
-    ({"settings": {"view": {"resolution": 32}}}, False), ({"settings": {"dataset": {"name": "sofa"}}}, False),
-    ({"environment": {**MACHINE, "threads": 4}}, True), ({"environment": {}, "status": "crashed"}, True),
-    ({"settings": {"results_dir": "elsewhere", "verbose": True, "packages": ["mine"], "priors_dir": "p"}}, True),
-    ({"settings": {"renderer": {"epsilon": 1e-3}, "seed": 5, "index": 2}, "renderer": "dvr"}, True),
-])  # fmt: skip
+@each(
+    "changed, merged",
+    [
+        ({"settings": {"view": {"resolution": 32}}}, False),
+        ({"settings": {"dataset": {"name": "sofa"}}}, False),
+        ({"environment": {**MACHINE, "threads": 4}}, True),
+        ({"environment": {}, "status": "crashed"}, True),
+        ({"settings": {"results_dir": "elsewhere", "verbose": True, "packages": ["mine"], "priors_dir": "p"}}, True),
+        ({"settings": {"renderer": {"epsilon": 1e-3}, "seed": 5, "index": 2}, "renderer": "dvr"}, True),
+    ],
+)
 def test_only_what_may_be_compared_is_merged(tmp_path_factory, changed, merged):
     results = tmp_path_factory.mktemp("results")
     write_run(results, "table1", DYNAMIC, metrics=costs(), **changed)
     write_run(results, "table1", PARALLEL, metrics=costs())
-    runs = chosen(results, "table1")
-    assert (len(runs.records), runs.left_out) == ((2, 0) if merged else (1, 1))
-    assert ("Not shown: 1 run" in page_text(table1.make(runs, None))) is not merged
+    made = chosen(results, "table1")
+    assert (len(made.records), made.left_out) == ((2, 0) if merged else (1, 1))
+    assert ("Not shown: 1 run" in told(table1.make(made, None))) is not merged
 
 
 @each("other", [{"threads": 8}, {"cpu": "Other CPU"}, {"device": "Some GPU"}, {"kernels": "compiled"}])
@@ -153,11 +168,11 @@ def test_times_of_different_machines_are_not_compared_without_saying_so(tmp_path
     results = tmp_path_factory.mktemp("results")
     write_run(results, "table1", DYNAMIC, metrics=costs())
     write_run(results, "table1", PARALLEL, environment={"waited_share": 0.1}, status="killed")
-    assert "Do not compare times" not in page_text(page_of(results, "table1"))
+    assert "Do not compare times" not in told(page_of(results, "table1"))
     write_run(results, "table1", NAIVE, metrics=costs(), environment={**MACHINE, **other})
-    runs = chosen(results, "table1")
-    assert runs.names() == [DYNAMIC, PARALLEL, NAIVE]  # no planned row is lost for it
-    result = table1.make(runs, None)
+    made = chosen(results, "table1")
+    assert made.names() == [DYNAMIC, PARALLEL, NAIVE]  # no planned row is lost for it
+    result = table1.make(made, None)
     (warning,) = [note for note in result.notes if note.startswith("Do not compare times of different machines")]
     assert all(words in warning for words in (*map(str, other.values()), f"({NAIVE})", f"({DYNAMIC})"))
     assert "2 machines, see the notes" in result.caption
@@ -181,7 +196,7 @@ def test_table_1_says_what_a_strategy_saves_and_has_the_published_numbers_at_the
     assert [published.words(line) for line in page.lines] == ["", "", "6.06M", "1.99M"]
 
 
-def test_a_strategy_without_its_predecessor_is_not_credited_with_the_savings_of_both(tmp_path):
+def test_a_strategy_whose_forerunner_is_missing_is_not_credited_with_what_both_save(tmp_path):
     for label, seconds in ((NAIVE, 9.0), (DYNAMIC, 1.5)):
         write_run(tmp_path, "table1", label, metrics=costs(step_seconds=seconds))
     assert "Speedup" not in page_of(tmp_path, "table1").verdict
@@ -201,13 +216,15 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     text = (tmp_path / "paper" / "table1.tex").read_text()
     assert r"\begin{tabular}{>{\raggedright\arraybackslash}p{0.4\textwidth}" in text
     row = text[text.index(r"\midrule") : text.index(r"\bottomrule")]
-    escaped = r"{[}50 \% of a\_b \& \#1 \{x\} \textbackslash{}input \textbar{} \textasciitilde{}\textasciicircum{} \$"
-    assert escaped in row and r"\textless{}script\textgreater{}" in row
+    assert (
+        r"{[}50 \% of a\_b \& \#1 \{x\} \textbackslash{}input \textbar{} \textasciitilde{}\textasciicircum{} \$" in row
+    )
+    assert r"\textless{}script\textgreater{}" in row
     assert row.replace(r"\&", "").count("&") == 12 and row.count(r"\\") == 1  # the 13 cells of one row
     assert r"$\infty$" in row and r"64$\times$64" in text and text.isascii()
     shown = next(paper.shown for paper in find_paper(tmp_path) if paper.name == "table1")
     assert shown.rows[0][0] == hostile and len(shown.rows[0]) == len(shown.columns) == 13
-    assert Page(tmp_path).paper("table1")["rows"][0][0] == hostile  # reading it asserts that it contains no script
+    assert Page(tmp_path).paper("table1")["rows"][0][0] == hostile  # reading it checks that no script can come of it
 
 
 def test_latex_has_one_sentence_powers_of_ten_dashes_and_rules_between_groups():
@@ -220,9 +237,9 @@ def test_latex_has_one_sentence_powers_of_ten_dashes_and_rules_between_groups():
         *(r"\midrule", r"sofa & a\_b & $2.2\times10^{-5}$ \\", r" & 50 \% & {[}$-1\times10^{-7}$, $1\times10^{6}$] \\"),
         *(r"\midrule", r"car & 96$^3$ & -- \\", r" & id3e5x & -- \\"),
     ]
-    without_groups, grouped = (latex(page.narrowed(names), "mine") for names in (["Error", "Row"], ["Row", "Family"]))
-    assert without_groups.count(r"\midrule") == 1 and r"$2.2\times10^{-5}$ & a\_b \\" in without_groups
-    assert grouped.count(r"\midrule") == 2 and "\\midrule\n96$^3$ & car \\\\\nid3e5x & car" in grouped
+    apart, second = (latex(page.narrowed(names), "mine") for names in (["Error", "Row"], ["Row", "Family"]))
+    assert apart.count(r"\midrule") == 1 and r"$2.2\times10^{-5}$ & a\_b \\" in apart
+    assert second.count(r"\midrule") == 2 and "\\midrule\n96$^3$ & car \\\\\nid3e5x & car" in second
 
 
 def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_path, capsys):
@@ -238,36 +255,43 @@ def test_columns_of_a_latex_table_are_chosen_by_their_headings(reported, tmp_pat
         ("columns.tabel1=Step", "columns.tabel1: no table of that name; there are table1, gradients, "),
     ):
         capsys.readouterr()
-        assert main([f"results_dir={copy}", argument]) == 2 and named in capsys.readouterr().err
+        assert main([f"results_dir={copy}", argument]) == 2
+        assert named in capsys.readouterr().err
 
 
-def gradient_metrics(factor: float = 1.0, camera: bool = True) -> dict:
+def bands(factor: float = 1.0, camera: bool = True) -> dict:
     """The metrics of a gradients run."""
     metrics = {"silhouette.pixels": 77, "silhouette.image_cosine": 0.75, "silhouette.image_scale": 0.5 * factor}
-    for rank, band in enumerate(("frontal", "oblique", "grazing"), start=1):
-        metrics |= {f"{band}.pixels": 100 * rank, f"{band}.excluded": rank}
-        for variable in ("code", "camera")[: 1 + camera]:
-            numbers = {"cosine": 1.0, "pooled_cosine": 1 - 0.01 * rank, "pooled_scale": 1.25 * factor}
-            numbers |= {"scale": factor * rank, "median_error": 1e-4 * rank, "p99_error": 0.1}
-            metrics |= {f"{band}.{variable}_{name}": value for name, value in numbers.items()}
+    for place, band in enumerate(("frontal", "oblique", "grazing"), start=1):
+        metrics |= {f"{band}.pixels": 100 * place, f"{band}.excluded": place}
+        for of in ("code", "camera")[: 1 + camera]:
+            numbers = {
+                "cosine": 1.0,
+                "pooled_cosine": 1 - 0.01 * place,
+                "pooled_scale": 1.25 * factor,
+                "scale": factor * place,
+                "median_error": 1e-4 * place,
+                "p99_error": 0.1,
+            }
+            metrics |= {f"{band}.{of}_{name}": value for name, value in numbers.items()}
     return metrics
 
 
-def write_gradients(results: Path) -> Path:
+def write_judged(results: Path) -> Path:
     """Writes three runs of the gradients' table, one of which failed."""
     definitions = {"code_cosine, camera_cosine": "Of both.", "else": "?", "frontal.pixels": "Drawn."}
-    write_run(results, "gradients", None, metrics=gradient_metrics(), renderer="dist", definitions=definitions)
-    write_run(results, "gradients", None, metrics=gradient_metrics(2.0, camera=False), renderer="dvr")
+    write_run(results, "gradients", None, metrics=bands(), renderer="dist", definitions=definitions)
+    write_run(results, "gradients", None, metrics=bands(2.0, camera=False), renderer="dvr")
     write_run(results, "gradients", None, renderer="naive", status="oom", reason="8 GB")
     return results
 
 
 @pytest.fixture
-def gradients_results(tmp_path: Path) -> Path:
-    return write_gradients(tmp_path)
+def judged(tmp_path: Path) -> Path:
+    return write_judged(tmp_path)
 
 
-def line_values(axis, label: str, letter: str = "y") -> list[float]:
+def drawn(axis, label: str, letter: str = "y") -> list[float]:
     """The values of the line with a label, along an axis."""
     line = next(line for line in axis.lines if line.get_label() == label)
     return [float(value) for value in getattr(line, f"get_{letter}data")()]
@@ -287,16 +311,19 @@ def completions(tmp_path: Path) -> Path:
 def test_fig5_says_which_terms_its_loss_has_and_whether_losses_can_be_compared(tmp_path):
     alone = "The loss has terms for depths and the silhouette; DIST, Fig. 5"
     for task, label, words in (
-        ({"normal_weight": 1.0}, "hinge", ["normals over 0.02 scene units (weight 1)", "is the same"]),
-        ({"normal_weight": 0.0}, "", [alone, "losses of different rows do not compare"]),
-        ({}, "", [alone]),  # older runs have no weight
+        (
+            {"normal_weight": 1.0, "normal_width": 0.02},
+            "hinge",
+            ["normals over 0.02 scene units (weight 1)", "all rows share it"],
+        ),
+        ({"normal_weight": 0.0, "normal_width": 0.02}, "", [alone, "losses of different rows cannot be compared"]),
+        ({}, "", [alone]),  # of older runs
     ):
-        task = task and task | {"normal_width": 0.02}
         settings = {"task": task, "silhouette": {"_label_": label} if label else {}}
         results = tmp_path / str(len(list(tmp_path.iterdir())))
         write_curve(write_run(results, "fig5", PARALLEL, settings=settings), [4, 3, 2, 1], {0: 0.4, 2: 0.1, 3: 0.2})
-        text = page_text(page_of(results, "fig5"))
-        assert all(phrase in text for phrase in words)
+        said = told(page_of(results, "fig5"))
+        assert all(one in said for one in words)
 
 
 def test_fig5_data_holds_runs_medians_and_correlation(completions):
@@ -311,8 +338,8 @@ def test_fig5_data_holds_runs_medians_and_correlation(completions):
     rho = data[data["kind"] == "correlation"].set_index("row")
     assert rho.loc[PARALLEL, "spearman"] == pytest.approx(0.5) and rho.loc[PARALLEL, "n"] == 1
     assert rho.loc[DYNAMIC, "spearman"] == pytest.approx(1) and rho.loc[DYNAMIC, "n"] == 2  # runs, each by itself
-    verdict = page_of(completions, "fig5").verdict
-    assert "in 1 of 2 different rows (ρ of 0.7 or more); not in + parallel (*0.50*)." in verdict
+    said = page_of(completions, "fig5").verdict
+    assert "in 1 of 2 different rows (ρ of 0.7 or more); not in + parallel (*0.50*)." in said
     assert rho.loc["+ aggressive", "spearman"] is None and rho.loc["+ aggressive", "n"] == 0
 
 
@@ -324,32 +351,32 @@ def test_fig5_counts_rows_that_are_one_computation_once(tmp_path):
 
 
 def test_fig5_plots_the_numbers_of_its_csv(completions):
-    page = page_of(completions, "fig5")
-    medians = page.data[(page.data["kind"] == "median") & (page.data["row"] == PARALLEL)]
+    made = page_of(completions, "fig5")
+    medians = made.data[(made.data["kind"] == "median") & (made.data["row"] == PARALLEL)]
     loss, chamfer = (medians.dropna(subset=name) for name in ("total", "chamfer_l2"))
-    axes = page.figure.axes
+    axes = made.figure.axes
     assert list(axes[0].lines[0].get_ydata()) == list(loss["total"])
     assert list(axes[1].lines[0].get_xdata()) == list(loss["seconds"])
     assert list(axes[2].lines[0].get_xdata()) == list(chamfer["iteration"]) == [0, 2, 3]
     assert list(axes[2].lines[0].get_ydata()) == pytest.approx([1000 * x for x in chamfer["chamfer_l2"]])
     assert "× 1000" in axes[2].get_ylabel()
-    line = page.table.set_index("Method").loc[PARALLEL]
+    line = made.table.set_index("Method").loc[PARALLEL]
     assert (line["End"], line["ρ"]) == ("200", "0.500")
     assert all(axis.get_xlabel() and axis.get_ylabel() for axis in axes)
     for words in ("no curve.jsonl", "infinite"):
-        assert words in page_text(page)
+        assert words in told(made)
     for words in ("2 of 5 runs did not end ok", "diverged (loss rose)", "n = 5 runs (1 shape, 3 seeds)"):
-        assert words in page.caption
+        assert words in made.caption
 
 
-def test_in_fig5_a_row_whose_runs_all_failed_is_not_the_best(tmp_path):
+def test_in_fig5_a_row_of_which_every_run_failed_is_not_the_best(tmp_path):
     write_curve(write_run(tmp_path, "fig5", PARALLEL), [4, 3], {0: 0.4, 1: 0.3})
     for seed in (0, 1):
         lost = {"settings": {"seed": seed}, "status": "not_reached", "reason": "far"}
         write_curve(write_run(tmp_path, "fig5", DYNAMIC, **lost), [4, 3], {0: 0.2, 1: 0.1})
-    page = page_of(tmp_path, "fig5")
-    assert page.table.set_index("Method")["End"].to_dict() == {PARALLEL: "300", DYNAMIC: "∞"}
-    assert f": *300* ({PARALLEL}) to ∞ ({DYNAMIC}); n = 1 run a row." in page.verdict
+    made = page_of(tmp_path, "fig5")
+    assert made.table.set_index("Method")["End"].to_dict() == {PARALLEL: "300", DYNAMIC: "∞"}
+    assert f": *300* ({PARALLEL}) to ∞ ({DYNAMIC}); n = 1 run per row." in made.verdict
     runs = chosen(tmp_path, "fig5")
     assert fig5.make(runs.where(runs.frame.row == DYNAMIC)).verdict == ""
 
@@ -361,54 +388,52 @@ def test_curve_with_broken_lines_is_read_as_far_as_it_goes(tmp_path):
     assert list(curve["total"]) == [float("inf")] and remark == "2 lines of curve.jsonl cannot be read"
 
 
-def test_experiments_whose_runs_all_failed_have_pages(tmp_path):
+def test_experiments_of_nothing_but_failures_are_still_made(tmp_path):
     for name in PAGES:
         write_run(tmp_path, name, NAIVE, status="crashed", reason="early", environment={}, settings={"renderer": None})
-        page = page_of(tmp_path, name)
-        assert set(page.data["row"].dropna()) == {NAIVE} and "crashed" in set(page.data["status"])
-        assert "The run did not end ok" in page.caption
-        assert page.figure is None or page.figure.draw_without_rendering() is None
+        made = page_of(tmp_path, name)
+        assert set(made.data["row"].dropna()) == {NAIVE} and "crashed" in set(made.data["status"])
+        assert "The run did not end ok" in made.caption
+        assert made.figure is None or made.figure.draw_without_rendering() is None
 
 
 def test_command_writes_all_files_and_the_page_shows_them(reported):
-    with_figure = {".csv", ".md", ".tex", ".json", ".png", ".pdf"}
-    table_only = {".csv", ".md", ".tex", ".json"}
-    suffixes = {"table1": table_only, "gradients": with_figure, "gradients_visibility": with_figure}
+    drawn_too = {".csv", ".md", ".tex", ".json", ".png", ".pdf"}
+    table_alone = {".csv", ".md", ".tex", ".json"}
+    suffixes = {"table1": table_alone, "gradients": drawn_too, "gradients_visibility": drawn_too}
     written = {path.name for path in (reported / "paper").iterdir()}
-    assert written == {name + suffix for name in suffixes for suffix in suffixes[name]}
+    assert written == {name + suffix for name, them in suffixes.items() for suffix in them}
     page = Page(reported)
-    details = [page.paper(paper["name"]) for paper in page.papers]
-    links = {link for detail in details for link in [*detail["files"].values(), detail["picture"]] if link}
+    found = [page.paper(paper["name"]) for paper in page.papers]
+    links = {link for whole in found for link in [*whole["files"].values(), whole["picture"]] if link}
     assert links == {f"paper/{name}" for name in written if not name.endswith(".json")}
     assert "+ dynamic" in page.paper("table1")["rows"][0]
     assert [paper["name"] for paper in page.papers] == ["table1", "gradients", "gradients_visibility"]
     assert (reported / "paper" / "gradients.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_page_alone_makes_nothing(gradients_results):
-    write_index(gradients_results)
-    assert not (gradients_results / "paper").exists()
+def test_page_alone_makes_nothing(judged):
+    write_index(judged)
+    assert not (judged / "paper").exists()
 
 
 def test_same_records_give_the_same_files(reported, tmp_path, capsys):
     copy = shutil.copytree(reported, tmp_path / "results")
     main([f"results_dir={copy}"])
     assert capsys.readouterr().out.splitlines()[-1] == str(copy / "index.html")
-    first, second = (
-        {path.name: path.read_bytes() for path in (folder / "paper").iterdir()} for folder in (reported, copy)
-    )
+    first, second = ({path.name: path.read_bytes() for path in (each / "paper").iterdir()} for each in (reported, copy))
     assert first == second
 
 
 def test_row_keeps_its_look_and_known_rows_differ():
-    assert style.look("mine") == style.look("mine") != style.look("yours")  # not in the list of looks
+    assert style.look("mine") == style.look("mine") != style.look("yours")  # that nobody listed
     strategies = [style.look(preset) for preset in table1.PUBLISHED]
     assert len({look.colour for look in strategies}) == len({look.marker for look in strategies}) == 7
 
 
-def test_drawing_leaves_the_settings_of_matplotlib_alone(gradients_results):
+def test_drawing_leaves_the_settings_of_matplotlib_alone(judged):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    page_of(gradients_results, "gradients")
+    page_of(judged, "gradients")
     assert dict(matplotlib.rcParams) == before

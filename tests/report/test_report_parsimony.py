@@ -1,10 +1,10 @@
-"""Tables and figures on how large a model each scene needs, from run folders with given numbers."""
+"""How much model each scene needs as tables and figures, made from run folders whose numbers are known."""
 
 import pytest
 
 from bench.report.write.result import latex
 from bench.studies import parsimony
-from tests.report.test_report_paper import page_of, page_text, write_run
+from tests.report.test_report_paper import page_of, told, write_run
 
 NETWORK, PAPERS = "network_8x512", 1_839_614  # the papers' network, and its numbers
 SIZES = {"sphere": 4, "box": 9, "union_3": 30, "grid_24": 3000, NETWORK: PAPERS}  # free numbers
@@ -14,61 +14,61 @@ VIEWS = {"fitted": 12, "held_out": 8, "share": 0.1}
 CONFIG = {"task": {"checks": {"seeds": 20, "drawn": 8}}, "models": {"views": VIEWS, "fit": {"iterations": 100}}}
 
 
-def write_capacity_run(results, scene, errors, *, needs, failed=(), status="ok", **metrics) -> None:
-    """Writes a run whose candidates have these errors in half pixels of 0.02."""
-    values = {"footprint": 0.02, "chamfer_l2": 0.001, "held_out_seeds": 20, "held_out_seeds_within": 0.6}
-    values |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": 1}
+def climbed(results, scene, errors, *, needs, failed=(), status="ok", **metrics) -> None:
+    """A run whose candidates have these errors in half pixels of 0.02."""
+    known = {"footprint": 0.02, "chamfer_l2": 0.001, "held_out_seeds": 20, "held_out_seeds_within": 0.6}
+    known |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": 1}
     for name, error in errors.items():
         spent = {"free": SIZES[name], "stored": STORED[name], "bytes": 4 * STORED[name], **COSTS}
         spent |= {"flops_per_query": 2 * SIZES[name]}
         spent |= {"failed": "nan: why"} if name in failed else {"error": 0.02 * error, "standard_error": 0.001}
-        values |= {f"{name}.{key}": value for key, value in spent.items()}
+        known |= {f"{name}.{key}": value for key, value in spent.items()}
     best = min((name for name in errors if name not in failed), key=lambda name: errors[name])
-    values |= {"recommended_field": needs, "best_field": best, "recommended_by": "stored"}
-    values |= {f"recommended_{size}": values[f"{needs}.{size}"] for size in ("free", "stored", "bytes")}
-    values |= {"recommended_error": values[f"{needs}.error"], "saved_free": PAPERS / SIZES[needs]}
-    values |= {"saved_stored": PAPERS / STORED[needs], "saved_bytes": PAPERS / STORED[needs]}
-    values |= {"auto.field": needs, "auto.stored": STORED[needs], "auto.error": 0.02, "auto.standard_error": 0.001}
-    values |= {"auto.seconds": 4.0, "auto.evaluations": 500, "auto.flops": 100_000, "auto.overhead": 1.5}
-    values |= {"frugal.stored": STORED[needs], "frugal.error": 0.03, "frugal.evaluations": 250}
-    values |= {"frugal.seconds": 1.0} | metrics
-    values = {name: value for name, value in values.items() if value is not ...}
-    changed = {"status": status, "reason": "" if status == "ok" else "why", "metrics": values if status == "ok" else {}}
-    changed |= {"dataset": scene, "scene": f"{scene} test 0", "settings": CONFIG}
-    write_run(results, "parsimony", None, task="capacity", **changed)
+    known |= {"recommended_field": needs, "best_field": best, "recommended_by": "stored"}
+    known |= {f"recommended_{size}": known[f"{needs}.{size}"] for size in ("free", "stored", "bytes")}
+    known |= {"recommended_error": known[f"{needs}.error"], "saved_free": PAPERS / SIZES[needs]}
+    known |= {"saved_stored": PAPERS / STORED[needs], "saved_bytes": PAPERS / STORED[needs]}
+    known |= {"auto.field": needs, "auto.stored": STORED[needs], "auto.error": 0.02, "auto.standard_error": 0.001}
+    known |= {"auto.seconds": 4.0, "auto.evaluations": 500, "auto.flops": 100_000, "auto.overhead": 1.5}
+    known |= {"frugal.stored": STORED[needs], "frugal.error": 0.03, "frugal.evaluations": 250}
+    known |= {"frugal.seconds": 1.0} | metrics
+    known = {name: value for name, value in known.items() if value is not ...}
+    changed = {"status": status, "reason": "" if status == "ok" else "why", "metrics": known if status == "ok" else {}}
+    write_run(
+        *(results, "parsimony", None),
+        **{"task": "capacity", "dataset": scene, "scene": f"{scene} test 0", "settings": CONFIG, **changed},
+    )
 
 
 @pytest.fixture(scope="module")
-def four_scenes(tmp_path_factory):
-    """Scenes that need three sizes, and one that crashed, in no order."""
+def four(tmp_path_factory):
+    """Scenes of three needs, and one that crashed, in no order."""
     tmp_path = tmp_path_factory.mktemp("four")
-    write_capacity_run(tmp_path, "car", {"sphere": 8, "union_3": 2, "grid_24": 0.9}, needs="grid_24")
-    write_capacity_run(tmp_path, "torus", {"sphere": 9, "box": 5}, needs="box", status="crashed")
-    write_capacity_run(tmp_path, "box", {"sphere": 7, "box": 0.5, "grid_24": 0.2}, needs="box")
-    write_capacity_run(
-        tmp_path, "ball", {"sphere": 0.01, "box": 5, "grid_24": 0.2}, needs="sphere", recommended_within=1
-    )
+    climbed(tmp_path, "car", {"sphere": 8, "union_3": 2, "grid_24": 0.9}, needs="grid_24")
+    climbed(tmp_path, "torus", {"sphere": 9, "box": 5}, needs="box", status="crashed")
+    climbed(tmp_path, "box", {"sphere": 7, "box": 0.5, "grid_24": 0.2}, needs="box")
+    climbed(tmp_path, "ball", {"sphere": 0.01, "box": 5, "grid_24": 0.2}, needs="sphere", recommended_within=1)
     return tmp_path
 
 
 @pytest.fixture(scope="module")
-def page(four_scenes):
-    """The page of these scenes, read-only."""
-    return page_of(four_scenes, "parsimony")
+def page(four):
+    """Made once: tests of the same runs only look at it."""
+    return page_of(four, "parsimony")
 
 
-def test_scenes_are_rows_the_smallest_size_first_and_a_failed_run_last(page):
+def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
     assert list(page.table["Scene"]) == ["ball 0", "box 0", "car 0", "torus 0"]
     assert list(page.table.iloc[3])[1:] == ["crashed"] + ["–"] * (len(parsimony.COLUMNS) - 2)
     assert list(page.table["Why"][:3]) == ["both", "under half a pixel", "under half a pixel"]
     lost = page.data[page.data["scene"] == "torus 0"]
     assert (lost["status"].item(), lost["reason"].item()) == ("crashed", "why")
-    assert "1 of 4 runs did not end ok: dist, torus: crashed (why)." in page_text(page)
-    most = "the most is grid 24 of 13,824 stored numbers, for car 0."
-    assert page.verdict == f"A single part suffices for *2 of 3* scenes; {most}"
+    assert "1 of 4 runs did not end ok: dist, torus: crashed (why)." in told(page)
+    most = "The largest field needed is grid 24 with 13,824 stored numbers, for car 0."
+    assert page.verdict == f"A single part suffices for *2 of 3* scenes. {most}"
 
 
-def test_a_row_has_the_recommended_size_and_its_savings(page):
+def test_a_row_tells_the_need_and_what_it_saves(page):
     table = page.table.set_index("Scene")
     cells, grid = table.loc["box 0"], table.loc["car 0"]
     assert cells["Recommended"] == "box"
@@ -81,7 +81,7 @@ def test_a_row_has_the_recommended_size_and_its_savings(page):
     assert r"10.0 $\pm$ 1.00" in latex(page.shown(), "parsimony")
 
 
-def test_candidates_are_one_line_each_of_the_csv(page):
+def test_candidates_stand_as_csv_a_line_each(page):
     data = page.data
     assert len(data) == 3 + 3 + 3 + 1
     assert list(data.loc[data["recommended"].eq(True), "rung"]) == ["sphere", "box", "grid_24"]
@@ -99,7 +99,7 @@ def test_what_suffices_is_filled_and_the_recommended_is_ringed(page):
 
 
 def test_a_candidate_that_failed_is_counted_and_crossed(tmp_path):
-    write_capacity_run(tmp_path, "car", {"sphere": 8, "box": 1, "grid_24": 0.2}, needs="grid_24", failed=("box",))
+    climbed(tmp_path, "car", {"sphere": 8, "box": 1, "grid_24": 0.2}, needs="grid_24", failed=("box",))
     page = page_of(tmp_path, "parsimony")
     assert page.table["Failed candidates"].item() == "1 of 3"
     assert page.data.set_index("rung").loc["box", "failed"] == "nan: why"
@@ -107,23 +107,21 @@ def test_a_candidate_that_failed_is_counted_and_crossed(tmp_path):
     assert [list(line.get_xdata()) for line in crosses] == [[9]]
 
 
-def test_pages_name_the_size_by_which_candidates_are_chosen(page, tmp_path):
-    write_capacity_run(tmp_path, "car", {"box": 8, "grid_24": 0.5}, needs="grid_24", recommended_by="free")
+def test_pages_say_by_which_size_the_choice_is(page, tmp_path):
+    climbed(tmp_path, "car", {"box": 8, "grid_24": 0.5}, needs="grid_24", recommended_by="free")
     other = page_of(tmp_path, "parsimony")
     assert "free numbers" in other.title and other.figure.axes[0].get_xlabel() == "free numbers"
-    assert "the smallest candidate by stored numbers whose error" in page_text(page)
+    assert "the smallest candidate by stored numbers whose error" in told(page)
 
 
-def test_a_row_has_field_auto_and_pixel_precision(page, tmp_path):
+def test_field_auto_and_pixel_precision_stand_beside(page, tmp_path):
     names = ["Overhead of field=auto", "Evaluations at pixel precision"]
     assert page.table.set_index("Scene").loc["box 0", names].tolist() == ["1.50", "0.250×"]
-    write_capacity_run(
-        tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", **{"frugal.error": ..., "auto.overhead": ...}
-    )
+    climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", **{"frugal.error": ..., "auto.overhead": ...})
     assert page_of(tmp_path, "parsimony").table[names].iloc[0].tolist() == ["–", "–"]
 
 
-def test_a_page_is_made_even_if_all_runs_failed(tmp_path):
-    write_capacity_run(tmp_path, "car", {"sphere": 8}, needs="sphere", status="timeout")
+def test_a_page_is_made_even_where_all_runs_failed(tmp_path):
+    climbed(tmp_path, "car", {"sphere": 8}, needs="sphere", status="timeout")
     page = page_of(tmp_path, "parsimony")
     assert page.table["Recommended"].tolist() == ["timeout"] and page.verdict == ""

@@ -1,4 +1,4 @@
-"""Tables and figures on one rendering, its pictures and its gradients, from run folders with given numbers."""
+"""Tables and figures of one rendering, its pictures and its gradients, from run folders whose numbers are known."""
 
 import numpy as np
 import pandas as pd
@@ -12,19 +12,19 @@ from tests.report.test_report_paper import (
     DYNAMIC,
     NAIVE,
     PARALLEL,
+    ball,
+    bands,
     costs,
-    gradient_metrics,
-    line_values,
+    drawn,
     page_of,
-    page_text,
-    sphere_normals,
-    write_gradients,
+    told,
     write_images,
+    write_judged,
     write_run,
 )
 
 
-def test_table1_has_measured_and_published_numbers_in_its_rows(tmp_path):
+def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
     write_run(tmp_path, "table1", "of ours", metrics=costs(5, step_seconds=0.5))
     write_run(tmp_path, "table1", DYNAMIC, metrics=costs(2_100_000))
     timed_out = {"status": "timeout", "reason": "64 pixels took over 60 s"}
@@ -34,12 +34,7 @@ def test_table1_has_measured_and_published_numbers_in_its_rows(tmp_path):
     rows = page.data.set_index("row")
     rows = rows.astype(object).where(rows.notna(), None)
     assert list(rows.index) == [NAIVE, PARALLEL, DYNAMIC, "of ours"]  # the paper's order, then others
-    assert list(rows["queries"]) == [
-        None,
-        None,
-        2_100_000,
-        5,
-    ]  # numbers of another size are missing, as N/A in the paper
+    assert list(rows["queries"]) == [None, None, 2_100_000, 5]  # those of the asked size: as N/A in the paper
     assert list(rows["size"]) == [64, 64, 64, 64]
     assert list(rows["published_queries"]) == ["N/A", "6.06M", "1.99M", None]
     assert list(rows["published_time"]) == ["N/A", "3.39s", "1.23s", None]
@@ -59,99 +54,103 @@ def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
     assert list(page.table["Size"]) == ["32 (64: timeout)", "– (64: crashed)", "64"]
     assert page.table["Time of a step"].iloc[2] == "750 ms (625–875)"
     assert page.table["Missed / spurious / wrong depth"].iloc[2] == "12 / 8 / 3"
-    conditions = ("car 0", "64×64 pixels", "4 layers of 128", "Some CPU", "2 threads", "5 repeats", "n = 3 runs")
-    failures = "2 of 3 runs did not end ok: Naive sphere tracing: timeout (over 60 s); + parallel: crashed"
-    assert all(words in page_text(page) for words in (*conditions, "GTX 1080Ti", failures))
+    said = (
+        "car 0",
+        "64×64 pixels",
+        "4 layers of 128",
+        "Some CPU",
+        "2 threads",
+        "5 repeats",
+        "n = 3 runs",
+        "GTX 1080Ti",
+    )
+    for words in (*said, "2 of 3 runs did not end ok: Naive sphere tracing: timeout (over 60 s); + parallel: crashed"):
+        assert words in told(page)
 
 
-def renderer_numbers(factor: float, coarse: int = 0) -> dict:
-    """The numbers of a renderer that takes `factor` times the time of the first renderer."""
-    offsets = {"": 0.0, "_low": -0.25, "_high": 0.25}
-    ratios = {f"{cost}_ratio{end}": factor + off for cost in benchmark.COSTS for end, off in offsets.items()}
+def numbers(factor: float, coarse: int = 0) -> dict:
+    """The numbers of a renderer that takes `factor` times what the first one does."""
+    ratios = {f"{cost}_ratio": factor for cost in benchmark.COSTS}
+    ends = {
+        f"{cost}_ratio_{end}": factor + off for cost in benchmark.COSTS for end, off in (("low", -0.25), ("high", 0.25))
+    }
     costs = {"forward_seconds": factor, "step_seconds": 2 * factor, "forward_cpu": factor, "step_cpu": factor}
     errors = {"lost": 1, "false": 2, "wrong": 3, "depth_error_median": 1e-6, "depth_error_p99": 1e-4, "hits": 9}
-    return {**ratios, **costs, **errors, "queries": 1000, "coarse_queries": coarse, "work_over_bound": 5.5}
+    return {**ratios, **ends, **costs, **errors, "queries": 1000, "coarse_queries": coarse, "work_over_bound": 5.5}
 
 
-def write_benchmark(results, size: int, threads: int, factor: float = 0.5, **changed) -> None:
+def timed(results, size: int, threads: int, factor: float = 0.5, **changed) -> None:
     metrics = {"rounds": 5}
     for name, times, coarse in (("base", 1.0, 0), ("newton", factor, 3000)):
-        metrics |= {f"{name}.{key}": number for key, number in renderer_numbers(times, coarse).items()}
+        metrics |= {f"{name}.{key}": number for key, number in numbers(times, coarse).items()}
     settings = {"task": {"size": size, "threads": threads}}
     write_run(results, "benchmark", None, **{"task": "benchmark", "metrics": metrics, "settings": settings, **changed})
 
 
 def test_a_benchmark_has_a_line_for_each_size_number_of_threads_and_renderer(tmp_path):
     for size, threads, factor in ((256, 1, 0.6), (256, 2, 0.9), (128, 2, 0.5), (128, 1, 0.75)):
-        write_benchmark(tmp_path, size, threads, factor)
-    write_benchmark(tmp_path, 512, 1, metrics={}, status="timeout", reason="dvr: more than 9 field values")
+        timed(tmp_path, size, threads, factor)
+    timed(tmp_path, 512, 1, metrics={}, status="timeout", reason="dvr: more than 9 field values")
     page = page_of(tmp_path, "benchmark")
     ratios = {128: {1: 0.75, 2: 0.5}, 256: {1: 0.6, 2: 0.9}}
-    lines = [(size, n, x) for size, by_threads in ratios.items() for n, r in by_threads.items() for x in (1.0, r)]
+    lines = [(size, n, each) for size, own in ratios.items() for n, ratio in own.items() for each in (1.0, ratio)]
     assert list(zip(*(page.data[key] for key in ("size", "threads", "forward_ratio")), strict=True))[:-1] == lines
     assert set(page.data["renderer"][1:6:2]) == {"newton"}
     line = page.table.iloc[1]
     assert (line["Field evaluations"], line["Forward ratio"]) == ("1.00k + 3.00k coarse", "0.75 (0.50–1.00)")
     assert line["Missed / spurious / wrong depth"] == "1 / 2 / 3"
     assert list(page.table["Forward ratio"].iloc[[0, -1]]) == ["1", "–"]  # of the first renderer, and of a failed run
-    assert "medians of 5 rounds" in page_text(page) and "timeout" in page_text(page)
-    assert "thread" not in page.shown().caption[-40:]
-    verdict = "A step at 256 × 256 pixels over that of dist: *0.600* (newton, 1 thread) to 0.900 (newton, 2 threads)"
-    assert page.verdict == f"{verdict}; n = one shape."
+    assert (
+        "medians of 5 rounds" in told(page) and "timeout" in told(page) and "thread" not in page.shown().caption[-40:]
+    )
+    said = "Step runtime at 256 × 256 pixels, relative to dist: *0.600* (newton, 1 thread) to 0.900 (newton, 2 threads)"
+    assert page.verdict == f"{said}; n = one shape."
 
 
 def test_gradients_have_a_row_for_each_renderer_and_band(tmp_path):
-    page = page_of(write_gradients(tmp_path), "gradients")
+    page = page_of(write_judged(tmp_path), "gradients")
     rows = page.data.set_index(["row", "band"])
     assert list(rows.index) == [(name, band) for name in ("dist", "dvr", "naive") for band in gradients.BANDS]
     assert rows.loc[("dvr", "oblique"), "code_scale"] == 4.0
-    grazing = rows.loc[("dist", "grazing")]
-    assert grazing[["camera_median_error", "code_pooled_cosine"]].tolist() == pytest.approx([3e-4, 0.97])
+    assert rows.loc[("dist", "grazing"), ["camera_median_error", "code_pooled_cosine"]].tolist() == pytest.approx(
+        [3e-4, 0.97]
+    )
     assert np.isnan(rows.loc[("dvr", "frontal"), "camera_scale"])
     assert rows.loc[("dist", "silhouette"), ["image_cosine", "pixels"]].tolist() == [0.75, 77]
     assert (rows.loc["naive", "status"] == "oom").all() and rows.loc["naive", "code_scale"].isna().all()
     assert page.table.loc[0, ["Code pooled cosine", "Code scale", "Pixels"]].tolist() == ["0.99000", "1.00", "100"]
-    assert "A pooled number compares the gradients of all pixels of a band" in page_text(page)
-    assert page.verdict.startswith("Least pooled cosine in any band of hits, 0 of 3 of 0.99 or more: *0.97000* (dist)")
+    assert "A pooled number compares the gradients of all pixels of a band" in told(page)
+    assert "0 of 3 reach a pooled cosine of 0.99 in all bands of hits. Smallest: *0.97000* (dist)" in page.verdict
 
 
 def test_a_renderer_without_a_number_in_a_band_has_no_least_one():
-    rows = [("a", band, "ok", 0.995) for band in gradients.ANGLES] + [("b", "frontal", "ok", 0.999)]
-    data = pd.DataFrame(rows, columns=["name", "band", "status", "code_pooled_cosine"])
-    assert ", 1 of 2 of 0.99 or more: *0.99500* (a); " in gradients._verdict(data)
+    known = [("a", band, "ok", 0.995) for band in gradients.ANGLES] + [("b", "frontal", "ok", 0.999)]
+    said = gradients._verdict(pd.DataFrame(known, columns=["name", "band", "status", "code_pooled_cosine"]))
+    assert "1 of 2 reach a pooled cosine of 0.99 in all bands of hits. Smallest: *0.99500* (a); " in said
 
 
 def test_gradients_figure_plots_the_numbers_of_its_csv(tmp_path):
-    page = page_of(write_gradients(tmp_path), "gradients")
+    page = page_of(write_judged(tmp_path), "gradients")
     code, camera, outline = page.figure.axes
-    oblique = page.data[page.data["band"] == "oblique"]
-    assert line_values(code, "oblique", "x")[:2] == list(oblique["code_median_error"])[:2] == [2e-4, 2e-4]
-    assert line_values(camera, "oblique", "x") == pytest.approx([2e-4, np.nan, np.nan], nan_ok=True)
-    assert line_values(outline, "cosine", "x")[:2] == [0.75, 0.75] and line_values(outline, "scale", "x")[:2] == [
-        0.5,
-        1.0,
-    ]
+    own = page.data[page.data["band"] == "oblique"]
+    assert drawn(code, "oblique", "x")[:2] == list(own["code_median_error"])[:2] == [2e-4, 2e-4]
+    assert drawn(camera, "oblique", "x") == pytest.approx([2e-4, np.nan, np.nan], nan_ok=True)
+    assert drawn(outline, "cosine", "x")[:2] == [0.75, 0.75] and drawn(outline, "scale", "x")[:2] == [0.5, 1.0]
     assert [label.get_text() for label in code.get_yticklabels()] == ["dist", "dvr", "naive (oom)"]
 
 
-def outline_metrics(blur: str, error: float) -> dict[str, float]:
-    """The metrics at the outline with a blur."""
-    renderer_numbers = {"image_cosine": 0.9, "image_scale": 1.1, "image_error": error, "image_spread": 2.0}
-    return {f"silhouette_{blur}.{name}": value for name, value in (renderer_numbers | {"values_per_ray": 30.0}).items()}
+def seen(blur: str, error: float) -> dict[str, float]:
+    """The metrics at the outline, at a blur."""
+    numbers = {"image_cosine": 0.9, "image_scale": 1.1, "image_error": error, "image_spread": 2.0}
+    return {f"silhouette_{blur}.{name}": value for name, value in (numbers | {"values_per_ray": 30.0}).items()}
 
 
-def test_visibility_gradients_have_a_row_for_each_blur(tmp_path):
-    blurred = outline_metrics("1e-03", 0.3) | outline_metrics("3e-02", 0.2)
-    sharp_metrics = {key.replace("_1e-03", ""): value for key, value in outline_metrics("1e-03", 0.9).items()}
-    write_run(tmp_path, "gradients", None, metrics=gradient_metrics() | sharp_metrics, renderer="idr")
-    write_run(
-        tmp_path,
-        "gradients",
-        None,
-        metrics=gradient_metrics() | sharp_metrics | {"silhouette.image_cosine": 0.5},
-        renderer="dvr",
-    )
-    write_run(tmp_path, "gradients", None, metrics=gradient_metrics() | sharp_metrics | blurred, renderer="neus")
+def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
+    blurred = seen("1e-03", 0.3) | seen("3e-02", 0.2)
+    own = {key.replace("_1e-03", ""): value for key, value in seen("1e-03", 0.9).items()}
+    write_run(tmp_path, "gradients", None, metrics=bands() | own, renderer="idr")
+    write_run(tmp_path, "gradients", None, metrics=bands() | own | {"silhouette.image_cosine": 0.5}, renderer="dvr")
+    write_run(tmp_path, "gradients", None, metrics=bands() | own | blurred, renderer="neus")
     write_run(tmp_path, "gradients", None, renderer="naive", status="oom", reason="8 GB")
     page = page_of(tmp_path, "gradients_visibility")
     rows = page.data.set_index("row")
@@ -160,13 +159,13 @@ def test_visibility_gradients_have_a_row_for_each_blur(tmp_path):
     assert rows.loc["idr", "image_error"] == 0.9 and np.isnan(rows.loc["idr", "blur"])
     assert rows.loc["naive", "status"] == "oom"
     cosine, scale = page.figure.axes
-    assert line_values(cosine, "neus") == [0.9, 0.9] and line_values(scale, "neus", "x") == [0.001, 0.03]
+    assert drawn(cosine, "neus") == [0.9, 0.9] and drawn(scale, "neus", "x") == [0.001, 0.03]
     sharp = [line.get_ydata()[0] for line in cosine.lines if line.get_label() == "without a blur (2 renderers)"]
     assert sharp == [0.5, 0.9]
     assert page.verdict.startswith("neus has a cosine of *0.90* and a scale of 1.10 at a blur of 0.001 scene units; ")
 
 
-def test_fig4_counts_the_wrong_pixels_of_the_pictures(tmp_path):
+def test_fig4_counts_what_the_pictures_show(tmp_path):
     write_images(write_run(tmp_path, "fig4", PARALLEL))
     write_images(write_run(tmp_path, "fig4", DYNAMIC), shift=0.1, tilt=10.0)
     write_images(write_run(tmp_path, "fig4", NAIVE, status="timeout", reason="slow"), size=8)
@@ -176,11 +175,11 @@ def test_fig4_counts_the_wrong_pixels_of_the_pictures(tmp_path):
     assert list(rows.index) == [PARALLEL, DYNAMIC, NAIVE, "+ aggressive"]
     assert list(rows["size"]) == [24, 24, 8, None]
     assert (rows.loc[PARALLEL, "lost"], rows.loc[PARALLEL, "false"], rows.loc[PARALLEL, "angle_max"]) == (0, 0, 0)
-    reference, moved = sphere_normals(24, 0.0, 0.0)[1], sphere_normals(24, 0.1, 0.0)[1]
+    reference, moved = ball(24, 0.0, 0.0)[1], ball(24, 0.1, 0.0)[1]
     assert rows.loc[DYNAMIC, "lost"] == (reference & ~moved).sum() > 0
     assert rows.loc[DYNAMIC, "false"] == (moved & ~reference).sum() > 0
     assert rows.loc[DYNAMIC, "hits"] == reference.sum()
-    assert "No pictures of 1 run: no images.npz." in page_text(page)
+    assert "No pictures of 1 run: no images.npz." in told(page)
     axis = page.figure.axes[0]
     titles = [label.get_text().replace("\n", " ") for label in axis.get_xticklabels()]
     assert titles == ["reference", PARALLEL, DYNAMIC, f"{NAIVE}, 8 px", "+ aggressive"]
@@ -189,7 +188,7 @@ def test_fig4_counts_the_wrong_pixels_of_the_pictures(tmp_path):
     assert page.verdict.startswith(f"Missed and spurious pixels: *0* ({PARALLEL}) to ")
 
 
-def test_angles_are_degrees_if_both_hit(tmp_path):
+def test_angles_are_degrees_where_both_hit(tmp_path):
     write_images(tmp_path, tilt=10.0)
     images = gallery.read_arrays(tmp_path, gallery.REFERENCE)[0]
     angles = gallery.angles(images)
@@ -207,14 +206,19 @@ def test_lost_and_false_pixels_have_their_colours(tmp_path):
         assert wrong.any() and ((shown == to_rgb(colour)).all(-1) == wrong).all()
 
 
-@pytest.mark.parametrize(("content", "why"), [
-    (b"", "cannot be read"), (b"PK\x03\x04 not a zip", "cannot be read"), ({"hit": np.ones((2, 2))}, "lacks an array"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "cannot be read"),
+        (b"PK\x03\x04 not a zip", "cannot be read"),
+        ({"hit": np.ones((2, 2))}, "lacks an array"),
+    ],
+)
 def test_broken_pictures_are_a_remark(tmp_path, content, why):
     path = write_run(tmp_path, "fig4", DYNAMIC) / "images.npz"
     path.write_bytes(content) if isinstance(content, bytes) else np.savez(path, **content)
     page = page_of(tmp_path, "fig4")
-    assert why in page_text(page) and list(page.data["lost"]) == [None]
+    assert why in told(page) and list(page.data["lost"]) == [None]
 
 
 def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
@@ -230,7 +234,7 @@ def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
     assert list(page.data["status"]) == ["ok", "killed", "ok", "ok"]
     shown = page.table[["Epsilon", "Missed", "Spurious"]].to_numpy().tolist()
     assert shown[0] == ["0.0500", "1.00 %", "25.0 %"] and shown[1][1:] == ["–", "–"]
-    assert "killed (stopped)" in page_text(page)
+    assert "killed (stopped)" in told(page)
     assert "fewest, *0.250 %* of the hits, at epsilon = 5e-05, and at 0.05 they are 26.0 %" in page.verdict
 
 
@@ -245,4 +249,4 @@ def test_pictures_are_of_one_scene(tmp_path):
     write_images(write_run(tmp_path, "fig7", None, settings={"index": 1}))
     write_images(write_run(tmp_path, "fig7", None, settings={"index": 0}))
     page = page_of(tmp_path, "fig7")
-    assert list(page.data["index"]) == [0] and "Not shown: 1 run" in page_text(page)
+    assert list(page.data["index"]) == [0] and "Not shown: 1 run" in told(page)

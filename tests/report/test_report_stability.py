@@ -1,61 +1,63 @@
-"""The stability atlas as tables and figures, from run folders with given numbers."""
+"""The stability atlas as tables and figures, made from run folders whose numbers are known."""
 
 import pytest
 
 from bench.report.data.records import row_of
 from bench.report.data.runs import named_rows, shared_loss
-from tests.report.test_report_paper import page_of, page_text, write_lines, write_run
+from tests.report.test_report_paper import page_of, told, write_lines, write_run
 
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
 
 
-def write_breakdown(
-    results, axis, label, level, *, status="ok", measure="rendering", criteria=None, repeats=None, **more
-):
-    """Writes a run of the atlas whose breakdown is at a level, with five trials at each end or with one."""
-    half_width, trials = (None, 1) if repeats == 1 else (0.05, 5)
-    ends = {"": level, "_low": half_width and level - half_width, "_high": half_width and level + half_width}
-    metrics = {f"level{end}": value for end, value in ends.items()}
-    metrics |= {
-        f"breakdown{end}": 0.01**value if value is not None and 0 <= value <= 1 else None for end, value in ends.items()
-    }
-    metrics |= {"trials": 10, "grid_trials": 40, "evaluations_per_ray": 4.0, "failed_lost": 3, "failed_false": 1}
-    metrics |= {f"{end}_trials": trials for end in ("mild", "severe")}
+def broke(results, axis, label, level, *, status="ok", measure="rendering", criteria=None, repeats=None, **more):
+    """A run of the atlas whose breakdown lies at a level; with a curve of ten trials, or one trial at each end."""
+    off, trials = (None, 1) if repeats == 1 else (0.05, 5)
+    ends = {"": level, "_low": off and level - off, "_high": off and level + off}
+    known = {f"level{end}": at for end, at in ends.items()}
+    known |= {f"breakdown{end}": 0.01**at if at is not None and 0 <= at <= 1 else None for end, at in ends.items()}
+    known |= {"trials": 10, "grid_trials": 40, "evaluations_per_ray": 4.0, "failed_lost": 3, "failed_false": 1}
+    known |= {f"{end}_trials": trials for end in ("mild", "severe")}
     renderer = {name: more.pop(name) for name in ("renderer",) if name in more}
     settings = {"renderer": {"_target_": more.pop("target")}} if "target" in more else {}
-    metrics |= {"mild_successes": trials * (level > 0), "severe_successes": trials * (level > 1)} | more
+    known |= {"mild_successes": trials * (level > 0), "severe_successes": trials * (level > 1)} | more
     stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP, "repeats": repeats}
     search = {"levels": 11, "repeats": 4}
-    task = {"stress": stress, "search": search, "fit_search": search, "criteria": criteria or {}}
     folder = write_run(
-        results, "stability", label, task="stability", dataset=axis, status=status,
-        reason="" if status == "ok" else "why", metrics=metrics if status == "ok" else {}, **renderer,
-        settings=settings | {"task": task, "stress": stress},
-    )  # fmt: skip
+        *(results, "stability", label),
+        task="stability",
+        dataset=axis,
+        status=status,
+        reason="" if status == "ok" else "why",
+        metrics=known if status == "ok" else {},
+        **renderer,
+        settings=settings
+        | {
+            "task": {"stress": stress, "search": search, "fit_search": search, "criteria": criteria or {}},
+            "stress": stress,
+        },
+    )
     if status == "ok":
         tried = [i / 10 for i in range(11)]
-        write_lines(folder, [{"level": value, "severity": 0.01**value, "success": value < level} for value in tried])
+        write_lines(folder, [{"level": at, "severity": 0.01**at, "success": at < level} for at in tried])
     return folder
 
 
-def test_a_breakdown_has_its_interval(tmp_path):
-    write_breakdown(tmp_path, "wires", "DIST", 0.5)
-    write_breakdown(tmp_path, "wires", "DVR", 1.1)
+def test_a_breakdown_stands_with_its_interval(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5)
+    broke(tmp_path, "wires", "DVR", 1.1)
     page = page_of(tmp_path, "stability")
     assert page.table.iloc[0].tolist()[:3] == ["wires", "scene units", "0.100 (0.126 to 0.0794)"]
     assert page.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"
     assert page.data["failures"].tolist() == ["1 false; 3 lost"] * 2
     assert page.verdict.endswith("does not break: *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes.")
-    assert "n = 20 trials in all, of 1 axes and 2 renderers" in page_text(
-        page
-    ) and "25 % of a full grid's" in page_text(page)
+    assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of the trials" in told(page)
     dist, dvr = page.atlas["cells"][0]
     assert dist["shade"] == 0.5 and (dvr["shade"], dvr["short"]) == (1.0, "none")
 
 
 def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):
-    write_breakdown(tmp_path, "camera_inside", "DIST", 0.5, repeats=1)
-    write_breakdown(tmp_path, "camera_inside", "DVR", -0.1, repeats=1)
+    broke(tmp_path, "camera_inside", "DIST", 0.5, repeats=1)
+    broke(tmp_path, "camera_inside", "DVR", -0.1, repeats=1)
     result = page_of(tmp_path, "stability")
     assert result.table.loc[0, ["DIST", "DVR"]].tolist() == ["0.100 (one trial)", "at once (1 of 1 failed)"]
     assert result.data[["breakdown_low", "breakdown_high", "level_low", "level_high"]].isna().all(axis=None)
@@ -70,39 +72,39 @@ def test_losses_that_differ_are_in_the_names_of_rows():
     assert shared_loss([record("a"), record("a")]) == "a"
     assert shared_loss([record("a"), record("b")]) == shared_loss([record("a"), record(None)]) == ""
     assert shared_loss([record(None)]) == ""
-    assert [row_of(named).name for named in named_rows([record("a"), record("b")])] == ["dist, a", "dist, b"]
-    assert [row_of(named).name for named in named_rows([record("a"), record("a")])] == ["dist", "dist"]
+    assert [row_of(one).name for one in named_rows([record("a"), record("b")])] == ["dist, a", "dist, b"]
+    assert [row_of(one).name for one in named_rows([record("a"), record("a")])] == ["dist", "dist"]
 
 
-def test_the_ends_of_a_sweep_have_their_counts(tmp_path):
-    write_breakdown(tmp_path, "wires", "DIST", -0.1)
-    write_breakdown(tmp_path, "wires", "DVR", 1.1)
-    write_breakdown(tmp_path, "wires", "IDR", 0.5, mild_successes=1, severe_successes=4)
+def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):
+    broke(tmp_path, "wires", "DIST", -0.1)
+    broke(tmp_path, "wires", "DVR", 1.1)
+    broke(tmp_path, "wires", "IDR", 0.5, mild_successes=1, severe_successes=4)
     row = page_of(tmp_path, "stability").table.iloc[0]
     assert row["DIST"] == "at once (5 of 5 failed, 48-100 %)"
     assert row["DVR"] == "none (0 of 5 failed, 0-52 %)"  # 0 of 5 still allows 52 %: 1 - 0.025^(1/5)
     assert row["IDR"].startswith("success rises with severity (mild: 4 of 5 failed")
 
 
-def test_a_failed_run_keeps_its_cell(tmp_path):
-    write_breakdown(tmp_path, "wires", "DIST", 0.5)
-    write_breakdown(tmp_path, "wires", "DVR", 0.5, status="crashed")
-    write_breakdown(tmp_path, "alpha", "DIST", 0.5)
-    write_breakdown(tmp_path, "alpha", "DVR", 0.5, status="unsupported")
+def test_what_did_not_end_ok_keeps_its_cell(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.5)
+    broke(tmp_path, "wires", "DVR", 0.5, status="crashed")
+    broke(tmp_path, "alpha", "DIST", 0.5)
+    broke(tmp_path, "alpha", "DVR", 0.5, status="unsupported")
     result = page_of(tmp_path, "stability")
     assert list(result.table["DVR"]) == ["crashed", "–"]
-    assert "2 of 4 runs did not end ok: DVR, wires: crashed (why); DVR, alpha: unsupported (why)." in page_text(result)
+    assert "2 of 4 runs did not end ok: DVR, wires: crashed (why); DVR, alpha: unsupported (why)." in told(result)
     assert [cell["shade"] for line in result.atlas["cells"] for cell in line] == [0.5, None, 0.5, None]
 
 
-def test_costs_are_over_the_axes_that_all_renderers_have(tmp_path):
+def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
     for label, level in (("DIST", 0.25), ("DVR", 0.75)):
-        write_breakdown(tmp_path, "wires", label, level, evaluations_per_ray=2.0 if label == "DIST" else 90.0)
-        write_breakdown(tmp_path, "thin_plate", label, -0.1 if label == "DIST" else 1.1)
-        write_breakdown(tmp_path, "gap", label, 0.5)
-        write_breakdown(tmp_path, "depth_noise", label, 0.5, measure="fit")
-    write_breakdown(tmp_path, "alpha", "DIST", 0.9)
-    write_breakdown(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
+        broke(tmp_path, "wires", label, level, evaluations_per_ray=2.0 if label == "DIST" else 90.0)
+        broke(tmp_path, "thin_plate", label, -0.1 if label == "DIST" else 1.1)
+        broke(tmp_path, "gap", label, 0.5)
+        broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
+    broke(tmp_path, "alpha", "DIST", 0.9)
+    broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
     page = page_of(tmp_path, "stability_cost")
     assert page.chart["panels"][0]["y"]["reversed"] and page.figure.axes[0].yaxis_inverted()
     rows = page.data.set_index("row")
@@ -117,9 +119,9 @@ def test_the_ranking_has_one_row_a_renderer(tmp_path):
     for axis in ("wires", "gap", "thin_plate", "bumps", "nested_shells", "csg_difference"):
         for label, preset in rows.items():
             target = "renderers.VolSDF" if preset == "volsdf_budget" else "renderers.DIST"
-            write_breakdown(tmp_path, axis, label, 0.5, renderer=preset, target=target)
+            broke(tmp_path, axis, label, 0.5, renderer=preset, target=target)
         for label, level in (("Mine", 0.5), ("Mine, slow", 0.9)):
-            write_breakdown(tmp_path, axis, label, level, renderer="custom", target="mypkg.Mine")
+            broke(tmp_path, axis, label, level, renderer="custom", target="mypkg.Mine")
     page = page_of(tmp_path, "stability_cost")
     assert set(page.data["row"]) == {"DIST, our default", "VolSDF, 136 samples", "Mine", "Mine, slow"}
     assert "4 renderers" in page.caption and "(Mine, slow, 4.00 field evaluations per ray)" in page.verdict
@@ -130,26 +132,26 @@ def test_the_ranking_has_one_row_a_renderer(tmp_path):
 @pytest.mark.parametrize("status", ["timeout", "missing"])
 def test_a_run_that_failed_or_is_missing_has_the_worst_rank(tmp_path, status):
     for label in ("DIST", "DVR"):
-        write_breakdown(tmp_path, "wires", label, 0.5)
+        broke(tmp_path, "wires", label, 0.5)
     if status != "missing":
-        write_breakdown(tmp_path, "thin_plate", "DIST", 0.1, status=status)
-    write_breakdown(tmp_path, "thin_plate", "DVR", 0.1)
+        broke(tmp_path, "thin_plate", "DIST", 0.1, status=status)
+    broke(tmp_path, "thin_plate", "DVR", 0.1)
     rows = page_of(tmp_path, "stability_cost").data.set_index("row")
     assert rows["rank"].to_dict() == {"DIST": 1.75, "DVR": 1.25}
     assert page_of(tmp_path, "stability").table["DIST"].tolist()[1] == ("" if status == "missing" else status)
 
 
 def test_rows_of_other_criteria_are_not_compared(tmp_path):
-    write_breakdown(tmp_path, "wires", "DIST", 0.5, criteria={"hits": 0.5})
-    write_breakdown(tmp_path, "wires", "DVR", 0.5, criteria={"hits": 0.99})
+    broke(tmp_path, "wires", "DIST", 0.5, criteria={"hits": 0.5})
+    broke(tmp_path, "wires", "DVR", 0.5, criteria={"hits": 0.99})
     result = page_of(tmp_path, "stability")
     assert list(result.table.columns) == ["Axis", "Unit", "DVR"]
-    assert "Success: 0.99 of the true hits" in page_text(result) and "Not shown: 1 run" in page_text(result)
+    assert "Success: 0.99 of the true hits" in told(result) and "Not shown: 1 run" in told(result)
 
 
 def test_curves_have_a_line_a_level_with_its_interval_and_a_panel_an_axis(tmp_path):
-    write_breakdown(tmp_path, "wires", "DIST", 0.45)
-    write_breakdown(tmp_path, "gap", "DIST", 0.45)
+    broke(tmp_path, "wires", "DIST", 0.45)
+    broke(tmp_path, "gap", "DIST", 0.45)
     page = page_of(tmp_path, "stability_curves")
     data = page.data[page.data["axis"] == "wires"]
     assert len(data) == 11 and data["successes"].sum() == 5 and data["level"].iloc[-1] == 1.0
@@ -159,7 +161,7 @@ def test_curves_have_a_line_a_level_with_its_interval_and_a_panel_an_axis(tmp_pa
 
 
 def test_a_curve_that_cannot_be_read_leaves_the_page_without_it(tmp_path):
-    folder = write_breakdown(tmp_path, "wires", "DIST", 0.5)
+    folder = broke(tmp_path, "wires", "DIST", 0.5)
     (folder / "curve.jsonl").write_text("not a line\n")
     page = page_of(tmp_path, "stability_curves")
     assert page.data.empty and page.chart["panels"] == []

@@ -1,8 +1,7 @@
-"""Any sweep has a table: a row for each varied setting, with failed cells counted and missing ones named."""
+"""Any sweep has a table: a row for what varies, with failed cells counted and missing ones named."""
 
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,39 +16,27 @@ from bench.report.write.paper import find_sweeps
 from tests.report.test_report import record, write_run
 
 
-def cell(renderer: str, *, seed: int = 0, index: int = 0, dataset: str = "sofa", **swept_keys: str) -> PlannedCell:
-    """A planned cell; `swept_keys` are keys of its renderer in the sweep."""
-    renderer_node = {"_label_": renderer.upper(), **swept_keys}
+def cell(renderer: str, *, seed: int = 0, index: int = 0, dataset: str = "sofa", **asked: str) -> PlannedCell:
+    """A planned cell; `asked` are keys of its renderer that the sweep asked for."""
+    renderer_node = {"_label_": renderer.upper(), **asked}
     config = {"renderer": renderer_node, "seed": seed, "index": index, "experiment": None, "label": None}
     overrides = [f"renderer={renderer}", f"dataset={dataset}", f"seed={seed}", f"index={index}"]
-    overrides += [f"+renderer.{key}={value}" for key, value in swept_keys.items()]
+    overrides += [f"+renderer.{key}={value}" for key, value in asked.items()]
     name = "-".join(override.replace("=", "") for override in overrides)
     return PlannedCell(name, overrides, "completion", renderer, dataset, seed, config)
 
 
 def ran(results: Path, planned: PlannedCell, chamfer: float | None, **changed) -> None:
-    """Writes the run of a cell; without an error it crashed."""
+    """The run of a cell; without an error it crashed."""
     metrics = {} if chamfer is None else {"steps_taken": 9, "fscore": 1 - chamfer, "chamfer_l2": chamfer}
     ended = {"status": "ok"} if chamfer is not None else {"status": "crashed", "reason": "as planned"}
-    identity = {
-        "config": planned.config,
-        "renderer": planned.renderer,
-        "dataset": planned.dataset,
-        "seed": planned.seed,
-    }
-    content = record(planned.id, **identity, metrics=metrics, **ended, **changed)
+    given = {"config": planned.config, "renderer": planned.renderer, "dataset": planned.dataset, "seed": planned.seed}
+    content = record(planned.id, **given, metrics=metrics, **ended, **changed)
     write_run(results, content, planned.id)
 
 
 def swept(results: Path, cells: list[PlannedCell], name: str = "completion-1") -> None:
     Plan(name, results, cells).write()
-
-
-def swept_and_ran(results: Path, cells: list[PlannedCell], chamfers: Iterable[float | None]) -> None:
-    """Writes a sweep and the runs of its first cells, one for each error."""
-    swept(results, cells)
-    for planned, chamfer in zip(cells, chamfers, strict=False):
-        ran(results, planned, chamfer)
 
 
 def table(results: Path, name: str = "completion-1") -> pd.DataFrame:
@@ -58,29 +45,38 @@ def table(results: Path, name: str = "completion-1") -> pd.DataFrame:
     return pd.read_csv(results / "sweeps" / name / "table.csv").set_index("row")
 
 
-def test_rows_are_the_varied_settings_except_shapes_and_seeds(tmp_path):
+def test_rows_are_what_varies_beside_shapes_and_seeds(tmp_path):
     cells = [cell(r, dataset=d, seed=s) for r in ("dist", "dvr") for d in ("sofa", "plane") for s in (0, 1)]
-    swept_and_ran(tmp_path, cells, [0.001 * (number + 1) for number in range(len(cells))])
-    rows = table(tmp_path)
-    assert list(rows.index) == ["DIST", "DVR"]
-    assert list(rows["chamfer_l2"]) == pytest.approx([0.0025, 0.0065])
-    assert list(rows["runs"]) == [4, 4] and list(rows["failed"]) == [0, 0]
-    assert rows.loc["DVR", "ratio"] == pytest.approx(0.0065 / 0.0025) and math.isnan(rows.loc["DIST", "ratio"])
-    assert list(rows["loop_seconds"]) == [30, 30] and list(rows["value_evaluations"]) == [1.43e6] * 2
-    assert rows["chamfer_l2_low"].isna().all()  # two shapes give no interval
+    swept(tmp_path, cells)
+    for number, one in enumerate(cells):
+        ran(tmp_path, one, 0.001 * (number + 1))
+    found = table(tmp_path)
+    assert list(found.index) == ["DIST", "DVR"]
+    assert list(found["chamfer_l2"]) == pytest.approx([0.0025, 0.0065])
+    assert list(found["runs"]) == [4, 4] and list(found["failed"]) == [0, 0]
+    assert found.loc["DVR", "ratio"] == pytest.approx(0.0065 / 0.0025) and math.isnan(found.loc["DIST", "ratio"])
+    assert list(found["loop_seconds"]) == [30, 30] and list(found["value_evaluations"]) == [1.43e6] * 2
+    assert found["chamfer_l2_low"].isna().all()  # two shapes give no interval
 
 
 def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once(tmp_path):
-    errors = {("dist", "sofa"): 1.0, ("dist", "plane"): 4.0, ("dvr", "sofa"): 3.0, ("dvr", "plane"): 2.0}
-    errors["dvr", "car"] = 9.0
+    errors = {
+        ("dist", "sofa"): 1.0,
+        ("dist", "plane"): 4.0,
+        ("dvr", "sofa"): 3.0,
+        ("dvr", "plane"): 2.0,
+        ("dvr", "car"): 9.0,
+    }
     cells = [cell(renderer, dataset=dataset) for renderer, dataset in errors]
-    swept_and_ran(tmp_path, cells, [error / 1000 for error in errors.values()])
+    swept(tmp_path, cells)
+    for one, error in zip(cells, errors.values(), strict=True):
+        ran(tmp_path, one, error / 1000)
     table(tmp_path)
-    (page,) = find_sweeps(tmp_path)
-    shown = page.shown
+    (found,) = find_sweeps(tmp_path)
+    shown = found.shown
     assert shown.columns[1:4] == ["sofa: Chamfer (x1000) ↓", "plane: Chamfer (x1000) ↓", "Chamfer (x1000) ↓"]
     assert [row[:4] for row in shown.rows] == [["DIST", "1.00", "4.00", "2.50"], ["DVR", "3.00", "2.00", "3.00"]]
-    assert [position for position in shown.best if position[1] < 4] == [[0, 1], [1, 2], [0, 3]]
+    assert [at for at in shown.best if at[1] < 4] == [[0, 1], [1, 2], [0, 3]]
     assert shown.question == "Which has the lowest Chamfer?"
     assert shown.verdict == (
         "Median Chamfer (x1000): *2.50* (DIST) to 3.00 (DVR); n = 3 shapes. Best by data set: sofa DIST, plane DVR."
@@ -88,14 +84,16 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     assert "n = 5 runs (3 shapes, 1 seed); fewer than six shapes: no interval." in shown.caption
     panels = shown.chart["panels"]
     assert [panel["title"] for panel in panels] == ["sofa", "plane"] and panels[0]["rows"] == ["DIST", "DVR"]
-    assert [(planned["x"], planned["y"]) for planned in panels[1]["series"]] == [([4.0], [0.0]), ([2.0], [1.0])]
-    text, tex = ((page.base.with_suffix(suffix)).read_text() for suffix in (".md", ".tex"))
+    assert [(one["x"], one["y"]) for one in panels[1]["series"]] == [([4.0], [0.0]), ([2.0], [1.0])]
+    text, tex = ((found.base.with_suffix(suffix)).read_text() for suffix in (".md", ".tex"))
     assert "| DIST | **1.00** | 4.00 |" in text and r"& \textbf{\boldmath 1.00} & 4.00 &" in tex and "(n = " not in text
 
 
-def test_a_data_set_on_which_a_row_only_failed_also_has_a_column(tmp_path):
+def test_a_data_set_on_which_a_row_only_failed_has_a_column_all_the_same(tmp_path):
     cells = [cell(renderer, dataset=dataset) for renderer in ("dist", "dvr") for dataset in ("sofa", "plane")]
-    swept_and_ran(tmp_path, cells, (0.001, 0.002, 0.003, None))
+    swept(tmp_path, cells)
+    for one, chamfer in zip(cells, (0.001, 0.002, 0.003, None), strict=True):
+        ran(tmp_path, one, chamfer)
     assert table(tmp_path)["chamfer_l2, plane"].isna().tolist() == [False, True]
     verdict = find_sweeps(tmp_path)[0].shown.verdict
     assert verdict.startswith("Median Chamfer (x1000): *1.50* (DIST) to ∞ (DVR)") and "Best by" not in verdict
@@ -106,44 +104,46 @@ def test_a_sweep_that_has_ended_has_its_table_at_once(tmp_path):
     swept(tmp_path, [cell("dist", seed=9)], "completion-0")
     plan = Plan("completion-1", tmp_path, cells)
     plan.write()
-    for planned in cells[:3]:  # the last was not run
-        ran(tmp_path, planned, 0.001)
+    for one in cells[:3]:  # the last was not run
+        ran(tmp_path, one, 0.001)
     assert write_sweep(plan) == tmp_path / "sweeps" / "completion-1" / "table.md"
     at_once = (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()
     assert list(table(tmp_path)["failed"]) == [0, 0] and list(table(tmp_path)["runs"]) == [2, 1]
     assert at_once == (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()  # as the report makes it
-    experiment = [replace(planned, config=planned.config | {"experiment": "table2"}) for planned in cells]
+    experiment = [replace(one, config=one.config | {"experiment": "table2"}) for one in cells]
     assert write_sweep(Plan("table2-1", tmp_path, experiment)) is None  # a page shows it
 
 
 def test_six_shapes_have_an_interval(tmp_path):
     cells = [cell(r, index=i) for r in ("dist", "dvr", "idr") for i in range(6)]
     swept(tmp_path, cells)
-    for number, planned in enumerate(cells):
-        failed = planned.renderer == "idr" and number % 3 == 0
-        ran(tmp_path, planned, None if failed else 0.001 * (1 + number % 6) * (2 if planned.renderer == "dvr" else 1))
-    rows = table(tmp_path)
-    assert rows.loc["IDR", "failed"] == 2
-    assert 0 < rows.loc["IDR", "failed_low"] < 0.1 and 0.7 < rows.loc["IDR", "failed_high"] < 0.9
-    rows = rows.loc[["DIST", "DVR"]]
-    assert (rows["chamfer_l2_low"] < rows["chamfer_l2"]).all() and (rows["fscore_high"] > rows["fscore"]).all()
-    assert rows.loc["DVR", ["ratio", "ratio_low", "ratio_high"]].tolist() == pytest.approx([2, 2, 2])  # paired
+    for number, one in enumerate(cells):
+        failed = one.renderer == "idr" and number % 3 == 0
+        ran(tmp_path, one, None if failed else 0.001 * (1 + number % 6) * (2 if one.renderer == "dvr" else 1))
+    found = table(tmp_path)
+    assert found.loc["IDR", "failed"] == 2
+    assert 0 < found.loc["IDR", "failed_low"] < 0.1 and 0.7 < found.loc["IDR", "failed_high"] < 0.9
+    found = found.loc[["DIST", "DVR"]]
+    assert (found["chamfer_l2_low"] < found["chamfer_l2"]).all() and (found["fscore_high"] > found["fscore"]).all()
+    assert found.loc["DVR", ["ratio", "ratio_low", "ratio_high"]].tolist() == pytest.approx([2, 2, 2])  # paired
     text = (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
     assert "95 % bootstrap intervals over shapes" in text
 
 
 def test_cells_that_failed_count_in_their_rows_and_those_that_were_not_run_do_not(tmp_path):
     cells = [cell(r, seed=s) for r in ("dist", "dvr") for s in (0, 1, 2)]
-    swept_and_ran(tmp_path, cells, (0.001, 0.002, 0.003, 0.002, None))
-    rows = table(tmp_path)
-    assert list(rows["failed"]) == [0, 1] and list(rows["runs"]) == [3, 2]
+    swept(tmp_path, cells)
+    for one, chamfer in zip(cells[:5], (0.001, 0.002, 0.003, 0.002, None), strict=True):
+        ran(tmp_path, one, chamfer)
+    found = table(tmp_path)
+    assert list(found["failed"]) == [0, 1] and list(found["runs"]) == [3, 2]
     assert "Left out: 1 that were not run" in (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
-    assert math.isinf(rows.loc["DVR", "chamfer_l2"]) and rows.loc["DVR", "fscore"] == pytest.approx(0.499)
-    assert rows.loc["DVR", "steps_taken"] == 9  # neither direction is better
-    assert rows.loc["DVR", "reasons"] == "crashed: as planned" and math.isnan(rows.loc["DVR", "ratio"])
+    assert math.isinf(found.loc["DVR", "chamfer_l2"]) and found.loc["DVR", "fscore"] == pytest.approx(0.499)
+    assert found.loc["DVR", "steps_taken"] == 9  # neither direction is better
+    assert found.loc["DVR", "reasons"] == "crashed: as planned" and math.isnan(found.loc["DVR", "ratio"])
 
 
-def test_settings_and_classes_are_distinguished(tmp_path):
+def test_settings_and_classes_are_told_apart(tmp_path):
     swept(tmp_path, [cell("dist", epsilon=e) for e in ("1e-4", "1e-3")], "epsilons")
     classes = [f"bad.{letter}" for letter in "ABCDEFGHIJKL"]
     swept(tmp_path, [cell("custom", _target_=path) for path in classes], "classes")
@@ -154,9 +154,11 @@ def test_settings_and_classes_are_distinguished(tmp_path):
 
 def test_a_stress_is_a_row_and_no_shape(tmp_path):
     cells = [cell("dist", dataset=stress) for stress in ("wires", "gap")]
-    for planned in cells:
-        planned.config["stress"] = {"scene": planned.dataset}
-    swept_and_ran(tmp_path, cells, (0.001, 0.001))
+    for one in cells:
+        one.config["stress"] = {"scene": one.dataset}
+    swept(tmp_path, cells)
+    for one in cells:
+        ran(tmp_path, one, 0.001)
     assert list(table(tmp_path).index) == ["wires", "gap"]
     assert "n = 2 runs;" in (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
 
@@ -164,27 +166,30 @@ def test_a_stress_is_a_row_and_no_shape(tmp_path):
 def test_a_sweep_of_an_experiment_with_a_page_needs_no_table(tmp_path):
     for experiment in ("table2", "of_mine"):
         cells = [cell("dist", seed=s) for s in (0, 1)]
-        for planned in cells:
-            planned.config["experiment"] = experiment
+        for one in cells:
+            one.config["experiment"] = experiment
         swept(tmp_path, cells, experiment)
     write_sweeps(read_records(tmp_path)[0], tmp_path, [])
-    assert [page.name for page in find_sweeps(tmp_path)] == ["of_mine"]
+    assert [found.name for found in find_sweeps(tmp_path)] == ["of_mine"]
 
 
 def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     cells = [cell(r) for r in ("dist", "dvr")]
-    swept_and_ran(tmp_path, cells, (0.001, 0.001))
+    swept(tmp_path, cells)
+    for one in cells:
+        ran(tmp_path, one, 0.001)
     report([f"results_dir={tmp_path}"])
     folder = tmp_path / "sweeps" / "completion-1"
-    assert str(folder / "table.csv") in capsys.readouterr().out and not (tmp_path / "paper").exists()
-    (page,) = find_sweeps(tmp_path)
-    assert (page.name, page.shown.title) == ("completion-1", "Sweep completion-1.")
-    assert page.shown.columns[:2] == ["Run", "Chamfer (x1000) ↓"] and page.shown.rows[0][:2] == ["DIST", "1.00"]
-    assert page.files == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
+    assert str(folder / "table.csv") in capsys.readouterr().out
+    assert not (tmp_path / "paper").exists()
+    (found,) = find_sweeps(tmp_path)
+    assert (found.name, found.shown.title) == ("completion-1", "Sweep completion-1.")
+    assert found.shown.columns[:2] == ["Run", "Chamfer (x1000) ↓"] and found.shown.rows[0][:2] == ["DIST", "1.00"]
+    assert found.files == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
     within = re.search(r"WITHIN = /(.*)/;", (ASSETS / "base" / "dom.js").read_text())
-    assert within and all(re.fullmatch(within[1], link) for link in page.files.values())  # the page links to them
+    assert within and all(re.fullmatch(within[1], link) for link in found.files.values())  # the page links to them
     assert r"\label{tab:completion-1}" in (folder / "table.tex").read_text()
-    assert "swept over renderer (dist, dvr)." in page.shown.caption and "All 2 runs ended ok." in page.shown.caption
+    assert "swept over renderer (dist, dvr)." in found.shown.caption and "All 2 runs ended ok." in found.shown.caption
 
 
 def test_a_cell_whose_record_is_damaged_is_missing(tmp_path):
@@ -192,11 +197,8 @@ def test_a_cell_whose_record_is_damaged_is_missing(tmp_path):
     swept(tmp_path, cells)
     ran(tmp_path, cells[0], 0.001)
     write_run(tmp_path, "{", cells[1].id)
-    (plan,), records = (
-        read_plans(tmp_path)[0],
-        {record_read["folder"]: record_read for record_read in read_records(tmp_path)[0]},
-    )
-    sweep = of_plan(plan, records)
+    (plan,), known = read_plans(tmp_path)[0], {one["folder"]: one for one in read_records(tmp_path)[0]}
+    sweep = of_plan(plan, known)
     assert sweep.missing == 1 and [(row["row"], row["runs"], row["failed"]) for row in lines(sweep)] == [("DIST", 1, 0)]
 
 
@@ -204,32 +206,32 @@ def test_a_sweep_with_an_odd_record_costs_no_other_table(tmp_path, capsys):
     for seed, name in enumerate(("odd", "sound")):
         swept(tmp_path, [cell("dist", seed=seed)], name)
         ran(tmp_path, cell("dist", seed=seed), 0.001, **({"environment": {"cpu": [1]}} if name == "odd" else {}))
-    assert report([f"results_dir={tmp_path}"]) == 1 and [page.name for page in find_sweeps(tmp_path)] == ["sound"]
-    printed = capsys.readouterr()
-    assert "not made: sweeps/odd (TypeError: " in printed.err and printed.out.endswith("index.html\n")
+    assert report([f"results_dir={tmp_path}"]) == 1 and [found.name for found in find_sweeps(tmp_path)] == ["sound"]
+    told = capsys.readouterr()
+    assert "not made: sweeps/odd (TypeError: " in told.err and told.out.endswith("index.html\n")
 
 
 def test_a_row_has_medians_not_means_of_its_ended_runs(tmp_path):
     cells = [cell("dist", seed=s) for s in range(5)]
     swept(tmp_path, cells)
-    for planned, chamfer, seconds in zip(cells, (0.001, 0.002, 0.003, 0.020, None), (1, 2, 3, 20, 500), strict=True):
+    for one, chamfer, seconds in zip(cells, (0.001, 0.002, 0.003, 0.020, None), (1, 2, 3, 20, 500), strict=True):
         spent = {"forward": seconds, "backward": 0.0, "total": 10 * seconds}
-        ran(tmp_path, planned, chamfer, seconds=spent, evaluations={"value": 1000 * seconds})
-    row = table(tmp_path).loc["DIST"]
-    assert row["chamfer_l2"] == pytest.approx(0.003)  # of five, one of them infinite
-    assert (row["loop_seconds"], row["value_evaluations"]) == (2.5, 2500)  # of the four that ended ok
+        ran(tmp_path, one, chamfer, seconds=spent, evaluations={"value": 1000 * seconds})
+    found = table(tmp_path).loc["DIST"]
+    assert found["chamfer_l2"] == pytest.approx(0.003)  # of five, one of them infinite
+    assert (found["loop_seconds"], found["value_evaluations"]) == (2.5, 2500)  # of the four that ended ok
 
 
 def test_two_sweeps_have_their_own_runs_in_the_order_of_their_plans(tmp_path):
     shared = cell("newton")
     for name, renderer, chamfer in (("first", "dvr", 0.002), ("second", "dist", 0.004)):
-        planned = cell(renderer)
-        swept(tmp_path, [shared, planned], name)
-        ran(tmp_path, planned, chamfer)
+        one = cell(renderer)
+        swept(tmp_path, [shared, one], name)
+        ran(tmp_path, one, chamfer)
     ran(tmp_path, shared, 0.001)
     assert list(table(tmp_path, "first")["chamfer_l2"].items()) == [("NEWTON", 0.001), ("DVR", 0.002)]
-    rows = table(tmp_path, "second")
-    assert list(rows["chamfer_l2"].items()) == [("NEWTON", 0.001), ("DIST", 0.004)]
-    named = [name for name in rows if name in ("chamfer_l2", "fscore", "steps_taken")]
+    found = table(tmp_path, "second")
+    assert list(found["chamfer_l2"].items()) == [("NEWTON", 0.001), ("DIST", 0.004)]
+    named = [name for name in found if name in ("chamfer_l2", "fscore", "steps_taken")]
     assert named == ["chamfer_l2", "fscore", "steps_taken"]  # the first one has the ratio
-    assert rows.loc["DIST", "ratio"] == 4
+    assert found.loc["DIST", "ratio"] == 4

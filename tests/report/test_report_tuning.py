@@ -1,4 +1,4 @@
-"""The tuning, from run folders with given errors: the best draw, and its file."""
+"""The tuning, from run folders whose errors are known: the best of some draws, and its file."""
 
 import math
 
@@ -14,31 +14,38 @@ from bench.tune import HEADER, LINE_WIDTH, main, write
 from tests.report.test_report_paper import write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
-SHAPE_ERRORS = (1.0, 2.0, 0.5, 4.0, 1.0, 0.25, 8.0)  # the geometric mean over the first six is 1
+OWN = (1.0, 2.0, 0.5, 4.0, 1.0, 0.25, 8.0)  # of shapes: their geometric mean over the first six is 1
 ERRORS = {"validation": VALIDATION, "test": TEST}
 RATES = (0.04, 0.01, 0.03, 0.02)
 
 
-def write_draws(
+def drawn(
     results, *, shapes=6, method="dist_mask", failed=(), left_out=(), killed=(), scale=1.0, family="sofa", **more
 ):
-    """Writes four draws of a method; an error is the draw's error times the shape's error."""
+    """Four draws of a method; the error of a shape is that of its draw times the shape's own."""
     name = more.pop("experiment", "tuning")
     for split, errors in more.pop("errors", ERRORS).items():
         for draw, value in enumerate(errors):
             for index in (i for i in range(shapes) if (split, draw, i) not in left_out):
                 status = {**dict.fromkeys(failed, "empty"), **dict.fromkeys(killed, "killed")}.get((split, draw, index))
-                settings = {"split": split, "draw": draw, "scale": {"name": "desk"}}
-                settings["dataset"] = {"name": family, "ranges": {f"width of a {family}": 1.0}}
-                settings["task"] = {"points": "20", "_target_": "completion"}
-                settings["task"]["optimiser"] = {"learning_rate": RATES[draw]}
-                settings["renderer"] = {"epsilon": 5e-5, "steps": 10 + draw}
                 write_run(
-                    results, name, "DIST with mask", task="completion", dataset=family, renderer="dist", index=index,
-                    method=f"space/{method}", status=status or "ok", evaluations={"value": 100 * (draw + 1)},
-                    metrics={} if status else {"chamfer_l2": scale * value * SHAPE_ERRORS[index] / 1000},
-                    settings=settings | more,
-                )  # fmt: skip
+                    results,
+                    name,
+                    "DIST with mask",
+                    **{"task": "completion", "dataset": family, "renderer": "dist", "method": f"space/{method}"},
+                    status=status or "ok",
+                    metrics={} if status else {"chamfer_l2": scale * value * OWN[index] / 1000},
+                    evaluations={"value": 100 * (draw + 1)},
+                    index=index,
+                    settings={
+                        **{"split": split, "draw": draw},
+                        "dataset": {"name": family, "ranges": {f"width of a {family}": 1.0}},
+                        "task": {"points": "20", "_target_": "completion", "optimiser": {"learning_rate": RATES[draw]}},
+                        "renderer": {"epsilon": 5e-5, "steps": 10 + draw},
+                        "scale": {"name": "desk"},
+                        **more,
+                    },
+                )
 
 
 def read(results):
@@ -46,37 +53,37 @@ def read(results):
 
 
 @pytest.fixture(scope="module")
-def complete_runs(tmp_path_factory):
+def whole(tmp_path_factory):
     """The runs of one method without a failure, written once."""
-    results = tmp_path_factory.mktemp("complete")
-    write_draws(results)
+    results = tmp_path_factory.mktemp("whole")
+    drawn(results)
     return read(results)
 
 
-def test_the_best_is_chosen_on_validation_shapes(complete_runs):
-    (method,) = tunings(complete_runs)
+def test_the_best_is_chosen_on_validation_shapes(whole):
+    (method,) = tunings(whole)
     assert (method.method, method.label, method.draws) == ("dist_mask", "DIST with mask", [0, 1, 2, 3])
     assert method.best == 1  # the last draw is better on the test shapes
     assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
-    assert method.validation == pytest.approx(np.log(np.outer(VALIDATION, SHAPE_ERRORS[:6])))
+    assert method.validation == pytest.approx(np.log(np.outer(VALIDATION, OWN[:6])))
 
 
 def test_what_families_differ_in_is_no_setting(tmp_path):
     for family in ("sofa", "plane"):
-        write_draws(tmp_path, family=family, shapes=1)
+        drawn(tmp_path, family=family, shapes=1)
     (method,) = tunings(read(tmp_path))
     assert method.settings[1] == {"task.optimiser.learning_rate": 0.01, "renderer.steps": 11}
 
 
 def test_a_failure_counts_as_the_worst_error_of_its_shape_and_its_draw_ranks_behind(tmp_path):
-    write_draws(tmp_path, failed={("validation", 1, 2)})
+    drawn(tmp_path, failed={("validation", 1, 2)})
     (method,) = tunings(read(tmp_path))
     assert method.validation[1, 2] == pytest.approx(math.log(4 * 0.5))
     assert method.failures.tolist() == [0, 1, 0, 0] and method.order.tolist() == [3, 2, 0, 1]
 
 
 def test_runs_that_have_not_ended_are_missing_and_not_failed(tmp_path, capsys):
-    write_draws(tmp_path, killed={("validation", 1, 5)})
+    drawn(tmp_path, killed={("validation", 1, 5)})
     (method,) = tunings(read(tmp_path))
     assert method.draws == [0, 2, 3] and method.draws[method.best] == 3
     assert main(["--results", str(tmp_path), "--into", str(tmp_path / "tuned.yaml")]) == 1
@@ -84,9 +91,9 @@ def test_runs_that_have_not_ended_are_missing_and_not_failed(tmp_path, capsys):
     assert not (tmp_path / "tuned.yaml").exists()
 
 
-def test_methods_are_compared_on_the_draws_and_shapes_that_all_have(tmp_path):
-    write_draws(tmp_path, left_out={("test", 2, 0)})
-    write_draws(tmp_path, method="idr_mask", shapes=7, scale=10)
+def test_methods_are_read_on_the_draws_and_shapes_that_all_of_them_have(tmp_path):
+    drawn(tmp_path, left_out={("test", 2, 0)})
+    drawn(tmp_path, method="idr_mask", shapes=7, scale=10)
     first, second = tunings(read(tmp_path))
     assert first.draws == second.draws == [0, 1, 3]
     assert left_out(read(tmp_path), [first, second]) == ["Left out, since a method or a shape lacks them: draws 2."]
@@ -95,7 +102,7 @@ def test_methods_are_compared_on_the_draws_and_shapes_that_all_have(tmp_path):
 
 
 def test_the_best_is_written_as_a_row_over_its_default(tmp_path, capsys):
-    write_draws(tmp_path)
+    drawn(tmp_path)
     path = tmp_path / "own/tuned.yaml"
     path.parent.mkdir()
     path.write_text("mine_mask: {label: Mine}\ndist_mask: {label: of before}\n")
@@ -112,10 +119,10 @@ def test_the_best_is_written_as_a_row_over_its_default(tmp_path, capsys):
     assert node["renderer"]["steps"] == 11 and set(node) == {"label", "task", "renderer"}
 
 
-def test_renderers_of_photographs_are_chosen_by_the_visible_surface(tmp_path, capsys):
+def test_renderers_of_photographs_are_chosen_by_what_is_seen(tmp_path, capsys):
     hinge = {"_target_": "renderers.silhouette.Hinge", "_label_": "DIST's mask loss"}
     under = {"experiment": "tuning_photographs", "silhouette": hinge}
-    write_draws(tmp_path, method="rgb_dist", errors={"validation": VALIDATION}, **under)
+    drawn(tmp_path, method="rgb_dist", errors={"validation": VALIDATION}, **under)
     assert main(["--results", str(tmp_path)]) == 1
     assert "has no runs of the tuning" in capsys.readouterr().err
     for path in tmp_path.glob("runs/*/record.json"):  # the experiment draws, and not the method's space
@@ -134,16 +141,16 @@ def test_the_shipped_settings_are_as_the_command_writes_them():
     assert text == HEADER + yaml.safe_dump(yaml.safe_load(text), sort_keys=False, width=LINE_WIDTH)
 
 
-@pytest.mark.parametrize("name", ["tuned", "conf/method"])
-def test_a_folder_is_no_table(tmp_path, capsys, name):
-    write_draws(tmp_path)
-    assert main(["--results", str(tmp_path), "--into", str(tmp_path / name)]) == 1
-    assert f"{name} is no table of settings: type --into conf/tuned.yaml" in capsys.readouterr().err
+@pytest.mark.parametrize("place", ["tuned", "conf/method"])
+def test_a_folder_is_no_table(tmp_path, capsys, place):
+    drawn(tmp_path)
+    assert main(["--results", str(tmp_path), "--into", str(tmp_path / place)]) == 1
+    assert f"{place} is no table of settings: type --into conf/tuned.yaml" in capsys.readouterr().err
 
 
 def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_named(tmp_path, capsys):
-    write_draws(tmp_path, left_out={("test", draw, 0) for draw in (0, 2)})
-    write_draws(tmp_path, method="idr_mask")
+    drawn(tmp_path, left_out={("test", draw, 0) for draw in (0, 2)})
+    drawn(tmp_path, method="idr_mask")
     for path in tmp_path.glob("runs/*/record.json"):
         text = path.read_text().replace('"steps": 13', '"steps": 11')
         path.write_text(text)
@@ -154,8 +161,8 @@ def test_a_setting_that_the_used_draws_share_is_written_too_and_the_others_are_n
 
 
 def test_one_draw_is_no_choice(tmp_path, capsys):
-    write_draws(tmp_path, left_out={("test", draw, 0) for draw in (0, 2, 3)})
-    write_draws(tmp_path, method="idr_mask")
+    drawn(tmp_path, left_out={("test", draw, 0) for draw in (0, 2, 3)})
+    drawn(tmp_path, method="idr_mask")
     assert main(["--results", str(tmp_path)]) == 1
     assert "draw 1 alone has a run on every shape" in capsys.readouterr().err
     assert not (tmp_path / "tuned.yaml").exists()

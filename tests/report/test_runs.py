@@ -1,4 +1,4 @@
-"""The runs that a study reads, and the columns of their table."""
+"""Which runs a study reads, and what their table holds."""
 
 import math
 
@@ -23,7 +23,7 @@ def test_the_table_has_all_field_values_and_the_seconds_of_the_loop(tmp_path):
     assert frame["values"].tolist() == [130, 100] and frame["loop"][0] == 5 and math.isnan(frame["loop"][1])
 
 
-def test_an_error_is_infinite_if_a_run_failed_or_lacks_it(tmp_path):
+def test_an_error_is_infinite_where_a_run_failed_or_lacks_it(tmp_path):
     metrics = {"chamfer_l1": 0.5}
     write_run(tmp_path, "mine", "A", metrics=metrics)
     write_run(tmp_path, "mine", "B", metrics=metrics, status="diverged")
@@ -32,7 +32,7 @@ def test_an_error_is_infinite_if_a_run_failed_or_lacks_it(tmp_path):
     assert read(tmp_path).error("chamfer_l1", scale=10).tolist() == [5, math.inf, math.inf, math.inf]
 
 
-def test_times_count_if_fewer_than_half_are_doubtful(tmp_path):
+def test_times_count_where_those_of_fewer_than_half_are_doubtful(tmp_path):
     for name, notes in (("A", ["loaded machine: 30 %"]), ("B", []), ("C", [])):
         write_run(tmp_path, "mine", name, notes=notes)
     runs = read(tmp_path)

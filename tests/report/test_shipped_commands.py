@@ -19,20 +19,20 @@ from tests.composing import cells_of
 from tests.documentation import text_of
 
 COMMAND = re.compile(r"`-m \+experiment=([^`]+)`")
-NAMED = re.compile(r"^\| \[?`(\w+)`")  # experiments whose command is only their name
-# Settings that change no result or name files of the machine, and sizes, whose values are also in other keys.
+NAMED = re.compile(r"^\| \[?`(\w+)`")  # experiments whose command is their name alone
+# What changes no result, or names files of the machine; and sizes, whose values stand in other keys too.
 IGNORED = re.compile(r"(sizes|scale|results_dir|priors_dir|threads|device|time_limit|packages|verbose)\b|dataset\.path")
 Cells = dict[tuple[str, ...], dict[str, str]]  # the settings of runs, by row, shape and seed
 
 
 @cache
 def shipped() -> dict[str, list[dict[str, Any]]]:
-    """The rows of each experiment, without restored rows, which lack most settings."""
-    by_experiment = defaultdict(list)
+    """The rows of each experiment; without restored ones, which have lost most settings."""
+    found = defaultdict(list)
     for record in read_rows(SHIPPED / FOLDER):
         if "restored" not in record:
-            by_experiment[record["config"]["experiment"]].append(record)
-    return by_experiment
+            found[record["config"]["experiment"]].append(record)
+    return found
 
 
 def described(config: dict[str, Any], dataset: str, renderer: str) -> tuple[tuple[str, ...], dict[str, str]]:
@@ -42,19 +42,19 @@ def described(config: dict[str, Any], dataset: str, renderer: str) -> tuple[tupl
 
 
 def planned(experiment: str) -> list[tuple[tuple[str, ...], dict[str, str]]]:
-    """The cells of the experiment's commands, from the tables that link to results."""
+    """The cells of the commands in the tables that link to results, of those whose runs name the experiment."""
     lines = [line for line in text_of("conf/README.md").splitlines() if line.startswith("|")]
     linked = [line for line in lines if "../results" in line or NAMED.match(line)]
     commands = [COMMAND.findall(line) or NAMED.findall(line) for line in linked]
-    result = []
-    for command in dict.fromkeys(command for line in commands for command in line):
+    found = []
+    for command in dict.fromkeys(command for of in commands for command in of):
         name, *words = shlex.split(command)
         file = CONF / "experiment" / f"{name}.yaml"
         if not file.exists() or OmegaConf.load(file).get("experiment") != experiment:
             continue
         cells = cells_of(f"+experiment={name}", *words)
-        result += [described(cell.config, cell.choices["dataset"], cell.choices["renderer"]) for cell in cells]
-    return result
+        found += [described(cell.config, cell.choices["dataset"], cell.choices["renderer"]) for cell in cells]
+    return found
 
 
 @pytest.mark.parametrize("experiment", sorted(shipped()))
@@ -72,7 +72,7 @@ def test_the_command_of_a_page_plans_the_runs_that_it_shows(experiment: str):
 
 
 def nearest(plan: set[tuple[Any, ...]], shown: set[tuple[Any, ...]]) -> str:
-    """Counts, and the differences between a run of one side and the nearest run of the other side."""
+    """Counts, and in what a run of one side differs from the one of the other side that is most like it."""
     first = min(plan or shown, key=str)
     other = min(shown if plan else [], key=lambda run: len({*run} - {*first}), default=())
     counts = f"{len(plan)} runs are planned alone, {len(shown)} shown alone"

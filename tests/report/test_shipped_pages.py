@@ -1,8 +1,7 @@
-"""The shipped pages: drawn from kept rows or by a named version, with one statistic per page."""
+"""The shipped pages: drawn from kept rows or by a named version, with one statistic a page."""
 
 import shutil
 import subprocess
-from collections import defaultdict
 
 import pytest
 
@@ -14,7 +13,9 @@ from tests.documentation import commands
 
 PAGES = {page.name: page.shown for page in find_paper(SHIPPED)}
 EXPERIMENTS = {row["config"]["experiment"] for row in read_rows(SHIPPED / FOLDER)}
-DRAWN = [name for name, page in PAGES.items() if not page.drawn_by and not name.startswith("suite")]  # keep their rows
+DRAWN = [
+    name for name, page in PAGES.items() if not page.drawn_by and not name.startswith("suite")
+]  # which keep their rows
 
 
 @pytest.mark.parametrize("name", DRAWN)
@@ -27,15 +28,15 @@ def test_a_page_of_this_version_has_rows_and_the_intervals_of_its_verdict(name: 
 
 
 def test_a_row_has_one_look_in_all_shipped_figures():
-    looks: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
-    panels = [panel for page in PAGES.values() for panel in (page.chart or {}).get("panels", ())]
-    for series in (series for panel in panels for series in panel["series"]):
-        for key in ("colour", "symbol", "dash"):  # lines may have no symbols, and points have no line
-            looks[series["name"], key] |= {*filter(None, [series.get(key)])}
-    assert {row: values for row, values in looks.items() if len(values) > 1} == {}
+    looks: dict[tuple[str, str], set[str]] = {}
+    for page in PAGES.values():
+        for series in (series for panel in (page.chart or {}).get("panels", ()) for series in panel["series"]):
+            for part in ("colour", "symbol", "dash"):  # lines may have no symbols, and points have no line
+                looks.setdefault((series["name"], part), set()).update(filter(None, [series.get(part)]))
+    assert {key: found for key, found in looks.items() if len(found) > 1} == {}
 
 
-def test_no_rows_are_in_the_former_format():
+def test_no_rows_are_in_the_format_of_before():
     assert [*(SHIPPED / FOLDER).glob("*.runs.csv")] == []
 
 
@@ -48,15 +49,13 @@ def test_the_shipped_ranking_has_one_row_a_renderer():
     assert sorted(ranked) == sorted({*classes.values()})
 
 
-def test_documented_columns_are_columns_of_shipped_pages(tmp_path):
-    columns = dict(
-        word.split("=", 1) for command in commands() for word in command.words if word.startswith("columns.")
-    )
-    write_columns(shutil.copytree(SHIPPED / FOLDER, tmp_path / FOLDER).parent, columns)
-    assert len(columns) == 2 and r"\begin{tabular}{lrr}" in (tmp_path / FOLDER / "table1.tex").read_text()
+def test_documented_columns_are_those_of_shipped_pages(tmp_path):
+    given = dict(word.split("=", 1) for one in commands() for word in one.words if word.startswith("columns."))
+    write_columns(shutil.copytree(SHIPPED / FOLDER, tmp_path / FOLDER).parent, given)
+    assert len(given) == 2 and r"\begin{tabular}{lrr}" in (tmp_path / FOLDER / "table1.tex").read_text()
 
 
-def test_shipped_latex_is_as_written_now_and_compiles(tmp_path):
+def test_shipped_latex_is_of_todays_writer_and_compiles(tmp_path):
     tables = [name for name, page in PAGES.items() if page.columns]
     for name in tables:
         text = (SHIPPED / FOLDER / f"{name}.tex").read_text()

@@ -1,4 +1,4 @@
-"""The parts of the page: names by what differs, safe scripts, meshes, the words of a run."""
+"""What the page is made of: names by what differs, safe scripts, meshes, words of a run."""
 
 import base64
 import json
@@ -38,7 +38,7 @@ from tests.report.test_report import record, write_run
 from tests.report.test_suite import attempt
 
 ROOT = Path(__file__).parents[2]
-MESH_HEADER_BYTES = 177
+BODY = 177  # where the numbers of the mesh begin
 
 
 def renderer(**settings) -> dict:
@@ -50,39 +50,43 @@ def test_a_setting_reads_the_same_in_a_list_and_in_the_table_of_its_sweep():
     assert [name.removeprefix("DIST, ") for name in names(swept)] == differences(swept)
 
 
-def custom(**config) -> dict:
-    return {"renderer": "custom", "config": config}
+def test_runs_are_named_by_what_differs():
+    swept = [record("x", **renderer(_label_="DIST", steps=steps, alpha=1.5)) for steps in (20, 50)]
+    assert names(swept) == ["DIST, steps 20", "DIST, steps 50"]
+    same = [record("x", **renderer(_label_="DIST", steps=20), seed=seed) for seed in (0, 1)]
+    assert names(same) == ["DIST", "DIST"]
 
 
-@each("changes, expected", [
-    ([renderer(_label_="DIST", steps=steps, alpha=1.5) for steps in (20, 50)], ["DIST, steps 20", "DIST, steps 50"]),
-    ([{"seed": seed, **renderer(_label_="DIST", steps=20)} for seed in (0, 1)], ["DIST", "DIST"]),
-    ([{"config": {"field": {"name": name}, "view": {"resolution": size}}} for name, size in (("a", 32), ("b", 64))],
-     ["dist, field a", "dist, field b"]),  # the resolution follows from the field
-    ([custom(renderer={"_target_": f"mypkg.{name}"}) for name in ("Mine", "Other")], ["Mine", "Other"]),
-    ([custom(label="Ours", renderer={"_target_": "mypkg.Mine"})], ["Ours"]),
-])  # fmt: skip
-def test_runs_are_named_by_what_differs(changes, expected):
-    assert names([record("x", **changed) for changed in changes]) == expected
+def test_a_setting_that_follows_from_another_is_not_named():
+    sizes = (("small", 32), ("large", 64))
+    configs = [{"field": {"name": name}, "view": {"resolution": size}} for name, size in sizes]
+    assert names([record("x", config=config) for config in configs]) == ["dist, field small", "dist, field large"]
 
 
 def test_scale_has_a_column_and_neither_it_nor_what_follows_from_it_is_in_names():
     sizes = (("smoke", 32), ("desk", 64))
-    records = [record("x", folder="x", config={"scale": {"name": n}, "view": {"resolution": r}, "task": {"points": p}})
+    made = [record("x", folder="x", config={"scale": {"name": n}, "view": {"resolution": r}, "task": {"points": p}})
             for n, r in sizes for p in (20, 100)]  # fmt: skip
-    assert names(records) == ["dist, points 20", "dist, points 100"] * 2
-    scales = columns(records, [Folder(Path("none"), f"run{number}") for number in range(4)])["texts"]["scale"]
-    assert [scales["values"][code] for code in scales["codes"]] == ["smoke", "smoke", "desk", "desk"]
+    assert names(made) == ["dist, points 20", "dist, points 100"] * 2
+    found = columns(made, [Folder(Path("none"), f"run{number}") for number in range(4)])["texts"]["scale"]
+    assert [found["values"][code] for code in found["codes"]] == ["smoke", "smoke", "desk", "desk"]
+
+
+def test_own_renderers_are_named_by_their_class():
+    own = [record("x", renderer="custom", **renderer(_target_=f"mypkg.{name}")) for name in ("Mine", "Other")]
+    assert names(own) == ["Mine", "Other"]
+    labelled = record("x", renderer="custom", config={"label": "Ours", "renderer": {"_target_": "mypkg.Mine"}})
+    assert names([labelled]) == ["Ours"]
 
 
 def test_at_most_three_settings_are_named_and_equal_ends_in_full():
     configs = [{"task": {"a": n & 1, "b": n & 2, "c": n & 4, "d": n & 8}} for n in range(16)]
     assert max(name.count(",") for name in names([record("x", config=config) for config in configs])) == 3
-    two_weights = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
-    assert names([record("x", config=config) for config in two_weights])[3] == "dist, weight 2, task.weight 1"
+    alike = [{"task": {"weight": n & 1}, "renderer": {"weight": n & 2}} for n in range(4)]
+    assert names([record("x", config=config) for config in alike])[3] == "dist, weight 2, task.weight 1"
 
 
-def test_an_odd_configuration_is_shown_too_and_cut_off_if_it_is_too_deep(tmp_path):
+def test_an_odd_configuration_is_shown_all_the_same_and_cut_off_where_it_has_no_end(tmp_path):
     nested: dict = {}
     for _ in range(300):
         nested = {"a": nested}
@@ -98,8 +102,8 @@ def test_an_odd_configuration_is_shown_too_and_cut_off_if_it_is_too_deep(tmp_pat
 
 def test_no_text_can_end_a_script_or_a_line():
     text = "</script><!-- & \u2028\u2029 \ud800 ü"
-    written = to_script("run", text, {"a": [text, float("inf"), float("nan")]})
-    assert written.isascii() and not set("<>&") & set(written) and written.count("\n") == 1
+    made_of = to_script("run", text, {"a": [text, float("inf"), float("nan")]})
+    assert made_of.isascii() and not set("<>&") & set(made_of) and made_of.count("\n") == 1
     assert json.loads(safe_json(text)) == text
     assert json.loads(safe_json({"a": float("-inf")})) == {"a": "-inf"}
 
@@ -113,11 +117,13 @@ def test_each_task_has_words():
     assert set(TASKS) == {path.stem for path in (ROOT / "conf" / "task").glob("[!_]*.yaml")}
 
 
-def test_the_request_of_a_run_is_a_sentence():
+def test_what_was_asked_is_a_sentence():
     config = {"task": {"points": "100"}, "view": {"resolution": 32}, "scale": {"name": "smoke"}}
     sentence = request_sentence(record("x", config=config, scene="sofa test 0"))
-    assert sentence.startswith("Complete a shape from sparse depth and its mask: sofa test 0, ")
-    assert sentence.endswith(": sofa test 0, 100 depth points, 32 × 32 pixels, seed 0, scale=smoke.")
+    assert sentence == (
+        "Complete a shape from sparse depth and its mask: sofa test 0, 100 depth points, 32 × 32 pixels, seed 0, "
+        "scale=smoke."
+    )
 
 
 def test_the_command_is_what_was_typed_and_safe_to_paste():
@@ -128,8 +134,10 @@ def test_the_command_is_what_was_typed_and_safe_to_paste():
 
 def test_a_planned_cell_has_the_command_that_its_sweep_planned():
     cell = PlannedCell("a", ["+experiment=fig5", "index=1"], "completion", "dist", "car", 0, {})
-    planned = not_run_record(cell, Plan("fig5-1", Path(RESULTS), [cell]))
-    assert command(planned, Path(RESULTS)) == "python -m bench +experiment=fig5 index=1"
+    assert (
+        command(not_run_record(cell, Plan("fig5-1", Path(RESULTS), [cell])), Path(RESULTS))
+        == "python -m bench +experiment=fig5 index=1"
+    )
 
 
 def test_the_lines_for_python_open_the_run(tmp_path):
@@ -137,17 +145,22 @@ def test_the_lines_for_python_open_the_run(tmp_path):
     save_field(Grid(torch.ones(3, 3, 3), 1.05), made.write(results, 0) / FIELD_FILE)
     made.write(results, 1)
     write_index(results)
-    variables: dict = {}
-    exec(Page(results).run("completion-0000")["python"], variables)  # as a reader would paste them
-    assert variables["run"].folder == "completion-0000" and variables["run"].chamfer_l2 == 0.001
-    assert len(variables["curve"]) == 8 and len(variables["mesh"].vertices) == 642
-    assert variables["field"](torch.zeros(1, 3)) == 1
+    found: dict = {}
+    exec(Page(results).run("completion-0000")["python"], found)  # as a reader would paste them
+    assert found["run"].folder == "completion-0000" and found["run"].chamfer_l2 == 0.001
+    assert len(found["curve"]) == 8 and len(found["mesh"].vertices) == 642
+    assert found["field"](torch.zeros(1, 3)) == 1
 
 
-@each("key, name", [
-    ("lost, false", "false"), ("saved_...", "saved_steps"), ("frontal.code_cosine", "grazing.code_cosine"),
-    ("depth_error", "depth_error_p99"),
-])  # fmt: skip
+@each(
+    "key, name",
+    [
+        ("lost, false", "false"),
+        ("saved_...", "saved_steps"),
+        ("frontal.code_cosine", "grazing.code_cosine"),
+        ("depth_error", "depth_error_p99"),
+    ],
+)
 def test_a_metric_has_its_definition(key, name):
     assert definition({"hull": "Another.", key: "Known."}, name) == "Known."
     assert definition({key: "Known."}, "unlike") == definition({key: "Known."}, "savedsteps") == ""
@@ -164,20 +177,20 @@ def test_a_long_curve_is_thinned_but_keeps_its_ends_and_checkpoints(tmp_path):
     folder = write_run(tmp_path, record("one"), "one")
     lines = [{"iteration": n, "total": 1.0} | ({"chamfer_l2": 0.1} if n == 1001 else {}) for n in range(5000)]
     (folder / "curve.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    iterations = curve(Folder(tmp_path, "one"))["iteration"]
-    assert len(iterations) < 250 and {0, 1001, 4999} <= set(iterations)
+    kept = curve(Folder(tmp_path, "one"))["iteration"]
+    assert len(kept) < 250 and {0, 1001, 4999} <= set(kept)
 
 
-def unpacked(packed: dict) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(packed["bdata"]), f"<{packed['dtype']}")
+def unpacked(part: dict) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(part["bdata"]), f"<{part['dtype']}")
 
 
-def test_a_mesh_is_in_plotlys_format_with_the_second_axis_up(tmp_path):
+def test_a_mesh_is_given_as_plotly_reads_it_with_our_second_axis_up(tmp_path):
     made.write_mesh(tmp_path / "mesh.ply")
-    mesh, data = read_ply(tmp_path / "mesh.ply"), mesh_data(tmp_path / "mesh.ply")
+    whole, data = read_ply(tmp_path / "mesh.ply"), mesh_data(tmp_path / "mesh.ply")
     x, y, z = (unpacked(data[axis]) for axis in "xyz")
-    assert np.allclose(np.stack([x, z, -y], axis=1), mesh.vertices, atol=1e-6)
-    assert (np.stack([unpacked(data[corner]) for corner in "ijk"], axis=1) == mesh.faces).all()
+    assert np.allclose(np.stack([x, z, -y], axis=1), whole.vertices, atol=1e-6)
+    assert (np.stack([unpacked(data[corner]) for corner in "ijk"], axis=1) == whole.faces).all()
     assert data["whole"] == data["shown"] == [642, 1280] and "vertexcolor" not in data
 
 
@@ -200,26 +213,29 @@ def test_a_mesh_that_names_a_texture_reads_no_other_file(tmp_path, caplog):
     assert len(read_ply(tmp_path / "mesh.ply").faces) == 1280 and not caplog.records
 
 
-@each("change, why", [
-    (lambda content: content[:-40], "unexpected length"),
-    (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "unexpected length"),
-    (lambda content: content.replace(b"binary_little", b"binary_big"), "not of its vertices"),
-    (lambda content: content.replace(b"double x", b"double u"), "no field of name x"),
-    (lambda content: content.replace(b"double x", b"double y"), "could not be read"),
-    (lambda content: content.replace(b"double x", b"object x"), "could not be read"),
-    (lambda content: content.replace(b"uchar int", b"double int"), "could not be read"),
-    (lambda content: b"", "Not a ply file"),
-    (lambda content: content[:-4] + b"\xff\xff\xff\x7f", "not of its vertices"),
-    (lambda content: content[:MESH_HEADER_BYTES] + b"\xff" * 8 + content[MESH_HEADER_BYTES + 8 :], "not finite"),
-])  # fmt: skip
-def test_a_mesh_that_cannot_be_read_is_an_error(tmp_path, change, why):
+@each(
+    "change, why",
+    [
+        (lambda content: content[:-40], "unexpected length"),
+        (lambda content: content.replace(b"vertex 642", b"vertex 4000000000"), "unexpected length"),
+        (lambda content: content.replace(b"binary_little", b"binary_big"), "not of its vertices"),
+        (lambda content: content.replace(b"double x", b"double u"), "no field of name x"),
+        (lambda content: content.replace(b"double x", b"double y"), "could not be read"),
+        (lambda content: content.replace(b"double x", b"object x"), "could not be read"),
+        (lambda content: content.replace(b"uchar int", b"double int"), "could not be read"),
+        (lambda content: b"", "Not a ply file"),
+        (lambda content: content[:-4] + b"\xff\xff\xff\x7f", "not of its vertices"),
+        (lambda content: content[:BODY] + b"\xff" * 8 + content[BODY + 8 :], "not finite"),
+    ],
+)
+def test_a_mesh_that_cannot_be_read_is_said_to_be(tmp_path, change, why):
     made.write_mesh(tmp_path / "mesh.ply")
     (tmp_path / "mesh.ply").write_bytes(change((tmp_path / "mesh.ply").read_bytes()))
     with pytest.raises(ValueError, match=why):
         mesh_data(tmp_path / "mesh.ply")
 
 
-def test_meshes_are_written_for_the_newest_runs_and_once(tmp_path, monkeypatch):
+def test_meshes_are_made_of_the_newest_runs_and_once(tmp_path, monkeypatch):
     for number in range(3):
         made.write(tmp_path, number)
     write_index(tmp_path, meshes=2)
@@ -243,12 +259,12 @@ def test_runs_share_scripts_from_which_each_has_its_own_details(tmp_path, monkey
     write_index(tmp_path)
     page = Page(tmp_path, beginning=1)
     assert len(list((page.data / "run").iterdir())) <= 16
-    for record_read in read_records(tmp_path)[0]:
-        details = detail(record_read, Folder(tmp_path, record_read["folder"]), tmp_path)
-        assert page.run(record_read["folder"]) == json.loads(safe_json(details))
+    for found in read_records(tmp_path)[0]:
+        whole = detail(found, Folder(tmp_path, found["folder"]), tmp_path)
+        assert page.run(found["folder"]) == json.loads(safe_json(whole))
 
 
-def test_a_deleted_run_leaves_the_page(tmp_path):
+def test_what_is_gone_leaves_the_page(tmp_path):
     for number in range(2):
         made.write(tmp_path, number)
     write_index(tmp_path)
@@ -260,7 +276,7 @@ def test_a_deleted_run_leaves_the_page(tmp_path):
         assert len(list((tmp_path / "page" / "data" / kind).iterdir())) == 1
 
 
-def test_a_script_that_somebody_replaced_is_written_again(tmp_path):
+def test_what_another_put_in_the_place_of_a_script_is_replaced(tmp_path):
     results, outside = tmp_path / "results", tmp_path / "outside"
     for number in range(2):
         made.write(results, number)
@@ -292,56 +308,56 @@ def test_pages_that_are_written_at_the_same_time_have_all_runs(tmp_path):
     assert sorted(Page(tmp_path).folders) == [f"completion-{n:04}" for n in range(4)]
 
 
-def test_waiting_for_another_process_is_reported(tmp_path, monkeypatch):
+def test_who_waits_for_another_page_is_told(tmp_path, monkeypatch):
     write_run(tmp_path, record("one"), "one")
-    other, messages = file_lock(tmp_path, html.FOLDER), []
+    other, said = file_lock(tmp_path, html.PAGE_FOLDER), []
 
     def tell(text: str, **_: object) -> None:
-        messages.append(text)
+        said.append(text)
         other.release()
 
     other.acquire()
     monkeypatch.setattr(html, "SILENT_WAIT_SECONDS", 0.01)
     monkeypatch.setattr(html, "print", tell, raising=False)
     write_index(tmp_path)
-    assert messages == [f"waiting for another process that writes the page of {tmp_path}"]
+    assert said == [f"waiting for another process that writes the page of {tmp_path}"]
 
 
 def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
     solved = attempt("Dist", "car test 0", {0: 0.8, 500: 0.0115, 600: 0.001}, preset="dist")
     mine = replace(solved, row="Mine", preset="custom", status="nan", reason="lost", overrides=[
         *solved.overrides, "renderer=custom", "+renderer.steps=7", "label=My own"])  # fmt: skip
-    overrides = ["+experiment=core_complete", "+method=tuned/dist_mask", "silhouette=own", "label='Dist, tuned'"]
-    tuned = replace(solved, row="Dist, tuned", overrides=overrides)
-    for name, result in (("a", solved), ("b", mine), ("a", tuned)):
-        write_attempts([result], tmp_path / name)
+    request_sentence = ["+experiment=core_complete", "+method=tuned/dist_mask", "silhouette=own", "label='Dist, tuned'"]
+    tuned = replace(solved, row="Dist, tuned", overrides=request_sentence)
+    for name, one in (("a", solved), ("b", mine), ("a", tuned)):
+        write_attempts([one], tmp_path / name)
     merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
     assert main([f"results_dir={tmp_path / 'both'}"]) == 0
     page = Page(tmp_path / "both")
     shown = page.paper("suite")
     assert [row[0] for row in shown["rows"]] == ["Dist", "Mine"] and shown["chart"]["panels"]
     assert "n = 1 problem" in shown["caption"] and "The run ended" not in shown["caption"]
-    renderers = page.read("list", "renderers")
-    assert renderers["problems"] == [["complete", "car test 0, 20 points", 0]]
-    dist, user, tuned_row = renderers["rows"]
-    assert tuned_row["command"] == "python -m bench.suite setting=tuned renderer=dist"
-    assert ["task.optimiser.learning_rate: tuned/dist_mask", "0.0215"] in tuned_row["settings"]
-    assert len(tuned_row["settings"]) == len(dist["settings"]) + 5  # weights, rate, and two settings of the renderer
+    found = page.read("list", "renderers")
+    assert found["problems"] == [["complete", "car test 0, 20 points", 0]]
+    dist, own, by_itself = found["rows"]
+    assert by_itself["command"] == "python -m bench.suite setting=tuned renderer=dist"
+    assert ["task.optimiser.learning_rate: tuned/dist_mask", "0.0215"] in by_itself["settings"]
+    assert len(by_itself["settings"]) == len(dist["settings"]) + 5  # weights, rate, and two of the renderer
     assert (dist["progress"], dist["failed"], dist["runs"]) == ([1.0], [], [None])
-    assert (user["progress"], user["failed"]) == ([0.0], [[0, "nan", "lost"]])
-    assert user["command"] == "python -m bench.suite renderer=custom +renderer.steps=7 'label=My own'"
-    assert ["steps", "7"] in user["settings"] and ["alpha", "1.5"] in dist["settings"]
+    assert (own["progress"], own["failed"]) == ([0.0], [[0, "nan", "lost"]])
+    assert own["command"] == "python -m bench.suite renderer=custom +renderer.steps=7 'label=My own'"
+    assert ["steps", "7"] in own["settings"] and ["alpha", "1.5"] in dist["settings"]
     assert dist["file"] == "renderers/dist.py" and "Deviates from the paper:" in dist["source"]
 
 
 def test_a_variant_has_the_settings_of_what_it_builds_on():
-    base, variant = (dict(node) for node in (_preset_settings("neus"), _preset_settings("neus_budget")))
-    assert variant["samples"] == 24 and {*base} <= {*variant} and _preset_settings("no_such") == {}
+    built, own = (dict(found) for found in (_preset_settings("neus"), _preset_settings("neus_budget")))
+    assert own["samples"] == 24 and {*built} <= {*own} and _preset_settings("no_such") == {}
     assert _source("mypkg.Mine") == ("mypkg.Mine", "")
     suite_rows = [name for name in choices("renderer") if "core" in choice("renderer", name).get("_rows_", {})]
     for name in suite_rows:
-        file, source = _source(_preset_settings(name)["_target_"])
-        assert (ROOT / file).is_file() and "Source:" in source, name
+        file, said = _source(_preset_settings(name)["_target_"])
+        assert (ROOT / file).is_file() and "Source:" in said, name
 
 
 def test_an_odd_run_of_the_suite_costs_no_page(tmp_path):

@@ -39,26 +39,34 @@ def mean(values: np.ndarray) -> np.ndarray:
     return values.mean(axis=-1)
 
 
-def recording(statistic) -> tuple:
-    """A statistic that records its values of bootstrap draws, and the list of these values."""
-    values_of_draws = []
+def seen(statistic) -> tuple:
+    """A statistic that notes what it gave for draws."""
+    noted = []
 
     def noting(values):
         result = statistic(values)
         if values.ndim == 2 and values.shape[0] > 1:
-            values_of_draws.extend(result)
+            noted.extend(result)
         return result
 
-    return noting, values_of_draws
+    return noting, noted
 
 
-@each("values, expected", [
-    ([7], 7), ([1, 4], 2.5), ([0, 100, 2, 1], 1.5), ([INF], INF), ([0, 1, INF, INF], INF),
-    ([12, 0, 3], 4),  # weights 1/4, 1, 1/4 over their sum 1.5
-    ([0, 1, 2, 4, 100], (0.75 * 1 + 2 + 0.75 * 4) / 2.5), ([0, 0, 1, 2, 4, 9], (0.5 * 0 + 1 + 2 + 0.5 * 4) / 3),
-    ([0, 1, 2, INF], 1.5),  # a failure in the outer quarter costs no more than a bad run
-    ([0, 1, INF], INF),  # each end of three counts partly
-])  # fmt: skip
+@each(
+    "values, expected",
+    [
+        ([7], 7),
+        ([1, 4], 2.5),
+        ([12, 0, 3], 4),  # weights 1/4, 1, 1/4 of 1.5
+        ([0, 100, 2, 1], 1.5),
+        ([0, 1, 2, 4, 100], (0.75 * 1 + 2 + 0.75 * 4) / 2.5),
+        ([0, 0, 1, 2, 4, 9], (0.5 * 0 + 1 + 2 + 0.5 * 4) / 3),
+        ([0, 1, 2, INF], 1.5),  # a failure in the outer quarter costs no more than a bad run
+        ([0, 1, INF, INF], INF),
+        ([0, 1, INF], INF),  # of three, each end counts in part
+        ([INF], INF),
+    ],
+)
 def test_interquartile_mean_closed_form(values, expected):
     assert interquartile_mean(values) == pytest.approx(expected)
 
@@ -77,9 +85,9 @@ def test_averages_refuse_what_is_no_error(average, values):
         average(values)
 
 
-def test_interval_of_a_mean_is_students_interval():
-    # The mean of a draw varies by the variance of shapes over n, and by the variance of seeds within a shape.
-    # With one seed the interval is mean +- t s / sqrt(n); a plain percentile interval is 11 % narrower.
+def test_interval_of_a_mean_is_that_of_student():
+    # A draw's mean varies by the shapes' variance (over n) and by the seeds' within a shape. With one seed the widening
+    # makes it mean +- t s / sqrt(n), s with n - 1 in the denominator; a plain percentile would be narrower by 11 %.
     n, t = 16, stats.t.ppf(0.975, 15)
     shapes = 10 + stats.norm.ppf((np.arange(n) + 0.5) / n)[:, None]
     interval = bootstrap(list(shapes), mean, seed=0, draws=40_000)
@@ -93,9 +101,9 @@ def test_interval_of_a_mean_is_students_interval():
     assert (interval.low, interval.high) == pytest.approx((10 - half, 10 + half), abs=0.03 * half)
 
 
-def test_an_interval_over_six_shapes_leaves_out_a_quarter_of_a_percent_of_draws_on_each_side():
-    # Hesterberg 2015: the normal tail beyond sqrt(n / (n - 1)) times Student's quantile with n - 1 degrees.
-    noting, noted = recording(mean)
+def test_of_six_shapes_an_interval_leaves_out_a_quarter_of_a_per_cent_of_draws_on_each_side():
+    # Hesterberg 2015: at the normal's tail beyond sqrt(n / (n - 1)) times Student's quantile with n - 1 degrees.
+    noting, noted = seen(mean)
     interval = bootstrap(list(np.random.default_rng(0).normal(size=(6, 40))), noting, seed=0, draws=10_000)
     tail = stats.norm.cdf(math.sqrt(6 / 5) * stats.t.ppf(0.025, df=5))
     assert tail == pytest.approx(0.00243, abs=5e-6)
@@ -106,24 +114,22 @@ def test_an_interval_over_six_shapes_leaves_out_a_quarter_of_a_percent_of_draws_
 @each("n", [1, 4, 5])
 def test_fewer_than_six_shapes_have_points_and_no_interval(n):
     groups = [np.array([i, i + 2.0]) for i in range(n)]
-    for interval in (
+    for found in (
         bootstrap(groups, mean, seed=0),
         paired_bootstrap(groups, groups, mean, seed=0),
         share(np.ones(n), 2 * np.ones(n)),
     ):
-        assert (
-            math.isnan(interval.low) and math.isnan(interval.high) and not interval.known and len(interval.points) == n
-        )
-        assert str(interval).endswith(f" (n = {n})")
-    interval = bootstrap(groups, mean, seed=0)
-    assert interval.value == n / 2 + 0.5 and interval.points == tuple(i + 1.0 for i in range(n))
+        assert math.isnan(found.low) and math.isnan(found.high) and not found.has_ends and len(found.points) == n
+        assert str(found).endswith(f" (n = {n})")
+    found = bootstrap(groups, mean, seed=0)
+    assert found.value == n / 2 + 0.5 and found.points == tuple(i + 1.0 for i in range(n))
     six = bootstrap(singles(*range(6)), mean, seed=0)
     assert MIN_SHAPES == 6 and six.has_ends and str(six) == f"2.50 {six.ends()}"
 
 
 def test_shapes_with_unequal_numbers_of_seeds():
-    # A draw with k copies of the shape of three seeds has 3 k ones among 6 + 2 k runs.
-    noting, noted = recording(mean)
+    # A draw that takes the shape of three seeds k times has 3 k ones among 6 + 2 k runs.
+    noting, noted = seen(mean)
     groups = [*singles(0, 0, 0, 0, 0), np.ones(3)]
     assert bootstrap(groups, noting, seed=0, draws=8000).value == 3 / 8
     times = np.arange(7)
@@ -134,9 +140,9 @@ def test_shapes_with_unequal_numbers_of_seeds():
 
 
 def test_views_and_seeds_are_drawn_within_their_shape():
-    # The variance of a mean over draws: shapes over 6, views in a shape over 12, seeds in a view over 36.
+    # A mean's variance over draws: of shapes over 6, of views in a shape over 12, of seeds in a view over 36.
     shapes, views, seeds = np.arange(6.0)[:, None, None] * 3, np.array([-2.0, 2.0])[:, None], np.array([-1.0, 0.0, 1.0])
-    noting, noted = recording(mean)
+    noting, noted = seen(mean)
     groups = [list(shape) for shape in shapes + views + seeds]
     assert bootstrap(groups, noting, seed=0, draws=20_000).value == pytest.approx(7.5)
     assert np.var(noted) == pytest.approx(shapes.var() / 6 + views.var() / 12 + seeds.var() / 36, rel=0.03)
@@ -188,9 +194,9 @@ def test_clopper_pearson_is_the_exact_interval(successes, n):
 
 def test_a_share_counts_shapes_not_trials():
     successes, trials = np.array([8, 8, 8, 8, 4, 0.0]), np.full(6, 8.0)
-    interval = share(successes, trials)
-    assert interval == clopper_pearson(36 / 48, 6) and interval.points == (1, 1, 1, 1, 0.5, 0)
-    assert share(10 * successes, 10 * trials) == interval
+    found = share(successes, trials)
+    assert found == clopper_pearson(36 / 48, 6) and found.points == (1, 1, 1, 1, 0.5, 0)
+    assert share(10 * successes, 10 * trials) == found
     for bad in (([1.0], [0.0]), ([3.0], [2.0]), ([-1.0], [2.0]), ([], []), ([1.0], [1.0, 1.0])):
         with pytest.raises(ValueError, match="successes must be"):
             share(np.array(bad[0]), np.array(bad[1]))
@@ -202,7 +208,7 @@ def test_a_share_counts_shapes_not_trials():
 def test_one_run_of_each_gives_no_probability_and_no_rank():
     assert np.isnan(front([point([1], [1]), point([2], [2])], seed=0)).all()
     assert front([point([1, 1], [1, 1]), point([2, 2], [2, 2])], seed=0) == [1, 0]
-    assert all(math.isnan(interval.value) for interval in rank({"a": {"cow": 1.0}, "b": {"cow": 2.0}}).values())
+    assert all(math.isnan(found.value) for found in rank({"a": {"cow": 1.0}, "b": {"cow": 2.0}}).values())
 
 
 def test_rank_worked_example():
@@ -211,21 +217,24 @@ def test_rank_worked_example():
         "b": {"cow": 1.0, "car": 1.0, "sofa": math.nan},
         "c": {"cow": 3.0, "sofa": 5.0},
     }
-    # cow 1.5, 1.5, 3; car 2, 1, fails; sofa fails, fails, 1. A failure has rank 3; hat, where all fail, does not count.
+    # cow 1.5, 1.5, 3; car 2, 1, fails; sofa fails, fails, 1; a hat nobody makes does not count; failing has rank 3
     expected = {"a": (1.5 + 2 + 3) / 3, "b": (1.5 + 1 + 3) / 3, "c": (3 + 3 + 1) / 3}
-    assert {name: interval.value for name, interval in rank(table).items()} == pytest.approx(expected)
-    assert [interval.value for interval in rank({"a": {"cow": None, "car": None}, "b": {}}).values()] == [2, 2]
+    assert {name: found.value for name, found in rank(table).items()} == pytest.approx(expected)
+    assert [found.value for found in rank({"a": {"cow": None, "car": None}, "b": {}}).values()] == [2, 2]
     assert rank({}) == {}
 
 
-def test_a_rank_has_an_interval_over_shapes_and_rows_as_good_as_the_best_are_named():
-    shapes = range(12)
-    table = {"best": dict.fromkeys(shapes, 1.0), "last": dict.fromkeys(shapes, 3.0)}
-    table["tied"] = {shape: 0.5 if shape % 2 else 2.0 for shape in shapes}
-    ranks = rank(table)
-    assert ranks["last"].value == ranks["last"].low == ranks["last"].high == 3
-    assert ranks["tied"].low < ranks["tied"].value == 1.5 < ranks["tied"].high
-    assert tied_with_best(ranks, "best") == ["tied"]
+def test_a_rank_has_an_interval_over_shapes_and_those_that_do_not_differ_from_the_best_are_named():
+    places = range(12)
+    table = {
+        "best": {i: 1.0 for i in places},
+        "tied": {i: 0.5 if i % 2 else 2.0 for i in places},
+        "last": {i: 3.0 for i in places},
+    }
+    found = rank(table)
+    assert found["last"].value == found["last"].low == found["last"].high == 3
+    assert found["tied"].low < found["tied"].value == 1.5 < found["tied"].high
+    assert tied_with_best(found, "best") == ["tied"]
     paired = {"best": Interval(5, 1, 9, (1, 9) * 6), "next": Interval(6, 2, 10, (2, 10) * 6)}  # worse on each shape
     assert tied_with_best(paired, "best") == []
 
@@ -258,10 +267,10 @@ def test_front_of_certain_cases():
 
 
 def test_front_of_uncertain_cases():
-    # The first point's median of three draws is 1 if two draws or more are among two of the shapes: 20 of 27 cases.
+    # The first one's median of three draws is 1, not 3, if two or three of them are of two shapes of three: 20 of 27.
     chances = front([point((1, 1, 1), (1, 1, 3)), point((1, 1, 1), (2, 2, 2))], seed=0, draws=8000)
     assert chances == pytest.approx([20 / 27, 7 / 27], abs=0.02)
-    # Mirror images: each wins half of the draws, and both are on the front if medians tie.
+    # Mirror images: who wins is tossed, and where medians tie both are on the front.
     spread = np.random.default_rng(0).uniform(size=10)
     mirrored = np.append(spread, -spread)
     chances = front([point(np.ones(20), 2 + mirrored), point(np.ones(20), 2 - mirrored)], seed=0)
@@ -270,11 +279,11 @@ def test_front_of_uncertain_cases():
     assert front([point((1, 1), (1, INF))], seed=0, draws=8000) == pytest.approx([0.25], abs=0.02)
 
 
-def test_the_interval_of_a_median_is_the_interval_of_the_sign_test():
+def test_the_interval_of_a_median_is_that_of_the_sign_test():
     errors = [np.array([1.0, 4.0]), *(np.array([e]) for e in (1.0, 3.0, 4.0, 8.0, 16.0))]
-    interval = typical(errors)
-    assert (interval.value, interval.low, interval.high) == pytest.approx((math.sqrt(12), 1.0, 16.0))  # of six, all
-    assert not typical(errors[:5]).known
+    found = typical(errors)
+    assert (found.value, found.low, found.high) == pytest.approx((math.sqrt(12), 1.0, 16.0))  # of six, all
+    assert not typical(errors[:5]).has_ends
     failed = typical([*errors, np.array([math.inf])])
     assert (failed.value, failed.high) == (pytest.approx(4.0), math.inf)
     eight = typical([np.array([2.0**k]) for k in range(8)])
@@ -284,21 +293,13 @@ def test_the_interval_of_a_median_is_the_interval_of_the_sign_test():
 
 
 def test_holm_takes_the_least_chance_first_and_stops_at_the_first_that_does_not_differ():
-    def of_shapes(below: int, shapes: int = 12) -> Interval:
+    def of(below: int, shapes: int = 12) -> Interval:
         return ratio([np.array([0.5])] * below + [np.array([2.0])] * (shapes - below), [np.array([1.0])] * shapes)
 
     yes, no = Verdict.DIFFERS, Verdict.NOT_DISTINGUISHED
-    assert ratio_verdicts([of_shapes(10), of_shapes(12)]) == [yes, yes]  # .0005 <= .05 / 2, then .039 <= .05
-    assert ratio_verdicts([of_shapes(12), of_shapes(10), of_shapes(10), of_shapes(6)]) == [
-        yes,
-        no,
-        no,
-        no,
-    ]  # .039 > .05 / 3
-    assert ratio_verdicts([of_shapes(0), of_shapes(5, shapes=5)]) == [
-        yes,
-        Verdict.NOT_DECIDABLE,
-    ]  # five shapes are not counted
+    assert ratio_verdicts([of(10), of(12)]) == [yes, yes]  # .0005 <= .05 / 2, then .039 <= .05
+    assert ratio_verdicts([of(12), of(10), of(10), of(6)]) == [yes, no, no, no]  # .039 > .05 / 3
+    assert ratio_verdicts([of(0), of(5, shapes=5)]) == [yes, Verdict.NOT_DECIDABLE]  # five shapes are not counted
     assert ratio_verdicts([]) == []
 
 
@@ -311,7 +312,8 @@ def test_a_family_that_no_data_could_reject_cannot_be_decided():
     assert ratio_verdicts(family(8, 7)) == [Verdict.NOT_DECIDABLE] * 7  # .0078 > .05 / 7
     assert ratio_verdicts(family(9, 7)) == [Verdict.DIFFERS] * 7
     mixed = ratio_verdicts([*family(6, 1), *family(12, 1)])  # .0005 <= .05 / 2, then .031 <= .05
-    assert mixed == [Verdict.DIFFERS] * 2 and [shapes_needed(n) for n in (1, 7, 14)] == [6, 9, 10]
+    assert mixed == [Verdict.DIFFERS] * 2
+    assert [shapes_needed(n) for n in (1, 7, 14)] == [6, 9, 10]
     assert [shapes_agreeing(12, 11), shapes_agreeing(12, 1), shapes_agreeing(8, 7)] == [12, 10, 9]
 
 
@@ -327,17 +329,17 @@ def test_shapes_with_equal_errors_are_no_trials_of_the_sign_test():
 
 def test_a_ratio_is_paired_by_shape():
     first = [np.array([e]) for e in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)]
-    tripled = ratio([3 * e for e in first], first)
-    assert (tripled.value, tripled.low, tripled.high) == pytest.approx((3.0, 3.0, 3.0))
-    assert tripled.points == pytest.approx((3.0,) * 6)
+    found = ratio([3 * e for e in first], first)
+    assert (found.value, found.low, found.high) == pytest.approx((3.0, 3.0, 3.0))
+    assert found.points == pytest.approx((3.0,) * 6)
     with pytest.raises(ValueError, match="must have the same shapes"):
         ratio(first, first[:5])
 
 
-def test_if_both_fail_on_a_shape_the_ratio_is_1():
+def test_where_both_fail_on_a_shape_the_ratio_is_1():
     good, failed = np.array([2.0]), np.array([np.inf])
-    doubled = ratio([failed, *[2 * good] * 5], [failed, *[good] * 5])
-    assert doubled.points == pytest.approx((1.0, *[2.0] * 5))
-    assert (doubled.value, doubled.low, doubled.high) == pytest.approx((2.0, 1.0, 2.0))
-    undecided = ratio([failed] * 3 + [good] * 3, [good] * 3 + [failed] * 3)  # neither is known to be better
-    assert math.isnan(undecided.value) and (undecided.low, undecided.high) == (0.0, math.inf)
+    found = ratio([failed, *[2 * good] * 5], [failed, *[good] * 5])
+    assert found.points == pytest.approx((1.0, *[2.0] * 5))
+    assert (found.value, found.low, found.high) == pytest.approx((2.0, 1.0, 2.0))
+    apart = ratio([failed] * 3 + [good] * 3, [good] * 3 + [failed] * 3)  # neither is known to be better
+    assert math.isnan(apart.value) and (apart.low, apart.high) == (0.0, math.inf)

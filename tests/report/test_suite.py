@@ -1,4 +1,4 @@
-"""The suite: the progress of attempts over costs, the ranking of rows, and results without run folders."""
+"""The suite: what an attempt has reached and when, how rows stand, and that results outlive their run folders."""
 
 from dataclasses import replace
 from itertools import permutations
@@ -57,26 +57,31 @@ from tests.report.test_report_paper import write_lines, write_run
 DIST = choice("renderer", "dist")["_label_"]
 SHIPPED = Path(__file__).resolve().parents[2] / "results"
 SCENES = tuple(f"{family} test {index}" for family in ("vase", "lamp") for index in range(4))  # not among references
-TEN_SCENES = tuple(f"vase test {index}" for index in range(10))
+
+
+TEN = tuple(f"vase test {index}" for index in range(10))
 
 
 def attempt(row: str, scene: str, errors: dict[float, float], **changed) -> Attempt:
-    """An attempt whose curve has these errors by cost, from the initial to the final error; 1 s is a cost of 1000."""
+    """One whose curve has these errors by cost, the first the start and the last the end; a second is 1000 values."""
     curve = [[cost, cost / 1000, error] for cost, error in errors.items()]
-    fields = {
+    known = {
         **{"set": "complete", "problem": f"{scene}, 20 points", "scene": scene, "seed": 0, "row": row},
         **{"preset": row.lower(), "status": "ok", "reason": "", "start": curve[0][2], "final": curve[-1][2]},
         **{"cost": curve[-1][0], "operations": None, "seconds": 1.0, "waited": None, "cpu": "one", "device": "cpu"},
         **{"threads": 1, "kernels": "torch", "started": "2026-01-01T00:00:00+00:00", "commit": "", "code": "a"},
         **{"settings": "", "curve": curve, "overrides": ["+experiment=core_complete", "task.points=20"]},
     }
-    return Attempt(**(fields | changed))
+    return Attempt(**(known | changed))
 
 
-def attempts_of_rows(rows: list[tuple[str, float, float]], scenes=SCENES) -> list[Attempt]:
-    """Attempts on all scenes of rows, each with its final error and the cost of each of two steps."""
-    curves = {row: {0: 1.0, cost: max(final, 0.1), 2 * cost: final} for row, final, cost in rows}
-    return [attempt(row, scene, errors) for row, errors in curves.items() for scene in scenes]
+def made(of: list[tuple[str, float, float]], scenes=SCENES) -> list[Attempt]:
+    """Attempts of rows with their final error and what they pay for each of two steps, on all scenes."""
+    return [
+        attempt(row, scene, {0: 1.0, pay: max(final, 0.1), 2 * pay: final})
+        for row, final, pay in of
+        for scene in scenes
+    ]
 
 
 def judged(attempts: list[Attempt]) -> pd.DataFrame:
@@ -94,9 +99,13 @@ def progress(attempts: list[Attempt], outcome: str = END) -> dict[str, float]:
 
 
 def write_completion(results: Path, errors: list[float], **changed) -> Path:
-    """Writes a run of the suite: line n of its curve has error n and the cost 1000 (n + 1); the last error is final."""
-    settings = {"split": "test", "task": {"points": "20"}, "renderer": {"_label_": "Mine"}}
-    settings |= changed.pop("settings", {})
+    """A run of the suite whose line n has these errors and n + 1 thousand values; the last error is that of its end."""
+    settings = {
+        "split": "test",
+        "task": {"points": "20"},
+        "renderer": {"_label_": "Mine"},
+        **changed.pop("settings", {}),
+    }
     changed = {"metrics": {"chamfer_l1": errors[-1]}, "metrics_start": {"chamfer_l1": errors[0]}} | changed
     changed = {"overrides": ["task.points=20", "results_dir=x"]} | changed
     folder = write_run(results, "core_complete", None, settings=settings, **changed)
@@ -110,38 +119,38 @@ def write_completion(results: Path, errors: list[float], **changed) -> Path:
 
 def test_a_checkpoint_has_the_costs_of_the_line_before_it(tmp_path):
     write_completion(tmp_path, [0.8, 0.4, 0.2])
-    (result,) = attempts_of(read_records(tmp_path)[0], tmp_path)
-    assert result.curve == [[0, 0, 0.8], [1000, 1, 0.4], [2000, 2, 0.2]]
-    assert (result.set, result.problem, result.row) == ("complete", "car test 0, 20 points", "Mine")
-    assert (result.start, result.final, result.overrides) == (0.8, 0.2, ["task.points=20"])
+    (found,) = attempts_of(read_records(tmp_path)[0], tmp_path)
+    assert found.curve == [[0, 0, 0.8], [1000, 1, 0.4], [2000, 2, 0.2]]
+    assert (found.set, found.problem, found.row, found.start, found.final) == (
+        "complete", "car test 0, 20 points", "Mine", 0.8, 0.2,
+    )  # fmt: skip
+    assert found.overrides == ["task.points=20"]
 
 
 def test_a_rendering_has_its_cost_and_its_pixel_errors(tmp_path):
     settings = {"split": "train", "task": {"size": 64}, "renderer": {"_label_": "Mine"}}
     metrics = {"pixel_errors": 3, "cost": 512.0, "forward_seconds": 0.25}
-    fields = {"settings": settings, "metrics": metrics, "metrics_start": {"pixel_errors": 900}}
-    write_run(tmp_path, "core_render", None, seconds={"forward": 0.25, "backward": 1.0}, **fields)
-    (result,) = attempts_of(read_records(tmp_path)[0], tmp_path)
-    assert (result.problem, result.start, result.curve) == ("car train 0, 64 pixels", 900, [[512, 0.25, 3]])
-    failed = replace(result, problem="another", status="timeout", final=inf)
-    assert wrong_pixels(compared(frame_of([result]))).to_dict() == {"Mine": 3 / 900} and judged([result]).empty
-    assert wrong_pixels(compared(frame_of([result, failed])))["Mine"] == pytest.approx((3 / 900 + 1) / 2)
+    known = {"settings": settings, "metrics": metrics, "metrics_start": {"pixel_errors": 900}}
+    write_run(tmp_path, "core_render", None, seconds={"forward": 0.25, "backward": 1.0}, **known)
+    (found,) = attempts_of(read_records(tmp_path)[0], tmp_path)
+    assert (found.problem, found.start, found.curve) == ("car train 0, 64 pixels", 900, [[512, 0.25, 3]])
+    failed = replace(found, problem="another", status="timeout", final=inf)
+    assert wrong_pixels(compared(frame_of([found]))).to_dict() == {"Mine": 3 / 900} and judged([found]).empty
+    assert wrong_pixels(compared(frame_of([found, failed])))["Mine"] == pytest.approx((3 / 900 + 1) / 2)
 
 
-def test_rows_are_compared_on_the_problems_that_all_complete_rows_have(monkeypatch):
-    required = {("complete", f"{scene}, 20 points", 0) for scene in SCENES[:6]}
-    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda _: required)
-    complete = attempts_of_rows(
-        [("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)]
-    )
-    partial = [result for result in complete if result.row != "Mine" or result.key[:3] in required]
-    runs = judged([result for result in partial if result.row != "Part" or result.scene == SCENES[0]])
-    assert {*runs["scene"]} == {*SCENES[:6]} and {*runs.loc[runs["whole"], "row"]} == {"B", "Dist", "Mine"}
+def test_rows_are_compared_at_the_problems_that_all_whole_rows_have(monkeypatch):
+    least = {("complete", f"{scene}, 20 points", 0) for scene in SCENES[:6]}
+    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda _: least)
+    whole = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0), ("Mine", 0.01, 100.0), ("Part", 0.01, 1.0)])
+    some = [one for one in whole if one.row != "Mine" or one.key[:3] in least]
+    runs = judged([one for one in some if one.row != "Part" or one.scene == SCENES[0]])
+    assert {*runs["scene"]} == {*SCENES[:6]} and {*runs.loc[runs["complete"], "row"]} == {"B", "Dist", "Mine"}
     assert {*runs.loc[runs["row"] == "Part", "missing"]} == {5}
-    assert {*judged(attempts_of_rows([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]))["scene"]} == {*SCENES}
+    assert {*judged(made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)]))["scene"]} == {*SCENES}
 
 
-def test_each_set_has_equal_weight_and_a_run_with_other_settings_is_not_compared():
+def test_each_set_weighs_the_same_and_a_run_under_other_settings_is_not_compared():
     many = [attempt("Dist", scene, {0: 1.0, 10: 0.01}) for scene in SCENES]
     lost = attempt("Dist", "s", {0: 90.0, 10: 90.0}, status="diverged", final=inf, set="pose", problem="s, 20 degrees")
     assert progress([*many, lost]) == {"Dist": 0.5}
@@ -151,8 +160,8 @@ def test_each_set_has_equal_weight_and_a_run_with_other_settings_is_not_compared
     assert progress([*many, newer]) == {"Dist": 1.0}
 
 
-def test_progress_is_logarithmic_between_the_initial_error_and_the_reference():
-    """Errors 100, 10, 1 are progress 0, 0.5 and 1; progress is interpolated between checkpoints and constant after."""
+def test_progress_is_that_of_the_logarithm_between_the_initial_error_and_the_reference():
+    """Of errors 100, 10, 1: none, half and all; a cost between checkpoints is interpolated, and the end is kept."""
     runs = judged([attempt("Dist", "s", {0: 100, 2: 10, 4: 1}), attempt("B", "s", {0: 100, 8: 10, 80: 5})])
     dist, b = (runs[runs["row"] == row].iloc[0] for row in ("Dist", "B"))
     assert (dist[AT_1], dist[AT_10], dist[END]) == (1, 1, 1)  # at its own cost a run has its own progress
@@ -167,18 +176,20 @@ def test_progress_is_logarithmic_between_the_initial_error_and_the_reference():
 
 
 def test_a_failed_run_has_made_no_progress_and_moves_no_initial_error():
-    complete = attempts_of_rows([("Dist", 0.01, 100.0), ("B", 0.02, 100.0)])
-    crash = {"start": 50.0, "final": inf, "status": "crashed", "curve": []}
-    rows = ("Lost", "Lost 2", "Lost 3")
-    lost = [replace(result, row=row, **crash) for row in rows for result in complete[: len(SCENES)]]
-    runs = judged([*complete, *lost])
-    assert progress([*complete, *lost])["Lost"] == 0 and {*runs["initial"]} == {1.0}
+    whole = made([("Dist", 0.01, 100.0), ("B", 0.02, 100.0)])
+    lost = [
+        replace(one, row=row, start=50.0, final=inf, status="crashed", curve=[])
+        for row in ("Lost", "Gone", "Dead")
+        for one in whole[: len(SCENES)]
+    ]
+    runs = judged([*whole, *lost])
+    assert progress([*whole, *lost])["Lost"] == 0 and {*runs["initial"]} == {1.0}
     assert {*runs.loc[runs["row"] == "Lost", AREA]} == {0.0}
-    unknown = replace(complete[0], start=inf, final=inf, status="crashed", curve=[[0.0, 0.0, inf]])
+    unknown = replace(whole[0], start=inf, final=inf, status="crashed", curve=[[0.0, 0.0, inf]])
     assert judged([unknown]).empty
 
 
-def test_stated_references_are_used_if_there_are_any():
+def test_the_stated_references_are_used_where_there_are_any():
     scene, error = next(iter(suite().references["complete"].items()))
     assert judged([attempt("A", scene, {0: 1.0, 1: 0.9})])["reference"].tolist() == [error]
     assert judged([attempt("A", "s", {0: 1.0, 1: 0.9})])["reference"].tolist() == [0.9]
@@ -187,14 +198,18 @@ def test_stated_references_are_used_if_there_are_any():
 
 def test_few_checkpoints_within_a_cost_measure_no_progress_there():
     steps = {cost: 0.5 ** (cost / 10) for cost in range(0, 100, 10)}
-    expensive = {10 * cost: error for cost, error in steps.items()}
+    dear = {10 * cost: error for cost, error in steps.items()}
     failed = [attempt("Lost", scene, {0: 1.0}, status="nan", final=inf) for scene in SCENES]
-    complete = [attempt(row, scene, errors) for row, errors in (("Dist", steps), ("B", expensive)) for scene in SCENES]
-    runs = judged([*complete, *failed])
-    assert [rows_with_few_checkpoints(runs, outcome) for outcome in (AT_1, AT_10, END)] == [{"B"}, set(), set()]
+    whole = [attempt(row, scene, of) for row, of in (("Dist", steps), ("B", dear)) for scene in SCENES]
+    runs = judged([*whole, *failed])
+    assert (
+        rows_with_few_checkpoints(runs, AT_1) == {"B"}
+        and rows_with_few_checkpoints(runs, AT_10) == set()
+        and rows_with_few_checkpoints(runs, END) == set()
+    )
 
 
-def test_the_p_value_of_a_difference_is_from_flipped_signs_over_scenes():
+def test_the_chance_of_a_difference_is_that_of_flipped_signs_over_scenes():
     assert p_values(np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])).tolist() == [0.25, 1.0, 1.0]
     assert signs(3).shape == (4, 3) and signs(40).shape == (2**15, 40) and (signs(40)[0] == 1).all()
     assert p_values(np.ones((40, 1))) == 1 / 2**15  # of random signs the first are those of the data
@@ -202,10 +217,10 @@ def test_the_p_value_of_a_difference_is_from_flipped_signs_over_scenes():
     assert holm(np.array([0.04, 0.02, 0.02])).tolist() == [False, False, False]  # 0.05 / 3 is less than 0.02
 
 
-def test_differences_are_corrected_over_all_pairs_not_over_the_pairs_of_a_row():
-    """One of 11 rows is worse everywhere: with 10 scenes, p is 2 / 2**10, between ALPHA / 55 and ALPHA / 10."""
+def test_rows_differ_by_the_correction_over_all_pairs_not_over_the_others_of_a_row():
+    """Of 11 rows one is worse everywhere: p is 2 / 2**10 with 10 scenes, between 2 % of 10 rows and of 55 pairs."""
     rows = [("Dist", 0.01, 100.0), *((f"B{n}", 0.01, 100.0) for n in range(9)), ("Lost", 0.5, 100.0)]
-    ten, twelve = (ranking(judged(attempts_of_rows(rows, [f"{n}" for n in range(scenes)])), END) for scenes in (10, 13))
+    ten, twelve = (ranking(judged(made(rows, [f"{n}" for n in range(scenes)])), END) for scenes in (10, 13))
     assert ALPHA / 55 < 2 / 2**10 < ALPHA / 10 and ten.better == set() and not ten.decidable
     assert twelve.better == {(row, "Lost") for row, *_ in rows[:-1]} and twelve.decidable
     assert twelve.rank("Lost") == "11" and twelve.rank("Dist") == "1–10"
@@ -213,12 +228,12 @@ def test_differences_are_corrected_over_all_pairs_not_over_the_pairs_of_a_row():
 
 @pytest.mark.parametrize("outcome", [AT_1, AREA])
 def test_equal_rows_differ_in_at_most_one_of_twenty_draws(outcome):
-    """The level of the shipped design: rows are centred per set, and scenes drawn among those with the same sets."""
+    """The level of the shipped design: rows are centred in each set, and scenes are drawn among those with its sets."""
     runs = judged(read_attempts(SHIPPED)[0])
     runs = runs[runs["complete"]]
     rows = runs.groupby(["set", "row"])[outcome].transform("mean")
     scores = by_scene(runs.assign(**{outcome: runs[outcome] - rows}), outcome)
-    sets = runs.groupby("scene")["set"].agg(lambda names: tuple(sorted({*names}))).reindex(scores.index)
+    sets = runs.groupby("scene")["set"].agg(lambda of: tuple(sorted({*of}))).reindex(scores.index)
     kinds = [scores.to_numpy()[sets == kind] for kind in sorted({*sets})]
     rng, false, (first, second) = np.random.default_rng(1), 0, np.triu_indices(scores.shape[1], 1)
     for _ in range(500):
@@ -235,27 +250,31 @@ def test_bounds_hold_the_ratios_that_flipped_signs_do_not_reject():
     low, high = bounds(judged([*dist, *b]), "complete")
     assert low < 2 * np.exp(noise.mean()) < high
     for end, inside in ((low, 1.001), (high, 0.999)):
-        within, beyond = (np.log(2) + noise - np.log(ratio) for ratio in (end * inside, end / inside))
-        assert p_values(within[:, None]) > ALPHA >= p_values(beyond[:, None])
+        values = np.log(2) + noise
+        assert (
+            p_values((values - np.log(end * inside))[:, None])
+            > ALPHA
+            >= p_values((values - np.log(end / inside))[:, None])
+        )
     assert bounds(judged([*dist[:5], *b[:5]]), "complete") is None  # 2 / 2**5 is more than 5 %
-    failed = [replace(result, row="Lost", status="nan", final=inf) for result in b]
+    failed = [replace(one, row="Lost", status="nan", final=inf) for one in b]
     assert bounds(judged([*dist, *b, *failed]), "complete") == (low, high)
     assert bounds(judged(dist), "complete") is None
 
 
-def test_nan_is_infinite_and_a_changed_renderer_has_another_name(tmp_path):
-    fields = {"overrides": ["+experiment=core_complete", "renderer=newton", "renderer.steps=9", "task.points=20"]}
-    write_completion(tmp_path, [0.8, 0.4, 0.2], **fields)
+def test_a_number_that_is_none_is_not_reached_and_a_changed_renderer_has_another_name(tmp_path):
+    asked = {"overrides": ["+experiment=core_complete", "renderer=newton", "renderer.steps=9", "task.points=20"]}
+    write_completion(tmp_path, [0.8, 0.4, 0.2], **asked)
     line = '{"iteration": 1, "seconds": 2.0, "cost": 2000.0, "total": NaN, "chamfer_l1": NaN}'
     curve = next(tmp_path.glob("runs/*/curve.jsonl"))
     curve.write_text(curve.read_text().splitlines()[0] + "\n" + line + "\n")
     write_attempts(attempts_of(read_records(tmp_path)[0], tmp_path), tmp_path)
-    ((result,), problems) = read_attempts(tmp_path)
-    assert problems == [] and result.row == "Mine, steps=9" and [error for *_, error in result.curve] == [0.8, inf, 0.2]
+    ((found,), problems) = read_attempts(tmp_path)
+    assert problems == [] and found.row == "Mine, steps=9" and [error for *_, error in found.curve] == [0.8, inf, 0.2]
 
 
 def page(attempts: list[Attempt], folder: Path, monkeypatch) -> Standing:
-    """The standing of the pages if only these attempts exist, as shipped ones."""
+    """What the pages are made of, if these attempts are shipped and there are no others."""
     write_attempts(attempts, folder / "shipped")
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", folder / "shipped")
     return Standing(gather(folder / "shipped", folder / "none"))
@@ -263,12 +282,12 @@ def page(attempts: list[Attempt], folder: Path, monkeypatch) -> Standing:
 
 def test_a_row_that_cost_nothing_has_no_line_and_leaves_the_axis_logarithmic(tmp_path, monkeypatch):
     late = [attempt("Late", scene, {0: 1.0}, status="timeout", final=inf) for scene in SCENES]
-    panel = study._panel(page([*attempts_of_rows([("Dist", 0.01, 100.0)]), *late], tmp_path, monkeypatch), None)
+    panel = study._panel(page([*made([("Dist", 0.01, 100.0)]), *late], tmp_path, monkeypatch), None)
     assert [line["name"] for line in panel["series"]] == ["Dist"] and panel["x"]["log"]
     assert (panel["series"][0]["x"][-1], panel["series"][0]["y"][-1]) == (1, 1)
 
 
-def test_without_comparable_attempts_both_pages_are_empty(tmp_path, monkeypatch):
+def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch):
     rendered = replace(attempt("Mine", "a", {0: 1.0}), set="render", problem="a, 64 pixels")
     for name, shipped in {"none": [], "render": [rendered]}.items():
         page(shipped, tmp_path / name, monkeypatch)
@@ -279,179 +298,186 @@ def test_without_comparable_attempts_both_pages_are_empty(tmp_path, monkeypatch)
 
 
 def test_problems_that_the_reference_row_lacks_are_not_compared():
-    complete = attempts_of_rows([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
-    of_b = next(result for result in complete if result.row == "B")
-    assert len(judged([*complete, replace(of_b, problem="another", scene="another")])) == len(complete)
-    tweaked = [replace(result, row="A tweak") for result in complete if result.row == "Dist"]
-    named = [replace(result, row=DIST) if result.row == "Dist" else result for result in complete]
+    whole = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
+    of_b = next(one for one in whole if one.row == "B")
+    assert len(judged([*whole, replace(of_b, problem="another", scene="another")])) == len(whole)
+    tweaked = [replace(one, row="A tweak") for one in whole if one.row == "Dist"]
+    named = [replace(one, row=DIST) if one.row == "Dist" else one for one in whole]
     assert standing.unit_row(frame_of([*tweaked, *named])) == DIST
 
 
 def test_seconds_are_compared_on_one_machine_and_field_evaluations_of_the_same_runs():
-    complete = attempts_of_rows([("Dist", 0.01, 100.0), ("Mine", 0.01, 200.0)])
+    whole = made([("Dist", 0.01, 100.0), ("Mine", 0.01, 200.0)])
 
-    def cost(results: list[Attempt]) -> tuple[float, float | None, int]:
-        runs = judged(results)
-        line = costs(runs, timed(runs, frame_of(results))).loc["complete", "Mine"]
+    def cost(of: list[Attempt]) -> tuple[float, float | None, int]:
+        runs = judged(of)
+        line = costs(runs, timed(runs, frame_of(of))).loc["complete", "Mine"]
         return line["evaluations"].value, line["seconds"] and line["seconds"].value, line["scenes"]
 
     unknown = pytest.approx(2), None, 8
-    mine = [replace(result, seconds=3.0) if result.row == "Mine" else result for result in complete]
+    mine = [replace(one, seconds=3.0) if one.row == "Mine" else one for one in whole]
     assert cost(mine) == pytest.approx((2, 3, 8))
-    moved = [replace(result, cpu="another") if result.row == "Mine" else result for result in mine]
+    moved = [replace(one, cpu="another") if one.row == "Mine" else one for one in mine]
     assert cost(moved) == unknown
-    moved_dist = {"cpu": "another", "seconds": 6.0, "cost": 400.0, "started": "2025"}
-    elsewhere = [replace(result, **moved_dist) for result in complete if result.row == "Dist"]
-    assert cost([*moved, *elsewhere]) == pytest.approx((1, 0.5, 8))  # both are from the runs on that machine
-    assert cost([*moved, *(replace(result, waited=0.2) for result in elsewhere)]) == unknown
-    assert (
-        cost([replace(result, waited=0.2) if result.row == "Mine" else result for result in [*moved, *elsewhere]])
-        == unknown
-    )
-    assert cost([*moved, *elsewhere[:5]]) == unknown  # too few scenes
-    settings = [replace(result, settings="x") for result in elsewhere[:6]]
-    assert cost([*moved, *settings]) == unknown
-    compiled = [
-        replace(result, kernels="native", seconds=1.0, started="2027") for result in complete if result.row == "Dist"
+    elsewhere = [
+        replace(one, cpu="another", seconds=6.0, cost=400.0, started="2025") for one in whole if one.row == "Dist"
     ]
+    assert cost([*moved, *elsewhere]) == pytest.approx((1, 0.5, 8))  # both are of the runs on that machine
+    assert cost([*moved, *(replace(one, waited=0.2) for one in elsewhere)]) == unknown
+    assert cost([replace(one, waited=0.2) if one.row == "Mine" else one for one in [*moved, *elsewhere]]) == unknown
+    assert cost([*moved, *elsewhere[:5]]) == unknown  # of too few scenes
+    settings = [replace(one, settings="x") for one in elsewhere[:6]]
+    assert cost([*moved, *settings]) == unknown
+    compiled = [replace(one, kernels="native", seconds=1.0, started="2027") for one in whole if one.row == "Dist"]
     assert cost([*mine, *compiled]) == unknown  # DIST's newest runs have another engine
 
 
-@each("better, beginning", [
-    ("AC AD BC BD", "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others. These cannot be"),
-    ("AB AC AD", "A (*90 %*) makes significantly more progress than the 3 others."),
-    ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than C; D."),
-    ("", "A (*90 %*) makes the most progress, and cannot be distinguished from any other."),
-])  # fmt: skip
-def test_the_answer_names_who_leads_by_a_rule(better, beginning):
+@each(
+    "better, said",
+    [
+        (
+            "AC AD BC BD",
+            "A (*90 %*) and B (*80 %*) make significantly more progress than the 2 others. These 2 cannot be",
+        ),
+        ("AB AC AD", "A (*90 %*) makes significantly more progress than the 3 others."),
+        ("AC AD BD", "A (*90 %*) makes the most progress, significantly more than 2 others: C; D."),
+        ("", "A (*90 %*) makes the most progress, and cannot be distinguished from any other."),
+    ],
+)
+def test_the_answer_names_who_leads_by_a_rule(better, said):
     pairs = {tuple(pair) for pair in better.split()}
     ranked = Ranking(dict(zip("ABCD", (0.9, 0.8, 0.7, 0.6), strict=True)), pairs, 6, 0.01, 16)
-    assert study.leaders(ranked).removeprefix("At the cost of one run of DIST, ").startswith(beginning)
+    assert study.leaders(ranked).removeprefix("At the cost of one DIST run, ").startswith(said)
 
 
 def test_the_answer_says_what_differs_at_the_end_what_failed_and_what_scenes_cannot_decide(tmp_path, monkeypatch):
     rows = [("Dist", 0.0101, 100.0), ("B", 0.01, 300.0)]
-    lost = [attempt("Lost", scene, {0: 1.0, 50: 1.0}, status="diverged", final=inf) for scene in TEN_SCENES]
-    answer = study.verdict(page([*attempts_of_rows(rows, TEN_SCENES), *lost], tmp_path / "three", monkeypatch))
-    assert "At the end, 3 of 3 pairs can be distinguished" in answer and "lie within" not in answer
+    lost = [attempt("Lost", scene, {0: 1.0, 50: 1.0}, status="diverged", final=inf) for scene in TEN]
+    answer = study.verdict(page([*made(rows, TEN), *lost], tmp_path / "three", monkeypatch))
+    assert "At the end of the runs, 3 of 3 pairs differ significantly" in answer and "lie within" not in answer
     assert "Lost failed in 10 of 10 problems of complete; none of the other 20 runs failed." in answer
-    end = {"final": 0.0099, "started": "2027"}
-    some_dist = attempts_of_rows(rows[:1], TEN_SCENES)[:3]
-    mixed = [replace(result, curve=[*result.curve[:2], [2e2, 0.2, 0.0099]], **end) for result in some_dist]
-    shown = page([*attempts_of_rows(rows, TEN_SCENES), *mixed], tmp_path / "two", monkeypatch)
-    assert "In complete, every renderer's mean final error is 0.99 to 1.01 times that" in " ".join(study._notes(shown))
-    assert "none of 1 pairs can be distinguished. A run costs *1* (Dist) to *3* (B)" in study.verdict(shown)
+    mixed = [
+        replace(one, curve=[*one.curve[:2], [2e2, 0.2, 0.0099]], final=0.0099, started="2027")
+        for one in made(rows[:1], TEN)[:3]
+    ]
+    shown = page([*made(rows, TEN), *mixed], tmp_path / "two", monkeypatch)
+    assert "In complete, every renderer's mean final error is 0.99 to 1.01 times D" in " ".join(study._notes(shown))
+    assert "none of 1 pairs differ significantly. A run costs *1* (Dist) to *3* (B) times" in study.verdict(shown)
     assert study.verdict(shown).endswith("None of 20 runs failed.")
-    few = [result for result in attempts_of_rows(rows, TEN_SCENES) if result.scene in TEN_SCENES[:3]]
+    few = [one for one in made(rows, TEN) if one.scene in TEN[:3]]
     assert study.verdict(page(few, tmp_path / "few", monkeypatch)).startswith("3 scenes cannot decide between 2 ")
 
 
 def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
     good = attempt("A b", "s", {0: 1.0, 5: 0.5}, reason='said "no", twice', started="2026-01-02T00:00:00+00:00")
-    end = {"status": "oom", "final": inf, "curve": [[0.0, 0.0, 1.0], [5.0, 0.005, inf]]}
-    failed = replace(good, started="2026-01-03T00:00:00+00:00", **end)
+    failed = replace(
+        good, status="oom", final=inf, curve=[[0.0, 0.0, 1.0], [5.0, 0.005, inf]], started="2026-01-03T00:00:00+00:00"
+    )
     older = replace(good, started="2026-01-01T00:00:00+00:00")
     other = replace(good, row="A-b")  # whose file has the same name
     for order in permutations([good, failed, older, other]):
-        assert {result.key: result for result in newest_attempts(order)} == {good.key: failed, other.key: other}
+        assert {one.key: one for one in newest_attempts(order)} == {good.key: failed, other.key: other}
     write_attempts([failed, other], tmp_path)
     assert {*map(repr, read_attempts(tmp_path)[0])} == {repr(failed), repr(other)}
     write_attempts([latest := replace(good, started="2026-01-04T00:00:00+00:00")], tmp_path)
-    assert sorted(read_attempts(tmp_path)[0], key=lambda result: result.row) == [latest, other]
+    assert sorted(read_attempts(tmp_path)[0], key=lambda one: one.row) == [latest, other]
     assert [path.name for path in attempts_folder(tmp_path).iterdir()] == ["a_b.csv"]
 
 
-def test_two_merged_halves_are_complete(tmp_path):
-    complete = attempts_of_rows([("Dist", 0.01, 100.0), ("B", 0.02, 50.0)])
-    write_attempts(complete[:5], tmp_path / "one")
-    write_attempts(complete[5:], tmp_path / "two")
+def test_two_halves_merged_are_the_whole(tmp_path):
+    whole = made([("Dist", 0.01, 100.0), ("B", 0.02, 50.0)])
+    write_attempts(whole[:5], tmp_path / "one")
+    write_attempts(whole[5:], tmp_path / "two")
     merge.merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
     by_key = [
-        sorted(newest_attempts(results), key=lambda result: result.key)
-        for results in (read_attempts(tmp_path / "both")[0], complete)
+        sorted(newest_attempts(of), key=lambda one: one.key) for of in (read_attempts(tmp_path / "both")[0], whole)
     ]
     assert by_key[0] == by_key[1]
 
 
-def test_a_file_that_cannot_be_read_is_named_and_others_are_kept(tmp_path):
+def test_a_file_that_cannot_be_read_is_told_and_others_are_kept(tmp_path):
     write_attempts([attempt("A", "s", {0: 1.0, 5: 0.5})], tmp_path)
     (attempts_folder(tmp_path) / "b.csv").write_text("set,problem\ncomplete,s\n")
-    results, problems = read_attempts(tmp_path)
-    assert len(results) == 1 and problems[0].startswith("b.csv")
+    found, problems = read_attempts(tmp_path)
+    assert len(found) == 1 and problems[0].startswith("b.csv")
     with pytest.raises(ValueError, match=r"b\.csv"):  # whose lines would be lost
-        write_attempts(results, tmp_path)
+        write_attempts(found, tmp_path)
     back = [[0.0, 0.0, 1.0], [5.0, 0.005, 0.6], [4.0, 0.006, 0.5], [5.0, 0.007, 0.5]]
     for wrong in ({"final": -1.0}, {"final": 0.4}, {"set": "none"}, {"status": "fine"}, {"curve": back}, {"curve": []}):
-        write_attempts([replace(results[0], **wrong)], tmp_path / str(wrong))
+        write_attempts([replace(found[0], **wrong)], tmp_path / str(wrong))
         assert read_attempts(tmp_path / str(wrong))[0] == []
 
 
-def test_rows_are_compared_at_the_smallest_size_that_the_users_rows_have(monkeypatch):
+def test_rows_are_compared_at_the_least_size_where_one_of_ones_own_lacks_more(monkeypatch):
     sizes = {"smoke": SCENES[:1], "quick": SCENES[:4], "core": SCENES}
     keys = {size: {("complete", f"{scene}, 20 points", 0) for scene in scenes} for size, scenes in sizes.items()}
     monkeypatch.setattr("bench.report.suite.attempts.problems_of", keys.get)
 
     def size(*rows: tuple[str, int]) -> str:
-        local = [result for row, count in rows for result in attempts_of_rows([(row, 0.1, 1.0)], SCENES[:count])]
+        local = [one for row, count in rows for one in made([(row, 0.1, 1.0)], SCENES[:count])]
         return Gathered([], local, []).size
 
     assert size() == size(("A", 8)) == size(("A", 5)) == size(("A", 8), ("B, tuned", 1)) == "quick"
     assert size(("A", 3)) == size(("A", 8), ("B", 1)) == "smoke"
 
 
-def test_more_problems_of_the_user_and_of_dist_leave_the_shipped_rows_compared(monkeypatch):
+def test_more_problems_of_ones_own_and_of_dist_leave_the_shipped_rows_compared(monkeypatch):
     monkeypatch.setattr(standing, "problems_of", lambda _: {("complete", f"{SCENES[0]}, 20 points", 0)})
-    complete = attempts_of_rows([("Dist", 0.011, 100.0), ("Mine", 0.01, 100.0)]) + attempts_of_rows(
-        [("Shipped", 0.02, 100.0)], SCENES[:6]
-    )
-    runs = judged(complete)
-    assert {*runs.loc[runs["whole"], "row"]} == {"Dist", "Mine", "Shipped"} and {*runs["scene"]} == {*SCENES[:6]}
+    whole = made([("Dist", 0.011, 100.0), ("Mine", 0.01, 100.0)]) + made([("Shipped", 0.02, 100.0)], SCENES[:6])
+    runs = judged(whole)
+    assert {*runs.loc[runs["complete"], "row"]} == {"Dist", "Mine", "Shipped"} and {*runs["scene"]} == {*SCENES[:6]}
 
 
 def test_a_set_in_which_dist_fails_is_measured_by_the_usual_cost():
-    rows = attempts_of_rows([("Dist", 0.01, 9.0), ("B", 0.01, 100.0)])
-    lost = [replace(result, status="nan", final=inf) if result.row == "Dist" else result for result in rows]
+    lost = [
+        replace(one, status="nan", final=inf) if one.row == "Dist" else one
+        for one in made([("Dist", 0.01, 9.0), ("B", 0.01, 100.0)])
+    ]
     assert progress(lost, AT_1) == {"B": 1.0, "Dist": 0.0}
     exact = [attempt("Dist", scene, {0: 1.0, 5: 0.0}) for scene in SCENES]
     assert progress(exact) == {"Dist": 1.0}  # a reference of 0 has no logarithm
 
 
-def test_a_few_problems_of_the_user_are_compared_with_shipped_rows_on_these_only(tmp_path, monkeypatch, capsys):
-    shipped, users = tmp_path / "shipped", tmp_path / "users"
+def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alone(tmp_path, monkeypatch, capsys):
+    shipped, own = tmp_path / "shipped", tmp_path / "own"
     smoke = {("complete", "car test 0, 20 points", 0)}
-    for module in ("attempts", "standing"):
-        problems_of = f"bench.report.suite.{module}.problems_of"
-        monkeypatch.setattr(problems_of, lambda size: smoke if size == "smoke" else {"none"})
-    write_completion(users, [0.8, 0.4, 0.05])
-    (mine,) = attempts_of(read_records(users)[0], users)
-    errors = {0: 0.8, 500: 0.0125, 600: 0.0124}
-    dist = [attempt("Dist", scene, errors, settings=mine.settings) for scene in ("car test 0", "car test 1")]
+    monkeypatch.setattr("bench.report.suite.attempts.problems_of", lambda size: smoke if size == "smoke" else {"none"})
+    monkeypatch.setattr("bench.report.suite.standing.problems_of", lambda size: smoke if size == "smoke" else {"none"})
+    write_completion(own, [0.8, 0.4, 0.05])
+    (mine,) = attempts_of(read_records(own)[0], own)
+    known = {0: 0.8, 500: 0.0125, 600: 0.0124}
+    dist = [attempt("Dist", scene, known, settings=mine.settings) for scene in ("car test 0", "car test 1")]
     write_attempts(dist, shipped)
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", shipped)
-    assert print_standing(users) == 0
-    printed = capsys.readouterr().out
-    assert "progress on the 1 problem that all rows have, of 2 problems with results" in printed
-    assert "Mine * " in printed and "Dist *" not in printed
-    problem = "Mine, complete, car test 0, 20 points"
-    assert f"{problem}: initial error 0.800, final error 0.0500; best renderer 0.0124," in printed
-    data = "".join(path.read_text() for path in (users / "page" / "data").rglob("*.js"))
-    assert "Mine" in data and "Dist" in data  # the page shows the same table
-    table = (users / "paper" / "suite.md").read_text()
+    assert print_standing(own) == 0
+    said = capsys.readouterr().out
+    assert (
+        "progress on the 1 problem that all rows have, of 2 problems with results" in said
+        and "Mine * " in said
+        and "Dist *" not in said
+    )
+    assert (
+        "Mine, complete, car test 0, 20 points: initial error 0.800, final error 0.0500; best renderer 0.0124," in said
+    )
+    data = "".join(path.read_text() for path in (own / "page" / "data").rglob("*.js"))
+    assert "Mine" in data and "Dist" in data  # the page, too, is of the table that was written
+    table = (own / "paper" / "suite.md").read_text()
     assert "| Dist |" in table and "| Mine |" in table and "n = 1 problem" in table
     assert "1 scene cannot decide between 2 renderers" in table
-    assert [result.row for result in read_attempts(users)[0]] == ["Mine"]
+    assert [one.row for one in read_attempts(own)[0]] == ["Mine"]
 
 
 @each(
-    "argument, words",
+    "argument, said",
     [("suite=large", "unknown suite 'large'"), ("setting=tunde", "did you mean tuned"),
      ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
      ("task.optimiser.budget=1e9", "is stated by the suite"),
      ("scale=smoke", "is stated by the suite"), ("+dataset.radius=.5", "is stated by the suite"),
      ("models.size=free", "is stated by the suite")],
 )  # fmt: skip
-def test_a_wrong_argument_is_named(argument, words, capsys):
-    assert main([argument]) == 2 and words in capsys.readouterr().err
+def test_a_wrong_argument_is_told(argument, said, capsys):
+    assert main([argument]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_a_label_of_a_shipped_row_is_refused(tmp_path, monkeypatch):
@@ -462,10 +488,10 @@ def test_a_label_of_a_shipped_row_is_refused(tmp_path, monkeypatch):
             parse_arguments(["renderer=custom", f"label={label}"])
 
 
-def test_unknown_settings_are_passed_on():
-    overrides = ["renderer=custom", "renderer._target_=a.B", "label=Mine", "dataset=sofa", "task.points=20"]
-    settings, passed = parse_arguments(["suite=core", *overrides])
-    assert settings["suite"] == "core" and passed == overrides
+def test_what_is_not_its_own_is_passed_on():
+    given = ["renderer=custom", "renderer._target_=a.B", "label=Mine", "dataset=sofa", "task.points=20"]
+    own, passed = parse_arguments(["suite=core", *given])
+    assert own["suite"] == "core" and passed == given
 
 
 def test_every_set_is_an_experiment_with_each_size():
@@ -474,25 +500,22 @@ def test_every_set_is_an_experiment_with_each_size():
         assert {*sizes} - {"chosen"} == {*suite().sizes.values()}
 
 
-def test_progress_in_the_time_of_dist_is_measured_on_the_same_machine():
-    """One second is a cost of 1000; DIST's run takes one second."""
+def test_progress_in_the_time_of_dist_is_that_at_its_seconds_on_the_same_machine():
+    """A second is 1000 field evaluations of a curve; DIST's run takes one second."""
     dist = [attempt("Dist", scene, {0: 1.0, 1000: 0.01}) for scene in SCENES]
     slow = [attempt("Slow", scene, {0: 1.0, 500: 0.5, 900: 0.1, 2000: 0.01}) for scene in SCENES]
-    lost = [replace(result, row="Lost", status="nan", final=inf) for result in slow]
+    lost = [replace(one, row="Lost", status="nan", final=inf) for one in slow]
     few = [attempt("Few", scene, {0: 1.0, 2000: 0.1}) for scene in SCENES]
     pairs = timed(judged([*dist, *slow, *lost, *few]), frame_of([*dist, *slow, *lost, *few]))
     means = pairs.groupby("row")[AT_SECONDS].mean()
     assert means.to_dict() == pytest.approx({"Dist": 1, "Slow": 0.5 + 0.5 * 100 / 1100, "Lost": 0, "Few": 0.25})
     assert rows_with_few_checkpoints(pairs, AT_SECONDS) == {"Dist", "Few"}  # two checkpoints in that time
-    loaded = [
-        replace(result, waited=0.3) if result.scene == SCENES[0] and result.row == "Slow" else result
-        for result in [*dist, *slow]
-    ]
-    assert {*timed(judged(loaded), frame_of(loaded))["scene"]} == {*SCENES[1:]}  # the scenes with times of all rows
+    some = [replace(one, waited=0.3) if one.scene == SCENES[0] and one.row == "Slow" else one for one in [*dist, *slow]]
+    assert {*timed(judged(some), frame_of(some))["scene"]} == {*SCENES[1:]}  # where all rows were timed
 
 
 def test_a_tuned_row_changes_no_comparison_and_has_lines_in_its_sets(tmp_path, monkeypatch):
-    stated = attempts_of_rows([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
+    stated = made([("Dist", 0.011, 100.0), ("B", 0.01, 100.0)])
     tuned = [attempt("Dist, tuned", scene, {0: 1.0, 9: 0.005}, settings="own", preset="dist") for scene in SCENES[:7]]
     runs = judged([*stated, *tuned])
     assert standing_of([*stated, *tuned]) == standing_of(stated) and {*progress([*stated, *tuned])} == {"Dist", "B"}
@@ -503,36 +526,38 @@ def test_a_tuned_row_changes_no_comparison_and_has_lines_in_its_sets(tmp_path, m
     assert [line["row"] for line in lines] == ["B", "Dist", "Dist, tuned"] and lines[2][END] == 1
 
 
-def test_a_tuned_setting_is_free_only_in_its_weights_and_rate(tmp_path):
-    results = {}
+def test_a_tuned_setting_is_free_in_its_weights_and_rate_alone(tmp_path):
+    found = {}
     for name, task in {
         "one": {"optimiser": {"learning_rate": 0.1, "budget": 9}, "silhouette_weight": 2.0},
         "two": {"optimiser": {"learning_rate": 0.2, "budget": 9}, "silhouette_weight": 3.0, "losses": {"eikonal": 1}},
         "more": {"optimiser": {"learning_rate": 0.1, "budget": 99}, "silhouette_weight": 2.0},
     }.items():
         for method in ("", "tuned/dist_mask"):
-            settings = {"task": {"points": "20"} | task, "label": "Mine, tuned" if method else None}
-            write_completion(tmp_path / name / method, [0.8, 0.2], settings=settings, method=method, renderer="dist")
-            (results[name, method],) = attempts_of(read_records(tmp_path / name / method)[0], tmp_path / name / method)
+            own = {"task": {"points": "20"} | task, "label": "Mine, tuned" if method else None}
+            write_completion(tmp_path / name / method, [0.8, 0.2], settings=own, method=method, renderer="dist")
+            (found[name, method],) = attempts_of(read_records(tmp_path / name / method)[0], tmp_path / name / method)
     stated, tuned = (
-        {name: results[name, method] for name in ("one", "two", "more")} for method in ("", "tuned/dist_mask")
+        {name: one for (name, of), one in found.items() if of == method} for method in ("", "tuned/dist_mask")
     )
-    assert len({result.settings for result in stated.values()}) == 3 and not stated["one"].tuned
+    assert len({one.settings for one in stated.values()}) == 3 and not stated["one"].tuned
     assert tuned["one"].settings == tuned["two"].settings != tuned["more"].settings
     assert (tuned["one"].row, tuned["one"].preset, tuned["one"].tuned) == ("Mine, tuned", "dist", True)
 
 
-def test_each_tuned_setting_is_a_sweep_and_sets_without_one_are_left_out(capsys):
+def test_tuned_settings_are_a_sweep_each_and_sets_without_one_are_left_out(capsys):
     arguments = ["setting=tuned", "renderer=newton,mesh_proxy_48", "set=pose,reconstruct,complete", "seed=0"]
-    settings, passed = parse_arguments(arguments)
-    sweeps = _sweeps(settings, passed)
-    titles = ["set 2 of 3: reconstruct, tuned/rgb_newton", "set 3 of 3: complete, tuned/newton_mask"]
-    assert [title for title, _ in sweeps] == titles
-    assert {"silhouette=cross_entropy_sharp", "+method=tuned/rgb_newton", "seed=0"} < {*sweeps[0][1]}
-    assert "silhouette=own" in sweeps[1][1] and not any(key.startswith("renderer=") for key in sweeps[1][1])
+    own, passed = parse_arguments(arguments)
+    found = _sweeps(own, passed)
+    assert [said for said, _ in found] == [
+        "set 2 of 3: reconstruct, tuned/rgb_newton",
+        "set 3 of 3: complete, tuned/newton_mask",
+    ]
+    assert {"silhouette=cross_entropy_sharp", "+method=tuned/rgb_newton", "seed=0"} < {*found[0][1]}
+    assert "silhouette=own" in found[1][1] and not any(key.startswith("renderer=") for key in found[1][1])
     assert capsys.readouterr().out == "set 1 of 3: pose: left out, since conf/tuned.yaml has no setting for it\n"
     sweeps = _sweeps(*parse_arguments(["set=pose,render"]))
-    assert [title for title, _ in sweeps] == ["set 1 of 2: pose", "set 2 of 2: render"]
+    assert [said for said, _ in sweeps] == ["set 1 of 2: pose", "set 2 of 2: render"]
     assert main(["setting=tuned", "renderer=mesh_proxy_48"]) == 2
     assert "no setting of mesh_proxy_48 for complete," in capsys.readouterr().err
 
@@ -544,9 +569,9 @@ from tests.user_renderer import Mine as Exact
 class Shifted(Exact):
     """Source: none. Differentiable in: field and rays. Needs: a distance. Deviates from the paper: its hits are off."""
     def render(self, field, rays):
-        exact = super().render(field, rays)
-        points = exact.points + 0.01 * rays.directions
-        return type(exact)(exact.distance + 0.01, exact.status, points, exact.residual, exact.closest)
+        found = super().render(field, rays)
+        points = found.points + 0.01 * rays.directions
+        return type(found)(found.distance + 0.01, found.status, points, found.residual, found.closest)
 
 class Slow(Exact):
     """Source: none. Differentiable in: field and rays. Needs: a distance. Deviates from the paper: it sleeps."""
@@ -561,21 +586,19 @@ def test_a_shifted_renderer_reaches_less_and_one_that_sleeps_takes_longer(tmp_pa
     (tmp_path / "odd.py").write_text(MINE)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path.cwd()}")
     results = tmp_path / "results"
-    arguments = ["set=complete", "task.points=dense", "index=0,1", "dataset=sofa,plane", f"results_dir={results}"]
-    classes = {"Exact": "tests.user_renderer.Mine", "Shifted": "odd.Shifted", "Slow": "odd.Slow"}
-    for label, target in classes.items():
-        assert main([*arguments, "renderer=custom", f"renderer._target_={target}", f"label={label}"]) == 0
+    asked = ["set=complete", "task.points=dense", "index=0,1", "dataset=sofa,plane", f"results_dir={results}"]
+    own = {"Exact": "tests.user_renderer.Mine", "Shifted": "odd.Shifted", "Slow": "odd.Slow"}
+    for label, target in own.items():
+        assert main([*asked, "renderer=custom", f"renderer._target_={target}", f"label={label}"]) == 0
     runs = judged(read_attempts(results)[0])
     ends = runs.groupby("row")[END].mean()
     assert ends["Shifted"] < ends["Exact"] == ends["Slow"]
-    spent = {
-        row: classes.sort_values("problem")[["cost", "seconds"]].to_numpy() for row, classes in runs.groupby("row")
-    }
+    spent = {row: own.sort_values("problem")[["cost", "seconds"]].to_numpy() for row, own in runs.groupby("row")}
     assert (spent["Slow"][:, 0] == spent["Exact"][:, 0]).all()
     assert (spent["Slow"][:, 1] > 5 + spent["Exact"][:, 1] / 2).all()
 
 
-def test_the_shipped_page_matches_the_shipped_rows():
+def test_the_shipped_page_is_that_of_the_shipped_rows():
     runs = judged(read_attempts(SHIPPED)[0])
     runs = runs[runs["complete"]]
     shown = pd.read_csv(SHIPPED / "paper" / "suite.csv").set_index("row")
@@ -588,19 +611,19 @@ def test_the_shipped_page_matches_the_shipped_rows():
         assert shown[f"{outcome}_rank"].astype(str).to_dict() == ranks
 
 
-def test_the_shipped_costs_match_the_shipped_rows():
-    shipped = Standing(gather(SHIPPED, SHIPPED))
-    expected = costs(shipped.whole, timed(shipped.whole, shipped.everything))
+def test_the_shipped_costs_are_those_of_the_shipped_rows():
+    made_of = Standing(gather(SHIPPED, SHIPPED))
+    known = costs(made_of.complete, timed(made_of.complete, made_of.everything))
     shown = pd.read_csv(SHIPPED / "paper" / "suite_sets.csv").set_index(["set", "row"])
     for name in ("evaluations", "seconds"):
-        values = expected[name].dropna().map(lambda ratio: ratio.value)
+        values = known[name].dropna().map(lambda ratio: ratio.value)
         assert len(values) and shown[name].reindex(values.index).to_numpy() == pytest.approx(values.to_numpy(float))
 
 
-def test_the_shipped_rows_have_the_present_settings():
-    """Otherwise no new run could be compared with them: a new key of a task or a prior changes every hash."""
-    last = {(result.set, result.tuned): result for result in read_attempts(SHIPPED)[0]}
-    for (of_set, tuned), result in last.items():
-        config = OmegaConf.to_container(composed(*result.overrides), resolve=True, throw_on_missing=False)
-        assert result.settings == attempts.settings_of(config, of_set, tuned), of_set
-    assert len(last) > 5
+def test_the_shipped_rows_are_of_todays_settings():
+    """Else a fresh run would stand beside none of them: a new key of a task or a prior changes every hash."""
+    each = {(one.set, one.tuned): one for one in read_attempts(SHIPPED)[0]}
+    for (of_set, tuned), one in each.items():
+        config = OmegaConf.to_container(composed(*one.overrides), resolve=True, throw_on_missing=False)
+        assert one.settings == attempts.settings_hash(config, of_set, tuned), of_set
+    assert len(each) > 5
