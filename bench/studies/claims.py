@@ -150,7 +150,7 @@ CLAIMS = (
     Claim("DVR, Eqs. 8 and 11", "the gradient of the depth is exact", test="test_the_implicit_gradient_is_exact"),
     Claim(
         "DVR, Sec. 1", "memory of the backward pass does not depend on n (samples per ray)",
-        test="test_what_a_step_keeps_does_not_grow_with_n",
+        test="test_dvr_memory_does_not_grow_with_samples",
     ),
     Claim(
         "DVR, Table 1", "cars: RGB supervision is about as good as ONet's 3D supervision", 0.196 / 0.181, "dvr_table1",

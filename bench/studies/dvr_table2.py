@@ -93,12 +93,19 @@ def make(runs: Runs) -> Result:
             scenes,
             show=table.thousandfold,
         ),
-        remarks=(shared_settings(optimised, NOTED_SETTINGS), *NOTES),
+        remarks=(shared_settings(optimised, NOTED_SETTINGS), _partial_rows(lines), *NOTES),
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
         figure=medians.draw_runs(runs, panels, [Row(line["preset"], line["method"]) for line in lines]),
     )
+
+
+def _partial_rows(lines: list[dict[str, Any]]) -> str:
+    """A note on rows without all scenes; empty without such rows."""
+    count = max((line["runs"] for line in lines), default=0)
+    partial = [f"{line['method']} ({line['runs']} of {count})" for line in lines if line["runs"] < count]
+    return f"Do not compare the medians of rows without all scenes: {'; '.join(partial)}." if partial else ""
 
 
 def _error(line: dict[str, Any]) -> float:

@@ -64,7 +64,7 @@ def test_observed_points_lie_on_the_object_and_in_the_unit_sphere(sofa_files, su
     view, observed = scene.observed_view()
     points = view.camera.rays().at(view.camera.distance(view.depth))[observed].double().numpy()
     assert OBJECT_RADIUS < np.linalg.norm(points, axis=1).max() < 1 and observed.sum() > pixels
-    assert scene.part and max(observed.shape) <= pixels and torch.equal(observed, view.mask)
+    assert scene.is_partial and max(observed.shape) <= pixels and torch.equal(observed, view.mask)
     world = points @ scene.to_world[:3, :3].T + scene.to_world[:3, 3]
     if unknown:
         motion = camera.camera_to_world.double().numpy()

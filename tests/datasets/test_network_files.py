@@ -1,4 +1,4 @@
-"""Network files as data sets: measured facts and refused files. The tests write the files."""
+"""A network's file as a dataset: what is measured of it, and what is refused; the files are made here."""
 
 import os
 import pickle
@@ -47,24 +47,24 @@ def checkpoint(folder: Path, state: Any, name: str = "shape.pth") -> NetworkFile
 
 
 def field_of(file: NetworkFile, index: int = 0) -> Field:
-    network = file.network(index)
-    return network.decoder.at(network.codes[index])
+    known = file.network(index)
+    return known.decoder.at(known.codes[index])
 
 
-def assert_near(actual: Tensor, expected: Tensor, tolerance: float = 1e-6) -> None:
-    torch.testing.assert_close(actual, expected, rtol=0, atol=tolerance)
+def near(found: Tensor, expected: Tensor, most: float = 1e-6) -> None:
+    torch.testing.assert_close(found, expected, rtol=0, atol=most)
 
 
-def test_a_distance_is_recognised_and_keeps_its_values(tmp_path):
+def test_a_distance_is_found_to_be_one_and_its_values_stay(tmp_path):
     file = npz(tmp_path, arrays())
-    network, field = file.network(0), field_of(file)
+    known, field = file.network(0), field_of(file)
     assert (field.kind, field.lipschitz) == (Kind.DISTANCE, None)
-    assert_near(field(POINTS), octahedron(POINTS))
-    facts = network.facts
-    assert facts.leaves == 0 and 0.99 < facts.flattest <= facts.steepest < 1.01
-    assert facts.inside == pytest.approx(2 * 3**0.5 * RADIUS**3 * 2 / (4 / 3 * np.pi), abs=0.02)
+    near(field(POINTS), octahedron(POINTS))
+    facts = known.facts
+    assert facts.sphere_fraction_inside == 0 and 0.99 < facts.min_slope <= facts.max_slope < 1.01
+    assert facts.fraction_inside == pytest.approx(2 * 3**0.5 * RADIUS**3 * 2 / (4 / 3 * np.pi), abs=0.02)
     assert list(facts.extent) == pytest.approx([2 * 3**0.5 * RADIUS] * 3, abs=0.3)
-    (note,) = network.notes
+    (note,) = known.notes
     for word in ("shape: values are negative inside", "level 0", "slopes from 1 to 1", "taken as a distance"):
         assert word in note
 
@@ -79,11 +79,11 @@ def test_sign_level_and_slope_are_measured(tmp_path, factor, level, inside, kind
     file = replace(npz(tmp_path, arrays(factor, level)), level=level)
     field = field_of(file)
     assert field.kind is kind and f"values are {inside} inside" in file.network(0).notes[0]
-    assert_near(field(POINTS) * divided, abs(factor) * octahedron(POINTS), 1e-4)
+    near(field(POINTS) * divided, abs(factor) * octahedron(POINTS), 1e-4)
 
 
-def test_values_between_0_and_1_are_probabilities_only_with_a_level(tmp_path):
-    file = npz(tmp_path, arrays(0.2, 0.3))  # from 0.2 to slightly more than 0.3
+def test_values_between_0_and_1_are_probabilities_only_where_that_is_said(tmp_path):
+    file = npz(tmp_path, arrays(0.2, 0.3))  # from 0.2 to 0.3 and a little
     with pytest.raises(BadInput, match=r"level 0 is not among them: set dataset.level \(0.5 where they are prob"):
         file.network(0)
     file = replace(file, level=0.3)
@@ -91,11 +91,11 @@ def test_values_between_0_and_1_are_probabilities_only_with_a_level(tmp_path):
     assert "at the level 0.3" in file.network(0).notes[0]
 
 
-def test_a_network_with_a_code_needs_the_code_and_states_its_level(tmp_path):
+def test_a_network_of_a_code_is_not_read_without_one_and_its_level_is_told(tmp_path):
     torch.manual_seed(0)
     path = tmp_path / "code.npy"
     state, logits = occupancy("shift")
-    for name, moved in (("weight", 0.0), ("bias", logits.median())):  # so that the median logit is 0
+    for name, moved in (("weight", 0.0), ("bias", logits.median())):  # so that logits are about 0
         state[f"decoder.fc_out.{name}"] = 4 * (state[f"decoder.fc_out.{name}"] - moved)
     file = checkpoint(tmp_path, state)
     with pytest.raises(BadInput, match=r"a code of 2 numbers, which it does not hold: set dataset.codes=FILE"):
@@ -107,45 +107,43 @@ def test_a_network_with_a_code_needs_the_code_and_states_its_level(tmp_path):
         assert "dataset.level=-1.386" in note
 
 
-def test_settings_override_the_measured_facts(tmp_path):
+def test_what_is_said_of_a_network_goes_before_what_is_measured(tmp_path):
     field = field_of(replace(npz(tmp_path, arrays(20.0)), kind="level", inside="positive", scale=0.5))
     assert field.kind is Kind.LEVEL
-    assert_near(field(0.5 * POINTS), -10 * octahedron(POINTS), 1e-4)
+    near(field(0.5 * POINTS), -10 * octahedron(POINTS), 1e-4)
 
 
-def test_the_mesh_is_the_surface_and_is_closed_at_the_unit_sphere(tmp_path):
+def test_the_surface_is_the_true_mesh_closed_where_it_leaves_the_sphere(tmp_path):
     file = replace(npz(tmp_path, arrays()), resolution=48)
     mesh = file.mesh(Split.TEST, 0)
     assert mesh.watertight and octahedron(torch.from_numpy(mesh.vertices.copy())).abs().max() < 0.02
     large = replace(file, scale=1.4)
-    mesh, network = large.mesh(Split.TRAIN, 0), large.network(0)
+    mesh, known = large.mesh(Split.TRAIN, 0), large.network(0)
     assert mesh.watertight and np.linalg.norm(mesh.vertices, axis=1).max() < 1.01
-    assert (
-        0 < network.facts.sphere_fraction_inside < 0.5 and "of the unit sphere's surface is inside" in network.notes[0]
-    )
+    assert 0 < known.facts.sphere_fraction_inside < 0.5 and "of the unit sphere's surface is inside" in known.notes[0]
 
 
-@each("codes, dtype, tolerance", [
+@each("codes, dtype, most", [
     (torch.tensor([[0.1], [-0.2]]), torch.float32, 1e-6),
     ({"weight": torch.tensor([[0.1], [-0.2]])}, torch.float32, 1e-6),
     (torch.tensor([[[0.1]], [[-0.2]]]), torch.float16, 1e-3),
 ])  # fmt: skip
-def test_a_deepsdf_folder_has_a_shape_for_each_code(tmp_path_factory, codes, dtype, tolerance):
+def test_a_deepsdf_folder_has_a_shape_for_each_code(tmp_path_factory, codes, dtype, most):
     file = deepsdf_folder(tmp_path_factory.mktemp("folder"), codes, dtype)
     for index, code in enumerate((0.1, -0.2)):
-        assert_near(field_of(file, index)(POINTS), octahedron(POINTS) + code, tolerance)
+        near(field_of(file, index)(POINTS), octahedron(POINTS) + code, most)
     with pytest.raises(BadInput, match="it has 2 codes, and index=2 is none of them: set index=0 to 1"):
         file.network(2)
 
 
 def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
-    codes = torch.tensor([[0.1], [-0.2], [-0.45]])  # the last shape fills most of the unit sphere
-    assert_near(field_of(deepsdf_folder(tmp_path, codes), 2)(POINTS), octahedron(POINTS) - 0.45)
+    codes = torch.tensor([[0.1], [-0.2], [-0.45]])  # the last reaches through most of the unit sphere
+    near(field_of(deepsdf_folder(tmp_path, codes), 2)(POINTS), octahedron(POINTS) - 0.45)
     bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
     assert bound.divisor == pytest.approx(3 * measure_field(octahedron, POINTS, kind=Kind.BOUND).divisor)
 
 
-def test_a_scaled_bound_has_slopes_of_at_most_1_at_each_code():
+def test_a_bound_that_is_scaled_has_no_slope_above_1_at_the_steepest_code():
     steep = lambda points: 3 * octahedron(points)  # noqa: E731
     bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
     slopes = autograd_gradients(lambda points: bound.factor * steep(points), POINTS).norm(dim=-1)
@@ -158,18 +156,19 @@ def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):
     with pytest.raises(BadInput, match=r"it has one code: set index=0$"):
         file.network(3)
     npz(tmp_path, arrays(3.0))
-    assert file.network(0).facts.max_slope == pytest.approx(3 * before[0]) and file.identity() != before[1]
+    assert file.network(0).facts.max_slope == pytest.approx(3 * before[0])
+    assert file.identity() != before[1]
 
 
 class Command:
-    """An object whose pickle would run a command."""
+    """A pickle of it would run a command."""
 
     def __reduce__(self) -> Any:
         return os.mkdir, ("was_run",)
 
 
 def scripted(folder: Path) -> NetworkFile:
-    with warnings.catch_warnings(action="ignore"):  # newer versions of torch deprecate it
+    with warnings.catch_warnings(action="ignore"):  # newer versions say that it is old
         torch.jit.script(torch.nn.Linear(3, 1)).save(folder / "shape.pt")
     return load("dataset", "network", path=str(folder / "shape.pt"))
 
@@ -208,13 +207,14 @@ def lacking(folder: Path, name: str) -> NetworkFile:
     (lambda d: npz(d, arrays(level=9.0)), ("between 8.5", "and the surface at the level 0", "dataset.level")),
     (lambda d: npz(d, arrays() | {"0002.dense.b": np.array([np.nan])}), ("not finite at 16384 of 16384",)),
 ])  # fmt: skip
-def test_an_invalid_file_is_refused_with_the_cause(tmp_path_factory, monkeypatch, make, words):
+def test_a_file_that_will_not_do_is_refused_with_the_cause(tmp_path_factory, monkeypatch, make, words):
     folder = tmp_path_factory.mktemp("wrong")
     monkeypatch.chdir(folder)
     file = make(folder)
     with pytest.raises(BadInput) as error:
         file.network(0)
-    assert all(word in str(error.value) for word in (file.path, *words)), error.value
+    for word in (file.path, *words):
+        assert word in str(error.value)
     assert not (folder / "was_run").exists()
 
 
@@ -234,7 +234,7 @@ def test_settings_are_checked(tmp_path_factory, settings, words):
     "dist", "dvr", "idr", "mesh_proxy", "naive", "neus", "newton", "range_analysis", "relaxed_boundary", "unisurf",
     "volsdf",
 ))  # fmt: skip
-def test_each_renderer_takes_a_module_of_the_user(name):
+def test_every_renderer_takes_a_plain_module_of_the_users(name):
     class Ball(torch.nn.Module):
         def forward(self, points: Tensor) -> Tensor:
             return points.norm(dim=-1, keepdim=True) - RADIUS
@@ -247,17 +247,17 @@ def test_each_renderer_takes_a_module_of_the_user(name):
     assert (hit == (closest < RADIUS)).float().mean() > 0.97
 
 
-def test_a_module_without_a_shape_is_refused_and_half_floats_are_converted():
+def test_a_module_whose_values_are_no_shape_is_refused_and_half_floats_are_rendered():
     for wrong in (lambda points: 0.5 - points.norm(dim=-1), lambda points: octahedron(points).sigmoid()):
         with pytest.raises(BadInput, match="negate them, subtract the level of the surface"):
             from_module(wrong)
-    plane = torch.nn.Linear(3, 1, bias=False).half()  # through the origin for any weights
+    plane = torch.nn.Linear(3, 1, bias=False).half()  # through the origin, whatever is drawn
     assert from_module(plane)(POINTS).dtype == POINTS.dtype == torch.float32
 
 
 def test_a_module_that_is_no_distance_becomes_a_bound_by_its_slope():
     module = torch.nn.Linear(3, 1)
-    torch.nn.init.constant_(module.weight, 2.0)  # the slope is 2 sqrt(3), too large for a distance
+    torch.nn.init.constant_(module.weight, 2.0)  # a slope of 2 sqrt(3), which no distance has
     field = from_module(module)
     steepest = 1.2 * module.weight.norm()
     assert (field.kind, field.lipschitz) == (Kind.BOUND, 1.0)
@@ -265,41 +265,41 @@ def test_a_module_that_is_no_distance_becomes_a_bound_by_its_slope():
     assert from_module(module, kind=Kind.LEVEL).kind is Kind.LEVEL
 
 
-@each("arguments, composed", [
+@each("given, composed", [
     (["field=file", "field_path=a.npz", "index=3"], ["dataset=network", "dataset.path=a.npz", "index=3"]),
     (["-m", "field=sphere", "dataset=sofa"], ["-m", "field=sphere", "dataset=sofa"]),
 ])  # fmt: skip
-def test_a_file_as_the_field_is_a_dataset(arguments, composed):
-    assert expand_field_file(arguments) == composed
+def test_a_file_as_the_field_is_a_dataset(given, composed):
+    assert expand_field_file(given) == composed
 
 
-@each("arguments, words", [
+@each("given, words", [
     (["field=file"], "field=file field_path=PATH"),
     (["field_path=a.npz"], "field=file field_path=PATH"),
     (["field=file", "field_path=a.npz", "dataset=sofa"], "remove dataset"),
 ])  # fmt: skip
-def test_a_field_file_without_its_path_is_refused(arguments, words):
+def test_half_of_the_two_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
-        expand_field_file(arguments)
+        expand_field_file(given)
 
 
 def composed_inputs(*overrides: str) -> RunInputs:
     return cell_from(composed(*overrides, "scale=smoke")).inputs
 
 
-def test_a_network_file_gives_the_field_of_the_scene_and_the_codes_of_the_prior(tmp_path):
+def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):
     file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
     inputs = composed_inputs("task=ablation", "dataset=network", f"dataset.path={file.path}", "index=1")
     fitted = inputs.fitted()
     assert len(inputs.prior.codes) == 2 and inputs.notes[-1] == file.network(1).notes[0]
-    assert_near(fitted.decoder.at(fitted.codes[0])(POINTS), octahedron(POINTS) - 0.2)
+    near(fitted.decoder.at(fitted.codes[0])(POINTS), octahedron(POINTS) - 0.2)
 
 
-def test_a_network_file_may_be_the_prior_of_another_dataset(tmp_path):
+def test_its_codes_are_the_prior_of_another_dataset(tmp_path):
     file = deepsdf_folder(tmp_path, torch.tensor([[0.1], [-0.2]]))
     inputs = composed_inputs("dataset=sphere", "prior=deepsdf", f"prior.path={file.path}", "split=train")
     assert inputs.prior.codes.tolist() == file.network(0).codes.tolist() and inputs.prior_choice.scene_code is None
-    assert_near(inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS), octahedron(POINTS) + 0.3)
+    near(inputs.prior.decoder.at(torch.tensor([0.3]))(POINTS), octahedron(POINTS) + 0.3)
 
 
 @each("wrong, words", [
@@ -307,43 +307,44 @@ def test_a_network_file_may_be_the_prior_of_another_dataset(tmp_path):
     ("prior.scale=-1", "prior.scale must be positive"),
     ("prior.level=9", r"the network {path}: .*: set prior.level \(.*, or prior.scale$"),
 ])  # fmt: skip
-def test_errors_of_a_prior_name_its_keys(tmp_path_factory, wrong, words):
+def test_keys_of_a_prior_are_named_as_its_own(tmp_path_factory, wrong, words):
     path = deepsdf_folder(tmp_path_factory.mktemp("dataset.path"), torch.zeros(1, 1)).path
     with pytest.raises(ValueError, match=words.format(path=path)):
         composed_inputs("dataset=sphere", "prior=deepsdf", f"prior.path='{path}'", wrong.format(path=path))
 
 
-def test_a_network_of_a_user_class_is_read_from_its_state(tmp_path, monkeypatch):
+def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkeypatch):
     (tmp_path / "mynet.py").write_text(NET)
     monkeypatch.syspath_prepend(tmp_path)
     state = {"weight": torch.tensor([[0.6, 0.0, 0.8]]), "bias": torch.tensor([0.25])}
     torch.save({"model": {f"net.inner.{key}": value for key, value in state.items()}, "step": 3}, tmp_path / "a.pth")
-    overrides = ["field=file", f"field_path={tmp_path}/a.pth", "field._target_=mynet.Net", "field.scale=2"]
-    overrides = [*expand_field_file(overrides), "task=ablation"]
-    inputs = composed_inputs(*overrides, "packages=[mynet]")
-    assert_near(inputs.prior.decoder.at(inputs.prior.codes[0])(POINTS), POINTS @ state["weight"][0] + 0.25)
-    several = {f"{network}.inner.{key}": value for network in "ab" for key, value in state.items()}
+    given = expand_field_file(
+        ["field=file", f"field_path={tmp_path}/a.pth", "field._target_=mynet.Net", "field.scale=2"]
+    )
+    inputs = composed_inputs(*given, "task=ablation", "packages=[mynet]")
+    near(inputs.prior.decoder.at(inputs.prior.codes[0])(POINTS), POINTS @ state["weight"][0] + 0.25)
+    several = {f"{of}.inner.{key}": value for of in "ab" for key, value in state.items()}
     for wrong, words in (
         (several, r"it has several networks, a\., b\.: save the state_dict"),
         ({"net.inner.bias": state["bias"]}, r"not those of Net: .* Missing key.*inner\.weight"),
     ):
         torch.save(wrong, tmp_path / "a.pth")
         with pytest.raises(BadInput, match=words):
-            composed_inputs(*overrides, "packages=[mynet]")
+            composed_inputs(*given, "task=ablation", "packages=[mynet]")
     with pytest.raises(ValueError, match=r"type packages=\[mynet\] if you trust it"):
-        composed_inputs(*overrides)
+        composed_inputs(*given, "task=ablation")
 
 
-def test_a_stress_without_effect_on_a_network_is_refused(tmp_path):
-    overrides = ("task=stability", "dataset=network", f"dataset.path={npz(tmp_path, arrays()).path}")
+def test_a_stress_that_a_network_has_no_part_in_is_refused(tmp_path):
+    given = ("task=stability", "dataset=network", f"dataset.path={npz(tmp_path, arrays()).path}")
     with pytest.raises(BadInput, match="the stress gap renders no network: remove field=file, or set stress="):
-        composed_inputs(*overrides, "stress=gap")
+        composed_inputs(*given, "stress=gap")
     with pytest.raises(BadInput, match="no code that the stress far_code could change: set stress=noisy_weights"):
-        composed_inputs(*overrides, "stress=far_code")
-    composed_inputs(*overrides, "stress=noisy_weights")
+        composed_inputs(*given, "stress=far_code")
+    composed_inputs(*given, "stress=noisy_weights")
 
 
-def test_the_program_of_the_page_trains_a_network_that_is_read(tmp_path, monkeypatch):
+def test_a_network_of_ones_own_is_trained_and_read_as_the_page_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (code,) = code_of("datasets/README.md", "python")
     exec(compile(code, "datasets/README.md", "exec"), {})

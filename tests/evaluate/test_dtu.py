@@ -1,4 +1,4 @@
-"""The protocol of DTU: closed forms, an independent brute force, culling by masks, and errors of missing files."""
+"""DTU's protocol: closed forms, an independent brute force, culling by masks, and what is said of missing files."""
 
 import math
 
@@ -33,27 +33,25 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_concentric_spheres_have_the_difference_of_their_radii_as_error(folder):
+def test_concentric_spheres_are_apart_by_the_difference_of_their_radii(folder):
     accuracy, completeness, overall = dtu_metrics(ball(21.5), read_scan(folder, NUMBER), seed=0).values()
-    # Points are about 0.3 mm apart, so the closest point is slightly farther away than the closest position.
+    # Points of either are about .3 mm apart, so the nearest one is a little farther than the nearest place.
     assert accuracy == pytest.approx(1.5, abs=0.03) and completeness == pytest.approx(1.5, abs=0.03)
     assert overall == (accuracy + completeness) / 2
 
 
 def brute_force(mesh: Mesh, folder, seed: int) -> list[float]:
-    """The protocol again, face by face and point by point, from its description."""
+    """The protocol once more, face by face and point by point, from its description."""
     points = [*mesh.vertices]
     for a, b, c in mesh.vertices[mesh.faces]:
         u, v = b - a, c - a
         sine = np.linalg.norm(np.cross(u, v)) / np.linalg.norm(u) / np.linalg.norm(v)
         n, m = (int(np.linalg.norm(side) * math.sqrt(sine) / 0.2) for side in (u, v))
-        offsets = [((i + 0.5) / n, (j + 0.5) / m) for i in range(n) for j in range(m)]
-        points += [a + s * u + t * v for s, t in offsets if s + t < 1]
+        places = [((i + 0.5) / n, (j + 0.5) / m) for i in range(n) for j in range(m)]
+        points += [a + s * u + t * v for s, t in places if s + t < 1]
     grid, plane = (loadmat(folder / "ObsMask" / name) for name in (f"ObsMask{NUMBER}_10.mat", f"Plane{NUMBER}.mat"))
     low, high = grid["BB"]
-    points = np.array(
-        [p for p in points if (p >= low - 60.2).all() and (p <= high + 120.2).all()]
-    )  # for the order only
+    points = np.array([p for p in points if (p >= low - 60.2).all() and (p <= high + 120.2).all()])  # order, not result
     np.random.default_rng(seed).shuffle(points, axis=0)
     left, kept = points, []
     while len(left):
@@ -67,28 +65,27 @@ def brute_force(mesh: Mesh, folder, seed: int) -> list[float]:
             judged.append(point)
     stored = read_scan(folder, NUMBER).points
     above = [p for p in stored if (plane["P"][:3, 0] @ p) + plane["P"][3, 0] > 0]
-    errors = [cdist(np.array(first), second).min(axis=1) for first, second in ((judged, stored), (above, near))]
-    means = [distances[distances < 20].mean() for distances in errors]
+    found = [cdist(np.array(first), second).min(axis=1) for first, second in ((judged, stored), (above, near))]
+    means = [one[one < 20].mean() for one in found]
     return [*means, sum(means) / 2]
 
 
-def test_metrics_of_a_scan_equal_those_of_a_brute_force(tmp_path):
-    # The mesh is a plate through the scan. It extends beyond the observed cells, the box, and 20 mm from all points.
-    # One point of the scan lies below the plane, and another is far from the mesh.
-    corners = [[-8.0, -3, 0], [6, -4, 1], [5, 5, -1], [-7, 4, 0], [30, 30, 4], [30, 31, 4], [31, 30, 4]]
-    plate = np.array(corners) + CENTRE
+def test_a_scan_with_all_of_it_equals_a_brute_force(tmp_path):
+    # A plate through the scan: parts beyond what was observed, beyond the box, and farther than 20 mm from all points;
+    # a point of the scan below the plane, and one that is far from the mesh.
+    plate = (
+        np.array([[-8.0, -3, 0], [6, -4, 1], [5, 5, -1], [-7, 4, 0], [30, 30, 4], [30, 31, 4], [31, 30, 4]]) + CENTRE
+    )
     far = np.array([[-91.0, 0, 0], [-92, 1, 0], [-90.5, 0, 1]]) + CENTRE
     mesh = Mesh(np.concatenate([plate, far]), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [7, 8, 9]]))
     cloud = np.concatenate([on_ball(400, 9.0), np.array([[0.0, 0, -15], [0, 0, 60]]) + CENTRE])
     write_dtu(tmp_path, cloud, reach=7.0, plane=(0.0, 0.1, 1.0, -590.0))
-    metrics = dtu_metrics(mesh, read_scan(tmp_path, NUMBER), seed=3)
-    assert [*metrics.values()] == pytest.approx(brute_force(mesh, tmp_path, 3), abs=1e-9) and tuple(
-        metrics
-    ) == METRIC_NAMES
+    found = dtu_metrics(mesh, read_scan(tmp_path, NUMBER), seed=3)
+    assert [*found.values()] == pytest.approx(brute_force(mesh, tmp_path, 3), abs=1e-9) and tuple(found) == METRIC_NAMES
 
 
 def test_thinning_keeps_the_first_of_points_that_are_near():
-    points = np.random.default_rng(1).uniform(size=(9000, 3)) * [3, 3, 0.05]  # more than one chunk of the thinning
+    points = np.random.default_rng(1).uniform(size=(9000, 3)) * [3, 3, 0.05]  # more than are thinned at once
     kept = []
     for point in points:
         if not kept or np.linalg.norm(np.array(kept) - point, axis=1).min() > 0.11:
@@ -99,24 +96,24 @@ def test_thinning_keeps_the_first_of_points_that_are_near():
 def test_the_box_reaches_60_mm_before_the_grid_and_120_mm_beyond_it():
     grid = np.array([[0.0, 0, 0], [10, 10, 10]])
     for axis in range(3):
-        for coordinate, counts in ((-61.0, False), (-59.0, True), (129.0, True), (131.0, False)):
-            centre = np.full(3, 5.0)
-            centre[axis] = coordinate
-            scan = DtuScan(centre[None], np.array([0.0, 0, 0, 1]), np.ones((6, 6, 6), dtype=bool), grid, 2.0)
-            speck = Mesh(centre + 0.01 * np.eye(3), np.array([[0, 1, 2]]))
+        for at, counts in ((-61.0, False), (-59.0, True), (129.0, True), (131.0, False)):
+            place = np.full(3, 5.0)
+            place[axis] = at
+            scan = DtuScan(place[None], np.array([0.0, 0, 0, 1]), np.ones((6, 6, 6), dtype=bool), grid, 2.0)
+            speck = Mesh(place + 0.01 * np.eye(3), np.array([[0, 1, 2]]))
             completeness = dtu_metrics(speck, scan, seed=0)["dtu_completeness"]
             assert completeness == (pytest.approx(0.01) if counts else math.inf)
 
 
-def test_no_mesh_or_a_mesh_far_from_the_scan_has_infinite_errors(folder):
+def test_without_a_mesh_or_far_from_the_scan_it_is_infinitely_wrong(folder):
     scan = read_scan(folder, NUMBER)
     assert dtu_metrics(None, scan, seed=0) == WORST == dtu_metrics(ball(centre=-CENTRE), scan, seed=0)
     with pytest.raises(BadInput, match=r"too much for points 0\.2 mm apart: is it in mm"):
         dtu_metrics(ball(2e4, np.array([0, 0, 2e4]) + CENTRE, subdivisions=1), scan, seed=0)
 
 
-def test_culling_removes_the_faces_outside_a_dilated_mask():
-    """The faces are a row of triangles across the image, and the mask is the left half of its 40 x 64 pixels."""
+def test_culling_takes_the_faces_that_a_mask_excludes_but_for_its_dilation():
+    """A row of triangles to the right of a camera's axis, whose mask is the left half of an image of 40 x 64 pixels."""
     square = camera_of(64, angles=(0.0, 0.0))
     pinhole = square.intrinsics - torch.tensor([[0, 0, 0], [0, 0, 12], [0, 0, 0]])
     camera = Camera(pinhole, square.world_to_camera, 40, 64)
@@ -132,19 +129,17 @@ def test_culling_removes_the_faces_outside_a_dilated_mask():
     pixels = camera.project(torch.from_numpy(kept.vertices).float())[0][:, 0].numpy()
     assert pixels[pixels <= 64].max() == pytest.approx(32 + 64 * MASK_DILATION_FRACTION, abs=1) and pixels.min() < 1
     shown = camera.shows(torch.from_numpy(mesh.vertices).float()).numpy().reshape(-1, 3)
-    assert not shown[-1].any() and (kept.vertices @ right).max() == pytest.approx(
-        1.21
-    )  # faces beyond the image are kept
+    assert not shown[-1].any() and (kept.vertices @ right).max() == pytest.approx(1.21)  # beyond the image: kept
     assert culled(mesh, [Shot("none", camera, colours, torch.zeros_like(half))]) is not None
     across = Mesh(np.stack([-0.5 * right, 0.5 * right, 0.1 * up - 0.5 * right]), np.array([[0, 1, 2]]))
     assert culled(across, [Shot("half", camera, colours, half)]) is None  # one corner is outside
-    shown_faces = Mesh(mesh.vertices, mesh.faces[shown.all(axis=1)])
-    assert culled(shown_faces, [Shot("none", camera, colours, torch.zeros_like(half))]) is None
+    seen = Mesh(mesh.vertices, mesh.faces[shown.all(axis=1)])
+    assert culled(seen, [Shot("none", camera, colours, torch.zeros_like(half))]) is None
     with pytest.raises(BadInput, match="culling needs a mask of each photograph, and bare has none"):
         culled(mesh, [Shot("bare", camera, colours, None)])
 
 
-def test_files_may_lie_as_in_the_archives_and_broken_files_are_named(folder):
+def test_files_may_lie_as_the_archives_have_them_and_broken_ones_are_named(folder):
     (folder / "SampleSet").mkdir()
     (folder / "ObsMask").rename(folder / "SampleSet" / "ObsMask")
     with pytest.raises(BadInput, match=r"has no ObsMask/ObsMask65_10.mat: give the folder .* \(SampleSet.zip has it\)"):
@@ -169,5 +164,5 @@ def test_files_may_lie_as_in_the_archives_and_broken_files_are_named(folder):
         read_scan(folder, NUMBER)
 
 
-def test_published_numbers_are_those_of_scans_in_the_paper_of_dvr():
+def test_published_numbers_are_of_the_scans_that_dvr_has():
     assert published_results(24) == [] and "DVR (RGB): 0.907" in published_results(65)[0]

@@ -1,4 +1,4 @@
-"""The evaluation of fields against a scene with ground truth."""
+"""What a field is worth against a scene whose truth is known."""
 
 from dataclasses import dataclass, replace
 
@@ -41,35 +41,38 @@ RADIUS = 0.6
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> RunInputs:
-    """The inputs of a run whose ground truth is a sphere, evaluated with 3,000 samples."""
+    """A sphere as the truth, judged with 3,000 samples."""
     camera = camera_of(24, angles=(30.0, 20.0))
     scene = scene_of(icosphere(RADIUS), camera)
     renderer = load("renderer", "naive", steps=40, epsilon=1e-4)
-    base = run_of(tmp_path_factory.mktemp("run"), renderer, ball_prior(), camera, make_scene=lambda: scene).inputs
-    return replace(base, evaluation=replace(base.evaluation, grid=48, points=3000, fscore_threshold=0.05))
+    found = run_of(tmp_path_factory.mktemp("run"), renderer, ball_prior(), camera, make_scene=lambda: scene).inputs
+    return replace(found, evaluation=replace(found.evaluation, grid=48, points=3000, fscore_threshold=0.05))
 
 
-def test_the_ground_truth_scores_best(inputs):
+def test_the_truth_itself_scores_best(inputs):
     judgement = evaluate(State(sphere(RADIUS), inputs))
     metrics = judgement.metrics
     assert set(metrics) == set(DEFINITIONS)
-    floor = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the closest of 3,000 even samples
+    floor = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the nearest of so many even samples
     assert metrics["accuracy"] == pytest.approx(floor, rel=0.15)
-    assert metrics["completeness"] == pytest.approx(floor, rel=0.15) and metrics["fscore"] > 0.99
-    assert metrics["normal_consistency"] > 0.99 and metrics["depth_mae"] < 3e-3 and metrics["mask_iou"] > 0.98
+    assert metrics["completeness"] == pytest.approx(floor, rel=0.15)
+    assert metrics["fscore"] > 0.99
+    assert metrics["normal_consistency"] > 0.99
+    assert metrics["depth_mae"] < 3e-3
+    assert metrics["mask_iou"] > 0.98
     assert np.linalg.norm(judgement.mesh.vertices, axis=1) == pytest.approx(RADIUS, abs=2e-3)
 
 
-def test_the_ground_truth_mesh_has_the_distance_of_two_independent_samplings(inputs):
+def test_the_true_mesh_has_the_distance_of_two_independent_samplings(inputs):
     state = State(sphere(RADIUS), inputs)
-    vars(state)["mesh"] = inputs.scene.mesh  # replaces the extracted mesh
-    expected = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the closest of 3,000 even samples
+    vars(state)["mesh"] = inputs.scene.mesh  # in place of the extracted one
+    expected = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the nearest of so many even samples
     assert chamfer_only(state)["chamfer_l1"] == pytest.approx(expected, rel=0.15)
 
 
-def test_a_partial_ground_truth_has_only_completeness(inputs):
-    mesh = inputs.scene.mesh
-    half = replace(mesh, faces=mesh.faces[(mesh.vertices[mesh.faces][..., 2] > 0).all(axis=1)])
+def test_a_part_of_the_truth_only_judges_whether_it_is_in_the_prediction(inputs):
+    whole = inputs.scene.mesh
+    half = replace(whole, faces=whole.faces[(whole.vertices[whole.faces][..., 2] > 0).all(axis=1)])
     scene = replace(inputs.scene, mesh=half, is_partial=True)
     state = State(sphere(RADIUS), replace(inputs, make_scene=lambda: scene))
     metrics = evaluate(state).metrics
@@ -86,30 +89,30 @@ def test_samples_of_the_field_are_one_spacing_apart(inputs):
 
 @dataclass(frozen=True)
 class Painted(Shape):
-    """A shape whose red is x of the view direction and whose green is y of the point, both from -1 to 1."""
+    """A shape whose red is x of the view direction, and whose green is y of the place; both lie in -1 to 1."""
 
     def colours(self, points, normals, directions):
         return torch.stack([directions[:, 0], points[:, 1], torch.zeros(len(points))], dim=-1) / 2 + 0.5
 
 
-def test_colours_are_evaluated_along_each_ray_or_along_the_normal(monkeypatch):
-    monkeypatch.setattr(state_module, "CHUNK", 4)
+def test_colours_are_those_seen_along_each_ray_or_from_straight_above(monkeypatch):
+    monkeypatch.setattr(state_module, "POINTS_PER_BATCH", 4)
     points = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     field, device = Painted(sphere(1.0).function), torch.device("cpu")
     for directions in (points.roll(1, dims=0), None):
-        used = -points if directions is None else directions  # along the normal: inwards
-        expected = torch.stack([used[:, 0], points[:, 1], torch.zeros(10)], dim=-1) / 2 + 0.5
+        seen = -points if directions is None else directions  # from above: inwards
+        expected = torch.stack([seen[:, 0], points[:, 1], torch.zeros(10)], dim=-1) / 2 + 0.5
         torch.testing.assert_close(colours_at(field, points, directions, device), expected)
 
 
-def test_the_image_of_a_volume_has_the_colours_of_its_surface(inputs):
+def test_a_volume_shows_the_colours_of_its_surface_where_they_are(inputs):
     field, camera = Painted(sphere(RADIUS).function), inputs.scene.view.camera
     view, image = render_image(field, camera, replace(inputs, renderer=load("renderer", "neus")))
-    colour_errors = (image - coloured_image(field, view, torch.device("cpu")))[view.mask].abs()
-    assert view.mask.sum() > 50 and colour_errors.mean() < 0.05
+    apart = (image - coloured_image(field, view, torch.device("cpu")))[view.mask].abs()
+    assert view.mask.sum() > 50 and apart.mean() < 0.05
 
 
-def test_a_mesh_has_the_colours_of_its_vertices_or_is_grey(inputs):
+def test_a_painted_mesh_has_the_colours_of_its_vertices_and_is_grey_without(inputs):
     mesh, view = inputs.scene.mesh, inputs.scene.view
     image = render_vertex_colours(replace(mesh, colours=mesh.vertices / 2 + 0.5), Truth(mesh), view.camera)
     mask, points = view.mask.numpy(), view.camera.rays().at(view.camera.distance(view.depth)).numpy()
@@ -124,13 +127,13 @@ def test_the_colour_error_is_the_mean_absolute_difference_over_the_true_surface(
     assert error == pytest.approx((1 / 4 + RADIUS / 4) / 3, rel=0.05)  # |x| of a unit sphere has the mean 1/2
 
 
-def test_the_renderer_changes_only_the_metrics_of_its_own_image(inputs):
-    """A renderer with a large epsilon has a larger outline: only the metrics of its own image may change."""
+def test_no_renderer_judges_itself(inputs):
+    """One that sees a fattened outline, as a large epsilon does, changes its own metrics and no other."""
     fat = replace(inputs, renderer=load("renderer", "idr", epsilon=0.05))
-    thin, fat_metrics = evaluate(State(sphere(RADIUS), inputs)).metrics, evaluate(State(sphere(RADIUS), fat)).metrics
-    differing = {name for name in thin if fat_metrics[name] != thin[name]}
+    thin, found = evaluate(State(sphere(RADIUS), inputs)).metrics, evaluate(State(sphere(RADIUS), fat)).metrics
+    differing = {name for name in thin if found[name] != thin[name]}
     assert differing == {"own_mask_iou", "own_depth_mae"}
-    assert fat_metrics["own_mask_iou"] < 0.95 < thin["own_mask_iou"]
+    assert found["own_mask_iou"] < 0.95 < thin["own_mask_iou"]
 
 
 def test_a_field_is_not_evaluated_outside_the_unit_sphere(inputs):
@@ -149,7 +152,7 @@ def test_a_field_without_a_surface_scores_worst(inputs, value):
     assert judgement.metrics["fscore"] == judgement.metrics["mask_iou"] == 0.0
 
 
-def test_a_field_that_is_nan_in_a_corner_is_evaluated_with_a_note(inputs, tmp_path):
+def test_a_field_that_is_nan_in_a_corner_is_judged_and_noted(inputs, tmp_path):
     corner = Shape(lambda p: torch.where((p > 0.8).all(-1), torch.nan, sphere(RADIUS)(p)))
     judged = evaluate(State(corner, inputs))
     assert judged.metrics == pytest.approx(evaluate(State(sphere(RADIUS), inputs)).metrics)
@@ -158,16 +161,16 @@ def test_a_field_that_is_nan_in_a_corner_is_evaluated_with_a_note(inputs, tmp_pa
     assert run.record.notes[-1].startswith("warning: the field is NaN at ")
 
 
-def test_a_state_is_extracted_once_and_its_pictures_take_one_evaluation_per_hit(inputs):
+def test_a_state_is_extracted_once_and_its_pictures_ask_for_a_value_per_hit(inputs):
     meter = Meter(sphere(RADIUS))
     state = State(meter, inputs)
     evaluate(state)
-    before = meter.counts.value
-    view = state.pictured(inputs.scene.view.camera)
-    assert meter.counts.value - before == view.mask.sum() == inputs.scene.view.mask.sum()
+    asked = meter.counts.value
+    view = state.refined_view(inputs.scene.view.camera)
+    assert meter.counts.value - asked == view.mask.sum() == inputs.scene.view.mask.sum()
 
 
-def test_the_ground_truth_is_sampled_once_in_a_run(inputs, monkeypatch):
+def test_the_truth_is_sampled_once_in_a_run(inputs, monkeypatch):
     fresh, draws = replace(inputs), []
     monkeypatch.setattr("bench.setup.inputs.sample_surface", lambda *args: draws.append(args) or sample_surface(*args))
     scores = [chamfer_only(State(sphere(radius), fresh))["chamfer_l2"] for radius in (0.5, 0.55, RADIUS)]
@@ -176,40 +179,45 @@ def test_the_ground_truth_is_sampled_once_in_a_run(inputs, monkeypatch):
 
 
 @each("scale", [0.1, 1.0, 10.0])
-def test_pictures_show_the_surface_of_the_field_for_any_kind(inputs, scale):
+def test_pictures_are_of_the_fields_own_surface_also_where_it_is_no_distance(inputs, scale):
     squares = Shape(lambda p: scale * (p.square().sum(-1) - RADIUS**2), Kind.LEVEL)
     camera = inputs.scene.view.camera
     view, on_mesh = State(squares, inputs).refined_view(camera), State(squares, inputs).view_from(camera)
     points = camera.rays().at(camera.distance(view.depth))[view.mask]
-    off = [(camera.rays().at(camera.distance(v.depth))[v.mask].norm(dim=-1) - RADIUS).abs() for v in (view, on_mesh)]
-    assert off[0].median() < 1e-5 < 1e-4 < off[1].median() and off[0].max() < 0.01
+    off = [
+        (camera.rays().at(camera.distance(one.depth))[one.mask].norm(dim=-1) - RADIUS).abs() for one in (view, on_mesh)
+    ]
+    assert off[0].median() < 1e-5 < 1e-4 < off[1].median()
+    assert off[0].max() < 0.01
     normals = (view.normals[view.mask] * torch.nn.functional.normalize(points, dim=-1)).sum(-1)
-    assert normals.min() > 0.99 and view.normals[~view.mask].abs().sum() == 0
+    assert normals.min() > 0.99
+    assert view.normals[~view.mask].abs().sum() == 0
 
 
-def dipped(centre: tuple[float, float, float], width: float) -> Shape:
-    """The distance to a sphere, with a local dip: a small surface floats where the distance is large."""
+def dipped(place: tuple[float, float, float], width: float) -> Shape:
+    """The distance to a sphere, with a local dip: a small surface floats where the rest of the field says far."""
     rest = sphere(RADIUS)
 
     def value(points: torch.Tensor) -> torch.Tensor:
-        squares = (points - torch.tensor(centre)).square().sum(-1)
+        squares = (points - torch.tensor(place)).square().sum(-1)
         return rest(points) - 0.5 * torch.exp(-squares / (2 * width**2))
 
     return Shape(value, lipschitz=None)
 
 
-def test_a_component_that_the_renderer_misses_is_in_the_picture_and_in_the_notes(inputs):
+def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inputs):
     fine = replace(inputs, renderer=load("renderer", "newton"), evaluation=replace(inputs.evaluation, grid=96))
     camera = camera_of(128)
     scene = replace(inputs.scene, view=State(sphere(RADIUS), fine).view_from(camera))
     fine = replace(fine, make_scene=lambda: scene)
     state = State(dipped((0.8, 0.3, 0.1), 0.03), fine)
-    evaluation = evaluate(state)
+    found = evaluate(state)
     assert state.mesh.parts.max() == 1
-    floating = state.pictured(camera).mask & ~scene.view.mask
-    assert floating.sum() > 8 and not (render_view(state.field, camera, fine).mask & floating).any()
-    (note,) = evaluation.notes
-    rays = int((state.seen(camera).mask & ~scene.view.mask).sum())
+    floating = state.refined_view(camera).mask & ~scene.view.mask
+    assert floating.sum() > 8
+    assert not (render_view(state.field, camera, fine).mask & floating).any()
+    (note,) = found.notes
+    rays = int((state.view_from(camera).mask & ~scene.view.mask).sum())
     assert "misses 1 part of the mesh, at most 0.1" in note and f"{rays} of its rays" in note
     assert evaluate(State(sphere(RADIUS) | sphere(0.1, (0.8, 0.3, 0.1)), fine)).notes == ()
 
@@ -221,7 +229,7 @@ def test_a_component_that_the_renderer_misses_is_in_the_picture_and_in_the_notes
         (np.inf, 0.126, True),
         (0.31, 0.1, True),
         (0.29, 0.1, False),
-        (0.0094, 0.003, False),  # the error of a shipped renderer on a plane, below a pixel
+        (0.0094, 0.003, False),  # of a plane by a shipped renderer: less than a pixel decides it
         (0.5, 0.0, True),
         (np.inf, np.inf, False),
     ],
@@ -233,20 +241,20 @@ def test_a_renderers_own_image_that_shows_another_surface_is_noted(of_renderer, 
     assert depth_gap_note({"psnr": 20.0, "own_psnr": 3.0}) == depth_gap_note({}) == ()
 
 
-def test_a_component_before_another_is_missed_if_the_renderer_hits_the_other(inputs):
+def test_a_part_that_lies_just_before_another_is_missed_where_the_renderer_sees_the_other(inputs):
     camera = inputs.scene.view.camera
     towards = torch.nn.functional.normalize(camera.center, dim=0)
     state = State(sphere(RADIUS) | sphere(0.1, tuple((0.85 * towards).tolist())), inputs)
     assert missed_parts_note(state, [state.view_from(camera)]) == ()
     (note,) = missed_parts_note(state, [State(sphere(RADIUS), inputs).view_from(camera)])  # 0.15 to 0.35 behind
     assert "misses 1 part of the mesh" in note
-    view = state.seen(camera)
-    odd = view.mask & (torch.arange(view.mask.numel()).view_as(view.mask) % 2 == 1)
-    assert missed_parts_note(state, [replace(view, mask=odd)]) == ()  # some rays hit each component
+    seen = state.view_from(camera)
+    odd = seen.mask & (torch.arange(seen.mask.numel()).view_as(seen.mask) % 2 == 1)
+    assert missed_parts_note(state, [replace(seen, mask=odd)]) == ()  # of each part some rays hit
 
 
 @each("scale", [0.01, 1.0, 100.0])
-def test_a_hit_moves_to_the_surface_by_at_most_the_longest_step_and_not_if_grazing(scale):
+def test_a_hit_moves_to_the_surface_at_most_the_longest_step_but_where_it_grazes(scale):
     plane = Shape(lambda points: scale * points[..., 2], Kind.LEVEL)
     directions = torch.nn.functional.normalize(torch.tensor([[0, 0, -1.0], [1, 0, -1], [1, 0, -0.04]]), dim=-1)
     for off in (0.05, -0.05, 2.0, -2.0):  # before the surface or behind it
@@ -258,8 +266,10 @@ def test_a_hit_moves_to_the_surface_by_at_most_the_longest_step_and_not_if_grazi
 
 
 def test_a_rendered_view_is_that_of_the_mesh(inputs):
-    view, truth = render_view(sphere(RADIUS), inputs.scene.view.camera, inputs), inputs.scene.view
-    both = view.mask & truth.mask
-    assert both.sum() > 0.97 * truth.mask.sum() and (view.depth - truth.depth)[both].abs().max() < 0.02
-    assert (view.normals * truth.normals).sum(-1)[both].min() > 0.98
-    assert view.depth[~view.mask].abs().sum() == 0 and view.normals[~view.mask].abs().sum() == 0
+    seen, truth = render_view(sphere(RADIUS), inputs.scene.view.camera, inputs), inputs.scene.view
+    both = seen.mask & truth.mask
+    assert both.sum() > 0.97 * truth.mask.sum()
+    assert (seen.depth - truth.depth)[both].abs().max() < 0.02
+    assert (seen.normals * truth.normals).sum(-1)[both].min() > 0.98
+    assert seen.depth[~seen.mask].abs().sum() == 0
+    assert seen.normals[~seen.mask].abs().sum() == 0

@@ -69,7 +69,7 @@ def test_swapping_the_surfaces():
     assert forth["accuracy"] == back["completeness"] != forth["completeness"]
 
 
-def test_normal_consistency_ignores_length_and_sign_and_is_zero_for_zero_normals():
+def test_length_and_sign_of_normals_do_not_count_and_zero_scores_zero():
     truth = surface([[0, 0, 0]], [[0, 0, 1]])
     for normal, expected in (([0, 0, -7], 1), ([0, 3, 4], 0.8), ([0, 0, 0], 0)):
         measured = surface_metrics(surface([[0, 0, 0]], [normal]), truth, threshold=0.01)
@@ -114,26 +114,28 @@ def test_image_worked_example():
 
 
 def test_image_edges():
-    depth, empty, full = np.ones((2, 3)), np.zeros((2, 3), dtype=bool), np.ones((2, 3), dtype=bool)
+    depth, none, every = np.ones((2, 3)), np.zeros((2, 3), dtype=bool), np.ones((2, 3), dtype=bool)
 
     def measured(depth: np.ndarray, mask: np.ndarray, true_mask: np.ndarray) -> tuple[float, ...]:
         return tuple(view_metrics(view(depth, mask), view(np.ones((2, 3)), true_mask)).values())
 
-    assert measured(depth, full, full) == (0, 1) and measured(depth, empty, full) == (np.inf, 0)
-    assert measured(depth, empty, empty) == (np.inf, 1)
-    assert measured(depth * np.nan, full, full) == (np.inf, 1)
-    unknown = np.array([[1.0, 0, 0], [1, 1, 1]])  # 0 means no depth
-    assert view_metrics(view(depth, full), view(unknown, full)) == {"depth_mae": 0, "mask_iou": 1}
+    assert measured(depth, every, every) == (0, 1)
+    assert measured(depth, none, every) == (np.inf, 0)
+    assert measured(depth, none, none) == (np.inf, 1)
+    assert measured(depth * np.nan, every, every) == (np.inf, 1)
+    unknown = np.array([[1.0, 0, 0], [1, 1, 1]])  # 0 is no depth
+    assert view_metrics(view(depth, every), view(unknown, every)) == {"depth_mae": 0, "mask_iou": 1}
 
 
-def test_drawn_points_are_distinct():
+def test_drawn_points_are_different_ones():
     points = np.arange(300.0).reshape(100, 3)
-    subset = subsample(points, 60, seed=0)
-    assert len(np.unique(subset, axis=0)) == 60 and np.isin(subset, points).all()
+    some = subsample(points, 60, seed=0)
+    assert len(np.unique(some, axis=0)) == 60 and np.isin(some, points).all()
     assert np.array_equal(subsample(points, 100, seed=0), points)
 
 
 def test_every_metric_has_one_sentence():
     assert set(DEFINITIONS) == {*WORST_SURFACE, *IMAGE_DEFINITIONS, *RENDERER_DEFINITIONS}
     for sentence in DEFINITIONS.values():
-        assert re.fullmatch(r"[A-Z][^\n]*\.", sentence) and re.search(r"scene units|from 0 to 1", sentence)
+        assert re.fullmatch(r"[A-Z][^\n]*\.", sentence)
+        assert re.search(r"scene units|from 0 to 1", sentence)

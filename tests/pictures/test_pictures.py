@@ -1,4 +1,4 @@
-"""Pictures of runs: strip, film, the images of galleries, and legends that stay within their figure."""
+"""Pictures of runs: the strip and the film, what galleries are made of, legends that stay within their figure."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ CAMERA = camera_of(16)
 
 @pytest.fixture
 def drawn(monkeypatch) -> list[Figure]:
-    """The saved figures, which replace their files."""
+    """The figures that are saved, in place of their files."""
     figures: list[Figure] = []
     monkeypatch.setattr(FigureCanvasAgg, "print_png", lambda canvas, *_, **__: figures.append(canvas.figure))
     return figures
@@ -52,13 +52,14 @@ def test_an_animation_has_a_frame_per_checkpoint_and_a_longer_last_one(inputs, t
     filmstrip.save(tmp_path, "a ball")
     assert f"film.{suffix}" in PICTURE_TEXTS
     with Image.open(tmp_path / f"film.{suffix}") as moving:
-        assert moving.n_frames == 3 and moving.size == (48, 24)
+        assert moving.n_frames == 3
+        assert moving.size == (48, 24)
         moving.seek(0)
         first = np.asarray(moving.convert("RGB"), dtype=float)
         moving.seek(2)
         last = np.asarray(moving.convert("RGB"), dtype=float)
     red = lambda image: ((image[:, 24:, 0] > 180) & (image[:, 24:, 1] < 90)).sum()  # noqa: E731
-    assert red(first) > 20 > red(last)  # missed pixels of the silhouette
+    assert red(first) > 20 > red(last)  # what is lost of the silhouette
     assert (tmp_path / "strip.png").is_file()
 
 
@@ -76,13 +77,13 @@ def test_the_chosen_frame_is_shown_with_its_name_in_bold(inputs, tmp_path, drawn
     filmstrip = Filmstrip(inputs, "by rung")
     for name in range(3 * MAX_STRIP_COLUMNS):
         filmstrip.add(f"rung_{name}", State(sphere(0.5), inputs), CAMERA)
-    for chosen in (0, 1):
-        filmstrip.save(tmp_path, "a ball", f"rung_{chosen}")
-        labels = [tick.label2 for tick in drawn[-1].axes[0].xaxis.get_major_ticks()]  # labels at the top
+    for own in (0, 1):
+        filmstrip.save(tmp_path, "a ball", f"rung_{own}")
+        labels = [tick.label2 for tick in drawn[-1].axes[0].xaxis.get_major_ticks()]  # those at the top
         names = [label.get_text() for label in labels]
         assert len(names) == MAX_STRIP_COLUMNS + 1
         assert (names[0], names[-2], names[-1]) == ("rung 0", f"rung {3 * MAX_STRIP_COLUMNS - 1}", "truth")
-        assert [label.get_text() for label in labels if label.get_fontweight() == "bold"] == [f"rung {chosen}"]
+        assert [label.get_text() for label in labels if label.get_fontweight() == "bold"] == [f"rung {own}"]
         assert sorted(names[:-1], key=lambda name: int(name.split()[1])) == names[:-1]
 
 
@@ -93,7 +94,7 @@ def test_a_part_of_the_surface_is_called_measured(inputs, tmp_path, drawn):
     assert [tick.label2.get_text() for tick in drawn[-1].axes[0].xaxis.get_major_ticks()] == ["0", "measured"]
 
 
-def test_nothing_is_drawn_if_pictures_are_off(inputs, tmp_path):
+def test_nothing_is_drawn_where_pictures_are_off(inputs, tmp_path):
     filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=None, film="gif")))
     filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
     filmstrip.save(tmp_path, "a ball")
@@ -101,14 +102,14 @@ def test_nothing_is_drawn_if_pictures_are_off(inputs, tmp_path):
 
 
 def photograph(height: int, width: int, *, masked: bool = True) -> Shown:
-    """A photograph of a coloured sphere, in another size than that of pictures."""
+    """A coloured ball, photographed in another size than that of pictures."""
     shot = shot_of(ball(0.7, (0.0, 0.0, 0.0)), camera_of(16).resized(height, width))
     mask = shot.mask if masked else torch.ones_like(shot.mask)
     return Shown(View(shot.camera, shot.depth, shot.normals, mask), shot.colours, masked)
 
 
 @pytest.mark.parametrize(("size", "masked"), [((10, 20), True), ((24, 15), False)])
-def test_coloured_frames_have_the_rows_of_the_photograph(inputs, tmp_path, drawn, size, masked):
+def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path, drawn, size, masked):
     true = photograph(*size, masked=masked)
     filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=32)), truth=true)
     for iteration, radius in enumerate((0.3, 0.7)):
@@ -124,13 +125,11 @@ def test_coloured_frames_have_the_rows_of_the_photograph(inputs, tmp_path, drawn
     assert height == int(height) and width == int(width)
     labels = [tick.label2.get_text() for tick in axis.xaxis.get_major_ticks()]
     assert labels == ["0", "1", "truth"]
-    assert axis.get_xticks() == pytest.approx([width * (column + 0.5) for column in range(3)])
-    assert axis.get_yticks() == pytest.approx([height * (row + 0.5) for row in range(len(rows))])
+    assert axis.get_xticks() == pytest.approx([width * (place + 0.5) for place in range(3)])
+    assert axis.get_yticks() == pytest.approx([height * (place + 0.5) for place in range(len(rows))])
     cells = montage[: int(height)].reshape(int(height), 3, int(width), 3).transpose(1, 0, 2, 3)
     middle = int(height) // 2, int(width) // 2
-    assert (cells[0, 2, 2] == 1.0).all() and cells[2, 2, 2] == pytest.approx(
-        0.5
-    )  # the render is on white, and the photograph on grey
+    assert (cells[0, 2, 2] == 1.0).all() and cells[2, 2, 2] == pytest.approx(0.5)  # on white, and as it was taken
     assert np.abs(cells[1] - cells[2])[middle] == pytest.approx(0.0, abs=0.1)
     if masked:
         errors = montage[2 * int(height) :].reshape(int(height), 3, int(width), 3).transpose(1, 0, 2, 3)
@@ -138,7 +137,7 @@ def test_coloured_frames_have_the_rows_of_the_photograph(inputs, tmp_path, drawn
         assert missed[0] > 20 and missed[0] > 5 * max(missed[1:])
 
 
-def test_an_enlarged_photograph_keeps_the_position_of_each_pixel():
+def test_a_photograph_is_enlarged_with_its_parts_in_place():
     true = photograph(10, 20)
     large = true.enlarged(true.view.camera.resized(30, 60))
     assert large.colours is not None and true.colours is not None
@@ -150,7 +149,7 @@ def test_an_enlarged_photograph_keeps_the_position_of_each_pixel():
     assert small.colours is not None and small.colours.shape == (5, 10, 3) and small.has_mask
 
 
-def test_frames_without_colours_have_no_row_of_colours(inputs, tmp_path, drawn):
+def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, drawn):
     for true in (None, photograph(16, 16)):
         filmstrip = Filmstrip(inputs, truth=true)
         filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
@@ -160,63 +159,63 @@ def test_frames_without_colours_have_no_row_of_colours(inputs, tmp_path, drawn):
 
 
 def half_ball(radius: float) -> Mesh:
-    """The half of a sphere towards the camera, at z above 0."""
-    mesh = icosphere(radius, subdivisions=3)
-    return replace(mesh, faces=mesh.faces[(mesh.vertices[mesh.faces][..., 2] >= 0).all(axis=1)]).compact()
+    """A ball of which the half towards the camera, at z above 0, is there."""
+    whole = icosphere(radius, subdivisions=3)
+    return replace(whole, faces=whole.faces[(whole.vertices[whole.faces][..., 2] >= 0).all(axis=1)]).compact()
 
 
-def test_a_gallery_has_two_views_and_the_observed_depths(inputs, tmp_path):
+def test_shapes_are_seen_by_two_cameras_and_depths_where_they_are_given(inputs, tmp_path):
     inputs = replace(inputs, evaluation=replace(inputs.evaluation, gallery=24))
     scene = inputs.scene
     observed = scene.view.mask & (torch.arange(256).view(16, 16) % 5 == 0)
     save_gallery(tmp_path, inputs, observed, {"start": None, "found": half_ball(0.4)})
     with np.load(tmp_path / "images.npz") as images:
-        arrays = dict(images)
-    assert np.array_equal(np.isfinite(arrays["given"]), observed.numpy())
-    depths = scene.view.depth.numpy()[observed.numpy()]
-    np.testing.assert_allclose(arrays["given"][observed.numpy()], depths, atol=2e-3)
-    assert {name: array.shape for name, array in arrays.items() if name != "given"} == {
-        f"{kind}_{name}": (2, 24, 24, *channels)
+        found = dict(images)
+    assert np.array_equal(np.isfinite(found["given"]), observed.numpy())
+    given = scene.view.depth.numpy()[observed.numpy()]
+    np.testing.assert_allclose(found["given"][observed.numpy()], given, atol=2e-3)
+    assert {name: array.shape for name, array in found.items() if name != "given"} == {
+        f"{kind}_{part}": (2, 24, 24, *more)
         for kind in ("start", "found", "true")
-        for name, channels in (("normals", (3,)), ("hit", ()))
+        for part, more in (("normals", (3,)), ("hit", ()))
     }
-    front, behind = arrays["true_hit"]
+    front, behind = found["true_hit"]
     assert front.sum() > 60 and np.array_equal(front, front[:, ::-1]) and abs(int(behind.sum()) - int(front.sum())) < 20
-    assert arrays["true_normals"][0, 12, 12, 2] > 0.9  # towards the camera
-    assert 0 < arrays["found_hit"][0].sum() < 0.6 * front.sum()  # the smaller sphere
-    assert (arrays["found_normals"][1][arrays["found_hit"][1]][:, 2] < 0).mean() > 0.5  # the inside, seen from behind
-    assert not arrays["start_hit"].any()
+    assert found["true_normals"][0, 12, 12, 2] > 0.9  # towards the camera
+    assert 0 < found["found_hit"][0].sum() < 0.6 * front.sum()  # the smaller ball
+    assert (found["found_normals"][1][found["found_hit"][1]][:, 2] < 0).mean() > 0.5  # its inside, from behind
+    assert not found["start_hit"].any()
 
 
 def test_depths_are_coloured_from_the_nearest_to_the_farthest():
     view = see(Truth(half_ball(0.6), closed=False), CAMERA)
     pair = ViewPair("truth", view, view, view.mask)
     image = _show_depth(Figure().subplots(), pair, (pair,))
-    depths = view.depth[view.mask]
-    assert image.get_clim() == (depths.min(), depths.max()) and depths.min() < depths.max()
+    known = view.depth[view.mask]
+    assert image.get_clim() == (known.min(), known.max()) and known.min() < known.max()
 
 
-def test_a_picture_and_the_metric_compare_equal_silhouettes_for_a_partial_mesh(inputs, tmp_path, drawn):
-    """The mesh of a depth image joins the centres of pixels, so that it is half a pixel smaller than the mask."""
+def test_a_picture_and_the_metric_compare_silhouettes_alike_where_the_mesh_is_what_is_seen(inputs, tmp_path, drawn):
+    """The mesh of a depth image joins the centres of pixels: it is half a pixel smaller than the mask all around."""
     scene = inputs.scene
     unmeasured = torch.arange(256).view(16, 16) == 8 * 16 + 8
-    partial = replace(scene, mesh=half_ball(0.5), is_partial=True, measured=scene.view.depth.where(~unmeasured, 0.0))
-    inputs = replace(inputs, make_scene=lambda: partial)
+    part = replace(scene, mesh=half_ball(0.5), is_partial=True, measured=scene.view.depth.where(~unmeasured, 0.0))
+    inputs = replace(inputs, make_scene=lambda: part)
     states = State(sphere(0.3), inputs), State(sphere(0.65), inputs)
     draw_run(tmp_path, states, InputView(scene.view, scene.view.mask.numpy()), [], "a depth image")
     summary = drawn[0].axes[:12]
     for state, axis in zip(states, summary[2:8:4], strict=True):
         missed, spurious = (float(text.get_text().split()[1]) / 100 for text in axis.texts)
-        overlap = view_metrics(state.seen(scene.view.camera), partial.view)["mask_iou"]
+        overlap = view_metrics(state.view_from(scene.view.camera), part.view)["mask_iou"]
         assert (1 - missed) / (1 + spurious) == pytest.approx(overlap, abs=0.001)
     assert [axis.axison for axis in summary[8:]] == [True, False, True, False]  # no normals, and no view from behind
     (measured,) = summary[8].get_images()
-    observed = enlarged(replace(scene.view, mask=scene.view.mask & ~unmeasured), CAMERA.resized(24, 24)).mask
-    assert np.isfinite(np.ma.filled(measured.get_array(), np.nan)).sum() == observed.sum()
+    given = enlarged(replace(scene.view, mask=scene.view.mask & ~unmeasured), CAMERA.resized(24, 24)).mask
+    assert np.isfinite(np.ma.filled(measured.get_array(), np.nan)).sum() == given.sum()
     assert np.isfinite(measured.get_clim()).all()
 
 
-def test_a_run_writes_the_gallery_of_its_setting(tmp_path):
+def test_a_run_writes_them_where_they_are_asked_for(tmp_path):
     small = ("scale=smoke", "evaluation.picture=null", "evaluation.grid=24", "evaluation.points=100", "isolation=off")
     small += ("task.optimiser.iterations=2", "evaluation.gallery=12", f"results_dir={tmp_path}")
     code, out, _ = command("task=deepsdf", *small)
@@ -239,8 +238,8 @@ def test_a_legend_wider_than_the_figure_takes_fewer_columns():
 
 
 def test_a_curve_has_terms_of_the_loss_and_no_error(drawn, tmp_path):
-    problem = SimpleNamespace(subject=SimpleNamespace(truth=object()))
-    errors = dict.fromkeys((*TRACKED, *ReconstructionProblem.tracked.fget(problem)), 1.0)  # type: ignore[misc]
+    known = SimpleNamespace(subject=SimpleNamespace(truth=object()))
+    errors = dict.fromkeys((*TRACKED, *ReconstructionProblem.tracked.fget(known)), 1.0)  # type: ignore[misc]
     line = {"iteration": 0, "seconds": 0.1, "value_evaluations": 9, "total": 2.0, "depth": 1.5}
     draw_curve(tmp_path / "curve.png", [line | errors, line | {"iteration": 1}])
-    assert [line.get_label() for line in drawn[0].axes[0].lines] == ["total", "depth"]
+    assert [shown.get_label() for shown in drawn[0].axes[0].lines] == ["total", "depth"]

@@ -53,7 +53,7 @@ def test_stopping_early_changes_nothing():
         assert torch.equal(getattr(plain, name), getattr(early, name)), name
 
 
-def test_the_memory_of_a_step_of_dvr_does_not_grow_with_the_samples():
+def test_dvr_memory_does_not_grow_with_samples():
     """DVR, Sec. 3.3: the samples of the search need no memory. NeuS keeps its samples, so that the test can fail."""
 
     def kept_bytes(name: str, **settings) -> int:

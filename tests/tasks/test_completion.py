@@ -55,16 +55,16 @@ class Fake:
 
     status: tuple = STATUS
     capabilities: Capabilities = CAN
-    received: torch.Tensor | None = None
+    asked: torch.Tensor | None = None
 
     def render(self, field, rays):
-        values = field(rays.iteration_used(torch.ones(rays.shape)))
+        values = field(rays.at(torch.ones(rays.shape)))
         distance = torch.tensor(DISTANCE) + (values - values.detach())
         status = torch.tensor(self.status, dtype=torch.int8)
-        return Rendering(distance, status, rays.iteration_used(distance), torch.zeros(rays.shape), values)
+        return Rendering(distance, status, rays.at(distance), torch.zeros(rays.shape), values)
 
     def silhouette_loss(self, field, rays, rendering, mask):
-        self.received = mask
+        self.asked = mask
         return rendering.closest.sum() * 0 + SILHOUETTE
 
 
@@ -97,7 +97,8 @@ def values(problem) -> dict[str, float]:
 def test_depth_is_compared_where_it_is_given_and_hit(problem_of):
     """Depths differ by .1 and .3 where they are compared; along the rays that is 1 / COSINE as much."""
     terms = values(problem_of())
-    assert terms["depth"] == pytest.approx(10.0 * (0.1 + 0.3) / 2, rel=1e-5) and terms["code"] == 0.0
+    assert terms["depth"] == pytest.approx(10.0 * (0.1 + 0.3) / 2, rel=1e-5)
+    assert terms["code"] == 0.0
     assert terms["silhouette"] == pytest.approx(4.0 * SILHOUETTE)
     assert terms["total"] == pytest.approx(2.0 + 2.8, rel=1e-5)
     assert values(problem_of(depth_loss="points"))["depth"] == pytest.approx(10.0 * 0.2 / COSINE)
@@ -111,8 +112,8 @@ def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
     """See tests/solve/test_observed_view.py for the term itself."""
     assert problem_of().compare.__self__.normals is None
     problem = problem_of(normal_weight=3.0)
-    terms, view = values(problem), problem.compare.__self__
-    assert (view.normal_weight, view.normal_width) == (3.0, 0.02) and torch.equal(view.normals, scene.view.normals)
+    terms, given = values(problem), problem.compare.__self__
+    assert (given.normal_weight, given.normal_width) == (3.0, 0.02) and torch.equal(given.normals, scene.view.normals)
     assert terms["total"] == pytest.approx(sum(terms[name] for name in terms if name != "total"))
 
 
@@ -123,8 +124,8 @@ def test_colours_are_compared_where_the_shape_is_shown_and_hit(problem_of, scene
     red = replace(scene, texture=lambda points, normals: np.tile([0.9, 0.2, 0.2], (len(points), 1)))
     problem = replace(SETTINGS, colour_weight=3.0).problem(red, textured, Fake(), seed=0, device=CPU)
     terms = problem.loss(0)
-    colour = problem.field().paint(red.view.camera.rays().iteration_used(torch.tensor(DISTANCE))[0])
-    assert terms["colour"].item() == pytest.approx(3 * (colour - torch.tensor([0.9, 0.2, 0.2])).abs().mean().item())
+    found = problem.field().paint(red.view.camera.rays().at(torch.tensor(DISTANCE))[0])
+    assert terms["colour"].item() == pytest.approx(3 * (found - torch.tensor([0.9, 0.2, 0.2])).abs().mean().item())
     terms["colour"].backward()
     assert (problem.code.grad[:2] != 0).any() and (problem.code.grad[2:] != 0).all()
 
@@ -147,27 +148,27 @@ def test_the_code_is_held_short(problem_of, average, expected):
 
 
 @dataclass
-class TakesDistances(Fake):
+class Told(Fake):
     """A fake whose loss takes the given distances as well."""
 
     def observed_loss(self, field, rays, rendering, observed):
-        self.received = observed.distance
+        self.asked = observed.distance
         return rendering.closest.sum() * 0 + SILHOUETTE
 
 
 def test_the_mask_is_compared_where_it_is_given_by_the_loss_that_is_chosen(problem_of):
-    sparse, dense, other, with_distances = Fake(), Fake(), Fake(), TakesDistances()
+    sparse, dense, other, told = Fake(), Fake(), Fake(), Told()
     assert set(values(problem_of(sparse, points="3", mask=False))) == {"total", "depth", "code"}
-    assert sparse.received is None
+    assert sparse.asked is None
     assert "silhouette" in values(problem_of(dense, points="dense", mask=False))  # which implies it
-    assert dense.received.tolist() == MASK
+    assert dense.asked.tolist() == MASK
     chosen = values(problem_of(other, silhouette=load("silhouette", "hinge")))
-    assert other.received is None and chosen["silhouette"] != pytest.approx(4.0 * SILHOUETTE)
-    problem = problem_of(with_distances, points="2")
+    assert other.asked is None and chosen["silhouette"] != pytest.approx(4.0 * SILHOUETTE)
+    problem = problem_of(told, points="2")
     values(problem)
-    observed_pixels = with_distances.received.isfinite()
-    assert torch.equal(observed_pixels, problem.observed) and observed_pixels.sum() == 2
-    assert with_distances.received[observed_pixels].tolist() == pytest.approx([2.0 / COSINE] * 2)
+    given = told.asked.isfinite()
+    assert torch.equal(given, problem.observed) and given.sum() == 2
+    assert told.asked[given].tolist() == pytest.approx([2.0 / COSINE] * 2)
 
 
 def test_the_gradient_is_that_of_the_loss(problem_of, prior, scene):
@@ -175,7 +176,7 @@ def test_the_gradient_is_that_of_the_loss(problem_of, prior, scene):
     problem = problem_of(silhouette_weight=0.0)
     problem.loss(0)["total"].backward()
     code = torch.zeros(4, requires_grad=True)
-    field = prior.decoder.iteration_used(code)(scene.view.camera.rays().iteration_used(torch.ones(2, 2)))
+    field = prior.decoder.at(code)(scene.view.camera.rays().at(torch.ones(2, 2)))
     (expected,) = torch.autograd.grad(field[0, 0] - field[0, 1], code)
     assert torch.allclose(problem.code.grad, 10.0 / 2 * COSINE * expected, rtol=1e-4, atol=1e-6)
 
@@ -186,25 +187,26 @@ def test_evaluations_are_counted_and_judging_is_not(problem_of):
     problem.loss(0)["total"].backward()
     assert (problem.counts.value, problem.counts.gradient) == (4, 2)  # two pixels are compared
     field = problem.field()
-    assert not field(torch.zeros(5, 3)).requires_grad and problem.counts.value == 4
+    assert not field(torch.zeros(5, 3)).requires_grad
+    assert problem.counts.value == 4
 
 
 @dataclass
 class Scheduled(Fake):
-    """A renderer with a schedule that records its calls and their iterations."""
+    """A renderer with a schedule: what was asked of it, and at which iteration."""
 
-    iteration_used: int | None = None
+    at: int | None = None
     log: list = field(default_factory=list)
 
     def at_iteration(self, iteration):
-        return replace(self, iteration_used=iteration)
+        return replace(self, at=iteration)
 
     def render(self, field, rays):
-        self.log.append(("render", self.iteration_used))
+        self.log.append(("render", self.at))
         return super().render(field, rays)
 
     def silhouette_loss(self, field, rays, rendering, mask):
-        self.log.append(("silhouette", self.iteration_used))
+        self.log.append(("silhouette", self.at))
         return super().silhouette_loss(field, rays, rendering, mask)
 
 
@@ -214,10 +216,9 @@ def test_a_renderer_with_a_schedule_is_as_it_is_at_the_iteration(problem_of):
     problem.loss(7)
     assert renderer.log == [("render", 7), ("silhouette", 7)]
     renderer.log.clear()
-    assert renderer.iteration_used is None  # the configured renderer is evaluated and drawn
+    assert renderer.at is None  # what is judged and drawn is by the renderer as configured
     optimise(problem, OptimiserSettings(3, 0.01, "constant"), CPU, history=History(), on_step=lambda line: None)
-    rendered = [iteration for call, iteration in renderer.log if call == "render"]
-    assert rendered == [0, 0, 1, 2]  # the first is the warm-up
+    assert [at for what, at in renderer.log if what == "render"] == [0, 0, 1, 2]  # the first is the warm-up
 
 
 def test_a_renderer_without_a_gradient_or_for_another_kind_of_field_is_unsupported(problem_of):
