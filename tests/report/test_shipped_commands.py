@@ -21,7 +21,9 @@ from tests.documentation import text_of
 COMMAND = re.compile(r"`-m \+experiment=([^`]+)`")
 NAMED = re.compile(r"^\| \[?`(\w+)`")  # experiments whose command is their name alone
 # What changes no result, or names files of the machine; and sizes, whose values stand in other keys too.
-IGNORED = re.compile(r"(sizes|scale|results_dir|priors_dir|threads|device|time_limit|packages|verbose|rerun)\b|dataset\.path")
+IGNORED = re.compile(
+    r"(sizes|scale|results_dir|priors_dir|threads|device|time_limit|packages|verbose|rerun)\b|dataset\.path"
+)
 Cells = dict[tuple[str, ...], dict[str, str]]  # the settings of runs, by row, shape and seed
 
 
