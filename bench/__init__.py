@@ -27,7 +27,7 @@ def __getattr__(name: str) -> Any:
     if name == "load":
         return import_module("bench.report.data.frame").load
     if name == "load_field":
-        return import_module("datasets.field_files").load_field
+        return import_module("datasets.files.field_files").load_field
     if name == "run":
         return import_module("bench.runner.library").run
     raise AttributeError(f"module 'bench' has no attribute {name!r}")

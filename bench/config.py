@@ -40,8 +40,8 @@ ROLE_OF_NODE = {  # the protocol or base class that the class of a node must hav
     "dataset": "datasets.scene.Dataset",
     "silhouette": "renderers.silhouette.SilhouetteLoss",
     "tracker": "bench.trackers.Tracker",
-    "prior": "datasets.network_files.HasNetwork",
-    "supervision": "bench.single_view.training.Supervision",
+    "prior": "datasets.files.network_files.HasNetwork",
+    "supervision": "bench.tasks.single_view.training.Supervision",
 }
 CLASS_OF_NODE = {  # for nodes without a _target_
     "view": "datasets.views.ViewSampler",

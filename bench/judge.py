@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bench.evaluate import dtu
 from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, subsample, surface_metrics
 from bench.records.read import check_links
 from bench.records.record import Record, RunStatus, digest, is_plain_name, now, read_record
 from bench.report.write.html import write_index
 from bench.tables import choice
+from bench.tasks.reconstruction import dtu
+from datasets.files.meshes import find_meshes, read_mesh, read_points
+from datasets.files.own_photographs import Capture, ReadSettings, read_capture, scan_number
 from datasets.mesh import Mesh, fit_in_sphere
-from datasets.meshes import find_meshes, read_mesh, read_points
-from datasets.own_photographs import Capture, ReadSettings, read_capture, scan_number
 from datasets.scene import sample_surface
 from renderers.checks import BadInput
 

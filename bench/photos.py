@@ -9,9 +9,17 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import SCREEN, bare, silhouette_image
-from datasets.captures.hull import MaskFit
-from datasets.captures.sphere import likely_cause
-from datasets.own_photographs import AXES, GOOD_OVERLAP, PHOTOS_HINT, WARN_BELOW, Capture, ReadSettings, read_capture
+from datasets.files.captures.hull import MaskFit
+from datasets.files.captures.sphere import likely_cause
+from datasets.files.own_photographs import (
+    AXES,
+    GOOD_OVERLAP,
+    PHOTOS_HINT,
+    WARN_BELOW,
+    Capture,
+    ReadSettings,
+    read_capture,
+)
 from renderers.camera import sphere_span
 
 MAX_SHOWN_PHOTOGRAPHS = 8

@@ -26,9 +26,9 @@ from datasets.mesh import Mesh
 from datasets.scene import Dataset, Split, Textured, Truth, sample_surface, seed_of
 from datasets.textures import TEXTURES, Texture, make_texture
 from renderers.checks import check_at_least, check_choice, check_positive
-from renderers.fields.coloured import TexturedDecoder, TexturedShape
 from renderers.fields.mlp import Decoder
-from renderers.fields.network import Published
+from renderers.fields.networks.coloured import TexturedDecoder, TexturedShape
+from renderers.fields.networks.network import Published
 
 SHIPPED = Path(__file__).resolve().parents[1] / "datasets" / "priors"
 VERSION = 1  # raise it when training changes, so that no prior of the old training is used for a new one

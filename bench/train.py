@@ -15,7 +15,7 @@ def train(run: Identity) -> None:
     from bench.machine.environment import flushing_denormals
     from bench.progress import run_progress
     from bench.setup.inputs import build_cell
-    from bench.tasks.single_view import OneImage, describe_training
+    from bench.tasks.single_view.task import OneImage, describe_training
 
     cell = build_cell(run.config)
     if not isinstance(cell.task, OneImage):

@@ -16,8 +16,8 @@ from torch import Tensor
 from bench.evaluate.state import render_vertex_colours
 from bench.pictures.run_figures import normals_image, shaded
 from bench.records.record import is_outside, read_record
+from datasets.files.meshes import SUFFIXES, read_mesh
 from datasets.mesh import Mesh, normalise
-from datasets.meshes import SUFFIXES, read_mesh
 from datasets.scene import Truth, View, see
 from datasets.views import ViewSampler
 

@@ -109,7 +109,7 @@ class Truth:
         if closed and not mesh.watertight:
             raise ValueError(
                 f"mesh: must be watertight to have an inside, found {mesh.faces.shape[0]} faces that do not close; "
-                "load it with datasets.meshes.load_mesh, which repairs it"
+                "load it with datasets.files.meshes.load_mesh, which repairs it"
             )
         self._tensor, self._faces = open3d.core.Tensor, mesh.faces
         self._scene = open3d.t.geometry.RaycastingScene()
@@ -291,7 +291,7 @@ class Photographed(Protocol):
         ...
 
     def capture(self, longest: int, held_out: int) -> Any:
-        """Reads a `datasets.own_photographs.Capture`.
+        """Reads a `datasets.files.own_photographs.Capture`.
 
         Args:
             longest: largest number of pixels per side.

@@ -158,7 +158,7 @@ def check_kind(renderer: Renderer, field: Field) -> None:
     needs = renderer.capabilities.needs
     if field.kind not in needs:
         names = " or ".join(need.value for need in needs)
-        bound = ", or make it a bound by renderers.fields.network.from_module" if Kind.BOUND in needs else ""
+        bound = ", or make it a bound by renderers.fields.networks.network.from_module" if Kind.BOUND in needs else ""
         raise Unsupported(
             f"{type(renderer).__name__} needs a {names} field, not a {field.kind.value} field: take another "
             f"renderer{bound}"

@@ -11,7 +11,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from datasets.shapenet import SYNSETS, ShapeNet
+from datasets.files.shapenet import SYNSETS, ShapeNet
 from datasets.views import ViewSampler
 from tests.datasets.test_shapenet import IDS, write_renders, write_shape, write_shapenet, write_split
 from tests.made_networks import arrays, deepsdf_folder, npz

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from datasets.network_files import NetworkFile
+from datasets.files.network_files import NetworkFile
 
 RADIUS = 0.5  # distance of the octahedron's faces from the origin
 

@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from datasets.captures.frames import OPENGL
-from datasets.own_photographs import Capture, ReadSettings
+from datasets.files.captures.frames import OPENGL
+from datasets.files.own_photographs import Capture, ReadSettings
 from datasets.views import look_at
 from renderers.camera import Camera
 

@@ -8,14 +8,14 @@ import pytest
 import trimesh
 
 import bench
-from bench.evaluate.dtu import METRIC_NAMES, dtu_metrics, read_scan
 from bench.evaluate.evaluate import DEFINITIONS, surface_metrics
 from bench.judge import Judge, main, metric_units
 from bench.merge import merge
 from bench.records.record import Record, read_record
+from bench.tasks.reconstruction.dtu import METRIC_NAMES, dtu_metrics, read_scan
+from datasets.files.meshes import read_mesh
+from datasets.files.own_photographs import ReadSettings, read_capture
 from datasets.mesh import Mesh
-from datasets.meshes import read_mesh
-from datasets.own_photographs import ReadSettings, read_capture
 from datasets.scene import sample_surface
 from tests.made_dtu import CENTRE, ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE as PHOTOGRAPHED

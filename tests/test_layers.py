@@ -25,7 +25,7 @@ FORBIDDEN = {  # what the modules of a package may not import
 # The rooms of bench in the order of imports: a room may use those before it, and none a command.
 ROOMS = (
     "tables", "config", "progress", "records", "machine", "trackers", "shape_prior",
-    "setup", "evaluate", "pictures", "solve", "models", "reconstruct", "single_view", "stress", "tasks",
+    "setup", "evaluate", "pictures", "solve", "tasks",
     "runner", "report", "studies",
 )  # fmt: skip
 COMMANDS = (

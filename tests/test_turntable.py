@@ -11,8 +11,8 @@ from PIL import Image
 
 from bench.records.record import Record
 from bench.turntable import UPRIGHT, main, make_upright, turntable
+from datasets.files.meshes import read_mesh
 from datasets.mesh import Mesh
-from datasets.meshes import read_mesh
 from tests.tiny import icosphere
 
 SIZE = 32

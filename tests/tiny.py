@@ -16,14 +16,14 @@ from bench.setup.fields import FieldChoice
 from bench.setup.inputs import Cell, RunContext, RunInputs, build_cell
 from bench.setup.priors import PriorChoice
 from bench.shape_prior import Prior
+from datasets.files.network_files import SceneNetwork
 from datasets.mesh import Mesh
-from datasets.network_files import SceneNetwork
 from datasets.scene import Scene, Truth, View, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
-from renderers.fields.network import FieldStatistics
+from renderers.fields.networks.network import FieldStatistics
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")

@@ -21,7 +21,7 @@ from datasets.shot import mask_iou
 from renderers.boundary import render_checked
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals
-from renderers.fields.coloured import Coloured
+from renderers.fields.networks.coloured import Coloured
 from renderers.rendering import Rendering
 
 OWN_PREFIX = "own_"  # begins names of metrics of the image by the renderer under test

@@ -26,7 +26,7 @@ HASHED_PATTERNS = ("*", "ModelParameters/*", "LatentCodes/*")  # the hashed file
 # Settings that name choices, which a run loads itself, with the modules of all such choices.
 LOADED_BY_NAME = {("task", "beside"): "renderers", ("prior", "of"): "datasets.families"}
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz")  # not hashed: gigabytes that no run reads
-FIELD_FILE = "field.safetensors"  # the only file of a run folder that another run reads; see `datasets.field_files`
+FIELD_FILE = "field.safetensors"  # the only file of a run folder that another run reads
 HASHED_LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVED_BYTES = 64 * 1024  # kept free, so that the record can still be written on a full disk
 RESERVE_FILE = ".reserve"

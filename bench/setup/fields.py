@@ -14,7 +14,7 @@ SIZE_PATTERNS = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+"
 EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
 NAME_FORMS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
 MAX_GRID_SAMPLES = 256  # per axis: 64 MiB of values
-STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.models.model.Size`
+STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.tasks.capacity.model.Size`
 SIZE_WORDS = {STORED: "stored numbers", FREE: "free numbers", BYTES: "bytes"}
 
 
@@ -78,7 +78,7 @@ class GrowthSettings:
         trial: fraction of a complete fit's iterations in a candidate's trial.
         patience: successive candidates that may be tried without improvement.
         budget: largest cost of all candidates together, as a multiple of the final candidate's complete fit. It is
-            estimated by `bench.models.growth.cost`, not measured, so that a run ends the same on every machine.
+            estimated by `bench.tasks.capacity.growth.cost`, not measured, so that a run ends the same on every machine.
     """
 
     trial: float
@@ -125,9 +125,9 @@ class ModelSettings:
     """The fields to choose from, and the settings of their fits.
 
     Args:
-        candidates: their names, the smallest first by free numbers; see `bench.models.candidates.candidate`.
-        size: the measure of size: "stored", "free" or "bytes"; see `bench.models.model.Size`. Candidates are tried in
-            its order, see `bench.models.candidates.by_size`.
+        candidates: their names, the smallest first by free numbers; see `bench.tasks.capacity.candidates.candidate`.
+        size: the measure of size: "stored", "free" or "bytes"; see `bench.tasks.capacity.model.Size`. Candidates are
+            tried in its order, see `bench.tasks.capacity.candidates.by_size`.
         fit: settings of each fit.
         growth: settings of `field=auto`.
         views: of a true shape, if candidates are fitted to one.

@@ -20,9 +20,9 @@ from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.optimise import CannotContinue, FirstChecked, History, Objective, OptimiserSettings, optimise
-from datasets.field_files import FIELD_FILE, save_field
+from datasets.files.field_files import FIELD_FILE, save_field
+from datasets.files.meshes import read_mesh
 from datasets.mesh import Mesh
-from datasets.meshes import read_mesh
 from datasets.scene import Scene
 from renderers.camera import Camera
 from renderers.field import Counts, Field

@@ -6,8 +6,6 @@ from typing import ClassVar
 
 import torch
 
-from bench.models.field import solve_by_growth
-from bench.models.observations import RayObservations, concatenate_views, hold_out, tiles
 from bench.pictures.colours import note_colours
 from bench.pictures.run_figures import InputView
 from bench.setup.auto import footprint
@@ -17,6 +15,8 @@ from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
 from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
+from bench.tasks.capacity.field import solve_by_growth
+from bench.tasks.capacity.observations import RayObservations, concatenate_views, hold_out, tiles
 from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive

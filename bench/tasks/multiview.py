@@ -11,15 +11,15 @@ from torch import Tensor
 from bench.evaluate.evaluate import evaluate
 from bench.evaluate.state import State
 from bench.pictures.run_figures import draw_curve
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, coloured, judge_mesh
-from bench.reconstruct.pictures import note_surface
-from bench.reconstruct.subject import NONE, Depths, PhotographTask, Subject, upright
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
 from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings
 from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, metric_definitions, run_optimisation, solve
+from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, coloured, judge_mesh
+from bench.tasks.reconstruction.pictures import note_surface
+from bench.tasks.reconstruction.subject import NONE, Depths, PhotographTask, Subject, upright
+from bench.tasks.single_view.encoder import EncoderSettings
 from datasets.mesh import Mesh
 from datasets.scene import Scene
 from datasets.shot import Shot

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from datasets.own_photographs import ReadSettings, read_capture
+from datasets.files.own_photographs import ReadSettings, read_capture
 from renderers.checks import BadInput
 from tests.made_photographs import (
     PLAIN,

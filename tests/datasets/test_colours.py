@@ -8,9 +8,9 @@ import trimesh
 from PIL import Image
 
 from bench.records.folder import Identity
-from datasets.colours import FileColours
-from datasets.local import LocalMeshes
-from datasets.meshes import read_mesh
+from datasets.files.colours import FileColours
+from datasets.files.local import LocalMeshes
+from datasets.files.meshes import read_mesh
 from datasets.scene import Split, sample_surface
 from renderers.checks import BadInput
 from tests.looped import each

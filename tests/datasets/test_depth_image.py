@@ -9,8 +9,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bench.config import load
-from datasets.depth_image import OBJECT_RADIUS, _crop_and_subsample
-from datasets.meshes import read_mesh
+from datasets.files.depth_image import OBJECT_RADIUS, _crop_and_subsample
+from datasets.files.meshes import read_mesh
 from datasets.scene import Split, Truth, see
 from datasets.views import look_at
 from renderers.camera import Camera

@@ -10,26 +10,26 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 import bench
-from bench.models.candidates import PRIMITIVES
 from bench.records.read import RESULTS
-from datasets import field_files
-from datasets.field_files import FIELD_FILE, load_field, load_network, save_field
+from bench.tasks.capacity.candidates import PRIMITIVES
+from datasets.files import field_files
+from datasets.files.field_files import FIELD_FILE, load_field, load_network, save_field
 from renderers.checks import BadInput
 from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields.analytic import sphere
-from renderers.fields.coloured import (
+from renderers.fields.grid import Grid
+from renderers.fields.mlp import Decoder
+from renderers.fields.networks.coloured import (
     ColouredDistance,
     ColouredGrid,
     ColouredOccupancy,
     ScaledOccupancyOf,
     TexturedDecoder,
 )
-from renderers.fields.grid import Grid
-from renderers.fields.mlp import Decoder
-from renderers.fields.network import Coded, Published
-from renderers.fields.occupancy import OccupancyNetwork
+from renderers.fields.networks.network import Coded, Published
+from renderers.fields.networks.occupancy import OccupancyNetwork
+from renderers.fields.networks.published import Layered
 from renderers.fields.parts import FORMULAS, formula
-from renderers.fields.published import Layered
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
 

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from datasets.colours import FileColours
-from datasets.meshes import read_mesh
-from datasets.readers.glb import UNCOLOURED_GREY, read_glb
+from datasets.files.colours import FileColours
+from datasets.files.meshes import read_mesh
+from datasets.files.readers.glb import UNCOLOURED_GREY, read_glb
 from tests.looped import each
 
 VERTICES = np.array([(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)], np.float32)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datasets.captures.lenses import FISHEYE_MODELS, PERSPECTIVE_MODELS, colmap_lens, nerf_lens
+from datasets.files.captures.lenses import FISHEYE_MODELS, PERSPECTIVE_MODELS, colmap_lens, nerf_lens
 from renderers.checks import BadInput
 from tests.looped import each
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets import local as module
-from datasets.local import LocalMeshes
-from datasets.meshes import load_mesh
+from datasets.files import local as module
+from datasets.files.local import LocalMeshes
+from datasets.files.meshes import load_mesh
 from datasets.scene import Split
 from tests.looped import each
 

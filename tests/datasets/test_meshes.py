@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from bench.reconstruct.surfaces import poisson
+from bench.tasks.reconstruction.surfaces import poisson
+from datasets.files.meshes import find_meshes, load_mesh, read_mesh, read_pieces, read_points, repair
+from datasets.files.repair import NOT_CHECKED_NOTE
 from datasets.mesh import Mesh, concatenate_meshes
-from datasets.meshes import find_meshes, load_mesh, read_mesh, read_pieces, read_points, repair
-from datasets.repair import NOT_CHECKED_NOTE
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.looped import each

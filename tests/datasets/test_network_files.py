@@ -15,11 +15,11 @@ from torch import Tensor
 from bench.config import load
 from bench.runner.command import expand_field_file
 from bench.setup.inputs import RunInputs
-from datasets.network_files import NetworkFile
+from datasets.files.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
 from renderers.field import LIPSCHITZ_SAFETY_FACTOR, Field, Kind, autograd_gradients, points_in_sphere
-from renderers.fields.network import from_module, measure_field
+from renderers.fields.networks.network import from_module, measure_field
 from tests.composing import composed
 from tests.documentation import code_of
 from tests.looped import each

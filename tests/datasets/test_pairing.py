@@ -9,10 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from datasets import own_photographs
-from datasets.captures.hull import measure_mask_fit
-from datasets.captures.pairing import find_images, find_masks, pair_by_name, pair_by_order
-from datasets.own_photographs import ReadSettings, read_capture
+from datasets.files import own_photographs
+from datasets.files.captures.hull import measure_mask_fit
+from datasets.files.captures.pairing import find_images, find_masks, pair_by_name, pair_by_order
+from datasets.files.own_photographs import ReadSettings, read_capture
 from renderers.checks import BadInput
 from tests.looped import each
 from tests.made_photographs import PLAIN, READ, colmap, idr, llff, off, renamed

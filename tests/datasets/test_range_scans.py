@@ -9,9 +9,9 @@ import pytest
 import torch
 import trimesh
 
+from datasets.files.range_scans import RangeScans, smooth
+from datasets.files.repair import repair
 from datasets.mesh import Mesh
-from datasets.range_scans import RangeScans, smooth
-from datasets.repair import repair
 from datasets.scene import Split, make_scene, sample_surface
 from datasets.views import ViewSampler
 from tests.looped import each

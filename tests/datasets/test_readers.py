@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from datasets.files.meshes import load_mesh
+from datasets.files.readers.ply import read_ply
+from datasets.files.readers.polygons import Polygons, ears
+from datasets.files.readers.text import read_obj, read_off, read_stl
 from datasets.mesh import Mesh
-from datasets.meshes import load_mesh
-from datasets.readers.ply import read_ply
-from datasets.readers.polygons import Polygons, ears
-from datasets.readers.text import read_obj, read_off, read_stl
 from tests.looped import each
 
 FEW = settings(max_examples=30, deadline=None)

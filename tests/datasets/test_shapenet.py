@@ -12,10 +12,10 @@ from PIL import Image
 
 from bench.records.folder import Identity, _class_counts_hash
 from bench.report.data.records import family
-from bench.single_view.images import Imaging
-from datasets import repair
+from bench.tasks.single_view.images import Imaging
+from datasets.files import repair
+from datasets.files.shapenet import ShapeNet
 from datasets.scene import Split, Truth, see
-from datasets.shapenet import ShapeNet
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PHOTOGRAPHY

@@ -8,7 +8,7 @@ import torch
 from scipy.io import loadmat, savemat
 from scipy.spatial.distance import cdist
 
-from bench.evaluate.dtu import (
+from bench.tasks.reconstruction.dtu import (
     MASK_DILATION_FRACTION,
     METRIC_NAMES,
     WORST,

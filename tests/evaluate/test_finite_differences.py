@@ -5,12 +5,12 @@ from math import sqrt
 import pytest
 import torch
 
-from bench.evaluate.finite_differences import _clear, differences, image_differences, outline_steps, subrays
+from bench.tasks.gradients.finite_differences import _clear, differences, image_differences, outline_steps, subrays
 from renderers.camera import Camera, Rays
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder
-from renderers.fields.network import Coded, Published
-from renderers.fields.published import Layered
+from renderers.fields.networks.network import Coded, Published
+from renderers.fields.networks.published import Layered
 from renderers.reference import trace
 from tests.looped import each
 from tests.tiny import camera_of, plane_decoder

@@ -16,14 +16,14 @@ from bench.evaluate.state import State
 from bench.pictures.filmstrip import MAX_STRIP_COLUMNS, SILHOUETTE_ROW, Filmstrip, Shown
 from bench.pictures.run_figures import InputView, ViewPair, _show_depth, draw_curve, draw_run, enlarged, save_gallery
 from bench.pictures.style import legend_below
-from bench.reconstruct.problem import ReconstructionProblem
 from bench.report.site.files import PICTURE_TEXTS
 from bench.tasks.pose import TRACKED
+from bench.tasks.reconstruction.problem import ReconstructionProblem
 from datasets.mesh import Mesh
 from datasets.scene import Truth, View, see
 from renderers.fields.analytic import sphere
-from tests.reconstruct.test_losses import ball, cast, shot_of
 from tests.runner.driving import command, record_of
+from tests.tasks.reconstruction.test_losses import ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, icosphere, run_of, scene_of
 
 CAMERA = camera_of(16)

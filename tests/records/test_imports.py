@@ -24,10 +24,15 @@ def test_a_run_depends_on_its_renderer_and_dataset_and_on_no_other():
     files = files_of(*COMPLETION)
     assert {"renderers/dist.py", "renderers/march.py", "datasets/families.py", "bench/solve/optimise.py"} <= files
     assert len(files) <= MAX_FILES
-    others = {"renderers/dvr.py", "renderers/volumes/neus.py", "datasets/captures/lenses.py", "bench/runner/command.py"}
+    others = {
+        "renderers/dvr.py",
+        "renderers/volumes/neus.py",
+        "datasets/files/captures/lenses.py",
+        "bench/runner/command.py",
+    }
     assert not files & others and not any(file.startswith(("bench/report", "bench/studies")) for file in files)
     assert files_of("renderers.DVR") - files >= {"renderers/dvr.py"}
-    assert "datasets/captures/lenses.py" in files_of("datasets.own_photographs.OwnPhotographs")
+    assert "datasets/files/captures/lenses.py" in files_of("datasets.files.own_photographs.OwnPhotographs")
 
 
 def test_every_module_that_python_loads_is_among_the_files():

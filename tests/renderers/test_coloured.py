@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from renderers.field import Field, Kind, Meter, autograd_gradients
-from renderers.fields import coloured
-from renderers.fields.coloured import (
+from renderers.fields.networks import coloured
+from renderers.fields.networks.coloured import (
     COLOUR_LOGIT_SCALE,
     LOGIT_WIDTH,
     Coloured,

@@ -10,10 +10,10 @@ from torch.nn.functional import batch_norm, layer_norm, linear, softplus
 
 from renderers.checks import BadInput
 from renderers.field import Coarse, Kind, coarse_version, field_bounds, points_in_sphere
-from renderers.fields import published
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import BoundDecoder
-from renderers.fields.network import Adjusted
+from renderers.fields.networks import published
+from renderers.fields.networks.network import Adjusted
 from tests.looped import each
 
 POINTS = points_in_sphere(64, torch.zeros(()))

@@ -1,7 +1,7 @@
 """Every kind of interval of the report covers the truth in 93 % of simulated experiments or more, nominal is 95 %.
 
 Each at the smallest size at which it is drawn, six shapes with a seed each, and at larger ones. The credible intervals
-of breakdowns are simulated in tests/stress.
+of breakdowns are simulated in tests/tasks/stability.
 """
 
 import math

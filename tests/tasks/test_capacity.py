@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 
 from bench.evaluate.evaluate import Evaluation
-from bench.models.candidates import candidate
-from bench.models.field import failure_of
-from bench.models.growth import grow
-from bench.models.held_out import HeldOutError
-from bench.models.model import Evidence, Size
-from bench.models.study import CheckSettings, shares
 from bench.records.record import Record, RunStatus
 from bench.runner.execute import execute
 from bench.runner.process import Job
 from bench.runner.summary import print_run_summary
 from bench.setup.fields import FieldChoice, ModelSettings
-from bench.tasks.capacity import Capacity, savings
+from bench.tasks.capacity.candidates import candidate
+from bench.tasks.capacity.field import failure_of
+from bench.tasks.capacity.growth import grow
+from bench.tasks.capacity.held_out import HeldOutError
+from bench.tasks.capacity.model import Evidence, Size
+from bench.tasks.capacity.study import CheckSettings, shares
+from bench.tasks.capacity.task import Capacity, savings
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
-from tests.models.test_models import FIT, GROWTH, VIEWS, fitter_of
+from tests.tasks.capacity.test_models import FIT, GROWTH, VIEWS, fitter_of
 from tests.tiny import Blind, ball_prior, camera_of, curve_of, plain, run_of, silent
 
 TINY = (

@@ -15,8 +15,8 @@ from bench.tasks.completion import Completion
 from datasets.scene import Scene, View
 from renderers.camera import Camera
 from renderers.field import Kind
-from renderers.fields.coloured import TexturedDecoder
 from renderers.fields.mlp import Decoder
+from renderers.fields.networks.coloured import TexturedDecoder
 from renderers.rendering import Capabilities, Rendering, Status, Unsupported, check_kind
 from renderers.silhouette import Own
 from tests.looped import each

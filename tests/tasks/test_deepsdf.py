@@ -10,9 +10,9 @@ from bench.config import load
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import History, OptimiserSettings, optimise
-from bench.tasks import prior_fit
-from bench.tasks.deepsdf import DeepSDF
-from bench.tasks.prior_fit import PriorFit
+from bench.tasks.baselines import prior_fit
+from bench.tasks.baselines.deepsdf import DeepSDF
+from bench.tasks.baselines.prior_fit import PriorFit
 from datasets.mesh import extract
 from datasets.scene import Scene, Truth, View, see
 from tests.looped import each

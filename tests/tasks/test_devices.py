@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from bench.config import build, load
-from bench.reconstruct.subject import Depths
 from bench.setup.fields import FieldChoice
-from bench.single_view.training import Training
 from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
 from bench.tasks.pose import Pose, PoseProblem
+from bench.tasks.reconstruction.subject import Depths
+from bench.tasks.single_view.training import Training
 from datasets.scene import Scene
 from renderers.fields.analytic import sphere
 from tests.composing import composed
-from tests.single_view.test_training import NETWORK, RGB, SETTINGS, images  # noqa: F401, a fixture
+from tests.tasks.single_view.test_training import NETWORK, RGB, SETTINGS, images  # noqa: F401, a fixture
 from tests.tiny import CPU, altered, ball_prior, camera_of, icosphere, run_of, scene_of, silent
 
 CASES = {

@@ -12,7 +12,16 @@ from bench.evaluate.reference import Reference, in_float64
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
-from bench.tasks.gradients import BANDS, DEFINITIONS, SAME_SURFACE_DISTANCE, Gradients, Subject, _bands, _draw, _outline
+from bench.tasks.gradients.task import (
+    BANDS,
+    DEFINITIONS,
+    SAME_SURFACE_DISTANCE,
+    Gradients,
+    Subject,
+    _bands,
+    _draw,
+    _outline,
+)
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind
 from renderers.rendering import Capabilities, Renderer, Rendering, Unsupported

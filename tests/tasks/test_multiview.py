@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.reconstruct.subject import HULL_RADIUS
 from bench.shape_prior import Prior
-from bench.single_view.encoder import EncoderSettings
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
 from bench.tasks.multiview import Multiview, PhotometricLoss, blur, sample
+from bench.tasks.reconstruction.subject import HULL_RADIUS
+from bench.tasks.single_view.encoder import EncoderSettings
+from datasets.files.meshes import read_mesh
 from datasets.mesh import extract
-from datasets.meshes import read_mesh
 from datasets.scene import Scene, Truth
 from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PHOTOGRAPHY

@@ -11,8 +11,8 @@ import trimesh
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import History, OptimiserSettings, optimise
+from bench.tasks.baselines.pose_icp import PoseICP, world_points
 from bench.tasks.pose import Pose, PoseProblem, build_shape_field, pose_error
-from bench.tasks.pose_icp import PoseICP, world_points
 from datasets.scene import Scene
 from renderers.fields.analytic import box
 from renderers.rendering import Unsupported

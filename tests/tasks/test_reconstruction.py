@@ -9,19 +9,19 @@ import torch
 import trimesh
 
 from bench.config import load
-from bench.evaluate.dtu import METRIC_NAMES, dtu_metrics, read_scan
-from bench.reconstruct.choice import Appearance, AutoField
-from bench.reconstruct.judge import COLOURED_DEFINITIONS
-from bench.reconstruct.losses import Losses
-from bench.reconstruct.subject import Depths
-from bench.reconstruct.symptoms import WEIGHT
 from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings
-from bench.tasks.reconstruction import Reconstruction
+from bench.tasks.reconstruction.choice import Appearance, AutoField
+from bench.tasks.reconstruction.dtu import METRIC_NAMES, dtu_metrics, read_scan
+from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS
+from bench.tasks.reconstruction.losses import Losses
+from bench.tasks.reconstruction.subject import Depths
+from bench.tasks.reconstruction.symptoms import WEIGHT
+from bench.tasks.reconstruction.task import Reconstruction
+from datasets.files.meshes import read_mesh
+from datasets.files.own_photographs import OwnPhotographs
 from datasets.mesh import Mesh
-from datasets.meshes import read_mesh
-from datasets.own_photographs import OwnPhotographs
 from datasets.scene import Scene, sample_surface
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported

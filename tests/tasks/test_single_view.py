@@ -13,23 +13,23 @@ from PIL import Image
 from bench.config import load
 from bench.evaluate.state import State
 from bench.records.read import read_records
-from bench.single_view import baselines, store
-from bench.single_view.baselines import MaskSearch, best_shape, mean_shape, most_similar_shape
-from bench.single_view.own_image import best_view, filled_fraction, read_picture
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import OptimiserSettings
 from bench.solve.solve import failure_of, run_optimisation
-from bench.tasks import single_view
-from bench.tasks.single_view import DEFINITIONS
+from bench.tasks.single_view import baselines, store
+from bench.tasks.single_view import task as single_view
+from bench.tasks.single_view.baselines import MaskSearch, best_shape, mean_shape, most_similar_shape
+from bench.tasks.single_view.own_image import best_view, filled_fraction, read_picture
+from bench.tasks.single_view.task import DEFINITIONS
 from bench.train import main
 from datasets.mesh import Mesh
 from datasets.scene import Split, Truth, see
 from renderers.checks import BadInput
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.reconstruct.test_losses import PAINT, Ball, shot_of
 from tests.runner.driving import CommandResult, command, record_of
-from tests.single_view.test_training import SAMPLER, Spheres, images  # noqa: F401, a fixture
+from tests.tasks.reconstruction.test_losses import PAINT, Ball, shot_of
+from tests.tasks.single_view.test_training import SAMPLER, Spheres, images  # noqa: F401, a fixture
 from tests.tiny import ball_prior, camera_of, curve_of, run_of, silent
 
 TINY = (

@@ -9,11 +9,11 @@ import pytest
 from bench.config import load
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
-from bench.stress.search import SearchSettings
-from bench.tasks.stability import Stability
+from bench.tasks.stability.search import SearchSettings
+from bench.tasks.stability.task import Stability
 from renderers import IDR
 from renderers.march import Stepping
-from tests.stress.test_stress import CRITERIA, FIT, stress_named
+from tests.tasks.stability.test_stress import CRITERIA, FIT, stress_named
 from tests.tiny import ball_prior, camera_of, curve_of, run_of
 
 SEARCH = SearchSettings(levels=17, repeats=3)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from bench.reconstruct.judge import COLOURED_DEFINITIONS, OWN_PREFIX, SEEN_PREFIX
-from bench.reconstruct.stereo import Matching
-from bench.reconstruct.subject import Depths
-from bench.reconstruct.surfaces import fuse_clouds, measured_clouds, with_colours
 from bench.solve.solve import COST_DEFINITIONS
-from bench.tasks.surfaces import Fusing, Hull, Poisson, Stereo
-from datasets.captures.hull import hull_mesh
+from bench.tasks.reconstruction.baselines import Fusing, Hull, Poisson, Stereo
+from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, OWN_PREFIX, SEEN_PREFIX
+from bench.tasks.reconstruction.stereo import Matching
+from bench.tasks.reconstruction.subject import Depths
+from bench.tasks.reconstruction.surfaces import fuse_clouds, measured_clouds, with_colours
+from datasets.files.captures.hull import hull_mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.datasets.test_photographs import PHOTOGRAPHY
@@ -78,7 +78,7 @@ def test_held_out_photographs_give_neither_shape_nor_colours(scene, tmp_path, mo
         )
 
     for name, function in (("with_colours", with_colours), ("hull_mesh", hull_mesh)):
-        monkeypatch.setattr(f"bench.tasks.surfaces.{name}", noted(function))
+        monkeypatch.setattr(f"bench.tasks.reconstruction.baselines.{name}", noted(function))
     HULL.execute(altered(run_in(tmp_path, scene), {"inputs.evaluation.picture": None}))
     assert [[shot.name for shot in shots] for shots in used] == [["1", "2", "3", "5", "6", "7"]] * 2
 

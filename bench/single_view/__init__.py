@@ -1,1 +1,0 @@
-"""One image, one shape: an encoder, a decoder of shape and colour, and their training over many shapes."""

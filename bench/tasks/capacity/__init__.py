@@ -1,0 +1,1 @@
+"""Fields without a prior: which is the smallest that suffices."""

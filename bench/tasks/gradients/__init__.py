@@ -1,0 +1,1 @@
+"""Gradients of a renderer compared with finite differences."""

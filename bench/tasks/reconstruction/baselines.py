@@ -1,0 +1,121 @@
+"""Surfaces from photographs without a renderer: baselines for `reconstruction`."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.solve import COST_DEFINITIONS
+from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS
+from bench.tasks.reconstruction.pictures import note_surface
+from bench.tasks.reconstruction.stereo import Cloud, Matching, stereo_clouds
+from bench.tasks.reconstruction.subject import NO_HULL, PhotographTask, Subject
+from bench.tasks.reconstruction.surfaces import fuse_clouds, given_clouds, measured_clouds, poisson, with_colours
+from datasets.files.captures.hull import hull_mesh
+from datasets.mesh import Mesh
+from renderers.checks import BadInput, check_at_least
+
+
+@dataclass(frozen=True)
+class _Surface(PhotographTask):
+    """A task that computes a surface without an optimisation loop."""
+
+    @abstractmethod
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The surface of the input photographs."""
+
+    def execute(self, run: RunContext) -> None:
+        """Computes the surface of the input photographs with their colours, and evaluates it on the held-out ones."""
+        record = run.record
+        record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
+        subject = self.subject(run.inputs)
+        record.notes = [*record.notes, subject.summary, "no renderer took part"]
+        with run.on_clock():
+            surface = self.surface(subject)
+            mesh = None if surface is None else surface.cut_off()
+            mesh = None if mesh is None else with_colours(mesh, subject.input_shots)
+        record.evaluations = {"value": 0, "gradient": 0}
+        with run.off_clock():
+            note_surface(run, mesh, subject, {})
+        subject.finish(run)
+
+
+@dataclass(frozen=True)
+class Fusing:
+    """Settings of the surface from points; see `bench.tasks.reconstruction.surfaces.poisson`."""
+
+    octree: int
+    trim: float
+
+    def __post_init__(self) -> None:
+        check_at_least("task.fusing.octree", self.octree, 2, "8 has 256 cells per axis")
+        check_at_least("task.fusing.trim", self.trim, 0, "0 trims nothing; DVR has 5 and 7 as well")
+
+    def surface(self, clouds: Sequence[Cloud]) -> Mesh | None:
+        """The surface of all points."""
+        return poisson(*fuse_clouds(clouds), depth=self.octree, trim=self.trim)
+
+
+@dataclass(frozen=True)
+class Hull(_Surface):
+    """The visual hull of the masks (Laurentini 1994).
+
+    Args:
+        samples: samples per axis.
+    """
+
+    samples: int
+
+    def __post_init__(self) -> None:
+        check_at_least("task.samples", self.samples, 8, "96 are as fine as a pixel at 96 x 96")
+        super().__post_init__()
+
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The mesh of the hull."""
+        if any(shot.mask is None for shot in subject.input_shots):
+            raise BadInput(f"{NO_HULL}, or set task=stereo")
+        return hull_mesh(subject.input_shots, self.samples)
+
+
+@dataclass(frozen=True)
+class Poisson(_Surface):
+    """Given depths or a given point cloud, fused by screened Poisson reconstruction.
+
+    Args:
+        fusing: settings of the surface.
+        cloud: a file of points in the cameras' world, for example from multi-view stereo; None: the given depths.
+    """
+
+    fusing: Fusing
+    cloud: str | None = None
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput if the file does not exist."""
+        if self.cloud is not None and not Path(self.cloud).is_file():
+            raise BadInput(f"task.cloud={self.cloud} is no file: check the path")
+
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The fused points."""
+        if self.cloud is not None:
+            return self.fusing.surface(measured_clouds(self.cloud, subject))
+        if all(shot.depth is None for shot in subject.input_shots):
+            raise BadInput("screened Poisson needs depths: set task.depths.points=dense, or task.cloud=POINTS.ply")
+        return self.fusing.surface(given_clouds(subject.input_shots))
+
+
+@dataclass(frozen=True)
+class Stereo(_Surface):
+    """Points on which neighbouring photographs agree, fused by screened Poisson reconstruction.
+
+    Args:
+        matching: choice of matched photographs.
+        fusing: settings of the surface.
+    """
+
+    matching: Matching
+    fusing: Fusing
+
+    def surface(self, subject: Subject) -> Mesh | None:
+        """The fused points on which the photographs agree."""
+        return self.fusing.surface(stereo_clouds(subject.input_shots, self.matching))

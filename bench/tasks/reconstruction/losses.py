@@ -1,0 +1,125 @@
+"""The losses of a reconstruction from images, each optional (DVR, Sec. 3.4; DIST, B.3; IDR, Sec. 3.4)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.solve.latent_code import Terms
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, normal_error
+from bench.tasks.reconstruction.pixels import Pixels
+from renderers.boundary import render_checked
+from renderers.camera import Rays
+from renderers.checks import BadInput, check_at_least, check_choice
+from renderers.field import Field, Kind, Meter
+from renderers.fields.networks.coloured import Coloured
+from renderers.rendering import RayObservation, Renderer, Volume
+from renderers.silhouette import SilhouetteLoss
+
+EIKONAL_POINTS = 512  # random points of the cube
+NEIGHBOUR_CUBE_SIDE = 2e-3  # scene units: a neighbour is drawn in this cube; DVR's code: 1e-3 of a unit cube
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Weights of the terms; 0 leaves a term out. Sums over rays are divided by the number of all rays.
+
+    Args:
+        colour: weight of the l1 error of colours, over hits on the foreground (DVR, Eq. 12). Volume renderers: of the
+            colours summed along all rays on the foreground.
+        colour_gradient: weight of the error of colour differences to the right and below, of the upper left pixel in
+            patches of 2 x 2, an l2 norm for each channel (DVR's official code; the paper has no equation for it).
+        depth: weight of the error of given depths over rays that hit (DVR, Eq. 13).
+        depth_loss: "depth", or "points", the distance in space.
+        silhouette: the silhouette loss; DVR, Eqs. 14 and 15, are `silhouette=occupancy`.
+        silhouette_weight: weight of the silhouette loss.
+        smoothness: weight of the difference between unit normals at a hit and at a random neighbour (DVR, Eq. 16).
+        normals: weight of 1 minus the cosine between normals and given ones, the mean over hits (DIST, B.3).
+        eikonal: weight of the squared difference of a distance's slope from 1, two means: at hits on the foreground and
+            in the cube (IDR, Sec. 3.4). A level set has none.
+    """
+
+    colour: float
+    colour_gradient: float
+    depth: float
+    depth_loss: str
+    silhouette: SilhouetteLoss
+    silhouette_weight: float
+    smoothness: float
+    normals: float
+    eikonal: float
+
+    def __post_init__(self) -> None:
+        check_choice("task.losses.depth_loss", self.depth_loss, DEPTH_LOSSES)
+        for name in ("colour", "colour_gradient", "depth", "silhouette_weight", "smoothness", "normals", "eikonal"):
+            check_at_least(f"task.losses.{name}", getattr(self, name), 0, "0 switches the term off")
+
+    def __call__(self, renderer: Renderer, shape: Coloured, metered: Meter, pixels: Pixels) -> Terms:
+        """The weighted terms and their sum, `total`.
+
+        Args:
+            renderer: the renderer at the current iteration.
+            shape: the field, with gradients for its parameters.
+            metered: the same field with counted evaluations.
+            pixels: the compared pixels; for `colour_gradient` in groups of four, see `Stack.draw`.
+        """
+        rendering = render_checked(renderer, metered, pixels.rays)
+        inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
+        points, rays = rendering.points[inside], len(inside)
+        gradients = gradients_at(metered, points)
+        normals = torch.nn.functional.normalize(gradients, dim=-1)
+        terms: Terms = {}
+        if self.colour or self.colour_gradient:
+            if rendering.volume is None:
+                compared, colours = inside, shape.colours(points, gradients, pixels.rays.directions[inside])
+            elif pixels.mask is None:
+                raise BadInput(f"{type(renderer).__name__} needs masks: without them it would paint what is behind too")
+            else:
+                compared = pixels.mask
+                colours = _volume_colours(shape, metered, pixels.rays, rendering.volume)[compared]
+            difference = torch.zeros_like(pixels.colours).index_put((compared,), colours - pixels.colours[compared])
+            if self.colour:
+                terms["colour"] = self.colour * difference.abs().sum() / rays
+            if self.colour_gradient:
+                terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / rays
+        if self.depth and pixels.distance is not None:
+            measured = rendering.hit & pixels.distance.isfinite()
+            scale = pixels.depth_per_distance[measured]
+            depths, given_depths = (distance[measured] * scale for distance in (rendering.distance, pixels.distance))
+            error = depth_error(self.depth_loss, depths, given_depths, scale)
+            terms["depth"] = self.depth * error.sum() / rays
+        if self.silhouette_weight and pixels.mask is not None:
+            observed = RayObservation(pixels.mask, pixels.guide)
+            loss = self.silhouette(renderer, metered, pixels.rays, rendering, observed)
+            terms["silhouette"] = self.silhouette_weight * loss
+        if self.smoothness:
+            nearby_points = points + NEIGHBOUR_CUBE_SIDE * (torch.rand_like(points) - 0.5)
+            neighbours = torch.nn.functional.normalize(gradients_at(metered, nearby_points), dim=-1)
+            terms["smoothness"] = self.smoothness * torch.linalg.vector_norm(normals - neighbours, dim=-1).sum() / rays
+        if self.normals and pixels.normals is not None:
+            terms["normals"] = self.normals * normal_error(normals, pixels.normals[inside])
+        if self.eikonal and shape.kind is not Kind.LEVEL:
+            random_points = 2 * torch.rand(EIKONAL_POINTS, 3, device=points.device) - 1
+            slopes = [torch.linalg.vector_norm(g, dim=-1) for g in (gradients, gradients_at(metered, random_points))]
+            terms["eikonal"] = self.eikonal * sum((slope - 1).square().sum() / max(len(slope), 1) for slope in slopes)
+        if not terms:
+            raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+
+def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:
+    """The colours of rays through a volume in front of black: the weighted sums of the samples' colours."""
+    sample_rays = rays[volume.ray]
+    points = sample_rays.at(volume.distance)
+    return volume.weighted_sum(
+        shape.colours(points, gradients_at(field, points), sample_rays.directions), len(rays.origins)
+    )
+
+
+def _neighbour_error(difference: Float[Tensor, "n 3"], inside: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    """The norm of the upper left pixel's differences to the right and below, summed over 2 x 2 patches inside."""
+    patches, patch_inside = difference.view(-1, 2, 2, 3), inside.view(-1, 4).all(-1)
+    corner = patches[:, 0, 0]
+    differences = torch.stack([patches[:, 0, 1] - corner, patches[:, 1, 0] - corner], dim=-1)
+    return (torch.linalg.vector_norm(differences, dim=-1).sum(-1) * patch_inside).sum()

@@ -1,0 +1,117 @@
+"""The inverse problem of learning a shape with colours from random pixels of photographs."""
+
+from copy import deepcopy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.evaluate.evaluate import Evaluation
+from bench.evaluate.state import State, colours_at
+from bench.pictures.filmstrip import Shown
+from bench.solve.latent_code import Terms
+from bench.tasks.reconstruction.judge import field_scores, judge, surface_scores
+from bench.tasks.reconstruction.losses import Losses
+from bench.tasks.reconstruction.pictures import draw_reconstruction
+from bench.tasks.reconstruction.pixels import Pixels, Stack
+from bench.tasks.reconstruction.subject import Subject
+from datasets.scene import View
+from renderers.boundary import render_checked
+from renderers.camera import Camera
+from renderers.field import Counts, Meter
+from renderers.fields.networks.coloured import Coloured, ColouredDistance, ColouredGrid, ColouredOccupancy
+from renderers.rendering import Renderer, at_iteration
+
+OBJECTIVE_PIXELS = 4096  # compared before and after the optimisation
+Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid  # modules whose `field` is a Coloured
+
+
+@dataclass
+class ReconstructionProblem:
+    """The problem of learning a field with colours; each of `iterations` draws new pixels."""
+
+    subject: Subject
+    stack: Stack
+    model: Learnt
+    losses: Losses
+    renderer: Renderer
+    rays_per_iteration: int
+    iterations: int
+    seed: int
+    counts: Counts = field(default_factory=Counts)
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The parameters of the field and its colours."""
+        return list(self.model.parameters())
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """Metrics of checkpoints: on held-out photographs and, if it is known, on the true surface."""
+        return ("psnr", *(["seen_chamfer_l1"] if self.subject.truth is not None else []))
+
+    @property
+    def observed(self) -> Bool[Tensor, "1 n"]:
+        """A mask of the pixels with a given depth, of all photographs in one row."""
+        distance, colours = self.stack.pixels.distance, self.stack.pixels.colours
+        return (torch.zeros_like(colours[:, 0]).bool() if distance is None else distance.isfinite())[None]
+
+    @property
+    def shown(self) -> Shown:
+        """The held-out photograph for the filmstrip."""
+        shot = self.subject.held_out[0]
+        blank = torch.zeros(shot.camera.height, shot.camera.width)
+        mask = torch.ones_like(blank).bool() if shot.mask is None else shot.mask
+        normals = blank[..., None].expand(-1, -1, 3) if shot.normals is None else shot.normals
+        return Shown(View(shot.camera, blank, normals, mask), shot.colours, shot.mask is not None)
+
+    def field(self) -> Coloured:
+        """A copy of the field at the current parameters; it counts operations like the learnt field."""
+        return deepcopy(self.model).field
+
+    def camera(self) -> Camera:
+        """The first held-out camera."""
+        return self.subject.held_out[0].camera
+
+    def evaluate(self, state: State) -> Evaluation:
+        """Compares the current shape with held-out photographs and the truth."""
+        return judge(state, self.subject)
+
+    def checkpoint(self, state: State) -> dict[str, float]:
+        """The `tracked` metrics of the current shape."""
+        scores = surface_scores(state.mesh, self.subject, state.inputs)
+        scores |= field_scores(state, self.subject.held_out)
+        return {name: scores[name] for name in self.tracked}
+
+    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
+        """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
+        draw_reconstruction(folder, states[1], self.subject, curve, title)
+
+    def loss(self, iteration: int) -> Terms:
+        """The terms and their sum, over new random pixels in each iteration."""
+        patches = self.losses.colour_gradient > 0
+        seed = self.seed * self.iterations + iteration
+        pixels = self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed)
+        shape = self.model.field
+        return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
+
+    def objective(self) -> float:
+        """The mean difference of colours over a fixed set of input pixels.
+
+        The loss is not used, because it compares hits only: it falls if the surface disappears.
+        """
+        return float(self.colour_errors(self.stack.draw(OBJECTIVE_PIXELS, patches=False, seed=self.seed)).mean())
+
+    def colour_errors(self, pixels: Pixels) -> Float[Tensor, " n"]:
+        """The mean difference of the three colours of each pixel, black outside of the shape and of masks."""
+        shape = self.field()
+        with torch.no_grad():
+            rendering = render_checked(at_iteration(self.renderer, self.iterations), shape, pixels.rays)
+        true_colours = pixels.colours if pixels.mask is None else pixels.colours * pixels.mask[:, None]
+        rendered_colours = torch.zeros_like(true_colours)
+        points, directions = rendering.points[rendering.hit], pixels.rays.directions[rendering.hit]
+        rendered_colours[rendering.hit] = colours_at(shape, points, directions, points.device).to(true_colours)
+        return (rendered_colours - true_colours).abs().mean(dim=-1)

@@ -1,0 +1,112 @@
+"""Shape and colour from photographs with known cameras, without a prior (DVR, Secs. 3.1 to 3.5, 4.2)."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from bench.evaluate.state import State
+from bench.setup.auto import AUTO
+from bench.setup.inputs import RunContext
+from bench.solve.optimise import OptimiserSettings
+from bench.solve.solve import check_field_gradient, solve
+from bench.tasks.reconstruction.choice import DEFINITIONS, Appearance, AutoField
+from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, judge
+from bench.tasks.reconstruction.losses import Losses
+from bench.tasks.reconstruction.pixels import Stack
+from bench.tasks.reconstruction.problem import ReconstructionProblem
+from bench.tasks.reconstruction.subject import (
+    GIVEN,
+    GUIDES,
+    HULL,
+    PhotographTask,
+    Subject,
+    given_distances,
+    hull_distances,
+)
+from renderers.checks import check_at_least, check_choice
+from renderers.field import Field
+from renderers.rendering import check_kind
+
+UNMASKED_WARNING = "without masks nothing says where the object ends: expect the shape to keep what is behind it"
+COUNT_DEFINITIONS = {
+    "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "
+    "foreground in each iteration, in a volume one per sample with a weight, nor second derivatives"
+}
+
+
+@dataclass(frozen=True)
+class Reconstruction(PhotographTask):
+    """Learns a field with colours, starting from a sphere, so that its renderings match the photographs.
+
+    Args:
+        images, longest, held_out, masks, depths: see `PhotographTask`.
+        guide: distances that a silhouette loss may use, such as `silhouette=occupancy` with `occupied_at: depth` (DVR,
+            Sec. 3.4): "none", "given" depths, or "hull": given depths, and at other pixels the visual hull's.
+        rays: number of pixels drawn in each iteration.
+        appearance: settings of the field, except its size.
+        auto: settings of `field=auto`.
+        losses: losses of the renderings.
+        optimiser: iterations and learning rates.
+    """
+
+    guide: str
+    rays: int
+    appearance: Appearance
+    auto: AutoField
+    losses: Losses
+    optimiser: OptimiserSettings
+
+    takes_field: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("task.guide", self.guide, GUIDES)
+        check_at_least("task.rays", self.rays, 4, "1024 work")
+        if self.losses.colour_gradient and self.rays % 4:
+            raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
+
+    def execute(self, run: RunContext) -> None:
+        """Learns the field, and evaluates it before and after."""
+        name, inputs = run.inputs.field.name, run.inputs
+        check_field_gradient(inputs.renderer)
+        with torch.random.fork_rng():
+            candidates = self.auto.candidates if name == AUTO else (name,)
+            models = {candidate: self.appearance.make(candidate) for candidate in candidates}
+        for model in models.values():  # before the slow reading of photographs
+            check_kind(inputs.renderer, model.field)
+        definitions = COLOURED_DEFINITIONS | COUNT_DEFINITIONS | (DEFINITIONS if name == AUTO else {})
+        run.record.definitions = dict(definitions)
+        subject = self.subject(inputs)
+        warnings = [UNMASKED_WARNING] if subject.input_shots[0].mask is None else []
+        run.record.notes = [*run.record.notes, subject.summary, *warnings]
+        if name != AUTO:
+            solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
+            subject.finish(run)
+            return
+        with torch.random.fork_rng():  # the final run is the same as a run of the chosen field alone
+            sizes = {name: sum(tensor.numel() for tensor in model.parameters()) for name, model in models.items()}
+            choice = self.auto.choose(lambda n, s: self.problem(n, s, run), sizes, subject, self.optimiser, run)
+        run.record.notes.append(choice.note)
+        solve(lambda: self.problem(choice.kept.candidate, subject, run), self.optimiser, run, definitions)
+        subject.finish(run)
+        seconds = run.record.seconds
+        run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
+        seconds["trials"] = choice.seconds
+
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
+        """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
+        subject = self.subject(run.inputs)
+        evaluation = judge(State(field, run.inputs), subject)
+        return evaluation.metrics | subject.point_metrics(evaluation.mesh, run.inputs)
+
+    def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
+        """The problem of learning the named field from photographs."""
+        inputs = run.inputs
+        model = self.appearance.make(name).to(inputs.device)
+        guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
+        stack = Stack.build(subject.input_shots, guide and guide(subject.input_shots), inputs.device)
+        iterations = self.optimiser.iterations
+        return ReconstructionProblem(
+            subject, stack, model, self.losses, inputs.renderer, self.rays, iterations, inputs.seed
+        )

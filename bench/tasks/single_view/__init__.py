@@ -1,0 +1,1 @@
+"""Shape from one image, by a network that a renderer trains."""

@@ -1,0 +1,1 @@
+"""Stress tests: at which severity a renderer fails."""

@@ -1,0 +1,1 @@
+"""What users bring: meshes, photographs, depth images, scans, networks. A format is a file."""

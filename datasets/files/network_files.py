@@ -1,0 +1,366 @@
+"""Trained networks of others as scenes: the true shape is the zero set of a network in a file or a folder.
+
+Only weights are read: nothing in a file is executed.
+"""
+
+import hashlib
+import json
+import pickle
+import re
+import struct
+import warnings
+import zipfile
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from math import isfinite
+from pathlib import Path
+from typing import Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from datasets.files.field_files import ASSUMED_WIDTH, FIELD_FILE, load_network
+from datasets.mesh import Mesh, extract
+from datasets.scene import Split
+from renderers.checks import BadInput, check_at_least, check_choice, check_positive
+from renderers.field import Kind
+from renderers.fields.analytic import Shape, sphere
+from renderers.fields.mlp import Decoder
+from renderers.fields.networks.network import Coded, FieldStatistics, Published, interpret, measure_field, scale_shapes
+from renderers.fields.networks.published import (
+    LAYERS,
+    SIGNED,
+    Residual,
+    load_deepsdf,
+    load_mlp,
+    load_occupancy_network,
+    load_sdf_network,
+)
+
+VERSION = 1  # raise it when reading or measuring changes the fields
+CUBE_HALF_SIDE = 1.05  # scene units: the surface within the unit sphere is extracted in this cube
+AUTO = "auto"
+MEASURED_CODES = 16  # the sign and the Lipschitz constant are measured at about so many codes
+INSIDE_SIGNS = {AUTO: None, "negative": 1.0, "positive": -1.0}  # see `FieldInterpretation`
+OWN_CLASS = "field._target_=PACKAGE.CLASS"
+DEEPSDF_FILES = ("ModelParameters/latest.pth", "LatentCodes/latest.pth")
+SUPPORTED_CHECKPOINTS = (
+    "DeepSDF (name the folder with its specs.json); IDR, NeuS, VolSDF (implicit_network.lin0, sdf_network.lin0); "
+    "occupancy networks, DVR (fc_p, conv_p)"
+)
+# The loader raises these if a file is no pickle of weights.
+CHECKPOINT_ERRORS = (pickle.UnpicklingError, LookupError, UnicodeDecodeError, struct.error)
+NUMPY_SCALAR_CLASSES = [  # some checkpoints store their best loss as a NumPy scalar
+    *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
+    *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
+]
+
+
+@dataclass(frozen=True)
+class SceneNetwork:
+    """The network of a scene, all its codes, and the measurements at the code of the scene.
+
+    Args:
+        decoder: `at(code)` is a field, negative inside.
+        codes: of all its shapes.
+        facts: of the field in the file, with the sign negative inside, at its level and scale.
+        notes: the measurements and conversions, in words.
+    """
+
+    decoder: Decoder | Published
+    codes: Float[Tensor, "shapes code_length"]
+    facts: FieldStatistics
+    notes: tuple[str, ...]
+
+
+@runtime_checkable
+class HasNetwork(Protocol):
+    """A dataset whose shapes are codes of a network: the network is the field of its scenes and their prior."""
+
+    def network(self, index: int) -> SceneNetwork:
+        """The network, and the measurements at code number `index`."""
+        ...
+
+
+@dataclass(frozen=True)
+class NetworkFile:
+    """The shapes of a network, each the zero set of its field at one code, within the unit sphere.
+
+    Every split has all codes. A network without codes has one shape.
+
+    Args:
+        path: a DeepSDF folder, with specs.json; a checkpoint of IDR, NeuS, VolSDF, an occupancy network or DVR; an
+            `.npz` of neural-implicit-queries; or the folder of a run with a saved field.
+        scale: factor that enlarges the shapes; renderers see the unit sphere.
+        inside: sign of the values inside, "negative" or "positive"; "auto" takes the sign rarer on the unit sphere.
+        level: value of the network on the surface.
+        kind: kind of field: "distance", "bound" or "level"; "auto" measures it. The values of a bound are divided by
+            its Lipschitz constant.
+        codes: a file of codes, `.npy` or `.pth` [shapes, length], that replace the network's codes.
+        tanh: number of tanh after the last layer of a DeepSDF network; None takes the number of its code.
+        resolution: samples per axis of the marching cubes that give the true mesh.
+    """
+
+    path: str
+    scale: float
+    inside: str
+    level: float
+    kind: str
+    codes: str | None
+    tanh: int | None
+    resolution: int
+
+    def __post_init__(self) -> None:
+        check_positive("dataset.scale", self.scale, "1 leaves the network's own units")
+        check_choice("dataset.inside", self.inside, tuple(INSIDE_SIGNS))
+        check_choice("dataset.kind", self.kind, (AUTO, *(kind.value for kind in Kind)))
+        check_at_least("dataset.resolution", self.resolution, 16, "128 keeps thin parts")
+        if self.tanh is not None:
+            check_at_least("dataset.tanh", self.tanh, 0, "1 is as in DeepSDF's code of 2019")
+        if not isfinite(self.level):
+            remedy = "0 for distances and logits, 0.5 for probabilities"
+            raise ValueError(f"dataset.level must be finite, not {self.level}: {remedy}")
+        if not Path(self.path).exists():
+            raise ValueError(f"dataset.path: there is nothing at '{self.path}': name a network's file or folder")
+
+    @property
+    def name(self) -> str:
+        """The file's or the folder's name, without suffix."""
+        return Path(self.path).resolve().stem
+
+    def mesh(self, split: Split, index: int) -> Mesh:
+        """The surface of a shape within the unit sphere, closed along the sphere."""
+        network = self.network(index)
+        field = network.decoder.at(network.codes[index])
+        surface = extract(Shape(field, field.kind) & sphere(1.0), grid=self.resolution, reach=CUBE_HALF_SIDE)
+        if surface is None:
+            raise BadInput(f"{self.path}, code {index}: the marching cubes find no surface: set dataset.resolution=256")
+        return surface
+
+    def network(self, index: int) -> SceneNetwork:
+        """The network, converted to a field by measurements at code number `index`.
+
+        Raises:
+            BadInput: it cannot be read, has no such code, or no surface in the unit sphere.
+        """
+        return _load_network(self, index, _content_hash(self.files))
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read."""
+        path = Path(self.path)
+        names = ("specs.json", FIELD_FILE, *DEEPSDF_FILES) if path.is_dir() else ("",)
+        return [file for file in (*(path / name for name in names), Path(self.codes or "")) if file.is_file()]
+
+    def identity(self) -> dict[str, Any]:
+        """Plain data that determines the shapes: the files' contents, not their paths."""
+        settings = {key: value for key, value in asdict(self).items() if key not in ("path", "codes", "module")}
+        return {"name": "network", "version": VERSION, "contents": _content_hash(self.files), **settings}
+
+
+@runtime_checkable
+class Module(Protocol):
+    """A network of the user, an nn.Module: points [n, 3] to values [n] or [n, 1]."""
+
+    def __call__(self, points: Tensor) -> Tensor: ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
+
+
+@dataclass(frozen=True)
+class ModuleFile(NetworkFile):
+    """A network of a class of the user, with its weights in a file.
+
+    Args:
+        module: the network, before its weights are read.
+    """
+
+    module: Module
+
+    def identity(self) -> dict[str, Any]:
+        """Plain data, see `NetworkFile`, with the module's `repr` and its plain attributes."""
+        attributes = {key: value for key, value in vars(self.module).items() if isinstance(value, int | float | str)}
+        return super().identity() | {"module": f"{self.module!r} {attributes}"}
+
+    def read(self) -> Published:
+        """The network in evaluation mode, with the weights of the file; their names may have any prefix."""
+        tensors, module = _tensors(Path(self.path)), deepcopy(cast(nn.Module, self.module)).eval()
+        names = [*module.state_dict()]
+        prefixes = [name.removesuffix(names[0]) for name in tensors if f".{name}".endswith(f".{names[0]}")]
+        if len(prefixes) > 1 and "" not in prefixes:
+            raise BadInput(f"it has several networks, {', '.join(prefixes)}: save the state_dict() of one of them")
+        prefix = "" if "" in prefixes else next(iter(prefixes), "")
+        try:
+            module.load_state_dict({name: tensors[prefix + name] for name in names if prefix + name in tensors})
+        except RuntimeError as error:
+            message = " ".join(str(error).split())
+            raise BadInput(f"its weights are not those of {type(module).__name__}: {message}") from error
+        return Published(Coded(_Body(module), code_length=0, width=ASSUMED_WIDTH))
+
+
+class _Body(nn.Module):
+    """A module as the body of a `Coded`."""
+
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(self, points: Float[Tensor, "n 3"], code: Tensor) -> Float[Tensor, " n"]:
+        return self.inner(points).reshape(len(points))
+
+
+@lru_cache(maxsize=4)
+def _load_network(file: NetworkFile, index: int, content: str) -> SceneNetwork:
+    """The network, measured at one code; read again when a file has changed."""
+    try:
+        network, codes = _read(file)
+        scale_shapes(network.inner, file.scale)
+        if index >= len(codes):
+            message = f"{len(codes)} codes, and index={index} is none of them: set index=0 to {len(codes) - 1}"
+            raise BadInput(f"it has {message if len(codes) > 1 else 'one code: set index=0'}")
+        return _measured(file, network, codes, index, content)
+    except BadInput as error:
+        raise BadInput(f"the network {file.path}: {error}") from error
+
+
+def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, content: str) -> SceneNetwork:
+    """The network, converted to a field that is negative inside and of the measured kind."""
+    others = [network.at(code) for code in codes[:: max(len(codes) // MEASURED_CODES, 1)]] if len(codes) > 1 else []
+    meaning = measure_field(
+        network.at(codes[index]),
+        codes,
+        kind=None if file.kind == AUTO else Kind(file.kind),
+        sign=INSIDE_SIGNS[file.inside],
+        level=file.level,
+        scale=file.scale,
+        others=others,
+    )
+    facts, kind = meaning.statistics, meaning.kind
+    if not facts.min_value < 0 < facts.max_value:
+        ends = sorted(
+            file.level + value / (meaning.factor * meaning.divisor) for value in (facts.min_value, facts.max_value)
+        )
+        raise BadInput(
+            f"its values in the unit sphere lie between {ends[0]:.3g} and {ends[1]:.3g}, and the surface at the level "
+            f"{file.level:g} is not among them: set dataset.level (0.5 where they are probabilities), or dataset.scale"
+        )
+    network.register_buffer("content", torch.frombuffer(bytearray.fromhex(content), dtype=torch.uint8))
+    decoder = interpret(network, meaning, level=file.level).requires_grad_(False)
+    side = f"values are {'negative' if meaning.factor > 0 else 'positive'} inside, at the level {file.level:g}"
+    if isinstance(network.inner, Coded) and isinstance(network.inner.body, Residual):
+        side += f" of the logits, a probability of {torch.tensor(file.level).sigmoid():.2g} (occupancy networks' own "
+        side += "meshes are at 0.2, dataset.level=-1.386)"
+    divided = f", by values divided by {meaning.divisor:.3g}" if kind is Kind.BOUND else ""
+    note = f"{file.name}: {side}; {facts.summary}; taken as a {kind.value}{divided}"
+    return SceneNetwork(decoder, codes, facts, (note,))
+
+
+def _read(file: NetworkFile) -> tuple[Published, Tensor]:
+    """The network of a file or a folder, and its codes."""
+    path = Path(file.path)
+    if isinstance(file, ModuleFile):
+        network, codes = file.read(), None
+    elif (path / FIELD_FILE).is_file() or (path / "record.json").is_file():
+        network, codes = load_network(path), None
+    elif path.is_dir():
+        network, codes = _read_folder(path, file.tanh)
+    elif path.suffix == ".npz":
+        network, codes = load_mlp(_arrays(path)), None
+    else:
+        network, codes = _by_tensor_names(_tensors(path)), None
+    if file.codes is not None:
+        codes = _codes(Path(file.codes))
+    length = network.code_length
+    if codes is None:
+        if not network.code_is_position:
+            raise BadInput(
+                f"its values depend on a code of {length} numbers, which it does not hold: set dataset.codes=FILE, an "
+                f".npy or .pth of [shapes, {length}], such as an encoder's output"
+            )
+        codes = torch.zeros(1, length)
+    if codes.dim() != 2 or codes.shape[1] != length:
+        raise BadInput(f"its codes must be [shapes, {length}], not {list(codes.shape)}")
+    return network, codes
+
+
+def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | None]:
+    """The network of a DeepSDF folder, and its codes; None without codes."""
+    try:
+        specs = json.loads((path / "specs.json").read_text("utf-8"))
+    except OSError:
+        raise BadInput("the folder has no specs.json: name a DeepSDF folder, or a file") from None
+    except ValueError as error:
+        raise BadInput(f"specs.json must be JSON: {error}") from error
+    weights, latent = (path / name for name in DEEPSDF_FILES)
+    if not weights.is_file():
+        raise BadInput(f"the folder has no {DEEPSDF_FILES[0]}")
+    network = load_deepsdf(_tensors(weights), specs, squash=squash)
+    return network, _codes(latent) if latent.is_file() and not network.code_is_position else None
+
+
+def _by_tensor_names(tensors: dict[str, Tensor]) -> Published:
+    """The network of a checkpoint; its tensors' names determine its format."""
+    if any(re.search(rf"(?:^|\.){SIGNED}\.{LAYERS}", name) for name in tensors):
+        return load_sdf_network(tensors)
+    if any(f".{first}_p." in f".{name}" for name in tensors for first in ("fc", "conv")):
+        return load_occupancy_network(tensors)
+    names = ", ".join([*tensors][:6]) or "no tensors"
+    formats = f"{SUPPORTED_CHECKPOINTS}; .npz; a class of yours, by {OWN_CLASS}"
+    raise BadInput(f"it is of no format that is read, which are {formats}: it has {names}")
+
+
+def _codes(path: Path) -> Tensor:
+    """The codes of a file: a tensor, alone or under `latent_codes`, or the weights of an embedding."""
+    if path.suffix == ".npy":
+        try:
+            return torch.from_numpy(np.load(path, allow_pickle=False)).float()
+        except (OSError, ValueError, EOFError) as error:
+            raise BadInput(f"{path.name} cannot be read: {error}") from error
+    tables = [tensor for tensor in _tensors(path).values() if tensor.dim() > 1]
+    if len(tables) != 1:
+        raise BadInput(f"{path.name} must hold one table of codes, not {len(tables)}")
+    return (tables[0].squeeze(1) if tables[0].dim() == 3 else tables[0]).float()
+
+
+def _arrays(path: Path) -> dict[str, Tensor]:
+    """The arrays of an `.npz` by name."""
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+            return {name: torch.from_numpy(np.asarray(arrays[name], dtype=np.float32)) for name in arrays.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise BadInput(f"it cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors of a checkpoint by their dotted names, on the CPU; all other contents are left out."""
+    try:
+        with torch.serialization.safe_globals(NUMPY_SCALAR_CLASSES), warnings.catch_warnings(action="ignore"):
+            return dict(_flatten(torch.load(path, weights_only=True, map_location="cpu")))
+    except CHECKPOINT_ERRORS as error:
+        message = "is no network file, or is broken: name a checkpoint of weights, an .npz or a folder"
+        if blocked := re.search(r"GLOBAL (\S+)", str(error)):
+            message = f"holds more than weights, which is not run ({blocked[1]}): save its state_dict() alone"
+        raise BadInput(f"{path.name} {message}") from error
+    except (OSError, RuntimeError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        if "TorchScript" in str(error):
+            message = f"a program, which is not run: save its state_dict(), and name its class by {OWN_CLASS}"
+            raise BadInput(f"{path.name} is TorchScript, {message}") from error
+        raise BadInput(f"{path.name} cannot be read: it may be cut short, copy it again") from error
+
+
+def _flatten(node: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
+    if isinstance(node, Tensor):
+        yield prefix.removesuffix(".") or "tensor", node
+    elif isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from _flatten(value, f"{prefix}{key}.")
+
+
+def _content_hash(files: list[Path]) -> str:
+    """A hash of the names and contents of files."""
+    hashes = (file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest() for file in files)
+    return hashlib.sha256(b"".join(hashes)).hexdigest()

@@ -1,0 +1,205 @@
+"""ShapeNetCore as a dataset: the files of a class and of a split, and the placement of their shapes."""
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datasets.files.captures.formats import find_layout
+from datasets.files.captures.take import read_shot
+from datasets.files.colours import FileColours
+from datasets.files.local import VERSION, load_repaired, split_files
+from datasets.files.meshes import read_mesh
+from datasets.files.repair import WRAPPED
+from datasets.mesh import Mesh, fit_in_sphere
+from datasets.scene import Split
+from datasets.shot import Shot
+from datasets.textures import Texture
+from renderers.checks import BadInput, check_choice
+
+SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
+    **{"plane": "02691156", "bench": "02828884", "cabinet": "02933112", "car": "02958343", "chair": "03001627"},
+    **{"display": "03211117", "lamp": "03636649", "speaker": "03691459", "rifle": "04090263", "sofa": "04256520"},
+    **{"table": "04379243", "phone": "04401088", "vessel": "04530566"},
+}
+NAMES = {number: name for name, number in SYNSETS.items()}
+MESH_PATHS = ("models/model_normalized.obj", "model.obj")  # ShapeNetCore v2 and v1
+SPLIT_WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"}  # parts of the names of lists
+DEEPSDF_BUFFER = 1.03  # radius of the unit sphere divided by the shape's radius
+UNKNOWN_INSIDE_WARNING = (
+    "warning: the file does not say what is inside: here it is what the wrap encloses; DeepSDF drops such shapes"
+)
+
+
+@dataclass(frozen=True)
+class ShapeNet:
+    """The shapes of a class of ShapeNetCore, each repaired to be a closed solid.
+
+    A split without a list has a fifth of the training list; without that list, of the shapes that no list names.
+    Training and validation repeat shapes if a prior takes more than exist. The test split does not.
+
+    Args:
+        path: the folder with the synsets' folders, with `ID/models/model_normalized.obj` (v2) or `ID/model.obj`.
+        synset: a name of `SYNSETS`, or a number.
+        split: a list of ids; see `_lists`. None: all shapes are divided among the splits.
+        normalised: "deepsdf", into the unit sphere, or "onet", into a cube of side 1.
+        renders: a folder with `SYNSET/ID`, of DVR's data or of NMR's in DVR's form, for `task=single_view`.
+    """
+
+    path: str
+    synset: str
+    split: str | None
+    normalised: str
+    renders: str | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("dataset.normalised", self.normalised, ("deepsdf", "onet"))
+        if not self.synset.isdigit():
+            check_choice("dataset.synset", self.synset, tuple(SYNSETS))
+        _ = self.files  # raises if something is missing
+        if self.renders is not None and not (class_folder := Path(self.renders) / self.folder.name).is_dir():
+            raise ValueError(f"dataset.renders: there is no folder '{class_folder}': give the one that has SYNSET/ID")
+
+    @property
+    def name(self) -> str:
+        """The class, by its name if `SYNSETS` has one."""
+        return f"shapenet_{NAMES.get(self.synset, self.synset)}"
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the class."""
+        return Path(self.path) / SYNSETS.get(self.synset, self.synset)
+
+    def mesh(self, split: Split, index: int) -> Mesh:
+        """A shape as a closed mesh; its `repairs` state its id, shapes that are missing on disk, and its repairs."""
+        file = self._file(split, index)
+        mesh, notes = _load(file, self.normalised), [f"the shape is {_id(file)}"]
+        if missing := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
+            text = f"{len(missing)} shapes of the list are not on disk, and left out, such as {min(missing)}"
+            notes.append(f"warning: {text}")
+        return replace(mesh, repairs=(*notes, *mesh.repairs))
+
+    def texture(self, split: Split, index: int) -> Texture:
+        """The colours of a shape from its file; see `Textured`."""
+        file = self._file(split, index)
+        return FileColours(file, load_repaired(file), self.mesh(split, index))
+
+    def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
+        """See `Pictured`."""
+        if self.renders is None:
+            return None
+        folder = Path(self.renders) / self.folder.name / _id(self._file(split, index))
+        return tuple(read_shot(frame, longest).in_world(np.eye(4)) for frame in find_layout(folder).frames)
+
+    def _file(self, split: Split, index: int) -> Path:
+        files = self.files[split]
+        if not files or (index >= len(files) and split is Split.TEST):
+            what = f"and none of number {index}: set a smaller index, unpack more shapes, or give another dataset.split"
+            if split is not Split.TEST:
+                what = "and a prior is trained on some: put their list beside dataset.split, unpack more shapes, "
+                what += "or set prior=deepsdf prior.path=FOLDER"
+            raise BadInput(f"{self.name} has {len(files)} {split} shapes in '{self.folder}', {what}")
+        return files[index % len(files)]
+
+    @cached_property
+    def files(self) -> dict[Split, list[Path]]:
+        """The files of each split that are on disk, in the order of its list.
+
+        Raises:
+            ValueError: the class or a list has no shapes.
+        """
+        by_id = _shapes(self.folder)
+        listed = {split: [by_id[name] for name in names if name in by_id] for split, names in self.lists.items()}
+        if listed and not any(listed.values()):
+            names = [name for names in self.lists.values() for name in names]
+            raise ValueError(
+                f"dataset.split: none of its {len(names)} shapes is in '{self.folder}', such as {names[0]}: unpack "
+                "them there, or give the split of the shapes that are"
+            )
+        rest = {*by_id.values()}.difference(*listed.values())
+        files = split_files(listed.get(Split.TRAIN, sorted(rest))) | listed
+        if Split.TRAIN in listed:
+            held_out = {*files[Split.VALIDATION], *files[Split.TEST]}
+            files[Split.TRAIN] = [file for file in files[Split.TRAIN] if file not in held_out]
+        return files
+
+    @cached_property
+    def lists(self) -> dict[Split, list[str]]:
+        """The ids that each list names."""
+        files = {} if self.split is None else _lists(Path(self.split))
+        return {split: _read_ids(file, self.folder.name) for split, file in files.items()}
+
+    def identity(self) -> dict[str, Any]:
+        """Plain data that determines the shapes: their paths, since the files of a ShapeNet release do not change."""
+        names = {split: [str(file.relative_to(self.folder)) for file in files] for split, files in self.files.items()}
+        shapes = hashlib.sha256(json.dumps(names).encode()).hexdigest()
+        renders = {} if self.renders is None else {"renders": self.renders}
+        return {"name": self.name, "version": VERSION, "shapes": shapes, "normalised": self.normalised} | renders
+
+
+def _id(file: Path) -> str:
+    """The id of a shape, the name of its folder."""
+    return file.parts[-3 if file.parent.name == "models" else -2]
+
+
+def _shapes(folder: Path) -> dict[str, Path]:
+    """The file of each shape in a class's folder, by its id."""
+    for inner in MESH_PATHS:
+        if files := sorted(folder.glob(f"*/{inner}")):
+            return {_id(file): file for file in files}
+    what = f"'{folder}' has no ID/{MESH_PATHS[0]} (v2) and no ID/{MESH_PATHS[1]} (v1)"
+    for parent in (folder, folder.parent):
+        what = what if parent.is_dir() else f"there is no folder '{parent}'"
+    raise ValueError(f"dataset.path: {what}: give the folder of ShapeNetCore in which that of the synset is unpacked")
+
+
+def _lists(file: Path) -> dict[Split, Path]:
+    """The list of each split: `file` and files of its folder with other `SPLIT_WORDS`; without any word, only test."""
+    if not file.is_file():
+        raise ValueError(f"dataset.split: there is no file '{file}': give a split of DeepSDF (.json) or a list (.lst)")
+    match = re.search(rf"(?<![a-z])({'|'.join(SPLIT_WORDS.values())})(?![a-z])", file.name)
+    if match is None:
+        return {Split.TEST: file}
+    names = {split: file.name[: match.start()] + word + file.name[match.end() :] for split, word in SPLIT_WORDS.items()}
+    return {split: file.with_name(name) for split, name in names.items() if file.with_name(name).is_file()}
+
+
+def _read_ids(file: Path, synset: str) -> list[str]:
+    """The ids of a synset in a list: DeepSDF's JSON, or lines with an id, alone or after its synset.
+
+    Raises:
+        ValueError: the list cannot be read, or has no ids of the synset.
+    """
+    ids = dict[str, list[str]]()
+    try:
+        if file.suffix == ".json":
+            for dataset in json.loads(file.read_text()).values():
+                ids |= dataset
+        else:
+            rows = (line.replace("/", " ").split() for line in file.read_text().splitlines() if line.strip())
+            for *parents, name in rows:
+                ids.setdefault(parents[-1] if parents else synset, []).append(name)
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"dataset.split: '{file}' cannot be read as a split of DeepSDF or a list: {error}") from None
+    if not ids.get(synset):
+        has = ", ".join(NAMES.get(number, number) for number in ids) or "nothing"
+        raise ValueError(f"dataset.split: '{file}' has nothing of {NAMES.get(synset, synset)}, but {has}: set "
+                         "dataset.synset to it, or give another list")  # fmt: skip
+    return ids[synset]
+
+
+@lru_cache(maxsize=64)
+def _load(path: Path, normalised: str) -> Mesh:
+    """The repaired mesh of a file, normalised by the vertices of the unrepaired mesh."""
+    points = read_mesh(path).used_vertices
+    centre, factor = fit_in_sphere(points, 1 / DEEPSDF_BUFFER)
+    if normalised == "onet":
+        factor = 1 / float((points.max(axis=0) - points.min(axis=0)).max())
+    mesh = load_repaired(path)
+    sign = (UNKNOWN_INSIDE_WARNING,) if any(note.startswith(WRAPPED) for note in mesh.repairs) else ()
+    return replace(mesh, vertices=(mesh.vertices - centre) * factor, repairs=(*sign, *mesh.repairs))

@@ -1,0 +1,1 @@
+"""Networks of others, occupancy networks, and fields with colours."""
