@@ -31,7 +31,7 @@ OUR_PACKAGES = ("renderers", "datasets", "bench")  # a `_target_` may always nam
 CLASS_PACKAGE_KEY = "_package_"  # key of the node `renderer`: the package of the class typed for renderer=custom
 PRIOR_DATASET_KEY = "of"  # key of the node `prior`: the dataset that it was trained on
 # Keys of a dataset or a task that other nodes refer to.
-FOLLOWED_KEYS = ("_prior_", "_field_", "_similarity_", "_iterations_", "_silhouette_weight_")
+FOLLOWED_KEYS = ("_prior_", "_field_", "_multiview_", "_similarity_", "_iterations_", "_silhouette_weight_")
 # All other keys of a node are arguments.
 RESERVED_KEYS = ("_target_", CLASS_PACKAGE_KEY, *FOLLOWED_KEYS, PRIOR_DATASET_KEY, LABEL_KEY, ROWS_KEY, LOOK_KEY)
 ROLE_OF_NODE = {  # the protocol or base class that the class of a node must have
@@ -40,7 +40,7 @@ ROLE_OF_NODE = {  # the protocol or base class that the class of a node must hav
     "dataset": "datasets.scene.Dataset",
     "silhouette": "renderers.silhouette.SilhouetteLoss",
     "tracker": "bench.trackers.Tracker",
-    "prior": "datasets.files.network_files.HasNetwork",
+    "prior": "datasets.scene.HasNetwork",
     "supervision": "bench.tasks.single_view.training.Supervision",
 }
 CLASS_OF_NODE = {  # for nodes without a _target_
@@ -50,6 +50,8 @@ CLASS_OF_NODE = {  # for nodes without a _target_
     "models": "bench.setup.fields.ModelSettings",
     "evaluation": "bench.config.EvaluationSettings",
 }
+PRIOR_FIELD = "prior"  # value of `field`: a latent code of the prior
+FIT_MODULE = "bench.tasks.capacity.field"  # its `fit_view` fits any other field; only such a run loads it
 TYPE_LABELS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "null"}
 
 
@@ -332,7 +334,7 @@ def _with_defaults(group: str, name: str) -> DictConfig:
 def _build_dataclass(cls: type, arguments: dict[str, Any], name: str, packages: Sequence[str]) -> Any:
     """An instance of a dataclass, with arguments converted to the field types; a ValueError names the wrong field."""
     types = get_type_hints(cls)
-    protocols = [key for key in arguments if getattr(types[key], "_is_protocol", False)]
+    protocols = [key for key, value in arguments.items() if value is not None and _protocol(types[key])]
     for key in protocols:
         if not isinstance(arguments[key], dict):
             raise ValueError(
@@ -351,7 +353,7 @@ def _build_dataclass(cls: type, arguments: dict[str, Any], name: str, packages: 
     values |= {key: tuple(value) for key, value in values.items() if get_origin(types[key]) is tuple}
     for key, child in nested.items():
         target = _class_path(child) if child else ""
-        values[key] = build(arguments[key], f"{name}.{key}", packages, target, role=child or types[key])
+        values[key] = build(arguments[key], f"{name}.{key}", packages, target, role=child or _protocol(types[key]))
     for item in fields(cls):
         has_default = item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING
         if item.name not in values and not has_default:
@@ -372,6 +374,11 @@ def _missing_value_message(cls: type, name: str, key: str) -> str:
 def _node_class(wanted: Any) -> type | None:
     """The dataclass in a field's type, such as `X` or `X | None`; None if there is no dataclass."""
     return next((cls for cls in (wanted, *get_args(wanted)) if isinstance(cls, type) and is_dataclass(cls)), None)
+
+
+def _protocol(wanted: Any) -> type | None:
+    """The protocol in a field's type, such as `X` or `X | None`; None if there is no protocol."""
+    return next((cls for cls in (wanted, *get_args(wanted)) if getattr(cls, "_is_protocol", False)), None)
 
 
 def _class_path(cls: type) -> str:

@@ -26,9 +26,9 @@ from datasets.mesh import Mesh
 from datasets.scene import Dataset, Split, Textured, Truth, sample_surface, seed_of
 from datasets.textures import TEXTURES, Texture, make_texture
 from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.field import LatentDecoder
 from renderers.fields.mlp import Decoder
-from renderers.fields.networks.coloured import TexturedDecoder, TexturedShape
-from renderers.fields.networks.network import Published
+from renderers.fields.textured import TexturedDecoder, TexturedShape
 
 SHIPPED = Path(__file__).resolve().parents[1] / "datasets" / "priors"
 VERSION = 1  # raise it when training changes, so that no prior of the old training is used for a new one
@@ -146,7 +146,7 @@ class PriorSettings:
 class Prior:
     """A decoder whose codes are shapes, and the codes of its training shapes. Code zero is the mean shape."""
 
-    decoder: Trained | Published
+    decoder: LatentDecoder
     codes: Float[Tensor, "shapes code_length"]
 
 

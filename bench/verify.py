@@ -24,7 +24,8 @@ from bench.records.format import number, plural
 from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, bad_link, read_record
 from bench.setup.inputs import EvaluatesField, RunContext, build_cell
-from datasets.files.field_files import FIELD_FILE, load_field
+from datasets.files.field_files import load_field
+from datasets.saved_field import FIELD_FILE
 from renderers.checks import BadInput
 
 METRIC_TOLERANCE = 1e-4  # relative: other machines add numbers in another order

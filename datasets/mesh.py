@@ -144,6 +144,15 @@ class Mesh:
         faces = self.faces[(np.linalg.norm(self.vertices, axis=1) <= 1)[self.faces].all(axis=1)]
         return replace(self, faces=faces).compact() if len(faces) else None
 
+    @staticmethod
+    def load(path: Path) -> "Mesh":
+        """The mesh of a file that `save` wrote; `datasets.files.meshes` reads other files."""
+        import trimesh
+
+        loaded = trimesh.load_mesh(path, process=False)
+        colours = loaded.visual.vertex_colors[:, :3] / 255 if loaded.visual.kind == "vertex" else None
+        return Mesh(np.array(loaded.vertices), np.array(loaded.faces), colours=colours)
+
     def save(self, path: str | Path) -> None:
         """Writes a binary .ply file."""
         path = Path(path)

@@ -17,6 +17,7 @@ from datasets.textures import Texture
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.checks import BadInput
+from renderers.field import LatentDecoder
 
 SPLIT_STRIDE = 1_000_000  # difference between the first seeds of two splits; a split has fewer shapes
 Corners = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]  # barycentric weights and vertex indices of points
@@ -276,6 +277,30 @@ class OneView(Protocol):
         Args:
             resolution: largest number of pixels of the view's longer side.
         """
+        ...
+
+
+@dataclass(frozen=True)
+class SceneNetwork:
+    """A network whose codes are shapes: the field of a scene, and its prior.
+
+    Args:
+        decoder: `at(code)` is a field, negative inside.
+        codes: of all its shapes.
+        notes: measurements of the network and conversions, in words.
+    """
+
+    decoder: LatentDecoder
+    codes: Float[Tensor, "shapes code_length"]
+    notes: tuple[str, ...]
+
+
+@runtime_checkable
+class HasNetwork(Protocol):
+    """A dataset whose shapes are codes of a network: the network is the field of its scenes and their prior."""
+
+    def network(self, index: int) -> SceneNetwork:
+        """The network, with notes on its field at code number `index`."""
         ...
 
 

@@ -55,6 +55,42 @@ class Field(Protocol):
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]: ...
 
 
+Vectors = Float[Tensor, "*batch 3"]
+
+
+@runtime_checkable
+class Coloured(Field, Protocol):
+    """A field whose surface has colours."""
+
+    def colours(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        normals: Float[Tensor, "*batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> Float[Tensor, "*batch 3"]:
+        """Red, green and blue from 0 to 1.
+
+        Args:
+            points: on the surface.
+            normals: the field's gradients at the points; through their graph, colours have a gradient to the shape.
+            directions: unit directions of the rays that hit the points.
+        """
+        ...
+
+
+@runtime_checkable
+class LatentDecoder(Protocol):
+    """A module whose latent codes are shapes; `code_is_position` if the code is a point in space, not learnt."""
+
+    code_length: int
+    width: int
+    code_is_position: bool
+
+    def at(self, code: Float[Tensor, "*shapes code_length"]) -> Field:
+        """The field of one code, or of a batch of codes."""
+        ...
+
+
 PointFunction = Callable[[Tensor], Tensor]  # points [*batch, 3] to values [*batch]: a field, or its coarse values
 
 

@@ -19,7 +19,11 @@ from tests.made_photographs import CENTRE, RADIUS, dvr, idr
 from tests.made_scans import write_scans
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = ("README.md", "CONTRIBUTING.md", *(f"{room}/README.md" for room in ("bench", "conf", "datasets", "renderers")))
+FILES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    *(f"{package}/README.md" for package in ("bench", "conf", "datasets", "renderers")),
+)
 CODE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"\s{2,}# .*$")
 SPAN = re.compile(r"`((?:python -m |-m \+experiment=)[^`]+)`")  # tables leave `python -m bench` out

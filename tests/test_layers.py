@@ -1,4 +1,4 @@
-"""Imports go one way: renderers <- datasets <- bench, in bench room by room; and tests check types."""
+"""Imports go one way: renderers <- datasets <- bench, in bench package by package; and tests check types."""
 
 import ast
 import sys
@@ -22,8 +22,8 @@ FORBIDDEN = {  # what the modules of a package may not import
     "bench": ("tests",),
     "conf": OURS,
 }
-# The rooms of bench in the order of imports: a room may use those before it, and none a command.
-ROOMS = (
+# The packages of bench in the order of imports: a package may use those before it, and none a command.
+PACKAGES = (
     "tables", "config", "progress", "records", "machine", "trackers", "shape_prior",
     "setup", "evaluate", "pictures", "solve", "tasks",
     "runner", "report", "studies",
@@ -32,6 +32,21 @@ COMMANDS = (
     "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune",
     "bench.turntable", "bench.verify",
 )  # fmt: skip
+# Three layers: a file imports only from its layer and the layers below. Files that are not listed are the core.
+DATA_LAYER = ("datasets.files", "renderers.fields.networks", "bench.photos")
+STUDIES_LAYER = (
+    "bench.report", "bench.studies", "renderers.volumes",
+    "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",
+    "bench.tasks.single_view", "bench.tasks.stability",
+    *(f"bench.{command}" for command in ("judge", "merge", "suite", "train", "tune", "turntable", "verify")),
+)  # fmt: skip
+LISTS = ("bench", "bench.__main__", "renderers")  # import from all layers, to list what there is
+MAX_CORE_LINES = 16_500
+CORE_MAY = {  # the libraries of the core
+    "torch", "jaxtyping", "safetensors", "numpy", "scipy", "skimage", "trimesh", "open3d", "matplotlib", "PIL", "hydra",
+    "omegaconf", "yaml", "rich", "filelock", "psutil",
+    "submitit", "ray", "mlflow",  # each in one function, if a user chooses it
+}  # fmt: skip
 # These modules decide what is run; no run imports them.
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them
 PASSES_PATH_ON = ("bench.runner.library",)  # reads where this process finds modules, for the process that it starts
@@ -39,8 +54,8 @@ RENDERERS_MAY = {"torch", "jaxtyping", "renderers", *sys.stdlib_module_names}
 ALSO = {"renderers.mesh_proxy": {"numpy", "open3d", "skimage"}}  # a renderer built on other libraries
 WITHOUT_TORCH = ("bench.records", "bench.report", STUDIES, "bench.pictures.style", "bench.pictures.size_chart")
 COMMON = "datasets.extras"  # without torch; renderers may not use it
-DATA_ROOMS = ("bench.report", "bench.records", "bench.tables")
-REPORT_MAY = (COMMON, *DATA_ROOMS, "bench.pictures.style", "bench.pictures.size_chart")
+DATA_PACKAGES = ("bench.report", "bench.records", "bench.tables")
+REPORT_MAY = (COMMON, *DATA_PACKAGES, "bench.pictures.style", "bench.pictures.size_chart")
 
 
 def imported(tree: ast.AST, module: str, is_package: bool) -> set[str]:
@@ -63,22 +78,36 @@ def within(name: str, *packages: str) -> bool:
     return any(name == package or name.startswith(package + ".") for package in packages)
 
 
-def room(name: str) -> str:
-    """The room of bench that a dotted name is in; empty for other packages."""
+def package_of(name: str) -> str:
+    """The package of bench that a dotted name is in; empty for other packages."""
     parts = name.split(".")
     return parts[1] if parts[0] == "bench" and len(parts) > 1 else ""
 
 
 def backward(module: str, names: set[str]) -> list[str]:
-    """The imports of a module from rooms behind its own."""
+    """The imports of a module from packages behind its own."""
     if module.endswith(".__main__") or module in COMMANDS:  # nothing imports them
         return []
-    own_room, messages = room(module), []
-    for name in (name for name in names if room(name) in ROOMS and own_room in ROOMS):
-        other_room = room(name)
-        if other_room != own_room and ROOMS.index(other_room) > ROOMS.index(own_room):
-            messages.append(f"imports {name} from a room behind {own_room}")
+    own_package, messages = package_of(module), []
+    for name in (name for name in names if package_of(name) in PACKAGES and own_package in PACKAGES):
+        other_package = package_of(name)
+        if other_package != own_package and PACKAGES.index(other_package) > PACKAGES.index(own_package):
+            messages.append(f"imports {name} from a package behind {own_package}")
     return messages
+
+
+def layer(module: str) -> int:
+    """0 for the core, 1 for what users bring, 2 for studies."""
+    return 2 if within(module, *STUDIES_LAYER) else 1 if within(module, *DATA_LAYER) else 0
+
+
+def upward(module: str, names: set[str]) -> list[str]:
+    """The imports of a module from a layer above it, and those of the core from other libraries than `CORE_MAY`."""
+    if not within(module, "renderers", "datasets", "bench") or module in LISTS:
+        return []
+    messages = [f"imports {name} from a layer above" for name in names if layer(name) > layer(module)]
+    libraries = {name.split(".")[0] for name in names} - {*OURS, *sys.stdlib_module_names}
+    return messages + [f"imports {name}" for name in libraries - CORE_MAY if layer(module) == 0]
 
 
 def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
@@ -89,7 +118,7 @@ def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
     messages = [f"imports {name}" for name in names if within(name, *FORBIDDEN.get(top, ()))]
     command = [name for name in names if ".__main__" in name or within(name, *COMMANDS)]
     messages += [f"imports a command: {name}" for name in command if top == "bench"]
-    messages += backward(module, names)
+    messages += backward(module, names) + upward(module, names)
     if top == "renderers":
         allowed = RENDERERS_MAY | ALSO.get(module, set())
         messages += [f"imports {name}" for name in names if name.split(".")[0] not in allowed]
@@ -128,10 +157,16 @@ def test_imports_go_one_way():
     assert {path: wrong for path, wrong in faults.items() if wrong} == {}
 
 
-def test_every_room_is_in_the_order_of_imports():
-    rooms = {path.stem for path in (ROOT / "bench").iterdir() if path.is_dir() and list(path.glob("*.py"))}
-    rooms |= {path.stem for path in (ROOT / "bench").glob("*.py")} - {"__init__", "__main__"}
-    assert rooms | {"studies"} == {*ROOMS, *map(room, COMMANDS)}
+def test_every_package_is_in_the_order_of_imports():
+    packages = {path.stem for path in (ROOT / "bench").iterdir() if path.is_dir() and list(path.glob("*.py"))}
+    packages |= {path.stem for path in (ROOT / "bench").glob("*.py")} - {"__init__", "__main__"}
+    assert packages | {"studies"} == {*PACKAGES, *map(package_of, COMMANDS)}
+
+
+def test_the_core_is_small():
+    core = [path for path in modules() if named(path)[0].split(".")[0] not in ("tests", "conf")]
+    core = [path for path in core if layer(named(path)[0]) == 0]
+    assert sum(len(path.read_text().splitlines()) for path in core) <= MAX_CORE_LINES
 
 
 def test_conf_holds_yaml_only():
@@ -153,6 +188,9 @@ WRONG = (
     ("bench", "import torch"), ("conf", "from bench import config"), ("bench.runner.run", "from os import *"),
     ("tests.test_layers", "import sys\nsys.path.insert(0, '.')"), ("tests.test_layers", "from sys import path"),
     ("bench.__main__", "import bench.studies.completion"),
+    ("bench.solve.solve", "from bench.tasks.capacity.field import fit_view"),
+    ("datasets.mesh", "from datasets.files.meshes import read_mesh"),
+    ("renderers.dist", "import renderers.volumes.neus"), ("bench.records.folder", "import pandas"),
     ("bench.report.write.html", "from ...studies.completion import make"),
     ("bench.studies.completion", "from .table1 import make"),
     ("bench.studies.completion", "from bench.setup.inputs import Task"),
@@ -162,6 +200,8 @@ RIGHT = (
     ("renderers.fields.mlp", "from ..field import Kind\nfrom .analytic import Shape"),
     ("datasets.scene", "import numpy\nfrom renderers.camera import Camera\nfrom datasets import mesh"),
     ("bench.runner.run", "import torch, renderers, datasets\nfrom bench.solve.solve import solve"),
+    ("bench.tasks.stability.task", "from datasets.files.meshes import read_mesh\nfrom bench.solve.solve import solve"),
+    ("renderers", "from renderers.volumes.neus import NeuS"),
     ("bench.__main__", "from bench.report.write.html import write_index"),
     ("bench.report.write.html", "import plotly, os.path\nfrom bench.records import format\nfrom . import caption"),
     ("bench", "import os"), ("benchmark.report", "import datasets_of_others"),

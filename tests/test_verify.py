@@ -11,7 +11,7 @@ import torch
 import bench
 from bench.records.folder import Identity
 from bench.verify import main
-from datasets.files.field_files import FIELD_FILE
+from datasets.saved_field import FIELD_FILE
 from tests.composing import composed
 from tests.runner.driving import command
 from tests.tiny import cell_from

@@ -16,18 +16,15 @@ from bench.setup.fields import FieldChoice
 from bench.setup.inputs import Cell, RunContext, RunInputs, build_cell
 from bench.setup.priors import PriorChoice
 from bench.shape_prior import Prior
-from datasets.files.network_files import SceneNetwork
 from datasets.mesh import Mesh
-from datasets.scene import Scene, Truth, View, see
+from datasets.scene import Scene, SceneNetwork, Truth, View, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
-from renderers.fields.networks.network import FieldStatistics
 from renderers.rendering import Capabilities
 
 CPU = torch.device("cpu")
-DISTANCE_FACTS = FieldStatistics(-1.0, 1.0, 0.1, (1.0, 1.0, 1.0), 0.0, 1.0, 1.0, (1.0, 1.0, 1.0), slope_p99=1.0)
 TRIANGLE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1]]))
 PEAK = 1e10  # operations per second of the machine in a record
 
@@ -138,7 +135,7 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
         make_pixel_precise=lambda: (renderer, []), views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
         evaluation=EvaluationSettings(**sizes, gallery=None, every=None, film=None), seed=0, device=CPU,
         cache=folder / "cache", field=FieldChoice("prior", None),
-        prior_choice=PriorChoice(SceneNetwork(prior.decoder, prior.codes, DISTANCE_FACTS, ()), scene_code=0),
+        prior_choice=PriorChoice(SceneNetwork(prior.decoder, prior.codes, ()), scene_code=0),
     )  # fmt: skip
     record = Record("id", "task", "renderer", "dataset", 0, {"label": None}, scene=scene.name)
     record.environment = {"gemm_peak_flops": PEAK}

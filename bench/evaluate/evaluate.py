@@ -20,8 +20,7 @@ from datasets.scene import Surface, View, sample_surface
 from datasets.shot import mask_iou
 from renderers.boundary import render_checked
 from renderers.camera import Camera
-from renderers.field import Field, autograd_normals
-from renderers.fields.networks.coloured import Coloured
+from renderers.field import Coloured, Field, autograd_normals
 from renderers.rendering import Rendering
 
 OWN_PREFIX = "own_"  # begins names of metrics of the image by the renderer under test

@@ -12,9 +12,8 @@ from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh, extract
 from datasets.scene import Truth, View, see
 from renderers.camera import Camera, Rays
-from renderers.field import Field, autograd_gradients, values_and_gradients
+from renderers.field import Coloured, Field, autograd_gradients, values_and_gradients
 from renderers.fields.analytic import Shape, sphere
-from renderers.fields.networks.coloured import Coloured
 
 DEFAULT_VERTEX_COLOUR = 0.5
 POINTS_PER_BATCH = 16_384

@@ -14,7 +14,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import OUR_PACKAGES, Rerun, check, check_draw
+from bench.config import FIT_MODULE, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_draw
 from bench.records.imports import ROOT, imported_files
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.tables import without_row_keys
@@ -83,6 +83,7 @@ class Identity:
         hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
         targets = {*_values_of_key(hashed, "_target_")}
         targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}
+        targets |= {FIT_MODULE} if hashed.get("field", PRIOR_FIELD) != PRIOR_FIELD else set()
         code = _our_code_hash(frozenset(targets), bool(packages))
         return digest([code, *(_package_hash(name) for name in packages), *files])
 

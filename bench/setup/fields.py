@@ -1,17 +1,19 @@
 """The field of an unknown shape: the names to choose from, and the settings of fits."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 
+from bench.config import FIT_MODULE, PRIOR_FIELD
 from bench.setup.auto import AUTO
 from bench.tables import nearest
 from renderers.checks import check_at_least, check_choice, check_fraction
 
-PRIOR = "prior"
 PRIMITIVES = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
 # The text after the underscore.
 SIZE_PATTERNS = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+", "occupancy": "[0-9]+"}
-EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR)
+EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR_FIELD)
 NAME_FORMS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
 MAX_GRID_SAMPLES = 256  # per axis: 64 MiB of values
 STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.tasks.capacity.model.Size`
@@ -164,13 +166,17 @@ class FieldChoice:
     models: ModelSettings | None
 
     def __post_init__(self) -> None:
-        if self.name not in (PRIOR, AUTO):
+        if self.name not in (PRIOR_FIELD, AUTO):
             parse_field_name(self.name)
 
     @property
     def of_prior(self) -> bool:
         """Whether the field is a code of the dataset's prior."""
-        return self.name == PRIOR
+        return self.name == PRIOR_FIELD
+
+    def load_fit(self) -> Callable[..., None]:
+        """Returns `fit_view`, which fits a field without a prior to a view."""
+        return import_module(FIT_MODULE).fit_view
 
     @property
     def candidates(self) -> tuple[str, ...]:

@@ -21,10 +21,10 @@ from bench.setup.auto import Node, at_pixel_precision, resolve_auto_settings
 from bench.setup.fields import FieldChoice
 from bench.setup.priors import PriorChoice, prior_keys_in_errors, training_dataset
 from bench.shape_prior import Prior, PriorSettings
-from datasets.files.network_files import HasNetwork
 from datasets.scene import (
     SPLIT_STRIDE,
     Dataset,
+    HasNetwork,
     OneView,
     Photographed,
     Scene,

@@ -13,8 +13,7 @@ from bench.config import load
 from bench.machine.environment import using_threads
 from bench.progress import Report
 from bench.shape_prior import Prior, PriorSettings, prior_for
-from datasets.files.network_files import SceneNetwork
-from datasets.scene import Dataset, OneView, Split
+from datasets.scene import Dataset, OneView, SceneNetwork, Split
 from datasets.textures import Texture
 from renderers.checks import BadInput
 

@@ -13,7 +13,7 @@ from datasets.scene import View
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Field, Meter
-from renderers.fields.networks.coloured import TexturedShape
+from renderers.fields.textured import TexturedShape
 from renderers.rendering import RayObservation, Renderer, Rendering, at_iteration
 from renderers.silhouette import SilhouetteLoss
 

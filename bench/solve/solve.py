@@ -20,9 +20,8 @@ from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.optimise import CannotContinue, FirstChecked, History, Objective, OptimiserSettings, optimise
-from datasets.files.field_files import FIELD_FILE, save_field
-from datasets.files.meshes import read_mesh
 from datasets.mesh import Mesh
+from datasets.saved_field import FIELD_FILE, save_field
 from datasets.scene import Scene
 from renderers.camera import Camera
 from renderers.field import Counts, Field
@@ -190,7 +189,7 @@ def save_in_world(folder: Path, to_world: Float[np.ndarray, "4 4"]) -> Mesh | No
     np.savetxt(folder / "to_world.txt", to_world, fmt="%.17g")
     if not (folder / "mesh.ply").is_file():
         return None
-    mesh = read_mesh(folder / "mesh.ply")
+    mesh = Mesh.load(folder / "mesh.ply")
     mesh.moved(to_world).save(folder / "mesh_world.ply")
     return mesh
 

@@ -8,15 +8,12 @@ import torch
 
 from bench.pictures.colours import note_colours
 from bench.pictures.run_figures import InputView
-from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
 from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
-from bench.tasks.capacity.field import solve_by_growth
-from bench.tasks.capacity.observations import RayObservations, concatenate_views, hold_out, tiles
 from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
@@ -24,7 +21,6 @@ from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
 MEASURED, EXACT = "measured", "exact"
-HELD_OUT_FRACTION = 0.2  # held out from a fit without a prior, by tiles of the view
 
 
 @dataclass(frozen=True)
@@ -102,9 +98,9 @@ class Completion:
                 note_colours(run, state)
         else:
             check_field_gradient(inputs.renderer)
-            scene, renderer = inputs.scene, inputs.renderer
-            observations, shown = self.observations(scene, renderer, seed=inputs.seed, device=inputs.device)
-            solve_by_growth(observations, shown, run, iterations=self.optimiser.iterations)
+            view = self._observed_view(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
+            fit_view = inputs.field.load_fit()
+            fit_view(view, self._pictured(inputs.scene, view), run, iterations=self.optimiser.iterations)
         if inputs.scene.to_world is not None:
             save_in_world(run.folder, inputs.scene.to_world)
 
@@ -122,20 +118,10 @@ class Completion:
         codes = torch.zeros(self.rotations, prior.decoder.code_length)
         return problem(initial=codes, initial_similarities=initial_rotations(self.rotations), trial=self.trial)
 
-    def observations(
-        self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device
-    ) -> tuple[RayObservations, InputView]:
-        """The observations for a field without a prior, of which a fifth is held out, and the view for pictures."""
-        view = self._observed_view(scene, renderer, seed=seed, device=device)
-        observed, camera = view.observed.cpu(), scene.view.camera
-        half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
-        tile_ids = tiles(*observed.shape)
-        rays = hold_out(
-            concatenate_views([view]), tile_ids, share=HELD_OUT_FRACTION, entire=(), footprint=half_pixel, seed=seed
-        )
-        return rays, InputView(
-            scene.observed_view(exact=self.depths == EXACT)[0], observed.numpy(), mask=view.mask is not None
-        )
+    def _pictured(self, scene: Scene, view: ObservedView) -> InputView:
+        """The observations for pictures."""
+        true_view, _ = scene.observed_view(exact=self.depths == EXACT)
+        return InputView(true_view, view.observed.cpu().numpy(), mask=view.mask is not None)
 
     def _observed_view(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:
         """The observed part of a scene's view."""

@@ -1,33 +1,27 @@
 """Shape from many views: optimises the code for photometric consistency between views (DIST, Sec. 4.2.2)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from math import radians
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.evaluate import evaluate
-from bench.evaluate.state import State
-from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
 from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings
-from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, metric_definitions, run_optimisation, solve
-from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, coloured, judge_mesh
-from bench.tasks.reconstruction.pictures import note_surface
-from bench.tasks.reconstruction.subject import NONE, Depths, PhotographTask, Subject, upright
-from bench.tasks.single_view.encoder import EncoderSettings
-from datasets.mesh import Mesh
+from bench.solve.solve import check_field_gradient, metric_definitions, solve
+from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.shot import Shot
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Field
-from renderers.rendering import RayObservation, Renderer, at_iteration, check_kind
+from renderers.rendering import RayObservation, Renderer, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 MIN_SCALE, MAX_SHIFT = 0.8, 0.2
@@ -35,12 +29,24 @@ MIN_INTERPOLATION_WEIGHT = 0.999  # a depth is interpolated only if pixels on th
 MAX_NEIGHBOUR_DEGREES = 60.0  # above this angle between compared photographs, the record has a note
 
 
+@runtime_checkable
+class CodeEncoder(Protocol):
+    """Gives the code from which the optimisation starts."""
+
+    def start(
+        self, run: RunContext, photography: Photography, photographs: Float[Tensor, "views height width 3"]
+    ) -> Float[Tensor, " code_length"]:
+        """The mean code of the photographs, which `photography` took."""
+        ...
+
+
 @dataclass(frozen=True)
-class Multiview(PhotographTask):
-    """Shape from photographs whose cameras are known.
+class Multiview:
+    """Shape from photographs whose cameras are known. The photographs are rendered from the scene's mesh.
 
     Args:
-        images, longest, held_out, masks: see `PhotographTask`; all except the first are for the user's photographs.
+        images: settings of the photographs.
+        longest, held_out, masks: of the user's photographs; see `PhotographTask`.
         focal: focal length of the photographs' cameras over that of the scene's camera (DIST, Fig. 10 a).
         views_per_step: number of views in an iteration, evenly spaced; they shift by one with each iteration.
         neighbour: a view is compared with the view that follows by this many.
@@ -62,6 +68,10 @@ class Multiview(PhotographTask):
         encoder: gives the mean of the initial codes, averaged over the photographs; None: zero, the mean shape.
     """
 
+    images: Photography
+    longest: int
+    held_out: int
+    masks: bool
     focal: float
     views_per_step: int
     neighbour: int
@@ -80,11 +90,9 @@ class Multiview(PhotographTask):
     silhouette: SilhouetteLoss
     silhouette_weight: float
     optimiser: OptimiserSettings
-    encoder: EncoderSettings | None = None
-    depths: Depths = field(default=Depths(NONE, 0.0), init=False)
+    encoder: CodeEncoder | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check_at_least("task.views_per_step", self.views_per_step, 1, "the paper uses 8")
         check_at_least("task.neighbour", self.neighbour, 1, "1 is the closest next view")
         if self.neighbour % self.images.views == 0:
@@ -116,23 +124,11 @@ class Multiview(PhotographTask):
         return self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput without a prior, or for an encoder with real photographs; ValueError for many rotations."""
+        """Raises BadInput without a prior."""
         inputs.check_prior()
-        if inputs.photographed is not None:
-            _ = self._with_rotations
-            if self.encoder is not None:
-                raise BadInput("an encoder learns made photographs, not yours: take +method=multiview_dist")
-
-    @property
-    def _with_rotations(self) -> "Multiview":
-        """The same task; with `similarity`, its starts are the mean shape in each of the rotations."""
-        return replace(self, starts=self.rotations, start_scale=0.0) if self.similarity else self
 
     def execute(self, run: RunContext) -> None:
         """Optimises the code, and evaluates the shape before and after."""
-        if run.inputs.photographed is not None:
-            self._with_rotations._execute_on_photographs(run)
-            return
         angle = 360 / self.images.views * min(self.neighbour, self.images.views - self.neighbour)
         if angle > MAX_NEIGHBOUR_DEGREES:
             note = f"compared photographs are {angle:.0f} degrees apart and share little: task.images.views=24 has 15"
@@ -149,45 +145,6 @@ class Multiview(PhotographTask):
 
         solve(problem, self.optimiser, run, metric_definitions(inputs), gallery=True)
 
-    def _execute_on_photographs(self, run: RunContext) -> None:
-        """Optimises the code for the user's photographs, and evaluates the shape on the held-out ones."""
-        inputs, record = run.inputs, run.record
-        check_field_gradient(inputs.renderer)
-        record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
-        subject = self.subject(inputs)
-        record.notes = [*record.notes, subject.summary]
-        photometric_loss = PhotometricLoss(self, inputs.renderer, subject.input_shots, inputs.device, from_user=True)
-        problem = self._problem(inputs.prior, photometric_loss, torch.Generator().manual_seed(inputs.seed))
-        check_kind(inputs.renderer, problem.field())
-
-        def mesh() -> Mesh | None:
-            return coloured(problem.field(), subject, inputs)
-
-        def scores(iteration: int) -> dict[str, float]:
-            metrics = judge_mesh(mesh(), subject, inputs).metrics
-            return {name: metrics[name] for name in ("psnr", "seen_chamfer_l1") if name in metrics}
-
-        with run.off_clock():
-            record.metrics_start = judge_mesh(mesh(), subject, inputs).metrics
-        history = run_optimisation(problem, self.optimiser, run, scores)
-        with run.off_clock():
-            note_surface(run, mesh(), subject, {}, history, problem.field())
-            draw_curve(run.folder / "curve.png", history.curve)
-        subject.finish(run)
-
-    def subject(self, inputs: RunInputs) -> Subject:
-        """See `PhotographTask`; with `similarity`, the subject is set upright."""
-        subject = super().subject(inputs)
-        return upright(subject) if self.similarity else subject
-
-    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
-        if run.inputs.photographed is None:
-            return evaluate(State(field, run.inputs)).metrics
-        subject = self.subject(run.inputs)
-        evaluation = judge_mesh(coloured(field, subject, run.inputs), subject, run.inputs)
-        return evaluation.metrics | subject.point_metrics(evaluation.mesh, run.inputs)
-
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device
     ) -> CodeProblem:
@@ -196,9 +153,10 @@ class Multiview(PhotographTask):
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
         photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        return self._problem(prior, PhotometricLoss(self, renderer, photographs, device), generator)
+        return self.problem_of(prior, PhotometricLoss(self, renderer, photographs, device), generator)
 
-    def _problem(self, prior: Prior, photometric_loss: "PhotometricLoss", generator: torch.Generator) -> CodeProblem:
+    def problem_of(self, prior: Prior, photometric_loss: "PhotometricLoss", generator: torch.Generator) -> CodeProblem:
+        """The problem of a loss; `generator` draws the initial codes."""
         if len(prior.codes) < 2:
             raise BadInput("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")
         code_std = self.start_scale * prior.codes.std(0)

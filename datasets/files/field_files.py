@@ -1,19 +1,19 @@
-"""Saves and loads the final field of a run: a file of tensors, with the tree of their objects in its metadata.
+"""Loads the final field of a run; see `datasets.saved_field`.
 
-Only objects of the classes in `CLASSES` with plain values are stored, and nothing in a file is executed.
+Only objects of the classes in `CLASSES` with plain values are loaded, and nothing in a file is executed.
 """
 
 import json
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
+from datasets.saved_field import FIELD_FILE, STATE_ATTRIBUTES, VERSION
 from renderers.checks import BadInput
 from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields.analytic import Shape
@@ -21,39 +21,22 @@ from renderers.fields.grid import Grid
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.fields.networks import coloured, network, occupancy, published
 from renderers.fields.parts import Formula
+from renderers.fields.textured import TexturedShape
 
-FIELD_FILE = "field.safetensors"
 DEFAULT_RUNS_FOLDER = Path("results/local/runs")  # has the names of `bench.load().folder`
-VERSION = "1"  # raise it when one of `CLASSES` changes its attributes
-MAX_FIELD_BYTES = 16_000_000
 CLASSES: dict[str, type] = {
     class_.__name__: class_
     for class_ in (
         *(BoundDecoder, Grid, Shape, Formula, Flops, Moved, network.Adjusted, network.AtCode),
         *(coloured.ColouredDistance, coloured.ColouredGrid, coloured.OccupancyOf, coloured.ScaledOccupancyOf),
-        coloured.TexturedShape,
+        TexturedShape,
         *(occupancy.BoundOccupancy, occupancy.OccupancyNetwork, occupancy.Block),
         *(published.Layered, published.Residual, published.Norm),
         *(nn.Linear, nn.LayerNorm, nn.ModuleList, nn.ModuleDict, nn.ParameterList),
     )
 }
-STATE_ATTRIBUTES = ("_parameters", "_buffers", "_modules")
-STANDARD_ATTRIBUTES = {*vars(nn.Module())}  # every module has these
 PRIVATE_ATTRIBUTES = ("_size",)  # the only one allowed; nn.ParameterList has it
 ASSUMED_WIDTH = 256  # neurons per layer of a field of unknown structure; sets the points per pass
-
-
-def save_field(field: Field, path: Path) -> str | None:
-    """Writes a field. If it is too large or has a class not in `CLASSES`, writes nothing and returns a note."""
-    tensors: dict[str, Tensor] = {}
-    try:
-        tree = _to_tree(field, tensors)
-        if (size := sum(tensor.nbytes for tensor in tensors.values())) > MAX_FIELD_BYTES:
-            raise BadInput(f"it has {size / 1e6:.0f} MB, and {MAX_FIELD_BYTES / 1e6:.0f} MB are the most")
-    except BadInput as error:
-        return f"the run leaves no {FIELD_FILE}: {error}"
-    path.write_bytes(save(tensors, {"version": VERSION, "kind": field.kind.value, "field": json.dumps(tree)}))
-    return None
 
 
 def load_field(run: Path | str, device: torch.device | str = "cpu") -> Field:
@@ -93,36 +76,8 @@ class _StoredField(nn.Module):
         return _from_tree(self.tree, dict(self.named_buffers()))(points)
 
 
-def _to_tree(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Converts a value to JSON data; adds its tensors to `tensors` under numbered names.
-
-    Raises:
-        BadInput: an object's class is not in `CLASSES`.
-    """
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, Kind):
-        return {"kind": value.value}
-    if isinstance(value, Tensor):
-        name = f"t{len(tensors)}"
-        tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
-        return {"tensor": name}
-    if isinstance(value, tuple | list):
-        return [_to_tree(entry, tensors) for entry in value]
-    if isinstance(value, dict):
-        return {"pairs": [[key, _to_tree(entry, tensors)] for key, entry in value.items()]}
-    name = type(value).__name__
-    if CLASSES.get(name) is not type(value):
-        raise BadInput(f"{type(value).__module__}.{type(value).__qualname__} is no class that is stored")
-    if is_dataclass(value):
-        return {"class": name, "has": {key.name: _to_tree(getattr(value, key.name), tensors) for key in fields(value)}}
-    states = {key: _to_tree(dict(vars(value)[key]), tensors) for key in STATE_ATTRIBUTES}
-    has = {key: _to_tree(entry, tensors) for key, entry in vars(value).items() if key not in STANDARD_ATTRIBUTES}
-    return {"class": name, "has": has, **states}
-
-
 def _from_tree(node: Any, tensors: dict[str, Tensor]) -> Any:
-    """Builds the value of a JSON node: the inverse of `_to_tree`, with tuples for lists."""
+    """Builds the value of a JSON node: the inverse of `datasets.saved_field.to_tree`, with tuples for lists."""
     if isinstance(node, list):
         return tuple(_from_tree(entry, tensors) for entry in node)
     if not isinstance(node, dict):

@@ -23,14 +23,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from datasets.files.field_files import ASSUMED_WIDTH, FIELD_FILE, load_network
+from datasets.files.field_files import ASSUMED_WIDTH, load_network
 from datasets.mesh import Mesh, extract
-from datasets.scene import Split
+from datasets.saved_field import FIELD_FILE
+from datasets.scene import SceneNetwork, Split
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, sphere
-from renderers.fields.mlp import Decoder
-from renderers.fields.networks.network import Coded, FieldStatistics, Published, interpret, measure_field, scale_shapes
+from renderers.fields.networks.network import Coded, Published, interpret, measure_field, scale_shapes
 from renderers.fields.networks.published import (
     LAYERS,
     SIGNED,
@@ -58,32 +58,6 @@ NUMPY_SCALAR_CLASSES = [  # some checkpoints store their best loss as a NumPy sc
     *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
     *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
 ]
-
-
-@dataclass(frozen=True)
-class SceneNetwork:
-    """The network of a scene, all its codes, and the measurements at the code of the scene.
-
-    Args:
-        decoder: `at(code)` is a field, negative inside.
-        codes: of all its shapes.
-        facts: of the field in the file, with the sign negative inside, at its level and scale.
-        notes: the measurements and conversions, in words.
-    """
-
-    decoder: Decoder | Published
-    codes: Float[Tensor, "shapes code_length"]
-    facts: FieldStatistics
-    notes: tuple[str, ...]
-
-
-@runtime_checkable
-class HasNetwork(Protocol):
-    """A dataset whose shapes are codes of a network: the network is the field of its scenes and their prior."""
-
-    def network(self, index: int) -> SceneNetwork:
-        """The network, and the measurements at code number `index`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -256,7 +230,7 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
         side += "meshes are at 0.2, dataset.level=-1.386)"
     divided = f", by values divided by {meaning.divisor:.3g}" if kind is Kind.BOUND else ""
     note = f"{file.name}: {side}; {facts.summary}; taken as a {kind.value}{divided}"
-    return SceneNetwork(decoder, codes, facts, (note,))
+    return SceneNetwork(decoder, codes, (note,))
 
 
 def _read(file: NetworkFile) -> tuple[Published, Tensor]:

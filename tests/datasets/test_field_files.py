@@ -12,8 +12,9 @@ from torch import nn
 import bench
 from bench.records.read import RESULTS
 from bench.tasks.capacity.candidates import PRIMITIVES
-from datasets.files import field_files
-from datasets.files.field_files import FIELD_FILE, load_field, load_network, save_field
+from datasets import saved_field
+from datasets.files.field_files import _read, load_field, load_network
+from datasets.saved_field import FIELD_FILE, VERSION, save_field
 from renderers.checks import BadInput
 from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields.analytic import sphere
@@ -24,12 +25,12 @@ from renderers.fields.networks.coloured import (
     ColouredGrid,
     ColouredOccupancy,
     ScaledOccupancyOf,
-    TexturedDecoder,
 )
 from renderers.fields.networks.network import Coded, Published
 from renderers.fields.networks.occupancy import OccupancyNetwork
 from renderers.fields.networks.published import Layered
 from renderers.fields.parts import FORMULAS, formula
+from renderers.fields.textured import TexturedDecoder
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
 
@@ -103,15 +104,15 @@ class UserField(nn.Module):
     (FIELDS["coloured"](), "0 MB are the most"),
 ])  # fmt: skip
 def test_a_user_class_or_a_large_field_is_not_saved_with_a_reason(field, words, tmp_path, monkeypatch):
-    monkeypatch.setattr(field_files, "MAX_FIELD_BYTES", 1000)
+    monkeypatch.setattr(saved_field, "MAX_FIELD_BYTES", 1000)
     assert words in (save_field(field, tmp_path / FIELD_FILE) or "") and not [*tmp_path.iterdir()]
 
 
 def changed(path: Path, old: str, new: str) -> None:
     """Replaces a text in the field description of a file."""
-    tree = json.dumps(field_files._read(path)[0])
+    tree = json.dumps(_read(path)[0])
     assert old in tree
-    save_file(load_file(path), path, {"version": field_files.VERSION, "field": tree.replace(old, new)})
+    save_file(load_file(path), path, {"version": VERSION, "field": tree.replace(old, new)})
 
 
 def test_the_name_of_a_run_is_enough_in_the_default_results_folder(tmp_path, monkeypatch):

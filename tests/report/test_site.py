@@ -29,7 +29,7 @@ from bench.report.write import html
 from bench.report.write.html import safe_json, to_script, write_index
 from bench.tables import choice
 from bench.tables import names as choices
-from datasets.files.field_files import FIELD_FILE, save_field
+from datasets.saved_field import FIELD_FILE, save_field
 from renderers.fields.grid import Grid
 from tests.browser import made
 from tests.looped import each

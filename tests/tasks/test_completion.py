@@ -16,7 +16,7 @@ from datasets.scene import Scene, View
 from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
-from renderers.fields.networks.coloured import TexturedDecoder
+from renderers.fields.textured import TexturedDecoder
 from renderers.rendering import Capabilities, Rendering, Status, Unsupported, check_kind
 from renderers.silhouette import Own
 from tests.looped import each

@@ -3,19 +3,25 @@
 from dataclasses import replace
 from typing import Any
 
+import torch
+
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.run_figures import InputView, draw_run
 from bench.records.record import Record, RunStatus, curve_file
+from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
+from bench.solve.observed_view import ObservedView
 from bench.solve.solve import COST_DEFINITIONS, draw, note_costs, note_result
 from bench.tasks.capacity.candidates import by_size
 from bench.tasks.capacity.fit import FitProblem, Fitter
 from bench.tasks.capacity.growth import Growth, grow
 from bench.tasks.capacity.model import Evidence
-from bench.tasks.capacity.observations import RayObservations
+from bench.tasks.capacity.observations import RayObservations, concatenate_views, hold_out, tiles
 
+# Of the rays of each tile of a view.
+HELD_OUT_FRACTION = 0.2
 SIZES = (
     "the numbers of its field that the optimiser may change; those that a file must hold so that it can be evaluated, "
     "of a grid all its samples; the size of that file in float32"
@@ -32,6 +38,16 @@ FIELD_DEFINITIONS = {
     "without checkpoints on what is held out",
     "fields_tried": "candidates that were tried",
 }
+
+
+def fit_view(view: ObservedView, pictured: InputView, run: RunContext, *, iterations: int) -> None:
+    """Fits the shape of a run to its view, of which a fraction of each tile is held out; see `solve_by_growth`."""
+    inputs = run.inputs
+    camera = inputs.scene.view.camera
+    half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
+    rays, groups = concatenate_views([view]), tiles(*view.observed.shape)
+    observations = hold_out(rays, groups, share=HELD_OUT_FRACTION, entire=(), footprint=half_pixel, seed=inputs.seed)
+    solve_by_growth(observations, pictured, run, iterations=iterations)
 
 
 def solve_by_growth(observations: RayObservations, pictured: InputView, run: RunContext, *, iterations: int) -> None:

@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.config import PRIOR_FIELD
 from bench.evaluate.state import REACH
 from bench.records.format import plural
 from bench.records.record import RunStatus
 from bench.setup.auto import AUTO
-from bench.setup.fields import PRIOR, parse_field_name
+from bench.setup.fields import parse_field_name
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.tasks.capacity.growth import Trials, climb
@@ -64,7 +65,7 @@ class Appearance:
         Raises:
             BadInput: for the name of a field without colours.
         """
-        kind, sizes = (name, ()) if name in (PRIOR, AUTO) else parse_field_name(name)
+        kind, sizes = (name, ()) if name in (PRIOR_FIELD, AUTO) else parse_field_name(name)
         if kind == "network":
             layers, width = sizes
             shape = {"layers": layers, "width": width, "octaves": self.octaves}

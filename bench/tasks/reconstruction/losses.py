@@ -12,8 +12,7 @@ from bench.tasks.reconstruction.pixels import Pixels
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice
-from renderers.field import Field, Kind, Meter
-from renderers.fields.networks.coloured import Coloured
+from renderers.field import Coloured, Field, Kind, Meter
 from renderers.rendering import RayObservation, Renderer, Volume
 from renderers.silhouette import SilhouetteLoss
 

@@ -21,8 +21,8 @@ from bench.tasks.reconstruction.subject import Subject
 from datasets.scene import View
 from renderers.boundary import render_checked
 from renderers.camera import Camera
-from renderers.field import Counts, Meter
-from renderers.fields.networks.coloured import Coloured, ColouredDistance, ColouredGrid, ColouredOccupancy
+from renderers.field import Coloured, Counts, Meter
+from renderers.fields.networks.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
 from renderers.rendering import Renderer, at_iteration
 
 OBJECTIVE_PIXELS = 4096  # compared before and after the optimisation

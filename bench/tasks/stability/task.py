@@ -15,7 +15,7 @@ from bench.tasks.stability.axes import Stress
 from bench.tasks.stability.distortions import NETWORK_DISTORTIONS
 from bench.tasks.stability.search import Bisection, Search, SearchSettings
 from bench.tasks.stability.trial import Conditions, Criteria, Failure, FitSettings, Trial
-from datasets.files.network_files import HasNetwork
+from datasets.scene import HasNetwork
 from renderers.checks import BadInput, check_at_least
 from renderers.rendering import Renderer, Unsupported
 

@@ -1,9 +1,9 @@
-"""Fields with colours: networks and grids of one shape, initialised to a sphere, and a decoder of a code."""
+"""Fields with colours: networks and grids of one shape, initialised to a sphere."""
 
 from dataclasses import dataclass
 from itertools import pairwise
 from math import pi, sqrt
-from typing import ClassVar, Protocol, cast, runtime_checkable
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Bounds, Field, Flops, Kind, OccupancyField, Wrapper, field_bounds
+from renderers.field import Flops, Kind, OccupancyField
 from renderers.fields.grid import FLOPS, Grid
-from renderers.fields.mlp import BoundDecoder, Decoder, flops_of, split_into_passes
+from renderers.fields.mlp import flops_of, split_into_passes
 from renderers.fields.networks.occupancy import BoundOccupancy, OccupancyNetwork
 
 SOFTPLUS_BETA = 100.0  # as in IDR: nearly a ReLU, with a second derivative
@@ -23,21 +23,6 @@ LOGIT_WIDTH = 0.1  # scene units over which the initial occupancy logit changes 
 OCCUPANCY_THRESHOLD = 0.5  # tau in DVR
 COLOUR_LOGIT_SCALE = 20.0  # makes one step size of Adam suit the colours and the distances of a grid
 Vectors = Float[Tensor, "*batch 3"]
-
-
-@runtime_checkable
-class Coloured(Field, Protocol):
-    """A field whose surface has colours."""
-
-    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
-        """Red, green and blue from 0 to 1.
-
-        Args:
-            points: on the surface.
-            normals: the field's gradients at the points; through their graph, colours have a gradient to the shape.
-            directions: unit directions of the rays that hit the points.
-        """
-        ...
 
 
 class ColouredDistance(nn.Module):
@@ -233,56 +218,6 @@ class ColouredGrid(nn.Module):
         zyx = (points.flip(-1) / self.reach).reshape(1, -1, 1, 1, 3)  # the order of `grid_sample`
         sampled = torch.nn.functional.grid_sample(self.logits[None], zyx, padding_mode="border", align_corners=True)
         return torch.sigmoid(COLOUR_LOGIT_SCALE * sampled.reshape(3, -1).T.reshape(points.shape))
-
-
-class TexturedDecoder(nn.Module):
-    """A distance decoder of the first half of a code, and a colour decoder of the whole code.
-
-    Source: DIST, B.1: a shape code and a texture code of 256 each; the texture network takes both.
-    Deviates: colours are a sigmoid of the outputs. The colour decoder has no narrowed layer before the skip, which
-        needs a width above the code's length.
-
-    Args:
-        layers, width, skip: of both decoders; see `Decoder`.
-        code_length: of both codes together, even.
-        narrow: of the distance decoder.
-    """
-
-    def __init__(self, *, layers: int, width: int, code_length: int, skip: int, narrow: bool) -> None:
-        super().__init__()
-        if code_length % 2:
-            raise ValueError(f"code_length must be even, not {code_length}: a half of it is the shape's")
-        self.code_length, self.width = code_length, width
-        self.shape = Decoder(layers=layers, width=width, code_length=code_length // 2, skip=skip, narrow=narrow)
-        self.texture = Decoder(layers=layers, width=width, code_length=code_length, skip=skip, narrow=False, outputs=3)
-
-    def at(self, code: Float[Tensor, "*shapes code_length"]) -> "TexturedShape":
-        """The field of one code, or of a batch of codes."""
-        shape = self.shape.at(code[..., : self.code_length // 2])
-        return TexturedShape(cast(Field, shape), self.texture.at(code))
-
-
-@dataclass(frozen=True)
-class TexturedShape(Wrapper):
-    """The field of a `TexturedDecoder` at one code. Colours depend on points alone and are not counted as cost."""
-
-    inner: Field
-    texture: BoundDecoder
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """See `BoundDecoder`."""
-        return field_bounds(self.inner)
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return self.inner(points)
-
-    def paint(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """The colours of points."""
-        return torch.sigmoid(self.texture.outputs(points))
-
-    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
-        return self.paint(points)
 
 
 def positional_encoding(vectors: Float[Tensor, "*batch 3"], octaves: int) -> Float[Tensor, "*batch encoding"]:

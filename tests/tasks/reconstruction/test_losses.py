@@ -13,8 +13,7 @@ from bench.tasks.reconstruction.losses import EIKONAL_POINTS, NEIGHBOUR_CUBE_SID
 from bench.tasks.reconstruction.pixels import Pixels
 from datasets.shot import Shot
 from renderers.camera import Camera, Rays
-from renderers.field import Kind, Meter
-from renderers.fields.networks.coloured import Coloured
+from renderers.field import Coloured, Kind, Meter
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.renderers.analytic_cases import vector
