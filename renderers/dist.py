@@ -42,7 +42,7 @@ class DIST:
         sphere_radius: of the sphere about the origin that contains the shape.
         silhouette_signed, silhouette_average: see `silhouette.Hinge`.
         coarse: march on the field's coarse values away from the surface, if it has any; see `field.marching_values`.
-            The result is the same as if all values were closer to 0 by at most twice their error. Without a gradient,
+            Their error shortens steps and never lengthens them, since values are reduced by it. Without a gradient,
             `closest` of a missed ray is such an approximate value.
     """
 

@@ -284,7 +284,8 @@ def march_front(
     for step in range(steps):
         if index.numel() == 0:
             break
-        has_finished_rays = all_rays or step % interval  # these are evaluated where they left the sphere, not beyond it
+        # Finished rays are evaluated where they left the sphere, not beyond it.
+        has_finished_rays = all_rays or step % interval != 0
         distance = state.table[2]
         clamped = distance.clamp(state.table[0], state.table[1]) if has_finished_rays else distance
         points = origins + clamped[:, None] * directions

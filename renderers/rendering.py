@@ -138,12 +138,16 @@ class RayObservation:
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Finds surfaces along rays. It never times, logs, draws or synchronises, and knows no task."""
+    """Finds surfaces along rays. It never times, logs or draws, knows no task, and rarely waits for a GPU."""
 
     capabilities: ClassVar[Capabilities]
 
     def render(self, field: Field, rays: Rays) -> Rendering:
-        """The rendering of the field along the rays; calls `check_kind` first."""
+        """The rendering of the field along the rays.
+
+        Raises:
+            Unsupported: the renderer cannot render this kind of field.
+        """
         ...
 
     def silhouette_loss(

@@ -1,4 +1,4 @@
-"""Fewer waits of the host for a device: marches keep finished rays for some steps, and counts are read late."""
+"""Fewer synchronisations with a GPU: marches keep finished rays for some steps, and counts are read late."""
 
 from collections.abc import Callable
 from contextvars import ContextVar

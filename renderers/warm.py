@@ -73,8 +73,8 @@ class CachedRays:
         self.slope = self.slope.index_put((index,), torch.where(converged, solved.slope, self.slope[index]))
         self.renderings += 1
 
-    def free(self, total_movement: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Which rays are still free after this movement: along the whole path, and up to their restart distance.
+    def still_free(self, total_movement: Float[Tensor, ""]) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
+        """Masks of rays that are still free after this movement: along the whole path; up to their restart distance.
 
         On a step that is at most `MAX_OVERSTEP` longer than the value, the field is at least half the smaller of the
         values at its ends, less half of `MAX_OVERSTEP`. A hit's final descent is not compared: its Newton step sees it.
@@ -170,7 +170,7 @@ def _march_all(tracer: Tracer, field: Field, rays: Rays, previous: CachedRays | 
 
 def _is_worthwhile(cache: CachedRays) -> bool:
     """Whether enough rays will be free, if values move as far as in the last rendering."""
-    free, _ = cache.free(cache.total_movement + cache.last_movement)
+    free, _ = cache.still_free(cache.total_movement + cache.last_movement)
     return bool((~free).sum() <= MAX_REMARCHED_FRACTION * len(free))
 
 
@@ -192,7 +192,7 @@ def _solve_cached(tracer: Tracer, memory: Memory, field: Field, rays: Rays, cach
         movement = torch.maximum(_largest(solved.first_value), _largest(probe_values - cache.probe_values))
         cache.last_movement, cache.probe_values = MOVEMENT_SAFETY_FACTOR * movement, probe_values
         cache.total_movement = cache.total_movement + cache.last_movement
-        free, up_to_restart = cache.free(cache.total_movement)
+        free, up_to_restart = cache.still_free(cache.total_movement)
         certain = free & ~cache.hit.index_put((reusable,), ~solved.converged)
         audited = torch.zeros_like(free)
         audited[AUDIT_OFFSET * cache.renderings % AUDIT_STRIDE :: AUDIT_STRIDE] = True

@@ -21,9 +21,9 @@ from bench.tables import without_row_keys
 from datasets.extras import referenced_files, version
 
 NO_STRESS = "none"
-INPUT_FILE_KEYS = ("path", "image_path", "mask_path", "truth", "codes", "cloud")  # keys whose values are files
-HASHED_PATTERNS = ("*", "ModelParameters/*", "LatentCodes/*")  # the hashed files of an input folder, also of DeepSDF's
-# Settings that name choices, which a run loads itself, with the modules of all such choices.
+# Keys whose values are files or folders.
+INPUT_FILE_KEYS = ("path", "image_path", "mask_path", "images", "truth", "codes", "cloud")
+# A run with such a key loads a choice by its name: the module of all such choices is hashed too.
 LOADED_BY_NAME = {("task", "beside"): "renderers", ("prior", "of"): "datasets.families"}
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz")  # not hashed: gigabytes that no run reads
 FIELD_FILE = "field.safetensors"  # the only file of a run folder that another run reads
@@ -75,11 +75,12 @@ class Identity:
         listed = [str(package) for package in self.config.get("packages") or []] if self._user_packages else []
         packages = sorted({*listed, *self._user_packages} - {*OUR_PACKAGES})  # a class may import a listed package
         dataset = self.config.get("dataset") or {}
-        paths = [path for key in INPUT_FILE_KEYS for path in _values_of_key(self.config, key)]
+        deep = () if "synset" in dataset else ("path", "images")  # a folder of ShapeNet has thousands of folders
+        inputs = [(path, key in deep) for key in INPUT_FILE_KEYS for path in _values_of_key(self.config, key)]
         for split in map(Path, _values_of_key(dataset, "split")):  # a list of shapes, with others in the same folder
-            paths += sorted(map(str, split.parent.glob(f"*{split.suffix or split.name}")))
-        files = [_file_hash(Path(path)) for path in paths]
-        files += [_class_counts_hash(str(dataset["path"]))] if "synset" in dataset else []
+            inputs += [(str(path), False) for path in sorted(split.parent.glob(f"*{split.suffix or split.name}"))]
+        files = [_file_hash(Path(path), deep=is_deep) for path, is_deep in inputs]
+        files += [_class_counts_hash(str(dataset[key])) for key in ("path", "renders") if "synset" in dataset]
         hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
         targets = {*_values_of_key(hashed, "_target_")}
         targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}
@@ -244,14 +245,19 @@ def _package_hash(name: str) -> str:
     return digest([_file_hash(path) for path in files])
 
 
-def _file_hash(path: Path) -> str:
-    """Hash of a file with the files that it names, of a run's field, or of a folder; empty if it does not exist."""
+def _file_hash(path: Path, *, deep: bool = False) -> str:
+    """Hash of a file with the files that it names, of a run's field, or of a folder; empty if it does not exist.
+
+    Args:
+        deep: whether the hash of a folder is of all files below it, not only of the files directly in it.
+    """
     try:
         if (path / FIELD_FILE).is_file():
             return _file_hash(path / FIELD_FILE)
         if path.is_dir():
-            files = [child for pattern in HASHED_PATTERNS for child in sorted(path.glob(pattern)) if child.is_file()]
-            return digest([_file_hash(child) for child in files if child.suffix not in ARCHIVE_SUFFIXES])
+            children = sorted(path.rglob("*") if deep else path.glob("*"))
+            files = [child for child in children if child.is_file() and child.suffix not in ARCHIVE_SUFFIXES]
+            return digest([[child.relative_to(path).as_posix(), _file_hash(child)] for child in files])
         name_and_hash = [path.name, hashlib.sha256(path.read_bytes()).hexdigest()]
         return digest([*name_and_hash, *map(_file_hash, referenced_files(path))])
     except OSError:

@@ -123,6 +123,18 @@ def test_a_run_is_another_one_if_a_file_that_it_reads_has_changed(tmp_path, key)
     assert code() != before
 
 
+def test_a_run_is_another_one_if_a_photograph_in_a_folder_of_its_dataset_has_changed(tmp_path):
+    photograph = tmp_path / "image" / "a.png"
+    photograph.parent.mkdir()
+    names = {"task": "multiview", "renderer": "dist", "dataset": "photos"}
+
+    def code(text: str) -> str:
+        photograph.write_text(text)
+        return Identity(names, {"dataset": {"path": str(tmp_path)}}).code
+
+    assert code("before") == code("before") != code("after")
+
+
 def test_a_package_is_in_the_identity_of_runs_with_a_class_of_the_user():
     names = {"task": "completion", "renderer": "dist", "dataset": "sofa"}
 
