@@ -33,7 +33,7 @@ SHAPES = tuple(range(6))
     ],
 )
 def test_a_verdict_follows_the_rule(expected, published, low, value, high, verdict):
-    claim = Claim("a paper", "a claim", published, expected=expected)
+    claim = Claim("a paper", "a claim", published and (lambda: published), expected=expected)
     assert verdict_of(claim, Interval(value, low, high, (value,) * 4)) == verdict
 
 
@@ -41,9 +41,9 @@ def test_every_claim_names_rows_and_tests_that_exist_or_says_what_it_needs():
     rows = {*names("renderer"), *names("method")}
     for claim in CLAIMS:
         if claim.experiment:
-            assert {claim.top, claim.bottom} <= rows and (claim.command or claim.experiment) in names("experiment"), (
-                claim
-            )
+            assert {claim.top, claim.bottom or claim.top} <= rows and (claim.command or claim.experiment) in names(
+                "experiment"
+            ), claim
         elif not claim.test:
             assert claim.why.startswith("needs"), claim
     tests = "".join(path.read_text() for path in Path(__file__).parents[1].rglob("test_*.py"))
@@ -75,9 +75,9 @@ def test_claims_are_measured_on_shapes_that_both_rows_have(tmp_path):
     assert {name: line["shapes"] for name, line in lines.items()} == dict.fromkeys(lines, 6) and len(lines) == 2
     printed, official = lines.values()
     assert printed["ratio"].value == pytest.approx(20**0.5) and printed["verdict"] == "does not hold"
-    assert printed["why"].startswith("the paper does not give") and printed["families"] == "sofa, plane, table"
+    assert printed["why"].startswith("not known") and printed["families"] == "sofa"
     assert official["ratio"].value == pytest.approx(0.3**0.5) and official["verdict"] == "not decided"  # 1 of 6 against
-    assert page.verdict.startswith(f"2 of {len(CLAIMS)} claims are measured: does not hold *1*; not decided *1*. ")
+    assert page.verdict.startswith("*0* of 2 measured claims hold, or are as claimed on few shapes. Others: ")
     assert page.verdict.endswith("are not tested.")
 
 
