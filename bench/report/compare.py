@@ -261,11 +261,10 @@ class Compared:
     def comparable(self) -> list[Line]:
         """The pooled lines of rows that lack no shape and have the settings of most runs; verdicts use only these.
 
-        The settings are the number of views and those of `Runs.mixed`. A note warns that rows with other values of
-        these do not compare.
+        The settings are those of `Runs.mixed`. A note warns that rows with other values of these do not compare.
         """
         is_usual = np.ones(len(self.runs.records), dtype=bool)
-        for key in (*self.runs.mixed(), "task.images.views"):
+        for key in self.runs.mixed():
             values = self.runs.setting(key)
             is_usual &= (values == values.mode()[0]).to_numpy()
         usual_rows = self.runs.where(pd.Series(is_usual)).rows()
@@ -287,8 +286,8 @@ class Compared:
             f"{format.number(line['error'].value)}{mark} ({line['row']}, {format.seconds(line['seconds'])}"
             for line, mark in ((best, "*"), (quickest, ""))
         )
-        other = ", which is also the fastest row)" if best is quickest else f"); the fastest row has {quickest_text})"
-        return f"The smallest median of {least_of} is *{best_text}{other}; n = {format.plural(n, 'shape')}."
+        other = "It is also the fastest." if best is quickest else f"The fastest row has {quickest_text})."
+        return f"The smallest median of {least_of} is *{best_text}); n = {format.plural(n, 'shape')}. {other}"
 
     def panels(self, ratio: str) -> list[chart.Panel]:
         """Panels of errors, of ratios (labelled `ratio`) and of costs: a line per row, the least error first."""
@@ -327,14 +326,16 @@ def differing(ratios: Sequence[tuple[str, Interval | None]], versus: str) -> str
     unequal = [
         f"{name} {ratio}" for (name, ratio), verdict in zip(tested, verdicts, strict=True) if verdict is Verdict.DIFFERS
     ]
+    differ = f"*{len(unequal)} of {len(tested)}* ratios {versus} differ significantly from 1"
+    differ += f"{': ' if unequal else ''}{'; '.join(unequal)}."
     parts = [
-        f"*{len(unequal)} of {len(tested)}* ratios {versus} differ from 1{': ' if unequal else ''}{'; '.join(unequal)}",
         f"{undistinguished} cannot be distinguished from 1" if undistinguished else "",
         f"{undecided} cannot be decided with {sizes[0]} shapes" if undecided else "",
     ]
     agreeing = f"{statistics.shapes_agreeing(sizes[-1], len(tested))} of {sizes[-1]} shapes"
     step = "" if unequal else f" The test needs {agreeing} on one side of 1."
-    return f"{HOLM}, {'; '.join(filter(None, parts))}.{step}"
+    others = "; ".join(filter(None, parts))
+    return f"{differ} {HOLM}{f', {others}' if others else ''}.{step}"
 
 
 def ordered(conditions: Collection[str]) -> list[str]:

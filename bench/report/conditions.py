@@ -7,8 +7,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from bench.records.format import plural
 from bench.report.data import records
-from bench.report.data.records import ONE_WAY, Record, by_shape, error, family, grouped, row_of, run_key, setting
+from bench.report.data.records import ONE_WAY, Record, by_shape, error, family, grouped, row_of, run_key, setting, solid
 from bench.report.data.statistics import Interval, bootstrap, median
 from bench.report.write import chart
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, estimate, metrics, text
@@ -42,6 +43,13 @@ def run_columns(conditions: Sequence[Condition], *other_keys: str) -> tuple[Colu
     """The columns of the CSV: identity, conditions, other settings of the task, and metrics."""
     keys = (*(configured(condition.key, "task", condition.key) for condition in conditions), *IDENTITY)
     return (FAMILY, *keys, *(configured(key, "task", key) for key in other_keys), *metrics(ONE_WAY, "chamfer_l2"))
+
+
+def shapes_text(runs: Sequence[Record]) -> str:
+    """The number of shapes, and how many each family has, such as 4 shapes, 2 per family."""
+    counts = [len(shapes) for shapes in grouped({solid(run) for run in runs}, lambda shape: shape[0]).values()]
+    per_family = f", {' or '.join(map(str, sorted({*counts})))} per family" if len(counts) > 1 else ""
+    return plural(sum(counts), "shape") + per_family
 
 
 def median_error(runs: Sequence[Record]) -> Interval:

@@ -12,7 +12,8 @@ CONDITIONS = (
     conditions.Condition("degrees", "rotation (degrees)", 0.0),
     conditions.Condition("scale", "size / true size", 1.0),
 )
-READS = (Selection("fig12", (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity")),)
+KEYS = (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity")
+READS = (Selection("fig12", KEYS, may_differ=("prior.truncation",)),)
 MAX_ERROR = 1.0  # squared scene units x 1000: about the errors of DIST, Table 3; a success has less
 NOTES = (
     f"A success ended ok with an error below {MAX_ERROR:g}. Its interval is over shapes (Clopper and Pearson).",
@@ -84,9 +85,12 @@ def _verdict(runs: Runs) -> str:
     """The fraction of successes of each row, over the runs that did not begin in place."""
     misplaced = [record for record in runs.records if any(c.value_of(record) != c.neutral for c in CONDITIONS)]
     shares = {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(misplaced, row_of).items()}
-    shapes = format.plural(len({solid(record) for record in misplaced}), "shape")
     return format.ends(
-        f"Misplaced runs that end with an error below {MAX_ERROR:g}", shares, shapes, show=table.percent, most=True
+        f"Misplaced runs that end with an error below {MAX_ERROR:g}",
+        shares,
+        conditions.shapes_text(misplaced),
+        show=table.percent,
+        most=True,
     )
 
 
