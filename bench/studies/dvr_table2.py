@@ -86,7 +86,7 @@ def make(runs: Runs) -> Result:
         f"the median.{_photograph_settings(runs)}",
         question="Which method best reconstructs shape and colour from photographs?",
         verdict=format.ends(
-            "Median Chamfer-L1 × 1000 of the seen surface, for methods that use no depth",
+            "Median Chamfer-L1 × 1000 of the seen surface, without depth",
             medians.comparable_medians(
                 [line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR
             ),
@@ -157,7 +157,7 @@ def convergence(runs: Runs) -> Result:
         "iterations and at the end; the figure has all checkpoints.",
         question="Would more iterations reduce the error on photographs?",
         verdict=format.ends(
-            "Decrease of the error from half of the iterations (nearest checkpoint) to the end",
+            "Decrease of the error in the second half",
             {line["method"]: line["fell"] for line in lines},
             _scenes(runs),
             show=table.percent,

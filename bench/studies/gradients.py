@@ -121,8 +121,8 @@ def _visibility_verdict(data: pd.DataFrame) -> str:
         )
     if len(sharp):
         most = sharp[[*IMAGE_METRICS]].max()
-        parts.append(f"renderers that differentiate only hits have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
-    return f"{'; '.join(parts)} (n = one shape)." if parts else ""
+        parts.append(f"Renderers that differentiate only hits have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
+    return f"{'. '.join(parts)} (n = one shape)." if parts else ""
 
 
 def draw(data: pd.DataFrame) -> Figure:

@@ -137,10 +137,9 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
                 f"{p['setting']} (*{format.seconds(p['seconds'])}*, error × 1000 {format.number(p['error'])})"
                 for p in (front[0], *front[1:][-1:])
             ]
-            return (
-                f"{len(front)} of {len(panel)} settings are on the front of {trial.title}: {' to '.join(ends)}; n = "
-                f"{format.plural(panel[0]['shapes'], 'shape')}."
-            )
+            n = format.plural(panel[0]["shapes"], "shape")
+            on_front = f"{len(front)} of {len(panel)} settings are on the front of {trial.title}; n = {n}."
+            return f"{on_front} From the fastest to the best: {' to '.join(ends)}."
     return ""
 
 
