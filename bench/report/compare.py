@@ -17,7 +17,7 @@ from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, Verdict, geometric_mean
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import Column, ends, estimate, text
+from bench.report.write.table import Column, columns, ends, estimate, text, word
 
 ALL_FAMILIES = "all families"
 COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "runtime (seconds)"}  # with their axis labels
@@ -226,16 +226,14 @@ class Compared:
     def columns(self, ratio: str) -> list[Column]:
         """The columns of the lines; `ratio` is the heading of the ratio."""
         return [
-            *(text("family", "Family"), text("row", "Method")),
-            *(Column(condition, heading(condition)) for condition in self.conditions),
+            *columns(word, family="Family", row="Method"),
+            *columns(**{condition: heading(condition) for condition in self.conditions}),
             *estimate("error", "Median over shapes"),
             text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
             *ends("ratio", lambda line: ratio_of(line["ratio"])),
-            *(
-                Column("evaluations", "Field evaluations", show=format.count),
-                Column("seconds", "Runtime", show=format.seconds),
-            ),
-            *(text("failed", "Failed"), text("preset")),
+            *columns(format.count, evaluations="Field evaluations"),
+            *columns(format.seconds, seconds="Runtime"),
+            *columns(word, failed="Failed", preset=""),
         ]
 
     def result(self, title: str, question: str, **changed: Any) -> Result:

@@ -214,10 +214,10 @@ CLAIMS = (
     ),
 )  # fmt: skip
 COLUMNS = (
-    *(table.text("source", "Paper"), table.text("claim", "Claim"), table.Column("published", "Published ratio")),
-    *(*table.estimate("ratio", "Measured ratio"), table.Column("shapes", "Shapes"), table.text("families", "Families")),
-    table.text("verdict", "Verdict"),
-    *(table.text("why", "Possible cause, or what is missing"), table.text("command", "Command, or test")),
+    *(*table.columns(table.word, source="Paper", claim="Claim"), table.Column("published", "Published ratio")),
+    *(*table.estimate("ratio", "Measured ratio"), table.Column("shapes", "Shapes")),
+    *table.columns(table.word, families="Families", verdict="Verdict", why="Possible cause, or what is missing"),
+    table.text("command", "Command, or test"),
 )
 NOTES = (
     "A ratio compares the errors of two rows, or in DIST, Table 1, their field evaluations. It is a median over shapes "

@@ -26,15 +26,13 @@ NOTES = (
     "cannot be compared directly with the measured rows.",
 )
 COLUMNS = (
-    *(table.text("family", "Family"), table.text("method", "Training"), table.Column("iou", "IoU")),
-    table.Column("chamfer_l1", "Chamfer-L1", show=table.thousandfold),
+    *(*table.columns(table.word, family="Family", method="Training"), *table.columns(iou="IoU")),
+    *table.columns(table.thousandfold, chamfer_l1="Chamfer-L1"),
     table.shown("95 % interval", lambda line: line["interval"].ends(1000) if "interval" in line else ""),
     *(table.shown(heading, lambda line, name=name: str(line.get(name) or "")) for name, heading in BASELINES.items()),
-    table.Column("normal_consistency", "Normals"),
-    *(table.Column("mask_iou", "Mask IoU"), table.Column("psnr", "PSNR")),
-    table.Column("training", "Trained in", show=format.seconds),
-    table.Column("seconds", "Inference", show=format.seconds),
-    *(table.text("failed", "Failed"), table.text("published", "Published")),
+    *table.columns(normal_consistency="Normals", mask_iou="Mask IoU", psnr="PSNR"),
+    *table.columns(format.seconds, training="Trained in", seconds="Inference"),
+    *table.columns(table.word, failed="Failed", published="Published"),
 )
 RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*MEDIANS, "chamfer_l2", "mask_iou_least"), *table.LOOP)
 IMAGES = {"given": "given", "photograph": "another\nimage"}  # arrays of images.npz

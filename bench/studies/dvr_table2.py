@@ -34,11 +34,9 @@ NOTED_SETTINGS = {  # names in the note on optimised rows, and configuration key
 }
 COLUMNS = (
     table.text("method", "Method"),
-    table.Column("seen_accuracy", "Accuracy", show=table.thousandfold),
-    table.Column("seen_completeness", "Completeness", show=table.thousandfold),
-    table.Column(SEEN_ERROR, "Chamfer-L1, seen", show=table.thousandfold),
-    table.Column("chamfer_l1", "all", show=table.thousandfold),
-    *(table.Column("psnr", "PSNR"), table.Column("ssim", "SSIM"), table.Column("mask_iou", "Mask IoU")),
+    *table.columns(table.thousandfold, seen_accuracy="Accuracy", seen_completeness="Completeness"),
+    *table.columns(table.thousandfold, seen_chamfer_l1="Chamfer-L1, seen", chamfer_l1="all"),
+    *table.columns(psnr="PSNR", ssim="SSIM", mask_iou="Mask IoU"),
     *medians.COST,
 )
 RUNS = (
@@ -52,11 +50,9 @@ PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN_ERROR, "ps
 
 CURVE_COLUMNS = (
     table.text("method", "Method"),
-    table.Column("iterations", "Iterations", show=table.integer),
-    table.Column("at", "Checkpoint nearest to half", show=table.integer),
-    table.Column("half", "Error at this checkpoint", show=table.thousandfold),
-    table.Column("end", "Error at the end", show=table.thousandfold),
-    table.Column("fell", "Decrease", show=table.percent),
+    *table.columns(table.integer, iterations="Iterations", at="Checkpoint nearest to half"),
+    *table.columns(table.thousandfold, half="Error at this checkpoint", end="Error at the end"),
+    *table.columns(table.percent, fell="Decrease"),
 )
 MAX_SCENES = 2
 LOOKALIKES = {  # presets not shown in figures, because they look like another row

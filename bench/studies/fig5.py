@@ -17,12 +17,9 @@ READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
 QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", CHAMFER_SCALE)}
 TIME_AXES = {"iteration": "iteration", "seconds": "time (seconds)"}
 COLUMNS = (
-    *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.integer)),
-    *(
-        table.Column(key, heading, show=table.thousandfold)
-        for key, heading in (("end", "End"), ("low", "Smallest"), ("high", "Largest"))
-    ),
-    *(table.Column("seconds", "Runtime", show=format.seconds), table.Column("spearman", "ρ")),
+    *(*table.columns(table.word, row="Method"), *table.columns(table.integer, runs="Runs")),
+    *table.columns(table.thousandfold, end="End", low="Smallest", high="Largest"),
+    *(*table.columns(format.seconds, seconds="Runtime"), *table.columns(spearman="ρ")),
 )
 HIGH_RHO = 0.7  # a larger correlation is called high
 NOTES = (

@@ -49,10 +49,8 @@ NUMBERS = (
 SHARE_COLUMNS = ("level", "severity", "successes", "trials", "share", "low", "high")
 COST_COLUMNS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
-    table.text("at_once", "At once"),
-    table.text("never", "None"),
-    table.Column("cost", "Field evaluations per ray"),
-    table.text("preset"),
+    *table.columns(table.word, at_once="At once", never="None"),
+    *(table.Column("cost", "Field evaluations per ray"), table.PRESET),
 )
 
 
