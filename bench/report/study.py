@@ -5,22 +5,11 @@
 """
 
 # ruff: noqa: F401 - these imports are re-exported
-from functools import cache
-from typing import Any
-
-import yaml
-
 from bench.pictures import style
 from bench.records import format
 from bench.report import compare, conditions, gallery, medians
+from bench.report.compare import published
 from bench.report.data import curves, records, statistics
 from bench.report.data.runs import Runs, Selection, merge_runs
 from bench.report.write import chart, table
 from bench.report.write.result import Result
-from bench.tables import CONF
-
-
-@cache
-def published(name: str) -> dict[str, Any]:
-    """A table of `conf/published.yaml`: numbers of a paper as text, as printed."""
-    return yaml.load((CONF / "published.yaml").read_text(encoding="utf-8"), yaml.BaseLoader)[name]

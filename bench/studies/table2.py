@@ -2,11 +2,10 @@
 
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, compare, gallery, published, records, style, table
+from bench.report.study import Result, Runs, Selection, chart, compare, gallery, records, style, table
 
 PLACE = 20
 READS = (Selection("table2", ("task.points",), may_differ=("prior.truncation",)),)
-REFERENCE = "dist_mask"
 HIDDEN_SUFFIXES = ("_paper", "_official")  # the figure leaves out these presets, to stay readable
 NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
@@ -30,26 +29,9 @@ ARRAYS = (
 BOTH_SIDES = (gallery.FRONT, gallery.BEHIND)
 
 
-def make(runs: Runs) -> Result:
-    """A line per family and row, with the oracle and published numbers of each family."""
-    compared, oracle = compare.Compared(runs, lambda _: REFERENCE), compare.oracles(runs, compare.METRIC)
-    columns = compared.columns("Ratio to DIST with mask")
-    return compared.result(
-        "Shape completion from one depth image, by its number of points.",
-        "Which method completes a shape best from sparse depth?",
-        plotted="Median error over {shapes and seeds} for each number of depth points, and for all numbers together.",
-        verdict=compared.best("errors × 1000 over all numbers of depth points"),
-        remarks=(compare.ERROR, f"{_shapes(compared)} {_iterations(runs)}", *NOTES),
-        columns=[column for column in columns if column.key not in compare.COSTS],
-        lines=compared.extended_lines({compare.ORACLE: oracle}, published("dist_table2")),
-        run_columns=RUNS,
-        figure=draw(compared, oracle),
-    )
-
-
-def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
+def draw(compared: compare.Compared) -> Figure:
     """Draws a panel per family: the median of each row over the number of points, and the oracle."""
-    conditions, panels = compared.conditions, []
+    conditions, oracle, panels = compared.conditions, compared.oracles, []
     positions = range(len(conditions))
     for family in compared.families:
         lines = []
@@ -65,9 +47,10 @@ def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
     return chart.draw(panels, 2.1 * height + 0.7, height, sharey=True)
 
 
-def _shapes(compared: compare.Compared) -> str:
+def _notes(compared: compare.Compared) -> tuple[str, ...]:
     counts = compared.cells.groupby(["family", "row", "condition"], observed=True).solid.nunique()
-    return f"Shapes per family and row: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
+    shapes = f"Shapes per family and row: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
+    return compare.ERROR, f"{shapes} {_iterations(compared.runs)}", *NOTES
 
 
 def _iterations(runs: Runs) -> str:
@@ -118,4 +101,18 @@ def _points(record: records.Record) -> str:
     return str(records.setting(record["config"], "task", "points"))
 
 
-PAGES = {"table2": make, "completion_gallery": pictures}
+PAGE = compare.Comparison(
+    title="Shape completion from one depth image, by its number of points.",
+    question="Which method completes a shape best from sparse depth?",
+    reference="dist_mask",
+    name="DIST with mask",
+    notes=_notes,
+    plotted="Median error over {shapes and seeds} for each number of depth points, and for all numbers together.",
+    least_of="errors × 1000 over all numbers of depth points",
+    above=lambda compared: {compare.ORACLE: compared.oracles},
+    published="dist_table2",
+    hidden=compare.COSTS,
+    run_columns=RUNS,
+    figure=draw,
+)
+PAGES = {"table2": PAGE, "completion_gallery": pictures}

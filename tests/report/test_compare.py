@@ -1,12 +1,13 @@
 """The comparison of rows and its pages, made from run folders whose errors and costs are known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import ALL_FAMILIES, HOLM, Compared, differing, ordered
+from bench.report.compare import ALL_FAMILIES, HOLM, Compared, Comparison, differing, ordered
 from bench.report.data import statistics
 from bench.report.data.runs import Runs, Selection, choose
 from bench.report.write.result import Result
@@ -19,9 +20,8 @@ METHODS = {"dist": (1.0, 1000, 4.0), "newton": (0.5, 500, 8.0), "neus": (0.25, 9
 
 def page(runs: Runs) -> Result:
     """A page of the ratios to DIST."""
-    found = Compared(runs, lambda _: "dist_mask")
-    verdict = f"{found.best('errors')} {found.differing('to DIST')}".strip()
-    return found.result("Rows.", "Which?", verdict=verdict, columns=found.columns("Ratio to DIST"))
+    made = Comparison("Rows.", "Which?", "dist_mask", "DIST", lambda _: (), least_of="errors")(runs)
+    return replace(made, verdict=f"{made.verdict} {Compared(runs, 'dist_mask').differing('to DIST')}".strip())
 
 
 def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
@@ -181,7 +181,7 @@ def test_a_verdict_that_no_data_could_give_is_none():
 
 
 def test_its_panels_have_a_line_per_row_the_least_error_first(whole):
-    errors, ratios, evaluations, seconds = Compared(whole, lambda _: "dist_mask").panels("Ratio to DIST")
+    errors, ratios, evaluations, seconds = Compared(whole, "dist_mask").panels("Ratio to DIST")
     names = [f"{name} with mask" for name in ("neus", "newton", "dist", "volsdf")]
     assert [panel["rows"] for panel in (errors, ratios, evaluations, seconds)] == [names] * 4
     assert [(each["name"], each["y"]) for each in errors["series"]] == [(name, [n]) for n, name in enumerate(names)]
