@@ -1,12 +1,14 @@
 """Table 2 and Figs. 6 to 8 of DVR: shape and colour from rendered photographs."""
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import pandas as pd
 
 from bench.records.metrics import DVR_TABLE2
-from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting, shared_settings
+from bench.records.record import as_number
+from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
 from bench.report.tuning import TUNED_PREFIX
 
@@ -89,12 +91,29 @@ def make(runs: Runs) -> Result:
             scenes,
             show=table.thousandfold,
         ),
-        remarks=(shared_settings(optimised, NOTED_SETTINGS), _partial_rows(lines), *NOTES),
+        remarks=(_settings(optimised), _partial_rows(lines), *NOTES),
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
         figure=medians.draw_runs(runs, panels, [Row(line["preset"], line["method"]) for line in lines]),
     )
+
+
+def _settings(records: list[Record]) -> str:
+    """A note on the settings that all records share, and on those in which they differ; empty without settings."""
+    values = {
+        name: {str(value): value for record in records if (value := setting(record["config"], *path)) is not None}
+        for name, path in NOTED_SETTINGS.items()
+    }
+    shared = [f"{name} {next(iter(each))}" for name, each in values.items() if len(each) == 1]
+    differ = [f"{name} ({', '.join(_ordered(each.values()))})" for name, each in values.items() if len(each) > 1]
+    parts = [("Rows share: ", shared), ("Rows differ in: ", differ)]
+    return " ".join(f"{word}{', '.join(listed)}." for word, listed in parts if listed)
+
+
+def _ordered(values: Iterable[Any]) -> list[str]:
+    """Values as text: numbers sorted by size, then words."""
+    return [str(value) for value in sorted(values, key=lambda x: (1, str(x)) if as_number(x) is None else (0, x))]
 
 
 def _partial_rows(lines: list[dict[str, Any]]) -> str:
@@ -200,10 +219,12 @@ def _fall(row: Row, curve: pd.Series) -> dict[str, Any]:
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, without rows that look like another."""
     rows, by_scene = list(_distinct(runs)), grouped(runs.records, medians.scene_of)
-    shown = {name: [r for r in group if row_of(r) in rows] for name, group in list(by_scene.items())[:MAX_SCENES]}
-    scenes = {name: gallery.Scene(runs, group, ARRAYS) for name, group in shown.items()}
-    photo = ("held out", lambda arrays: [arrays["photograph"]])
-    blocks = [gallery.colours_above_normals(scenes[name], name, rows, group, photo) for name, group in shown.items()]
+    shown = {
+        name: {row_of(record): record for record in group if row_of(record) in rows}
+        for name, group in list(by_scene.items())[:MAX_SCENES]
+    }
+    scenes = {name: gallery.Scene(runs, group.values(), ARRAYS) for name, group in shown.items()}
+    blocks = [_block(name, rows, shown[name], scene) for name, scene in scenes.items()]
     return Result(
         runs,
         "Shapes from photographs in pictures.",
@@ -216,6 +237,17 @@ def figures(runs: Runs) -> Result:
         ),
         run_columns=PICTURE_COLUMNS,
         figure=gallery.draw(blocks),
+    )
+
+
+def _block(name: str, rows: list[Row], record_of: dict[Row, Record], scene: gallery.Scene) -> gallery.Block:
+    """The colours of each row beside the photograph and, below, its normals."""
+    paints = {"colours": gallery.colours(), "normals": gallery.normals()}
+    cells = {kind: [scene.cell(record_of.get(row), paint) for row in rows] for kind, paint in paints.items()}
+    photograph = scene.shared(record_of.values(), lambda arrays: [arrays["photograph"]])
+    first = {"colours": photograph, "normals": gallery.Cell()}
+    return gallery.Block(
+        name, ["held out", *(row.name for row in rows)], {kind: [first[kind], *cells[kind]] for kind in paints}
     )
 
 

@@ -1,10 +1,13 @@
 """After Figs. 12 and 24 of DIST: shape from many views if the initial similarity is wrong, and optimised too."""
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from bench.report.data.records import CHAMFER_SCALE, ONE_WAY, Record, error, family, grouped, row_of, setting, solid
-from bench.report.study import Result, Runs, Selection, conditions, format, gallery, statistics, table
+from bench.report.study import Result, Runs, Selection, chart, conditions, format, gallery, statistics, table
 
 PLACE = 55
 CONDITIONS = (
@@ -65,8 +68,23 @@ def make(runs: Runs) -> Result:
         ),
         lines=lines + lines_of_known,
         run_columns=RUNS,
-        figure=conditions.draw(lines, CONDITIONS, MAX_ERROR) if lines else None,
+        figure=draw(lines) if lines else None,
     )
+
+
+def draw(lines: Sequence[dict[str, Any]]) -> Figure:
+    """Draws a row of panels per family: the error over each condition, a line per method, and the largest success."""
+    lines_by_family, panels = grouped(lines, lambda line: line["family"]), []
+    for (name, family_lines), condition in product(lines_by_family.items(), CONDITIONS):
+        shown = [line for line in family_lines if line["key"] == condition.key]
+        curves = [
+            chart.curve(*row, [line["value"] for line in row_lines], [line["error"] for line in row_lines])
+            for row, row_lines in grouped(shown, lambda line: (line["method"], line["preset"])).items()
+        ]
+        if curves:
+            curves.append(chart.level("success: below", [line["value"] for line in shown], MAX_ERROR))
+        panels.append(chart.panel_data(name, condition.label, conditions.LABEL, curves))
+    return chart.draw(panels, 2.1 * len(lines_by_family) + 0.5, len(lines_by_family), legend=3, sharey="row")
 
 
 def _succeeded(record: Record) -> bool:
