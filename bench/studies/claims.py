@@ -228,6 +228,8 @@ NOTES = (
     "and “less than half the effect” if it contains 1.",
     f"A claim of no larger error allows ratios up to {MAX_SAME_RATIO}. This margin is ours. The claim “holds” if the "
     "interval is below it. “Larger (size not decided)”: the interval is above 1 and contains the margin.",
+    "ρ is Spearman's rank correlation of loss and Chamfer distance over the iterations of a run. Its limit of "
+    f"{HIGH_RHO} is ours.",
     "With fewer than six shapes, the verdict only states whether the median is as claimed. The algorithm nearly "
     "determines the counts of DIST, Table 1: one shape shows their size. All other cases are “not decided”.",
     "Each claim is a separate question, so there is no correction for the number of claims.",
@@ -269,11 +271,12 @@ def _line(claim: Claim, runs: Runs | None) -> dict[str, Any]:
     ratio = statistics.ratio(*above_and_below) if above_and_below else None
     verdict = verdict_of(claim, ratio) if ratio else CHECKED if claim.test else UNTESTED
     explained = verdict.startswith(("holds", AS_CLAIMED, CHECKED))
+    cause = "" if ratio is not None and claim.why.startswith("needs") else claim.why
     return {
         **{"source": claim.source, "claim": claim.text, "published": claim.published and claim.published()},
         **{"ratio": ratio, "shapes": None if pairs is None else len(pairs), "verdict": verdict},
         "families": "" if pairs is None else ", ".join(pairs.index.unique("family")),
-        "why": "" if explained else claim.why or (NO_RUNS if ratio is None else ""),
+        "why": "" if explained else cause or (NO_RUNS if ratio is None else ""),
         "command": f"-m +experiment={claim.command or claim.experiment}" if claim.experiment else claim.test,
     }
 
@@ -289,7 +292,7 @@ def pairs_of(claim: Claim, runs: Runs) -> pd.DataFrame | None:
     sides = []
     bottom_settings = claim.top_settings if claim.bottom_settings is None else claim.bottom_settings
     for preset, settings in ((claim.top, claim.top_settings), (claim.bottom or claim.top, bottom_settings)):
-        chosen = frame.preset == preset
+        chosen = (frame.preset == preset) & frame.error.notna()
         for key, value in settings.items():
             chosen &= runs.setting(key).map(_as_number) == _as_number(str(value))
         if claim.families:

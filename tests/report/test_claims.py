@@ -9,7 +9,7 @@ from bench.config import names
 from bench.report.data.statistics import Interval
 from bench.studies.claims import CLAIMS, NO_LARGER, NO_RUNS, SMALLER, Claim, verdict_of
 from tests.looped import each
-from tests.report.test_report_paper import page_of, write_run
+from tests.report.test_report_paper import page_of, write_curve, write_run
 
 SHAPES = tuple(range(6))
 
@@ -100,6 +100,15 @@ def test_a_claim_is_not_tested_by_runs_of_other_settings_than_it_names(tmp_path)
         line for line in page_of(tmp_path, "claims").lines if line["claim"].startswith("aggressive marching saves")
     ]
     assert (line["verdict"], line["why"]) == ("not tested", NO_RUNS)
+
+
+def test_loss_and_error_are_compared_by_the_rank_correlation_of_each_run(tmp_path):
+    for index in SHAPES:
+        folder = write_run(tmp_path, "fig5", "dist_coarse_to_fine", renderer="dist_coarse_to_fine", index=index)
+        write_curve(folder, [5, 4, 3, 2, 1], {0: 5.0, 1: 4.0, 2: 3.0, 3: 1.0, 4: 2.0} if index else {0: 1.0})
+    (line,) = [line for line in page_of(tmp_path, "claims").lines if line["shapes"]]
+    assert (line["shapes"], line["verdict"], line["why"]) == (5, "as claimed, 5 shapes", "")
+    assert line["ratio"].value == pytest.approx(0.1)  # ρ is 0.9
 
 
 def test_a_claim_is_not_tested_by_runs_that_are_only_planned(tmp_path):
