@@ -24,7 +24,6 @@ from bench.report.study import (
     statistics,
     table,
 )
-from bench.studies.fig5 import HIGH_RHO
 
 PLACE = 5
 EXPERIMENTS = ("table1_large", "table2", "table3", "fig5", "fig10", "fig12", "dvr_table1", "dvr_table2")
@@ -143,8 +142,8 @@ CLAIMS = (
         why="needs runs of the method `multiview_mesh_long` with 72 views and 180 iterations",
     ),
     Claim(
-        "DIST, Fig. 5", f"loss and error are tightly correlated (our test: 1 - ρ is at most {1 - HIGH_RHO:.1f})", None,
-        "fig5", "dist_coarse_to_fine", metric=DISORDER, expected=(0.0, 1 - HIGH_RHO),
+        "DIST, Fig. 5", f"loss and error are tightly correlated (our test: 1 - ρ is at most {1 - curves.HIGH_RHO:.1f})",
+        None, "fig5", "dist_coarse_to_fine", metric=DISORDER, expected=(0.0, 1 - curves.HIGH_RHO),
         why="needs the run folders, because rows do not have the curves",
     ),
     Claim(
@@ -229,7 +228,7 @@ NOTES = (
     f"A claim of no larger error allows ratios up to {MAX_SAME_RATIO}. This margin is ours. The claim “holds” if the "
     "interval is below it. “Larger (size not decided)”: the interval is above 1 and contains the margin.",
     "ρ is Spearman's rank correlation of loss and Chamfer distance over the iterations of a run. Its limit of "
-    f"{HIGH_RHO} is ours.",
+    f"{curves.HIGH_RHO} is ours.",
     "With fewer than six shapes, the verdict only states whether the median is as claimed. The algorithm nearly "
     "determines the counts of DIST, Table 1: one shape shows their size. All other cases are “not decided”.",
     "Each claim is a separate question, so there is no correction for the number of claims.",
