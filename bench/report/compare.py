@@ -1,13 +1,15 @@
 """Compares rows on the same shapes: medians per condition, mean errors, ratios, costs, Pareto fronts, a figure."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import yaml
+from matplotlib.figure import Figure
 
 from bench.records import format
 from bench.records.read import read_plans
@@ -17,7 +19,8 @@ from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, Verdict, geometric_mean
 from bench.report.write import chart
 from bench.report.write.result import Result
-from bench.report.write.table import Column, ends, estimate, text
+from bench.report.write.table import Column, columns, ends, estimate, text, word
+from bench.tables import CONF
 
 ALL_FAMILIES = "all families"
 COSTS = {"evaluations": "field evaluations\nof a run", "seconds": "runtime (seconds)"}  # with their axis labels
@@ -41,7 +44,18 @@ CONDITION_ORDER = ("dense", "50%", "10%", "100", "50", "20")
 PRIORS = Selection("priors")
 ORACLE = "oracle: the prior's fit to the truth"
 FITTED = "The oracle is a latent code fitted to the distances of the true mesh (`+experiment=priors`), for all shapes."
+PLOTTED = (
+    "Median error under each condition; median over shapes of their geometric means, with its ratio; median cost of "
+    "runs that ended ok."
+)
 Line = dict[str, Any]
+Above = dict[str, dict[str, Any]]  # medians of further lines, by name and family
+
+
+@cache
+def published(name: str) -> dict[str, Any]:
+    """A table of `conf/published.yaml`: numbers of a paper as text, as printed."""
+    return yaml.load((CONF / "published.yaml").read_text(encoding="utf-8"), yaml.BaseLoader)[name]
 
 
 @dataclass(frozen=True)
@@ -67,14 +81,13 @@ class Compared:
 
     Args:
         runs: at least one.
-        reference: maps the preset of a row to the preset of its reference row. If several rows have that preset, the
-            reference is the one that the sweep planned first.
+        reference: the preset of the reference row. If several rows have it, the one that the sweep planned first.
         metric: the error.
         label: the name of the error on axes.
     """
 
     runs: Runs
-    reference: Callable[[str], str]
+    reference: str
     metric: str = METRIC
     label: str = LABEL
 
@@ -117,11 +130,11 @@ class Compared:
         ordered = [row for rows in sorted(planned_rows, key=len, reverse=True) for row in rows]
         return list(dict.fromkeys([*ordered, *self.rows]))
 
-    def reference_of(self, row: Row) -> Row:
-        """The reference row of a row; the row itself if it has none."""
-        preset = self.reference(row.preset)
-        candidates = [other for other in self.rows if other.preset == preset]
-        return min(candidates, key=self.planned.index) if len(candidates) > 1 else next(iter(candidates), row)
+    @cached_property
+    def reference_row(self) -> Row | None:
+        """The reference row, if it was run."""
+        candidates = [row for row in self.rows if row.preset == self.reference]
+        return min(candidates, key=self.planned.index) if len(candidates) > 1 else next(iter(candidates), None)
 
     @cached_property
     def conditions(self) -> list[str]:
@@ -184,13 +197,13 @@ class Compared:
         return [self._line(name, row) for name in names for row in self.rows]
 
     def _line(self, family: str, row: Row) -> Line:
-        lines, reference, lacking = self.cells_of(family, row), self.reference_of(row), self.lacking(family, row)
+        lines, reference, lacking = self.cells_of(family, row), self.reference_row, self.lacking(family, row)
         costs = {cost: lines[cost][lines.ok].dropna().median() for cost in COSTS}
         return {
             **{"family": family, "row": row.name, "preset": row.preset},
             **{condition: self.median(family, row, condition) for condition in self.conditions},
             "error": self.error(family, row),
-            "ratio": None if reference == row else self.gap(family, row, reference),
+            "ratio": None if reference in (row, None) else self.gap(family, row, reference),
             **{cost: None if math.isnan(value) else float(value) for cost, value in costs.items()},
             "lacking": lacking,
             "failed": f"{(~lines.ok).sum()} of {len(lines)}" + (f", {lacking} missing" if lacking else ""),
@@ -201,12 +214,26 @@ class Compared:
         """The lines over all families."""
         return [line for line in self.lines if line["family"] == self.lines[0]["family"]]
 
-    def extended_lines(self, above: dict[str, dict[str, Any]], published: dict[str, dict[str, Line]]) -> list[Line]:
+    @cached_property
+    def oracles(self) -> dict[str, float]:
+        """The median Chamfer x 1000 of the prior's fits, for each family with fits of all shapes.
+
+        The fits must have been evaluated like the runs: with the same split, prior, grid and number of points.
+        """
+        runs, fits = self.runs, self.runs.other(PRIORS)
+        if fits is None or _evaluation_settings(fits.requested()) != _evaluation_settings(runs.requested()):
+            return {}
+        errors = {shape(record): CHAMFER_SCALE * error(record, self.metric) for record in fits.records}
+        shapes_by_family = {name: {shape(record) for record in records} for name, records in runs.families().items()}
+        fitted = {name: shapes for name, shapes in shapes_by_family.items() if shapes <= set(errors)}
+        return {name: float(statistics.median([errors[key] for key in shapes])) for name, shapes in fitted.items()}
+
+    def extended_lines(self, above: Above, published: dict[str, dict[str, Any]]) -> list[Line]:
         """The lines of each family, with further lines above and published lines below.
 
         Args:
             above: the medians of the further lines, by name and family.
-            published: the published numbers, by family, row and condition.
+            published: the published numbers, by family, row and condition; or by family and row.
         """
         lines = []
         for family in dict.fromkeys(line["family"] for line in self.lines):
@@ -218,7 +245,7 @@ class Compared:
             ]
             lines += [line for line in self.lines if line["family"] == family]
             lines += [
-                empty | {"row": f"published: {row}"} | numbers
+                empty | {"row": f"published: {row}"} | (numbers if isinstance(numbers, dict) else {"": numbers})
                 for row, numbers in published.get(family.removeprefix(SHAPENET), {}).items()
             ]
         return lines
@@ -226,46 +253,24 @@ class Compared:
     def columns(self, ratio: str) -> list[Column]:
         """The columns of the lines; `ratio` is the heading of the ratio."""
         return [
-            *(text("family", "Family"), text("row", "Method")),
-            *(Column(condition, heading(condition)) for condition in self.conditions),
+            *columns(word, family="Family", row="Method"),
+            *columns(**{condition: heading(condition) for condition in self.conditions}),
             *estimate("error", "Median over shapes"),
             text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
             *ends("ratio", lambda line: ratio_of(line["ratio"])),
-            *(
-                Column("evaluations", "Field evaluations", show=format.count),
-                Column("seconds", "Runtime", show=format.seconds),
-            ),
-            *(text("failed", "Failed"), text("preset")),
+            *columns(format.count, evaluations="Field evaluations"),
+            *columns(format.seconds, seconds="Runtime"),
+            *columns(word, failed="Failed", preset=""),
         ]
-
-    def result(self, title: str, question: str, **changed: Any) -> Result:
-        """The page of the comparison: a line per family and row, and a figure with a line per row.
-
-        Args:
-            changed: further arguments of the result, such as `verdict`, `remarks` and `columns`. They replace the
-                default ones, such as `lines` and `figure`.
-        """
-        parts: dict[str, Any] = {
-            "plotted": "Median error under each condition; median over shapes of their geometric means, with its "
-            "ratio; median cost of runs that ended ok.",
-            "interval": INTERVAL,
-            "estimates": [line["error"] for line in self.lines],
-            "lines": self.lines,
-        } | changed
-        panels = self.panels(next(column.heading for column in parts["columns"] if column.key == "ratio"))
-        if "figure" not in parts:
-            parts["figure"] = chart.draw(panels, 0.19 * len(self.rows) + 1.1, legend=0, sharey=True)
-        return Result(self.runs, title, question=question, chart={"panels": panels}, **parts)
 
     @property
     def comparable(self) -> list[Line]:
         """The pooled lines of rows that lack no shape and have the settings of most runs; verdicts use only these.
 
-        The settings are the number of views and those of `Runs.mixed`. A note warns that rows with other values of
-        these do not compare.
+        The settings are those of `Runs.mixed`. A note warns that rows with other values of these do not compare.
         """
         is_usual = np.ones(len(self.runs.records), dtype=bool)
-        for key in (*self.runs.mixed(), "task.images.views"):
+        for key in self.runs.mixed():
             values = self.runs.setting(key)
             is_usual &= (values == values.mode()[0]).to_numpy()
         usual_rows = self.runs.where(pd.Series(is_usual)).rows()
@@ -287,8 +292,8 @@ class Compared:
             f"{format.number(line['error'].value)}{mark} ({line['row']}, {format.seconds(line['seconds'])}"
             for line, mark in ((best, "*"), (quickest, ""))
         )
-        other = ", which is also the fastest row)" if best is quickest else f"); the fastest row has {quickest_text})"
-        return f"The smallest median of {least_of} is *{best_text}{other}; n = {format.plural(n, 'shape')}."
+        other = "It is also the fastest." if best is quickest else f"The fastest row has {quickest_text})."
+        return f"The smallest median of {least_of} is *{best_text}); n = {format.plural(n, 'shape')}. {other}"
 
     def panels(self, ratio: str) -> list[chart.Panel]:
         """Panels of errors, of ratios (labelled `ratio`) and of costs: a line per row, the least error first."""
@@ -312,6 +317,56 @@ class Compared:
         return panels
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """A page with a line per family and row, the ratio to a reference row, and a figure with a line per row.
+
+    Args:
+        title, question, notes, plotted, run_columns, figure: as in `Result`; by default, `Compared.panels` are drawn.
+        reference, metric, label: as in `Compared`.
+        name: the name of the reference in headings and verdicts.
+        least_of: errors whose smallest is the verdict; if empty, the verdict is on the ratios.
+        above: returns further lines, as in `Compared.extended_lines`.
+        published: a table of `conf/published.yaml`.
+        hidden: keys of columns that are left out.
+    """
+
+    title: str
+    question: str
+    reference: str
+    name: str
+    notes: Callable[[Compared], Iterable[str]]
+    plotted: str = PLOTTED
+    least_of: str = ""
+    metric: str = METRIC
+    label: str = LABEL
+    above: Callable[[Compared], Above] = lambda _: {}
+    published: str = ""
+    hidden: Collection[str] = ()
+    run_columns: Sequence[Column] = ()
+    figure: Callable[[Compared], Figure] | None = None
+
+    def __call__(self, runs: Runs) -> Result:
+        compared, ratio = Compared(runs, self.reference, self.metric, self.label), f"Ratio to {self.name}"
+        panels = compared.panels(ratio)
+        height = 0.19 * len(compared.rows) + 1.1
+        return Result(
+            runs,
+            self.title,
+            self.plotted,
+            question=self.question,
+            verdict=compared.best(self.least_of) if self.least_of else compared.differing(f"to {self.name}"),
+            interval=INTERVAL,
+            estimates=[line["error"] for line in compared.lines],
+            remarks=self.notes(compared),
+            columns=[column for column in compared.columns(ratio) if column.key not in self.hidden],
+            lines=compared.extended_lines(self.above(compared), published(self.published) if self.published else {}),
+            run_columns=self.run_columns,
+            figure=self.figure(compared) if self.figure else chart.draw(panels, height, legend=0, sharey=True),
+            chart={"panels": panels},
+        )
+
+
 def differing(ratios: Sequence[tuple[str, Interval | None]], versus: str) -> str:
     """The verdict on a family of named ratios, see `statistics.ratio_verdicts`; empty if none has an interval."""
     tested = [(name, ratio) for name, ratio in ratios if ratio is not None and ratio.has_ends]
@@ -327,14 +382,16 @@ def differing(ratios: Sequence[tuple[str, Interval | None]], versus: str) -> str
     unequal = [
         f"{name} {ratio}" for (name, ratio), verdict in zip(tested, verdicts, strict=True) if verdict is Verdict.DIFFERS
     ]
+    differ = f"*{len(unequal)} of {len(tested)}* ratios {versus} differ significantly from 1"
+    differ += f"{': ' if unequal else ''}{'; '.join(unequal)}."
     parts = [
-        f"*{len(unequal)} of {len(tested)}* ratios {versus} differ from 1{': ' if unequal else ''}{'; '.join(unequal)}",
         f"{undistinguished} cannot be distinguished from 1" if undistinguished else "",
         f"{undecided} cannot be decided with {sizes[0]} shapes" if undecided else "",
     ]
     agreeing = f"{statistics.shapes_agreeing(sizes[-1], len(tested))} of {sizes[-1]} shapes"
     step = "" if unequal else f" The test needs {agreeing} on one side of 1."
-    return f"{HOLM}, {'; '.join(filter(None, parts))}.{step}"
+    others = "; ".join(filter(None, parts))
+    return f"{differ} {HOLM}{f', {others}' if others else ''}.{step}"
 
 
 def ordered(conditions: Collection[str]) -> list[str]:
@@ -347,20 +404,6 @@ def ordered(conditions: Collection[str]) -> list[str]:
 def heading(condition: str) -> str:
     """The heading of a condition's column; a number is a number of depth points."""
     return f"{condition} pts" if condition.isdigit() else condition or "Median"
-
-
-def oracles(runs: Runs, metric: str) -> dict[str, float]:
-    """The median Chamfer x 1000 of the prior's fits, for each family with fits of all shapes.
-
-    The fits must have been evaluated like the runs: with the same split, prior, grid and number of points.
-    """
-    fits = runs.other(PRIORS)
-    if fits is None or _evaluation_settings(fits.requested()) != _evaluation_settings(runs.requested()):
-        return {}
-    errors = {shape(record): CHAMFER_SCALE * error(record, metric) for record in fits.records}
-    shapes_by_family = {name: {shape(record) for record in records} for name, records in runs.families().items()}
-    fitted = {name: shapes for name, shapes in shapes_by_family.items() if shapes <= set(errors)}
-    return {name: float(statistics.median([errors[key] for key in shapes])) for name, shapes in fitted.items()}
 
 
 def _evaluation_settings(config: dict[str, Any]) -> list[Any]:

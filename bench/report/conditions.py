@@ -2,15 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
-from matplotlib.figure import Figure
-
+from bench.records.format import plural
 from bench.report.data import records
-from bench.report.data.records import ONE_WAY, Record, by_shape, error, family, grouped, row_of, run_key, setting
+from bench.report.data.records import ONE_WAY, Record, by_shape, error, family, grouped, row_of, run_key, setting, solid
 from bench.report.data.statistics import Interval, bootstrap, median
-from bench.report.write import chart
 from bench.report.write.table import FAMILY, IDENTITY, Column, configured, estimate, metrics, text
 
 ERROR_TEXT = "median Chamfer distance from truth to prediction (squared scene units, times 1000)"
@@ -44,6 +41,13 @@ def run_columns(conditions: Sequence[Condition], *other_keys: str) -> tuple[Colu
     return (FAMILY, *keys, *(configured(key, "task", key) for key in other_keys), *metrics(ONE_WAY, "chamfer_l2"))
 
 
+def shapes_text(runs: Sequence[Record]) -> str:
+    """The number of shapes, and how many each family has, such as 4 shapes, 2 per family."""
+    counts = [len(shapes) for shapes in grouped({solid(run) for run in runs}, lambda shape: shape[0]).values()]
+    per_family = f", {' or '.join(map(str, sorted({*counts})))} per family" if len(counts) > 1 else ""
+    return plural(sum(counts), "shape") + per_family
+
+
 def median_error(runs: Sequence[Record]) -> Interval:
     """The median error x 1000 over shapes and seeds; the error of a failed run is infinite."""
     return bootstrap(by_shape({run_key(run): records.CHAMFER_SCALE * error(run, ONE_WAY) for run in runs}), median)
@@ -52,33 +56,15 @@ def median_error(runs: Sequence[Record]) -> Interval:
 def lines_of(runs: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
     """A line per family, row, condition and value, from the runs whose other conditions are neutral.
 
-    Its keys: family, method, preset, condition (as text), key, position (of the condition), value, runs, error.
+    Its keys: family, method, preset, condition (as text), key, value, runs, error.
     """
     lines = []
-    for position, condition in enumerate(conditions):
+    for condition in conditions:
         others = [other for other in conditions if other != condition]
         shown = [run for run in runs if all(other.value_of(run) == other.neutral for other in others)]
         groups = grouped(shown, lambda record, get=condition.value_of: (family(record), row_of(record), get(record)))
         for (family_name, row, value), group in groups.items():
             line = {"family": family_name, "method": row.name, "preset": row.preset}
             line |= {"condition": f"{condition.label}: {value:g}", "runs": group, "error": median_error(group)}
-            lines.append(line | {"key": condition.key, "position": position, "value": value})
+            lines.append(line | {"key": condition.key, "value": value})
     return sorted(lines, key=lambda line: (line["family"], line["method"], line["key"], line["value"]))
-
-
-def draw(lines: Sequence[dict[str, Any]], conditions: Sequence[Condition], success: float) -> Figure:
-    """Draws a row of panels per family: the error over the value of each condition, a line per method.
-
-    A line shows `success`, the largest error that counts as a success. Infinite errors are drawn at the edge.
-    """
-    lines_by_family, panels = grouped(lines, lambda line: line["family"]), []
-    for (family_name, family_lines), (position, condition) in product(lines_by_family.items(), enumerate(conditions)):
-        shown = [line for line in family_lines if line["position"] == position]
-        curves = [
-            chart.curve(*row, [line["value"] for line in row_lines], [line["error"] for line in row_lines])
-            for row, row_lines in grouped(shown, lambda line: (line["method"], line["preset"])).items()
-        ]
-        if curves:
-            curves.append(chart.level("success: below", [line["value"] for line in shown], success))
-        panels.append(chart.panel_data(family_name, condition.label, LABEL, curves))
-    return chart.draw(panels, 2.1 * len(lines_by_family) + 0.5, len(lines_by_family), legend=3, sharey="row")

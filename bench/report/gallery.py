@@ -19,7 +19,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from bench.pictures import style
 from bench.records.format import plural
-from bench.report.data.records import Record, Row, family, grouped, index, row_of
+from bench.report.data.records import Record, family, grouped, index, row_of
 from bench.report.data.runs import Runs
 
 MAX_PICTURE_INCHES, MAX_COMPARED_INCHES = 0.9, 1.5  # the second if the figure has a colour bar
@@ -122,26 +122,6 @@ def normals(prefix: str = "") -> Paint:
 
 def colours(prefix: str = "") -> Paint:
     return lambda arrays: [on_white(arrays[f"{prefix}colours"], arrays[f"{prefix}hit"])]
-
-
-def colours_above_normals(
-    scene: Scene,
-    title: str,
-    rows: Iterable[Row],
-    records: Sequence[Record],
-    reference: tuple[str, Paint],
-) -> Block:
-    """A block with the colours of each row and, below, its normals.
-
-    `reference` is the heading of the first column and the picture that it shows next to the colours.
-    """
-    record_by_row = {row_of(record): record for record in records}
-    heading, paint = reference
-    cells = {
-        "colours": [scene.shared(records, paint), *(scene.cell(record_by_row.get(row), colours()) for row in rows)],
-        "normals": [Cell(), *(scene.cell(record_by_row.get(row), normals()) for row in rows)],
-    }
-    return Block(title, [heading, *(row.name for row in rows)], cells)
 
 
 def depth(arrays: Arrays) -> Sequence[np.ndarray]:

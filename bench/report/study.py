@@ -8,6 +8,7 @@
 from bench.pictures import style
 from bench.records import format
 from bench.report import compare, conditions, gallery, medians
+from bench.report.compare import published
 from bench.report.data import curves, records, statistics
 from bench.report.data.runs import Runs, Selection, merge_runs
 from bench.report.write import chart, table

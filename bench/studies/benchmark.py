@@ -96,28 +96,23 @@ def _ratio(cost: str) -> table.Column:
 
 
 COLUMNS = (
-    table.Column("size", "Size", show=table.integer),
-    table.Column("threads", "Threads", show=table.integer),
-    table.text("renderer", "Renderer"),
-    *(*map(table.text, ("status", "reason", "folder")), table.Column("rounds")),
+    *table.columns(table.integer, size="Size", threads="Threads"),
+    *table.columns(table.word, renderer="Renderer", status="", reason="", folder=""),
+    *table.raw("rounds"),
     table.Column(
-        "queries",
-        "Field evaluations",
-        words=lambda line: format.queries(line.get("queries"), line.get("coarse_queries")),
+        "queries", "Field evaluations", words=lambda x: format.queries(x.get("queries"), x.get("coarse_queries"))
     ),
-    table.Column("coarse_queries"),
-    table.Column("forward_seconds", "Forward", show=format.seconds),
-    table.Column("step_seconds", "Step", show=format.seconds),
-    *map(table.Column, ("forward_cpu", "step_cpu")),
+    *table.raw("coarse_queries"),
+    *table.columns(format.seconds, forward_seconds="Forward", step_seconds="Step"),
+    *table.raw("forward_cpu", "step_cpu"),
     *map(_ratio, COSTS),
-    *(table.Column(f"{cost}_ratio_{end}") for cost in COSTS for end in ("low", "high")),
-    table.Column("peak_memory_bytes"),
+    *table.raw(*(f"{cost}_ratio_{end}" for cost in COSTS for end in table.ENDS), "peak_memory_bytes"),
     table.Column("work_over_bound", "Work over bound"),
-    *map(table.Column, ("rays", "hits", "lost", "false", "wrong")),
+    *table.raw("rays", "hits", "lost", "false", "wrong"),
     table.shown(
         "Missed / spurious / wrong depth", table.joined_cell(dict.get, table.integer, "lost", "false", "wrong")
     ),
-    *map(table.Column, ("depth_error_median", "depth_error_p99", "depth_error_max")),
+    *table.raw("depth_error_median", "depth_error_p99", "depth_error_max"),
     table.shown(
         "Depth error median / p99", table.joined_cell(dict.get, format.number, "depth_error_median", "depth_error_p99")
     ),

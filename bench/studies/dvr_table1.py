@@ -6,19 +6,12 @@ from matplotlib.figure import Figure
 
 from bench.report.data.records import SHAPENET, Record, Row, by_shape, error, grouped, median_or_none, row_of, setting
 from bench.report.data.statistics import typical
-from bench.report.study import Result, Runs, Selection, compare, format, gallery, medians, table
+from bench.report.study import Result, Runs, Selection, compare, format, gallery, medians, published, table
 
 PLACE = 41
 READS = (Selection("dvr_table1", setup=("machine",), conditions=("task.training.seed",)),)
 BASELINES = {"single_view_mean": "Over the mean shape", "single_view_nearest": "Over the nearest image"}  # presets
 MEDIANS = ("iou", "chamfer_l1", "normal_consistency", "mask_iou", "psnr")
-# DVR (Niemeyer et al. 2020), Table 1: Chamfer-L1, in tenths of the largest edge of a shape's bounding box.
-PUBLISHED = {
-    "car": {"DVR, RGB": 0.196, "DVR, depth": 0.179, "ONet (3D)": 0.181},
-    "sofa": {"DVR, RGB": 0.224, "DVR, depth": 0.221, "ONet (3D)": 0.217},
-    "table": {"DVR, RGB": 0.280, "DVR, depth": 0.180, "ONet (3D)": 0.185},
-    "plane": {"DVR, RGB": 0.190, "DVR, depth": 0.143, "ONet (3D)": 0.151},
-}
 NOTES = (
     "Each shape is unseen in training, and has one input image. Its other images evaluate the mask and the colours.",
     "Training from images begins with the visual hull of the masks, without a renderer. “Masks, hull” has only that.",
@@ -33,15 +26,13 @@ NOTES = (
     "cannot be compared directly with the measured rows.",
 )
 COLUMNS = (
-    *(table.text("family", "Family"), table.text("method", "Training"), table.Column("iou", "IoU")),
-    table.Column("chamfer_l1", "Chamfer-L1", show=table.thousandfold),
+    *(*table.columns(table.word, family="Family", method="Training"), *table.columns(iou="IoU")),
+    *table.columns(table.thousandfold, chamfer_l1="Chamfer-L1"),
     table.shown("95 % interval", lambda line: line["interval"].ends(1000) if "interval" in line else ""),
     *(table.shown(heading, lambda line, name=name: str(line.get(name) or "")) for name, heading in BASELINES.items()),
-    table.Column("normal_consistency", "Normals"),
-    *(table.Column("mask_iou", "Mask IoU"), table.Column("psnr", "PSNR")),
-    table.Column("training", "Trained in", show=format.seconds),
-    table.Column("seconds", "Inference", show=format.seconds),
-    *(table.text("failed", "Failed"), table.text("published", "Published")),
+    *table.columns(normal_consistency="Normals", mask_iou="Mask IoU", psnr="PSNR"),
+    *table.columns(format.seconds, training="Trained in", seconds="Inference"),
+    *table.columns(table.word, failed="Failed", published="Published"),
 )
 RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*MEDIANS, "chamfer_l2", "mask_iou_least"), *table.LOOP)
 IMAGES = {"given": "given", "photograph": "another\nimage"}  # arrays of images.npz
@@ -53,9 +44,9 @@ def make(runs: Runs) -> Result:
     family_lines = {name: _lines_of(runs, name) for name in runs.families()}
     lines = []
     for name, rows in family_lines.items():
-        published = PUBLISHED.get(name.removeprefix(SHAPENET), {}).items()
+        printed = published("dvr_table1").get(name.removeprefix(SHAPENET), {}).items()
         lines += rows
-        lines += [{"family": name, "method": f"published: {row}", "published": f"{x:.3f}"} for row, x in published]
+        lines += [{"family": name, "method": f"published: {row}", "published": number} for row, number in printed]
     return Result(
         runs,
         "Shape from one image.",

@@ -1,12 +1,14 @@
 """Table 2 and Figs. 6 to 8 of DVR: shape and colour from rendered photographs."""
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import pandas as pd
 
 from bench.records.metrics import DVR_TABLE2
-from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting, shared_settings
+from bench.records.record import as_number
+from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
 from bench.report.tuning import TUNED_PREFIX
 
@@ -34,11 +36,9 @@ NOTED_SETTINGS = {  # names in the note on optimised rows, and configuration key
 }
 COLUMNS = (
     table.text("method", "Method"),
-    table.Column("seen_accuracy", "Accuracy", show=table.thousandfold),
-    table.Column("seen_completeness", "Completeness", show=table.thousandfold),
-    table.Column(SEEN_ERROR, "Chamfer-L1, seen", show=table.thousandfold),
-    table.Column("chamfer_l1", "all", show=table.thousandfold),
-    *(table.Column("psnr", "PSNR"), table.Column("ssim", "SSIM"), table.Column("mask_iou", "Mask IoU")),
+    *table.columns(table.thousandfold, seen_accuracy="Accuracy", seen_completeness="Completeness"),
+    *table.columns(table.thousandfold, seen_chamfer_l1="Chamfer-L1, seen", chamfer_l1="all"),
+    *table.columns(psnr="PSNR", ssim="SSIM", mask_iou="Mask IoU"),
     *medians.COST,
 )
 RUNS = (
@@ -52,11 +52,9 @@ PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN_ERROR, "ps
 
 CURVE_COLUMNS = (
     table.text("method", "Method"),
-    table.Column("iterations", "Iterations", show=table.integer),
-    table.Column("at", "Checkpoint nearest to half", show=table.integer),
-    table.Column("half", "Error at this checkpoint", show=table.thousandfold),
-    table.Column("end", "Error at the end", show=table.thousandfold),
-    table.Column("fell", "Decrease", show=table.percent),
+    *table.columns(table.integer, iterations="Iterations", at="Checkpoint nearest to half"),
+    *table.columns(table.thousandfold, half="Error at this checkpoint", end="Error at the end"),
+    *table.columns(table.percent, fell="Decrease"),
 )
 MAX_SCENES = 2
 LOOKALIKES = {  # presets not shown in figures, because they look like another row
@@ -86,19 +84,36 @@ def make(runs: Runs) -> Result:
         f"the median.{_photograph_settings(runs)}",
         question="Which method best reconstructs shape and colour from photographs?",
         verdict=format.ends(
-            "Median Chamfer-L1 × 1000 of the seen surface, for methods that use no depth",
+            "Median Chamfer-L1 × 1000 of the seen surface, without depth",
             medians.comparable_medians(
                 [line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR
             ),
             scenes,
             show=table.thousandfold,
         ),
-        remarks=(shared_settings(optimised, NOTED_SETTINGS), _partial_rows(lines), *NOTES),
+        remarks=(_settings(optimised), _partial_rows(lines), *NOTES),
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
         figure=medians.draw_runs(runs, panels, [Row(line["preset"], line["method"]) for line in lines]),
     )
+
+
+def _settings(records: list[Record]) -> str:
+    """A note on the settings that all records share, and on those in which they differ; empty without settings."""
+    values = {
+        name: {str(value): value for record in records if (value := setting(record["config"], *path)) is not None}
+        for name, path in NOTED_SETTINGS.items()
+    }
+    shared = [f"{name} {next(iter(each))}" for name, each in values.items() if len(each) == 1]
+    differ = [f"{name} ({', '.join(_ordered(each.values()))})" for name, each in values.items() if len(each) > 1]
+    parts = [("Rows share: ", shared), ("Rows differ in: ", differ)]
+    return " ".join(f"{word}{', '.join(listed)}." for word, listed in parts if listed)
+
+
+def _ordered(values: Iterable[Any]) -> list[str]:
+    """Values as text: numbers sorted by size, then words."""
+    return [str(value) for value in sorted(values, key=lambda x: (1, str(x)) if as_number(x) is None else (0, x))]
 
 
 def _partial_rows(lines: list[dict[str, Any]]) -> str:
@@ -157,7 +172,7 @@ def convergence(runs: Runs) -> Result:
         "iterations and at the end; the figure has all checkpoints.",
         question="Would more iterations reduce the error on photographs?",
         verdict=format.ends(
-            "Decrease of the error from half of the iterations (nearest checkpoint) to the end",
+            "Decrease of the error in the second half",
             {line["method"]: line["fell"] for line in lines},
             _scenes(runs),
             show=table.percent,
@@ -204,10 +219,12 @@ def _fall(row: Row, curve: pd.Series) -> dict[str, Any]:
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, without rows that look like another."""
     rows, by_scene = list(_distinct(runs)), grouped(runs.records, medians.scene_of)
-    shown = {name: [r for r in group if row_of(r) in rows] for name, group in list(by_scene.items())[:MAX_SCENES]}
-    scenes = {name: gallery.Scene(runs, group, ARRAYS) for name, group in shown.items()}
-    photo = ("held out", lambda arrays: [arrays["photograph"]])
-    blocks = [gallery.colours_above_normals(scenes[name], name, rows, group, photo) for name, group in shown.items()]
+    shown = {
+        name: {row_of(record): record for record in group if row_of(record) in rows}
+        for name, group in list(by_scene.items())[:MAX_SCENES]
+    }
+    scenes = {name: gallery.Scene(runs, group.values(), ARRAYS) for name, group in shown.items()}
+    blocks = [_block(name, rows, shown[name], scene) for name, scene in scenes.items()]
     return Result(
         runs,
         "Shapes from photographs in pictures.",
@@ -220,6 +237,17 @@ def figures(runs: Runs) -> Result:
         ),
         run_columns=PICTURE_COLUMNS,
         figure=gallery.draw(blocks),
+    )
+
+
+def _block(name: str, rows: list[Row], record_of: dict[Row, Record], scene: gallery.Scene) -> gallery.Block:
+    """The colours of each row beside the photograph and, below, its normals."""
+    paints = {"colours": gallery.colours(), "normals": gallery.normals()}
+    cells = {kind: [scene.cell(record_of.get(row), paint) for row in rows] for kind, paint in paints.items()}
+    photograph = scene.shared(record_of.values(), lambda arrays: [arrays["photograph"]])
+    first = {"colours": photograph, "normals": gallery.Cell()}
+    return gallery.Block(
+        name, ["held out", *(row.name for row in rows)], {kind: [first[kind], *cells[kind]] for kind in paints}
     )
 
 

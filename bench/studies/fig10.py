@@ -12,7 +12,8 @@ CONDITIONS = (
     conditions.Condition("focal", "focal length / the scene's", 1.0),
     conditions.Condition("start_scale", "noise in the initial code (prior's σ)", 1.0),
 )
-READS = (Selection("fig10", tuple(f"task.{condition.key}" for condition in CONDITIONS)),)
+KEYS = tuple(f"task.{condition.key}" for condition in CONDITIONS)
+READS = (Selection("fig10", KEYS, may_differ=("prior.truncation",)),)
 NOTES = (
     "One condition varies, and the other is at 1. The noise is in standard deviations of the prior's training codes. "
     "At 0, a run starts from the mean shape or, with an encoder, from the encoder's code.",
@@ -65,11 +66,14 @@ def _ratios(lines: Sequence[dict[str, Any]]) -> dict[float, statistics.Interval]
 
 def _verdict(runs: Runs) -> str:
     """The factor between the smallest and largest median error over conditions, of each row and family."""
-    keys = [runs.frame.row, runs.frame.family, *(runs.setting(f"task.{condition.key}") for condition in CONDITIONS)]
+    keys = [runs.frame.row, runs.frame.family, *map(runs.setting, KEYS)]
     errors = runs.error(records.ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
     factors = {", ".join(names): ratio for names, ratio in (errors.max() / errors.min()).items()}
-    shapes = format.plural(len(runs.frame[["family", "solid"]].drop_duplicates()), "shape")
-    return format.ends("Largest median error of all conditions, relative to the smallest", factors, shapes)
+    return format.ends(
+        "Largest median error of all conditions, relative to the smallest",
+        factors,
+        conditions.shapes_text(runs.records),
+    )
 
 
 PAGES = {"fig10": make}

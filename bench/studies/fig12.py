@@ -1,10 +1,13 @@
 """After Figs. 12 and 24 of DIST: shape from many views if the initial similarity is wrong, and optimised too."""
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from bench.report.data.records import CHAMFER_SCALE, ONE_WAY, Record, error, family, grouped, row_of, setting, solid
-from bench.report.study import Result, Runs, Selection, conditions, format, gallery, statistics, table
+from bench.report.study import Result, Runs, Selection, chart, conditions, format, gallery, statistics, table
 
 PLACE = 55
 CONDITIONS = (
@@ -12,7 +15,8 @@ CONDITIONS = (
     conditions.Condition("degrees", "rotation (degrees)", 0.0),
     conditions.Condition("scale", "size / true size", 1.0),
 )
-READS = (Selection("fig12", (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity")),)
+KEYS = (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity")
+READS = (Selection("fig12", KEYS, may_differ=("prior.truncation",)),)
 MAX_ERROR = 1.0  # squared scene units x 1000: about the errors of DIST, Table 3; a success has less
 NOTES = (
     f"A success ended ok with an error below {MAX_ERROR:g}. Its interval is over shapes (Clopper and Pearson).",
@@ -64,8 +68,23 @@ def make(runs: Runs) -> Result:
         ),
         lines=lines + lines_of_known,
         run_columns=RUNS,
-        figure=conditions.draw(lines, CONDITIONS, MAX_ERROR) if lines else None,
+        figure=draw(lines) if lines else None,
     )
+
+
+def draw(lines: Sequence[dict[str, Any]]) -> Figure:
+    """Draws a row of panels per family: the error over each condition, a line per method, and the largest success."""
+    lines_by_family, panels = grouped(lines, lambda line: line["family"]), []
+    for (name, family_lines), condition in product(lines_by_family.items(), CONDITIONS):
+        shown = [line for line in family_lines if line["key"] == condition.key]
+        curves = [
+            chart.curve(*row, [line["value"] for line in row_lines], [line["error"] for line in row_lines])
+            for row, row_lines in grouped(shown, lambda line: (line["method"], line["preset"])).items()
+        ]
+        if curves:
+            curves.append(chart.level("success: below", [line["value"] for line in shown], MAX_ERROR))
+        panels.append(chart.panel_data(name, condition.label, conditions.LABEL, curves))
+    return chart.draw(panels, 2.1 * len(lines_by_family) + 0.5, len(lines_by_family), legend=3, sharey="row")
 
 
 def _succeeded(record: Record) -> bool:
@@ -84,9 +103,12 @@ def _verdict(runs: Runs) -> str:
     """The fraction of successes of each row, over the runs that did not begin in place."""
     misplaced = [record for record in runs.records if any(c.value_of(record) != c.neutral for c in CONDITIONS)]
     shares = {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(misplaced, row_of).items()}
-    shapes = format.plural(len({solid(record) for record in misplaced}), "shape")
     return format.ends(
-        f"Misplaced runs that end with an error below {MAX_ERROR:g}", shares, shapes, show=table.percent, most=True
+        f"Misplaced runs that end with an error below {MAX_ERROR:g}",
+        shares,
+        conditions.shapes_text(misplaced),
+        show=table.percent,
+        most=True,
     )
 
 

@@ -17,14 +17,10 @@ READS = (Selection("fig5", alike=("dataset", "view", "prior", "task")),)
 QUANTITIES = {"total": ("weighted loss", 1.0), "chamfer_l2": ("Chamfer × 1000 (scene units²)", CHAMFER_SCALE)}
 TIME_AXES = {"iteration": "iteration", "seconds": "time (seconds)"}
 COLUMNS = (
-    *(table.text("row", "Method"), table.Column("runs", "Runs", show=table.integer)),
-    *(
-        table.Column(key, heading, show=table.thousandfold)
-        for key, heading in (("end", "End"), ("low", "Smallest"), ("high", "Largest"))
-    ),
-    *(table.Column("seconds", "Runtime", show=format.seconds), table.Column("spearman", "ρ")),
+    *(*table.columns(table.word, row="Method"), *table.columns(table.integer, runs="Runs")),
+    *table.columns(table.thousandfold, end="End", low="Smallest", high="Largest"),
+    *(*table.columns(format.seconds, seconds="Runtime"), *table.columns(spearman="ρ")),
 )
-HIGH_RHO = 0.7  # a larger correlation is called high
 NOTES = (
     "Chamfer distance is chamfer_l2, in squared scene units, times 1000. The optimisation does not use it.",
     "A curve is the median over the runs of a row. A failed run is infinite after its end.",
@@ -70,8 +66,10 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
     with_rank = [line for line in lines if line["spearman"] is not None]
     same = grouped(with_rank, lambda line: tuple(line.get(name) for name in numbers)).values()
     ranks = {" = ".join(line["row"] for line in group): group[0]["spearman"] for group in same}
-    apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < HIGH_RHO]
-    alike = f"{len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')} (ρ of {HIGH_RHO} or more)"
+    apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < curves.HIGH_RHO]
+    alike = (
+        f"{len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')} (ρ of {curves.HIGH_RHO} or more)"
+    )
     judgement = f"not in {', '.join(apart)}" if apart else "as in the paper"
     return f"Loss and error fall together in {alike}; {judgement}." if ranks else ""
 

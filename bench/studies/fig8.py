@@ -47,9 +47,9 @@ def make(runs: Runs) -> Result:
         "Shapes and colours of latent codes, rendered at several sizes, from several sides and lights.",
         "Renderings of the mesh and of its latent codes of shape and colour; a test shape has no code of training.",
         question="How accurate are the colours of a latent code, and how large is the code?",
-        verdict=f"Error of colour {texts}; a code has {code:.0f} bytes, the network of all codes of a family "
-        f"{network / 1000:.0f} kB, the original mesh and texture {sum(mesh_and_texture) / 1000:.0f} kB (medians, "
-        f"n = {format.plural(len(runs.records), 'shape')}).",
+        verdict=f"Median error of colour {texts}; n = {format.plural(len(runs.records), 'shape')}. A code has "
+        f"{code:.0f} bytes, the network of all codes of a family {network / 1000:.0f} kB, the original mesh and "
+        f"texture {sum(mesh_and_texture) / 1000:.0f} kB (medians).",
         remarks=(
             "Meshes have their original triangles: a mesh with the error of its code has far fewer.",
             "A “code of the image” is optimised from the colours and the mask of the given image, without depth.",

@@ -121,8 +121,8 @@ def _visibility_verdict(data: pd.DataFrame) -> str:
         )
     if len(sharp):
         most = sharp[[*IMAGE_METRICS]].max()
-        parts.append(f"renderers that differentiate only hits have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
-    return f"{'; '.join(parts)} (n = one shape)." if parts else ""
+        parts.append(f"Renderers that differentiate only hits have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
+    return f"{'. '.join(parts)} (n = one shape)." if parts else ""
 
 
 def draw(data: pd.DataFrame) -> Figure:
@@ -175,15 +175,14 @@ def _column(name: str) -> table.Column:
 
 
 COLUMNS = (
-    table.text("name", "Renderer"),
-    table.text("band", "Band"),
+    *table.columns(table.word, name="Renderer", band="Band"),
     *map(_column, NUMBERS),
     table.text("status", "Status"),
 )
 VISIBILITY_COLUMNS = (
     table.text("name", "Renderer"),
     table.Column("blur", "Blur (scene units)", show=lambda x: "" if x is None else f"{x:g}"),
-    *(table.Column(name, heading) for name, heading in VISIBILITY_HEADINGS.items()),
+    *table.columns(**VISIBILITY_HEADINGS),
     table.text("status", "Status"),
 )
 

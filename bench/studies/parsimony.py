@@ -157,29 +157,25 @@ SIZES = ("stored", "free", "bytes")
 SCENE = (table.text("scene", "Scene"), *(table.text(column.key) for column in table.IDENTITY))
 CANDIDATES = (  # a line is a run and a candidate
     *SCENE,
-    *map(table.Column, ("footprint", "chamfer_l2", "recommended_within", "recommended_enough")),
-    *map(table.Column, ("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held")),
-    *(table.Column(f"saved_{name}") for name in (*SIZES, FLOPS, "seconds")),
-    *map(
-        table.Column, ("rung", "kind", "recommended", "best", *SIZES, "sparse_bytes", FLOPS, "error", "standard_error")
-    ),
-    *map(table.Column, (*COSTS, "iterations", "falling", "failed", *(f"{cost}_at_auto" for cost in COSTS))),
+    *table.raw("footprint", "chamfer_l2", "recommended_within", "recommended_enough"),
+    *table.raw("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held"),
+    *table.raw(*(f"saved_{name}" for name in (*SIZES, FLOPS, "seconds")), "rung", "kind", "recommended", "best"),
+    *table.raw(*SIZES, "sparse_bytes", FLOPS, "error", "standard_error", *COSTS, "iterations", "falling", "failed"),
+    *table.raw(*(f"{cost}_at_auto" for cost in COSTS)),
 )
 COLUMNS = (  # a line is a run
     SCENE[0],
     table.shown("Recommended", lambda line: _label(line, "chosen")),
-    table.Column("chosen.stored", "Stored numbers", show=_whole),
-    table.Column("chosen.free", "Free numbers", show=_whole),
+    *table.columns(_whole, **{"chosen.stored": "Stored numbers", "chosen.free": "Free numbers"}),
     table.Column("chosen.bytes", "Size of the file", show=format.size),
     table.shown("Error × 1000", lambda line: _spread(line, "chosen")),
-    *(table.Column("footprint", "Half a pixel × 1000", show=table.thousandfold), table.shown("Why", _why)),
+    *(*table.columns(table.thousandfold, footprint="Half a pixel × 1000"), table.shown("Why", _why)),
     table.shown("Best candidate", lambda line: _label(line, "best")),
     table.shown("Best error × 1000", lambda line: _spread(line, "best")),
-    table.Column("held_out_seeds_held", "Seeds held", show=table.percent),
-    table.Column("saved_stored", "Saved stored numbers", show=_factor),
-    table.Column("saved_seconds", "Saved fit seconds", show=_factor),
+    *table.columns(table.percent, held_out_seeds_held="Seeds held"),
+    *table.columns(_factor, saved_stored="Saved stored numbers", saved_seconds="Saved fit seconds"),
     table.Column("auto.overhead", "Overhead of field=auto"),
-    table.Column("frugal_evaluations", "Evaluations at pixel precision", show=_factor),
+    *table.columns(_factor, frugal_evaluations="Evaluations at pixel precision"),
     table.text("lost", "Failed candidates"),
 )
 PAGES = {"parsimony": make}

@@ -9,16 +9,11 @@ READS = (Selection("photos", setup=("scenes", "machine")),)
 NAMES = ("psnr", "ssim", "mask_iou", "mask_iou_least")
 DEFINED = {"psnr": "PSNR", "ssim": "SSIM", "mask_iou": "Mask IoU"}
 TRUTH_COLUMNS = (  # for runs with dataset.truth
-    table.Column("dtu_accuracy", "Accuracy (mm)"),
-    table.Column("dtu_completeness", "Completeness (mm)"),
-    table.Column("dtu_overall", "Chamfer-L1 (mm)"),
-    table.Column("seen_chamfer_l1", "Chamfer-L1 × 1000, seen", show=table.thousandfold),
+    *table.columns(dtu_accuracy="Accuracy (mm)", dtu_completeness="Completeness (mm)", dtu_overall="Chamfer-L1 (mm)"),
+    *table.columns(table.thousandfold, seen_chamfer_l1="Chamfer-L1 × 1000, seen"),
 )
 COLUMNS = (
-    table.Column("psnr", "PSNR (dB)"),
-    table.Column("ssim", "SSIM"),
-    table.Column("mask_iou", "Mask IoU"),
-    table.Column("mask_iou_least", "least"),
+    *table.columns(psnr="PSNR (dB)", ssim="SSIM", mask_iou="Mask IoU", mask_iou_least="least"),
     *medians.COST,
 )
 TRUTH = tuple(column.key for column in TRUTH_COLUMNS)

@@ -27,9 +27,9 @@ def _ratio(record: records.Record) -> float | None:
 
 RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*DEFINED), table.Column("ratio", value=_ratio))
 COLUMNS = (
-    *(table.text("family", "Family"), table.text("shapes", "Shapes")),
+    *table.columns(table.word, family="Family", shapes="Shapes"),
     *(table.Column(name, DEFINED[name], show=table.thousandfold) for name in ("chamfer_l2", "floor_chamfer_l2")),
-    *(table.Column("ratio", "Fit / floor"), table.Column("largest", "largest")),
+    *table.columns(ratio="Fit / floor", largest="largest"),
     *(table.Column(name, DEFINED[name]) for name in ("distance_error", "slope_median", "slope_p99")),
 )
 

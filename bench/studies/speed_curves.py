@@ -20,8 +20,8 @@ NOTES = (
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (
-    *(table.text("setting", "Setting"), table.text("runs", "Runs"), table.text("reached", "Reached")),
-    *(table.Column("time", "Median time to error", show=format.seconds), table.Column("rank", "ρ of loss and error")),
+    *table.columns(table.word, setting="Setting", runs="Runs", reached="Reached"),
+    *(*table.columns(format.seconds, time="Median time to error"), *table.columns(rank="ρ of loss and error")),
 )
 Line = dict[str, Any]  # a setting of a renderer, with its records and histories
 

@@ -64,7 +64,7 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
         interval="in the CSV, 95 % bootstrap intervals of interquartile means over {shapes and seeds}",
         estimates=[line["middle"] for line in lines],
         remarks=(*NOTES, undefined(line["on_front"] for line in lines)),
-        columns=[*COLUMNS, *map(table.Column, renderer_columns), table.text("resolution")],
+        columns=[*COLUMNS, *table.raw(*renderer_columns), table.text("resolution")],
         lines=lines,
         figure=draw(drawn, [*map(_front, panels.values())]),
         chart={"panels": drawn, "note": POINT},
@@ -137,10 +137,9 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
                 f"{p['setting']} (*{format.seconds(p['seconds'])}*, error × 1000 {format.number(p['error'])})"
                 for p in (front[0], *front[1:][-1:])
             ]
-            return (
-                f"{len(front)} of {len(panel)} settings are on the front of {trial.title}: {' to '.join(ends)}; n = "
-                f"{format.plural(panel[0]['shapes'], 'shape')}."
-            )
+            n = format.plural(panel[0]["shapes"], "shape")
+            on_front = f"{len(front)} of {len(panel)} settings are on the front of {trial.title}; n = {n}."
+            return f"{on_front} From the fastest to the best: {' to '.join(ends)}."
     return ""
 
 
@@ -192,12 +191,11 @@ def _failed(line: Line) -> str:
 
 
 COLUMNS = (
-    *(table.text("trial", "Trial"), table.text("setting", "Setting"), table.text("renderer")),
-    table.Column("seconds", "Time", show=format.seconds),
-    table.Column("evaluations", "Field evaluations", show=format.count),
+    *table.columns(table.word, trial="Trial", setting="Setting", renderer=""),
+    *(*table.columns(format.seconds, seconds="Time"), *table.columns(format.count, evaluations="Field evaluations")),
     *(table.Column("error", "Error × 1000"), table.Column("error_iqm", value=lambda line: line["middle"].value)),
     *table.ends("error", lambda line: line["middle"]),
-    *map(table.Column, ("failed", "runs", "missing")),
+    *table.raw("failed", "runs", "missing"),
     table.shown("Failed", _failed),
     *(table.Column("on_front", "P(on the front)"), table.Column("dominated")),
 )

@@ -49,10 +49,8 @@ NUMBERS = (
 SHARE_COLUMNS = ("level", "severity", "successes", "trials", "share", "low", "high")
 COST_COLUMNS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
-    table.text("at_once", "At once"),
-    table.text("never", "None"),
-    table.Column("cost", "Field evaluations per ray"),
-    table.text("preset"),
+    *table.columns(table.word, at_once="At once", never="None"),
+    *(table.Column("cost", "Field evaluations per ray"), table.PRESET),
 )
 
 
@@ -74,7 +72,7 @@ def make(runs: Runs) -> Result:
         "The severity at which half of the trials succeed, on each axis (kind of stress).",
         question="At which severity of stress does each renderer break?",
         verdict=format.ends(
-            "Axes (kinds of stress) on which a renderer does not break",
+            "Axes on which a renderer does not break",
             cells.groupby("row", sort=False)["never"].sum().to_dict(),
             f"{trials:.0f} trials on {len(axes)} axes",
             show=table.integer,
@@ -110,8 +108,9 @@ def make_cost(runs: Runs) -> Result:
         chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
         for line in lines[lines["cost"].notna() & means.notna()].itertuples()
     ]
-    costs = [f"{line.row}, {format.number(line.cost)} field evaluations per ray" for line in lines.itertuples()]
-    ends = format.ends("Mean rank, 1 is best", dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
+    costs = [f"{line.row}, {format.number(line.cost)}" for line in lines.itertuples()]
+    title = "Mean rank (1 is best) and field evaluations per ray"
+    ends = format.ends(title, dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
     panel = chart.panel_data("", *COST_AXES, points, height=420)
     panel["y"] = {"title": COST_AXES[1], "log": False, "reversed": True}
     return Result(
@@ -307,7 +306,7 @@ def _alike(ranks: dict[str, statistics.Interval]) -> str:
     if not similar:
         return f"All others can be distinguished from {best}."
     listed = f"*{len(similar)}* of the {len(ranks) - 1} others ({'; '.join(similar)})"
-    return f"{listed} cannot be distinguished from {best}."
+    return f"Also, {listed} cannot be distinguished from {best}."
 
 
 def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:

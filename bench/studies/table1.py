@@ -3,21 +3,11 @@
 from dataclasses import replace
 from itertools import pairwise
 
-from bench.report.study import Result, Runs, Selection, format, merge_runs, records, table
+from bench.report.study import Result, Runs, Selection, format, merge_runs, published, records, table
 
 PLACE = 10
 ALIKE = ("dataset", "view", "prior", "task")
 READS = (Selection("table1", alike=ALIKE), Selection("table1_large", alike=ALIKE))  # 64 pixels, and the paper's 512
-# DIST (Liu et al. 2020), Table 1: size, steps, queries, time; on a GTX 1080Ti. In the paper's order.
-PUBLISHED = {
-    "naive_serial": (512, 50, "N/A", "N/A"),
-    "naive_practical": (512, 50, "6.06M", "1.6h"),
-    "naive_practical_parallel": (512, 50, "6.06M", "3.39s"),
-    "dist_dynamic": (512, 50, "1.99M", "1.23s"),
-    "dist_aggressive": (512, 50, "1.43M", "1.08s"),
-    "dist_coarse_to_fine": (512, 50, "887K", "0.99s"),
-    "dist_coarse_to_fine_100": (512, 100, "898K", "1.24s"),
-}
 NOTES = (
     "Forward is one rendering without gradients. A step is a rendering with gradients, the loss and the backward pass. "
     "It takes longer than forward and backward together. In brackets: the smallest and the largest of several repeats.",
@@ -41,7 +31,7 @@ CSV_METRICS = (
 def make(small: Runs | None, large: Runs | None) -> Result:
     """A line per size and strategy: the paper's in its order, then others in the order of their runs."""
     runs = merge_runs(small, large)
-    rank = {preset: number for number, preset in enumerate(PUBLISHED)}
+    rank = {preset: number for number, preset in enumerate(published("dist_table1"))}
     runs = replace(
         runs,
         records=sorted(
@@ -65,18 +55,21 @@ def make(small: Runs | None, large: Runs | None) -> Result:
 
 
 def _verdict(runs: Runs) -> str:
-    """The speedup of a step by each strategy of the paper over the previous one, at the smallest size."""
-    least = _requested(runs.records[0])
+    """The speedup of a step by each strategy of the paper over the previous one, a sentence per size."""
+    return " ".join(filter(None, (_speedups(runs, size) for size in dict.fromkeys(map(_requested, runs.records)))))
+
+
+def _speedups(runs: Runs, size: int | None) -> str:
     steps = {
         records.row_of(record).preset: (records.row_of(record).name, _at_size(record, "step_seconds"))
         for record in runs.records
-        if _requested(record) == least and record["status"] == "ok"
+        if _requested(record) == size and record["status"] == "ok"
     }
-    chain = [steps.get(preset, ("", None)) for preset in list(PUBLISHED)[:-1]]
+    chain = [steps.get(preset, ("", None)) for preset in list(published("dist_table1"))[:-1]]
     factors = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
     if not factors:
-        return format.ends(f"Step runtime at {least} pixels", dict(steps.values()), "one shape", show=format.seconds)
-    title = f"Speedup of a step at {least} pixels over the previous strategy"
+        return format.ends(f"Step runtime at {size} pixels", dict(steps.values()), "one shape", show=format.seconds)
+    title = f"Speedup of a step at {size} pixels over the previous strategy"
     return f"{title}: {', '.join(factors)}; n = one shape."
 
 
@@ -109,13 +102,13 @@ def _step(record: records.Record) -> str:
     return f"{texts[0]} ({texts[1].split()[0]}–{texts[2].split()[0]})" if same else "{} ({}–{})".format(*texts)
 
 
-def _published(record: records.Record, column: int) -> int | str | None:
-    return PUBLISHED.get(records.row_of(record).preset, (None,) * 4)[column]
+def _published(record: records.Record, column: str) -> str | None:
+    return published("dist_table1").get(records.row_of(record).preset, {}).get(column)
 
 
-def _shown(record: records.Record, column: int) -> str:
+def _shown(record: records.Record, column: str) -> str:
     """A published value as text, if the row has the published size."""
-    return str(_published(record, column) or "") if _published(record, 0) == _requested(record) else ""
+    return str(_published(record, column) or "") if _published(record, "size") == str(_requested(record)) else ""
 
 
 RUNS = (
@@ -127,8 +120,8 @@ RUNS = (
         for name in CSV_METRICS
     ),
     *(
-        table.Column(f"published_{name}", value=lambda record, index=index: _published(record, index))
-        for index, name in enumerate(("size", "steps", "queries", "time"))
+        table.Column(f"published_{name}", value=lambda record, name=name: _published(record, name))
+        for name in ("size", "steps", "queries", "time")
     ),
 )
 COLUMNS = (  # shown columns of a record; metrics are those of the largest finished size
@@ -151,8 +144,8 @@ COLUMNS = (  # shown columns of a record; metrics are those of the largest finis
         table.joined_cell(records.measured, format.number, "depth_error_median", "depth_error_max"),
     ),
     table.metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
-    table.shown("Published evaluations", lambda record: _shown(record, 2)),
-    table.shown("Published time of a step", lambda record: _shown(record, 3)),
+    table.shown("Published evaluations", lambda record: _shown(record, "queries")),
+    table.shown("Published time of a step", lambda record: _shown(record, "time")),
 )
 
 PAGES = {"table1": make}

@@ -5,27 +5,8 @@ from matplotlib.figure import Figure
 from bench.report.study import Result, Runs, Selection, chart, compare, gallery, records, style, table
 
 PLACE = 20
-READS = (Selection("table2", ("task.points",)),)
-REFERENCE = "dist_mask"
+READS = (Selection("table2", ("task.points",), may_differ=("prior.truncation",)),)
 HIDDEN_SUFFIXES = ("_paper", "_official")  # the figure leaves out these presets, to stay readable
-# DIST (Liu et al. 2020), Table 2: median Chamfer x 1000 over 200 shapes of ShapeNet, by `compare.CONDITION_ORDER`.
-PUBLISHED = {
-    "sofa": {
-        "DeepSDF": (5.37, 5.56, 5.50, 5.93, 6.03, 7.63),
-        "DIST": (4.12, 5.75, 5.49, 5.72, 5.57, 6.95),
-        "DIST with mask": (4.12, 3.98, 4.31, 3.98, 4.30, 4.94),
-    },
-    "plane": {
-        "DeepSDF": (3.71, 3.73, 4.29, 4.44, 4.40, 5.39),
-        "DIST": (2.18, 4.08, 4.81, 4.44, 4.51, 5.30),
-        "DIST with mask": (2.18, 2.08, 2.62, 2.26, 2.55, 3.60),
-    },
-    "table": {
-        "DeepSDF": (12.93, 12.78, 11.67, 12.87, 13.76, 15.77),
-        "DIST": (5.37, 12.05, 11.42, 11.70, 13.76, 15.83),
-        "DIST with mask": (5.37, 5.15, 5.16, 5.26, 6.33, 7.62),
-    },
-}
 NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
     "Dense depth includes the mask. “Paper's setting” is DIST, B.4, with the mean of the squared code of the official "
@@ -48,30 +29,9 @@ ARRAYS = (
 BOTH_SIDES = (gallery.FRONT, gallery.BEHIND)
 
 
-def make(runs: Runs) -> Result:
-    """A line per family and row, with the oracle and published numbers of each family."""
-    compared, oracle = compare.Compared(runs, lambda _: REFERENCE), compare.oracles(runs, compare.METRIC)
-    published = {
-        family: {row: dict(zip(compare.CONDITION_ORDER, numbers, strict=True)) for row, numbers in rows.items()}
-        for family, rows in PUBLISHED.items()
-    }
-    columns = compared.columns("Ratio to DIST with mask")
-    return compared.result(
-        "Shape completion from one depth image, by its number of points.",
-        "Which method completes a shape best from sparse depth?",
-        plotted="Median error over {shapes and seeds} for each number of depth points, and for all numbers together.",
-        verdict=compared.best("errors × 1000 over all numbers of depth points"),
-        remarks=(compare.ERROR, f"{_shapes(compared)} {_iterations(runs)}", *NOTES),
-        columns=[column for column in columns if column.key not in compare.COSTS],
-        lines=compared.extended_lines({compare.ORACLE: oracle}, published),
-        run_columns=RUNS,
-        figure=draw(compared, oracle),
-    )
-
-
-def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
+def draw(compared: compare.Compared) -> Figure:
     """Draws a panel per family: the median of each row over the number of points, and the oracle."""
-    conditions, panels = compared.conditions, []
+    conditions, oracle, panels = compared.conditions, compared.oracles, []
     positions = range(len(conditions))
     for family in compared.families:
         lines = []
@@ -83,13 +43,14 @@ def draw(compared: compare.Compared, oracle: dict[str, float]) -> Figure:
             lines.append(chart.level(compare.ORACLE, positions, oracle[family]))
             lines.append(chart.level("1.5 times the oracle", positions, 1.5 * oracle[family], dash=":"))
         panels.append(chart.panel_data(family, "observed depth points", compare.LABEL, lines, ticks=conditions))
-    height = -(-len(panels) // 4)
-    return chart.draw(panels, 2.4 * height + 0.7, height, sharey=True)
+    height = -(-len(panels) // 3)  # at most three panels side by side, so that the labels of the points have room
+    return chart.draw(panels, 2.1 * height + 0.7, height, sharey=True)
 
 
-def _shapes(compared: compare.Compared) -> str:
+def _notes(compared: compare.Compared) -> tuple[str, ...]:
     counts = compared.cells.groupby(["family", "row", "condition"], observed=True).solid.nunique()
-    return f"Shapes per family and row: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
+    shapes = f"Shapes per family and row: {counts.min()}{f' to {counts.max()}' if counts.nunique() > 1 else ''}."
+    return compare.ERROR, f"{shapes} {_iterations(compared.runs)}", *NOTES
 
 
 def _iterations(runs: Runs) -> str:
@@ -140,4 +101,18 @@ def _points(record: records.Record) -> str:
     return str(records.setting(record["config"], "task", "points"))
 
 
-PAGES = {"table2": make, "completion_gallery": pictures}
+PAGE = compare.Comparison(
+    title="Shape completion from one depth image, by its number of points.",
+    question="Which method completes a shape best from sparse depth?",
+    reference="dist_mask",
+    name="DIST with mask",
+    notes=_notes,
+    plotted="Median error over {shapes and seeds} for each number of depth points, and for all numbers together.",
+    least_of="errors × 1000 over all numbers of depth points",
+    above=lambda compared: {compare.ORACLE: compared.oracles},
+    published="dist_table2",
+    hidden=compare.COSTS,
+    run_columns=RUNS,
+    figure=draw,
+)
+PAGES = {"table2": PAGE, "completion_gallery": pictures}

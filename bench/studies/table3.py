@@ -3,13 +3,7 @@
 from bench.report.study import Result, Runs, Selection, compare, conditions, gallery, medians, records, table
 
 PLACE = 40
-READS = (Selection("table3"),)
-REFERENCE = "multiview_dist"
-# DIST (Liu et al. 2020), Table 3: Chamfer from truth to prediction x 1000, of 50 shapes of the test set of PMO.
-PUBLISHED = {
-    "car": {"PMO": 0.661, "PMO, random start": 1.187, "DIST, random start": 0.919},
-    "plane": {"PMO": 1.129, "PMO, random start": 6.124, "DIST, random start": 1.595},
-}
+READS = (Selection("table3", must_agree=("task.images.views",)),)
 NOTES = (
     "Error: mean squared distance from points of the true surface to the nearest points of the reconstruction, not the "
     "reverse, in squared scene units, times 1000. A failed run has an infinite error.",
@@ -38,32 +32,21 @@ RUNS = (
 MAX_SHAPES = 4  # per family in pictures
 
 
-def make(runs: Runs) -> Result:
-    """A line per family and method, with the start, the oracle and published numbers of each family."""
-    compared = compare.Compared(runs, lambda _: REFERENCE, records.ONE_WAY, conditions.LABEL)
-    starts = records.CHAMFER_SCALE * runs.number(f"start_{records.ONE_WAY}")
+def _above(compared: compare.Compared) -> compare.Above:
+    """The initial errors, by the kind of initial code, and the oracle."""
+    runs, errors = compared.runs, records.CHAMFER_SCALE * compared.runs.number(f"start_{records.ONE_WAY}")
     encoded = runs.setting(ENCODER_KEY) != ""
-    starts_by_kind = {"initial error, random": starts[~encoded], "initial error, encoder": starts[encoded]}
-    above = {
-        **{
-            name: errors.groupby(runs.frame.family, sort=False).median().dropna().to_dict()
-            for name, errors in starts_by_kind.items()
-        },
-        compare.ORACLE: compare.oracles(runs, records.ONE_WAY),
+    starts = {"initial error, random": errors[~encoded], "initial error, encoder": errors[encoded]}
+    medians_of = {
+        name: values.groupby(runs.frame.family, sort=False).median().dropna().to_dict()
+        for name, values in starts.items()
     }
-    published = {name: {row: {"": str(number)} for row, number in rows.items()} for name, rows in PUBLISHED.items()}
-    on_mesh = [ON_MESH.format(row=row.name, published=PMO[row.preset]) for row in runs.rows() if row.preset in PMO]
-    return compared.result(
-        "Shape from many views, without a mask.",
-        "Which method best reconstructs a shape from photographs of many views, without a mask?",
-        plotted="Median error over {shapes and seeds}; median over shapes alone, with its ratio to DIST; median cost "
-        "of runs that ended ok.",
-        verdict=compared.best("errors × 1000 from ground truth to prediction"),
-        remarks=(*NOTES, *on_mesh, *([ENCODER] if encoded.any() else [])),
-        columns=compared.columns("Ratio to DIST"),
-        lines=compared.extended_lines(above, published),
-        run_columns=RUNS,
-    )
+    return {**medians_of, compare.ORACLE: compared.oracles}
+
+
+def _notes(compared: compare.Compared) -> list[str]:
+    on_mesh = [ON_MESH.format(row=row.name, published=PMO[row.preset]) for row in compared.rows if row.preset in PMO]
+    return [*NOTES, *on_mesh, ENCODER if (compared.runs.setting(ENCODER_KEY) != "").any() else ""]
 
 
 def pictures(runs: Runs) -> Result:
@@ -97,4 +80,19 @@ def _cells(names: list[str], group: list[records.Record], scene: gallery.Scene) 
     return [*shared, *(scene.cell(record_by_row.get(name), gallery.normals(gallery.PREDICTED)) for name in names)]
 
 
-PAGES = {"table3": make, "multiview_gallery": pictures}
+PAGE = compare.Comparison(
+    title="Shape from many views, without a mask.",
+    question="Which method best reconstructs a shape from photographs of many views, without a mask?",
+    reference="multiview_dist",
+    name="DIST",
+    notes=_notes,
+    plotted="Median error over {shapes and seeds}; median over shapes alone, with its ratio to DIST; median cost of "
+    "runs that ended ok.",
+    least_of="errors × 1000 from ground truth to prediction",
+    metric=records.ONE_WAY,
+    label=conditions.LABEL,
+    above=_above,
+    published="dist_table3",
+    run_columns=RUNS,
+)
+PAGES = {"table3": PAGE, "multiview_gallery": pictures}

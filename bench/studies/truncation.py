@@ -92,10 +92,10 @@ def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
     wrong = {name: table.small_percent(lines[kind, 1.5]["wrong"]) for name, kind in kinds.items()}
     plain, clamped, both = (lines[kind, 1.5] for kind in kinds.values())
     return (
-        f"At alpha = 1.5, *{wrong['plain']}* of the pixels are wrong on distances without clamped steps. With clamped "
-        f"steps, {wrong['clamped']} are wrong on distances and {wrong['both']} on a truncated field. These steps cost "
-        f"{clamped['cost']:.2f} and {both['cost']:.2f} times the field evaluations of alpha = 1 without clamp; "
-        f"n = {plain['shapes']} shapes."
+        f"At alpha = 1.5, *{wrong['plain']}* of the pixels are wrong on distances, {wrong['clamped']} with clamped "
+        f"steps and {wrong['both']} on a truncated field with clamped steps; n = {plain['shapes']} shapes. "
+        f"Clamped steps cost {clamped['cost']:.2f} and {both['cost']:.2f} times the field evaluations of alpha = 1 "
+        "without clamp."
     )
 
 

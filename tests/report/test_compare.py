@@ -1,12 +1,13 @@
 """The comparison of rows and its pages, made from run folders whose errors and costs are known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import ALL_FAMILIES, HOLM, Compared, differing, ordered
+from bench.report.compare import ALL_FAMILIES, HOLM, Compared, Comparison, differing, ordered
 from bench.report.data import statistics
 from bench.report.data.runs import Runs, Selection, choose
 from bench.report.write.result import Result
@@ -19,9 +20,8 @@ METHODS = {"dist": (1.0, 1000, 4.0), "newton": (0.5, 500, 8.0), "neus": (0.25, 9
 
 def page(runs: Runs) -> Result:
     """A page of the ratios to DIST."""
-    found = Compared(runs, lambda _: "dist_mask")
-    verdict = f"{found.best('errors')} {found.differing('to DIST')}".strip()
-    return found.result("Rows.", "Which?", verdict=verdict, columns=found.columns("Ratio to DIST"))
+    made = Comparison("Rows.", "Which?", "dist_mask", "DIST", lambda _: (), least_of="errors")(runs)
+    return replace(made, verdict=f"{made.verdict} {Compared(runs, 'dist_mask').differing('to DIST')}".strip())
 
 
 def compared(results, *, families=("sofa", "plane"), shapes=6, failed=()):
@@ -82,7 +82,7 @@ def test_a_line_has_errors_ratio_and_cost(whole):
     assert own["error"] == pytest.approx(0.5 * 12 ** (1 / 2) * 2 * 9)  # of shapes 1 to 6, points 1 and 4
     assert own["100"] == pytest.approx(0.5 * 3.5 * 9) and own["20"] == pytest.approx(0.5 * 3.5 * 9 * 4)
     assert line(result, "dist with mask")["ratio"] == ""
-    assert "*3 of 3* ratios to DIST differ from 1: newton with mask 0.500 [0.500, 0.500];" in result.verdict
+    assert "*3 of 3* ratios to DIST differ significantly from 1: newton with mask 0.500 [0.500," in result.verdict
 
 
 def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
@@ -110,7 +110,7 @@ def test_where_nothing_ended_well_there_is_no_verdict(tmp_path):
 
 def test_the_verdict_names_the_best_and_the_quickest(whole):
     verdict = page(whole).verdict
-    assert "(neus with mask, 30.0 s)" in verdict and "(dist with mask, 4.00 s); n = 12 shapes." in verdict
+    assert "(neus with mask, 30.0 s); n = 12 shapes." in verdict and "(dist with mask, 4.00 s)." in verdict
 
 
 def test_a_shape_that_lacks_a_condition_is_left_out_of_the_mean_and_the_row_has_no_rank(whole):
@@ -164,14 +164,14 @@ def test_rows_of_other_families_with_other_evaluations_are_told(tmp_path):
 def test_a_verdict_counts_the_ratios_that_differ_from_1():
     ratios = {name: of_eight([one, other]) for name, one, other in (("worse", 2.0, 2.0), ("mixed", 1.5, 0.7))}
     said = differing([*ratios.items()], "to DIST")
-    assert said.startswith(f"{HOLM}, *1 of 2* ratios to DIST differ from 1: worse 2.00")
-    assert said.endswith("; 1 cannot be distinguished from 1.")
+    assert said.startswith("*1 of 2* ratios to DIST differ significantly from 1: worse 2.00")
+    assert said.endswith(f"{HOLM}, 1 cannot be distinguished from 1.")
 
 
 def test_a_ratio_with_seven_of_eight_shapes_is_no_difference():
     seven = statistics.ratio([np.array([0.5])] * 7 + [np.array([2.0])], [np.ones(1)] * 8)
     said = differing([("one", seven), ("other", seven)], "to DIST")
-    assert said.startswith(f"{HOLM}, *0 of 2* ratios to DIST differ from 1; 2 cannot be distinguished from 1.")
+    assert said.startswith(f"*0 of 2* ratios to DIST differ significantly from 1. {HOLM}, 2 cannot be")
 
 
 def test_a_verdict_that_no_data_could_give_is_none():
@@ -181,7 +181,7 @@ def test_a_verdict_that_no_data_could_give_is_none():
 
 
 def test_its_panels_have_a_line_per_row_the_least_error_first(whole):
-    errors, ratios, evaluations, seconds = Compared(whole, lambda _: "dist_mask").panels("Ratio to DIST")
+    errors, ratios, evaluations, seconds = Compared(whole, "dist_mask").panels("Ratio to DIST")
     names = [f"{name} with mask" for name in ("neus", "newton", "dist", "volsdf")]
     assert [panel["rows"] for panel in (errors, ratios, evaluations, seconds)] == [names] * 4
     assert [(each["name"], each["y"]) for each in errors["series"]] == [(name, [n]) for n, name in enumerate(names)]

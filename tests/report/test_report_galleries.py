@@ -161,7 +161,7 @@ def test_codes_of_shape_and_colour_are_shown_beside_the_mesh_and_its_bytes(tmp_p
     cosine = 0.8 / np.sqrt(0.8**2 + 0.3**2 + 0.5**2)
     assert right == pytest.approx(0.8 * (fig8.AMBIENT + (1 - fig8.AMBIENT) * cosine), abs=1e-3)
     assert set(notes(result.figure)) == {"crashed"} and failed
-    assert "a code has 256 bytes" in result.verdict and "mesh and texture 4 kB" in result.verdict
+    assert "A code has 256 bytes" in result.verdict and "mesh and texture 4 kB" in result.verdict
     assert "No pictures of 1 run: no images.npz." in told(result)
     assert "1 of 3 runs did not end ok" in result.caption
 

@@ -12,6 +12,7 @@ from bench.records.read import read_records
 from bench.report.__main__ import main
 from bench.report.data import curves
 from bench.report.data.runs import Runs, choose
+from bench.report.study import published
 from bench.report.write.html import write_index
 from bench.report.write.paper import find_paper, studies
 from bench.report.write.result import Result, Shown, latex
@@ -427,7 +428,7 @@ def test_same_records_give_the_same_files(reported, tmp_path, capsys):
 
 def test_row_keeps_its_look_and_known_rows_differ():
     assert style.look("mine") == style.look("mine") != style.look("yours")  # that nobody listed
-    strategies = [style.look(preset) for preset in table1.PUBLISHED]
+    strategies = [style.look(preset) for preset in published("dist_table1")]
     assert len({look.colour for look in strategies}) == len({look.marker for look in strategies}) == 7
 
 

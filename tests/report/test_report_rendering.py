@@ -38,7 +38,7 @@ def test_table1_numbers_stand_in_their_rows_with_the_published_beside(tmp_path):
     assert list(rows["size"]) == [64, 64, 64, 64]
     assert list(rows["published_queries"]) == ["N/A", "6.06M", "1.99M", None]
     assert list(rows["published_time"]) == ["N/A", "3.39s", "1.23s", None]
-    assert list(rows["published_steps"]) == [50, 50, 50, None]
+    assert list(rows["published_steps"]) == ["50", "50", "50", None]
     assert list(rows["status"]) == ["timeout", "crashed", "ok", "ok"]
     assert list(rows["reason"]) == ["64 pixels took over 60 s", "no luck", "", ""]
     names = ("forward_s", "backward_s", "step_s", "step_s_low", "step_s_high", "lost", "false", "wrong")
@@ -162,7 +162,7 @@ def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
     assert drawn(cosine, "neus") == [0.9, 0.9] and drawn(scale, "neus", "x") == [0.001, 0.03]
     sharp = [line.get_ydata()[0] for line in cosine.lines if line.get_label() == "without a blur (2 renderers)"]
     assert sharp == [0.5, 0.9]
-    assert page.verdict.startswith("neus has a cosine of *0.90* and a scale of 1.10 at a blur of 0.001 scene units; ")
+    assert page.verdict.startswith("neus has a cosine of *0.90* and a scale of 1.10 at a blur of 0.001 scene units. ")
 
 
 def test_fig4_counts_what_the_pictures_show(tmp_path):

@@ -71,7 +71,7 @@ def test_curves_are_medians_of_scenes_that_end_at_the_errors_of_the_table(tmp_pa
     of = {row: lines.set_index("iteration")["seen_chamfer_l1"].to_dict() for row, lines in result.data.groupby("row")}
     assert of[NEWTON] == pytest.approx({20: 0.06, 180: 0.04, 400: 0.02}) and of[HULL] == pytest.approx({0: 0.08})
     assert result.table.values.tolist() == [[NEWTON, "400", "180", "40.0", "20.0", "50 %"]]
-    assert "to the end: *50 %* (Newton, RGB); n = 2 scenes." in result.verdict
+    assert "in the second half: *50 %* (Newton, RGB); n = 2 scenes." in result.verdict
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from bench.report.data.runs import Runs
 
 HISTORY = ("iteration", "seconds", "value_evaluations", "error", "loss")
 COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
+HIGH_RHO = 0.7  # a larger rank correlation of loss and error is called high
 
 
 def read(folder: Path, columns: Sequence[str] = COLUMNS) -> tuple[pd.DataFrame, str]:

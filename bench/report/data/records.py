@@ -106,27 +106,6 @@ def setting(config: dict[str, Any], *path: str) -> Any:
     return node
 
 
-def shared_settings(records: list[Record], names: dict[str, tuple[str, ...]]) -> str:
-    """A note on the settings that all records share, and on those in which they differ; empty without settings.
-
-    Args:
-        names: the path of each setting in a configuration, by the name of the setting in the note.
-    """
-    values = {
-        name: {str(value): value for record in records if (value := setting(record["config"], *path)) is not None}
-        for name, path in names.items()
-    }
-    shared = [f"{name} {next(iter(each))}" for name, each in values.items() if len(each) == 1]
-    differ = [f"{name} ({', '.join(_ordered(each.values()))})" for name, each in values.items() if len(each) > 1]
-    parts = [("Rows share: ", shared), ("Rows differ in: ", differ)]
-    return " ".join(f"{word}{', '.join(listed)}." for word, listed in parts if listed)
-
-
-def _ordered(values: Iterable[Any]) -> list[str]:
-    """Values as text: numbers sorted by size, then words."""
-    return [str(value) for value in sorted(values, key=lambda x: (1, str(x)) if as_number(x) is None else (0, x))]
-
-
 def shape(record: Record) -> tuple[str, Any]:
     """The family and the index of a run's shape."""
     return family(record), index(record)

@@ -29,8 +29,6 @@ from bench.report.data.records import (
 )
 
 MACHINE_KEYS = ("cpu", "device", "threads")
-# Rows of one table may differ in these settings: their errors against the ground truth stay comparable.
-ROW_SETTINGS = ("prior.truncation",)
 
 
 @dataclass(frozen=True)
@@ -42,12 +40,16 @@ class Selection:
         conditions: settings in which runs of one row differ, such as task.points or split.
         setup: parts of the setup that captions name if they are known.
         alike: further parts of the configuration, such as task, in which only runs that equal the newest are read.
+        must_agree: further settings in which rows must agree to be compared, see `Runs.mixed`.
+        may_differ: settings in which rows that are compared may differ.
     """
 
     experiment: str
     conditions: tuple[str, ...] = ()
     setup: tuple[str, ...] = ("scenes", "pixels", "network", "machine")
     alike: tuple[str, ...] = ()
+    must_agree: tuple[str, ...] = ()
+    may_differ: tuple[str, ...] = ()
 
 
 class NoFolder(LookupError):
@@ -178,17 +180,21 @@ class Runs:
         return {machine: [record["name"] for record in records] for machine, records in machines.items()}
 
     def mixed(self) -> list[str]:
-        """The settings in which runs differ: view and evaluation in an experiment, prior and field in a family."""
+        """The settings in which rows differ, so that they do not compare, as the selection extends or limits them.
+
+        These are view and evaluation in an experiment, and prior and field in a family.
+        """
         experiments = grouped(self.records, lambda record: record["config"].get("experiment")).values()
         comparisons = [(records, ("view", "evaluation")) for records in experiments]
         families = (records for group in experiments for records in grouped(group, family).values())
         comparisons += [(records, ("prior", "field")) for records in families]
-        differing, ignored = dict[str, None](), {*self.selection.conditions, *ROW_SETTINGS}
+        differing, ignored = dict[str, None](), {*self.selection.conditions, *self.selection.may_differ}
         for records, sections in comparisons:
             configs = [flat({key: record["config"].get(key) for key in sections}, "") for record in records]
             keys = dict.fromkeys(key for config in configs for key in config if key not in ignored)
             texts = {key: {str(config[key]) for config in configs if key in config} for key in keys}
             differing |= {key: None for key in keys if len(texts[key]) > 1}
+        differing |= {key: None for key in self.selection.must_agree if self.setting(key).nunique() > 1}
         return list(differing)
 
     def of_newest_scene(self) -> "Runs":

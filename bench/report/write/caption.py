@@ -57,7 +57,8 @@ def undefined(values: Iterable[float]) -> str:
 
 def warnings(runs: Runs) -> list[str]:
     """Notes on differing settings, incomparable or doubtful times, old runs and missing runs."""
-    notes = (_mixed(runs), _machines(runs), _loaded(runs), *age.notes(runs.records), _omitted(runs))
+    timing = (_machines(runs), _loaded(runs)) if "machine" in runs.selection.setup else ()  # else it shows no times
+    notes = (_mixed(runs), *timing, *age.notes(runs.records), _omitted(runs))
     return [note for note in notes if note]
 
 

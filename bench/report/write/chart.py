@@ -1,7 +1,7 @@
 """Charts as data: panels of series, drawn here as a figure, and by the page as an interactive chart."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import Any
 
@@ -98,74 +98,6 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     if legend:
         style.legend_below(figure, *axes.flat, columns=legend)
     return figure
-
-
-@style.styled
-def draw_lead(panels: Sequence[Panel], ranks: Mapping[str, Mapping[str, str]]) -> Figure:
-    """Draws the first panel large, with the names of its lines, the ranks to its right, and the other panels below.
-
-    Args:
-        panels: fractions from 0 to 1 over costs, on a logarithmic axis.
-        ranks: by their titles, the rank of each row, such as 5, or the ranks that it can have, such as 1–4.
-    """
-    figure = Figure(figsize=(style.WIDTH, 5.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.55, 1))
-    lead, *others = above.subplots(1, 1 + len(ranks), width_ratios=(5.6, *[1.0] * len(ranks)))
-    _fractions(lead, panels[0])
-    lead.set_title(panels[0]["title"], loc="left", pad=46)  # points, above the names
-    _name_lines(lead, panels[0]["series"])
-    for axis, (title, rows) in zip(others, ranks.items(), strict=True):
-        _ranks(axis, title, rows, panels[0]["series"], named=axis is others[0])
-    small = below.subplots(1, max(len(panels) - 1, 1), sharey=True, squeeze=False)[0]
-    for axis, panel in zip(small, panels[1:], strict=False):
-        _fractions(axis, panel)
-        axis.set_title(panel["title"], loc="left")
-    below.supxlabel(panels[0]["x"]["title"], fontsize=lead.yaxis.label.get_size())
-    return figure
-
-
-def _fractions(axis: Axes, panel: Panel) -> None:
-    """Draws lines of fractions, with a point at the end of each, or a cross if the row failed."""
-    for line in panel["series"]:
-        axis.plot(line["x"], line["y"], color=line["colour"], ls=line["dash"])
-        end = {"marker": "x" if line.get("failed") else "o", "color": line["colour"], "clip_on": False, "zorder": 3}
-        axis.plot(line["x"][-1], line["y"][-1], **end)
-    costs = [cost for line in panel["series"] for cost in (line["x"][0], 1.6 * line["x"][-1])]
-    axis.set(xscale="log", xlim=(min(costs, default=0.1), max(costs, default=10.0)), ylim=(0, 1))
-    axis.minorticks_off()
-    axis.xaxis.set_major_formatter(lambda cost, _: f"{cost:g} ×")
-    axis.set_yticks([0, 0.25, 0.5, 0.75, 1], ["initial error", "25 %", "50 %", "75 %", "best possible"])
-
-
-def _name_lines(axis: Axes, lines: Sequence[Series]) -> None:
-    """Writes the name of each line above the axes, joined to its end; next to its end if that is below 0.5."""
-    above, across = axis.get_xaxis_transform(), axis.transScale + axis.transLimits
-    position = -1.0
-    for line in sorted(lines, key=lambda line: line["x"][-1]):
-        end, name = (line["x"][-1], line["y"][-1]), line["name"].partition(",")[0]
-        look = {"color": line["colour"], "fontsize": style.RC["legend.fontsize"]}
-        if end[1] < 0.5:
-            axis.annotate(name, end, (4, 0), textcoords="offset points", va="center", **look)
-            continue
-        position = max(across.transform(end)[0], position + 0.08)  # at least this fraction of the width between names
-        cost = across.inverted().transform((position, 0))[0]
-        axis.plot([end[0], cost], [end[1], 1.02], transform=above, lw=0.6, color=line["colour"], clip_on=False)
-        axis.text(cost, 1.03, name, transform=above, rotation=40, rotation_mode="anchor", **look)
-
-
-def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[Series], *, named: bool) -> None:
-    """Draws the ranks that each row can have as a bar."""
-    for number, line in enumerate(lines):
-        low, *_, high = [int(rank) for rank in 2 * rows[line["name"]].split("–")]
-        axis.barh(number, high - low + 0.7, left=low - 0.35, height=0.55, color=line["colour"])
-    count = len(lines)
-    axis.set(xlim=(0.3, count + 0.7), ylim=(count - 0.4, -0.6), xticks=[1, count], xlabel="rank")
-    axis.set_title(title, loc="left")
-    axis.set_yticks(range(count), [line["name"].partition(",")[0] if named else "" for line in lines])
-    for label, line in zip(axis.get_yticklabels(), lines, strict=True):
-        label.set_color(line["colour"])
-    axis.tick_params(axis="y", length=0)
-    axis.grid(False, axis="y")
 
 
 def _shown(panel: Panel) -> list[Series]:

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -28,6 +29,7 @@ SHIPPED = ROOT / "results"  # only in a checkout
 STUDIES = ROOT / "bench" / "studies"
 SUITE_PAGE = "suite"  # its rows include the shipped ones
 SHIPPED_ROW_PREFIX = "shipped: "
+MAX_ANSWER_WORDS = 25  # as in tests.words
 
 HEAD = """# Results
 
@@ -276,9 +278,19 @@ def key_of(name: str) -> str:
     return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
+def _short(answer: str) -> str:
+    """The first sentence of an answer; a longer one ends after a clause, or else after so many words."""
+    sentence = re.split(r"(?<=[.!?]) (?=[A-Z])", answer)[0]
+    ends = [word.end() for word in re.finditer(r"\w(\S*\w)?", sentence)]
+    if len(ends) <= MAX_ANSWER_WORDS:
+        return sentence
+    start = sentence[: ends[MAX_ANSWER_WORDS - 1]]
+    return f"{start.rpartition('; ')[0]}; ..." if "; " in start else f"{start} ..."
+
+
 def _line(page: Page) -> str:
-    """A page's line of the index: its question with a link, its answer and its experiments."""
+    """A page's line of the index: its question with a link, its short answer and its experiments."""
     question = as_markdown(page.shown.question or page.shown.title.rstrip("."))
-    answer = page.shown.answer + (f" (drawn by {page.shown.drawn_by})" if page.shown.drawn_by else "")
+    answer = _short(page.shown.answer) + (f" (drawn by {page.shown.drawn_by})" if page.shown.drawn_by else "")
     experiments = ", ".join(f"`{name}`" for name in page.shown.experiments)
     return f"| [{question}]({FOLDER}/{page.name}.md) | {as_markdown(answer)} | {experiments} |\n"

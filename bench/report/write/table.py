@@ -98,6 +98,16 @@ def best(columns: Sequence[Column], lines: Sequence[Any]) -> list[list[int]]:
     return cells
 
 
+def columns(show: Callable[[Any], str] = format.number, /, **headings: str) -> tuple[Column, ...]:
+    """Columns by their keys, with their headings and how all of them show values."""
+    return tuple(Column(key, heading, show=show) for key, heading in headings.items())
+
+
+def raw(*keys: str) -> tuple[Column, ...]:
+    """Columns of the CSV only."""
+    return tuple(map(Column, keys))
+
+
 def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None) -> Column:
     return Column(key, heading, value, show=word)
 
