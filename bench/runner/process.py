@@ -151,8 +151,6 @@ def _watch(
 ) -> AbnormalExit | None:
     start, is_ready, max_bytes = time.perf_counter(), False, limits.bytes
     phase = "while setting up"  # until the first step is reported
-    with suppress(psutil.NoSuchProcess):
-        memory = psutil.Process(process.pid)
     while True:
         raise_if_stopped()
         wait([channel, process.sentinel], timeout=POLL_INTERVAL_SECONDS)
@@ -178,7 +176,7 @@ def _watch(
         if not is_ready and spent > STARTUP_TIMEOUT_SECONDS:
             return AbnormalExit(RunStatus.CRASHED, f"its process was not ready within {STARTUP_TIMEOUT_SECONDS:g} s")
         with suppress(psutil.NoSuchProcess):
-            if memory.memory_info().rss > max_bytes:
+            if psutil.Process(process.pid).memory_info().rss > max_bytes:
                 process.kill()  # at once, before the machine runs out of memory
                 reason = f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {phase}"
                 return AbnormalExit(RunStatus.OOM, reason)

@@ -133,16 +133,19 @@ class RunContext:
     def on_clock(self) -> Iterator[None]:
         """Context for a method without a loop: its seconds count as forward seconds."""
         clock = time.perf_counter()
-        yield
-        self.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        try:
+            yield
+        finally:
+            self.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
 
     @contextmanager
     def off_clock(self) -> Iterator[None]:
         """Context for work outside of the loop: its seconds count as evaluation seconds."""
-        clock = time.perf_counter()
-        yield
-        seconds = self.record.seconds
-        seconds["evaluation"] = seconds.get("evaluation", 0.0) + time.perf_counter() - clock
+        clock, seconds = time.perf_counter(), self.record.seconds
+        try:
+            yield
+        finally:
+            seconds["evaluation"] = seconds.get("evaluation", 0.0) + time.perf_counter() - clock
 
 
 @runtime_checkable

@@ -1,15 +1,17 @@
 """A configuration becomes objects, each node once; and a run takes its threads."""
 
 from collections import Counter
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 from bench import config as config_module
 from bench.machine.environment import using_threads
-from bench.setup.inputs import build_cell
+from bench.records.record import Record
+from bench.setup.inputs import RunContext, RunInputs, build_cell
 from renderers.checks import BadInput
-from tests.tiny import cell_from, plain
+from tests.tiny import cell_from, plain, silent
 
 
 @pytest.fixture(autouse=True)
@@ -74,3 +76,12 @@ def test_the_run_takes_its_threads_and_its_check_does_not(compose_config):
     assert torch.get_num_threads() == 2
     cell_from(compose_config("scale=smoke")).start()
     assert torch.get_num_threads() == 1
+
+
+@pytest.mark.parametrize(("context", "name"), [("on_clock", "forward"), ("off_clock", "evaluation")])
+def test_the_seconds_of_a_failed_block_are_kept(tmp_path, clock, context, name):
+    run = RunContext(Mock(spec=RunInputs), tmp_path, Record("id", "task", "renderer", "dataset", 0, {}), silent)
+    with pytest.raises(ZeroDivisionError), getattr(run, context)():
+        clock.sleep(2.0)
+        _ = 1 / 0
+    assert run.record.seconds[name] == pytest.approx(2.0, abs=0.01)

@@ -7,6 +7,7 @@ import sys
 import time
 from multiprocessing import Pipe
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import psutil
 import pytest
@@ -80,6 +81,16 @@ def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
         wait_for(lambda: lines_of_curves(tmp_path / "r"), forked)
         assert at_work(tmp_path) and forked.send(signal.SIGKILL).code == -signal.SIGKILL
     wait_for(lambda: not at_work(tmp_path))
+
+
+def test_a_process_that_is_lost_before_the_first_measurement_of_its_memory_is_reported():
+    alive = iter((True, False))
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    pipes = [Pipe(), Pipe()]
+    lost = Mock(pid=ended.pid, sentinel=pipes[0][0], exitcode=-signal.SIGKILL, is_alive=lambda: next(alive))
+    failure = process._watch(lost, pipes[1][0], process.RunLimits(None, None), lambda message: None)
+    assert failure is not None and "ended by SIGKILL" in failure.reason
 
 
 def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(tmp_path, monkeypatch):
