@@ -17,10 +17,11 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import type_of
 from bench.progress import notice
 from bench.records.folder import Identity
-from bench.runner.compose import OPTIONAL_GROUPS, Composer, composing, parse_override, without_hydra
-from bench.runner.job import Interrupted, write_error_message
+from bench.runner.compose import Composer, composing, parse_override, without_hydra
+from bench.runner.library import OPTIONAL_GROUPS
+from bench.runner.messages import Interrupted, write_error_message
 from bench.runner.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
-from bench.runner.sweep import LauncherStopped, run_job_per_cell
+from bench.runner.sweep import LauncherStopped, work_per_cell
 from bench.tables import names, nearest
 
 DANGLING_COMMA = re.compile(r"[=,]\s*,|,\s*$")
@@ -45,16 +46,16 @@ FIELD_FILE_ALIASES = {"dataset.path: ": "field_path: ", "dataset.module.": "fiel
 KERNELS_VARIABLE = "IMPLICIT_BENCH_KERNELS"  # defined in renderers/kernels/library.py, which imports torch
 SWEEP_OPTIONS = ("--multirun", "-m")
 OPTIONS = (*SWEEP_OPTIONS, "--config-dir", "-cd", "--cfg", "-c", "--resolve", "--help", "-h")
-Job = Callable[[Identity], object]  # does the work of one configuration; returns the status if that is a run
+Work = Callable[[Identity], object]  # of one configuration; returns the status if that is a run
 Sweep = Callable[[Composer, DictConfig], list[str]]  # makes the runs of a sweep; returns their statuses
 
 
-def command_line(job: Job, sweep: Sweep | None = None) -> int:
+def command_line(work: Work, sweep: Sweep | None = None) -> int:
     """Runs the command line.
 
     Args:
-        job: does the work of a single configuration.
-        sweep: makes the runs of a sweep; None does `job` for each cell, in a command that makes no runs.
+        work: of a single configuration.
+        sweep: makes the runs of a sweep; None does `work` for each cell, in a command that makes no runs.
 
     Returns:
         the exit status: 0, 1 if a run did not end ok, or that of a mistake, which is printed on standard error.
@@ -64,7 +65,7 @@ def command_line(job: Job, sweep: Sweep | None = None) -> int:
     catch_signals()
     aliases = FIELD_FILE_ALIASES if "field=file" in sys.argv else {}
     try:
-        all_ok = _compose_and_run(sys.argv[1:], job, sweep)
+        all_ok = _compose_and_run(sys.argv[1:], work, sweep)
         raise_if_stopped()  # a library may have swallowed the exception
         return 0 if all_ok else EXIT_FAILURE
     except KeyboardInterrupt as error:
@@ -89,7 +90,7 @@ def command_line(job: Job, sweep: Sweep | None = None) -> int:
         forget_signals()
 
 
-def _compose_and_run(arguments: list[str], job: Job, sweep: Sweep | None) -> bool:
+def _compose_and_run(arguments: list[str], work: Work, sweep: Sweep | None) -> bool:
     """Composes the configuration and runs it; returns whether all runs ended ok.
 
     Raises:
@@ -109,7 +110,7 @@ def _compose_and_run(arguments: list[str], job: Job, sweep: Sweep | None) -> boo
             if sweep is not None:
                 return all(status == "ok" for status in sweep(composer, config))
             _refuse_plan(config)
-            return run_job_per_cell(composer, config, job)
+            return work_per_cell(composer, config, work)
         params = OmegaConf.select(config, "hydra.sweeper.params")
         os.environ |= {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
         identity = composer.single_run(config)
@@ -117,7 +118,7 @@ def _compose_and_run(arguments: list[str], job: Job, sweep: Sweep | None) -> boo
         _refuse_plan(identity.config)
     elif params:
         notice("note: this is one run; with -m in the command it is all runs of the table")
-    return job(identity) in (None, "ok")
+    return work(identity) in (None, "ok")
 
 
 def _refuse_plan(config: Any) -> None:

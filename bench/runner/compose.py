@@ -30,9 +30,9 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from bench.config import CLASS_PACKAGE_KEY, Config, type_of, wrong_type_message
 from bench.records.folder import Identity, identify, resolve_config
+from bench.runner.library import OPTIONAL_GROUPS
 from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
-OPTIONAL_GROUPS = ("method", "experiment")  # they take a plus: +method=NAME
 NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")
 REFERENCE_PATTERN = re.compile(r"\$\{.*(index|seed)", re.DOTALL)  # a value that may refer to index or seed
 

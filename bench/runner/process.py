@@ -20,7 +20,7 @@ import psutil
 import bench.tasks
 import datasets
 from bench.records.record import RunStatus
-from bench.runner.job import FinalRecordSent, Job, Message, Started, Step
+from bench.runner.messages import FinalRecordSent, Message, RunRequest, Started, Step
 
 POLL_INTERVAL_SECONDS = 0.05
 TERMINATION_GRACE_SECONDS = 0.5  # for a child to send its record after SIGTERM
@@ -58,8 +58,8 @@ class AbnormalExit:
     reason: str
 
 
-def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> AbnormalExit | None:
-    """Runs a job in a child process, and passes every message of the child to `receive` as it arrives.
+def run_isolated(request: RunRequest, limits: RunLimits, receive: Callable[[Message], None]) -> AbnormalExit | None:
+    """Runs a request in a child process, and passes every message of the child to `receive` as it arrives.
 
     Returns:
         None if the child sent its final record, else how it ended.
@@ -67,10 +67,10 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     context = warm_up()
     channel, child_channel = context.Pipe()
     child_lifeline, lifeline = context.Pipe(duplex=False)  # closes whenever this process ends, and the child notices
-    process = context.Process(target=_run_job, args=(job, child_channel, child_lifeline))
+    process = context.Process(target=_run, args=(request, child_channel, child_lifeline))
     with channel, lifeline:
         try:
-            with signals_delayed():  # an interrupted request would end the fork server
+            with signals_delayed():  # an interrupted start would end the fork server
                 process.start()
                 child_channel.close()
                 child_lifeline.close()
@@ -107,7 +107,7 @@ def warm_up() -> ForkServerContext:
     resource_tracker.ensure_running()  # here, because it unblocks the signal that is blocked below
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a new process inherits the mask
     try:
-        with signals_delayed():  # an interrupted request would end the server
+        with signals_delayed():  # an interrupted start would end the server
             forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -137,13 +137,13 @@ def _send_result(work: Callable[[Any], Any], argument: Any, sender: Connection) 
     sender.send(work(argument))
 
 
-def _run_job(job: Job, channel: Connection, lifeline: Connection) -> None:
+def _run(request: RunRequest, channel: Connection, lifeline: Connection) -> None:
     for module in preloaded_modules():  # before `Started`, so that the run's time excludes it
         with suppress(ImportError):
             import_module(module)
     from bench.runner.execute import main
 
-    main(job, channel, lifeline)
+    main(request, channel, lifeline)
 
 
 def _watch(
@@ -230,6 +230,11 @@ def _stop(number: int, frame: object) -> None:
     _stopped = "stopped by Ctrl-C" if number == signal.SIGINT else f"stopped by {signal.Signals(number).name}"
     if not _delayed:
         raise KeyboardInterrupt(_stopped)
+
+
+def stop_signal() -> str:
+    """The signal that stopped this command, in words; empty if there was none."""
+    return _stopped
 
 
 def stopped_by(error: BaseException) -> str:

@@ -14,7 +14,7 @@ import pytest
 
 from bench.records.record import Record
 from bench.runner import process
-from bench.runner.process import Job, Step
+from bench.runner.process import RunRequest, Step
 from tests.runner.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -97,8 +97,8 @@ def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(tmp_path
     calls = []
     monkeypatch.setattr(process, "import_module", calls.append)
     monkeypatch.setattr("bench.runner.execute.main", lambda *_: calls.append("main"))
-    job = Job(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
-    process._run_job(job, *Pipe())
+    request = RunRequest(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
+    process._run(request, *Pipe())
     assert calls == [*process.preloaded_modules(), "main"] and "open3d" in calls
 
 
