@@ -91,13 +91,13 @@ class Plan:
         return ended_record(self.results_dir / "runs" / cell.id, self.asked)
 
 
-def ended_record(folder: Path, asked: str) -> dict[str, Any] | None:
-    """The record of a run that was requested at the time `asked` or later, and has ended, else None."""
+def ended_record(folder: Path, since: str) -> dict[str, Any] | None:
+    """The record of a run that was requested at the time `since` or later, and has ended, else None."""
     try:
         record = read_record(folder)
     except (OSError, ValueError, RecursionError):
         return None
-    return record if record.get("ended") and record.get("asked", "") >= asked else None
+    return record if record.get("ended") and record.get("asked", "") >= since else None
 
 
 def read_plans(results_dir: Path) -> tuple[list[Plan], list[str]]:

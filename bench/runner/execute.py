@@ -7,7 +7,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import torch
 
 from bench.machine import environment
 from bench.progress import Report, notices_to
-from bench.records.record import Record, RunStatus, now
+from bench.records.record import Record, RunStatus, append_to_log, now
 from bench.runner.messages import FinalRecordSent, Notice, RunRequest, Started, Step, reason_of
 from bench.setup.inputs import RunContext, prepare_run
 from renderers.checks import BadInput
@@ -74,7 +73,7 @@ def execute(request: RunRequest, *, progress: Report, checkpoint: Callable[[Reco
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:
         record.status, record.reason = RunStatus.REFUSED, reason_of(error)
-        _append_to_log(folder, traceback.format_exc())
+        append_to_log(folder, f"{now()} {traceback.format_exc()}")
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, reason_of(error)
     except (MemoryError, torch.OutOfMemoryError) as error:
@@ -83,7 +82,7 @@ def execute(request: RunRequest, *, progress: Report, checkpoint: Callable[[Reco
         out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
         record.status = RunStatus.OOM if out_of_memory else RunStatus.CRASHED
         record.reason = reason_of(error, folder)
-        _append_to_log(folder, traceback.format_exc())
+        append_to_log(folder, f"{now()} {traceback.format_exc()}")
     finally:
         record.environment["waited_share"] = environment.waited_share(schedule_before)
         record.notes += environment.doubts(record)
@@ -125,9 +124,3 @@ def _redirect_output(path: Path) -> None:
     os.dup2(log, 1)
     os.dup2(log, 2)
     os.close(log)
-
-
-def _append_to_log(folder: Path, text: str) -> None:
-    """Adds a text to the run's log; on a full disk it is lost, but the record has the reason of a failure."""
-    with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
-        log.write(f"{now()} {text}\n")

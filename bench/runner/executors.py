@@ -27,10 +27,12 @@ Jobs = Sequence[Sequence[Identity]]  # the cells, in groups that one job of a cl
 Messages = Generator[list[str], None, None]  # of each cell or task that has ended
 EXTRA_BY_EXECUTOR = {"slurm": "submitit", "ray": "ray"}  # each extra has the name of its package
 # Keys of conf/hydra/launcher/slurm.yaml: those that submitit does not know, and those that all its clusters share.
-OUR_SETTINGS = {"executor", "cluster", "minutes_per_job", "minutes_per_run", "array_size"}
-OUR_SETTINGS |= {"submitit_folder", "max_num_timeout"}
-COMMON_SETTINGS = {"timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes", "name"}
-COMMON_SETTINGS |= {"stderr_to_stdout"}
+OUR_SETTINGS = (
+    *("executor", "cluster", "minutes_per_job", "minutes_per_run", "array_size", "submitit_folder", "max_num_timeout"),
+)
+COMMON_SETTINGS = (
+    *("timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes", "name", "stderr_to_stdout"),
+)
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,8 @@ class Launcher:
         variables = {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
         launcher = cls(str(config.hydra.runtime.choices["hydra/launcher"]), settings, variables)
         if launcher.executor not in EXECUTORS:
-            raise ValueError(
-                f"hydra.launcher.executor must be one of {', '.join(EXECUTORS)}, not {launcher.executor!r}"
-            )
+            options = ", ".join(EXECUTORS)
+            raise ValueError(f"hydra.launcher.executor must be one of {options}, not {launcher.executor!r}")
         if (extra := EXTRA_BY_EXECUTOR.get(launcher.executor)) is not None:
             try:
                 import_module(extra)

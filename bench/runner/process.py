@@ -26,6 +26,7 @@ POLL_INTERVAL_SECONDS = 0.05
 TERMINATION_GRACE_SECONDS = 0.5  # for a child to send its record after SIGTERM
 STARTUP_TIMEOUT_SECONDS = 120.0  # long, because a cold disk is slow
 GIB = 2**30
+Failure = tuple[RunStatus, str]  # the status and reason of a child that ended without a final record
 # Signals from outside: from a user, a batch system, or the operating system when memory runs out.
 EXTERNAL_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 # A signal is also stored, because an interrupted library may swallow or replace the exception.
@@ -50,15 +51,7 @@ class RunLimits:
         return 0.9 * machine_memory() if self.memory is None else self.memory * GIB
 
 
-@dataclass(frozen=True)
-class AbnormalExit:
-    """The status and reason of a child that ended without a final record."""
-
-    status: RunStatus
-    reason: str
-
-
-def run_isolated(request: RunRequest, limits: RunLimits, receive: Callable[[Message], None]) -> AbnormalExit | None:
+def run_isolated(request: RunRequest, limits: RunLimits, receive: Callable[[Message], None]) -> Failure | None:
     """Runs a request in a child process, and passes every message of the child to `receive` as it arrives.
 
     Returns:
@@ -148,7 +141,7 @@ def _run(request: RunRequest, channel: Connection, lifeline: Connection) -> None
 
 def _watch(
     process: BaseProcess, channel: Connection, limits: RunLimits, receive: Callable[[Message], None]
-) -> AbnormalExit | None:
+) -> Failure | None:
     start, is_ready, max_bytes = time.perf_counter(), False, limits.bytes
     phase = "while setting up"  # until the first step is reported
     while True:
@@ -172,14 +165,13 @@ def _watch(
             return _exit_reason(process)
         spent = time.perf_counter() - start
         if is_ready and limits.seconds is not None and spent > limits.seconds:
-            return AbnormalExit(RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {phase}")
+            return RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {phase}"
         if not is_ready and spent > STARTUP_TIMEOUT_SECONDS:
-            return AbnormalExit(RunStatus.CRASHED, f"its process was not ready within {STARTUP_TIMEOUT_SECONDS:g} s")
+            return RunStatus.CRASHED, f"its process was not ready within {STARTUP_TIMEOUT_SECONDS:g} s"
         with suppress(psutil.NoSuchProcess):
             if psutil.Process(process.pid).memory_info().rss > max_bytes:
                 process.kill()  # at once, before the machine runs out of memory
-                reason = f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {phase}"
-                return AbnormalExit(RunStatus.OOM, reason)
+                return RunStatus.OOM, f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {phase}"
 
 
 def _terminate(process: BaseProcess, channel: Connection, receive: Callable[[Message], None]) -> None:
@@ -197,16 +189,16 @@ def _terminate(process: BaseProcess, channel: Connection, receive: Callable[[Mes
     process.close()
 
 
-def _exit_reason(process: BaseProcess) -> AbnormalExit:
+def _exit_reason(process: BaseProcess) -> Failure:
     process.join()
     code = process.exitcode or 0
     if code >= 0:
-        return AbnormalExit(RunStatus.CRASHED, f"its process ended by itself, with exit status {code}")
+        return RunStatus.CRASHED, f"its process ended by itself, with exit status {code}"
     name = signal.Signals(-code).name
     if -code in EXTERNAL_SIGNALS:
         hint = "; the operating system does that where memory runs out" if -code == signal.SIGKILL else ""
-        return AbnormalExit(RunStatus.KILLED, f"its process was ended by {name}{hint}")
-    return AbnormalExit(RunStatus.CRASHED, f"its process died of {name} in native code")
+        return RunStatus.KILLED, f"its process was ended by {name}{hint}"
+    return RunStatus.CRASHED, f"its process died of {name} in native code"
 
 
 def machine_memory() -> int:

@@ -15,16 +15,8 @@ from bench.progress import Report, notice, run_progress
 from bench.records.folder import Identity, free_reserve, locked_folder, reusable_record
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.runner.messages import (
-    Interrupted,
-    Message,
-    Notice,
-    RunRequest,
-    Started,
-    Step,
-    reason_of,
-    write_error_message,
-)
+from bench.runner import messages
+from bench.runner.messages import Interrupted, RunRequest, reason_of, write_error_message
 from bench.runner.plan import planned_cell, refusal_reasons, show_plan
 from bench.runner.process import RunLimits, run_isolated, signals_delayed, stopped_by
 from bench.runner.summary import print_run_summary, write_log
@@ -181,20 +173,19 @@ def _execute(request: RunRequest, limits: RunLimits, progress: Report, on_ready:
         execute(request, progress=progress, checkpoint=lambda record: record.write(request.folder))
         return
 
-    def receive(message: Message) -> None:
-        if isinstance(message, Started):
+    def receive(message: messages.Message) -> None:
+        if isinstance(message, messages.Started):
             on_ready()
         elif isinstance(message, Record):
             vars(request.record).update(vars(message))
             request.record.write(request.folder)
-        elif isinstance(message, Step):
+        elif isinstance(message, messages.Step):
             progress(message.phase, message.finished, message.total, message.loss)
-        elif isinstance(message, Notice):
+        elif isinstance(message, messages.Notice):
             notice(message.text)
 
-    failure = run_isolated(request, limits, receive)
-    if failure is not None:
-        request.record.status, request.record.reason = failure.status, failure.reason
+    if (failure := run_isolated(request, limits, receive)) is not None:
+        request.record.status, request.record.reason = failure
 
 
 def _export(tracker: Tracker, folder: Path, record: Record) -> None:

@@ -39,13 +39,13 @@ class LauncherStopped(RuntimeError):
 
 @dataclass(frozen=True)
 class RunOnce:
-    """Runs a cell unless it has ended since `asked`, when its sweep was planned, so that a requeued job continues."""
+    """Runs a cell unless it has ended since its sweep was planned, so that a requeued job continues."""
 
-    asked: str
+    planned_at: str
 
     def __call__(self, identity: Identity) -> list[str]:
         """Returns a message if the cell has no record."""
-        record = ended_record(Path(identity.config["results_dir"]) / "runs" / identity.name, self.asked)
+        record = ended_record(Path(identity.config["results_dir"]) / "runs" / identity.name, self.planned_at)
         return run_cell(identity) if record is None or record["status"] == RunStatus.KILLED else []
 
 
@@ -149,33 +149,28 @@ def follow_progress(plan: Plan, reused: set[str]) -> Iterator[None]:
     Args:
         reused: ids of cells that take no time, because their finished run is reused.
     """
+    pending, failed, stop, start = {cell.id: cell for cell in plan.cells}, 0, threading.Event(), time.monotonic()
+    count = len(plan.cells)
     with display() as live:
-        task = live.add_task("sweep", total=len(plan.cells) - len(reused), status="")
-        pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
-        start = time.monotonic()
+        task = live.add_task("sweep", total=count - len(reused), status="")
 
-        def progress_prefix(finished: int) -> str:
-            """The text before a cell's line if there is no terminal; `finished` counts the cells that were run."""
-            if not live.disable:
-                return ""
-            parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
-            if finished and (to_run := len(pending.keys() - reused)):
+        def progress_prefix() -> str:
+            """The text before a cell's line if there is no terminal."""
+            parts = [f"{count - len(pending)}/{count}"]
+            if (finished := count - len(reused | pending.keys())) and (to_run := len(pending.keys() - reused)):
                 parts.append(f"{seconds((time.monotonic() - start) / finished * to_run)} left")
-            return f"[{', '.join(parts)}] "
-
-        def count_run() -> int:
-            return len(plan.cells) - len(reused | pending.keys())
+            return f"[{', '.join(parts)}] " if live.disable else ""
 
         def update() -> None:
             nonlocal failed
-            for cell in list(pending.values()):
+            for cell in [*pending.values()]:
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
                     overrides = " ".join(plan.distinct_overrides(cell))
-                    text = cell_line(plan.results_dir / "runs" / cell.id, record, overrides)
-                    print(progress_prefix(count_run()) + text, flush=True)
-            live.update(task, completed=count_run(), status=f"{failed} failed")
+                    line = cell_line(plan.results_dir / "runs" / cell.id, record, overrides)
+                    print(progress_prefix() + line, flush=True)
+            live.update(task, completed=count - len(reused | pending.keys()), status=f"{failed} failed")
 
         def follow() -> None:
             while not stop.wait(max(FOLLOW_INTERVAL_SECONDS, 1e-3 * len(pending))):

@@ -90,7 +90,7 @@ def test_a_process_that_is_lost_before_the_first_measurement_of_its_memory_is_re
     pipes = [Pipe(), Pipe()]
     lost = Mock(pid=ended.pid, sentinel=pipes[0][0], exitcode=-signal.SIGKILL, is_alive=lambda: next(alive))
     failure = process._watch(lost, pipes[1][0], process.RunLimits(None, None), lambda message: None)
-    assert failure is not None and "ended by SIGKILL" in failure.reason
+    assert failure is not None and "ended by SIGKILL" in failure[1]
 
 
 def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(tmp_path, monkeypatch):
