@@ -195,11 +195,11 @@ def quote_text(argument: str) -> str:
     return f"{setting[1]}={','.join(typed)}"
 
 
-def _print_error(message: str, code: int = EXIT_FAILURE) -> int:
+def _print_error(message: str, exit_status: int = EXIT_FAILURE) -> int:
     if any(argument.replace(" ", "").lower() == "verbose=true" for argument in sys.argv[1:]):
         traceback.print_exc()
     print(f"error: {message}", file=sys.stderr)
-    return code
+    return exit_status
 
 
 def message_of(error: Exception) -> str:

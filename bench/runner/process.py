@@ -84,8 +84,6 @@ def preloaded_modules() -> list[str]:
 
 def fork_server() -> ForkServerContext:
     """The context of processes that are forked from a server, which has imported the slow modules once for all."""
-    if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
-        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set another one
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(preloaded_modules())
     return context
