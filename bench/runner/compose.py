@@ -34,7 +34,7 @@ from bench.runner.library import OPTIONAL_GROUPS
 from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
 NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")
-REFERENCE_PATTERN = re.compile(r"\$\{[^}]*(index|seed)")  # in a value that may refer to index or seed
+INDEX_OR_SEED_REFERENCE = re.compile(r"\$\{[^}]*(index|seed)")
 
 
 class ChoiceSource(ConfigSource):
@@ -325,7 +325,7 @@ class Composer:
         cache_key = tuple(text.partition("=")[0] if NUMBER_OVERRIDE.fullmatch(text) else text for text in cell)
         if (resolved := self.resolved_cells.get(cache_key)) is None:
             config, resolved = self._resolve(cell)
-            if REFERENCE_PATTERN.search(str(OmegaConf.to_container(config))) is None:
+            if INDEX_OR_SEED_REFERENCE.search(str(OmegaConf.to_container(config))) is None:
                 self.resolved_cells[cache_key] = resolved
         overrides = [text for text in cell if parse_override(text).get_key_element() not in resolved.left_out]
         return identify(resolved.values | numbers, resolved.choices, overrides)
