@@ -226,16 +226,12 @@ class Composer:
     """Composes the configurations of a command line's cells; to be used within `composing`."""
 
     def __init__(self, texts: Sequence[str]) -> None:
-        overrides = [*map(parse_override, texts)]
-        hydra = [override for override in overrides if override.is_hydra_override()]
-        self.run_overrides = [str(override.input_line) for override in overrides if not override.is_hydra_override()]
+        self.overrides = [*map(parse_override, texts)]
+        hydra = [override for override in self.overrides if override.is_hydra_override()]
         self.hydra_choices = [str(override.input_line) for override in hydra if not sets_value(override)]
-        self.hydra_settings = [override for override in hydra if sets_value(override)]
-        for override in hydra:
-            if override.is_sweep_override():
-                raise ValueError(
-                    f"{override.key_or_group} has several values, but a sweep has one launcher: choose one"
-                )
+        self.run_overrides = [str(override.input_line) for override in self.overrides if override not in hydra]
+        if swept := [override.key_or_group for override in hydra if override.is_sweep_override()]:
+            raise ValueError(f"{swept[0]} has several values, but a sweep has one launcher: choose one")
         self.composed: dict[tuple[str, ...], tuple[DictConfig, dict[str, Any]]] = {}
         self.resolved_cells: dict[tuple[str, ...], ResolvedCells] = {}
         self.used_keys: set[str] = set()  # keys that at least one cell has
@@ -248,13 +244,12 @@ class Composer:
         Raises:
             ValueError: if a choice or a key of Hydra is unknown, or a value has the wrong type.
         """
-        fixed = [override for override in map(parse_override, self.run_overrides) if not override.is_sweep_override()]
-        config = compose_choices([*self.hydra_choices, *(str(o.input_line) for o in fixed if not sets_value(o))])
-        for override in self.hydra_settings:
-            if not set_value(override, config):
-                raise unknown_key(override.key_or_group, config)
+        fixed = [override for override in self.overrides if not override.is_sweep_override()]
+        config = compose_choices([str(override.input_line) for override in fixed if not sets_value(override)])
         for override in filter(sets_value, fixed):
             if not set_value(override, config):
+                if override.is_hydra_override():
+                    raise unknown_key(override.key_or_group, config)
                 self.lacking_keys.setdefault(override.key_or_group, config)
         return config
 
@@ -264,7 +259,7 @@ class Composer:
         Raises:
             ValueError: if a key is unknown or has several values, or a value is invalid.
         """
-        for override in map(parse_override, self.run_overrides):
+        for override in self.overrides:
             if override.is_sweep_override():
                 key, values = override.key_or_group, str(override.input_line).partition("=")[2]
                 quoted = f", write {key}=[{values}] for a list, or quote it where it is one value: '{key}=\"{values}\"'"
