@@ -130,15 +130,13 @@ def _run_by_workers(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
             for channel in wait([*workers]):
                 assert isinstance(channel, Connection)
                 try:
-                    messages = channel.recv()
+                    yield channel.recv()
                     channel.send(next(remaining, None))
                 except (EOFError, ConnectionError):  # the worker has received None, or is lost
                     process = workers.pop(channel)
                     process.join()
                     if process.exitcode:
                         raise RuntimeError(f"a worker ended with exit status {process.exitcode}") from None
-                else:
-                    yield messages
     finally:
         for process in workers.values():
             process.terminate()
