@@ -32,8 +32,8 @@ CLASS_PACKAGE_KEY = "_package_"  # key of the node `renderer`: the package of th
 PRIOR_DATASET_KEY = "of"  # key of the node `prior`: the dataset that it was trained on
 # Keys of a dataset or a task that other nodes refer to.
 FOLLOWED_KEYS = ("_prior_", "_field_", "_multiview_", "_similarity_", "_iterations_", "_silhouette_weight_")
-# All other keys of a node are arguments.
-RESERVED_KEYS = ("_target_", CLASS_PACKAGE_KEY, *FOLLOWED_KEYS, PRIOR_DATASET_KEY, LABEL_KEY, ROWS_KEY, LOOK_KEY)
+MARKS = (CLASS_PACKAGE_KEY, *FOLLOWED_KEYS, PRIOR_DATASET_KEY, LABEL_KEY, ROWS_KEY, LOOK_KEY)
+# All keys of a node except these and `_target_` are arguments.
 ROLE_OF_NODE = {  # the protocol or base class that the class of a node must have
     "task": "bench.setup.inputs.Task",
     "renderer": "renderers.rendering.Renderer",
@@ -219,7 +219,7 @@ def build(
         raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
     class_package = [str(node[CLASS_PACKAGE_KEY])] if name == "renderer" and CLASS_PACKAGE_KEY in node else []
     cls = find_class(node.get("_target_", target), name, [*packages, *class_package], role)
-    arguments = {str(key): value for key, value in node.items() if key not in RESERVED_KEYS}
+    arguments = {str(key): value for key, value in node.items() if key not in ("_target_", *MARKS)}
     argument_names = _argument_names(cls)
     for key in (key for key, value in node.items() if value == MISSING):
         raise ValueError(_missing_value_message(cls, name, str(key)))
@@ -313,7 +313,7 @@ def load(group: str, name: str, **arguments: Any) -> Any:
         raise ValueError(f"unknown {group} {name!r}{nearest(name, names(group))}")
     register_resolvers()  # otherwise only the command line registers them
     node = cast(DictConfig, OmegaConf.merge(_with_defaults(group, name), arguments))
-    for key in RESERVED_KEYS[1:]:
+    for key in MARKS:
         node.pop(key, None)
     return build(node, group, [arguments.get("_target_", "").split(".")[0]])  # a class named in Python is trusted
 

@@ -40,27 +40,27 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
         raise ValueError(f"{into} is a file: --into must be a folder, or a new name")
     check_links(into)
     (into / "runs").mkdir(parents=True, exist_ok=True)
-    lines, problems = list[str](), list[str]()
+    lines, faults = list[str](), list[str]()
     for source in sources:
-        attempts, problems_of_attempts = read_attempts(source)
-        problems += [f"{source}: not copied: {problem}" for problem in problems_of_attempts]
+        attempts, faults_of_attempts = read_attempts(source)
+        faults += [f"{source}: not copied: {fault}" for fault in faults_of_attempts]
         if attempts:
             write_attempts(attempts, into)
         for folder in [*run_folders(source), *sorted((source / "earlier").glob("[!.]*/"))]:
             if link := bad_link(folder, source):
-                problems.append(f"{folder}: not copied, since {link} is a link out of its results folder")
+                faults.append(f"{folder}: not copied, since {link} is a link out of its results folder")
             elif folder.parent.name == "earlier":
                 copy_atomically(into / "earlier" / folder.name, folder)
             else:
                 lines += _copy_run(folder, into)
-                if problem := read_run(folder, source)[1]:
-                    problems.append(f"{source}: {UNREADABLE}{problem}")
-        problems += [f"{source}: this plan cannot be read: {problem}" for problem in read_plans(source)[1]]
+                if fault := read_run(folder, source)[1]:
+                    faults.append(f"{source}: {UNREADABLE}{fault}")
+        faults += [f"{source}: this plan cannot be read: {fault}" for fault in read_plans(source)[1]]
         for plan in sorted((source / "sweeps").glob("*/plan.json")):  # plans of the same name have the same cells
             if not is_outside(plan, source):
                 (into / "sweeps" / plan.parent.name).mkdir(parents=True, exist_ok=True)
                 _keep_later(into / "sweeps" / plan.parent.name / plan.name, plan)
-    return lines, problems
+    return lines, faults
 
 
 def _keep_later(target: Path, path: Path) -> None:
@@ -118,14 +118,14 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--into", required=True, type=Path, metavar="FOLDER", help="where all of them go; may exist")
     options = parser.parse_args(arguments)
     try:
-        lines, problems = merge(options.sources, options.into)
-        for problem in problems:
-            print(f"warning: {problem}", file=sys.stderr)
+        lines, faults = merge(options.sources, options.into)
+        for fault in faults:
+            print(f"warning: {fault}", file=sys.stderr)
         print(*lines, write_index(options.into), sep="\n")
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return 1 if problems else 0
+    return 1 if faults else 0
 
 
 if __name__ == "__main__":

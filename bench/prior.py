@@ -14,10 +14,10 @@ def train(run: Identity) -> None:
     """
     from bench.machine.environment import flushing_denormals
     from bench.progress import run_progress
-    from bench.setup.inputs import build_cell
+    from bench.setup.inputs import prepare_run
     from bench.shape_prior import PriorSettings, prior_file
 
-    inputs = build_cell(run.config).inputs
+    inputs = prepare_run(run.config).inputs
     choice = inputs.prior_choice
     if not isinstance(choice.source, PriorSettings):
         raise ValueError("the codes of a network are the prior already: there is nothing to train")

@@ -14,19 +14,19 @@ def train(run: Identity) -> None:
     """
     from bench.machine.environment import flushing_denormals
     from bench.progress import run_progress
-    from bench.setup.inputs import build_cell
+    from bench.setup.inputs import prepare_run
     from bench.tasks.single_view.task import OneImage, describe_training
 
-    cell = build_cell(run.config)
-    if not isinstance(cell.task, OneImage):
+    prepared = prepare_run(run.config)
+    if not isinstance(prepared.task, OneImage):
         raise ValueError(
             "bench.train trains the network of task=single_view: python -m bench.train +method=single_view "
             "dataset=car; python -m bench.prior trains a prior"
         )
     with flushing_denormals(), run_progress("single_view") as progress:
-        cell.start()
-        inputs = cell.inputs
-        recipe = cell.task.recipe(inputs, run.config)
+        prepared.configure_process()
+        inputs = prepared.inputs
+        recipe = prepared.task.recipe(inputs, run.config)
         path = recipe.make(inputs.cache, inputs.device, progress)
     print(describe_training(recipe.load(path)[1]), file=sys.stderr)
     print(path)

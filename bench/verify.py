@@ -23,7 +23,7 @@ from bench.records.folder import Identity
 from bench.records.format import number, plural
 from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, bad_link, read_record
-from bench.setup.inputs import EvaluatesField, RunContext, build_cell
+from bench.setup.inputs import EvaluatesField, RunContext, prepare_run
 from datasets.files.field_files import load_field
 from datasets.saved_field import FIELD_FILE
 from renderers.checks import BadInput
@@ -121,12 +121,12 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.dev
         notes = [note for note in record.notes if FIELD_FILE in note]
         status = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
         raise NothingToCompare(notes[0] if notes else f"it has no {FIELD_FILE}, since it optimised no field{status}")
-    cell = build_cell(record.config)
-    cell.start()
-    field = load_field(folder, cell.inputs.device)
-    run = RunContext(cell.inputs, folder, record, lambda *_: None)
-    metrics = cell.task.field_metrics(field, run) if isinstance(cell.task, EvaluatesField) else None
-    return evaluate(State(field, cell.inputs)).metrics if metrics is None else metrics, cell.inputs.device
+    prepared = prepare_run(record.config)
+    prepared.configure_process()
+    field = load_field(folder, prepared.inputs.device)
+    run = RunContext(prepared.inputs, folder, record, lambda *_: None)
+    metrics = prepared.task.field_metrics(field, run) if isinstance(prepared.task, EvaluatesField) else None
+    return evaluate(State(field, prepared.inputs)).metrics if metrics is None else metrics, prepared.inputs.device
 
 
 def _relative_difference(first: float, second: float) -> float:

@@ -74,8 +74,8 @@ def recommendation() -> str:
         "run, in depth completion, "
         f"`{hard[0]}` is first, and {', '.join(near[:-1])} and {near[-1]} are not significantly behind. "
         "All others are. At the end of their runs, no two renderers can be distinguished. "
-        f"Over all problems, a run costs {costs[least]:.2g} (`{least}`) to {costs[most]:.2g} (`{most}`) times the "
-        "field evaluations of a DIST run."
+        f"Over all sets, a run needs {costs[least]:.2g} (`{least}`) to {costs[most]:.2g} (`{most}`) times the "
+        "field evaluations of a DIST run. The table has these ratios for completion alone."
     )
 
 

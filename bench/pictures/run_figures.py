@@ -20,7 +20,7 @@ from bench.evaluate.state import State, empty_view
 from bench.pictures import style
 from bench.pictures.size_chart import Candidates, panels
 from bench.pictures.style import MISSED, PIXEL_NAMES, PIXELS, SCREEN, SPURIOUS, bare, save, silhouette_image
-from bench.records.read import CHECKPOINT_METRICS, NOT_LOSS_TERMS
+from bench.records.read import NOT_LOSS_TERMS
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import Scene, Truth, View, see
@@ -105,9 +105,7 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
-        for name in dict.fromkeys(
-            name for line in curve for name in line if name not in (*NOT_LOSS_TERMS, *CHECKPOINT_METRICS)
-        ):
+        for name in dict.fromkeys(name for line in curve for name in line if name not in NOT_LOSS_TERMS):
             points = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
             if points:
                 axis.plot(*zip(*points, strict=True), label=name, lw=1.4)

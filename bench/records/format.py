@@ -76,17 +76,22 @@ def interval(low: float | None, high: float | None) -> str:
 
 
 def ends(
-    what: str, values: Mapping[str, float | None], n: str, *, show: Callable[[float], str] = number, most: bool = False
+    what: str,
+    values: Mapping[str, float | None],
+    n: str,
+    *,
+    show: Callable[[float], str] = number,
+    largest_first: bool = False,
 ) -> str:
     """A sentence with the best and the worst value and their rows; empty if no value is finite.
 
     Args:
         n: the sample in words.
         show: formats a value.
-        most: whether the largest value is the best; the best comes first.
+        largest_first: whether the largest value is the best, which comes first.
     """
     numbers = {row: value for row, value in values.items() if value is not None and not math.isnan(value)}
-    ordered = sorted(numbers, key=lambda row: -numbers[row] if most else numbers[row])
+    ordered = sorted(numbers, key=lambda row: -numbers[row] if largest_first else numbers[row])
     if not ordered or math.isinf(numbers[ordered[0]]):
         return ""
     best, worst = (f"{show(numbers[row])}" for row in (ordered[0], ordered[-1]))

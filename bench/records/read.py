@@ -31,8 +31,10 @@ RESULTS = "results/local"  # the default results folder; conf/config.yaml has th
 PLAN_FILE = "plan.json"
 NON_FINITE_STRINGS = ('"inf"', '"-inf"', '"nan"')
 CURVE_COST_KEYS = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "cost")
-NOT_LOSS_TERMS = (*CURVE_COST_KEYS, "chamfer_l1", "chamfer_l2")
-CHECKPOINT_METRICS = ("psnr", "seen_chamfer_l1", "rotation_error_deg", "translation_error", "success")
+NOT_LOSS_TERMS = (
+    *CURVE_COST_KEYS,
+    *("chamfer_l1", "chamfer_l2", "psnr", "seen_chamfer_l1", "rotation_error_deg", "translation_error", "success"),
+)
 PAGE_FOLDERS = ("page", "base", "parts", "views", "data", "list", "run", "mesh")
 SUBFOLDERS = ("runs", "sweeps", "earlier", "paper", "suite", ".locks", *PAGE_FOLDERS)
 # The files and folders of a results folder that this project writes.
@@ -86,18 +88,23 @@ class Plan:
 
     def record(self, cell: PlannedCell) -> dict[str, Any] | None:
         """The record of a cell, if it was requested after the plan was made and has ended, else None."""
-        try:
-            record = read_record(self.results_dir / "runs" / cell.id)
-        except (OSError, ValueError, RecursionError):
-            return None
-        return record if record.get("ended") and record.get("asked", "") >= self.asked else None
+        return ended_record(self.results_dir / "runs" / cell.id, self.asked)
+
+
+def ended_record(folder: Path, since: str) -> dict[str, Any] | None:
+    """The record of a run that was requested at the time `since` or later, and has ended, else None."""
+    try:
+        record = read_record(folder)
+    except (OSError, ValueError, RecursionError):
+        return None
+    return record if record.get("ended") and record.get("asked", "") >= since else None
 
 
 def read_plans(results_dir: Path) -> tuple[list[Plan], list[str]]:
     """All plans of a results folder, and a message for each plan that cannot be read."""
     paths = sorted((results_dir / "sweeps").glob(f"*/{PLAN_FILE}"))
     pairs = [_read_plan(path, results_dir) for path in paths]
-    return [plan for plan, _ in pairs if plan is not None], [problem for _, problem in pairs if problem]
+    return [plan for plan, _ in pairs if plan is not None], [fault for _, fault in pairs if fault]
 
 
 def _read_plan(path: Path, results_dir: Path) -> tuple[Plan | None, str]:
@@ -130,19 +137,19 @@ def read_records(results_dir: Path) -> tuple[list[dict[str, Any]], list[str]]:
         ValueError: if `results_dir` is not a folder, or one of its folders or files is a link that leads out of it.
     """
     check_results(results_dir)
-    records, problems, shared_nodes = list[dict[str, Any]](), list[str](), dict[bytes, Any]()
+    records, faults, shared_nodes = list[dict[str, Any]](), list[str](), dict[bytes, Any]()
     for folder in run_folders(results_dir):
-        record, problem = read_run(folder, results_dir)
+        record, fault = read_run(folder, results_dir)
         if record is not None:
             records.append(_deduplicate(record, shared_nodes))
-        if problem:
-            problems.append(problem)
+        if fault:
+            faults.append(fault)
     folders = {record["folder"] for record in records}
-    plans, plan_problems = read_plans(results_dir)
+    plans, plan_faults = read_plans(results_dir)
     missing = {cell.id: not_run_record(cell, plan) for plan in plans for cell in plan.cells if cell.id not in folders}
     records.extend(missing.values())
     records.sort(key=started, reverse=True)
-    return records, problems + plan_problems
+    return records, faults + plan_faults
 
 
 def _deduplicate(record: dict[str, Any], nodes: dict[bytes, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -279,6 +279,12 @@ def curve_file(folder: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
     """Opens `folder/curve.jsonl` and yields a function that writes a line, which is in the file at once."""
     with (folder / "curve.jsonl").open("w", buffering=1, encoding="utf-8") as curve:
         yield lambda line: curve.write(json.dumps(to_json_values(line), allow_nan=False) + "\n")
+
+
+def append_to_log(folder: Path, text: str) -> None:
+    """Adds a text to a run's `log.txt`; on a full disk it is lost, but the record has the reason of a failure."""
+    with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
+        log.write(f"{text}\n")
 
 
 def to_json(data: Any) -> str:

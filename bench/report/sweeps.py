@@ -223,7 +223,7 @@ def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict
     metric, is_higher_better = headings[lead], better_direction(lead) == HIGHER
     values = {row: metric.factor * interval.value for row, interval in interval_by_row.items()}
     shapes = format.plural(len({records.solid(run) for run in sweep.runs.records}), "shape")
-    verdict = [format.ends(f"Median {metric.label}", values, shapes, most=is_higher_better)]
+    verdict = [format.ends(f"Median {metric.label}", values, shapes, largest_first=is_higher_better)]
     best = dict[str, str]()
     for dataset in sweep.datasets:
         intervals = {line["row"]: line[_on(lead, dataset)] for line in lines}

@@ -7,7 +7,6 @@ import traceback
 from argparse import ArgumentError, ArgumentParser, Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
@@ -17,10 +16,11 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.config import type_of
 from bench.progress import notice
 from bench.records.folder import Identity
-from bench.runner.compose import OPTIONAL_GROUPS, Composer, composing, parse_override, without_hydra
-from bench.runner.job import Interrupted, write_error_message
+from bench.runner.compose import Composer, composing, parse_override, without_hydra
+from bench.runner.library import OPTIONAL_GROUPS
+from bench.runner.messages import Interrupted, write_error_message
 from bench.runner.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
-from bench.runner.sweep import LauncherStopped, run_job_per_cell
+from bench.runner.sweep import LauncherStopped, work_per_cell
 from bench.tables import names, nearest
 
 DANGLING_COMMA = re.compile(r"[=,]\s*,|,\s*$")
@@ -45,51 +45,48 @@ FIELD_FILE_ALIASES = {"dataset.path: ": "field_path: ", "dataset.module.": "fiel
 KERNELS_VARIABLE = "IMPLICIT_BENCH_KERNELS"  # defined in renderers/kernels/library.py, which imports torch
 SWEEP_OPTIONS = ("--multirun", "-m")
 OPTIONS = (*SWEEP_OPTIONS, "--config-dir", "-cd", "--cfg", "-c", "--resolve", "--help", "-h")
-Job = Callable[[Identity], object]  # does the work of one configuration; returns the status if that is a run
+Work = Callable[[Identity], object]  # of one configuration; returns the status if that is a run
 Sweep = Callable[[Composer, DictConfig], list[str]]  # makes the runs of a sweep; returns their statuses
 
 
-def command_line(job: Job, sweep: Sweep | None = None) -> int:
+def command_line(work: Work, sweep: Sweep | None = None) -> int:
     """Runs the command line.
 
     Args:
-        job: does the work of a single configuration.
-        sweep: makes the runs of a sweep; None does `job` for each cell, in a command that makes no runs.
+        work: of a single configuration.
+        sweep: makes the runs of a sweep; None does `work` for each cell, in a command that makes no runs.
 
     Returns:
         the exit status: 0, 1 if a run did not end ok, or that of a mistake, which is printed on standard error.
     """
-    if (text := _help_text(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
-        return _print(text)
     catch_signals()
-    aliases = FIELD_FILE_ALIASES if "field=file" in sys.argv else {}
     try:
-        all_ok = _compose_and_run(sys.argv[1:], job, sweep)
+        if (text := _help_text(sys.argv[1:], sys.modules["__main__"].__doc__ or "")) is not None:
+            print(text, flush=True)
+            return 0
+        all_ok = _compose_and_run(sys.argv[1:], work, sweep)
         raise_if_stopped()  # a library may have swallowed the exception
         return 0 if all_ok else EXIT_FAILURE
-    except KeyboardInterrupt as error:
-        return _report_stop(error)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is also an OSError
         text = message_of(error)
-        for key, alias in aliases.items():
+        for key, alias in FIELD_FILE_ALIASES.items() if "field=file" in sys.argv else ():
             text = text.replace(key, alias)
         return _print_error(_add_file(text), EXIT_USAGE)
     except BrokenPipeError:  # `| head` reads only a part
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return EXIT_FAILURE
-    except OSError as error:
-        return _report_stop(error) if stopped_by(error) else _print_error(write_error_message(error))
-    except LauncherStopped as error:
-        return _print_error(str(error))
-    except Exception as error:
-        if stopped_by(error):  # a library turned the signal into another error
-            return _report_stop(error)
+    except (KeyboardInterrupt, Exception) as error:
+        if stopped := stopped_by(error):  # also if a library turned the signal into another error
+            text = stopped if isinstance(error, Interrupted) else f"{stopped}; nothing was run"
+            return _print_error(text, EXIT_INTERRUPTED)
+        if isinstance(error, OSError | LauncherStopped):
+            return _print_error(write_error_message(error) if isinstance(error, OSError) else str(error))
         raise
     finally:
         forget_signals()
 
 
-def _compose_and_run(arguments: list[str], job: Job, sweep: Sweep | None) -> bool:
+def _compose_and_run(arguments: list[str], work: Work, sweep: Sweep | None) -> bool:
     """Composes the configuration and runs it; returns whether all runs ended ok.
 
     Raises:
@@ -105,31 +102,18 @@ def _compose_and_run(arguments: list[str], job: Job, sweep: Sweep | None) -> boo
             composer.check_keys()
             print(OmegaConf.to_yaml(without_hydra(config), resolve=options.resolve), end="")
             return True
+        if sweep is None and config.plan:
+            raise ValueError("plan=true lists runs, and this command starts none: remove it")
         if options.multirun or config.hydra.mode == RunMode.MULTIRUN:
             if sweep is not None:
                 return all(status == "ok" for status in sweep(composer, config))
-            _refuse_plan(config)
-            return run_job_per_cell(composer, config, job)
+            return work_per_cell(composer, config, work)
         params = OmegaConf.select(config, "hydra.sweeper.params")
         os.environ |= {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
         identity = composer.single_run(config)
-    if sweep is None:
-        _refuse_plan(identity.config)
-    elif params:
+    if params and sweep is not None:
         notice("note: this is one run; with -m in the command it is all runs of the table")
-    return job(identity) in (None, "ok")
-
-
-def _refuse_plan(config: Any) -> None:
-    """Raises ValueError if plan=true is set in a command that makes no runs."""
-    if config["plan"]:
-        raise ValueError("plan=true lists runs, and this command starts none: remove it")
-
-
-def _report_stop(error: BaseException) -> int:
-    """Prints the signal that stopped the command; returns the exit status."""
-    text = stopped_by(error)
-    return _print_error(text if isinstance(error, Interrupted) else f"{text}; nothing was run", EXIT_INTERRUPTED)
+    return work(identity) in (None, "ok")
 
 
 def _help_text(arguments: list[str], about: str) -> str | None:
@@ -140,15 +124,6 @@ def _help_text(arguments: list[str], about: str) -> str | None:
     groups = ("task", "renderer", "dataset", "scale") if is_help else LISTED_GROUPS
     listed = "\n".join(f"{group}: {', '.join(_choice_names(group))}" for group in groups)
     return f"{about.strip()}\n{HELP}\n\n{listed}" if is_help else listed
-
-
-def _print(text: str) -> int:
-    """Prints a text, of which `| head` may read only a part; returns the exit status."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    return 0
 
 
 def options_of(arguments: list[str]) -> Namespace:
@@ -220,11 +195,11 @@ def quote_text(argument: str) -> str:
     return f"{setting[1]}={','.join(typed)}"
 
 
-def _print_error(message: str, code: int = EXIT_FAILURE) -> int:
+def _print_error(message: str, exit_status: int = EXIT_FAILURE) -> int:
     if any(argument.replace(" ", "").lower() == "verbose=true" for argument in sys.argv[1:]):
         traceback.print_exc()
     print(f"error: {message}", file=sys.stderr)
-    return code
+    return exit_status
 
 
 def message_of(error: Exception) -> str:

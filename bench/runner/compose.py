@@ -30,11 +30,11 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from bench.config import CLASS_PACKAGE_KEY, Config, type_of, wrong_type_message
 from bench.records.folder import Identity, identify, resolve_config
+from bench.runner.library import OPTIONAL_GROUPS
 from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
-OPTIONAL_GROUPS = ("method", "experiment")  # they take a plus: +method=NAME
 NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")
-REFERENCE_PATTERN = re.compile(r"\$\{.*(index|seed)", re.DOTALL)  # a value that may refer to index or seed
+INDEX_OR_SEED_REFERENCE = re.compile(r"\$\{[^}]*(index|seed)")
 
 
 class ChoiceSource(ConfigSource):
@@ -214,14 +214,6 @@ def dotted_keys(node: Any, prefix: str = "") -> list[str]:
 
 
 @dataclass(frozen=True)
-class ComposedChoices:
-    """The composition of a combination of choices, without Hydra's node, and the names of all choices by group."""
-
-    config: DictConfig
-    choices: dict[str, Any]
-
-
-@dataclass(frozen=True)
 class ResolvedCells:
     """The resolved configuration of cells that differ only in `index` or `seed`, and the keys left out."""
 
@@ -234,17 +226,13 @@ class Composer:
     """Composes the configurations of a command line's cells; to be used within `composing`."""
 
     def __init__(self, texts: Sequence[str]) -> None:
-        overrides = [*map(parse_override, texts)]
-        hydra = [override for override in overrides if override.is_hydra_override()]
-        self.run_overrides = [str(override.input_line) for override in overrides if not override.is_hydra_override()]
+        self.overrides = [*map(parse_override, texts)]
+        hydra = [override for override in self.overrides if override.is_hydra_override()]
         self.hydra_choices = [str(override.input_line) for override in hydra if not sets_value(override)]
-        self.hydra_settings = [override for override in hydra if sets_value(override)]
-        for override in hydra:
-            if override.is_sweep_override():
-                raise ValueError(
-                    f"{override.key_or_group} has several values, but a sweep has one launcher: choose one"
-                )
-        self.composed: dict[tuple[str, ...], ComposedChoices] = {}
+        self.run_overrides = [str(override.input_line) for override in self.overrides if override not in hydra]
+        if swept := [override.key_or_group for override in hydra if override.is_sweep_override()]:
+            raise ValueError(f"{swept[0]} has several values, but a sweep has one launcher: choose one")
+        self.composed: dict[tuple[str, ...], tuple[DictConfig, dict[str, Any]]] = {}
         self.resolved_cells: dict[tuple[str, ...], ResolvedCells] = {}
         self.used_keys: set[str] = set()  # keys that at least one cell has
         self.lacking_keys: dict[str, DictConfig] = {}  # by key: a configuration without it
@@ -256,13 +244,12 @@ class Composer:
         Raises:
             ValueError: if a choice or a key of Hydra is unknown, or a value has the wrong type.
         """
-        fixed = [override for override in map(parse_override, self.run_overrides) if not override.is_sweep_override()]
-        config = compose_choices([*self.hydra_choices, *(str(o.input_line) for o in fixed if not sets_value(o))])
-        for override in self.hydra_settings:
-            if not set_value(override, config):
-                raise unknown_key(override.key_or_group, config)
+        fixed = [override for override in self.overrides if not override.is_sweep_override()]
+        config = compose_choices([str(override.input_line) for override in fixed if not sets_value(override)])
         for override in filter(sets_value, fixed):
             if not set_value(override, config):
+                if override.is_hydra_override():
+                    raise unknown_key(override.key_or_group, config)
                 self.lacking_keys.setdefault(override.key_or_group, config)
         return config
 
@@ -272,12 +259,15 @@ class Composer:
         Raises:
             ValueError: if a key is unknown or has several values, or a value is invalid.
         """
-        for override in map(parse_override, self.run_overrides):
+        for override in self.overrides:
             if override.is_sweep_override():
-                raise _several_values_error(override)
+                key, values = override.key_or_group, str(override.input_line).partition("=")[2]
+                quoted = f", write {key}=[{values}] for a list, or quote it where it is one value: '{key}=\"{values}\"'"
+                hint = quoted if sets_value(override) else ""
+                raise ValueError(f"{key} has several values: add -m for a run of each{hint}")
         self.check_keys()
-        parts = _without_hydra_node(config)
-        return identify(resolve_config(parts.config, parts.choices), parts.choices, self.run_overrides)
+        config, choices = _split_off_choices(config)
+        return identify(resolve_config(config, choices), choices, self.run_overrides)
 
     def swept(self, config: DictConfig) -> list[list[str]]:
         """The overrides of each cell of the sweep with the configuration `shared_config`.
@@ -330,7 +320,7 @@ class Composer:
         cache_key = tuple(text.partition("=")[0] if NUMBER_OVERRIDE.fullmatch(text) else text for text in cell)
         if (resolved := self.resolved_cells.get(cache_key)) is None:
             config, resolved = self._resolve(cell)
-            if not _has_reference(OmegaConf.to_container(config)):
+            if INDEX_OR_SEED_REFERENCE.search(str(OmegaConf.to_container(config))) is None:
                 self.resolved_cells[cache_key] = resolved
         overrides = [text for text in cell if parse_override(text).get_key_element() not in resolved.left_out]
         return identify(resolved.values | numbers, resolved.choices, overrides)
@@ -342,9 +332,9 @@ class Composer:
         overrides = [override for override in overrides if override.get_key_element() not in left_out]
         choices = tuple(str(override.input_line) for override in overrides if not sets_value(override))
         if choices not in self.composed:
-            self.composed[choices] = _without_hydra_node(compose_choices([*self.hydra_choices, *choices]))
-        parts = self.composed[choices]
-        config = deepcopy(parts.config)
+            self.composed[choices] = _split_off_choices(compose_choices([*self.hydra_choices, *choices]))
+        shared_config, names = self.composed[choices]
+        config = deepcopy(shared_config)
         for override in filter(sets_value, overrides):
             key = override.key_or_group
             if set_value(override, config):
@@ -352,7 +342,7 @@ class Composer:
             else:
                 left_out.add(key)
                 self.lacking_keys.setdefault(key, config)
-        return config, ResolvedCells(resolve_config(config, parts.choices), parts.choices, left_out)
+        return config, ResolvedCells(resolve_config(config, names), names, left_out)
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
@@ -363,17 +353,10 @@ def without_hydra(config: DictConfig) -> DictConfig:
     return config
 
 
-def _without_hydra_node(config: DictConfig) -> ComposedChoices:
+def _split_off_choices(config: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
+    """The configuration without Hydra's node, and the names of all choices by group."""
     choices: Any = OmegaConf.to_container(config.hydra.runtime.choices)
-    return ComposedChoices(without_hydra(config), choices)
-
-
-def _several_values_error(override: Override) -> ValueError:
-    """The error for a key with several values in a command that makes one run."""
-    key, values = override.key_or_group, str(override.input_line).partition("=")[2]
-    text = f"{key} has several values: add -m for a run of each"
-    quoted = f", write {key}=[{values}] for a list, or quote it where it is one value: '{key}=\"{values}\"'"
-    return ValueError(text + quoted if sets_value(override) else text)
+    return without_hydra(config), choices
 
 
 def _needs_class(group: str, name: Any) -> bool:
@@ -395,10 +378,3 @@ def _keys_for_custom(overrides: Sequence[Override], groups: set[str]) -> set[str
     others = [group for group in groups if f"{group}._target_" in keys and not _needs_class(group, keys.get(group))]
     left_out = {key for key in keys for group in others if key.startswith((f"{group}._target_", f"+{group}."))}
     return left_out | ({"label"} if others else set())
-
-
-def _has_reference(node: Any) -> bool:
-    """Whether a value of a configuration may refer to `index` or `seed`."""
-    if isinstance(node, dict | list):
-        return any(map(_has_reference, node.values() if isinstance(node, dict) else node))
-    return REFERENCE_PATTERN.search(str(node)) is not None

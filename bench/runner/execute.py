@@ -7,7 +7,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -15,17 +14,17 @@ import torch
 
 from bench.machine import environment
 from bench.progress import Report, notices_to
-from bench.records.record import Record, RunStatus, now
-from bench.runner.job import FinalRecordSent, Job, Notice, Started, Step, reason_of
-from bench.setup.inputs import RunContext, build_cell
+from bench.records.record import Record, RunStatus, append_to_log, now
+from bench.runner.messages import FinalRecordSent, Notice, RunRequest, Started, Step, reason_of
+from bench.setup.inputs import RunContext, prepare_run
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 
 PROGRESS_INTERVAL_SECONDS = 0.05
 
 
-def main(job: Job, channel: Connection, parent: Connection) -> None:
-    """Runs a job to its end in the process of a run; its output goes to the job's log.
+def main(request: RunRequest, channel: Connection, parent: Connection) -> None:
+    """Runs a request to its end in the process of a run; its output goes to `log.txt`.
 
     Args:
         parent: the reading end of a pipe that only the parent holds open, and never writes to.
@@ -33,22 +32,22 @@ def main(job: Job, channel: Connection, parent: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
     signal.signal(signal.SIGTERM, _stop)
     _exit_with_parent(parent)
-    _redirect_output(job.folder / "log.txt")
+    _redirect_output(request.folder / "log.txt")
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:
-        execute(job, progress=_Progress(channel), checkpoint=channel.send)
+        execute(request, progress=_Progress(channel), checkpoint=channel.send)
     except KeyboardInterrupt:
-        channel.send(job.record)  # as far as it is filled; then ends by SIGTERM, so that the exit code is right
+        channel.send(request.record)  # as far as it is filled; then ends by SIGTERM, so that the exit code is right
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTERM)
-    channel.send(job.record)
+    channel.send(request.record)
     channel.send(FinalRecordSent())
 
 
 @environment.flushing_denormals()
-def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None]) -> None:
-    """Runs a job; its record gets a status, and a reason if that is not ok.
+def execute(request: RunRequest, *, progress: Report, checkpoint: Callable[[Record], None]) -> None:
+    """Runs a request; its record gets a status, and a reason if that is not ok.
 
     Args:
         checkpoint: receives the record as soon as the machine is known.
@@ -56,25 +55,25 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
     Raises:
         KeyboardInterrupt: if the run was stopped; the record is filled as far as possible.
     """
-    folder, record = job.folder, job.record
+    folder, record = request.folder, request.record
     schedule_before = environment.scheduled()
     try:
         try:
-            cell = build_cell(record.config, progress=progress)
+            prepared = prepare_run(record.config, progress=progress)
         except (ValueError, OSError) as error:  # the configuration is invalid
             raise BadInput(reason_of(error)) from error
-        cell.start()
-        inputs = cell.inputs
+        prepared.configure_process()
+        inputs = prepared.inputs
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
         checkpoint(record)
         try:
-            cell.task.execute(RunContext(inputs, folder, record, progress))
+            prepared.task.execute(RunContext(inputs, folder, record, progress))
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:
         record.status, record.reason = RunStatus.REFUSED, reason_of(error)
-        _append_to_log(folder, traceback.format_exc())
+        append_to_log(folder, f"{now()} {traceback.format_exc()}")
     except Unsupported as error:
         record.status, record.reason = RunStatus.UNSUPPORTED, reason_of(error)
     except (MemoryError, torch.OutOfMemoryError) as error:
@@ -83,7 +82,7 @@ def execute(job: Job, *, progress: Report, checkpoint: Callable[[Record], None])
         out_of_memory = "DefaultCPUAllocator: can't allocate" in str(error)
         record.status = RunStatus.OOM if out_of_memory else RunStatus.CRASHED
         record.reason = reason_of(error, folder)
-        _append_to_log(folder, traceback.format_exc())
+        append_to_log(folder, f"{now()} {traceback.format_exc()}")
     finally:
         record.environment["waited_share"] = environment.waited_share(schedule_before)
         record.notes += environment.doubts(record)
@@ -125,9 +124,3 @@ def _redirect_output(path: Path) -> None:
     os.dup2(log, 1)
     os.dup2(log, 2)
     os.close(log)
-
-
-def _append_to_log(folder: Path, text: str) -> None:
-    """Adds a text to the run's log; on a full disk it is lost, but the record has the reason of a failure."""
-    with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
-        log.write(f"{now()} {text}\n")

@@ -2,9 +2,11 @@
 
 import os
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import chain
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -17,10 +19,12 @@ from omegaconf import DictConfig, OmegaConf
 from bench.progress import notice
 from bench.records.folder import Identity
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
-from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed, stopped_by
+from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed, stop_signal
 from datasets.extras import install_command
 
 Make = Callable[[Identity], list[str]]  # runs a cell; returns messages if it leaves no record
+Jobs = Sequence[Sequence[Identity]]  # the cells, in groups that one job of a cluster runs one after another
+Messages = Generator[list[str], None, None]  # of each cell or task that has ended
 EXTRA_BY_EXECUTOR = {"slurm": "submitit", "ray": "ray"}  # each extra has the name of its package
 # Keys of conf/hydra/launcher/slurm.yaml: those that submitit does not know, and those that all its clusters share.
 OUR_SETTINGS = (
@@ -56,9 +60,8 @@ class Launcher:
         variables = {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
         launcher = cls(str(config.hydra.runtime.choices["hydra/launcher"]), settings, variables)
         if launcher.executor not in EXECUTORS:
-            raise ValueError(
-                f"hydra.launcher.executor must be one of {', '.join(EXECUTORS)}, not {launcher.executor!r}"
-            )
+            options = ", ".join(EXECUTORS)
+            raise ValueError(f"hydra.launcher.executor must be one of {options}, not {launcher.executor!r}")
         if (extra := EXTRA_BY_EXECUTOR.get(launcher.executor)) is not None:
             try:
                 import_module(extra)
@@ -85,11 +88,8 @@ class Launcher:
         return 1
 
 
-def execute(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+def execute(make: Make, jobs: Jobs, launcher: Launcher) -> bool:
     """Runs all cells; returns whether each left a record. Errors are printed as they occur.
-
-    Args:
-        jobs: the cells, in groups that one job of a cluster runs one after another.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM.
@@ -98,28 +98,30 @@ def execute(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) 
     if not jobs:
         return True
     os.environ |= launcher.variables
-    return EXECUTORS[launcher.executor](make, jobs, launcher)
+    with closing(EXECUTORS[launcher.executor](make, jobs, launcher)) as results:
+        return print_errors(results)
 
 
-def _print_errors(messages: Sequence[str]) -> bool:
-    """Prints the error messages of cells; returns whether there are none."""
-    for text in messages:
+def print_errors(results: Iterable[list[str]]) -> bool:
+    """Prints the error messages of cells as they end; returns whether there are none."""
+    succeeded = True
+    for text in chain.from_iterable(results):
         notice(f"error: {text}")
-    return not messages
+        succeeded = False
+    return succeeded
 
 
-def _run_in_turn(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
-    succeeded = []
-    for identity in (identity for job in jobs for identity in job):
-        succeeded.append(_print_errors(make(identity)))
+def run_in_turn(make: Make, cells: Iterable[Identity]) -> Messages:
+    """Runs cells in this process."""
+    for identity in cells:
+        yield make(identity)
         raise_if_stopped()  # a library may have swallowed the exception
-    return all(succeeded)
 
 
-def _run_by_workers(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+def _run_by_workers(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
     """Runs cells in processes of this machine, each one cell at a time."""
-    cells = [identity for job in jobs for identity in job]
-    remaining, succeeded = iter(cells), []
+    cells = [*chain.from_iterable(jobs)]
+    remaining = iter(cells)
     workers = dict(_start_worker(make) for _ in range(min(launcher.concurrency, len(cells))))
     try:
         for channel in workers:
@@ -128,7 +130,7 @@ def _run_by_workers(make: Make, jobs: Sequence[Sequence[Identity]], launcher: La
             for channel in wait([*workers]):
                 assert isinstance(channel, Connection)
                 try:
-                    succeeded.append(_print_errors(channel.recv()))
+                    yield channel.recv()
                     channel.send(next(remaining, None))
                 except (EOFError, ConnectionError):  # the worker has received None, or is lost
                     process = workers.pop(channel)
@@ -140,7 +142,6 @@ def _run_by_workers(make: Make, jobs: Sequence[Sequence[Identity]], launcher: La
             process.terminate()
         for process in workers.values():
             process.join()
-    return all(succeeded)
 
 
 def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
@@ -192,20 +193,18 @@ class PackedJob:
         try:
             for identity in self.cells[job.global_rank :: job.num_tasks]:
                 messages += self.make(identity)
-        except KeyboardInterrupt as error:
-            reason = stopped_by(error).removeprefix("killed: ").partition(";")[0]
-            messages.append(f"job {job.job_id}: {reason}; the same command goes on")
+        except KeyboardInterrupt:
+            messages.append(f"job {job.job_id}: {stop_signal()}; the same command goes on")
         return messages
 
 
-def _run_by_slurm(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+def _run_by_slurm(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
     """Runs the cells in one array of jobs after another."""
-    executor, size, succeeded = _submitit_executor(launcher.settings), launcher.settings["array_size"], []
+    executor, size = _submitit_executor(launcher.settings), launcher.settings["array_size"]
     packed_jobs = [PackedJob(make, job, str(Path.cwd()), launcher.variables) for job in jobs]
     for start in range(0, len(packed_jobs), size):
         for job in executor.submit_array(packed_jobs[start : start + size]):
-            succeeded += [_print_errors(_task_messages(job.task(task))) for task in range(job.num_tasks)]
-    return all(succeeded)
+            yield from (_task_messages(job.task(task)) for task in range(job.num_tasks))
 
 
 def _submitit_executor(settings: dict[str, Any]) -> Any:
@@ -231,19 +230,18 @@ def _task_messages(task: Any) -> list[str]:
         return [f"job {task.job_id} was lost; {task.paths.stderr} may say why; the same command goes on"]
 
 
-def _run_by_ray(make: Make, jobs: Sequence[Sequence[Identity]], launcher: Launcher) -> bool:
+def _run_by_ray(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
     """Runs each cell in a Ray task."""
     import ray
 
-    settings, succeeded = launcher.settings["ray"], []
+    settings = launcher.settings["ray"]
     if not ray.is_initialized():
         ray.init(**settings["init"])
     remote, folder = ray.remote(**settings["remote"])(_make_in_folder), str(Path.cwd())
-    pending = [remote.remote(make, identity, folder, launcher.variables) for job in jobs for identity in job]
+    pending = [remote.remote(make, cell, folder, launcher.variables) for cell in chain.from_iterable(jobs)]
     while pending:
         ended, pending = ray.wait(pending)
-        succeeded += [_print_errors(ray.get(task)) for task in ended]
-    return all(succeeded)
+        yield from map(ray.get, ended)
 
 
 def _make_in_folder(make: Make, identity: Identity, folder: str, variables: dict[str, str]) -> list[str]:
@@ -253,4 +251,9 @@ def _make_in_folder(make: Make, identity: Identity, folder: str, variables: dict
     return make(identity)
 
 
-EXECUTORS = {"basic": _run_in_turn, "workers": _run_by_workers, "slurm": _run_by_slurm, "ray": _run_by_ray}
+EXECUTORS: dict[str, Callable[[Make, Jobs, Launcher], Messages]] = {
+    "basic": lambda make, jobs, launcher: run_in_turn(make, chain.from_iterable(jobs)),
+    "workers": _run_by_workers,
+    "slurm": _run_by_slurm,
+    "ray": _run_by_ray,
+}

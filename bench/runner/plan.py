@@ -1,6 +1,6 @@
 """Checks all runs of a sweep before the first one starts; `plan=true` lists them with an estimate of their duration.
 
-A check builds the configuration with the same code as the run, `bench.setup.inputs.build_cell`.
+A check builds the configuration with the same code as the run, `bench.setup.inputs.prepare_run`.
 """
 
 import io
@@ -16,7 +16,7 @@ from bench.records.folder import Identity, reusable_record
 from bench.records.format import plural, seconds
 from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import digest, row_name
-from bench.runner.job import reason_of
+from bench.runner.messages import reason_of
 from bench.runner.process import run_in_child
 
 # Statuses of runs whose duration says nothing about similar runs.
@@ -52,11 +52,11 @@ def is_reused(plan: Plan, cell: PlannedCell) -> bool:
 
 def refusal_reason(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
     """Why the run of a configuration would be refused; empty if it would start, or fail in another way."""
-    from bench.setup.inputs import build_cell  # it imports torch
+    from bench.setup.inputs import prepare_run  # it imports torch
 
     try:
         with redirect_stdout(io.StringIO()):  # classes of the user may print
-            build_cell(config, built)
+            prepare_run(config, built)
     except (ValueError, OSError) as error:
         return reason_of(error)
     except (Exception, SystemExit):  # noqa: BLE001 - a class of the user; the run will record the error

@@ -20,12 +20,13 @@ import psutil
 import bench.tasks
 import datasets
 from bench.records.record import RunStatus
-from bench.runner.job import FinalRecordSent, Job, Message, Started, Step
+from bench.runner.messages import FinalRecordSent, Message, RunRequest, Started, Step
 
 POLL_INTERVAL_SECONDS = 0.05
 TERMINATION_GRACE_SECONDS = 0.5  # for a child to send its record after SIGTERM
 STARTUP_TIMEOUT_SECONDS = 120.0  # long, because a cold disk is slow
 GIB = 2**30
+Failure = tuple[RunStatus, str]  # the status and reason of a child that ended without a final record
 # Signals from outside: from a user, a batch system, or the operating system when memory runs out.
 EXTERNAL_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 # A signal is also stored, because an interrupted library may swallow or replace the exception.
@@ -50,16 +51,8 @@ class RunLimits:
         return 0.9 * machine_memory() if self.memory is None else self.memory * GIB
 
 
-@dataclass(frozen=True)
-class AbnormalExit:
-    """The status and reason of a child that ended without a final record."""
-
-    status: RunStatus
-    reason: str
-
-
-def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]) -> AbnormalExit | None:
-    """Runs a job in a child process, and passes every message of the child to `receive` as it arrives.
+def run_isolated(request: RunRequest, limits: RunLimits, receive: Callable[[Message], None]) -> Failure | None:
+    """Runs a request in a child process, and passes every message of the child to `receive` as it arrives.
 
     Returns:
         None if the child sent its final record, else how it ended.
@@ -67,10 +60,10 @@ def run_isolated(job: Job, limits: RunLimits, receive: Callable[[Message], None]
     context = warm_up()
     channel, child_channel = context.Pipe()
     child_lifeline, lifeline = context.Pipe(duplex=False)  # closes whenever this process ends, and the child notices
-    process = context.Process(target=_run_job, args=(job, child_channel, child_lifeline))
+    process = context.Process(target=_run, args=(request, child_channel, child_lifeline))
     with channel, lifeline:
         try:
-            with signals_delayed():  # an interrupted request would end the fork server
+            with signals_delayed():  # an interrupted start would end the fork server
                 process.start()
                 child_channel.close()
                 child_lifeline.close()
@@ -91,8 +84,6 @@ def preloaded_modules() -> list[str]:
 
 def fork_server() -> ForkServerContext:
     """The context of processes that are forked from a server, which has imported the slow modules once for all."""
-    if multiprocessing.get_start_method(allow_none=True) not in (None, *multiprocessing.get_all_start_methods()):
-        multiprocessing.set_start_method("forkserver", force=True)  # joblib's workers set another one
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(preloaded_modules())
     return context
@@ -107,7 +98,7 @@ def warm_up() -> ForkServerContext:
     resource_tracker.ensure_running()  # here, because it unblocks the signal that is blocked below
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a new process inherits the mask
     try:
-        with signals_delayed():  # an interrupted request would end the server
+        with signals_delayed():  # an interrupted start would end the server
             forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -137,22 +128,20 @@ def _send_result(work: Callable[[Any], Any], argument: Any, sender: Connection) 
     sender.send(work(argument))
 
 
-def _run_job(job: Job, channel: Connection, lifeline: Connection) -> None:
+def _run(request: RunRequest, channel: Connection, lifeline: Connection) -> None:
     for module in preloaded_modules():  # before `Started`, so that the run's time excludes it
         with suppress(ImportError):
             import_module(module)
     from bench.runner.execute import main
 
-    main(job, channel, lifeline)
+    main(request, channel, lifeline)
 
 
 def _watch(
     process: BaseProcess, channel: Connection, limits: RunLimits, receive: Callable[[Message], None]
-) -> AbnormalExit | None:
+) -> Failure | None:
     start, is_ready, max_bytes = time.perf_counter(), False, limits.bytes
     phase = "while setting up"  # until the first step is reported
-    with suppress(psutil.NoSuchProcess):
-        memory = psutil.Process(process.pid)
     while True:
         raise_if_stopped()
         wait([channel, process.sentinel], timeout=POLL_INTERVAL_SECONDS)
@@ -174,14 +163,13 @@ def _watch(
             return _exit_reason(process)
         spent = time.perf_counter() - start
         if is_ready and limits.seconds is not None and spent > limits.seconds:
-            return AbnormalExit(RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {phase}")
+            return RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {phase}"
         if not is_ready and spent > STARTUP_TIMEOUT_SECONDS:
-            return AbnormalExit(RunStatus.CRASHED, f"its process was not ready within {STARTUP_TIMEOUT_SECONDS:g} s")
+            return RunStatus.CRASHED, f"its process was not ready within {STARTUP_TIMEOUT_SECONDS:g} s"
         with suppress(psutil.NoSuchProcess):
-            if memory.memory_info().rss > max_bytes:
+            if psutil.Process(process.pid).memory_info().rss > max_bytes:
                 process.kill()  # at once, before the machine runs out of memory
-                reason = f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {phase}"
-                return AbnormalExit(RunStatus.OOM, reason)
+                return RunStatus.OOM, f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {phase}"
 
 
 def _terminate(process: BaseProcess, channel: Connection, receive: Callable[[Message], None]) -> None:
@@ -199,16 +187,16 @@ def _terminate(process: BaseProcess, channel: Connection, receive: Callable[[Mes
     process.close()
 
 
-def _exit_reason(process: BaseProcess) -> AbnormalExit:
+def _exit_reason(process: BaseProcess) -> Failure:
     process.join()
     code = process.exitcode or 0
     if code >= 0:
-        return AbnormalExit(RunStatus.CRASHED, f"its process ended by itself, with exit status {code}")
+        return RunStatus.CRASHED, f"its process ended by itself, with exit status {code}"
     name = signal.Signals(-code).name
     if -code in EXTERNAL_SIGNALS:
         hint = "; the operating system does that where memory runs out" if -code == signal.SIGKILL else ""
-        return AbnormalExit(RunStatus.KILLED, f"its process was ended by {name}{hint}")
-    return AbnormalExit(RunStatus.CRASHED, f"its process died of {name} in native code")
+        return RunStatus.KILLED, f"its process was ended by {name}{hint}"
+    return RunStatus.CRASHED, f"its process died of {name} in native code"
 
 
 def machine_memory() -> int:
@@ -232,6 +220,11 @@ def _stop(number: int, frame: object) -> None:
     _stopped = "stopped by Ctrl-C" if number == signal.SIGINT else f"stopped by {signal.Signals(number).name}"
     if not _delayed:
         raise KeyboardInterrupt(_stopped)
+
+
+def stop_signal() -> str:
+    """The signal that stopped this command, in words; empty if there was none."""
+    return _stopped
 
 
 def stopped_by(error: BaseException) -> str:

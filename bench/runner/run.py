@@ -15,7 +15,8 @@ from bench.progress import Report, notice, run_progress
 from bench.records.folder import Identity, free_reserve, locked_folder, reusable_record
 from bench.records.read import Plan
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.runner.job import Interrupted, Job, Message, Notice, Started, Step, reason_of, write_error_message
+from bench.runner import messages
+from bench.runner.messages import Interrupted, RunRequest, reason_of, write_error_message
 from bench.runner.plan import planned_cell, refusal_reasons, show_plan
 from bench.runner.process import RunLimits, run_isolated, signals_delayed, stopped_by
 from bench.runner.summary import print_run_summary, write_log
@@ -110,7 +111,7 @@ def run(identity: Identity) -> tuple[Path, Record]:
             return folder, _reuse(folder, finished)
         hashes = {"config_hash": identity.config_hash, "code": identity.code}
         settings = {"seed": config["seed"], "config": config, "overrides": identity.overrides}
-        return folder, _start_run(Job(folder, Record(identity.name, **identity.choices, **settings, **hashes)))
+        return folder, _start_run(RunRequest(folder, Record(identity.name, **identity.choices, **settings, **hashes)))
 
 
 def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
@@ -122,9 +123,9 @@ def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
     return record
 
 
-def _start_run(job: Job) -> Record:
-    """Runs a job; the record has the status killed until the end, then the final status."""
-    folder, record = job.folder, job.record
+def _start_run(request: RunRequest) -> Record:
+    """Runs a request; the record has the status killed until the end, then the final status."""
+    folder, record = request.folder, request.record
     started, stopped, tracker = time.perf_counter(), "", None
 
     def restart_clock() -> None:
@@ -138,7 +139,7 @@ def _start_run(job: Job) -> Record:
         tracker = build(config["tracker"], "tracker", config["packages"])
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
         with run_progress(record.name) as progress:
-            _run_job(job, limits, progress, restart_clock)
+            _execute(request, limits, progress, restart_clock)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness, such as a full disk
         stopped = stopped_by(error)
         record.status, record.reason = RunStatus.CRASHED, reason_of(error, folder)
@@ -160,32 +161,31 @@ def _start_run(job: Job) -> Record:
     return record
 
 
-def _run_job(job: Job, limits: RunLimits, progress: Report, on_ready: Callable[[], None]) -> None:
-    """Runs the job in a child process or, for debugging, in this one, and fills its record.
+def _execute(request: RunRequest, limits: RunLimits, progress: Report, on_ready: Callable[[], None]) -> None:
+    """Runs the request in a child process or, for debugging, in this one, and fills its record.
 
     Args:
         on_ready: called when the child has imported its modules.
     """
-    if job.record.config["isolation"] == Isolation.off:
+    if request.record.config["isolation"] == Isolation.off:
         from bench.runner.execute import execute  # imports torch, which a launcher's worker does not need
 
-        execute(job, progress=progress, checkpoint=lambda record: record.write(job.folder))
+        execute(request, progress=progress, checkpoint=lambda record: record.write(request.folder))
         return
 
-    def receive(message: Message) -> None:
-        if isinstance(message, Started):
+    def receive(message: messages.Message) -> None:
+        if isinstance(message, messages.Started):
             on_ready()
         elif isinstance(message, Record):
-            vars(job.record).update(vars(message))
-            job.record.write(job.folder)
-        elif isinstance(message, Step):
+            vars(request.record).update(vars(message))
+            request.record.write(request.folder)
+        elif isinstance(message, messages.Step):
             progress(message.phase, message.finished, message.total, message.loss)
-        elif isinstance(message, Notice):
+        elif isinstance(message, messages.Notice):
             notice(message.text)
 
-    failure = run_isolated(job, limits, receive)
-    if failure is not None:
-        job.record.status, job.record.reason = failure.status, failure.reason
+    if (failure := run_isolated(request, limits, receive)) is not None:
+        request.record.status, request.record.reason = failure
 
 
 def _export(tracker: Tracker, folder: Path, record: Record) -> None:

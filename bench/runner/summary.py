@@ -3,7 +3,6 @@
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from rich.table import Table
 from bench.records.format import count, number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.read import RESULTS, Plan
-from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus
+from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus, append_to_log
 
 CUSTOM_RENDERER = "custom"  # the choice of renderer for a class of the user
 # See CONTRIBUTING.md.
@@ -50,19 +49,18 @@ def print_sweep_summary(plan: Plan, index: Path, table: Path | None = None) -> l
     Args:
         table: the file of the sweep's table, if it has one.
     """
-    statuses = [record["status"] if (record := plan.record(cell)) else NOT_RUN for cell in plan.cells]
+    records = [plan.record(cell) for cell in plan.cells]
+    statuses = [record["status"] if record else NOT_RUN for record in records]
     counts = ", ".join(f"{count} {status}" for status, count in Counter(statuses).most_common())
     print(f"{len(plan.cells)} planned: {counts}")
     if set(statuses) - {"ok", "unsupported"}:
         print("the same command runs what was not run or was killed; with rerun=failed, also the cells that failed")
-    failures = [(cell, record) for cell in plan.cells if (record := plan.record(cell)) and record["status"] != "ok"]
-    for cell, record in failures[:1]:
-        print(f"first failure: {index.parent / 'runs' / cell.id} ({record['status']}: {record['reason']})")
+    for record in [record for record in records if record and record["status"] != "ok"][:1]:
+        print(f"first failure: {index.parent / 'runs' / record['folder']} ({record['status']}: {record['reason']})")
     if table is not None:
         print(f"table of this sweep: {table}")
     print(f"report: {index}")
-    records = [record for cell in plan.cells if (record := plan.record(cell)) and not record["reused"]]
-    _print_contract_test(index.parent / "runs", records)
+    _print_contract_test(index.parent / "runs", [record for record in records if record and not record["reused"]])
     _print_report_command(index.parent)
     print(plan.folder)
     return statuses
@@ -83,9 +81,8 @@ def _print_report_command(results_dir: Path) -> None:
 
 
 def write_log(folder: Path, record: Record) -> None:
-    """Appends the command, the machine and the results of a run to its `log.txt`, unless the disk is full."""
-    with suppress(OSError), (folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as log:
-        log.writelines(f"{line}\n" for line in _log_lines(record))
+    """Appends the command, the machine and the results of a run to its `log.txt`."""
+    append_to_log(folder, "\n".join(_log_lines(record)))
 
 
 def _log_lines(record: Record) -> Iterator[str]:

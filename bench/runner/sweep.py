@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ from bench.progress import display, notice
 from bench.records.folder import Identity
 from bench.records.format import number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
-from bench.records.read import Plan
+from bench.records.read import Plan, ended_record
 from bench.records.record import RunStatus, row_name
 from bench.runner.compose import Composer
-from bench.runner.executors import Launcher, execute
-from bench.runner.job import Interrupted, reason_of
+from bench.runner.executors import Launcher, execute, print_errors, run_in_turn
 from bench.runner.jobs import check_jobs, describe_jobs, split_into_jobs
-from bench.runner.plan import check_plan, identity_of, is_reused, plan_of, planned_cell, show_plan
+from bench.runner.messages import Interrupted, reason_of
+from bench.runner.plan import check_plan, identity_of, is_reused, plan_of, show_plan
 from bench.runner.process import stopped_by, warm_up
 from bench.runner.run import run_cell
 
@@ -41,11 +41,11 @@ class LauncherStopped(RuntimeError):
 class RunOnce:
     """Runs a cell unless it has ended since its sweep was planned, so that a requeued job continues."""
 
-    plan: Plan
+    planned_at: str
 
     def __call__(self, identity: Identity) -> list[str]:
         """Returns a message if the cell has no record."""
-        record = self.plan.record(planned_cell(identity))
+        record = ended_record(Path(identity.config["results_dir"]) / "runs" / identity.name, self.planned_at)
         return run_cell(identity) if record is None or record["status"] == RunStatus.KILLED else []
 
 
@@ -104,12 +104,12 @@ def _print_plan(plan: Plan, reused: set[str], launcher: Launcher) -> None:
 
 def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
     """Makes all runs of a plan by the executor; this process marks the reused runs as requested."""
-    make, jobs = RunOnce(replace(plan, cells=[])), [[cell] for cell in plan.cells]
+    make, cells = RunOnce(plan.asked), plan.cells
     try:
         if launcher.executor != "basic":
-            finished = [identity_of(cell) for cell in plan.cells if cell.id in reused]
-            execute(make, [finished], replace(launcher, settings={}))
-            jobs = [[cell] for cell in plan.cells if cell.id not in reused]
+            print_errors(run_in_turn(make, [identity_of(cell) for cell in cells if cell.id in reused]))
+            cells = [cell for cell in cells if cell.id not in reused]
+        jobs = [[cell] for cell in cells]
         if launcher.packs_runs and (jobs := split_into_jobs(plan, launcher.settings, reused)):
             notice(describe_jobs(jobs, launcher.settings))
         execute(make, [[*map(identity_of, job)] for job in jobs], launcher)
@@ -121,20 +121,20 @@ def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
         raise LauncherStopped(f"the launcher stopped: {reason_of(error)}; the same command goes on") from error
 
 
-def run_job_per_cell(composer: Composer, config: DictConfig, job: Callable[[Identity], object]) -> bool:
-    """Does a job that is not a run, for each cell of a sweep; returns whether all succeeded.
+def work_per_cell(composer: Composer, config: DictConfig, work: Callable[[Identity], object]) -> bool:
+    """Does work that is not a run, for each cell of a sweep; returns whether all succeeded.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM.
         ValueError: if the sweep is invalid.
     """
     cells = composer.cells(composer.swept(config))
-    return execute(partial(_run_job, job), [[cell] for cell in cells], Launcher.of(config))
+    return execute(partial(_work, work), [[cell] for cell in cells], Launcher.of(config))
 
 
-def _run_job(job: Callable[[Identity], object], identity: Identity) -> list[str]:
+def _work(work: Callable[[Identity], object], identity: Identity) -> list[str]:
     try:
-        job(identity)
+        work(identity)
     except (OSError, ValueError) as error:
         return [reason_of(error)]
     return []
@@ -149,33 +149,28 @@ def follow_progress(plan: Plan, reused: set[str]) -> Iterator[None]:
     Args:
         reused: ids of cells that take no time, because their finished run is reused.
     """
+    pending, failed, stop, start = {cell.id: cell for cell in plan.cells}, 0, threading.Event(), time.monotonic()
+    count = len(plan.cells)
     with display() as live:
-        task = live.add_task("sweep", total=len(plan.cells) - len(reused), status="")
-        pending, failed, stop = {cell.id: cell for cell in plan.cells}, 0, threading.Event()
-        start = time.monotonic()
+        task = live.add_task("sweep", total=count - len(reused), status="")
 
-        def progress_prefix(finished: int) -> str:
-            """The text before a cell's line if there is no terminal; `finished` counts the cells that were run."""
-            if not live.disable:
-                return ""
-            parts = [f"{len(plan.cells) - len(pending)}/{len(plan.cells)}"]
-            if finished and (to_run := len(pending.keys() - reused)):
+        def progress_prefix() -> str:
+            """The text before a cell's line if there is no terminal."""
+            parts = [f"{count - len(pending)}/{count}"]
+            if (finished := count - len(reused | pending.keys())) and (to_run := len(pending.keys() - reused)):
                 parts.append(f"{seconds((time.monotonic() - start) / finished * to_run)} left")
-            return f"[{', '.join(parts)}] "
-
-        def count_run() -> int:
-            return len(plan.cells) - len(reused | pending.keys())
+            return f"[{', '.join(parts)}] " if live.disable else ""
 
         def update() -> None:
             nonlocal failed
-            for cell in list(pending.values()):
+            for cell in [*pending.values()]:
                 if record := plan.record(cell):
                     del pending[cell.id]
                     failed += record["status"] != "ok"
                     overrides = " ".join(plan.distinct_overrides(cell))
-                    text = cell_line(plan.results_dir / "runs" / cell.id, record, overrides)
-                    print(progress_prefix(count_run()) + text, flush=True)
-            live.update(task, completed=count_run(), status=f"{failed} failed")
+                    line = cell_line(plan.results_dir / "runs" / cell.id, record, overrides)
+                    print(progress_prefix() + line, flush=True)
+            live.update(task, completed=count - len(reused | pending.keys()), status=f"{failed} failed")
 
         def follow() -> None:
             while not stop.wait(max(FOLLOW_INTERVAL_SECONDS, 1e-3 * len(pending))):

@@ -1,6 +1,6 @@
 """The objects of a run: its task, the task's inputs, and the run in progress.
 
-Only `build_cell` turns a configuration into objects: for the check of a sweep, and for each run.
+Only `prepare_run` turns a configuration into objects: for the check of a sweep, and for each run.
 """
 
 import time
@@ -101,23 +101,19 @@ class RunInputs:
                 f"prior.path=FOLDER; {remedy}"
             )
 
-    def check_fitted(self) -> int:
-        """The index of the scene's shape among the codes of the prior.
-
-        Raises:
-            BadInput: the prior was not trained on the scene's shape.
-        """
+    def check_fitted(self) -> None:
+        """Raises BadInput if the prior was not trained on the scene's shape."""
         if self.prior_choice.scene_code is None:
             raise BadInput(
                 "the task renders a network at the shape that it was fitted to: add +experiment=fitted, or set "
                 "dataset=network dataset.path=FILE for a network of yours"
             )
-        return self.prior_choice.scene_code
 
     def fitted(self) -> Prior:
         """The prior with the code of the scene's shape alone; raises as `check_fitted` does."""
-        code = self.check_fitted()
-        return Prior(self.prior.decoder, self.prior.codes[code : code + 1])
+        self.check_fitted()
+        index = self.prior_choice.scene_code
+        return Prior(self.prior.decoder, self.prior.codes[index : index + 1])
 
 
 @dataclass(frozen=True)
@@ -133,16 +129,19 @@ class RunContext:
     def on_clock(self) -> Iterator[None]:
         """Context for a method without a loop: its seconds count as forward seconds."""
         clock = time.perf_counter()
-        yield
-        self.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
+        try:
+            yield
+        finally:
+            self.record.seconds |= {"forward": time.perf_counter() - clock, "backward": 0.0}
 
     @contextmanager
     def off_clock(self) -> Iterator[None]:
         """Context for work outside of the loop: its seconds count as evaluation seconds."""
-        clock = time.perf_counter()
-        yield
-        seconds = self.record.seconds
-        seconds["evaluation"] = seconds.get("evaluation", 0.0) + time.perf_counter() - clock
+        clock, seconds = time.perf_counter(), self.record.seconds
+        try:
+            yield
+        finally:
+            seconds["evaluation"] = seconds.get("evaluation", 0.0) + time.perf_counter() - clock
 
 
 @runtime_checkable
@@ -181,18 +180,18 @@ class EvaluatesField(Protocol):
 
 
 @dataclass(frozen=True)
-class Cell:
+class PreparedRun:
     """A task and its inputs, built and checked without any slow step.
 
     Args:
-        threads: of the CPU; None: see `start`.
+        threads: of the CPU; None: see `configure_process`.
     """
 
     task: Task
     inputs: RunInputs
     threads: int | None
 
-    def start(self) -> None:
+    def configure_process(self) -> None:
         """Sets the threads and the seed of this process.
 
         Without `threads`, a narrow network takes one thread, and others take PyTorch's default. Evaluations of a narrow
@@ -204,7 +203,9 @@ class Cell:
         torch.manual_seed(self.inputs.seed)
 
 
-def build_cell(config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None) -> Cell:
+def prepare_run(
+    config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None
+) -> PreparedRun:
     """Builds and checks everything that a configuration names, before the first slow step.
 
     Args:
@@ -238,7 +239,7 @@ def build_cell(config: Node, built: dict[str, Any] | None = None, *, progress: R
         notes=(*notes, *prior.notes),
     )
     _check(task, inputs, index)
-    return Cell(task, inputs, threads)
+    return PreparedRun(task, inputs, threads)
 
 
 @dataclass(frozen=True)

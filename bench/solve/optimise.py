@@ -66,8 +66,8 @@ class OptimiserSettings:
 
 
 @runtime_checkable
-class Objective(Protocol):
-    """The function that the optimisation loop minimises. `counts` counts every field evaluation of `loss`."""
+class Optimisable(Protocol):
+    """Parameters and their loss, which the optimisation loop minimises. `counts` counts all its field evaluations."""
 
     parameters: list[Tensor]
     counts: Counts
@@ -79,31 +79,31 @@ class Objective(Protocol):
 
 @dataclass
 class FirstChecked:
-    """An objective that checks the hits of its renderings at the first loss, the warm-up of `optimise`.
+    """A problem that checks the hits of its renderings at the first loss, the warm-up of `optimise`.
 
     The check evaluates the field once. This is neither counted nor timed.
 
     Args:
-        problem: the objective.
+        problem: the problem without the check.
         notes: receives a note if hits lie off the surface; the run continues.
     """
 
-    problem: Objective
+    problem: Optimisable
     notes: list[str]
     checked: bool = False
 
     @property
     def parameters(self) -> list[Tensor]:
-        """The objective's parameters."""
+        """The problem's parameters."""
         return self.problem.parameters
 
     @property
     def counts(self) -> Counts:
-        """The objective's counts."""
+        """The problem's counts."""
         return self.problem.counts
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
-        """The objective's loss.
+        """The problem's loss.
 
         Raises:
             BrokenContract: the first loss is a number, but the distance of a hit is not finite or is negative.
@@ -134,7 +134,7 @@ class History:
 
 
 def optimise(
-    problem: Objective,
+    problem: Optimisable,
     settings: OptimiserSettings,
     device: torch.device,
     *,

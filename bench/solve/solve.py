@@ -19,7 +19,7 @@ from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.optimise import CannotContinue, FirstChecked, History, Objective, OptimiserSettings, optimise
+from bench.solve.optimise import CannotContinue, FirstChecked, History, Optimisable, OptimiserSettings, optimise
 from datasets.mesh import Mesh
 from datasets.saved_field import FIELD_FILE, save_field
 from datasets.scene import Scene
@@ -52,7 +52,7 @@ COST_DEFINITIONS = {
 
 
 @runtime_checkable
-class Problem(Objective, Protocol):
+class Problem(Optimisable, Protocol):
     """An inverse problem: its unknown, and the evaluation and drawing of its state."""
 
     tracked: tuple[str, ...]  # metrics that each checkpoint writes into the curve

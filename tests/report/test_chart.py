@@ -100,6 +100,9 @@ def test_what_is_infinite_is_above_all_that_its_axis_shows(shared, edge):
 def test_a_verdict_has_the_best_and_the_worst_row_and_none_where_nothing_is_finite():
     values = {"a": 2.0, "b": math.inf, "c": 1.0, "d": None, "e": math.nan}
     assert ends("Error", values, "3 shapes") == "Error: *1.00* (c) to ∞ (b); n = 3 shapes."
-    assert ends("Score", {"a": 2.0, "c": 1.0}, "3 shapes", most=True) == "Score: *2.00* (a) to 1.00 (c); n = 3 shapes."
+    assert (
+        ends("Score", {"a": 2.0, "c": 1.0}, "3 shapes", largest_first=True)
+        == "Score: *2.00* (a) to 1.00 (c); n = 3 shapes."
+    )
     assert ends("Error", {"a": 2.0}, "1 shape") == "Error: *2.00* (a); n = 1 shape."
     assert ends("Error", {"b": math.inf}, "3 shapes") == ends("Error", {}, "3 shapes") == ""

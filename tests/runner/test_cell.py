@@ -1,15 +1,17 @@
 """A configuration becomes objects, each node once; and a run takes its threads."""
 
 from collections import Counter
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 from bench import config as config_module
 from bench.machine.environment import using_threads
-from bench.setup.inputs import build_cell
+from bench.records.record import Record
+from bench.setup.inputs import RunContext, RunInputs, prepare_run
 from renderers.checks import BadInput
-from tests.tiny import cell_from, plain
+from tests.tiny import cell_from, plain, silent
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +35,7 @@ def built(monkeypatch) -> Counter[str]:
 
 
 def test_a_run_builds_each_node_once(compose_config, built):
-    build_cell(plain(compose_config("scale=smoke")))
+    prepare_run(plain(compose_config("scale=smoke")))
     assert set(built.values()) == {1}
     assert {"task", "renderer", "view", "dataset", "evaluation", "prior", "models"} <= set(built)
 
@@ -44,7 +46,7 @@ def test_a_node_that_cells_share_is_built_once_also_an_invalid_one(compose_confi
     wrong = valid | {"renderer": valid["renderer"] | {"steps": 0}}
     for config in (valid, wrong, valid | {"index": 3}, wrong):
         try:
-            build_cell(config, shared)
+            prepare_run(config, shared)
         except ValueError as error:
             reasons.append(str(error))
     assert reasons == ["steps must be at least 1, not 0: the paper uses 50 to 100"] * 2
@@ -62,7 +64,7 @@ def test_a_shape_has_a_code_of_the_prior_if_its_training_had_the_shape(compose_c
 def test_a_narrow_network_takes_one_thread_and_a_wide_one_all(compose_config, monkeypatch):
     monkeypatch.setattr("bench.setup.inputs.DEFAULT_THREADS", 3)
     for width, threads in ((128, 1), (512, 3)):
-        cell_from(compose_config("scale=smoke", f"scale.network.width={width}")).start()
+        cell_from(compose_config("scale=smoke", f"scale.network.width={width}")).configure_process()
         assert torch.get_num_threads() == threads
 
 
@@ -70,7 +72,16 @@ def test_the_run_takes_its_threads_and_its_check_does_not(compose_config):
     torch.set_num_threads(1)
     cell = cell_from(compose_config("scale=smoke", "threads=2"))
     assert torch.get_num_threads() == 1
-    cell.start()
+    cell.configure_process()
     assert torch.get_num_threads() == 2
-    cell_from(compose_config("scale=smoke")).start()
+    cell_from(compose_config("scale=smoke")).configure_process()
     assert torch.get_num_threads() == 1
+
+
+@pytest.mark.parametrize(("context", "name"), [("on_clock", "forward"), ("off_clock", "evaluation")])
+def test_the_seconds_of_a_failed_block_are_kept(tmp_path, clock, context, name):
+    run = RunContext(Mock(spec=RunInputs), tmp_path, Record("id", "task", "renderer", "dataset", 0, {}), silent)
+    with pytest.raises(ZeroDivisionError), getattr(run, context)():
+        clock.sleep(2.0)
+        _ = 1 / 0
+    assert run.record.seconds[name] == pytest.approx(2.0, abs=0.01)

@@ -7,13 +7,14 @@ import sys
 import time
 from multiprocessing import Pipe
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import psutil
 import pytest
 
 from bench.records.record import Record
 from bench.runner import process
-from bench.runner.process import Job, Step
+from bench.runner.process import RunRequest, Step
 from tests.runner.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -82,12 +83,22 @@ def test_the_run_dies_with_its_driver_even_in_native_code(tmp_path):
     wait_for(lambda: not at_work(tmp_path))
 
 
+def test_a_process_that_is_lost_before_the_first_measurement_of_its_memory_is_reported():
+    alive = iter((True, False))
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    pipes = [Pipe(), Pipe()]
+    lost = Mock(pid=ended.pid, sentinel=pipes[0][0], exitcode=-signal.SIGKILL, is_alive=lambda: next(alive))
+    failure = process._watch(lost, pipes[1][0], process.RunLimits(None, None), lambda message: None)
+    assert failure is not None and "ended by SIGKILL" in failure[1]
+
+
 def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(process, "import_module", calls.append)
     monkeypatch.setattr("bench.runner.execute.main", lambda *_: calls.append("main"))
-    job = Job(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
-    process._run_job(job, *Pipe())
+    request = RunRequest(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
+    process._run(request, *Pipe())
     assert calls == [*process.preloaded_modules(), "main"] and "open3d" in calls
 
 

@@ -208,7 +208,7 @@ def test_the_error_that_ends_a_run_is_in_its_record(bench, monkeypatch, tmp_path
         meanwhile.extend(json.loads(path.read_text()) for path in (tmp_path / "r").glob("runs/*/record.json"))
         raise error
 
-    monkeypatch.setattr(execute, "build_cell", fail)
+    monkeypatch.setattr(execute, "prepare_run", fail)
     exit_code, out, err, folder = bench()
     record = json.loads((folder / "record.json").read_text())
     assert (exit_code, record["status"]) == (code, status) and record["seconds"]["total"] > 0
@@ -285,12 +285,12 @@ def test_random_numbers_of_a_run_do_not_depend_on_whether_its_prior_was_cached(c
     for used in (0, 1000):
         monkeypatch.setattr(priors_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
         cell = cell_from(compose_config("threads=1", "seed=3"))
-        cell.start()
+        cell.configure_process()
         stage = cell.inputs
         assert stage.prior is stage.prior is prior  # made once
         drawn.append(torch.rand(4).tolist())
     assert drawn[0] == drawn[1]
-    cell_from(compose_config("threads=1", "seed=4")).start()
+    cell_from(compose_config("threads=1", "seed=4")).configure_process()
     assert torch.rand(4).tolist() != drawn[0]
 
 

@@ -125,6 +125,6 @@ def test_a_line_of_a_sweep_estimates_the_time_left_from_cells_that_are_not_reuse
     [({}, 1), ({"n_jobs": 3}, 3), ({"n_jobs": -1}, 7), ({"n_jobs": None}, 1), ({"array_parallelism": 256}, 256)],
 )
 def test_a_sweep_says_how_many_runs_a_launcher_makes_at_a_time(launcher, workers, monkeypatch):
-    """Joblib takes all processors for -1; submitit has its own limit."""
+    """-1 stands for all processors; submitit has its own limit."""
     monkeypatch.setattr("os.cpu_count", lambda: 7)
     assert Launcher("workers", launcher, {}).concurrency == workers

@@ -9,7 +9,7 @@ import pytest
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import Record, RunStatus
 from bench.runner.execute import execute
-from bench.runner.process import Job
+from bench.runner.process import RunRequest
 from bench.runner.summary import print_run_summary
 from bench.setup.fields import FieldChoice, ModelSettings
 from bench.tasks.capacity.candidates import candidate
@@ -38,7 +38,7 @@ def run(folder, compose_config, *overrides: str) -> Record:
     """The record of a run in this process, and its files in the folder."""
     config = compose_config(*TINY, *overrides)
     record = Record("id", "task", "dist", config.dataset.name, 0, plain(config))
-    execute(Job(folder, record), progress=silent, checkpoint=lambda record: None)
+    execute(RunRequest(folder, record), progress=silent, checkpoint=lambda record: None)
     return record
 
 

@@ -8,7 +8,7 @@ import torch
 
 from bench.config import build, load
 from bench.setup.fields import FieldChoice
-from bench.solve.optimise import History, Objective, OptimiserSettings, optimise
+from bench.solve.optimise import History, Optimisable, OptimiserSettings, optimise
 from bench.tasks.pose import Pose, PoseProblem
 from bench.tasks.reconstruction.subject import Depths
 from bench.tasks.single_view.training import Training
@@ -72,7 +72,7 @@ def test_a_training_from_images_stays_on_its_device(images, tmp_path, renderer, 
     assert all(parameter.device == CPU and parameter.isfinite().all() for parameter in model.parameters())
 
 
-def check(problem: Objective) -> None:
+def check(problem: Optimisable) -> None:
     """Optimises a problem where tensors that name no device have no data."""
     history = History()
     torch.set_default_device("meta")  # what is made on it by mistake cannot meet what the run has made

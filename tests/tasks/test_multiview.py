@@ -189,6 +189,7 @@ def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is
     small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=40", "evaluation.grid=24")
     result = command(*overrides, *small, "prior.of=car", "isolation=off", f"results_dir={tmp_path}")
     record, folder = record_of(result.out), Path(result.out.splitlines()[-1])
+    assert record["status"] == "ok", record["reason"]
     assert record["metrics"]["mask_iou"] > record["metrics_start"]["mask_iou"]
     to_world = np.loadtxt(folder / "to_world.txt")
     radius = np.linalg.norm(to_world[:3, 0]) * HULL_RADIUS

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.names import SharedSettings, flat
-from bench.records.read import CHECKPOINT_METRICS, NOT_LOSS_TERMS, curve_lines
+from bench.records.read import NOT_LOSS_TERMS, curve_lines
 from bench.records.record import as_number
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
@@ -107,7 +107,7 @@ def curve(folder: Folder) -> dict[str, Any] | None:
     if not numbered:
         return None
     keys = dict.fromkeys(key for line in numbered for key in line)
-    terms = [key for key in keys if key not in (*NOT_LOSS_TERMS, *CHECKPOINT_METRICS)]
+    terms = [key for key in keys if key not in NOT_LOSS_TERMS]
     terms = [key for key in terms if any(as_number(line.get(key)) is not None for line in numbered)][:MAX_LOSS_TERMS]
     thinned = [numbered[index] for index in _kept_indices(numbered)]
     names = [*NOT_LOSS_TERMS, *terms]

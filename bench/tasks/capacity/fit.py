@@ -186,7 +186,7 @@ class Fitter:
 
 @dataclass
 class FitProblem:
-    """Fits the parameters of a candidate with a renderer; see `bench.solve.optimise.Objective`."""
+    """Fits the parameters of a candidate with a renderer; see `bench.solve.optimise.Optimisable`."""
 
     model: Model
     observations: RayObservations
@@ -219,7 +219,7 @@ class FitProblem:
 
 @dataclass
 class WarmStart:
-    """Fits a model's parameters to points; see `bench.solve.optimise.Objective`.
+    """Fits a model's parameters to points; see `bench.solve.optimise.Optimisable`.
 
     A field with a formula is fitted to the observed points, where it should be 0, and to points known to lie outside,
     where it should not be negative. Other fields are fitted to the values of a target field.

@@ -133,7 +133,7 @@ def judge_fit(
 
 @dataclass
 class SphereProblem:
-    """The problem of finding a sphere's four parameters; see `bench.solve.optimise.Objective`."""
+    """The problem of finding a sphere's four parameters; see `bench.solve.optimise.Optimisable`."""
 
     sphere: Float[Tensor, "4"]
     view: ObservedView

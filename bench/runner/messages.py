@@ -8,8 +8,8 @@ from bench.records.record import Record
 
 
 @dataclass(frozen=True)
-class Job:
-    """A run for a child process: the folder for its files, and the record with its configuration, which it fills."""
+class RunRequest:
+    """A run that a child process makes: the folder for its files, and the record, which has the configuration."""
 
     folder: Path
     record: Record
