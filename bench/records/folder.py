@@ -31,7 +31,7 @@ HASHED_LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh",
 RESERVED_BYTES = 64 * 1024  # kept free, so that the record can still be written on a full disk
 RESERVE_FILE = ".reserve"
 # Keys that change no result, such as a limit, but can decide whether a failed run fails again.
-LIMIT_KEYS = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun", "plan"}
+LIMIT_KEYS = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun", "plan", "tracker"}
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Identity:
         for split in map(Path, _values_of_key(dataset, "split")):  # a list of shapes, with others in the same folder
             inputs += [(str(path), False) for path in sorted(split.parent.glob(f"*{split.suffix or split.name}"))]
         files = [_file_hash(Path(path), deep=is_deep) for path, is_deep in inputs]
-        files += [_class_counts_hash(str(dataset[key])) for key in ("path", "renders") if "synset" in dataset]
+        files += [_class_counts_hash(str(dataset.get(key))) for key in ("path", "renders") if "synset" in dataset]
         hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
         targets = {*_values_of_key(hashed, "_target_")}
         targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datasets.files.captures.formats import find_layout
 from datasets.files.captures.frames import OPENGL, Frame, Layout, nearest_rigid_matrix, rigid_matrix
 from datasets.files.captures.hull import MaskFit, measure_mask_fit
+from datasets.files.captures.layouts import find_layout
 from datasets.files.captures.sphere import Sphere, hull_sphere, likely_cause, viewed_sphere
 from datasets.files.captures.take import exif_notes, read_shot
 from datasets.mesh import Mesh

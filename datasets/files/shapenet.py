@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from datasets.files.captures.formats import find_layout
+from datasets.files.captures.layouts import find_layout
 from datasets.files.captures.take import read_shot
 from datasets.files.colours import FileColours
 from datasets.files.local import VERSION, load_repaired, split_files

@@ -14,10 +14,10 @@ from PIL import ExifTags, Image
 
 from bench.photos import main
 from datasets.files import own_photographs
-from datasets.files.captures.formats import find_layout
+from datasets.files.captures.formats.choy import _from_angles
 from datasets.files.captures.frames import OPENGL
 from datasets.files.captures.hull import carve, hull_mesh, measure_mask_fit
-from datasets.files.captures.rows import _from_angles
+from datasets.files.captures.layouts import find_layout
 from datasets.files.captures.take import _same_aspect, read_image, read_shot
 from datasets.files.own_photographs import ReadSettings, read_capture
 from datasets.shot import Shot

@@ -32,7 +32,10 @@ def test_a_run_depends_on_its_renderer_and_dataset_and_on_no_other():
     }
     assert not files & others and not any(file.startswith(("bench/report", "bench/studies")) for file in files)
     assert files_of("renderers.DVR") - files >= {"renderers/dvr.py"}
-    assert "datasets/files/captures/lenses.py" in files_of("datasets.files.own_photographs.OwnPhotographs")
+    assert files_of("datasets.files.own_photographs.OwnPhotographs") >= {
+        "datasets/files/captures/lenses.py",
+        "datasets/files/captures/formats/llff.py",
+    }
 
 
 def test_every_module_that_python_loads_is_among_the_files():

@@ -3,7 +3,7 @@
 Axes and pixels are those of `renderers.camera`: x right, y down, z forward, the first pixel's centre at (0.5, 0.5).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,27 @@ class Layout:
     points_sphere: tuple[Float[np.ndarray, "3"], float] | None = None
     world: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     example_image: str = ""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of photographs with cameras. A file of `captures/formats` defines one, with the name FORMAT.
+
+    Args:
+        name: the name in messages.
+        rank: formats of lower rank are tried first, if a folder has the files of several formats.
+        camera_files: patterns of the files of cameras in a folder.
+        description: these files and the folders of images, for messages.
+        read: gives the layout of a folder, from the folder, the files found and whether masks are read. If
+            `takes_images`, it takes the folder of images too, as `images`.
+    """
+
+    name: str
+    rank: int
+    camera_files: Sequence[str]
+    description: str
+    read: Callable[..., "Layout"]
+    takes_images: bool = False
 
 
 def require_key(settings: Mapping[str, Any], key: str, where: str) -> Any:

@@ -2,41 +2,31 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from zipfile import BadZipFile
 
-from datasets.files.captures.colmap import read_colmap
-from datasets.files.captures.frames import Layout
-from datasets.files.captures.matrices import read_matrices
-from datasets.files.captures.nerf import read_transforms
+from datasets.files.captures import formats
+from datasets.files.captures.frames import Format, Layout
 from datasets.files.captures.pairing import natural_key
-from datasets.files.captures.rows import read_blended_mvs, read_choy, read_llff, read_middlebury
 from datasets.files.readers.text import wrong_kind_message
 from renderers.checks import BadInput
 
-SUPPORTED_FORMATS = (
-    "cameras*.npz with image/ (IDR, NeuS, DVR), transforms.json or transforms_train.json (NeRF, nerfstudio), "
-    "*_par.txt (Middlebury), poses_bounds.npy with images/ (LLFF), sparse/0 with images/ (COLMAP), cams/*_cam.txt "
-    "(BlendedMVS), rendering_metadata.txt (Choy)"
-)
-COLMAP_ROOTS = ("sparse", "colmap/sparse", "distorted/sparse", ".")
-COLMAP_FOLDERS = [f"{root}/{inner}" for root in COLMAP_ROOTS for inner in ("[0-9]*/", "")]
-FORMATS = {  # the readers, and their files of cameras
-    "IDR, NeuS or DVR": (read_matrices, ("cameras_sphere.npz", "cameras.npz")),
-    "NeRF": (read_transforms, ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json")),
-    "Middlebury": (read_middlebury, ("*_par.txt",)),
-    "LLFF": (read_llff, ("poses_bounds.npy",)),
-    "COLMAP": (read_colmap, [f"{folder}images.[bt][ix][nt]" for folder in COLMAP_FOLDERS]),
-    "BlendedMVS": (read_blended_mvs, ("cams/*_cam.txt",)),
-    "Choy": (read_choy, ("rendering_metadata.txt", "rendering/rendering_metadata.txt")),
-}
 READ_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, MemoryError, BadZipFile)
 READ_ERRORS += (RuntimeError,)
 
 
+@cache
+def known_formats() -> list[Format]:
+    """The formats of the files in `captures/formats`, in the order in which they are tried."""
+    modules = [import_module(f"{formats.__name__}.{module.name}") for module in iter_modules(formats.__path__)]
+    return sorted((module.FORMAT for module in modules), key=lambda format: format.rank)
+
+
 def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) -> Layout:
-    """Reads the photographs of a folder, in the first of `FORMATS` with cameras and images in the folder.
+    """Reads the photographs of a folder, in the first of `known_formats` with cameras and images in the folder.
 
     Args:
         images: the folder of COLMAP's images, in `folder` or elsewhere; None for the usual folders.
@@ -48,20 +38,21 @@ def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) 
     if not folder.is_dir():
         what = f"{folder} is a file" if folder.exists() else f"there is no folder {folder}"
         raise BadInput(f"{what}: name the folder that has the photographs and their cameras")
-    camera_files = {name: files for name, (_, patterns) in FORMATS.items() if (files := _files(folder, patterns))}
-    if not camera_files:
+    candidates = [(format, files) for format in known_formats() if (files := _files(folder, format.camera_files))]
+    if not candidates:
         subfolder = next((path for path in sorted(folder.glob("*/")) if any(path.glob("cameras*.npz"))), None)
+        supported = ", ".join(format.description for format in known_formats())
         other = f"; name one of its folders, such as {subfolder}" if subfolder else ""
-        raise BadInput(f"{folder} has no cameras that are known: {SUPPORTED_FORMATS}{other}")
+        raise BadInput(f"{folder} has no cameras that are known: {supported}{other}")
     layouts_without_images = list[Layout]()
-    for name, files in camera_files.items():
-        extra = {"images": images} if name == "COLMAP" else {}
-        read = partial(FORMATS[name][0], folder, files, masks, **extra)
-        layout = _read(f"{name} cameras of {files[0]}", read, folder)
+    for format, files in candidates:
+        extra = {"images": images} if format.takes_images else {}
+        read = partial(format.read, folder, files, masks, **extra)
+        layout = _read(f"{format.name} cameras of {files[0]}", read, folder)
         if layout.frames:
-            if images is not None and name != "COLMAP":
+            if images is not None and not format.takes_images:
                 raise BadInput(f"dataset.images={images} is for COLMAP, and {folder} has {layout.format}: leave it out")
-            others = [str(paths[0].relative_to(folder)) for other, paths in camera_files.items() if other != name]
+            others = [str(paths[0].relative_to(folder)) for other, paths in candidates if other != format]
             notes = (f"other cameras in the folder are not used: {', '.join(others)}",) if others else ()
             return replace(layout, notes=(*layout.notes, *notes))
         layouts_without_images.append(layout)

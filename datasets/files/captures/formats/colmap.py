@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from datasets.extras import install_command
-from datasets.files.captures.frames import Frame, Layout, rigid_matrix
+from datasets.files.captures.frames import Format, Frame, Layout, rigid_matrix
 from datasets.files.captures.lenses import colmap_lens
 from datasets.files.captures.pairing import find_images, find_masks, images_in, unpaired_note
 from renderers.checks import BadInput
@@ -18,7 +18,7 @@ IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "image",
 SPHERE_POINTS_FRACTION = 0.9  # the other points may be far from the object
 
 
-def read_colmap(folder: Path, files: Sequence[Path], masked: bool, images: str | None = None) -> Layout:
+def read_layout(folder: Path, files: Sequence[Path], masked: bool, images: str | None = None) -> Layout:
     """The model with the most images, read by pycolmap; its points lie about the object or about the whole view.
 
     Args:
@@ -90,3 +90,15 @@ def _names_in_text(folder: Path) -> dict[int, str]:
                     f"{file}: after {rest[-1]} there must be a line of its points, or a blank one: add these"
                 )
     return names
+
+
+ROOTS = ("sparse", "colmap/sparse", "distorted/sparse", ".")
+FOLDERS = [f"{root}/{inner}" for root in ROOTS for inner in ("[0-9]*/", "")]
+FORMAT = Format(
+    "COLMAP",
+    50,
+    [f"{folder}images.[bt][ix][nt]" for folder in FOLDERS],
+    "sparse/0 with images/ (COLMAP)",
+    read_layout,
+    takes_images=True,
+)

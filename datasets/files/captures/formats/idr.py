@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from datasets.files.captures.frames import Frame, Layout, decompose, homogeneous_matrix, require_key
+from datasets.files.captures.frames import Format, Frame, Layout, decompose, homogeneous_matrix, require_key
 from datasets.files.captures.image import image_size
 from datasets.files.captures.lenses import unread_keys_note
 from datasets.files.captures.pairing import find_masks, first_images, pair_by_name, pair_by_order
@@ -18,7 +18,7 @@ SIMILARITY_TOLERANCE = 1e-4  # largest relative difference of scale_mat from a s
 DVR_CUBE_RADIUS = 0.75**0.5  # the cube reaches from -1/2 to 1/2
 
 
-def read_matrices(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_layout(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """IDR and NeuS: projections world_mat_i of image i in string order, and scale_mat_i from the unit sphere.
 
     DVR: camera_mat_i onto an image from -1 to 1, world_mat_i, scale_mat_i from a cube of side 1; and depths.
@@ -101,3 +101,12 @@ def _scale(cameras: Matrices, count: int, file: str) -> tuple[Float[np.ndarray, 
             raise BadInput(f"{file}: scale_mat_{i} differs from {name}: the unit sphere must be the same")
     lacking = [f"{count - len(with_scale)} have none, such as camera {i}" for i in range(count) if i not in with_scale]
     return scale, tuple(f"{name} is that of all cameras: {text}" for text in lacking[:1])
+
+
+FORMAT = Format(
+    "IDR, NeuS or DVR",
+    10,
+    ("cameras_sphere.npz", "cameras.npz"),
+    "cameras*.npz with image/ (IDR, NeuS, DVR)",
+    read_layout,
+)

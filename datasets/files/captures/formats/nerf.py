@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datasets.files.captures.frames import OPENGL, Frame, Layout, homogeneous_matrix, require_key
+from datasets.files.captures.frames import OPENGL, Format, Frame, Layout, homogeneous_matrix, require_key
 from datasets.files.captures.image import image_size
 from datasets.files.captures.lenses import LENS_KEYS, nerf_lens, unread_keys_note
 from datasets.files.captures.pairing import find_images, find_masks, natural_key, unpaired_note
@@ -27,7 +27,7 @@ IGNORED_KEYS = {  # they do not change a camera
 FOCAL_LENGTH_TOLERANCE = 0.02  # largest relative difference between two statements of a focal length
 
 
-def read_transforms(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
+def read_layout(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     """Reads camera_to_world, in OpenGL's axes or in the axes of a flag, focal lengths or fields of view, and lenses."""
     shared = json.loads(files[0].read_text(encoding="utf-8-sig"))
     entries = require_key(shared, "frames", str(files[0]))
@@ -136,3 +136,12 @@ def _focal(settings: Mapping[str, Any], axis: str, pixels: int, length: float | 
         listed = ", ".join(f"{value:.6g} pixels by {key}" for key, value in lengths.items())
         raise BadInput(f"{where}: focal lengths differ, {listed} of {pixels} pixels: leave the wrong one out")
     return next(iter(lengths.values()), None)
+
+
+FORMAT = Format(
+    "NeRF",
+    20,
+    ("transforms.json", "transforms_train.json", "transform.json", "transform_train.json"),
+    "transforms.json or transforms_train.json (NeRF, nerfstudio)",
+    read_layout,
+)

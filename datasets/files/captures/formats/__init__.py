@@ -1,0 +1,1 @@
+"""One file per format of photographs with cameras, with its `FORMAT`; `captures/layouts.py` lists the files."""
