@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bench.config import load
-from renderers.boundary import BrokenContract, check_gradients, render_checked, silhouette_loss
+from renderers.boundary import BrokenContract, render_checked, silhouette_loss
 from renderers.camera import Rays
 from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, sphere
@@ -168,16 +168,6 @@ def test_observations_of_a_wrong_shape_or_type_are_errors():
         changed(OBSERVATION, mask=MASK.float()).__post_init__()
     with pytest.raises(ValueError, match=r"distance must have the mask's shape \[8, 8\], not \[3\]: give NaN where no"):
         changed(OBSERVATION, distance=torch.ones(3)).__post_init__()
-
-
-def test_missing_gradients_of_a_hit_are_errors_if_they_are_claimed():
-    gradient = torch.ones(2)
-    check_gradients(Mine(), gradient, gradient)
-    check_gradients(Mine(capabilities=NO_GRADIENT), None, None)
-    with pytest.raises(BrokenContract, match="field_gradient is True"):
-        check_gradients(Mine(), None, gradient)
-    with pytest.raises(BrokenContract, match="ray_gradient is True"):
-        check_gradients(Mine(), gradient, None)
 
 
 @each("name", ["dist", "dvr"])

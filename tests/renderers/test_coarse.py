@@ -11,11 +11,10 @@ from bench.config import load
 from bench.machine.limits import LimitReached, Limits
 from renderers.boundary import render_checked
 from renderers.camera import Rays
-from renderers.field import Coarse, Counts, Field, Kind, Meter, Wrapper, coarse_version, points_in_sphere
+from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_version, points_in_sphere
 from renderers.fields import mlp
-from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
+from renderers.fields.analytic import box, capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
-from renderers.packed_march import Stop
 from renderers.rendering import Status, at_iteration, with_empty_memory
 from tests.looped import each
 from tests.renderers.test_newton import camera, exact
@@ -47,14 +46,6 @@ class Offering(Wrapper):
     def coarse(self) -> Coarse:
         """The coarse values."""
         return Coarse(lambda points: self.inner(points) + self.off(points), ERROR)
-
-
-@each("name", ["dist", "idr"])
-def test_a_hit_is_of_the_field_also_where_its_threshold_is_larger_than_the_error(name):
-    renderer = replace(MARCHES[name], epsilon=2 * ERROR)
-    with torch.no_grad():
-        found = renderer.render(Offering(SHAPES["ring"], ERRORS["too small"]), camera().rays())
-    assert found.residual[found.hit].abs().max() < 2 * ERROR
 
 
 @each("name", MARCHES)
@@ -134,26 +125,6 @@ def test_an_optimisation_begins_warm_on_coarse_values_too():
         apart = (found.distance - cold.distance).abs() > 5e-4
         assert int(((found.hit != cold.hit) | (cold.hit & apart)).sum()) <= 2
         assert meter.counts.coarse > 0
-
-
-def test_rays_in_doubt_go_on_along_a_bound_without_a_search():
-    """Half of them, where coarse values are no numbers; a twentieth of the distance takes many steps of the field."""
-    rod = capsule((-0.5, -0.3, 0.0), (0.5, 0.3, 0.1), 0.02)
-    asked = Meter(Offering(Shape(lambda p: 0.05 * rod(p), Kind.BOUND), ERRORS["not a number"]))
-    with torch.no_grad():
-        found, truth = NEWTON.render(asked, camera().rays()), exact(rod)
-    assert truth.hit.sum() > 20 and torch.equal(found.hit, truth.hit)
-    assert asked.counts.value < 19.5 * found.hit.numel()  # 18.0; 21.7 with a search of those that ran out of steps
-
-
-@each("shape", SHAPES.values())
-def test_what_rays_have_passed_is_no_more_than_the_field_is_there(shape):
-    rays = camera().rays()
-    table, _ = NEWTON.tracer.trace(Offering(shape, ERRORS["too large"]), rays)
-    left = table.stopped(Stop.LEFT) & table.least.isfinite()
-    there = shape(rays.flat().at(table.least_distance))
-    assert left.sum() > 1000
-    assert (table.path_clearance <= there + 1e-5)[left].all()
 
 
 @each("behind", [2.0, 0.06])

@@ -82,13 +82,6 @@ def test_colours_lead_to_the_weights_of_the_distance_through_points_normals_and_
     assert min(sizes) > 0 and sizes[0] != sizes[1]
 
 
-def test_its_operations_are_counted():
-    network = make(width=16, octaves=1)
-    value = 2 * (9 * 16 + 2 * 16 * 16 + 16)
-    assert (network.field.flops.value, network.field.flops.gradient) == (value, 2 * value)
-    assert network.requires_grad_(False).field.flops.gradient == value
-
-
 def on_sphere(count: int = 500) -> Tensor:
     return torch.nn.functional.normalize(draw(count).float(), dim=-1)
 

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.machine.environment import using_threads
 from renderers.field import Flops
 from renderers.fields import mlp
 from renderers.fields.mlp import Decoder
@@ -53,23 +52,15 @@ def draw(decoder: Decoder, *shape: int) -> tuple[Tensor, Tensor]:
 
 @each("name", NETWORKS)
 @each("shape", [(5,), (), (0,), (2, 3)])
-def test_values_with_a_folded_code_are_those_of_the_plain_network(name, shape):
+def test_values_and_gradients_with_a_folded_code_are_those_of_the_plain_network(name, shape):
     decoder = make(name)
     code, points = draw(decoder, *shape)
-    torch.testing.assert_close(decoder.at(code)(points), plain(decoder, code, points), rtol=0, atol=1e-13)
-
-
-@each("name", NETWORKS)
-def test_gradients_are_those_of_the_plain_network(name):
-    decoder = make(name)
-    code, points = draw(decoder, 6)
-    wanted = (code, points, *decoder.parameters())
-    folded = torch.autograd.grad(decoder.at(code)(points).square().sum(), wanted, allow_unused=not decoder.code_length)
-    reference = torch.autograd.grad(plain(decoder, code, points).square().sum(), wanted)
-    if not decoder.code_length:  # an empty code has an empty gradient
-        folded, reference = folded[1:], reference[1:]
-    torch.testing.assert_close(folded, reference, rtol=1e-11, atol=1e-12)
-    assert all(gradient.abs().sum() > 0 for gradient in folded)
+    wanted = (points, *decoder.parameters(), *([code] if decoder.code_length else []))
+    folded, reference = decoder.at(code)(points), plain(decoder, code, points)
+    torch.testing.assert_close(folded, reference, rtol=0, atol=1e-13)
+    gradients, expected = (torch.autograd.grad(values.square().sum(), wanted) for values in (folded, reference))
+    torch.testing.assert_close(gradients, expected, rtol=1e-11, atol=1e-12)
+    assert shape == (0,) or all(gradient.abs().sum() > 0 for gradient in gradients)
 
 
 @each("name", NETWORKS)
@@ -99,17 +90,6 @@ def test_chunks_change_nothing_and_bound_a_pass(monkeypatch, count):
     assert sum(sizes) == count and max(sizes) <= 7
     gradients = [torch.autograd.grad(values.square().sum(), (code, points)) for values in (unchunked, chunked)]
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=1e-13)
-
-
-def test_a_pass_has_as_many_points_as_caches_hold_and_far_more_on_a_gpu():
-    one_mebibyte, gpu = 2**20, torch.device("cuda")
-    with using_threads(1):
-        for width, dtype, most in [(128, torch.float32, 2048), (512, torch.float32, 512), (512, torch.bfloat16, 1024)]:
-            assert (
-                mlp.points_per_pass(width, dtype, torch.device("cpu")) == most == one_mebibyte / width / dtype.itemsize
-            )
-        assert mlp.points_per_pass(2**16, torch.float64, torch.device("cpu")) == 256  # at least
-    assert mlp.points_per_pass(128, torch.float32, gpu) == 2**18
 
 
 def test_a_pass_back_takes_the_memory_of_one_gradient_however_many_chunks_it_has(monkeypatch):

@@ -1,6 +1,6 @@
 """Volume and band renderers: the claims of their papers, in numbers, and reported faults."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import pi
 
 import pytest
@@ -11,7 +11,7 @@ from torch.nn.functional import l1_loss
 from bench.config import load
 from renderers.bracket import equally_spaced
 from renderers.camera import Rays, sphere_span
-from renderers.field import Counts, Meter
+from renderers.field import Meter
 from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.relaxed_boundary import _parabola_vertex
 from renderers.rendering import Blurred, Status, Volume, at_iteration
@@ -87,26 +87,6 @@ def test_the_width_at_which_volsdf_begins_bounds_the_error_of_any_field():
     field = Shape(lambda p: torch.where((20 * p[..., 2]).round() % 2 == 0, 0.7, -0.001), sphere(0.5).kind)
     for _, samples, width in renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets]):
         assert (OpacityErrorBound.of(samples).max_error(width) <= renderer.error).all()
-
-
-def test_the_least_width_of_volsdf_is_within_ten_halvings_of_that_which_bounds_the_error():
-    @dataclass(frozen=True)
-    class Falling:
-        """A bound whose error is 0.1 at the width `least`."""
-
-        least: Tensor
-
-        def max_error(self, width: Tensor) -> Tensor:
-            return (0.1 * self.least / width).squeeze(1)
-
-        def select(self, index: Tensor) -> "Falling":
-            return Falling(self.least[index])
-
-    renderer = replace(VOLSDF, error=0.1).with_blur(0.001)
-    bound, first = Falling(vector((0.123, 0.0005, 2.0))[:, None]), vector((1.001, 1.001, 1.001))[:, None]
-    # The first of 1024 steps of 1 / 1024 from 0.001 that is at least 0.123; the least width; the greatest width.
-    expected = vector((0.001 + 125 / 1024, 0.001, 1.001))[:, None]
-    torch.testing.assert_close(renderer._least_width(bound, first), expected, rtol=0, atol=1e-12)
 
 
 def test_the_clearance_of_volsdf_is_that_of_the_empty_spheres_about_both_ends():
@@ -208,14 +188,6 @@ def test_distances_have_the_gradient_of_the_surface_at_every_sharpness(renderer,
     assert rate.item() == pytest.approx(-(1 / cosine[clear]).sum().item(), rel=0.12)
 
 
-def test_a_surface_near_the_unit_sphere_has_a_gradient_in_unisurf():
-    leaf = torch.tensor(0.95, dtype=torch.float64, requires_grad=True)
-    ray = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None])
-    rendering = at_iteration(UNISURF, 0).render(sphere(leaf), ray)
-    assert rendering.hit.item() and rendering.distance.item() > 1.01  # not where the ray enters
-    assert torch.autograd.grad(rendering.distance.sum(), leaf)[0].item() < -0.2
-
-
 @VOLUMES
 def test_hits_lie_on_a_surface_also_at_an_outline_before_a_wall(renderer):
     """At the outline the weights are a mixture of sphere and wall, but a hit lies on one of them."""
@@ -274,15 +246,6 @@ def test_a_sharpening_ends_at_the_setting(renderer):
     assert blurs == sorted(blurs, reverse=True) and blurs[0] > 10 * blurs[-1]
     assert blurs[-1] == blurs[-2] == renderer.blur and renderer.with_blur(0.02).blur == pytest.approx(0.02)
     assert at_iteration(renderer.with_blur(0.02), 0).blur == pytest.approx(0.02)
-
-
-@VOLUMES
-def test_few_values_need_a_graph(renderer):
-    """Samples without weight have no gradient, so that few values are differentiated."""
-    counts, leaf = Counts(), torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    rendering = renderer.render(Meter(sphere(leaf), counts), parallel(20))
-    rendering.volume.weight.sum().backward()
-    assert 0 < counts.gradient < 0.2 * counts.value
 
 
 @VOLUMES

@@ -14,7 +14,7 @@ from renderers.field import Field, Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, sphere
 from renderers.rendering import Rendering, at_iteration, final_notes, with_empty_memory
 from renderers.silhouette import Hinge
-from renderers.warm import AUDIT_STRIDE, MIN_AUDITED_RAYS, PROBE_STRIDE, Memory
+from renderers.warm import AUDIT_STRIDE, MIN_AUDITED_RAYS, Memory
 from tests.tiny import camera_of
 
 SIZE = 48  # pixels per side
@@ -93,13 +93,6 @@ def test_a_shape_that_enters_the_view_is_hit_and_a_shape_that_leaves_is_missed(w
 def test_a_field_that_jumps_has_the_hits_of_a_cold_rendering(warm, second):
     _, (rendering, _) = in_turn(warm, [ball(0.5), second])
     assert differing(rendering, second) == 0
-
-
-def test_after_a_large_movement_the_last_hits_are_not_evaluated(warm):
-    fields = [ball(0.4, x=0.3 * i - 0.3) for i in range(3)]
-    *_, (_, values) = in_turn(warm, fields)
-    cold = in_turn(COLD, fields[-1:])[0][1]
-    assert cold <= values <= cold + SIZE * SIZE / PROBE_STRIDE + 1
 
 
 def test_the_audit_detects_a_surface_that_appears_without_measured_movement(warm, monkeypatch):
