@@ -18,14 +18,14 @@ from bench.setup.inputs import RunInputs
 from datasets.files.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
-from renderers.field import LIPSCHITZ_SAFETY_FACTOR, Field, Kind, autograd_gradients, points_in_sphere
+from renderers.field import Field, Kind, points_in_sphere
 from renderers.fields.networks.network import from_module, measure_field
 from tests.composing import composed
 from tests.documentation import code_of
 from tests.looped import each
 from tests.made_networks import RADIUS, arrays, deepsdf_folder, npz, octahedron
 from tests.renderers.test_published import CODE, occupancy
-from tests.tiny import camera_of, cell_from
+from tests.tiny import cell_from
 
 NET = """
 import torch
@@ -143,13 +143,6 @@ def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
     assert bound.divisor == pytest.approx(3 * measure_field(octahedron, POINTS, kind=Kind.BOUND).divisor)
 
 
-def test_a_bound_that_is_scaled_has_no_slope_above_1_at_the_steepest_code():
-    steep = lambda points: 3 * octahedron(points)  # noqa: E731
-    bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
-    slopes = autograd_gradients(lambda points: bound.factor * steep(points), POINTS).norm(dim=-1)
-    assert bound.lipschitz == 1.0 and slopes.max() == pytest.approx(1 / LIPSCHITZ_SAFETY_FACTOR, rel=1e-3)
-
-
 def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):
     file = npz(tmp_path, arrays())
     before = file.network(0).facts.max_slope, file.identity()
@@ -228,23 +221,6 @@ def test_settings_are_checked(tmp_path_factory, settings, words):
     file = npz(tmp_path_factory.mktemp("file"), arrays())
     with pytest.raises(ValueError, match=words):
         replace(file, **settings)
-
-
-@each("name", (
-    "dist", "dvr", "idr", "mesh_proxy", "naive", "neus", "newton", "range_analysis", "relaxed_boundary", "unisurf",
-    "volsdf",
-))  # fmt: skip
-def test_every_renderer_takes_a_plain_module_of_the_users(name):
-    class Ball(torch.nn.Module):
-        def forward(self, points: Tensor) -> Tensor:
-            return points.norm(dim=-1, keepdim=True) - RADIUS
-
-    rays = camera_of(16).rays()
-    field = from_module(Ball())
-    assert field.kind is Kind.DISTANCE
-    hit = load("renderer", name).render(field, rays).hit
-    closest = torch.linalg.vector_norm(torch.linalg.cross(rays.origins, rays.directions), dim=-1)
-    assert (hit == (closest < RADIUS)).float().mean() > 0.97
 
 
 def test_a_module_whose_values_are_no_shape_is_refused_and_half_floats_are_rendered():

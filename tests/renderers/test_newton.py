@@ -65,6 +65,12 @@ def test_a_ray_that_passes_an_edge_by_less_than_near_hits_what_is_behind():
     assert rendering.hit.all() and rendering.distance.tolist() == pytest.approx([2.4] * 4, abs=1e-6)
 
 
+def test_a_ray_that_passes_a_surface_by_less_than_near_does_not_hit_it():
+    rays = beam(*((0.5 + NEWTON.march_epsilon * share, 0.0, -2.0) for share in (0.05, 0.2, 0.5, 0.9)))
+    rendering = NEWTON.render(sphere(0.5), rays)
+    assert (rendering.status == Status.MISS).all() and (rendering.closest > 0).all()
+
+
 def test_the_dense_search_hits_at_a_grazing_angle():
     ground, angle = plane((0, 1, 0), 0.0), torch.tensor(2.0, dtype=torch.float64).deg2rad()
     direction = torch.stack([angle.cos(), -angle.sin(), torch.zeros_like(angle)])
@@ -95,6 +101,18 @@ WRONG_FIELDS = {  # fields with the zero set of a distance d, and the most evalu
     "far too strong": (lambda d: 20 * d, 4.5),
     "saturated": (lambda d: torch.tanh(d / 0.2), 4.5),
 }
+
+
+@each("share", [0.3, 0.45])
+def test_the_search_brackets_a_plate_between_samples_if_values_are_below_half_their_spacing(share):
+    rays, number = beam((0.0, 0.0, -2.0)), torch.tensor([0])
+    spacing = 2 / (NEWTON.search_samples - 1)
+    middle = -1 + 7.5 * spacing
+    plate = Shape(lambda p: (p[..., 2] - middle).abs() - (0.5 - share) * spacing, Kind.DISTANCE, 1.0)
+    crossing, bracket = NEWTON.tracer._search(plate, rays, RayTable.on_sphere(rays, 1.0), number)
+    assert crossing.tolist() == [0]
+    front = 2 + middle - (0.5 - share) * spacing
+    assert bracket.near.item() < front < bracket.far.item() < front + spacing / 8
 
 
 @each("change, most", WRONG_FIELDS.values())
