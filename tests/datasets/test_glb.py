@@ -260,7 +260,7 @@ def test_colours_are_shares_of_1_and_parts_without_are_grey_beside_others():
 DRACO = ({"extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {}}}},)
 REFUSED = {
     "draco": (glb(extensionsRequired=["KHR_draco_mesh_compression"]), "without 'KHR_draco_mesh_compression'; export"),
-    "draco, told only where it is used": (
+    "draco, named only where it is used": (
         glb((VERTICES, {"empty": True}), parts=DRACO, extensionsUsed=["KHR_draco_mesh_compression"]),
         "accessor 0 has none .extensions: KHR_draco_mesh_compression",
     ),

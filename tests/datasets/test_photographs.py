@@ -142,17 +142,3 @@ def test_a_camera_that_sees_nothing_is_refused(ball):
     away = replace(CAMERA, world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ CAMERA.world_to_camera)
     with pytest.raises(ValueError, match="camera 0 sees nothing of the shape"):
         PHOTOGRAPHY.take(ball, away, seed=0)
-
-
-@each(
-    "changed, message",
-    [
-        ({"views": 1}, "views must be at least 2"),
-        ({"places": "cube"}, "places must be one of circle, arc, sphere"),
-        ({"texture_size": 0.0}, "texture_size must be positive"),
-        ({"blur": float("nan")}, "blur must be at least 0"),
-    ],
-)
-def test_invalid_settings_are_errors(changed, message):
-    with pytest.raises(ValueError, match=message):
-        replace(PHOTOGRAPHY, **changed)

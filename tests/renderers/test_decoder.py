@@ -112,21 +112,6 @@ def test_flops_are_two_per_weight_without_the_code():
     assert make("no-code-skip").at(torch.zeros(0, dtype=torch.float64)).flops == Flops(272, 2 * 272)
 
 
-@each(
-    "change, message",
-    [
-        ({"skip": 4}, "skip must lie between 0 .* layers - 1 = 3, not 4"),
-        ({"width": 7, "narrow": True}, r"width must exceed code_length \+ 3 = 7 .*, not 7"),
-        ({"layers": 0, "skip": 0}, "layers must be at least 1, not 0"),
-    ],
-)
-def test_impossible_networks_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        Decoder(**(NETWORKS["skip"] | change))
-    with pytest.raises(ValueError, match="code must end in 4 numbers, not 3"):
-        make("skip").at(torch.zeros(3, dtype=torch.float64))
-
-
 def pair(dtype: torch.dtype) -> tuple[Decoder, Decoder]:
     """A decoder with fixed weights, and the same decoder with trainable weights."""
     torch.manual_seed(3)

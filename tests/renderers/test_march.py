@@ -248,10 +248,3 @@ def test_a_relaxed_step_towards_a_plane_touches_its_next_empty_sphere():
         value = field(ray.at(before))
         march_front(field, ray, front, stepping, 1)
         assert (front.distance - before).item() == pytest.approx(value.item() * (1.0 if steps == 1 else 4 / 3))
-
-
-@each("settings, message", [({"relaxation": 0.3}, "relaxation needs step_back=true"),
-                            ({"relaxation": 1.3, "step_back": True}, "relaxation must lie between 0")])  # fmt: skip
-def test_relaxation_without_stepping_back_is_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        load("renderer", "dist", **settings)

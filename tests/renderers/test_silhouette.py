@@ -97,20 +97,6 @@ def test_under_one_loss_renderers_agree(renderer):
     assert of_sphere(load("renderer", renderer), hinge, mask) == pytest.approx(expected, rel=0.05)
 
 
-@each(
-    "loss, values, message",
-    [
-        ("hinge", {"average": "some"}, "average must be one of all, violating, missed_plus_spurious, not 'some'"),
-        ("cross_entropy", {"sharpness": -1.0}, "sharpness must be positive, not -1.0"),
-        ("occupancy", {"weight": -1.0}, "weight must be at least 0, not -1.0"),
-        ("occupancy", {"occupied_at": "hull"}, "occupied_at must be one of random, depth, not 'hull'"),
-    ],
-)
-def test_invalid_settings_are_refused(loss, values, message):
-    with pytest.raises(ValueError, match=message):
-        load("silhouette", loss, **values)
-
-
 def test_a_correct_hit_costs_nothing_for_any_threshold_of_the_renderer():
     """A hit may have a value far above the threshold of the loss. The weight of a spurious hit must not change."""
     rough = load("renderer", "idr", epsilon=0.05)  # also rays that pass the sphere by 0.005 are hits

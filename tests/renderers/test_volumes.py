@@ -188,6 +188,14 @@ def test_distances_have_the_gradient_of_the_surface_at_every_sharpness(renderer,
     assert rate.item() == pytest.approx(-(1 / cosine[clear]).sum().item(), rel=0.12)
 
 
+def test_a_surface_near_the_unit_sphere_has_a_gradient_in_unisurf():
+    leaf = torch.tensor(0.95, dtype=torch.float64, requires_grad=True)
+    ray = Rays(vector((0, 0, -2))[None], vector((0, 0, 1))[None])
+    rendering = at_iteration(UNISURF, 0).render(sphere(leaf), ray)
+    assert rendering.hit.item() and rendering.distance.item() > 1.01  # not where the ray enters
+    assert torch.autograd.grad(rendering.distance.sum(), leaf)[0].item() < -0.2
+
+
 @VOLUMES
 def test_hits_lie_on_a_surface_also_at_an_outline_before_a_wall(renderer):
     """At the outline the weights are a mixture of sphere and wall, but a hit lies on one of them."""
@@ -284,10 +292,3 @@ def test_the_band_samples_the_vertex_of_the_parabola_through_three_samples():
     distances = vector((0.0, 0.3, 0.9, 0.1, 0.3, 0.35)).view(2, 3).T
     lowest = vector((0.37, 0.28))
     torch.testing.assert_close(_parabola_vertex(distances, 3 * (distances - lowest) ** 2 + 0.1), lowest)
-
-
-def test_invalid_settings_are_refused():
-    for renderer, setting in ((NEUS, "sharpness"), (VOLSDF, "error"), (UNISURF, "interval"), (BAND, "band")):
-        for name in (setting, "sphere_radius"):
-            with pytest.raises(ValueError, match=f"{name} must be positive, not 0"):
-                replace(renderer, **{name: 0})

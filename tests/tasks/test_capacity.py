@@ -6,23 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.evaluate.evaluate import Evaluation
 from bench.records.record import Record, RunStatus
 from bench.runner.execute import execute
 from bench.runner.process import Job
 from bench.runner.summary import print_run_summary
-from bench.setup.fields import FieldChoice, ModelSettings
 from bench.tasks.capacity.candidates import candidate
-from bench.tasks.capacity.field import failure_of
-from bench.tasks.capacity.growth import grow
 from bench.tasks.capacity.held_out import HeldOutError
 from bench.tasks.capacity.model import Evidence, Size
 from bench.tasks.capacity.study import CheckSettings, shares
 from bench.tasks.capacity.task import Capacity, savings
-from renderers.rendering import Unsupported
 from renderers.silhouette import Own
-from tests.tasks.capacity.test_models import FIT, GROWTH, VIEWS, fitter_of
-from tests.tiny import Blind, ball_prior, camera_of, curve_of, plain, run_of, silent
+from tests.tiny import curve_of, plain, silent
 
 TINY = (
     "scale=smoke", "view.resolution=16", "evaluation.picture=null", "evaluation.grid=24", "device=cpu",
@@ -87,17 +81,6 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert re.search(r"recommended_field +rounded_box\b", capsys.readouterr().out)
 
 
-def test_a_fit_as_good_as_its_start_is_ok_and_a_worse_one_is_not_reached():
-    growth = grow(fitter_of("box", iterations=10, seed=1), [candidate("sphere")], GROWTH)
-    assert growth.fitted.evidence.mean > growth.footprint  # a ball is no box
-    assert failure_of(growth, Evaluation({})) is None
-    assert failure_of(growth, Evaluation({}, failure=(RunStatus.EMPTY, "nothing")))[0] == RunStatus.EMPTY
-    better = replace(growth.initial_error, sums=growth.initial_error.sums * [0.5, 1, 0.5, 1])
-    status, reason = failure_of(replace(growth, initial_error=better), Evaluation({}))
-    assert status == RunStatus.NOT_REACHED
-    assert reason.startswith("the held-out error rose by more than its noise: 0.0")
-
-
 def test_a_users_renderer_without_epsilon_works(compose_config, tmp_path):
     user_renderer = ("renderer=custom", "renderer._target_=tests.user_renderer.Mine", "+renderer.steps=40")
     record = run(
@@ -105,14 +88,6 @@ def test_a_users_renderer_without_epsilon_works(compose_config, tmp_path):
     )
     assert (record.status, record.metrics["recommended_field"]) == ("ok", "sphere")
     assert not [note for note in record.notes if note.startswith("pixel precision: renderer.")]
-
-
-def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
-    ladder = ModelSettings(("sphere",), "stored", FIT, GROWTH, VIEWS)
-    run = run_of(tmp_path, Blind(), ball_prior(), camera_of(8), field=FieldChoice("prior", ladder))
-    task = Capacity("depth", 10.0, Own(), 10.0, 1, 0.5, CheckSettings(4, 2, 2))
-    with pytest.raises(Unsupported, match="no gradient towards the field"):
-        task.execute(run)
 
 
 def test_saved_time_is_given_only_where_the_network_was_fitted():

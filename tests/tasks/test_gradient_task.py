@@ -19,7 +19,6 @@ from bench.tasks.gradients.task import (
     Gradients,
     Subject,
     _bands,
-    _draw,
     _outline,
 )
 from renderers.camera import Camera, Rays
@@ -149,18 +148,6 @@ def test_the_scale_of_dist_is_alpha_times_the_cosine_times_the_slope(tmp_path, a
         assert metrics["colour.texture_pooled_scale"] == pytest.approx(1, abs=1e-5)
 
 
-def test_where_a_band_is_empty_it_says_so(tmp_path):
-    """All is hit, at one angle: there is no outline either."""
-    prior, camera = plane_prior(50.0, 1.0), camera_of(8, field_of_view=0.5)
-    metrics = judged(tmp_path, EXACT["idr"], prior, camera).record.metrics
-    for band in ("frontal", "grazing"):
-        assert {name: value for name, value in metrics.items() if name.startswith(band)} == {
-            f"{band}.pixels": 0, f"{band}.excluded": 0,
-        }  # fmt: skip
-    assert {name: value for name, value in metrics.items() if name.startswith("silhouette")} == {"silhouette.pixels": 0}
-    assert metrics["oblique.pixels"] == SETTINGS.pixels
-
-
 @dataclass
 class Changed:
     """A renderer that answers as another one does, but for what is changed."""
@@ -218,17 +205,3 @@ def test_bands_are_of_the_angle_between_ray_and_inward_normal():
     assert {band: pixels.tolist() for band, pixels in result.items()} == {
         "frontal": [0, 1], "oblique": [2, 3], "grazing": [4, 5],
     }  # fmt: skip
-
-
-def test_the_outline_is_beside_the_outline():
-    hit = torch.zeros(5, 6, dtype=torch.bool)
-    hit[:, 3:] = True
-    assert _outline(hit).tolist() == [6 * row + column for row in range(5) for column in (2, 3)]
-    assert _outline(torch.ones(5, 6).bool()).tolist() == _outline(torch.zeros(5, 6).bool()).tolist() == []
-
-
-def test_pixels_are_drawn_without_repetition_and_by_the_seed():
-    pixels = torch.arange(100, 200)
-    first, again, other = (_draw(pixels, 30, torch.Generator().manual_seed(seed)).tolist() for seed in (0, 0, 1))
-    assert first == again != other and first == sorted(set(first)) and len(first) == 30
-    assert _draw(pixels[:5], 30, torch.Generator()).tolist() == pixels[:5].tolist()

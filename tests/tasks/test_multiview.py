@@ -11,7 +11,7 @@ from bench.config import load
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
-from bench.tasks.multiview import Multiview, PhotometricLoss, blur, sample
+from bench.tasks.multiview import Multiview, PhotometricLoss, sample
 from bench.tasks.reconstruction.subject import HULL_RADIUS
 from bench.tasks.single_view.encoder import EncoderSettings
 from datasets.files.meshes import read_mesh
@@ -65,13 +65,6 @@ def test_masks_are_compared_where_their_loss_has_a_weight_and_hold_what_a_shape_
     assert masked.compare(smaller, 0)["silhouette"] > 3 * masked.compare(sphere(0.5), 0)["silhouette"]
 
 
-def test_views_move_on_and_are_spread_evenly(scene):
-    photographs = overrides(scene)
-    assert photographs.pairs(0) == [(0, 1), (2, 3), (4, 5), (6, 7)]
-    assert photographs.pairs(3) == [(3, 4), (5, 6), (7, 0), (1, 2)]
-    assert overrides(scene, views_per_step=99, neighbour=2).pairs(0) == [(i, (i + 2) % 8) for i in range(8)]
-
-
 def test_it_finds_the_ball(scene):
     problem = problem_of(scene)
     problem.code.data += torch.tensor([0.0, 0.05, 0.0, 0.15])  # higher and larger
@@ -119,29 +112,11 @@ def test_a_misplaced_ball_is_put_back(scene):
     assert problem.field()(torch.tensor([[0.0, 0, 0.5]])).abs().item() < 0.02
 
 
-def test_a_similarity_is_sought_in_place_where_that_is_asked_for(scene):
-    assert problem_of(scene).similarities == []
-    problem = problem_of(scene, similarity=True)
-    assert problem.similarity.tolist() == [0.0] * 7 and problem.similarities[0].requires_grad
-
-
 def test_coarse_images_come_first(scene):
     photographs = overrides(scene, coarse_blur=0.0625)
     roughness = [photographs.images_at(i).diff(dim=1).abs().mean().item() for i in (0, 8, 15, 29)]
     assert roughness[0] < roughness[1] < roughness[2] == roughness[3]
     assert torch.equal(photographs.images_at(15), photographs.colours)
-
-
-def test_blurring_keeps_what_is_constant_and_the_mean():
-    flat = torch.full((2, 9, 7, 3), 0.3)
-    assert torch.allclose(blur(flat, 1.5), flat, atol=1e-6)
-    spot = torch.zeros(1, 21, 21, 3)
-    spot[0, 10, 10] = 1.0
-    soft = blur(spot, 1.5)
-    assert soft.sum().item() == pytest.approx(3.0, rel=1e-4)
-    variance = (soft[0, :, :, 0].sum(1) * (torch.arange(21) - 10) ** 2).sum().item()
-    assert variance == pytest.approx(1.5**2, rel=0.05)
-    assert blur(torch.rand(1, 2, 2, 3), 5.0).isfinite().all()  # wider than the image
 
 
 def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
@@ -169,12 +144,6 @@ def test_a_linear_image_is_sampled_exactly_and_nothing_outside_is_read():
     expected = 2 * pixels[:, 0] + 3 * pixels[:, 1] + 1
     assert torch.allclose(colours[inside, 0], expected[inside], atol=1e-4) and (colours[~inside] == 0).all()
     assert not sample(image, torch.tensor([[float("nan"), 1.0]]))[1].any()
-
-
-def test_gradients_reach_the_pixels():
-    image = torch.rand(5, 5, 2, generator=torch.Generator().manual_seed(1)).double()
-    places = (0.7 + 3.5 * torch.rand(20, 2, generator=torch.Generator().manual_seed(2))).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: sample(image, p)[0], places)
 
 
 def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is_put_there(tmp_path):

@@ -11,7 +11,7 @@ import trimesh
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import History, OptimiserSettings, optimise
-from bench.tasks.baselines.pose_icp import PoseICP, world_points
+from bench.tasks.baselines.pose_icp import PoseICP
 from bench.tasks.pose import Pose, PoseProblem, build_shape_field, pose_error
 from datasets.scene import Scene
 from renderers.fields.analytic import box
@@ -76,13 +76,6 @@ def test_the_first_start_is_off_by_what_is_asked_and_others_are_turned_from_it()
     assert torch.equal(again[2].world_to_camera, others[1].world_to_camera)
     alone = replace(START, starts=1).cameras(CAMERA, seed=4)
     assert torch.equal(alone[0].world_to_camera, first.world_to_camera)  # more starts change nothing of the first
-
-
-def test_success_needs_both_errors_to_be_small():
-    near = CAMERA.with_object_moved(torch.tensor([0.03, 0, 0, 0, 0, radians(4.0)]))
-    turned = CAMERA.with_object_moved(torch.tensor([0.03, 0, 0, 0, 0, radians(6.0)]))
-    far = CAMERA.with_object_moved(torch.tensor([0.06, 0, 0, 0, 0, radians(4.0)]))
-    assert [START.metrics(camera, CAMERA)["success"] for camera in (near, turned, far)] == [1.0, 0.0, 0.0]
 
 
 def test_the_true_pose_costs_nearly_nothing(scene):
@@ -154,11 +147,6 @@ def test_closest_points_find_a_near_pose(run, method):
     assert run.record.metrics_start["rotation_error_deg"] == pytest.approx(12.0, abs=0.01)
     assert run.record.metrics["rotation_error_deg"] < 4.0 and run.record.evaluations["value"] == 0
     assert run.record.seconds["forward"] > 0
-
-
-def test_the_points_of_the_true_camera_lie_on_the_surface(scene):
-    points = world_points(scene.view, CAMERA)
-    assert len(points) == int(scene.view.mask.sum()) and box(SIZES)(points).abs().max() < 1e-4
 
 
 def test_points_that_never_come_near_are_told(run):

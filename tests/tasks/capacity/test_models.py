@@ -13,9 +13,9 @@ from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.solve.observed_view import ObservedView
-from bench.tasks.capacity.candidates import PAPER_NETWORK, REACH, by_size, candidate
+from bench.tasks.capacity.candidates import REACH, by_size, candidate
 from bench.tasks.capacity.field import rendered_curve
-from bench.tasks.capacity.fit import SCREENING, FitProblem, Fitter, scatter_points
+from bench.tasks.capacity.fit import FitProblem, Fitter
 from bench.tasks.capacity.growth import _is_better, cost, grow
 from bench.tasks.capacity.held_out import MISSED_FOOTPRINTS, HeldOutError
 from bench.tasks.capacity.model import Evidence, Model, Size, StartInputs
@@ -292,13 +292,6 @@ def test_the_eikonal_term_is_the_squared_difference_of_slopes_from_one():
         assert terms["eikonal"].item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_each_of_several_starts_is_tried_before_the_best_one_goes_on(monkeypatch):
-    spent = []
-    monkeypatch.setattr(Fitter, "_warm_start", lambda self, fitted, start, iterations: spent.append(iterations))
-    fitter_of("box", warm_iterations=80).begin(candidate("union_3"), None, evaluate=False)
-    assert len(spent) > 3 and spent == [80 // SCREENING] * (len(spent) - 1) + [80]
-
-
 @each("spread, better", [(0.002, True), (-0.002, False)])
 def test_a_candidate_is_better_beyond_the_noise_of_the_difference(spread, better):
     """The difference is the same in both cases: all groups agree on it, or they contradict each other."""
@@ -344,17 +337,6 @@ def test_the_remaining_error_depends_on_the_depth_and_not_on_the_silhouette(name
     assert observations.depth_error(observations.terms(nothing, 0, 1.0)) == np.inf
 
 
-def test_a_renderers_random_draws_are_the_same_for_every_fit():
-    dvr = load("renderer", "dvr", n_ray_samples=16, doublings=[])
-    fitter, means = fitter_of("ball", dvr, warm_iterations=10), []
-    for _ in range(2):
-        fitted = fitter.begin(candidate("sphere"), None)
-        fitter.fit(fitted, 4, checkpoints=False)
-        means.append(fitted.model.parameters[0].tolist())
-        torch.rand(3)
-    assert means[0] == means[1]
-
-
 def test_too_few_depths_to_hold_some_out_are_an_error():
     view = see(shape_of("box"), SAMPLER.camera(0.0, 20.0))
     few = view.mask & (view.mask.flatten().cumsum(0).view_as(view.mask) <= 2)
@@ -370,21 +352,12 @@ def test_too_few_depths_to_hold_some_out_are_an_error():
         )
 
 
-def test_half_of_the_points_of_a_warm_start_lie_near_the_surface():
-    far = torch.tensor([[0.0, 0.0, 9.0]])  # outside the sphere of the other points
-    scattered = scatter_points(far, 100, torch.Generator().manual_seed(0))
-    assert int(((scattered - far).norm(dim=1) < 0.5).sum()) == 50
-    assert int((scattered.norm(dim=1) <= 1.1).sum()) == 50
-
-
 def test_a_warm_start_counts_evaluations_of_the_previous_field():
     fitter = fitter_of("ball", warm_iterations=10)
     ball = fitter.begin(candidate("sphere"), None)
     grid = fitter.begin(candidate("grid_16"), ball.model)
-    previous_evaluations = (
-        12 * 128 + 16**3
-    )  # evaluations of the sphere in each iteration, the warm-up, the final loss, and on the grid
-    assert grid.evidence.evaluations == 10 * 128 + previous_evaluations
+    # Those of the sphere are of each iteration, the warm-up, the final loss, and the grid.
+    assert grid.evidence.evaluations == 10 * 128 + 12 * 128 + 16**3
     network = fitter.begin(candidate("network_1x16"), ball.model)
     assert network.evidence.evaluations == 10 * 128 + 12 * 128
     assert network.evidence.flops > 10 * 128 * (10 + candidate("network_1x16").flops)
@@ -403,14 +376,10 @@ GRID, NETWORK = Size(free=4_427, stored=32_768, sparse_bytes=40_000), Size(free=
 
 @each("measure, chosen", [("free", "grid_32"), ("stored", "network_4x64"), ("bytes", "network_4x64")])
 def test_free_and_stored_numbers_disagree_and_the_measure_decides(measure, chosen):
+    assert str(GRID) == "32,768 numbers, 4,427 of them free" and str(NETWORK) == "12,801 numbers"
     fits = [evidence_of("grid_32", GRID, an_error(0.008)), evidence_of("network_4x64", NETWORK, an_error(0.009))]
     choice = choose(fits, 0.01, measure)
     assert (choice.chosen.candidate, choice.measure, choice.best.candidate) == (chosen, measure, "grid_32")
-
-
-def test_sizes_in_words():
-    assert str(GRID) == "32,768 numbers, 4,427 of them free" and str(NETWORK) == "12,801 numbers"
-    assert (GRID.bytes, NETWORK.bytes) == (131_072, 51_204) and candidate(PAPER_NETWORK).stored == 1_839_614
 
 
 def test_candidates_are_tried_in_the_order_of_the_measure():
@@ -441,29 +410,11 @@ def test_a_fit_continues_while_its_error_falls_and_states_if_it_was_stopped(shap
     assert left.mean == pytest.approx(fitted.evidence.mean)
 
 
-def test_a_first_round_is_kept_although_the_warm_start_imitates_a_better_field():
-    fitter = fitter_of("ball", iterations=8, warm_iterations=200)
-    fitted = fitter.begin(candidate("network_2x32"), fitter.begin(candidate("sphere"), None).model)
-    imitation = fitted.evidence.mean
-    fitter.finish(fitted, 1)
-    assert fitted.evidence.mean > imitation and fitted.evidence.iterations == 8
-
-
 def test_the_seconds_of_a_fit_continue_those_of_its_trial():
-    def line(candidate: str, phase: str, seconds: float) -> dict[str, object]:
-        return {"candidate": candidate, "phase": phase, "part": "growth", "seconds": seconds, "total": seconds}
-
-    trial = [line("box", "warm", 9.0), line("box", "fit", 1.0), line("box", "fit", 2.5)]
-    rest = [
-        line("sphere", "fit", 7.0),
-        line("box", "fit", 0.5),
-        line("box", "fit", 2.0),
-    ]  # the seconds begin at 0 again
-    curve = rendered_curve([*trial, *rest], "box")
-    assert [point["seconds"] for point in curve] == [1.0, 2.5, 3.0, 4.5]
-    assert [point["iteration"] for point in curve] == [0, 1, 2, 3] and [point["total"] for point in curve] == [
-        1,
-        2.5,
-        0.5,
-        2,
-    ]
+    """In the second part the seconds begin at 0 again."""
+    rows = [("box", "warm", 9.0), ("box", "fit", 1.0), ("box", "fit", 2.5), ("sphere", "fit", 7.0), ("box", "fit", 0.5)]
+    lines = [{"candidate": name, "phase": phase, "part": "growth", "seconds": n, "total": n} for name, phase, n in rows]
+    curve = rendered_curve(lines, "box")
+    assert [(point["iteration"], point["seconds"], point["total"]) for point in curve] == [
+        (0, 1.0, 1.0), (1, 2.5, 2.5), (2, 3.0, 0.5),
+    ]  # fmt: skip

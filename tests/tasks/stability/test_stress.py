@@ -9,12 +9,9 @@ from omegaconf import OmegaConf
 
 from bench.config import build, load
 from bench.machine.limits import LimitReached, Limits
-from bench.records.record import RunStatus
-from bench.solve.optimise import History
 from bench.tables import choice, names
-from bench.tasks.stability import fit
 from bench.tasks.stability.axes import Stress, Sweep
-from bench.tasks.stability.fit import _failure, judge_fit
+from bench.tasks.stability.fit import judge_fit
 from bench.tasks.stability.judge import judge_gradient, judge_rendering, truth
 from bench.tasks.stability.scenes import CAMERA_DISTANCE, SCENES
 from bench.tasks.stability.search import Bisection, Search, SearchSettings
@@ -25,7 +22,7 @@ from renderers.camera import Rays
 from renderers.rendering import Status, Unsupported
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.tiny import CPU, Blind, ball_prior, camera_of
+from tests.tiny import CPU, Blind, ball_prior
 
 CRITERIA = Criteria(hits=0.99, false_hits=0.01, cosine=0.99, scale=0.1, surface_error=0.02)
 LIMITS = Limits(1e8, 8)
@@ -111,15 +108,6 @@ def test_a_floater_is_hit_by_samples_and_missed_by_a_march():
         near = (rendering.distance - exact.distance).abs() < 0.01
         share[name] = float((rendering.hit & near)[in_front].double().mean())
     assert share["dist"] < 0.1 and share["newton"] < 0.1 and share["dvr"] > 0.9
-
-
-def test_errors_of_a_mask_are_of_both_kinds():
-    mask = torch.zeros(40, 40, dtype=torch.bool)
-    mask[:, :20] = True
-    observation = fit.Observation(camera_of(40), torch.ones(40, 40), mask, mask)
-    wrong = fit.mask_errors(observation, 0.3, drawn()).mask ^ mask
-    assert wrong[:, :20].double().mean() == pytest.approx(0.3, abs=0.08)
-    assert wrong[:, 20:].double().mean() == pytest.approx(0.3, abs=0.08)
 
 
 def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
@@ -227,15 +215,6 @@ def test_a_disturbed_fit_ends_further_off(scene):
     assert mild.success and severe.numbers["surface_error"] > mild.numbers["surface_error"]
 
 
-def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
-    fits, draw_spheres = [], fit._draw_parameters
-    monkeypatch.setattr(fit, "_draw_parameters", lambda draw, offset: fits.append(offset) or draw_spheres(draw, offset))
-    for name in ("far_start", "a_ball"):
-        few = replace(conditions(), fit=replace(FIT, resolution=8, iterations=1))
-        judge_fit(name, 0.7, drawn(), renderer=load("renderer", "dist"), conditions=few)
-    assert fits == [0.7, FIT.offset]
-
-
 def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
     held = replace(conditions(), limits=Limits(1, 8))
     assert stress_named("thin_plate").trial(load("renderer", "idr"), 0.0, 0, held).failure is Failure.TIMEOUT
@@ -249,13 +228,6 @@ def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
     one_in_five = Limits(int(spent(LIMITS) * fit.iterations / 5), 8)
     with pytest.raises(LimitReached, match="field values"):
         spent(one_in_five)
-
-
-def test_a_fit_fails_where_its_error_is_above_the_largest():
-    assert _failure(History(), 0.05, 0.05) is Failure.NONE
-    assert _failure(History(), 0.051, 0.05) is Failure.NOT_REACHED
-    assert _failure(History(), float("nan"), 0.05) is Failure.NAN
-    assert _failure(History(status=RunStatus.DIVERGED), 0.01, 0.05) is Failure.DIVERGED
 
 
 def test_sweeps_and_stresses_are_checked():
@@ -302,14 +274,6 @@ def test_the_interval_of_a_noisy_breakdown_holds(width, least):
         holds += result.low <= middle <= result.high
         assert len(search.trials) <= search.max_trials
     assert holds / 20 >= least
-
-
-@each("succeeds, end", [(True, 32), (False, 0)])
-def test_an_end_without_a_breakdown_is_tried_repeatedly(succeeds, end):
-    search = searched(DESK, lambda level: succeeds)
-    result = search.result()
-    assert result.low > 1 if succeeds else result.high < 0
-    assert search.trials.count((end, succeeds)) >= DESK.repeats
 
 
 def bisected(succeeds, levels: int = 33) -> Bisection:
