@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bench.config import load
 from bench.solve.observed_view import ObservedView, central_differences, gradients_at, normal_error
+from bench.tasks.capacity.observations import concatenate_views
 from datasets.scene import View
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
