@@ -9,7 +9,7 @@ import torch
 from bench.config import load
 from renderers.boundary import BrokenContract, render_checked, silhouette_loss
 from renderers.camera import Rays
-from renderers.field import Counts, Kind, Meter
+from renderers.field import Kind
 from renderers.fields.analytic import Shape, sphere
 from renderers.rendering import Capabilities, RayObservation, Rendering
 from tests.looped import each
@@ -161,22 +161,3 @@ def test_observed_distances_reach_only_a_renderer_that_takes_them():
         BrokenContract, match=r"TakesDistances\.observed_loss must return a tensor with one number, not None"
     ):
         silhouette_loss(TakesDistances(loss=lambda loss: None), field, RAYS, rendering, observation)
-
-
-@each("name", ["dist", "dvr"])
-@each("free", [True, False])
-def test_a_valid_rendering_passes_unchanged_without_evaluations(name, free):
-    renderer, counts = load("renderer", name), (Counts(), Counts())
-    plain, checked_field = (Meter(ball(free=free), count) for count in counts)
-    torch.manual_seed(0)
-    expected = renderer.render(plain, RAYS)
-    expected_loss = renderer.silhouette_loss(plain, RAYS, expected, MASK)
-    torch.manual_seed(0)
-    rendering = render_checked(renderer, checked_field, RAYS)
-    loss = silhouette_loss(renderer, checked_field, RAYS, rendering, OBSERVATION)
-    assert torch.equal(rendering.distance, expected.distance) and loss.item() == expected_loss.item()
-    if free:
-        (expected.distance.sum() + expected_loss).backward()
-        (rendering.distance.sum() + loss).backward()
-        assert counts[0].gradient > 0
-    assert counts[0] == counts[1] and counts[0].value > 0

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from renderers.camera import Camera, Rays, distance_to_origin, rigid, sphere_span
 from tests.looped import each
-from tests.renderers.analytic_cases import vector
+from tests.renderers.analytic_cases import sheet, vector
 
 INTRINSICS = torch.tensor([[100.0, 0, 32], [0, 50, 20], [0, 0, 1]], dtype=torch.float64)
 
@@ -62,21 +62,13 @@ def test_gradients_reach_intrinsics_and_extrinsics():
     assert torch.autograd.gradcheck(project, (intrinsics, translation))
 
 
-def parallel(height: int, width: int) -> Rays:
-    """Rays along z, one through the centre of each unit square of a sheet."""
-    rows, columns = torch.meshgrid(
-        torch.arange(height, dtype=torch.float64) + 0.5, torch.arange(width, dtype=torch.float64) + 0.5, indexing="ij"
-    )
-    origins = torch.stack([columns, rows, torch.zeros_like(rows)], -1)
-    return Rays(origins, vector((0, 0, 1)).expand_as(origins), image=True)
-
-
 def test_coarser_rays_run_through_the_middles_of_their_blocks_and_repeat_the_edge():
-    coarse = parallel(8, 4).coarser(4)
+    x, y = torch.arange(5).double() + 0.5, torch.arange(8).double() + 0.5
+    coarse = sheet(x[:4], y).coarser(4)
     assert coarse.image and coarse.directions.tolist() == [[[0, 0, 1]], [[0, 0, 1]]]
     assert coarse.origins[..., :2].tolist() == [[[2, 2]], [[2, 6]]]
     # 5 columns in blocks of 4: columns 0 to 3, then 4 by itself. 3 rows: 0.5, 1.5, 2.5 and 2.5 again, mean 1.75.
-    assert parallel(3, 5).coarser(4).origins[..., :2].tolist() == [[[2, 1.75], [4.5, 1.75]]]
+    assert sheet(x, y[:3]).coarser(4).origins[..., :2].tolist() == [[[2, 1.75], [4.5, 1.75]]]
 
 
 def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:

@@ -11,12 +11,13 @@ from bench.config import load
 from bench.machine.limits import LimitReached, Limits
 from renderers.boundary import render_checked
 from renderers.camera import Rays
-from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_version, points_in_sphere
+from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_version
 from renderers.fields import mlp
 from renderers.fields.analytic import box, capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
 from renderers.rendering import Status, at_iteration, with_empty_memory
 from tests.looped import each
+from tests.renderers.analytic_cases import sheet
 from tests.renderers.test_newton import camera, exact
 
 NEWTON = load("renderer", "newton")
@@ -131,13 +132,11 @@ def test_an_optimisation_begins_warm_on_coarse_values_too():
 @each("name", [*MARCHES])
 def test_what_a_coarse_ray_passed_is_decided_for_its_pixels_too(behind, name):
     """The edge of a small ball, before a wall, so near that coarse rays lie closer than coarse values are exact."""
-    y, x = torch.meshgrid(0.047 + 1e-4 * torch.arange(64), 1e-4 * torch.arange(64), indexing="ij")
-    origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
-    near = Rays(origins, torch.tensor([0.0, 0.0, 1.0]).expand_as(origins), image=True)
+    near = sheet(1e-4 * torch.arange(64), 0.047 + 1e-4 * torch.arange(64))
     scene = sphere(0.05) | plane((0.0, 0.0, -1.0), -behind)
     with torch.no_grad():
         rendering = MARCHES[name].render(Offering(scene, ERRORS["too large"]), near)
-    inside = x.square() + y.square() < 0.05**2
+    inside = near.origins[..., :2].norm(dim=-1) < 0.05
     on_ball = rendering.hit & (rendering.distance < 2.05)
     assert inside.sum() > 1000
     assert (on_ball ^ inside).sum() <= (0.02 if name == "newton" else 0.03) * inside.sum()  # a ring of epsilon has 0.02
@@ -184,30 +183,6 @@ def test_the_coarse_values_of_a_network_are_off_by_no_more_than_they_say(wide):
         assert 0 < off.max() <= coarse.error
         assert coarse.values(torch.zeros(2, 5, 3)).shape == (2, 5) and coarse.values(torch.zeros(0, 3)).shape == (0,)
         assert off.max() > coarse.error / 10
-
-
-def test_a_network_with_hardly_a_surface_states_the_error_of_all_its_coarse_values(wide):
-    """Of no value that is near 0, or of few of them, nothing could be measured."""
-    drawn = points_in_sphere(mlp.ERROR_SAMPLE_POINTS, torch.zeros(()))
-    for least in (mlp.NEAR_SURFACE_VALUE + 0.01, mlp.NEAR_SURFACE_VALUE - 0.01):
-        wide.last.weight.mul_(10.0)
-        wide.last.bias.sub_(wide.at(torch.zeros(8))(drawn).min() - least)
-        field = wide.at(torch.zeros(8))
-        assert (field.coarse.values(drawn).abs() <= mlp.NEAR_SURFACE_VALUE).sum() < mlp.MIN_NEAR_SURFACE_POINTS
-        off = (field.coarse.values(drawn) - field(drawn)).abs().max()
-        assert field.coarse.error == pytest.approx(mlp.COARSE_ERROR_FACTOR * off.item())
-
-
-def test_their_error_is_measured_once_for_each_state_of_the_weights(wide, monkeypatch):
-    measured = []
-    largest = mlp._largest_error
-    monkeypatch.setattr(mlp, "_largest_error", lambda *arguments: measured.append(1) or largest(*arguments))
-    for code in torch.eye(8)[:3]:
-        assert wide.at(code).coarse
-    assert len(measured) == 1
-    wide.last.weight.mul_(2.0)
-    assert wide.at(torch.zeros(8)).coarse
-    assert len(measured) == 2
 
 
 def test_without_the_private_names_of_torch_they_are_the_same(wide, monkeypatch):

@@ -174,27 +174,3 @@ def test_idr_mask_loss_by_hand():
     entropies = [softplus(-20 * rendering.closest[i]) for i in (1, 2)] + [softplus(20 * rendering.closest[3])]
     assert rendering.closest[2].item() == pytest.approx(0.3, abs=0.1)
     assert loss.item() == pytest.approx(sum(e.item() for e in entropies) / (20 * 4), rel=1e-9)
-
-
-def test_naive_is_the_same_ray_by_ray_and_its_practical_gradient_is_that_of_dist():
-    rays = along_z(0.0, 0.2, 0.45, 0.6, 1.2)
-    radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    shared = {"n_gradient_samples": 2, "epsilon": 1e-6, "silhouette_average": "all"}
-    dist = load("renderer", "dist", alpha=1.0, extra_step_cap=None, coarse_to_fine=False, active_only=False, **shared)
-    results = {}
-    for gradient in ("unrolled", "practical"):
-        for serial in (False, True):
-            renderer = load("renderer", "naive", gradient=gradient, serial=serial, **shared)
-            rendering = renderer.render(sphere(radius), rays)
-            (rate,) = torch.autograd.grad(rendering.distance[rendering.hit].sum(), radius)
-            results[gradient, serial] = rendering, rate
-        for name in ("distance", "status", "residual", "closest"):
-            assert torch.equal(getattr(results[gradient, False][0], name), getattr(results[gradient, True][0], name)), (
-                name
-            )
-        assert results[gradient, False][1] == pytest.approx(results[gradient, True][1].item())
-    other = dist.render(sphere(radius), rays)
-    (rate,) = torch.autograd.grad(other.distance[other.hit].sum(), radius)
-    assert torch.equal(other.distance, results["practical", False][0].distance)
-    assert rate.item() == pytest.approx(results["practical", False][1].item())
-    assert rate.item() != pytest.approx(results["unrolled", False][1].item(), rel=0.01)

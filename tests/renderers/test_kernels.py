@@ -7,15 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from bench.config import load
 from bench.machine import environment
 from bench.machine.environment import using_threads
-from bench.shape_prior import initialise_to_sphere
-from datasets.views import ViewSampler
-from renderers.field import Counts, Meter
-from renderers.fields import mlp
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.kernels import decoder as of_decoders
 from renderers.kernels import library
@@ -100,35 +94,6 @@ def test_values_follow_weights_that_are_being_learnt():
         torch.testing.assert_close(field(points), field._forward(points), rtol=1e-6, atol=1e-6)
     with using_threads(1), torch.inference_mode():
         torch.testing.assert_close(make("skip").at(torch.zeros(4))(points), make("skip").at(torch.zeros(4))(points))
-
-
-def ball() -> BoundDecoder:
-    decoder = Decoder(layers=4, width=128, code_length=4, skip=2, narrow=False)
-    torch.manual_seed(0)
-    initialise_to_sphere(decoder, radius=0.5)
-    return decoder.requires_grad_(False).at(torch.full((4,), 0.1))
-
-
-def rendered(name: str) -> tuple[Tensor, Tensor, Counts]:
-    field = Meter(ball(), Counts())
-    rays = ViewSampler(1.2, 70.0, (0.0, 360.0), (15.0, 35.0), 48).camera(30.0, 25.0).rays()
-    with torch.no_grad():
-        rendering = load("renderer", name).render(field, rays)
-    return rendering.status, rendering.distance, field.counts
-
-
-@with_compiler
-@each("name", ["dist", "newton", "idr", "neus", "relaxed_boundary"])
-def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, monkeypatch):
-    with using_threads(1):
-        status, distance, counts = rendered(name)
-        monkeypatch.setattr(mlp, "compile_decoder", lambda *_: None)
-        status_of_torch, distance_of_torch, counts_of_torch = rendered(name)
-        monkeypatch.undo()
-    alike = status == status_of_torch
-    assert (~alike).sum() <= 2 and len(status.unique()) > 1
-    assert counts.value == pytest.approx(counts_of_torch.value, rel=2e-3)
-    assert (distance - distance_of_torch)[alike].abs().quantile(0.99) < 1e-4
 
 
 def test_torch_alone_is_left_to_torch_and_nothing_else_can_be_asked_for(monkeypatch, tmp_path):

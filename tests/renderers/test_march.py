@@ -13,7 +13,7 @@ from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
 from renderers.march import RayFront, Stepping, march_coarse_to_fine, march_front, ray_pyramid
 from renderers.rendering import Status
 from tests.looped import each
-from tests.renderers.analytic_cases import beam, sphere_hits, vector
+from tests.renderers.analytic_cases import beam, sheet, sphere_hits, vector
 from tests.tiny import camera_of
 
 PLAIN = Stepping(epsilon=5e-5)
@@ -24,13 +24,10 @@ FINE = load("renderer", "dist", coarse_to_fine=False)
 COARSE = replace(FINE, coarse_to_fine=True)
 
 
-def sheet(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
-    """An image of rays along z from z = -2, `pitch` apart; with the default pitch all rays run through the centre."""
-    rows = (torch.arange(height, dtype=torch.float64) - (height - 1) / 2) * pitch
-    columns = (torch.arange(width, dtype=torch.float64) - (width - 1) / 2) * pitch
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    origins = torch.stack([x, y, torch.full_like(x, -2)], -1).expand(*batch, height, width, 3)
-    return Rays(origins, vector((0, 0, 1)).expand_as(origins), image=True)
+def square(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
+    """An image of rays along z, `pitch` apart; with the default pitch all rays run through the centre."""
+    x, y = (pitch * (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) for count in (width, height))
+    return sheet(x, y, *batch)
 
 
 def trace(field: Shape, rays: Rays, stepping: Stepping, *, steps: int = 50, samples: int = 1) -> tuple[RayFront, int]:
@@ -96,13 +93,13 @@ def test_finished_rays_are_evaluated_only_without_active_only():
 ])  # fmt: skip
 def test_coarse_to_fine_marches_blocks_of_16_then_of_4_then_pixels(size, steps, evaluations):
     # 8 x 8 pixels: 2 x 2 rays for three steps, 4 x 4 for three, then 8 x 8. With steps of 0.01 no ray ends.
-    front, count = trace(constant(0.01), sheet(*size), PLAIN, steps=steps)
+    front, count = trace(constant(0.01), square(*size), PLAIN, steps=steps)
     assert count == evaluations and (front.status == Status.OUT_OF_STEPS).all()
     assert front.distance.tolist() == pytest.approx([1 + 0.01 * steps] * len(front.distance))
 
 
 def test_a_ray_continues_the_coarse_ray_that_covers_it():
-    for level, (columns, across) in zip(ray_pyramid(sheet(7, 10, pitch=0.1)), [(5, 3), (10, 5)], strict=True):
+    for level, (columns, across) in zip(ray_pyramid(square(7, 10, pitch=0.1)), [(5, 3), (10, 5)], strict=True):
         for ray, parent in enumerate(level.parent.tolist()):
             assert parent == ray // columns // 2 * across + ray % columns // 2
 

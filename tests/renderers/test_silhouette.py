@@ -14,6 +14,7 @@ from renderers.fields.analytic import sphere
 from renderers.rendering import Capabilities, RayObservation, Renderer, at_iteration
 from renderers.silhouette import Hinge, SilhouetteLoss
 from tests.looped import each
+from tests.renderers.analytic_cases import sheet
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
 CLOSEST = torch.tensor([0.5, 0.03, -0.3, -0.04], dtype=torch.float64)
@@ -108,10 +109,7 @@ def test_a_correct_hit_costs_nothing_for_any_threshold_of_the_renderer():
 def test_each_spurious_hit_shrinks_the_shape_whatever_its_closest_value(name):
     """The least value of a volume renderer may lie in front of the surface, and would cost nothing at a hit."""
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    side = torch.linspace(-0.45, 0.45, 12, dtype=torch.float64)
-    x, y = torch.meshgrid(side, side, indexing="xy")
-    origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
-    rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(origins))
+    rays = sheet(*[torch.linspace(-0.45, 0.45, 12, dtype=torch.float64)] * 2)
     rendering = at_iteration(load("renderer", name), 0).render(sphere(radius), rays)
     assert (rendering.hit & (rendering.closest > 5e-5)).sum() > 10
     loss = Hinge(5e-5, signed=True, average="all").of_rendering(

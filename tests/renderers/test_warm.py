@@ -178,19 +178,6 @@ def test_a_batch_of_views(warm):
         assert rendering.distance.shape == (2, SIZE, SIZE) and differing(rendering, field, views) <= 1
 
 
-def test_a_field_that_is_nan_somewhere(warm):
-    def values(points):
-        inner = ball(0.5)(points)
-        return torch.where(points[..., 0] > 0.3, torch.nan, inner)
-
-    broken = Shape(values, Kind.BOUND, None)
-    for field in (broken, ball(0.5), broken, broken, ball(0.5)):
-        rendering = render_checked(at_iteration(warm, 1), field, RAYS)
-        for tensor in (rendering.distance, rendering.closest, rendering.residual):
-            assert tensor.isfinite().all()
-    assert differing(rendering, ball(0.5)) == 0
-
-
 def test_in_another_thread_nothing_is_remembered(warm):
     in_turn(warm, [ball(0.5)] * 2)
 
