@@ -20,6 +20,7 @@ from bench.evaluate.evaluate import (
 )
 from bench.evaluate.state import (
     DEFAULT_VERTEX_COLOUR,
+    REACH,
     State,
     coloured_image,
     colours_at,
@@ -70,6 +71,13 @@ def test_a_part_of_the_truth_only_judges_whether_it_is_in_the_prediction(inputs)
     metrics = evaluate(state).metrics
     assert metrics.keys() & WORST_SURFACE.keys() == {"completeness", "chamfer_gt_to_pred"} and chamfer_only(state) == {}
     assert metrics["completeness"] == pytest.approx(0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5, rel=0.15)
+
+
+def test_samples_of_the_field_are_one_spacing_apart(inputs):
+    state = State(sphere(RADIUS), inputs)
+    steps = (state.mesh.vertices + REACH) / state.spacing
+    on_samples = np.abs(steps - steps.round()) < 1e-3
+    assert (on_samples.sum(axis=1) >= 2).all()  # a vertex of marching cubes lies on an edge between two samples
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from bench.evaluate.evaluate import (
     IMAGE_DEFINITIONS,
     RENDERER_DEFINITIONS,
     WORST_SURFACE,
+    subsample,
     surface_metrics,
     view_metrics,
 )
@@ -50,6 +51,13 @@ def test_worked_example():
             "normal_consistency": 0.55,
         }
     )
+
+
+def test_a_distance_equal_to_the_threshold_does_not_count():
+    # Both ways the distances are 1/2 and 1/4; below 1/2 lies one of two, so precision, recall and F are 1/2.
+    truth = surface([[0, 0, 0], [4, 0, 0]], [[0, 0, 1], [0, 0, 1]])
+    predicted = surface([[0, 0, 0.5], [4, 0, 0.25]], [[0, 0, 1], [0, 0, 1]])
+    assert surface_metrics(predicted, truth, threshold=0.5)["fscore"] == 0.5
 
 
 def test_swapping_the_surfaces():
@@ -96,6 +104,15 @@ def view(depth: np.ndarray, mask: np.ndarray) -> View:
     return View(camera_of(8), torch.from_numpy(depth), torch.zeros(*depth.shape, 3), torch.from_numpy(mask))
 
 
+def test_image_worked_example():
+    # Foreground in both: two pixels, with errors 0.5 and 0.25; in at least one: three.
+    predicted_depth = np.array([[1.5, 2.0], [9.0, np.inf]], dtype=np.float32)
+    truth_depth = np.array([[1.0, 2.25], [np.nan, 0.0]], dtype=np.float32)
+    predicted_mask, truth_mask = np.array([[True, True], [True, False]]), np.array([[True, True], [False, False]])
+    measured = view_metrics(view(predicted_depth, predicted_mask), view(truth_depth, truth_mask))
+    assert measured == pytest.approx({"depth_mae": 0.375, "mask_iou": 2 / 3})
+
+
 def test_image_edges():
     depth, none, every = np.ones((2, 3)), np.zeros((2, 3), dtype=bool), np.ones((2, 3), dtype=bool)
 
@@ -108,6 +125,13 @@ def test_image_edges():
     assert measured(depth * np.nan, every, every) == (np.inf, 1)
     unknown = np.array([[1.0, 0, 0], [1, 1, 1]])  # 0 is no depth
     assert view_metrics(view(depth, every), view(unknown, every)) == {"depth_mae": 0, "mask_iou": 1}
+
+
+def test_drawn_points_are_different_ones():
+    points = np.arange(300.0).reshape(100, 3)
+    some = subsample(points, 60, seed=0)
+    assert len(np.unique(some, axis=0)) == 60 and np.isin(some, points).all()
+    assert np.array_equal(subsample(points, 100, seed=0), points)
 
 
 def test_every_metric_has_one_sentence():

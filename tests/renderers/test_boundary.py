@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bench.config import load
-from renderers.boundary import BrokenContract, render_checked, silhouette_loss
+from renderers.boundary import BrokenContract, check_gradients, render_checked, silhouette_loss
 from renderers.camera import Rays
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, sphere
@@ -161,3 +161,13 @@ def test_observed_distances_reach_only_a_renderer_that_takes_them():
         BrokenContract, match=r"TakesDistances\.observed_loss must return a tensor with one number, not None"
     ):
         silhouette_loss(TakesDistances(loss=lambda loss: None), field, RAYS, rendering, observation)
+
+
+def test_missing_gradients_of_a_hit_are_errors_if_they_are_claimed():
+    gradient = torch.ones(2)
+    check_gradients(Mine(), gradient, gradient)
+    check_gradients(Mine(capabilities=NO_GRADIENT), None, None)
+    with pytest.raises(BrokenContract, match="field_gradient is True"):
+        check_gradients(Mine(), None, gradient)
+    with pytest.raises(BrokenContract, match="ray_gradient is True"):
+        check_gradients(Mine(), gradient, None)

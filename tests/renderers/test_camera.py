@@ -35,6 +35,7 @@ def test_points_along_the_rays_project_back_to_their_pixels_and_depth_is_camera_
     view = camera(motion(angle, translation))
     distance = 0.5 + torch.rand(40, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     rays = view.rays()
+    assert rays.image and rays.shape == (40, 64)
     points = rays.at(distance) @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
     torch.testing.assert_close(view.depth(distance), points[..., 2], rtol=0, atol=1e-12)  # Eq. 2
     torch.testing.assert_close(view.distance(view.depth(distance)), distance)

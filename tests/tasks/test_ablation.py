@@ -1,5 +1,6 @@
 """What a renderer costs on one view: counts, clock, limits and errors, on networks of a few neurons."""
 
+import json
 import weakref
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -8,20 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.image import imread
 
 from bench.config import load
 from bench.evaluate.reference import Reference
 from bench.machine.limits import Limits
-from bench.records.record import RunStatus
+from bench.records.record import RunStatus, to_json
 from bench.setup.inputs import RunContext
 from bench.tasks import ablation
 from bench.tasks.ablation import BASE, DEFINITIONS, SHRINK_FACTOR, WARM_UP_PIXELS, Ablation, Timings
 from renderers import waits
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
-from renderers.rendering import Capabilities, Renderer, Rendering, Status, Unsupported
+from renderers.rendering import Capabilities, Renderer, Rendering, Status
 from tests.looped import each
-from tests.tiny import PEAK, Blind, ball_prior, camera_of, run_of
+from tests.tiny import PEAK, ball_prior, camera_of, run_of
 
 SETTINGS = Ablation(repeats=2, limits=Limits(values=1e6, memory=8), smallest=2, wrong=0.02)
 PRIOR = ball_prior()
@@ -43,6 +45,13 @@ def measured(folder: Any, renderer: Any, settings: Ablation = SETTINGS, size: in
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory) -> RunContext:
     return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"))
+
+
+def test_it_ends_well_with_all_its_files(dist):
+    assert (dist.record.status, dist.record.reason) == (RunStatus.OK, "")
+    assert {path.name for path in dist.folder.iterdir()} == {"cache", "images.npz", "summary.png"}
+    assert imread(dist.folder / "summary.png")[..., :3].std() > 0.02
+    json.loads(to_json(dist.record.metrics), parse_constant=pytest.fail)
 
 
 def defined(name: str, definition: str) -> bool:
@@ -260,14 +269,6 @@ def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, v
     assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
 
 
-def test_renderers_that_cannot_are_unsupported(tmp_path):
-    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
-        measured(tmp_path, Blind())
-    picky = Fake(capabilities=Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True))
-    with pytest.raises(Unsupported, match="Fake needs a level field, not a distance field"):
-        measured(tmp_path, picky)
-
-
 TURNS = replace(SETTINGS, repeats=1, beside=["newton", "dvr"], rounds=2, size=16, threads=1)
 
 
@@ -291,3 +292,13 @@ def test_every_renderer_in_turn_has_its_numbers_and_a_limit_names_the_one_that_r
     run = measured(tmp_path, load("renderer", "dist"), replace(TURNS, limits=Limits(values=8000, memory=8)), 32)
     assert run.record.status is RunStatus.TIMEOUT
     assert run.record.reason.startswith("more than 8,000 field values in a rendering of dvr at 16 x 16; ")
+
+
+def test_threads_follow_the_setting_and_are_restored(tmp_path, monkeypatch):
+    threads, before = [], torch.get_num_threads()
+    clock = ablation.Workbench._clock
+    monkeypatch.setattr(
+        ablation.Workbench, "_clock", lambda *arguments: threads.append(torch.get_num_threads()) or clock(*arguments)
+    )
+    measured(tmp_path, load("renderer", "dist"), replace(SETTINGS, threads=2))
+    assert set(threads) == {2} and torch.get_num_threads() == before

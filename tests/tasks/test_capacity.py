@@ -6,16 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.evaluate.evaluate import Evaluation
 from bench.records.record import Record, RunStatus
 from bench.runner.execute import execute
 from bench.runner.process import Job
 from bench.runner.summary import print_run_summary
 from bench.tasks.capacity.candidates import candidate
+from bench.tasks.capacity.field import failure_of
+from bench.tasks.capacity.growth import grow
 from bench.tasks.capacity.held_out import HeldOutError
 from bench.tasks.capacity.model import Evidence, Size
 from bench.tasks.capacity.study import CheckSettings, shares
 from bench.tasks.capacity.task import Capacity, savings
 from renderers.silhouette import Own
+from tests.tasks.capacity.test_models import GROWTH, fitter_of
 from tests.tiny import curve_of, plain, silent
 
 TINY = (
@@ -79,6 +83,17 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     record.seconds["total"] = 1.0
     print_run_summary(tmp_path, record)
     assert re.search(r"recommended_field +rounded_box\b", capsys.readouterr().out)
+
+
+def test_a_fit_as_good_as_its_start_is_ok_and_a_worse_one_is_not_reached():
+    growth = grow(fitter_of("box", iterations=10, seed=1), [candidate("sphere")], GROWTH)
+    assert growth.fitted.evidence.mean > growth.footprint  # a ball is no box
+    assert failure_of(growth, Evaluation({})) is None
+    assert failure_of(growth, Evaluation({}, failure=(RunStatus.EMPTY, "nothing")))[0] == RunStatus.EMPTY
+    better = replace(growth.initial_error, sums=growth.initial_error.sums * [0.5, 1, 0.5, 1])
+    status, reason = failure_of(replace(growth, initial_error=better), Evaluation({}))
+    assert status == RunStatus.NOT_REACHED
+    assert reason.startswith("the held-out error rose by more than its noise: 0.0")
 
 
 def test_a_users_renderer_without_epsilon_works(compose_config, tmp_path):

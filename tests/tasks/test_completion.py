@@ -17,7 +17,7 @@ from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
 from renderers.fields.networks.coloured import TexturedDecoder
-from renderers.rendering import Capabilities, Rendering, Status, Unsupported, check_kind
+from renderers.rendering import Capabilities, Rendering, Status
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.tiny import CPU, TRIANGLE
@@ -108,6 +108,15 @@ def test_depth_is_compared_where_it_is_given_and_hit(problem_of):
     assert values(few)["depth"] == pytest.approx(10.0 * expected, rel=1e-4)
 
 
+def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
+    """See tests/solve/test_observed_view.py for the term itself."""
+    assert problem_of().compare.__self__.normals is None
+    problem = problem_of(normal_weight=3.0)
+    terms, view = values(problem), problem.compare.__self__
+    assert (view.normal_weight, view.normal_width) == (3.0, 0.02) and torch.equal(view.normals, scene.view.normals)
+    assert terms["total"] == pytest.approx(sum(terms[name] for name in terms if name != "total"))
+
+
 def test_colours_are_compared_where_the_shape_is_shown_and_hit(problem_of, scene):
     """Of the three pixels that show the shape two are hit; the gradient reaches both halves of the code."""
     torch.manual_seed(0)
@@ -172,6 +181,16 @@ def test_the_gradient_is_that_of_the_loss(problem_of, prior, scene):
     assert torch.allclose(problem.code.grad, 10.0 / 2 * COSINE * expected, rtol=1e-4, atol=1e-6)
 
 
+def test_evaluations_are_counted_and_judging_is_not(problem_of):
+    problem = problem_of()
+    assert problem.rays_per_iteration == 4
+    problem.loss(0)["total"].backward()
+    assert (problem.counts.value, problem.counts.gradient) == (4, 2)  # two pixels are compared
+    field = problem.field()
+    assert not field(torch.zeros(5, 3)).requires_grad
+    assert problem.counts.value == 4
+
+
 @dataclass
 class Scheduled(Fake):
     """A renderer with a schedule: what was asked of it, and at which iteration."""
@@ -200,12 +219,3 @@ def test_a_renderer_with_a_schedule_is_as_it_is_at_the_iteration(problem_of):
     assert renderer.iteration_asked is None  # what is judged and drawn is by the renderer as configured
     optimise(problem, OptimiserSettings(3, 0.01, "constant"), CPU, history=History(), on_step=lambda line: None)
     assert [iteration for what, iteration in renderer.log if what == "render"] == [0, 0, 1, 2]  # the warm-up first
-
-
-def test_a_renderer_without_a_gradient_or_for_another_kind_of_field_is_unsupported(problem_of):
-    with pytest.raises(Unsupported, match="Fake has no gradient towards the field"):
-        problem_of(Fake(capabilities=Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True)))
-    picky = Fake(capabilities=Capabilities((Kind.BOUND, Kind.LEVEL), field_gradient=True, ray_gradient=True))
-    with pytest.raises(Unsupported, match="Fake needs a bound or level field, not a distance field"):
-        check_kind(picky, problem_of().field())
-    check_kind(Fake(), problem_of().field())

@@ -26,7 +26,7 @@ SETTINGS = DeepSDF(
 )  # fmt: skip
 FIT = PriorFit(
     distances=2000, batch=500, surface_width=0.05, code=CodePenalty(0.0, "sum"),
-    optimiser=OptimiserSettings(200, 0.02, "cosine"),
+    optimiser=OptimiserSettings(80, 0.05, "cosine"),
 )  # fmt: skip
 
 

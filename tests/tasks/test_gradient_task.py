@@ -23,7 +23,7 @@ from bench.tasks.gradients.task import (
 )
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind
-from renderers.rendering import Capabilities, Renderer, Rendering, Unsupported
+from renderers.rendering import Capabilities, Renderer, Rendering
 from tests.looped import each
 from tests.tiny import ball_prior, camera_of, plane_decoder, run_of
 
@@ -180,14 +180,6 @@ def test_pixels_whose_hit_lies_on_another_surface_are_excluded_and_counted(tmp_p
     # A bias on the same surface is an error of the renderer, and compared.
     off = judged(tmp_path, Changed(EXACT["idr"], EXACT["idr"].capabilities, -2 * SAME_SURFACE_DISTANCE)).record.metrics
     assert min(off[f"{band}.pixels"] for band in HITS) >= SETTINGS.pixels - 3
-
-
-def test_renderers_that_cannot_are_unsupported(tmp_path):
-    inner = EXACT["idr"]
-    with pytest.raises(Unsupported, match="Changed has no gradient towards the field"):
-        judged(tmp_path, Changed(inner, Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True)))
-    with pytest.raises(Unsupported, match="Changed needs a level field, not a distance field"):
-        judged(tmp_path, Changed(inner, Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True)))
 
 
 def test_bands_are_of_the_angle_between_ray_and_inward_normal():

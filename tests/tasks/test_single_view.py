@@ -1,5 +1,7 @@
 """Shape from one image from the command line: trained, inferred, judged, and the rows that need no network."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +165,14 @@ def test_a_picture_of_ones_own_has_a_shape(folder, network, picture):
     assert (run / "mesh.ply").is_file() and (run / "summary.png").stat().st_size > 1000
 
 
+def test_a_picture_that_changed_is_seen_anew(folder, network, picture, tmp_path):
+    picture = Path(shutil.copy(picture, tmp_path))
+    files = (f"task.image_path={picture}", f"results_dir={folder}", "evaluation.picture=null")
+    assert not record_of(command(*TINY, *files).out)["reused"]
+    Image.open(picture).rotate(90).save(picture)
+    assert not record_of(command(*TINY, *files).out)["reused"]
+
+
 @each(
     "image, mask, says",
     [
@@ -222,6 +232,17 @@ def test_the_nearest_image_and_the_best_shape_are_those_of_the_same_shape(images
         assert most_similar_shape(shape.image(1), images) == index
         assert most_similar_shape((shape.image(2) + 0.01).clamp(0, 1), images) == index
         assert best_shape(Spheres().mesh(Split.TEST, index), Spheres(), 3) == index
+
+
+def test_the_nearest_image_is_one_image_and_no_mean_over_a_shape(images):  # noqa: F811
+    """The first shape has the exact image among different ones. All images of the second differ slightly."""
+    shape = images[0]
+    image, colours = shape.image(0), shape.colours[:1]
+    same = replace(shape, masks=shape.masks[:1].repeat(3, 1, 1))
+    very = replace(same, colours=torch.cat([colours, torch.zeros_like(colours), torch.zeros_like(colours)]))
+    near = (colours.int() + 20).clamp(0, 255).to(torch.uint8)
+    all_near = replace(same, colours=near.repeat(3, 1, 1, 1))
+    assert most_similar_shape(image, [all_near, very]) == 1
 
 
 def test_the_mean_shape_has_the_mean_distance(tmp_path):

@@ -103,6 +103,16 @@ def test_a_guard_moves_its_breakdown(tmp_path, guard, stress):
     assert guarded["level"] > bare["level"] + 0.03
 
 
+def test_success_that_rises_with_severity_is_noted(tmp_path):
+    stress = stress_named("gap")
+    turned = replace(stress, sweep=replace(stress.sweep, mild=stress.sweep.severe, severe=stress.sweep.mild))
+    few = SearchSettings(levels=5, repeats=2)
+    for used_stress, doubted in ((stress, False), (turned, True)):
+        run = run_of(tmp_path, load("renderer", "idr"), ball_prior(), camera_of(8))
+        Stability(used_stress, few, few, CRITERIA, SHORT, 32, Limits(1e8, 8)).execute(run)
+        assert any(note.startswith("success does not fall with severity") for note in run.record.notes) is doubted
+
+
 def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
     metrics = run(tmp_path, "empty_scene", load("renderer", "idr", epsilon=1e-3))
     lines = curve_of(tmp_path)
@@ -114,6 +124,11 @@ def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
         assert (images["kinds"] == 3).sum() > 0
         assert images["severity"] == pytest.approx(next(x["severity"] for x in lines if x["level"] == mildest))
     assert (tmp_path / "failure.png").stat().st_size > 5000
+
+
+def test_a_task_without_a_stress_names_the_remedy():
+    with pytest.raises(ValueError, match="set stress=thin_plate"):
+        Stability(None, SEARCH, SEARCH, CRITERIA, FIT, 24, Limits(1e8, 8))
 
 
 def test_a_fit_is_searched_with_its_own_settings(tmp_path):

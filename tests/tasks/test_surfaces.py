@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from bench.solve.solve import COST_DEFINITIONS
 from bench.tasks.reconstruction.baselines import Fusing, Hull, Poisson, Stereo
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, OWN_PREFIX, SEEN_PREFIX
 from bench.tasks.reconstruction.stereo import Matching
 from bench.tasks.reconstruction.subject import Depths
-from bench.tasks.reconstruction.surfaces import measured_clouds, with_colours
+from bench.tasks.reconstruction.surfaces import fuse_clouds, measured_clouds, with_colours
 from datasets.files.captures.hull import hull_mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
@@ -118,3 +119,14 @@ def test_points_of_another_program_are_read_in_the_cameras_world(scene, tmp_path
     subject.truth.save(tmp_path / "mesh.ply")
     with pytest.raises(BadInput, match="has faces: give a cloud of points"):
         replace(POISSON, cloud=str(tmp_path / "mesh.ply")).surface(subject)
+
+
+def test_points_are_turned_to_a_camera_that_sees_them_not_to_the_nearest(scene, tmp_path):  # noqa: F811
+    """The inner side of a plate far from the middle, which hides it from the camera that is nearest."""
+    subject = POISSON.subject(run_in(tmp_path / "run", scene).inputs)
+    plate = trimesh.creation.box((0.2, 0.9, 0.9)).apply_translation([0.6, 0.0, 0.0])
+    trimesh.PointCloud(trimesh.sample.sample_surface(plate, 6000, seed=0)[0]).export(tmp_path / "plate.ply")
+    bare = replace(subject, input_shots=tuple(replace(shot, mask=None) for shot in subject.input_shots))
+    points, normals = fuse_clouds(measured_clouds(str(tmp_path / "plate.ply"), bare))
+    for inner, side in ((points[:, 0] < 0.52, -1), (points[:, 0] > 0.68, 1)):
+        assert (side * normals[inner, 0] > 0).mean() > 0.95

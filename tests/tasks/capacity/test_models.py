@@ -15,7 +15,7 @@ from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewS
 from bench.solve.observed_view import ObservedView
 from bench.tasks.capacity.candidates import REACH, by_size, candidate
 from bench.tasks.capacity.field import rendered_curve
-from bench.tasks.capacity.fit import FitProblem, Fitter
+from bench.tasks.capacity.fit import SCREENING, FitProblem, Fitter
 from bench.tasks.capacity.growth import _is_better, cost, grow
 from bench.tasks.capacity.held_out import MISSED_FOOTPRINTS, HeldOutError
 from bench.tasks.capacity.model import Evidence, Model, Size, StartInputs
@@ -292,6 +292,13 @@ def test_the_eikonal_term_is_the_squared_difference_of_slopes_from_one():
         assert terms["eikonal"].item() == pytest.approx(expected, abs=1e-6)
 
 
+def test_each_of_several_starts_is_tried_before_the_best_one_goes_on(monkeypatch):
+    spent = []
+    monkeypatch.setattr(Fitter, "_warm_start", lambda self, fitted, start, iterations: spent.append(iterations))
+    fitter_of("box", warm_iterations=80).begin(candidate("union_3"), None, evaluate=False)
+    assert len(spent) > 3 and spent == [80 // SCREENING] * (len(spent) - 1) + [80]
+
+
 @each("spread, better", [(0.002, True), (-0.002, False)])
 def test_a_candidate_is_better_beyond_the_noise_of_the_difference(spread, better):
     """The difference is the same in both cases: all groups agree on it, or they contradict each other."""
@@ -335,6 +342,17 @@ def test_the_remaining_error_depends_on_the_depth_and_not_on_the_silhouette(name
     assert right < observations.footprint < small
     nothing = Shape(lambda p: 1 + 0 * p[..., 0], Kind.DISTANCE)
     assert observations.depth_error(observations.terms(nothing, 0, 1.0)) == np.inf
+
+
+def test_a_renderers_random_draws_are_the_same_for_every_fit():
+    dvr = load("renderer", "dvr", n_ray_samples=16, doublings=[])
+    fitter, means = fitter_of("ball", dvr, warm_iterations=10), []
+    for _ in range(2):
+        fitted = fitter.begin(candidate("sphere"), None)
+        fitter.fit(fitted, 4, checkpoints=False)
+        means.append(fitted.model.parameters[0].tolist())
+        torch.rand(3)
+    assert means[0] == means[1]
 
 
 def test_too_few_depths_to_hold_some_out_are_an_error():
@@ -408,6 +426,14 @@ def test_a_fit_continues_while_its_error_falls_and_states_if_it_was_stopped(shap
     assert fitted.evidence.falling is falling is (fitted.evidence.iterations == 8 * rounds)
     left = fitter.observations.error(fitted.model.frozen())
     assert left.mean == pytest.approx(fitted.evidence.mean)
+
+
+def test_a_first_round_is_kept_although_the_warm_start_imitates_a_better_field():
+    fitter = fitter_of("ball", iterations=8, warm_iterations=200)
+    fitted = fitter.begin(candidate("network_2x32"), fitter.begin(candidate("sphere"), None).model)
+    imitation = fitted.evidence.mean
+    fitter.finish(fitted, 1)
+    assert fitted.evidence.mean > imitation and fitted.evidence.iterations == 8
 
 
 def test_the_seconds_of_a_fit_continue_those_of_its_trial():

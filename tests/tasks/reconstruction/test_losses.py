@@ -217,6 +217,16 @@ def test_the_eikonal_term_is_of_the_slope_at_hits_and_anywhere(slope):
     assert meter.counts.value > EIKONAL_POINTS
 
 
+def test_unknown_observations_have_no_term_and_the_total_is_the_sum():
+    settings = losses(colour=1.0, depth=1.0, normals=1.0, smoothness=1.0, eikonal=1.0, silhouette_weight=1.0)
+    assert set(terms_of(settings, BALL, PIXELS)) == {"total", "colour", "smoothness", "eikonal"}
+    observed = replace(PIXELS, mask=LEFT_HALF, distance=DISTANCE + 0.1, normals=BALL.normals(POINTS).nan_to_num(0.0))
+    terms = terms_of(settings, ball(radius=0.5), observed)
+    assert set(terms) == {"total", "colour", "depth", "silhouette", "normals", "smoothness", "eikonal"}
+    total = terms.pop("total").item()
+    assert total == pytest.approx(sum(term.item() for term in terms.values()))
+
+
 def test_a_surface_that_no_ray_meets_has_finite_terms():
     settings = losses(colour=1.0, depth=1.0, normals=1.0, smoothness=1.0, eikonal=1.0, silhouette_weight=1.0)
     observed = replace(PIXELS, mask=LEFT_HALF, distance=DISTANCE, normals=BALL.normals(POINTS).nan_to_num(0.0))

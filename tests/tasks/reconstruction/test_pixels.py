@@ -87,3 +87,13 @@ def test_observed_depths_become_distances_along_rays_or_nan():
     assert stack.pixels.normals is not None and stack.pixels.normals.shape == (len(true), 3)
     alone = Stack.build([shots[0], replace(shots[1], depth=None)], None, CPU).pixels.distance
     assert alone is not None and alone[12 * 20 :].isnan().all() and alone[: 12 * 20].isfinite().any()
+
+
+def test_a_guide_keeps_its_order_and_unknown_observations_are_none():
+    guide = [torch.full(size, 1.0 + number) for number, size in enumerate(SIZES)]
+    pixels = Stack.build([replace(shot, mask=None) for shot in SHOTS], guide, CPU).pixels
+    assert pixels.guide is not None and pixels.guide.tolist() == [1.0] * 240 + [2.0] * 144
+    assert (pixels.mask, pixels.distance, pixels.normals) == (None, None, None)
+    subset = pixels[torch.tensor([239, 240])]
+    assert subset.guide is not None and subset.guide.tolist() == [1.0, 2.0] and subset.mask is None
+    assert Stack.build(SHOTS, None, CPU).pixels.guide is None

@@ -56,6 +56,13 @@ def test_every_nth_photograph_is_held_out(inputs):
     assert all(shot.mask is not None for shot in blind.held_out)
 
 
+def test_too_few_photographs_are_refused(inputs):
+    few = replace(IMAGES, views=4)
+    with pytest.raises(BadInput, match="4 photographs with every 2th held out leave 2: give more"):
+        Hull(few, 16, 2, True, NO_DEPTHS, samples=8).subject(inputs)
+    assert len(Hull(few, 16, 4, True, NO_DEPTHS, samples=8).subject(inputs).input_shots) == 3
+
+
 @each("points, count", [("dense", None), ("25%", None), ("30", 30)])
 def test_the_number_of_observed_depths_follows_the_setting(points, count):
     shot = shot_of(ball(), CAMERA)

@@ -16,7 +16,8 @@ from bench.tasks.single_view.training import Supervision, Training, TrainingFail
 from datasets.scene import Split
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
-from renderers.silhouette import CrossEntropy
+from renderers.field import Counts
+from renderers.silhouette import CrossEntropy, Occupancy
 from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
 from tests.tiny import CPU, icosphere, silent
@@ -124,6 +125,13 @@ def test_pixels_are_those_of_the_image(images):
     assert float((pixels.distance - behind)[both].max()) > 0.02  # the hull of three masks is larger than the sphere
 
 
+def test_the_visual_hull_replaces_an_unknown_depth():
+    masks = Occupancy(width=0.02, weight=1.0, sphere_radius=1.0, occupied_at="depth")
+    by_mask = replace(RGB, losses=replace(LOSSES, silhouette=masks))
+    assert by_mask.needs_hull_depth and not RGB.needs_hull_depth
+    assert not replace(by_mask, losses=replace(by_mask.losses, depth=1.0)).needs_hull_depth
+
+
 def test_a_network_learns_which_sphere_an_image_shows(images, renderer, tmp_path):
     model, course = trained(images, renderer, tmp_path / "s", VOLUME, steps=150, shapes_per_step=3, keep_every=1000)
     assert np.mean(course.losses[-10:]) < 0.5 * course.losses[0]
@@ -131,6 +139,21 @@ def test_a_network_learns_which_sphere_an_image_shows(images, renderer, tmp_path
     right = [overlap(model.at(code), shape, CPU) for code, shape in zip(codes, images, strict=True)]
     wrong = [overlap(model.at(codes[2 - index]), shape, CPU) for index, shape in enumerate(images) if index != 1]
     assert min(right) > 0.6 and min(right[0], right[2]) > max(wrong) + 0.2
+
+
+def test_a_step_over_more_shapes_has_no_larger_loss_and_gradient(images, renderer):
+    """The loss is a mean: three equal shapes give the same loss as one."""
+    results = []
+    for count in (1, 3):
+        settings = replace(SETTINGS, shapes_per_step=count)
+        training = Training([images[2]] * 3, replace(VOLUME, points=4096), renderer, settings, CPU)
+        torch.manual_seed(0)
+        model = SingleView(NETWORK)
+        loss = training.accumulate_gradients(model, 0, Counts())
+        slopes = [parameter.grad for parameter in model.parameters() if parameter.grad is not None]
+        results.append((loss, torch.cat([g.flatten() for g in slopes])))
+    (once, slope), (thrice, other) = results
+    assert thrice == pytest.approx(once, rel=0.1) and other.norm() == pytest.approx(slope.norm().item(), rel=0.3)
 
 
 def test_a_network_learns_from_the_visual_hull_which_sphere_an_image_shows(images, renderer, tmp_path):
@@ -202,6 +225,16 @@ def recipe(renderer, **changed) -> Recipe:
     return Recipe(Spheres(), 3, 3, IMAGING, NETWORK, RGB, settings, renderer, {"training": {"steps": settings.steps}})
 
 
+def test_a_training_resumes_without_the_gpu_that_it_began_on(images, renderer, tmp_path, monkeypatch):
+    state, steps = tmp_path / "begun.state", []
+    with monkeypatch.context() as patch:
+        patch.setattr("torch.serialization.location_tag", lambda storage: "cuda:0")
+        trained(images, renderer, state, steps=2)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    trained(images, renderer, state, progress=lambda phase, step, *rest: steps.append(step))
+    assert steps[0] == 3
+
+
 def test_a_step_that_is_nan_keeps_the_last_state_and_has_a_record(renderer, tmp_path, monkeypatch):
     give = Training.accumulate_gradients
 
@@ -245,6 +278,16 @@ def test_a_training_that_is_stopped_after_its_last_step_is_not_lost(renderer, tm
         prepared.make(tmp_path, CPU, silent)
     monkeypatch.setattr(Training, "accumulate_gradients", lambda *_: pytest.fail("trained again"))
     assert prepared.make(tmp_path, CPU, silent).exists()
+
+
+def test_neither_training_nor_loading_changes_later_draws(renderer, tmp_path):
+    drawn = []
+    for _ in range(2):  # the first is trained, and the second is loaded
+        torch.manual_seed(5)
+        recipe(renderer).load(recipe(renderer).make(tmp_path, CPU, silent))
+        drawn.append(torch.rand(1).item())
+    torch.manual_seed(5)
+    assert drawn == [torch.rand(1).item()] * 2
 
 
 def test_a_damaged_network_is_refused(renderer, tmp_path):

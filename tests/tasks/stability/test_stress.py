@@ -9,9 +9,11 @@ from omegaconf import OmegaConf
 
 from bench.config import build, load
 from bench.machine.limits import LimitReached, Limits
+from bench.records.record import RunStatus
+from bench.solve.optimise import History
 from bench.tables import choice, names
 from bench.tasks.stability.axes import Stress, Sweep
-from bench.tasks.stability.fit import judge_fit
+from bench.tasks.stability.fit import _failure, judge_fit
 from bench.tasks.stability.judge import judge_gradient, judge_rendering, truth
 from bench.tasks.stability.scenes import CAMERA_DISTANCE, SCENES
 from bench.tasks.stability.search import Bisection, Search, SearchSettings
@@ -228,6 +230,13 @@ def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
     one_in_five = Limits(int(spent(LIMITS) * fit.iterations / 5), 8)
     with pytest.raises(LimitReached, match="field values"):
         spent(one_in_five)
+
+
+def test_a_fit_fails_where_its_error_is_above_the_largest():
+    assert _failure(History(), 0.05, 0.05) is Failure.NONE
+    assert _failure(History(), 0.051, 0.05) is Failure.NOT_REACHED
+    assert _failure(History(), float("nan"), 0.05) is Failure.NAN
+    assert _failure(History(status=RunStatus.DIVERGED), 0.01, 0.05) is Failure.DIVERGED
 
 
 def test_sweeps_and_stresses_are_checked():
