@@ -91,15 +91,11 @@ def test_the_square_crop_of_an_object_keeps_the_ray_of_each_pixel(most):
         assert after == pytest.approx(before)
 
 
-@each(
-    "key, value, message",
-    [
-        ("path", "nothing.png", "dataset.path=nothing.png is no file"),
-        ("scale", 0.0, "dataset.scale must be positive"),
-        ("intrinsics", [150.0, 140.0, 70.3], r"intrinsics must have shape \[3, 3\].*write \[fx,fy,cx,cy\]"),
-        ("camera_to_world", (2 * np.eye(4)).tolist(), "must hold a rotation.*for a rigid motion"),
-    ],
-)
+@each("key, value, message", [
+    ("path", "nothing.png", "dataset.path=nothing.png is no file"), ("scale", 0.0, "dataset.scale must be positive"),
+    ("intrinsics", [150.0, 140.0, 70.3], r"intrinsics must have shape \[3, 3\].*write \[fx,fy,cx,cy\]"),
+    ("camera_to_world", (2 * np.eye(4)).tolist(), "must hold a rotation.*for a rigid motion"),
+])  # fmt: skip
 def test_invalid_cameras_and_files_are_refused(sofa_files, key, value, message):
     with pytest.raises(ValueError, match=message):
         depth_image(sofa_files, **{key: value})

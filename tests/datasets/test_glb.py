@@ -100,14 +100,10 @@ READ = {  # a file, and the vertices of its tetrahedra
     "normalised bytes below -1": (glb((np.where(SMALL == -127, -128, SMALL).astype(np.int8), SHARE)), SMALL / 127),
     "sparse": (glb((FLAT, {"sparse": (np.array([3], np.uint8), VERTICES[3:])})), VERTICES),
     "sparse over zeros": (
-        glb((VERTICES, {"empty": True, "sparse": (np.arange(1, 4, dtype=np.uint16), VERTICES[1:])})),
-        VERTICES,
-    ),
+        glb((VERTICES, {"empty": True, "sparse": (np.arange(1, 4, dtype=np.uint16), VERTICES[1:])})), VERTICES),
     "strip": (glb(VERTICES, np.array([0, 2, 1, 3, 0, 2], np.uint16), parts=({"mode": 5},)), VERTICES),
     "fan, and its base": (
-        glb(VERTICES, np.array([0, 1, 3, 2, 1], np.uint16), FACES[2], parts=({"mode": 6}, {"indices": 2})),
-        VERTICES,
-    ),
+        glb(VERTICES, np.array([0, 1, 3, 2, 1], np.uint16), FACES[2], parts=({"mode": 6}, {"indices": 2})), VERTICES),
     "lines and points beside": (glb(parts=({"mode": 0}, {"mode": 1}, {"mode": 3}, {})), VERTICES),
     "moved by parts": (glb(nodes=[{"mesh": 0, **MOVED}]), PLACES),
     "moved by a matrix": (glb(nodes=[{"mesh": 0, "matrix": MATRIX.T.ravel().tolist()}]), PLACES),
@@ -116,17 +112,13 @@ READ = {  # a file, and the vertices of its tetrahedra
     "twice": (glb(nodes=[{"mesh": 0, **MOVED}, {"mesh": 0}], scenes=[{"nodes": [0, 1]}]), PLACES, VERTICES),
     "instances": (
         glb(VERTICES, CORNERS, *AT, nodes=[{"mesh": 0, "extensions": INSTANCES}], extensionsRequired=[*INSTANCES]),
-        VERTICES,
-        TURN.apply(VERTICES) + AT[0][1],
-    ),
+        VERTICES, TURN.apply(VERTICES) + AT[0][1]),
     "instances without a turn": (
         glb(VERTICES, CORNERS, AT[0], nodes=[{"mesh": 0, "extensions": SHIFTED}]),
         *(VERTICES + at for at in AT[0]),
     ),
     "a morph target": (
-        glb(VERTICES, CORNERS, VERTICES, nodes=[{"mesh": 0, "weights": [0.5]}], parts=TARGET),
-        1.5 * VERTICES,
-    ),
+        glb(VERTICES, CORNERS, VERTICES, nodes=[{"mesh": 0, "weights": [0.5]}], parts=TARGET), 1.5 * VERTICES),
     "a morph target at zero": (glb(VERTICES, CORNERS, VERTICES, parts=TARGET), VERTICES),
     "a morph target by the node before the mesh": (
         glb(
@@ -165,7 +157,7 @@ READ = {  # a file, and the vertices of its tetrahedra
     ),
     "another scene beside": (glb(nodes=PARENT, scene=1, scenes=[{"nodes": [0]}, {"nodes": [1]}]), VERTICES),
     "no scene": (glb(nodes=PARENT, scenes=[]), PLACES),
-}
+}  # fmt: skip
 
 
 def ordered(triangles: np.ndarray) -> np.ndarray:

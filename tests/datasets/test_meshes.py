@@ -54,15 +54,11 @@ def test_a_folder_gives_its_meshes_sorted_and_a_file_itself(tmp_path, monkeypatc
     assert find_meshes(str(tmp_path / "b.OBJ")) == [tmp_path / "b.OBJ"]
 
 
-@each(
-    "name, message",
-    [
-        ("teapt.obj", r"found nothing at .*teapt.obj'; did you mean '.*teapot\.obj'\?"),
-        ("nowhere/zebra.obj", "check the spelling and the current folder"),
-        ("empty", "found none directly in"),
-        ("notes.txt", r"must end in one of \.obj .* \.glb, found 'notes\.txt'"),
-    ],
-)
+@each("name, message", [
+    ("teapt.obj", r"found nothing at .*teapt.obj'; did you mean '.*teapot\.obj'\?"),
+    ("nowhere/zebra.obj", "check the spelling and the current folder"), ("empty", "found none directly in"),
+    ("notes.txt", r"must end in one of \.obj .* \.glb, found 'notes\.txt'"),
+])  # fmt: skip
 def test_paths_that_hold_no_mesh_are_refused_with_a_remedy(tmp_path, name, message):
     for file in ("teapot.obj", "notes.txt"):
         (tmp_path / file).write_text("x")
@@ -129,21 +125,17 @@ REPAIRED = {  # a mesh, its volume after repair, and the notes without a warning
     "a part twice": (joined(box(), box(centre=(2, 0, 0)), box()), 2, (f"1 part {DROPPED}",)),
     "three times, and another part": (joined(box(), box(), box(), box(centre=(1, 0, 0))), 2, (f"2 parts {DROPPED}",)),
     "a part twice, and two of its faces three times": (
-        with_faces(np.concatenate([box().faces, box().faces[:2]])),
-        1,
-        (f"1 part {DROPPED}", "2 doubled faces dropped"),
+        with_faces(np.concatenate([box().faces, box().faces[:2]])), 1, (f"1 part {DROPPED}", "2 doubled faces dropped"),
     ),
     "separate": (joined(box(), box(centre=(2, 0, 0))), 2, ()),
     "overlapping": (joined(box(), box(centre=(0.1, 0.1, 0.1))), 2 - 0.9**3, ("2 overlapping parts merged into 1",)),
     "overlapping, and one inside out": (
-        joined(box(), box(centre=(0.5, 0.1, 0.2), inverted=True)),
-        2 - 0.5 * 0.9 * 0.8,
-        ("1 part turned outward", "2 overlapping parts merged into 1"),
-    ),
+        joined(box(), box(centre=(0.5, 0.1, 0.2), inverted=True)), 2 - 0.5 * 0.9 * 0.8,
+        ("1 part turned outward", "2 overlapping parts merged into 1")),
     "nested": (joined(box(), box(size=0.4)), 1, ("2 overlapping parts merged into 1",)),
     "hollow": (joined(box(), box(size=0.4, inverted=True)), 1 - 0.064, ()),
     "hollow, inside out": (joined(box(inverted=True), box(size=0.4)), 1 - 0.064, ("2 parts turned outward",)),
-}
+}  # fmt: skip
 
 
 @each("scale", [1e-6, 1.0, 1e3])

@@ -216,18 +216,11 @@ def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inp
     assert evaluate(State(sphere(RADIUS) | sphere(0.1, (0.8, 0.3, 0.1)), fine)).notes == ()
 
 
-@each(
-    "of_renderer, error, noted",
-    [
-        (3.95, 0.126, True),
-        (np.inf, 0.126, True),
-        (0.31, 0.1, True),
-        (0.29, 0.1, False),
-        (0.0094, 0.003, False),  # of a plane by a shipped renderer: less than a pixel decides it
-        (0.5, 0.0, True),
-        (np.inf, np.inf, False),
-    ],
-)
+@each("of_renderer, error, noted", [
+    (3.95, 0.126, True), (np.inf, 0.126, True), (0.31, 0.1, True), (0.29, 0.1, False),
+    (0.0094, 0.003, False),  # of a plane by a shipped renderer: less than a pixel decides it
+    (0.5, 0.0, True), (np.inf, np.inf, False),
+])  # fmt: skip
 def test_a_renderers_own_image_that_shows_another_surface_is_noted(of_renderer, error, noted):
     notes = depth_gap_note({"depth_mae": error, "own_depth_mae": of_renderer, "own_mask_iou": 0.1, "mask_iou": 0.9})
     both = f"is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene units. The renderer does not"

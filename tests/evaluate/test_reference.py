@@ -80,19 +80,15 @@ def other_code(row: int) -> Prior:
     return Prior(PRIOR.decoder, codes)
 
 
-@each(
-    "prior, camera, new",
-    [
-        (other_weights(), CAMERA, True),
-        (other_code(0), CAMERA, True),
-        (other_code(1), CAMERA, False),  # it is the first shape's
-        (PRIOR, CAMERA.resized(13, 12), True),
-        (PRIOR, Camera(CAMERA.intrinsics, CAMERA.world_to_camera, 12, 13), True),  # the same rays, and one more column
-        (PRIOR, camera_of(12, angles=(70.1, 20.0)), True),
-        (PRIOR, camera_of(12, angles=(70.0, 20.0), field_of_view=49.0), True),
-        (ball_prior(), camera_of(12, angles=(70.0, 20.0)), False),
-    ],
-)
+@each("prior, camera, new", [
+    (other_weights(), CAMERA, True), (other_code(0), CAMERA, True),
+    (other_code(1), CAMERA, False),  # it is the first shape's
+    (PRIOR, CAMERA.resized(13, 12), True),
+    (PRIOR, Camera(CAMERA.intrinsics, CAMERA.world_to_camera, 12, 13), True),  # the same rays, and one more column
+    (PRIOR, camera_of(12, angles=(70.1, 20.0)), True),
+    (PRIOR, camera_of(12, angles=(70.0, 20.0), field_of_view=49.0), True),
+    (ball_prior(), camera_of(12, angles=(70.0, 20.0)), False),
+])  # fmt: skip
 def test_the_key_depends_on_weights_and_camera(monkeypatch, tmp_path_factory, prior, camera, new):
     monkeypatch.setattr(reference_store, "make_reference", lambda field, camera: BLANK)
     folder = tmp_path_factory.mktemp("cache")

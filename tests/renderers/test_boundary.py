@@ -67,26 +67,21 @@ BROKEN = {
     "nothing": (lambda r: None, "Mine.render must return a Rendering, not None: see "),
     "short": (
         lambda r: changed(r, distance=r.distance[:-1]),
-        r"Mine.render: distance must have the shape \[8, 8\], not \[7, 8\]: return one answer per ray",
-    ),
+        r"Mine.render: distance must have the shape \[8, 8\], not \[7, 8\]: return one answer per ray"),
     "flat points": (
         lambda r: changed(r, points=r.points[..., :2]),
-        r"points must have the shape \[8, 8, 3\], not \[8, 8, 2\]: return points of shape \[\*rays, 3\]",
-    ),
+        r"points must have the shape \[8, 8, 3\], not \[8, 8, 2\]: return points of shape \[\*rays, 3\]"),
     "double": (
         lambda r: changed(r, residual=r.residual.double()),
-        r"residual must be float32, as the rays are, not float64: convert it with .to\(torch.float32\)",
-    ),
+        r"residual must be float32, as the rays are, not float64: convert it with .to\(torch.float32\)"),
     "long status": (
         lambda r: changed(r, status=r.status.long()),
-        r"status must be int8, a Status per ray, not int64: convert it with .to\(torch.int8\)",
-    ),
+        r"status must be int8, a Status per ray, not int64: convert it with .to\(torch.int8\)"),
     "no tensor": (lambda r: changed(r, closest=None), "closest must be a tensor, not a NoneType"),
     "elsewhere": (
         lambda r: changed(r, closest=r.closest.detach().to("meta")),
-        "closest must be on cpu, not on meta: create tensors with device=rays.origins.device",
-    ),
-}
+        "closest must be on cpu, not on meta: create tensors with device=rays.origins.device"),
+}  # fmt: skip
 
 
 @each("name", BROKEN)
@@ -111,16 +106,13 @@ def test_a_claimed_gradient_that_is_missing_is_an_error():
         render_checked(Mine(detached), ball(), free_rays())
 
 
-@each(
-    "renderer, field, rays",
-    [
-        (Mine(detached, capabilities=NO_GRADIENT), ball(free=True), RAYS),  # the renderer claims no gradient
-        (Mine(detached, capabilities=NO_GRADIENT), ball(), free_rays()),
-        (Mine(detached), ball(), RAYS),  # nothing requires a gradient
-        (Mine(detached), ball(0.001, free=True).translate((0.0, 0.9, 0.0)), RAYS),  # nothing is hit
-        (Mine(), ball(free=True), free_rays()),  # the gradient exists
-    ],
-)
+@each("renderer, field, rays", [
+    (Mine(detached, capabilities=NO_GRADIENT), ball(free=True), RAYS),  # the renderer claims no gradient
+    (Mine(detached, capabilities=NO_GRADIENT), ball(), free_rays()),
+    (Mine(detached), ball(), RAYS),  # nothing requires a gradient
+    (Mine(detached), ball(0.001, free=True).translate((0.0, 0.9, 0.0)), RAYS),  # nothing is hit
+    (Mine(), ball(free=True), free_rays()),  # the gradient exists
+])  # fmt: skip
 def test_a_gradient_that_is_not_needed_may_be_missing(renderer, field, rays):
     render_checked(renderer, field, rays)
 

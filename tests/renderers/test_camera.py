@@ -76,20 +76,16 @@ def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
     return Rays(vector(origin), torch.nn.functional.normalize(vector(direction), dim=0))
 
 
-@each(
-    "origin, direction, radius, entry, leave, meets",
-    [
-        ((0, 0, -2), (0, 0, 1), 1, 1, 3, True),
-        ((0.6, 0, -2), (0, 0, 1), 1, 1.2, 2.8, True),  # half a chord is (1 - 0.36)^(1/2) = 0.8
-        ((0.3, 0, -2), (0, 0, 1), 0.5, 1.6, 2.4, True),
-        ((0, 0, 0), (0, 3, 4), 1, 0, 1, True),  # from the centre
-        ((0, 0, -0.5), (0, 0, 1), 1, 0, 1.5, True),  # from inside
-        ((0, 0, 0.5), (0, 0, 1), 1, 0, 0.5, True),  # from inside, the centre behind
-        ((0, 0, 2), (0, 0, 1), 1, None, None, False),  # behind the camera
-        ((2, 0, -3), (0, 0, 1), 1, 3, 3, False),  # passes by
-        ((2, 0, 3), (0, 0, 1), 1, None, None, False),  # passed by, and behind
-    ],
-)
+@each("origin, direction, radius, entry, leave, meets", [
+    ((0, 0, -2), (0, 0, 1), 1, 1, 3, True),
+    ((0.6, 0, -2), (0, 0, 1), 1, 1.2, 2.8, True),  # half a chord is (1 - 0.36)^(1/2) = 0.8
+    ((0.3, 0, -2), (0, 0, 1), 0.5, 1.6, 2.4, True), ((0, 0, 0), (0, 3, 4), 1, 0, 1, True),  # from the centre
+    ((0, 0, -0.5), (0, 0, 1), 1, 0, 1.5, True),  # from inside
+    ((0, 0, 0.5), (0, 0, 1), 1, 0, 0.5, True),  # from inside, the centre behind
+    ((0, 0, 2), (0, 0, 1), 1, None, None, False),  # behind the camera
+    ((2, 0, -3), (0, 0, 1), 1, 3, 3, False),  # passes by
+    ((2, 0, 3), (0, 0, 1), 1, None, None, False),  # passed by, and behind
+])  # fmt: skip
 def test_spans_of_the_sphere_by_closed_form(origin, direction, radius, entry, leave, meets):
     first, last, intersects = sphere_span(ray(origin, direction), radius)
     assert intersects.item() is meets and first >= 0
@@ -120,16 +116,13 @@ def test_gradients_of_spans_and_distances_are_exact_and_finite():
     assert torch.autograd.grad(total, edge)[0].isfinite().all()
 
 
-@each(
-    "twist, origin_in_camera",
-    [
-        ((0.1, 0, 0, 0, 0, 0), (0.1, 0, 2)),  # the world moves to the right of the camera
-        ((0, 0, 0.5, 0, 0, 0), (0, 0, 2.5)),  # and away from it
-        ((0, 0, 0, 0, torch.pi / 2, 0), (2, 0, 0)),  # a quarter turn about y, down: from ahead to the right
-        ((0, 0, 0, torch.pi / 2, 0, 0), (0, -2, 0)),
-        ((0, 0, 0, 0, 0, 1.0), (0, 0, 2)),  # a rotation about the line of sight
-    ],
-)
+@each("twist, origin_in_camera", [
+    ((0.1, 0, 0, 0, 0, 0), (0.1, 0, 2)),  # the world moves to the right of the camera
+    ((0, 0, 0.5, 0, 0, 0), (0, 0, 2.5)),  # and away from it
+    ((0, 0, 0, 0, torch.pi / 2, 0), (2, 0, 0)),  # a quarter turn about y, down: from ahead to the right
+    ((0, 0, 0, torch.pi / 2, 0, 0), (0, -2, 0)),
+    ((0, 0, 0, 0, 0, 1.0), (0, 0, 2)),  # a rotation about the line of sight
+])  # fmt: skip
 def test_a_twist_moves_the_world_in_the_cameras_axes(twist, origin_in_camera):
     motion = torch.eye(4, dtype=torch.float64)
     motion[2, 3] = 2.0  # the origin lies 2 ahead

@@ -1,5 +1,7 @@
 """The decoder with its code folded in, against the plain network on concatenated inputs, in float64."""
 
+from itertools import product
+
 import pytest
 import torch
 from torch import Tensor
@@ -71,8 +73,7 @@ def test_a_batch_of_codes_has_the_values_of_each_code(name, batch):
     points = torch.randn(*batch, 5, 3, dtype=torch.float64)
     values = decoder.at(codes)(points)
     assert values.shape == (*batch, 5)
-    for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
-        index = tuple(index)
+    for index in product(*map(range, batch)):
         torch.testing.assert_close(values[index], plain(decoder, codes[index], points[index]), rtol=0, atol=1e-13)
 
 

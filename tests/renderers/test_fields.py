@@ -140,24 +140,16 @@ def tensor(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers if len(numbers) > 1 else numbers[0], dtype=torch.float64, requires_grad=True)
 
 
-@each(
-    "make, parameters",
-    [
-        (sphere, (tensor(0.5), tensor(0.1, 0.2, 0.3))),
-        (plane, (tensor(1.0, 2.0, 0.5), tensor(0.2))),
-        (box, (tensor(0.3, 0.4, 0.5),)),
-        (rounded_box, (tensor(0.3, 0.4, 0.5), tensor(0.1))),
-        (torus, (tensor(0.5), tensor(0.2))),
-        (capsule, (tensor(-0.3, 0.1, 0.2), tensor(0.4, 0.3, -0.5), tensor(0.15))),
-        (cylinder, (tensor(0.4), tensor(0.3))),
-        (lambda offset: A.translate(offset), (tensor(0.1, 0.2, 0.3),)),
-        (lambda factor: A.scale(factor), (tensor(1.5),)),
-        (lambda factors: B.stretch(factors), (tensor(0.5, 1.5, 2.0),)),
-        (lambda angle: A.rotate(rotation(angle)), (tensor(0.3),)),
-        (lambda radius: smooth_union(A, B, radius=radius), (tensor(0.4),)),
-        (lambda radius: A - sphere(radius), (tensor(0.4),)),
-    ],
-)
+@each("make, parameters", [
+    (sphere, (tensor(0.5), tensor(0.1, 0.2, 0.3))), (plane, (tensor(1.0, 2.0, 0.5), tensor(0.2))),
+    (box, (tensor(0.3, 0.4, 0.5),)), (rounded_box, (tensor(0.3, 0.4, 0.5), tensor(0.1))),
+    (torus, (tensor(0.5), tensor(0.2))), (capsule, (tensor(-0.3, 0.1, 0.2), tensor(0.4, 0.3, -0.5), tensor(0.15))),
+    (cylinder, (tensor(0.4), tensor(0.3))), (lambda offset: A.translate(offset), (tensor(0.1, 0.2, 0.3),)),
+    (lambda factor: A.scale(factor), (tensor(1.5),)), (lambda factors: B.stretch(factors), (tensor(0.5, 1.5, 2.0),)),
+    (lambda angle: A.rotate(rotation(angle)), (tensor(0.3),)),
+    (lambda radius: smooth_union(A, B, radius=radius), (tensor(0.4),)),
+    (lambda radius: A - sphere(radius), (tensor(0.4),)),
+])  # fmt: skip
 def test_gradients_flow_to_tensor_parameters(make, parameters):
     points = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda p, *rest: make(*rest)(p), (points, *parameters))

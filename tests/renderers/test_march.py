@@ -59,16 +59,12 @@ def test_aggressive_steps_halve_the_distance_and_change_side():
     assert front.sample_value.tolist() == [[-(2**-15), 2**-14, -(2**-13), 2**-12]]
 
 
-@each(
-    "alpha, cap, clamp, expected",
-    [
-        (1.0, None, None, [1, 0.1, 0, -0.1, -1]),
-        (1.5, None, None, [1.5, 0.15, 0, -0.15, -1.5]),
-        (1.5, 0.25, None, [1.25, 0.15, 0, -0.15, -1.25]),
-        (1.5, None, 0.125, [0.1875, 0.15, 0, -0.15, -0.1875]),  # the value is clamped, then multiplied
-        (1.5, 0.2, 0.5, [0.7, 0.15, 0, -0.15, -0.7]),
-    ],
-)
+@each("alpha, cap, clamp, expected", [
+    (1.0, None, None, [1, 0.1, 0, -0.1, -1]), (1.5, None, None, [1.5, 0.15, 0, -0.15, -1.5]),
+    (1.5, 0.25, None, [1.25, 0.15, 0, -0.15, -1.25]),
+    (1.5, None, 0.125, [0.1875, 0.15, 0, -0.15, -0.1875]),  # the value is clamped, then multiplied
+    (1.5, 0.2, 0.5, [0.7, 0.15, 0, -0.15, -0.7]),
+])  # fmt: skip
 def test_a_step_by_cap_and_clamp(alpha, cap, clamp, expected):
     stepping = replace(PLAIN, alpha=alpha, extra_step_cap=cap, step_clamp=clamp)
     assert stepping.length(vector((1, 0.1, 0, -0.1, -1))).tolist() == pytest.approx(expected)
@@ -112,14 +108,11 @@ def test_a_careful_split_keeps_the_outline_that_a_plain_split_loses():
     assert 0 < (plain != fine).sum() < 0.1 * (fine == Status.HIT).sum()
 
 
-@each(
-    "apart, careful, start",
-    [
-        (0.02, True, 2.0),  # 0.05 is more than twice 0.02: the coarse ray passed at a safe distance
-        (0.03, True, 1.2),  # the finer ray may hit what the coarse ray passed: back to its closest sample
-        (0.03, False, 2.0),
-    ],
-)
+@each("apart, careful, start", [
+    (0.02, True, 2.0),  # 0.05 is more than twice 0.02: the coarse ray passed at a safe distance
+    (0.03, True, 1.2),  # the finer ray may hit what the coarse ray passed: back to its closest sample
+    (0.03, False, 2.0),
+])  # fmt: skip
 def test_where_a_split_ray_goes_on(apart, careful, start):
     # The coarse ray stands at 2.0, and had its least value, 0.05, at 1.2. The unit sphere begins at 1.
     front = RayFront.on_sphere(HEAD_ON, radius=1.0, samples=2)

@@ -1,5 +1,6 @@
 """The occupancy network against a plain computation in float64, and the logits of fields."""
 
+from itertools import product
 from math import log
 
 import pytest
@@ -73,8 +74,7 @@ def test_a_batch_of_codes_has_the_outputs_of_each_code(code_length, batch):
     points = torch.randn(*batch, 5, 3, dtype=torch.float64)
     logits, colours = both(network, codes, points)
     assert (logits.shape, colours.shape) == ((*batch, 5), (*batch, 5, 3))
-    for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
-        index = tuple(index)
+    for index in product(*map(range, batch)):
         expected = plain(network, codes[index], points[index])
         torch.testing.assert_close((logits[index], colours[index]), expected, rtol=0, atol=1e-13)
 

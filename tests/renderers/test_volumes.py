@@ -144,11 +144,9 @@ def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_wi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("renderer", "ratio", "margin"),
-    [(NEUS, 1.0, 0.01), (VOLSDF, 1.05, 2.9), (UNISURF, 1.08, 2.97)],
-    ids=lambda renderer: type(renderer).__name__,
-)
+@pytest.mark.parametrize(("renderer", "ratio", "margin"), [
+    (NEUS, 1.0, 0.01), (VOLSDF, 1.05, 2.9), (UNISURF, 1.08, 2.97),
+], ids=lambda renderer: type(renderer).__name__)  # fmt: skip
 def test_opacity_carries_the_gradient_of_a_silhouette_that_density_outside_makes_larger(renderer, ratio, margin):
     """The margin is in units of the blur: except for NeuS, density outside absorbs light along a close ray."""
     area, rate, _ = area_rates(renderer.with_blur(0.01), 0.5, side=120)

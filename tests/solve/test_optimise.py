@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.evaluate.evaluate import Evaluation
 from bench.records.record import RunStatus
 from bench.solve.optimise import (
     DIVERGENCE_FACTOR,
@@ -44,32 +43,10 @@ class Toy:
     counts: Counts = field(default_factory=Counts)
     calls: int = 0
     rays_per_iteration: int = POINTS
-    tracked: tuple[str, ...] = ()
-    observed: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, dtype=torch.bool))
-
-    shown = None
 
     def __post_init__(self):
         self.radius = torch.tensor(1.0, requires_grad=True)
         self.parameters = [self.radius]
-
-    def field(self):
-        return sphere(self.radius.detach())
-
-    def objective(self):
-        return None
-
-    def camera(self):
-        return None
-
-    def evaluate(self, state):
-        return Evaluation({"radius": self.radius.item()})
-
-    def checkpoint(self, state):
-        return {}
-
-    def draw(self, folder, states, curve, title):
-        pass
 
     def loss(self, iteration):
         metered = Meter(sphere(self.radius), self.counts)
@@ -152,10 +129,9 @@ def test_the_time_of_on_step_is_not_counted(clock):
     assert history.seconds == pytest.approx({"warmup": 1.0, "forward": 3.0, "backward": 0.0}, abs=0.01)
 
 
-@each(
-    "nan_terms, subject",
-    [((), "the loss is"), (("depth",), "the depth term is"), (("depth", "mask"), "the depth and the mask terms are")],
-)
+@each("nan_terms, subject", [
+    ((), "the loss is"), (("depth",), "the depth term is"), (("depth", "mask"), "the depth and the mask terms are"),
+])  # fmt: skip
 def test_a_loss_that_is_nan_names_its_terms_and_no_step_is_taken(nan_terms, subject):
     class Spoilt(Toy):
         def loss(self, iteration):

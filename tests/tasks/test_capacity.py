@@ -134,14 +134,10 @@ def test_hits_off_the_surface_are_noted_once_of_all_candidates(compose_config, t
     assert note.startswith("at the first iteration, WrongHits.render: ")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "ends"),
-    [
-        (("task=completion", "dataset=box", "task.points=dense"), "box"),
-        (("task=completion", "dataset=sphere", "field=sphere", "task.points=50", "task.mask=false"), "sphere"),
-    ],
-    ids=["auto", "one candidate, without a mask"],
-)
+@pytest.mark.parametrize(("overrides", "ends"), [
+    (("task=completion", "dataset=box", "task.points=dense"), "box"),
+    (("task=completion", "dataset=sphere", "field=sphere", "task.points=50", "task.mask=false"), "sphere"),
+], ids=["auto", "one candidate, without a mask"])  # fmt: skip
 def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
     default_field = () if any(override.startswith("field=") for override in overrides) else ("field=auto",)
     record = run(tmp_path, compose_config, *overrides, *default_field, *BETTER)

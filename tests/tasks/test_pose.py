@@ -154,14 +154,11 @@ def test_points_that_never_come_near_are_told(run):
     assert run.record.status is RunStatus.NOT_REACHED and run.record.metrics["success"] == 0.0
 
 
-@each(
-    "settings, changed, message",
-    [
-        (SETTINGS, {"degrees": 200.0}, r"task\.degrees must lie between 0 and 180"),
-        (SETTINGS, {"starts": 12}, r"task\.optimiser\.iterations must be more than"),
-        (ICP, {"reach": ()}, r"task\.reach must have one pass or more"),
-    ],
-)
+@each("settings, changed, message", [
+    (SETTINGS, {"degrees": 200.0}, r"task\.degrees must lie between 0 and 180"),
+    (SETTINGS, {"starts": 12}, r"task\.optimiser\.iterations must be more than"),
+    (ICP, {"reach": ()}, r"task\.reach must have one pass or more"),
+])  # fmt: skip
 def test_what_cannot_be_is_told(settings, changed, message):
     with pytest.raises(ValueError, match=message):
         replace(settings, **changed)

@@ -97,16 +97,12 @@ def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
         assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters)
 
 
-@each(
-    "changed, message",
-    [
-        ({"candidates": ("unoin_3",)}, "did you mean union_3"),
-        ({"candidates": ("union_1",)}, "union_2 is the smallest"),
-        ({"candidates": ("grid_4",)}, "between 8 and 256"),
-        ({"candidates": ("sphere", "box", "sphere")}, "name each candidate once"),
-        ({"size": "parameters"}, r"models\.size must be one of stored, free, bytes, not 'parameters'"),
-    ],
-)
+@each("changed, message", [
+    ({"candidates": ("unoin_3",)}, "did you mean union_3"), ({"candidates": ("union_1",)}, "union_2 is the smallest"),
+    ({"candidates": ("grid_4",)}, "between 8 and 256"),
+    ({"candidates": ("sphere", "box", "sphere")}, "name each candidate once"),
+    ({"size": "parameters"}, r"models\.size must be one of stored, free, bytes, not 'parameters'"),
+])  # fmt: skip
 def test_invalid_settings_are_refused(changed, message):
     settings = {"candidates": ("sphere",), "size": "stored", "fit": FIT, "growth": GROWTH, "views": VIEWS}
     with pytest.raises(ValueError, match=message):
