@@ -74,17 +74,17 @@ def test_the_view_of_a_shape_is_not_drawn_as_the_shape_is():
     assert abs(np.corrcoef(turns, shapes)[0, 1]) < 0.5
 
 
-@each("direction", [(0.3, -0.4, 0.5), (0.0, 0.0, -2.0), (-1.0, 0.2, 0.0)])
-def test_the_camera_towards_a_direction_stands_in_it(direction):
+TILT = (0.0, cos(pi / 180), sin(pi / 180))  # straight above, but for a degree
+
+
+@each("direction, expected", [
+    *((direction, direction) for direction in ((0.3, -0.4, 0.5), (0.0, 0.0, -2.0), (-1.0, 0.2, 0.0))),
+    ((0.0, 1.0, 0.0), TILT),
+])  # fmt: skip
+def test_the_camera_towards_a_direction_stands_in_it(direction, expected):
     camera = VIEWS.towards(torch.tensor(direction))
-    expected = 2.5 * np.array(direction) / np.linalg.norm(direction)
-    assert camera.center.numpy() == pytest.approx(expected, abs=1e-5)
+    assert camera.center.numpy() == pytest.approx(2.5 * np.array(expected) / np.linalg.norm(expected), abs=1e-5)
     assert project(camera, (0.0, 0.0, 0.0)) == pytest.approx([16.5, 16.5], abs=1e-4)
-
-
-def test_the_camera_straight_above_is_tilted_by_a_degree():
-    above = VIEWS.towards(torch.tensor([0.0, 1.0, 0.0])).center.numpy()
-    assert above == pytest.approx([0.0, 2.5 * cos(pi / 180), 2.5 * sin(pi / 180)], abs=1e-5)
 
 
 @each("points, count", [("dense", 200), ("2.5%", 5), ("0.01%", 1), (7, 7), (" 7 ", 7)])

@@ -30,28 +30,20 @@ def plane(normal: tuple[float, float, float], scale: float = 1.0) -> Decoder:
     return plane_decoder([scale * x for x in normal], scale * CODE_WEIGHTS, scale * OFFSET)
 
 
-def published_plane(normal: torch.Tensor) -> Coded:
-    """The same as a network that takes one code at a time."""
-    layer = torch.cat([CODE_WEIGHTS, normal])[None], torch.tensor([-OFFSET], dtype=torch.float64)
-    return Coded(Layered([layer], activation="relu"), code_length=3, width=1).double()
-
-
-def distance_to_plane(normal: torch.Tensor, rays: Rays, code: torch.Tensor) -> torch.Tensor:
-    level = OFFSET - CODE_WEIGHTS @ code
-    return (level - rays.origins @ normal) / (rays.directions @ normal)
-
-
 @each("scale", [1.0, 0.4, 3.0])
 @each("angle", NORMALS)
 def test_differences_are_the_derivatives_of_a_plane(angle, scale):
     normal, pixels = torch.tensor(NORMALS[angle], dtype=torch.float64), torch.tensor([0, 7, 20, 35])
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    distance = distance_to_plane(normal, camera().moved(twist).rays().flat()[pixels], CODE)
+    rays = camera().moved(twist).rays().flat()[pixels]
+    distance = (OFFSET - CODE_WEIGHTS @ CODE - rays.origins @ normal) / (rays.directions @ normal)
     by_camera = torch.stack([torch.autograd.grad(hit, twist, retain_graph=True)[0] for hit in distance])
     slope = camera().rays().flat()[pixels].directions @ normal
     directions = torch.linalg.qr(torch.randn(3, 2, generator=torch.Generator().manual_seed(0)).double()).Q
 
-    for network in (plane(NORMALS[angle], scale), Published(published_plane(normal), 0)):
+    layer = torch.cat([CODE_WEIGHTS, normal])[None], torch.tensor([-OFFSET], dtype=torch.float64)
+    published = Coded(Layered([layer], activation="relu"), code_length=3, width=1).double()  # takes one code at a time
+    for network in (plane(NORMALS[angle], scale), Published(published, 0)):
         result = differences(network, CODE, directions, camera=camera(), pixels=pixels, distance=distance.detach())
         assert result.valid.all()
         assert torch.allclose(result.code[:, 0], -(CODE_WEIGHTS @ directions) / slope[:, None], rtol=1e-7, atol=1e-8)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.nn.functional import normalize
 
 from renderers.camera import Camera, Rays, distance_to_origin, rigid, sphere_span
 from tests.looped import each
@@ -16,7 +17,7 @@ INTRINSICS = torch.tensor([[100.0, 0, 32], [0, 50, 20], [0, 0, 1]], dtype=torch.
 
 def motion(angle: float = 0.0, translation: tuple[float, ...] = (0, 0, 0)) -> torch.Tensor:
     """A rigid motion: a rotation about an oblique axis, then a translation."""
-    x, y, z = axis = torch.nn.functional.normalize(vector((1, 2, -2)), dim=0)
+    x, y, z = axis = normalize(vector((1, 2, -2)), dim=0)
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] *= cos(angle)
@@ -72,10 +73,6 @@ def test_coarser_rays_run_through_the_middles_of_their_blocks_and_repeat_the_edg
     assert sheet(x, y[:3]).coarser(4).origins[..., :2].tolist() == [[[2, 1.75], [4.5, 1.75]]]
 
 
-def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
-    return Rays(vector(origin), torch.nn.functional.normalize(vector(direction), dim=0))
-
-
 @each("origin, direction, radius, entry, leave, meets", [
     ((0, 0, -2), (0, 0, 1), 1, 1, 3, True),
     ((0.6, 0, -2), (0, 0, 1), 1, 1.2, 2.8, True),  # half a chord is (1 - 0.36)^(1/2) = 0.8
@@ -87,14 +84,14 @@ def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
     ((2, 0, 3), (0, 0, 1), 1, None, None, False),  # passed by, and behind
 ])  # fmt: skip
 def test_spans_of_the_sphere_by_closed_form(origin, direction, radius, entry, leave, meets):
-    first, last, intersects = sphere_span(ray(origin, direction), radius)
+    first, last, intersects = sphere_span(Rays(vector(origin), normalize(vector(direction), dim=0)), radius)
     assert intersects.item() is meets and first >= 0
     assert entry is None or (first.item(), last.item()) == pytest.approx((entry, leave))
 
 
 def test_the_least_distance_to_the_origin_agrees_with_samples():
     origins, directions = torch.randn(2, 200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    rays = Rays(origins, torch.nn.functional.normalize(directions, dim=-1))
+    rays = Rays(origins, normalize(directions, dim=-1))
     least = distance_to_origin(rays)
     assert torch.equal(sphere_span(rays, 0.7)[2], least < 0.7)
     sampled = rays.at_each(torch.linspace(0, 8, 2000, dtype=torch.float64)).norm(dim=-1).amin(1)
@@ -106,7 +103,7 @@ def test_gradients_of_spans_and_distances_are_exact_and_finite():
     directions = vector((0, 0, 1)).expand(3, 3).clone().requires_grad_(True)
 
     def spans(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        rays = Rays(origins, torch.nn.functional.normalize(directions, dim=-1))
+        rays = Rays(origins, normalize(directions, dim=-1))
         return (*sphere_span(rays)[:2], distance_to_origin(rays))
 
     assert torch.autograd.gradcheck(spans, (origins, directions))

@@ -29,17 +29,13 @@ by_case = each("case", CASES)
 by_name = each("name", EXACT)
 
 
-def slab(thickness: float) -> Shape:
-    return box((2.0, 2.0, thickness / 2))
-
-
 @each("samples", [8, 17, 64])
 def test_a_slab_thinner_than_the_spacing_may_be_missed(samples):
     spacing = 2 / (samples - 1)
     renderer = replace(DVR, n_ray_samples=samples)
     # Two slabs in the middle of an interval: slightly thinner and slightly thicker than the spacing.
     middle = -1 + spacing * (samples // 2 - 0.5)
-    thin, thick = (slab(share * spacing).translate((0.0, 0.0, middle)) for share in (0.98, 1.02))
+    thin, thick = (box((2.0, 2.0, share * spacing / 2)).translate((0.0, 0.0, middle)) for share in (0.98, 1.02))
     assert renderer.render(thin, along_z(0.0)).status.tolist() == [Status.MISS]
     assert renderer.render(thick, along_z(0.0)).status.tolist() == [Status.HIT]
 

@@ -142,3 +142,15 @@ def test_a_check_evaluates_the_field_once_and_is_not_counted():
     assert hits.off_surface() == ""
     assert len(evaluated) == 1 and MAX_CHECKED_HITS / 2 < evaluated[0] <= MAX_CHECKED_HITS < hits.hit.sum()
     assert counts.value == before
+
+
+def test_hits_are_kept_within_the_innermost_block_alone():
+    renderer = load("renderer", "idr")
+    with collect_hits() as outer:
+        with collect_hits() as inner:
+            render_checked(renderer, PLATE, RAYS)
+        render_checked(renderer, PLATE, RAYS)
+        render_checked(renderer, PLATE, RAYS)
+    render_checked(renderer, PLATE, RAYS)
+    assert (len(outer), len(inner)) == (2, 1)
+    assert not any(tensor.requires_grad for tensor in (inner[0].distance, inner[0].residual))

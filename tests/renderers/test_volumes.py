@@ -34,6 +34,13 @@ def parallel(side: int, half: float = 0.8) -> Rays:
     return replace(sheet(centres, centres), image=False)
 
 
+def meeting(side: int) -> tuple[Rays, Tensor, Tensor]:
+    """The parallel rays that meet the unit sphere, and where they enter and leave it."""
+    rays = parallel(side).flat()
+    entry, leave, meets = sphere_span(rays)
+    return rays[meets], entry[meets], leave[meets]
+
+
 def error(renderer: Blurred, case: Case, blur: float) -> float:
     """The distance of a hit behind the surface, in units of the blur."""
     rendering = renderer.with_blur(blur).render(case.field(), case.rays())
@@ -58,9 +65,7 @@ def test_neus_is_unbiased_and_volsdf_is_not(case):
 def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
     """VolSDF, Theorem 1 and Algorithm 1, against 20,000 samples of the opacity along each ray."""
     renderer = replace(VOLSDF, error=error_bound, rounds=8).with_blur(width)
-    rays = parallel(8).flat()
-    entry, leave, meets = sphere_span(rays)
-    rays, entry, leave = rays[meets], entry[meets], leave[meets]
+    rays, entry, leave = meeting(8)
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
         sharp, indices = 0, []
         for index, samples, reached in renderer.bounded_samples(field, rays, entry, leave):
@@ -80,10 +85,9 @@ def test_volsdf_bounds_the_error_of_the_opacity(width, error_bound):
 
 def test_the_width_at_which_volsdf_begins_bounds_the_error_of_any_field():
     """Lemma 2 holds for few samples and any values; this field leaves no space for a large step."""
-    renderer, rays = replace(VOLSDF, samples=3, rounds=0, error=0.1), parallel(6).flat()
-    entry, leave, meets = sphere_span(rays)
+    renderer = replace(VOLSDF, samples=3, rounds=0, error=0.1)
     field = Shape(lambda p: torch.where((20 * p[..., 2]).round() % 2 == 0, 0.7, -0.001), sphere(0.5).kind)
-    for _, samples, width in renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets]):
+    for _, samples, width in renderer.bounded_samples(field, *meeting(6)):
         assert (OpacityErrorBound.of(samples).max_error(width) <= renderer.error).all()
 
 
@@ -111,12 +115,10 @@ def test_a_grazing_ray_of_volsdf_has_at_most_five_rounds_of_samples():
 
 @pytest.mark.parametrize(("renderer", "least"), [(VOLSDF, 1.0), (load("renderer", "volsdf_budget"), 0.6)])
 def test_the_presets_of_volsdf_bound_the_error_on_a_fraction_of_the_rays(renderer, least):
-    rays = parallel(12).flat()
-    entry, leave, meets = sphere_span(rays)
     for field in (sphere(0.5), box((0.3, 0.5, 0.02))):
-        batches = renderer.bounded_samples(field, rays[meets], entry[meets], leave[meets])
+        batches = renderer.bounded_samples(field, *meeting(12))
         reached = torch.cat([(width == renderer.width).flatten() for _, _, width in batches])
-        assert len(reached) == int(meets.sum()) and reached.double().mean() >= least
+        assert len(reached) == len(meeting(12)[1]) and reached.double().mean() >= least
 
 
 def area_rates(renderer, radius: float, side: int) -> tuple[float, float, float]:

@@ -65,6 +65,13 @@ def test_masks_are_compared_where_their_loss_has_a_weight_and_hold_what_a_shape_
     assert masked.compare(smaller, 0)["silhouette"] > 3 * masked.compare(sphere(0.5), 0)["silhouette"]
 
 
+def test_views_move_on_and_are_spread_evenly(scene):
+    photographs = overrides(scene)
+    assert photographs.pairs(0) == [(0, 1), (2, 3), (4, 5), (6, 7)]
+    assert photographs.pairs(3) == [(3, 4), (5, 6), (7, 0), (1, 2)]
+    assert overrides(scene, views_per_step=99, neighbour=2).pairs(0) == [(i, (i + 2) % 8) for i in range(8)]
+
+
 def test_it_finds_the_ball(scene):
     problem = problem_of(scene)
     problem.code.data += torch.tensor([0.0, 0.05, 0.0, 0.15])  # higher and larger
@@ -112,6 +119,12 @@ def test_a_misplaced_ball_is_put_back(scene):
     assert problem.field()(torch.tensor([[0.0, 0, 0.5]])).abs().item() < 0.02
 
 
+def test_a_similarity_is_sought_in_place_where_that_is_asked_for(scene):
+    assert problem_of(scene).similarities == []
+    problem = problem_of(scene, similarity=True)
+    assert problem.similarity.tolist() == [0.0] * 7 and problem.similarities[0].requires_grad
+
+
 def test_coarse_images_come_first(scene):
     photographs = overrides(scene, coarse_blur=0.0625)
     roughness = [photographs.images_at(i).diff(dim=1).abs().mean().item() for i in (0, 8, 15, 29)]
@@ -144,6 +157,12 @@ def test_a_linear_image_is_sampled_exactly_and_nothing_outside_is_read():
     expected = 2 * pixels[:, 0] + 3 * pixels[:, 1] + 1
     assert torch.allclose(colours[inside, 0], expected[inside], atol=1e-4) and (colours[~inside] == 0).all()
     assert not sample(image, torch.tensor([[float("nan"), 1.0]]))[1].any()
+
+
+def test_gradients_reach_the_pixels():
+    image = torch.rand(5, 5, 2, generator=torch.Generator().manual_seed(1)).double()
+    positions = (0.7 + 3.5 * torch.rand(20, 2, generator=torch.Generator().manual_seed(2))).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: sample(image, p)[0], positions)
 
 
 def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is_put_there(tmp_path):
