@@ -18,7 +18,7 @@ from datasets.files.captures.formats import find_layout
 from datasets.files.captures.frames import OPENGL
 from datasets.files.captures.hull import carve, hull_mesh, measure_mask_fit
 from datasets.files.captures.rows import _from_angles
-from datasets.files.captures.take import read_image, read_shot
+from datasets.files.captures.take import _same_aspect, read_image, read_shot
 from datasets.files.own_photographs import ReadSettings, read_capture
 from datasets.shot import Shot
 from renderers.checks import BadInput
@@ -203,6 +203,13 @@ def test_images_of_two_sizes_each_have_their_camera(tmp_path):
     half = np.diag([0.5, 0.5, 1.0, 1.0])
     rewritten(tmp_path / "cameras_sphere.npz", lambda arrays: arrays | {"world_mat_3": half @ arrays["world_mat_3"]})
     assert "24 x 20 and 48 x 40 pixels" in read_capture(tmp_path, READ).summary
+
+
+@each("size, same", [
+    ((400, 300), True), ((401, 300), True), ((133, 100), True), ((400, 297), False), ((4000, 2975), False),
+])  # fmt: skip
+def test_a_cropped_image_has_another_aspect(size, same):
+    assert _same_aspect(size, (3000, 4000)) == same
 
 
 @each("tag, turn", [*((tag, None) for tag in range(2, 9)), (6, Image.Transpose.ROTATE_90)])

@@ -18,7 +18,7 @@ from bench.setup.inputs import RunInputs
 from datasets.files.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput
-from renderers.field import Field, Kind, points_in_sphere
+from renderers.field import LIPSCHITZ_SAFETY_FACTOR, Field, Kind, autograd_gradients, points_in_sphere
 from renderers.fields.networks.network import from_module, measure_field
 from tests.composing import composed
 from tests.documentation import code_of
@@ -143,6 +143,13 @@ def test_sign_and_bound_are_those_of_the_network_at_several_codes(tmp_path):
     near(field_of(deepsdf_folder(tmp_path, codes), 2)(POINTS), octahedron(POINTS) - 0.45)
     bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, others=[lambda points: 3 * octahedron(points)])
     assert bound.divisor == pytest.approx(3 * measure_field(octahedron, POINTS, kind=Kind.BOUND).divisor)
+
+
+def test_a_bound_that_is_scaled_has_no_slope_above_1_at_the_steepest_code():
+    steep = lambda points: 3 * octahedron(points)  # noqa: E731
+    bound = measure_field(octahedron, POINTS, kind=Kind.BOUND, scale=3.0, others=[octahedron, steep])
+    slopes = autograd_gradients(lambda points: bound.factor * steep(points), POINTS).norm(dim=-1)
+    assert bound.lipschitz == 1.0 and slopes.max() == pytest.approx(1 / LIPSCHITZ_SAFETY_FACTOR, rel=1e-3)
 
 
 def test_a_changed_file_is_read_again_and_is_another_dataset(tmp_path):

@@ -133,6 +133,16 @@ def test_the_split_of_deepsdf_gives_the_order_and_its_training_list_the_others(v
         shapenet(v2, test).mesh(Split.TRAIN, 0)
 
 
+def test_a_prior_may_take_a_shape_twice_and_a_test_may_not(v2):
+    dataset = shapenet(v2)
+    first, again = (dataset.mesh(Split.TRAIN, index) for index in (0, len(dataset.files[Split.TRAIN])))
+    assert first.repairs == again.repairs
+    with pytest.raises(ValueError, match=r"shapenet_sofa has 1 test shapes in .*, and none of number 1: set a smaller"):
+        dataset.mesh(Split.TEST, 1)
+    with pytest.raises(ValueError, match="shapenet_table has 0 train shapes"):
+        shapenet(v2, synset="table").mesh(Split.TRAIN, 0)
+
+
 @pytest.mark.parametrize("line", ["{id}", "04256520 {id}", "04256520/{id}"], ids=["choy", "pmo", "path"])
 def test_lists_have_a_line_for_each_id(v2, tmp_path, line):
     other = [] if line == "{id}" else [line.format(id="01ff").replace(SOFA, TABLE)]

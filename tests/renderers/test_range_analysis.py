@@ -113,6 +113,19 @@ def test_rounding_does_not_blur_the_bounds_of_a_deep_network_in_float32():
     assert ((high - low) - (exact[1] - exact[0])).abs().max() < 1e-4
 
 
+def test_values_of_a_network_of_large_weights_lie_within_its_bounds_in_float32():
+    """The segments are so short that only rounding separates the bounds from the value."""
+    torch.manual_seed(0)
+    decoder = Decoder(layers=4, width=128, code_length=0, skip=2, narrow=False).requires_grad_(False)
+    for layer in decoder.hidden:
+        layer.weight.mul_(6.0)
+    field = decoder.at(torch.zeros(0))
+    middle, half = (vectors.float() for vectors in segments(1000, 2e-7))
+    low, high = field.bounds(middle, half)
+    values = field(middle)
+    assert values.abs().max() > 10 and ((low <= values) & (values <= high)).all()
+
+
 def test_too_few_segments_are_out_of_steps():
     rendering = replace(RENDERER, most_segments=3).render(network(0), from_all_sides(50))
     assert (rendering.status == Status.OUT_OF_STEPS).any() and rendering.distance.isfinite().all()

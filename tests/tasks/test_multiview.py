@@ -11,7 +11,7 @@ from bench.config import load
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty
 from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
-from bench.tasks.multiview import Multiview, PhotometricLoss, sample
+from bench.tasks.multiview import Multiview, PhotometricLoss, blur, sample
 from bench.tasks.reconstruction.subject import HULL_RADIUS
 from bench.tasks.single_view.encoder import EncoderSettings
 from datasets.files.meshes import read_mesh
@@ -130,6 +130,18 @@ def test_coarse_images_come_first(scene):
     roughness = [photographs.images_at(i).diff(dim=1).abs().mean().item() for i in (0, 8, 15, 29)]
     assert roughness[0] < roughness[1] < roughness[2] == roughness[3]
     assert torch.equal(photographs.images_at(15), photographs.colours)
+
+
+def test_blurring_keeps_what_is_constant_and_the_mean():
+    flat = torch.full((2, 9, 7, 3), 0.3)
+    assert torch.allclose(blur(flat, 1.5), flat, atol=1e-6)
+    spot = torch.zeros(1, 21, 21, 3)
+    spot[0, 10, 10] = 1.0
+    soft = blur(spot, 1.5)
+    assert soft.sum().item() == pytest.approx(3.0, rel=1e-4)
+    variance = (soft[0, :, :, 0].sum(1) * (torch.arange(21) - 10) ** 2).sum().item()
+    assert variance == pytest.approx(1.5**2, rel=0.05)
+    assert blur(torch.rand(1, 2, 2, 3), 5.0).isfinite().all()  # wider than the image
 
 
 def test_views_that_share_no_point_end_the_run_with_the_reason(scene):
