@@ -40,8 +40,8 @@ def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), parts
         accessor = {"componentType": CODES[array.dtype.str[1:]], "count": len(array), "type": TYPES[array.shape[1:]]}
         if "sparse" in keys:
             index, values = keys["sparse"]
-            places = {"bufferView": view(index), "componentType": CODES[index.dtype.str[1:]]}
-            accessor["sparse"] = {"count": len(index), "indices": places, "values": {"bufferView": view(values)}}
+            indices = {"bufferView": view(index), "componentType": CODES[index.dtype.str[1:]]}
+            accessor["sparse"] = {"count": len(index), "indices": indices, "values": {"bufferView": view(values)}}
         if "stride" in keys:
             padded = np.zeros((len(array), keys["stride"]), np.uint8)
             start = keys.get("byteOffset", 0)
@@ -50,7 +50,7 @@ def glb(vertices=VERTICES, corners=CORNERS, *others, nodes=({"mesh": 0},), parts
         elif "empty" not in keys:
             accessor["bufferView"] = view(array)
         accessors.append(accessor | {key: keys[key] for key in ("normalized", "count", "byteOffset") if key in keys})
-    primitives = [{"attributes": {"POSITION": 0}, "indices": 1} | part for part in parts]
+    primitives = [{"attributes": {"POSITION": 0}, "indices": 1} | primitive for primitive in parts]
     stored = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes}
     stored |= {"meshes": [{"primitives": primitives}], "accessors": accessors, "bufferViews": views}
     stored |= {"buffers": [{"byteLength": len(binary)}], **more}
@@ -73,12 +73,12 @@ TURN = Rotation.from_euler("xyz", (30, 40, 50), degrees=True)
 MOVED = {"translation": [5, 6, 7], "rotation": TURN.as_quat().tolist(), "scale": [2, 3, 0.5]}
 MATRIX = np.eye(4)
 MATRIX[:3] = np.c_[TURN.as_matrix() * [2, 3, 0.5], [5, 6, 7]]
-PLACES = VERTICES @ MATRIX[:3, :3].T + MATRIX[:3, 3]
+MOVED_VERTICES = VERTICES @ MATRIX[:3, :3].T + MATRIX[:3, 3]
 PARENT = [{"children": [1], **MOVED}, {"mesh": 0}]
 TARGET = ({"targets": [{"POSITION": 2}]},)
 INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 2, "ROTATION": 3}}}
 SHIFTED = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 2}}}
-AT = np.float32([(0, 0, 0), (9, 0, 0)]), np.array([(0, 0, 0, 1), TURN.as_quat()], np.float32)
+OFFSETS = np.float32([(0, 0, 0), (9, 0, 0)]), np.array([(0, 0, 0, 1), TURN.as_quat()], np.float32)
 BIND = np.stack([np.eye(4), np.eye(4)]).astype(np.float32)
 BIND[1, 3, :3] = -1, 0, 0  # a column
 BONES = np.array([(0, 1, 0, 0)] * 4, np.uint8), (np.array([(127, 128, 0, 0)] * 4, np.uint8), SHARE), BIND
@@ -105,17 +105,17 @@ READ = {  # a file, and the vertices of its tetrahedra
     "fan, and its base": (
         glb(VERTICES, np.array([0, 1, 3, 2, 1], np.uint16), FACES[2], parts=({"mode": 6}, {"indices": 2})), VERTICES),
     "lines and points beside": (glb(parts=({"mode": 0}, {"mode": 1}, {"mode": 3}, {})), VERTICES),
-    "moved by parts": (glb(nodes=[{"mesh": 0, **MOVED}]), PLACES),
-    "moved by a matrix": (glb(nodes=[{"mesh": 0, "matrix": MATRIX.T.ravel().tolist()}]), PLACES),
-    "moved by its parent": (glb(nodes=PARENT), PLACES),
+    "moved by parts": (glb(nodes=[{"mesh": 0, **MOVED}]), MOVED_VERTICES),
+    "moved by a matrix": (glb(nodes=[{"mesh": 0, "matrix": MATRIX.T.ravel().tolist()}]), MOVED_VERTICES),
+    "moved by its parent": (glb(nodes=PARENT), MOVED_VERTICES),
     "mirrored": (glb(nodes=[{"mesh": 0, "scale": [-1, 1, 1]}]), VERTICES * [-1, 1, 1]),
-    "twice": (glb(nodes=[{"mesh": 0, **MOVED}, {"mesh": 0}], scenes=[{"nodes": [0, 1]}]), PLACES, VERTICES),
+    "twice": (glb(nodes=[{"mesh": 0, **MOVED}, {"mesh": 0}], scenes=[{"nodes": [0, 1]}]), MOVED_VERTICES, VERTICES),
     "instances": (
-        glb(VERTICES, CORNERS, *AT, nodes=[{"mesh": 0, "extensions": INSTANCES}], extensionsRequired=[*INSTANCES]),
-        VERTICES, TURN.apply(VERTICES) + AT[0][1]),
+        glb(VERTICES, CORNERS, *OFFSETS, nodes=[{"mesh": 0, "extensions": INSTANCES}], extensionsRequired=[*INSTANCES]),
+        VERTICES, TURN.apply(VERTICES) + OFFSETS[0][1]),
     "instances without a turn": (
-        glb(VERTICES, CORNERS, AT[0], nodes=[{"mesh": 0, "extensions": SHIFTED}]),
-        *(VERTICES + at for at in AT[0]),
+        glb(VERTICES, CORNERS, OFFSETS[0], nodes=[{"mesh": 0, "extensions": SHIFTED}]),
+        *(VERTICES + offset for offset in OFFSETS[0]),
     ),
     "a morph target": (
         glb(VERTICES, CORNERS, VERTICES, nodes=[{"mesh": 0, "weights": [0.5]}], parts=TARGET), 1.5 * VERTICES),
@@ -156,7 +156,7 @@ READ = {  # a file, and the vertices of its tetrahedra
         VERTICES + BENT,
     ),
     "another scene beside": (glb(nodes=PARENT, scene=1, scenes=[{"nodes": [0]}, {"nodes": [1]}]), VERTICES),
-    "no scene": (glb(nodes=PARENT, scenes=[]), PLACES),
+    "no scene": (glb(nodes=PARENT, scenes=[]), MOVED_VERTICES),
 }  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import torch
 from bench.machine import environment
 from bench.machine.environment import using_threads
 from renderers.fields.mlp import BoundDecoder, Decoder
-from renderers.kernels import decoder as of_decoders
+from renderers.kernels import decoder as decoder_kernels
 from renderers.kernels import library
 from renderers.kernels.library import kernels
 from tests.looped import each
@@ -26,19 +26,19 @@ NETWORKS = {
 
 
 def by_default() -> library.Kernels:
-    """What a process finds that asks for nothing."""
+    """The kernels of a process that chooses nothing."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv(library.KERNELS_VARIABLE, raising=False)
         return kernels.__wrapped__()
 
 
-THERE = by_default()
-with_compiler = pytest.mark.skipif(THERE.library is None, reason=f"nothing is compiled here: {THERE.description}")
+COMPILED = by_default()
+with_compiler = pytest.mark.skipif(COMPILED.library is None, reason=f"nothing is compiled here: {COMPILED.description}")
 
 
 @pytest.fixture(autouse=True)
 def compiled_code(monkeypatch):
-    monkeypatch.setattr(of_decoders, "kernels", lambda: THERE)
+    monkeypatch.setattr(decoder_kernels, "kernels", lambda: COMPILED)
 
 
 def make(name: str) -> Decoder:
@@ -47,7 +47,7 @@ def make(name: str) -> Decoder:
 
 
 def fresh(monkeypatch: pytest.MonkeyPatch, cache: Path, **environment: str) -> library.Kernels:
-    """What a new process would find."""
+    """The kernels of a new process."""
     for name, value in {"XDG_CACHE_HOME": str(cache), library.KERNELS_VARIABLE: "", **environment}.items():
         monkeypatch.setenv(name, value)
     return kernels.__wrapped__()
@@ -69,7 +69,7 @@ def test_values_are_those_of_torch(name, count):
 
 @with_compiler
 def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatch):
-    monkeypatch.setattr(environment, "kernels", lambda: THERE)
+    monkeypatch.setattr(environment, "kernels", lambda: COMPILED)
     monkeypatch.setattr(BoundDecoder, "_compiled", lambda self: pytest.fail("compiled code was asked"))
     points, code = torch.rand(5, 3), torch.zeros(4)
     with using_threads(1):
@@ -120,11 +120,11 @@ def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(mo
 
 @with_compiler
 def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
-    asked = "from renderers.kernels.library import kernels; print(kernels().description)"
+    program = "from renderers.kernels.library import kernels; print(kernels().description)"
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.KERNELS_VARIABLE: ""}
-    command = [sys.executable, "-c", asked]
+    command = [sys.executable, "-c", program]
     several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    assert [one.communicate()[0].strip() for one in several] == ["compiled"] * 3
+    assert [process.communicate()[0].strip() for process in several] == ["compiled"] * 3
     (built,) = (tmp_path / "implicit-bench" / "kernels").iterdir()
     whole = built.read_bytes()
     built.unlink()

@@ -8,7 +8,7 @@ from renderers.fields.analytic import Shape, box, plane, sphere
 from renderers.reference import trace
 from renderers.rendering import Status
 from tests.looped import each
-from tests.renderers.analytic_cases import CASES, along_z, sphere_hits
+from tests.renderers.analytic_cases import CASES, along_z, sphere_hits, vector
 
 
 def evaluate(field: Shape, rays: Rays, *, lipschitz: float = 1.0, least_step: float = 2e-4):
@@ -36,6 +36,15 @@ def test_the_step_is_as_short_as_the_lipschitz_constant_requires():
     steep = Shape(lambda p: 4 * box((0.6, 0.6, 5e-3))(p), lipschitz=4.0)
     assert evaluate(steep, along_z(0.0), lipschitz=4.0).hit.all()
     assert not evaluate(steep, along_z(0.0), lipschitz=1.0).hit.any()  # steps of four times the distance
+
+
+def test_every_ray_has_a_status():
+    origins = vector((0, 0, -2, 0, 0.8, -2, 0, 3, -2, 0.1, 0, 0, 0, 0, 2)).view(5, 3)
+    rendering = evaluate(sphere(0.5), Rays(origins, vector((0, 0, 1)).expand(5, 3)))
+    assert rendering.status.tolist() == [Status.HIT, Status.MISS, Status.MISS, Status.STARTED_INSIDE, Status.MISS]
+    assert rendering.distance.isfinite().all() and evaluate(sphere(0.5), along_z()).distance.shape == (0,)
+    shaped = evaluate(sphere(0.5), Rays(origins[:4].view(2, 2, 3), vector((0, 0, 1)).expand(2, 2, 3)))
+    assert shaped.status.shape == (2, 2)
 
 
 def test_the_estimated_lipschitz_constant_is_the_longest_gradient_with_a_margin():

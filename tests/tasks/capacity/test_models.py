@@ -15,7 +15,7 @@ from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewS
 from bench.solve.observed_view import ObservedView
 from bench.tasks.capacity.candidates import REACH, by_size, candidate
 from bench.tasks.capacity.field import rendered_curve
-from bench.tasks.capacity.fit import SCREENING, FitProblem, Fitter
+from bench.tasks.capacity.fit import SCREENING, FitProblem, Fitter, scatter_points
 from bench.tasks.capacity.growth import _is_better, cost, grow
 from bench.tasks.capacity.held_out import MISSED_FOOTPRINTS, HeldOutError
 from bench.tasks.capacity.model import Evidence, Model, Size, StartInputs
@@ -364,6 +364,13 @@ def test_too_few_depths_to_hold_some_out_are_an_error():
             footprint=0.02,
             seed=0,
         )
+
+
+def test_half_of_the_points_of_a_warm_start_lie_near_the_surface():
+    far = torch.tensor([[0.0, 0.0, 9.0]])  # outside the sphere of the other points
+    scattered = scatter_points(far, 100, torch.Generator().manual_seed(0))
+    assert int(((scattered - far).norm(dim=1) < 0.5).sum()) == 50
+    assert int((scattered.norm(dim=1) <= 1.1).sum()) == 50
 
 
 def test_a_warm_start_counts_evaluations_of_the_previous_field():

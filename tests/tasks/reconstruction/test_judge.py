@@ -9,7 +9,7 @@ import torch
 
 from bench.config import load
 from bench.evaluate.evaluate import render_image
-from bench.evaluate.state import State
+from bench.evaluate.state import State, empty_view
 from bench.records.record import RunStatus
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, OWN_PREFIX, image_scores, judge, surface_scores
 from bench.tasks.reconstruction.subject import Subject
@@ -118,6 +118,22 @@ def test_images_are_compared_black_outside_of_their_masks():
     assert meets.any() and not meets.all() and blind["psnr"] == pytest.approx(-10 * log10(wrong), abs=1e-4)
 
 
+def _view(shot) -> View:
+    return View(shot.camera, shot.depth, shot.normals, shot.mask)
+
+
+def test_means_and_the_least_are_over_photographs_of_any_size():
+    shots = [shot_of(painted(), camera) for camera in (camera_of(16), camera_of(24).resized(12, 24))]
+    views = [_view(shots[0]), replace(_view(shots[1]), mask=torch.zeros(12, 24, dtype=torch.bool))]
+    images = [shots[0].colours * shots[0].mask[..., None], torch.zeros(12, 24, 3)]
+    images[0] = images[0] + 0.1
+    for _ in range(5):  # type checks sample the elements
+        scores = image_scores(views, images, shots)
+    lost = (shots[1].colours[shots[1].mask] ** 2).mean().item()
+    assert scores["psnr"] == pytest.approx((20.0 - 10 * log10(lost)) / 2, abs=1e-4)
+    assert (scores["mask_iou"], scores["mask_iou_least"]) == (0.5, 0.0)
+
+
 def test_a_volume_is_judged_by_the_weighted_sum_that_it_shows(inputs):
     """For one colour the sum is the colour times the opacity. At the mean depth it would be the colour itself."""
     plain = cast(ball(0.6, CENTRE, torch.zeros(3, 10)), torch.float32)  # grey, 1/2
@@ -166,3 +182,8 @@ def test_a_wide_blur_has_weight_before_the_surface(subject: Subject, inputs, sha
     neus = load("renderer", "neus", sharpness=sharpness, sharpening=0)
     scores = early_weight(painted(), views, replace(inputs, renderer=neus))
     assert least <= scores["own_early_weight"] < most
+
+
+def test_a_renderer_of_hits_has_no_weight_before_the_surface(subject: Subject, inputs):
+    assert early_weight(painted(), [see(Truth(subject.truth), subject.held_out[0].camera)], inputs) == {}
+    assert early_weight(painted(), [empty_view(shot.camera) for shot in subject.held_out], inputs) == {}

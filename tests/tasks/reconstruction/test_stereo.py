@@ -86,6 +86,14 @@ def test_neighbours_are_the_nearest_by_angle_within_bounds(sphere, monkeypatch, 
     assert matched_pairs == pairs and len(clouds) == len(pairs)
 
 
+def test_a_photograph_is_unchanged_by_the_identity(sphere):
+    """The centre of the first pixel is at (0, 0) in OpenCV, half a pixel less than here."""
+    (shot,) = taken(sphere, (10.0, 20.0))
+    pinhole = shot.camera.intrinsics.double().numpy() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    turned = stereo._rectify(shot, shot.camera.world_to_camera.double().numpy()[:3, :3], pinhole, PIXELS)
+    np.testing.assert_allclose(turned.astype(float), 255 * shot.colours.numpy(), atol=2)
+
+
 def test_points_outside_of_a_mask_are_left_out(sphere):
     shots = taken(sphere, (0.0, 0.0), (15.0, 0.0))
     free = points_of([replace(shot, mask=None) for shot in shots])
@@ -95,6 +103,12 @@ def test_points_outside_of_a_mask_are_left_out(sphere):
     above = free[:, 1] > 0  # y is up, and both cameras look along the horizon
     assert 0.3 < above.mean() < 0.7
     np.testing.assert_allclose(halved, free[above])
+
+
+def test_points_outside_of_the_unit_sphere_are_left_out(sphere):
+    """In a world that is half as large, the same photographs show a sphere of radius 1.4."""
+    shots = [shot.in_world(np.diag([0.5, 0.5, 0.5, 1.0])) for shot in taken(sphere, (0.0, 0.0), (15.0, 0.0))]
+    assert all((np.linalg.norm(cloud.points, axis=1) < 1).all() for cloud in stereo_clouds(shots, ALL))
 
 
 def test_without_opencv_the_error_has_a_remedy(monkeypatch):

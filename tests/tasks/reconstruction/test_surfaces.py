@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bench.evaluate.state import DEFAULT_VERTEX_COLOUR
+from bench.tasks.reconstruction import surfaces
 from bench.tasks.reconstruction.stereo import Cloud
 from bench.tasks.reconstruction.surfaces import fuse_clouds, given_clouds, poisson, with_colours
 from tests.looped import each
@@ -55,6 +56,14 @@ def test_normals_look_at_the_camera_of_their_cloud(outward):
     assert steep.mean() > 0.4 and cosines[steep].min() > 0.98
 
 
+def test_too_few_points_have_no_surface():
+    few = surfaces.NORMAL_NEIGHBOURS - 1
+    for clouds, count in (([], 0), ([Cloud(directions(few), FRONT)], few)):
+        points, normals = fuse_clouds(clouds)
+        assert points.shape == normals.shape == (count, 3) and not normals.any()
+        assert poisson(points, normals, depth=4, trim=0.0) is None
+
+
 def test_points_of_a_sphere_give_a_sphere():
     towards = directions(1500)
     centre = np.array(CENTRE)
@@ -94,3 +103,16 @@ def test_vertices_have_the_colours_of_photographs_or_are_grey_if_unseen():
     assert expected[visible].std(axis=0)[1:].min() > 0.1  # a wrong position would have a wrong colour
     assert np.abs(coloured.colours - expected)[visible].max() < 0.02
     assert (coloured.colours[unseen] == DEFAULT_VERTEX_COLOUR).all()
+
+
+def test_a_photograph_that_a_vertex_faces_counts_most():
+    mesh = icosphere(RADIUS)
+    front, aside = (shot_of(ball(RADIUS, (0.0, 0.0, 0.0)), camera_of(32, angles=(turn, 0.0))) for turn in (0.0, 60.0))
+    white, black = (replace(shot, colours=torch.full((32, 32, 3), c)) for shot, c in ((front, 1.0), (aside, 0.0)))
+    colours = with_colours(mesh, [white, black]).colours
+    assert colours is not None
+    nearest = np.argmax(mesh.vertices[:, 2])
+    middle = np.argmax(mesh.vertices @ [np.sin(np.radians(30)), 0, np.cos(np.radians(30))])
+    other = np.argmax(mesh.vertices @ aside.camera.center.numpy())
+    assert 0.9 < colours[nearest, 0] < 1 and 0 < colours[other, 0] < 0.1
+    assert colours[middle, 0] == pytest.approx(0.5, abs=0.1)
