@@ -5,6 +5,7 @@ from functools import cache
 
 import pytest
 import torch
+from torch import Tensor
 
 from bench.config import load
 from renderers.camera import Camera, Rays, sphere_span
@@ -290,3 +291,16 @@ def test_rays_that_cut_an_edge_closely_hit_it(half_side):
     edge, shape = 1.4 * half_side, box((half_side, half_side, half_side)).rotate(turned)
     rays = beam(*((edge - depth, 0.0, -2.0 - x / 977) for x in range(20) for depth in (0.0005, 0.0007, 0.001)))
     assert NEWTON.render(shape, rays).hit.all()
+
+
+def test_the_tip_of_a_cone_is_hit_and_spoils_no_gradient():
+    height = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+
+    def cone(points: Tensor) -> Tensor:
+        return 0.6 * points[..., :2].square().sum(-1).sqrt() + 0.8 * (-points[..., 2] - height)
+
+    rays = beam((0.0, 0.0, -2.0), (0.1, 0.0, -2.0), (0.0, 0.2, -2.0))
+    rendering = NEWTON.render(Shape(cone, Kind.BOUND), rays)
+    assert rendering.hit.all() and rendering.distance.tolist() == pytest.approx([1.7, 1.775, 1.85], abs=1e-6)
+    (gradient,) = torch.autograd.grad(rendering.distance[1:].sum(), height)
+    assert gradient.item() == pytest.approx(-2.0)

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from torch import Tensor
 
 from renderers.field import Coarse, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere, torus
-from renderers.tracer import MAX_DISTANCE_SLOPE, SlopeNormalised, measure_slope_scale, normalise_slope
+from renderers.tracer import MAX_DISTANCE_SLOPE, SLOPE_PAIR_COUNT, SlopeNormalised, measure_slope_scale, normalise_slope
 from tests.looped import each
 
 LIKE = torch.zeros(0, 3)
@@ -31,6 +32,19 @@ def test_the_scale_of_a_multiple_of_a_distance_is_the_factor(shape, factor):
 def test_the_scale_is_measured_at_finite_values(spoilt):
     assert slope_scale(lambda p: torch.where(p[..., 0] > 0.2, spoilt, 4 * BALL(p))) == pytest.approx(4.0, rel=0.1)
     assert slope_scale(lambda p: torch.full_like(p[..., 0], spoilt)) == 1.0
+
+
+@each("radius", [0.05, 30.0])
+def test_the_scale_is_measured_at_points_in_the_sphere(radius):
+    evaluated: list[Tensor] = []
+
+    def values(points: Tensor) -> Tensor:
+        evaluated.append(points)
+        return 4 * sphere(radius / 2)(points)
+
+    assert slope_scale(values, radius) == pytest.approx(4.0, rel=0.1)
+    (points,) = evaluated
+    assert len(points) == 2 * SLOPE_PAIR_COUNT and points.norm(dim=-1).max() <= radius
 
 
 def test_values_and_coarse_values_of_a_normalised_field_are_divided_and_counted():

@@ -19,6 +19,7 @@ from bench.tasks.gradients.task import (
     Gradients,
     Subject,
     _bands,
+    _draw,
     _outline,
 )
 from renderers.camera import Camera, Rays
@@ -197,3 +198,17 @@ def test_bands_are_of_the_angle_between_ray_and_inward_normal():
     assert {band: pixels.tolist() for band, pixels in result.items()} == {
         "frontal": [0, 1], "oblique": [2, 3], "grazing": [4, 5],
     }  # fmt: skip
+
+
+def test_the_outline_is_beside_the_outline():
+    hit = torch.zeros(5, 6, dtype=torch.bool)
+    hit[:, 3:] = True
+    assert _outline(hit).tolist() == [6 * row + column for row in range(5) for column in (2, 3)]
+    assert _outline(torch.ones(5, 6).bool()).tolist() == _outline(torch.zeros(5, 6).bool()).tolist() == []
+
+
+def test_pixels_are_drawn_without_repetition_and_by_the_seed():
+    pixels = torch.arange(100, 200)
+    first, again, other = (_draw(pixels, 30, torch.Generator().manual_seed(seed)).tolist() for seed in (0, 0, 1))
+    assert first == again != other and first == sorted(set(first)) and len(first) == 30
+    assert _draw(pixels[:5], 30, torch.Generator()).tolist() == pixels[:5].tolist()

@@ -11,7 +11,7 @@ import trimesh
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import History, OptimiserSettings, optimise
-from bench.tasks.baselines.pose_icp import PoseICP
+from bench.tasks.baselines.pose_icp import PoseICP, world_points
 from bench.tasks.pose import Pose, PoseProblem, build_shape_field, pose_error
 from datasets.scene import Scene
 from renderers.fields.analytic import box
@@ -147,6 +147,11 @@ def test_closest_points_find_a_near_pose(run, method):
     assert run.record.metrics_start["rotation_error_deg"] == pytest.approx(12.0, abs=0.01)
     assert run.record.metrics["rotation_error_deg"] < 4.0 and run.record.evaluations["value"] == 0
     assert run.record.seconds["forward"] > 0
+
+
+def test_the_points_of_the_true_camera_lie_on_the_surface(scene):
+    points = world_points(scene.view, CAMERA)
+    assert len(points) == int(scene.view.mask.sum()) and box(SIZES)(points).abs().max() < 1e-4
 
 
 def test_points_that_never_come_near_are_told(run):
