@@ -43,6 +43,15 @@ def test_the_first_fall_from_free_to_occupied(values, first):
         assert (ends.near_value.item(), ends.far_value.item()) == (values[first], values[first + 1])
 
 
+def test_rays_with_a_crossing_have_a_bracket():
+    values = torch.stack([vector((1, -1)), vector((1, 1)), vector((2, -3))])
+    crosses, ends = first_crossing(vector((0, 1)).expand(3, 2), values)
+    assert crosses.tolist() == [True, False, True]
+    assert ends.select(crosses.nonzero().squeeze(-1)).far_value.tolist() == [-1, -3]
+    crosses_empty, empty = first_crossing(torch.zeros(0, 4), torch.zeros(0, 4))
+    assert (crosses_empty.shape, empty.near.shape) == ((0,), (0,))
+
+
 @each("steps", [0, 1, 5])
 def test_bisection_halves_the_bracket_with_one_evaluation_per_step(steps):
     meter = Meter(WALL)

@@ -11,7 +11,7 @@ from bench.config import load
 from bench.machine.limits import LimitReached, Limits
 from renderers.boundary import render_checked
 from renderers.camera import Rays
-from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_version
+from renderers.field import Coarse, Counts, Field, Meter, Wrapper, coarse_version, points_in_sphere
 from renderers.fields import mlp
 from renderers.fields.analytic import box, capsule, plane, sphere, torus
 from renderers.fields.mlp import Decoder
@@ -183,6 +183,30 @@ def test_the_coarse_values_of_a_network_are_off_by_no_more_than_they_say(wide):
         assert 0 < off.max() <= coarse.error
         assert coarse.values(torch.zeros(2, 5, 3)).shape == (2, 5) and coarse.values(torch.zeros(0, 3)).shape == (0,)
         assert off.max() > coarse.error / 10
+
+
+def test_a_network_with_hardly_a_surface_states_the_error_of_all_its_coarse_values(wide):
+    """Of no value that is near 0, or of few of them, nothing could be measured."""
+    drawn = points_in_sphere(mlp.ERROR_SAMPLE_POINTS, torch.zeros(()))
+    for least in (mlp.NEAR_SURFACE_VALUE + 0.01, mlp.NEAR_SURFACE_VALUE - 0.01):
+        wide.last.weight.mul_(10.0)
+        wide.last.bias.sub_(wide.at(torch.zeros(8))(drawn).min() - least)
+        field = wide.at(torch.zeros(8))
+        assert (field.coarse.values(drawn).abs() <= mlp.NEAR_SURFACE_VALUE).sum() < mlp.MIN_NEAR_SURFACE_POINTS
+        off = (field.coarse.values(drawn) - field(drawn)).abs().max()
+        assert field.coarse.error == pytest.approx(mlp.COARSE_ERROR_FACTOR * off.item())
+
+
+def test_their_error_is_measured_once_for_each_state_of_the_weights(wide, monkeypatch):
+    measured = []
+    largest = mlp._largest_error
+    monkeypatch.setattr(mlp, "_largest_error", lambda *arguments: measured.append(1) or largest(*arguments))
+    for code in torch.eye(8)[:3]:
+        assert wide.at(code).coarse
+    assert len(measured) == 1
+    wide.last.weight.mul_(2.0)
+    assert wide.at(torch.zeros(8)).coarse
+    assert len(measured) == 2
 
 
 def test_without_the_private_names_of_torch_they_are_the_same(wide, monkeypatch):

@@ -55,6 +55,12 @@ def test_the_hits_of_no_shipped_renderer_are_flagged(name):
             assert bool(hits.hit.any()) and hits.off_surface() == ""
 
 
+def test_hits_within_the_largest_shipped_epsilon_are_not_flagged():
+    """The epsilon of Figure 7: the residual accounts for the distance of such a hit from the surface."""
+    hits = hits_of(replace(load("renderer", "dist"), epsilon=0.05), PLATE)
+    assert float(PLATE(RAYS.at(hits.distance)[hits.hit]).max()) > 0.02 and hits.off_surface() == ""
+
+
 @each("name", ["dist", "dvr", "newton", "mesh_proxy", "relaxed_boundary", "neus", "unisurf", "volsdf"])
 def test_distances_that_are_5_percent_short_are_noted_in_each_kind_of_field(name):
     for kind in load("renderer", name).capabilities.needs:
@@ -69,6 +75,16 @@ def test_how_far_off_hits_are_does_not_depend_on_the_fields_scale(factor):
     right, short = hits_of(load("renderer", "dvr"), field), hits_of(WrongHits("short", "dvr"), field)
     assert right.off_surface() == ""
     assert short.off_surface() == hits_of(WrongHits("short", "dvr"), PLATE).off_surface() != ""
+
+
+def test_a_note_has_the_number_of_wrong_hits_and_their_median_distance():
+    facing, ball = camera_of(20).rays(), sphere(0.5)
+    hits = hits_of(WrongHits("short"), ball, facing)
+    off, count = float(ball(facing.at(hits.distance))[hits.hit].median()), int(hits.hit.sum())
+    note = hits.off_surface()
+    assert off == pytest.approx(0.08, abs=0.02)
+    assert note.startswith(f"WrongHits.render: {count} of {count} hits are not on the surface ")
+    assert f"median distance from it is {off:.2g} scene units, and 0.02 beyond the residual is allowed. Return" in note
 
 
 @each("kind", [Kind.DISTANCE, Kind.BOUND])

@@ -9,9 +9,9 @@ from torch.nn.functional import normalize
 from bench.config import load
 from bench.machine.limits import Limits
 from renderers.camera import Rays
-from renderers.field import Counts, Meter, Moved, estimate_lipschitz, field_bounds
+from renderers.field import Counts, Kind, Meter, Moved, estimate_lipschitz, field_bounds
 from renderers.fields.affine import segment_bounds
-from renderers.fields.analytic import box, sphere
+from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.reference import trace
 from renderers.rendering import Status
@@ -79,6 +79,28 @@ def test_a_thin_plate_is_hit():
     for thickness in (0.1, 0.01, 0.002):
         rendering = RENDERER.render(box((0.5, 0.5, thickness / 2)), rays)
         assert rendering.hit.all()
+
+
+@each("scale", [4.0, 0.05])
+def test_a_scaled_plate_is_hit_if_its_lipschitz_constant_is_stated(scale):
+    """Half of the shortest segment is worth more or less than half of the plate."""
+    thickness = 0.02
+    plate = Shape(lambda p: scale * box((0.5, 0.5, thickness / 2))(p), Kind.BOUND, scale)
+    rays = from_all_sides(400)
+    truth = RENDERER.render(box((0.5, 0.5, thickness / 2)), rays)
+    rendering = RENDERER.render(plate, rays)
+    assert truth.hit.sum() > 50 and torch.equal(rendering.hit, truth.hit)
+    torch.testing.assert_close(rendering.distance[rendering.hit], truth.distance[rendering.hit], rtol=0, atol=1e-6)
+
+
+def test_rounded_values_give_hits_at_their_change_of_sign(step=0.002):
+    """A rounded value is 0 at the end of a segment that was certified to be empty."""
+    exact = sphere(0.5)
+    rounded = Shape(lambda p: (exact(p) / step).round() * step, exact.kind, exact.lipschitz)
+    rendering, truth = RENDERER.render(rounded, from_all_sides(400)), RENDERER.render(exact, from_all_sides(400))
+    assert rendering.hit.sum() > 100
+    assert (rendering.hit == truth.hit).sum() > 395  # all rays except at the outline
+    assert exact(rendering.points[rendering.hit]).abs().max() <= step
 
 
 def test_bounds_are_counted_by_their_matrix_products():

@@ -262,9 +262,10 @@ def play(count: int, trial: int, iterations: int, loss) -> list[tuple[int, int]]
     return turns
 
 
-def test_starts_take_turns_and_the_best_start_continues():
+def test_starts_take_turns_and_the_best_start_continues_by_the_end_of_its_round():
     turns = play(3, 2, 9, lambda start, step: (5.0, 1.0, 3.0)[start])
     assert turns == [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (1, 2), (1, 3), (1, 4)]
+    assert play(2, 6, 20, lambda start, step: 100 - 30 * step if start else 10)[-1] == (1, 6 + 20 - 12 - 1)
 
 
 def test_a_quarter_of_the_starts_remains_after_each_round():
@@ -273,11 +274,6 @@ def test_a_quarter_of_the_starts_remains_after_each_round():
     turns = play(5, 1, 10, lambda start, step: 10 - start if step == 0 else 100 * start)
     assert [start for start, _ in turns] == [0, 1, 2, 3, 4, 4, 3, 3, 3, 3]  # 4 and 3 remain, and then 3 is better
     assert [step for _, step in turns[5:]] == [1, 1, 2, 3, 4]
-
-
-def test_a_start_is_scored_by_the_end_of_its_round():
-    turns = play(2, 6, 20, lambda start, step: 100 - 30 * step if start else 10)
-    assert turns[-1] == (1, 6 + 20 - 12 - 1)
 
 
 def test_rounds_must_leave_something_of_the_budget():
