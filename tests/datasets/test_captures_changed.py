@@ -75,7 +75,13 @@ def masks(change: Callable[[np.ndarray], np.ndarray], selected: slice = slice(No
 
 def text(name: str, old: str, new: str | Callable[[re.Match], str]) -> Spoil:
     """Replaces the matches of a pattern."""
-    return lambda folder: (folder / name).write_text(re.sub(old, new, (folder / name).read_text()))
+
+    def replaced(folder: Path) -> None:
+        content, count = re.subn(old, new, (folder / name).read_text())
+        assert count
+        (folder / name).write_text(content)
+
+    return replaced
 
 
 def rotated(folder: Path) -> None:
