@@ -276,6 +276,12 @@ def test_a_quarter_of_the_starts_remains_after_each_round():
     assert [step for _, step in turns[5:]] == [1, 1, 2, 3, 4]
 
 
+def test_the_first_start_is_best_until_all_were_tried():
+    starts = Starts(StartSettings(2, 1))
+    starts.note(1, 0, torch.tensor(0.0))
+    assert starts.best() == 0
+
+
 def test_rounds_must_leave_something_of_the_budget():
     StartSettings(4, 8).check(33)
     with pytest.raises(ValueError, match=r"optimiser\.iterations must be more than 32, not 32: 4 starts share it"):

@@ -12,6 +12,7 @@ from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.solve.optimise import History
 from bench.tables import choice, names
+from bench.tasks.stability import fit
 from bench.tasks.stability.axes import Stress, Sweep
 from bench.tasks.stability.fit import _failure, judge_fit
 from bench.tasks.stability.judge import judge_gradient, judge_rendering, truth
@@ -24,7 +25,7 @@ from renderers.camera import Rays
 from renderers.rendering import Status, Unsupported
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.tiny import CPU, Blind, ball_prior
+from tests.tiny import CPU, Blind, ball_prior, camera_of
 
 CRITERIA = Criteria(hits=0.99, false_hits=0.01, cosine=0.99, scale=0.1, surface_error=0.02)
 LIMITS = Limits(1e8, 8)
@@ -110,6 +111,15 @@ def test_a_floater_is_hit_by_samples_and_missed_by_a_march():
         near = (rendering.distance - exact.distance).abs() < 0.01
         share[name] = float((rendering.hit & near)[in_front].double().mean())
     assert share["dist"] < 0.1 and share["newton"] < 0.1 and share["dvr"] > 0.9
+
+
+def test_errors_of_a_mask_are_of_both_kinds():
+    mask = torch.zeros(40, 40, dtype=torch.bool)
+    mask[:, :20] = True
+    observation = fit.Observation(camera_of(40), torch.ones(40, 40), mask, mask)
+    wrong = fit.mask_errors(observation, 0.3, drawn()).mask ^ mask
+    assert wrong[:, :20].double().mean() == pytest.approx(0.3, abs=0.08)
+    assert wrong[:, 20:].double().mean() == pytest.approx(0.3, abs=0.08)
 
 
 def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
