@@ -1,8 +1,8 @@
 """Photographs of a sphere, written in each format and in the variants that people write."""
 
 import json
-import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -33,8 +33,6 @@ from tests.made_photographs import (
     READ,
     SIZE,
     cameras,
-    changed,
-    colmap,
     idr,
     image,
     llff,
@@ -207,10 +205,9 @@ def test_images_of_two_sizes_each_have_their_camera(tmp_path):
     assert "24 x 20 and 48 x 40 pixels" in read_capture(tmp_path, READ).summary
 
 
-@each(
-    "size, same",
-    [((400, 300), True), ((401, 300), True), ((133, 100), True), ((400, 297), False), ((4000, 2975), False)],
-)
+@each("size, same", [
+    ((400, 300), True), ((401, 300), True), ((133, 100), True), ((400, 297), False), ((4000, 2975), False),
+])  # fmt: skip
 def test_a_cropped_image_has_another_aspect(size, same):
     assert _same_aspect(size, (3000, 4000)) == same
 
@@ -256,15 +253,6 @@ def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
     assert (tmp_path / "a" / "b.png").is_file()
 
 
-def test_photographs_that_show_a_part_of_the_hull_have_a_note(tmp_path, capsys, monkeypatch):
-    nerf(tmp_path)
-    monkeypatch.setattr(
-        own_photographs, "measure_mask_fit", lambda *arguments: replace(measure_mask_fit(*arguments), shown=(0.7,))
-    )
-    assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
-    assert "note: the photographs show 70% of the object (median): cameras" in capsys.readouterr().out
-
-
 def test_cameras_of_other_images_are_refused_except_with_unchecked(tmp_path):
     idr(tmp_path)
     for i, file in enumerate(sorted((tmp_path / "mask").iterdir())):
@@ -273,6 +261,19 @@ def test_cameras_of_other_images_are_refused_except_with_unchecked(tmp_path):
         read_capture(tmp_path, READ)
     capture = read_capture(tmp_path, ReadSettings(48, unchecked=True))
     assert "cameras may be those of other images" in capture.notes[-1]
+
+
+@each("shown, note", [(0.7, "show 70% of the object (median): cameras"), (0.4, None)])
+def test_photographs_that_show_a_part_of_the_hull_have_a_note_and_a_small_part_is_refused(tmp_path, shown, note):
+    nerf(tmp_path)
+
+    def fit(*arguments):
+        return replace(measure_mask_fit(*arguments), shown=(shown,))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(own_photographs, "measure_mask_fit", fit)
+        with nullcontext() if note else pytest.raises(BadInput, match="the photographs show 40% of the object"):
+            assert note in read_capture(tmp_path, READ).notes[-1]
 
 
 def test_other_cameras_in_the_folder_are_named_in_a_note(tmp_path):
@@ -284,9 +285,6 @@ def test_other_cameras_in_the_folder_are_named_in_a_note(tmp_path):
     assert layout.format == "NeRF" and layout.notes == (note,)
 
 
-# NeRF's files
-
-
 def test_masks_that_transforms_json_does_not_name_are_used(tmp_path):
     nerf(tmp_path)
     white = np.full(SIZE, 255, np.uint8)
@@ -296,54 +294,6 @@ def test_masks_that_transforms_json_does_not_name_are_used(tmp_path):
     capture = read_capture(tmp_path, READ)
     assert any("does not name it" in note for note in capture.notes)
     assert all(shot.mask.float().mean() > 0.9 for shot in capture.shots)
-
-
-def test_fields_of_view_and_matrices_give_focal_lengths(tmp_path):
-    nerf(tmp_path)
-    angles = [2 * np.arctan(SIZE[1 - i] / 2 / FOCAL) for i in (0, 1)]
-    matrix = [[FOCAL, 0, MIDDLE[0], 0], [0, FOCAL, MIDDLE[1], 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-    plain = json.loads((tmp_path / "transforms.json").read_text())
-    for focal_keys in (
-        {"camera_angle_x": angles[0], "camera_angle_y": angles[1]},
-        {"camera_angle_y": angles[1]},
-        {"x_fov": np.degrees(angles[0])},
-        {"intrinsic_matrix": matrix},
-        {"fl_x": FOCAL, "fl_y": None, "w": None, "h": None},
-    ):
-        stored = {key: value for key, value in plain.items() if key not in ("fl_x", "fl_y")} | focal_keys
-        (tmp_path / "transforms.json").write_text(json.dumps(stored))
-        capture = read_capture(tmp_path, PLAIN)
-        assert off(capture) < 0.01
-        assert any("transforms.json states no w and h" in note for note in capture.notes) == ("w" in focal_keys)
-
-
-def test_each_frame_has_its_own_camera(tmp_path):
-    nerf(tmp_path)
-    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-    changed(tmp_path, lambda stored: [frame.update({key: stored[key] for key in keys}) for frame in stored["frames"]])
-    top = {"fl_x": 1.0, "fl_y": 1.0, "camera_angle_x": 1.0, "y_fov": 9.0, "intrinsic_matrix": np.eye(3).tolist()}
-    changed(tmp_path, lambda stored: stored.update(top, cx=0.0, cy=0.0))
-    assert off(read_capture(tmp_path, PLAIN)) < 0.01
-
-
-@each("key", ["s1", "ftheta_p0", "equirectangular", "distortion", "K1", "camera_type", "lens", "rolling_shutter"])
-def test_keys_that_are_not_read_are_named_in_a_note(tmp_path_factory, key):
-    folder = tmp_path_factory.mktemp(key)
-    nerf(folder)
-    changed(folder, lambda stored: stored["frames"][3].update({key: 0.1, "rotation": 0.01}))
-    (note,) = read_capture(folder, PLAIN).notes
-    assert note.startswith(f"transforms.json has keys that are not read, {key}: if they describe a lens, undistort")
-
-
-MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])  # x left, y up, z forward
-
-
-@each("axes, flag", [(np.eye(4), {}), (OPENGL, {"from_na": True}), (MITSUBA, {"from_mitsuba": True})])
-def test_flags_of_other_axes_are_read(tmp_path, axes, flag):
-    nerf(tmp_path)
-    moved(tmp_path, lambda matrix: matrix @ axes)
-    changed(tmp_path, lambda stored: stored.update(flag))
-    assert off(read_capture(tmp_path, PLAIN)) < 0.01
 
 
 def test_flipped_axes_are_reported_and_can_be_set(tmp_path, capsys):
@@ -365,45 +315,6 @@ def test_rounded_matrices_become_the_nearest_rotation(tmp_path, digits):
     assert off(read_capture(tmp_path, PLAIN)) < 0.1
 
 
-# Other formats
-
-
-def test_a_single_scale_matrix_holds_for_all_cameras(tmp_path):
-    idr(tmp_path)
-    rewritten(
-        tmp_path / "cameras_sphere.npz",
-        lambda arrays: {key: matrix for key, matrix in arrays.items() if key[:5] == "world" or key[-2:] == "_0"},
-    )
-    capture = read_capture(tmp_path, READ)
-    assert off(capture) < 0.01 and "scale_mat_0 is that of all cameras: 9 have none" in capture.notes[0]
-
-
-def test_matrices_that_are_not_read_are_named_in_a_note(tmp_path):
-    idr(tmp_path)
-    more = {"dist_coeffs": [0.1], "world_mat_inv_0": np.eye(4)}
-    rewritten(tmp_path / "cameras_sphere.npz", lambda arrays: arrays | more)
-    (note,) = read_capture(tmp_path, READ).notes
-    assert note.startswith("cameras_sphere.npz has keys that are not read, dist_coeffs: if they describe a lens")
-
-
-def test_intrinsics_in_a_file_of_neus_are_accepted(tmp_path):
-    idr(tmp_path)
-    file = tmp_path / "cameras_sphere.npz"
-    intrinsics = {f"camera_mat_{i}": np.diag([FOCAL, FOCAL, 1.0, 1.0]) for i in range(10)}
-    rewritten(file, lambda arrays: arrays | intrinsics)
-    for name in (file.name, "cameras.npz"):
-        file = file.rename(tmp_path / name)
-        capture = read_capture(tmp_path, READ)
-        assert capture.format == "IDR/NeuS" and off(capture) < 0.01
-
-
-def test_middlebury_needs_no_count(tmp_path):
-    middlebury(tmp_path)
-    file = tmp_path / "ball_par.txt"
-    file.write_text(file.read_text().partition("\n")[2])
-    assert off(read_capture(tmp_path, PLAIN)) < 0.01
-
-
 @FEW
 @given(st.floats(0, 360), st.floats(-80, 80), st.floats(0.5, 2))
 def test_cameras_of_choy_follow_from_angles(azimuth, elevation, distance):
@@ -416,30 +327,3 @@ def test_cameras_of_choy_follow_from_angles(azimuth, elevation, distance):
     expected[:3, :3] = object_to_camera @ world_to_object
     expected[:3, 3] = -object_to_camera @ [distance, 0, 0]
     np.testing.assert_allclose(_from_angles(azimuth, elevation, distance), OPENGL @ expected, atol=1e-12)
-
-
-def test_the_largest_model_is_used_and_images_without_a_camera_are_named(tmp_path):
-    colmap(tmp_path)
-    shutil.copytree(tmp_path / "sparse" / "0", tmp_path / "sparse" / "1")
-    lines = (tmp_path / "sparse" / "0" / "images.txt").read_text().splitlines()
-    (tmp_path / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:8]) + "\n")
-    for folder in ("images", "mask"):
-        shutil.copy(tmp_path / folder / "003.png", tmp_path / folder / "100.png")
-    capture = read_capture(tmp_path, READ)
-    assert off(capture) < 0.01 and len(capture.shots) == 10
-    assert capture.notes == (
-        "sparse/1 with 10 images is taken, not sparse/0 with 4",
-        "no camera for 1 of the images, such as 100.png",
-    )
-
-
-def test_lines_of_points_scaled_quaternions_and_other_line_ends_are_read(tmp_path):
-    colmap(tmp_path)
-    file = tmp_path / "sparse" / "0" / "images.txt"
-    text = file.read_text()
-    longer = re.sub(
-        r"(?m)^(\d+) (\S+ \S+ \S+ \S+)", lambda m: f"{m[1]} {' '.join(str(2 * float(v)) for v in m[2].split())}", text
-    )
-    for good in (longer, text.replace("png\n\n", "png\n1.5 2.5 -1 3e1 4.5 -1\n"), text.replace("\n", "\r\n")):
-        file.write_text(good)
-        assert off(read_capture(tmp_path, PLAIN)) < 0.01

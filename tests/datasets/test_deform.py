@@ -62,9 +62,3 @@ def test_twist_keeps_volume_and_bend_turns_the_axis_into_an_arc(axis):
     assert np.linalg.norm(arc - centre, axis=1) == pytest.approx(4)
     lengths = np.linalg.norm(np.diff(arc, axis=0), axis=1)
     assert lengths.sum() == pytest.approx(2, rel=1e-3)
-
-
-def test_a_wrong_strength_is_refused():
-    for strength in (-0.1, 1.5, float("nan")):
-        with pytest.raises(ValueError, match="strength: must be from 0 to 1"):
-            Deformation.draw(0, strength)

@@ -102,8 +102,6 @@ def test_splits_share_no_seed():
     for split in Split:
         low, high = seed_of(split, 0), seed_of(split, SPLIT_STRIDE - 1)
         assert ordered.index(high) - ordered.index(low) == 2  # no seed of another split lies between
-    with pytest.raises(ValueError, match=f"index must lie between 0 and {SPLIT_STRIDE - 1}, not {SPLIT_STRIDE}"):
-        seed_of(Split.TEST, SPLIT_STRIDE)
 
 
 @by_family
@@ -120,13 +118,6 @@ def test_the_identity_changes_with_each_setting_of_the_shapes(family):
         key(name=next(other for other in NAMES if other != family.name)),
     ]
     assert key() == digest(Family(**asdict(family)).identity()) and len({key(), *others}) == 5
-
-
-def test_an_invalid_family_is_an_error(sofa):
-    with pytest.raises(ValueError, match=r"name must be one of .*sofa.*, not 'lamp'"):
-        replace(sofa, name="lamp")
-    with pytest.raises(ValueError, match=r"radius must be above 0 and at most 1, not 1.5: rays start on the unit"):
-        replace(sofa, radius=1.5)
 
 
 def test_a_shape_that_fills_the_cube_is_refused(sofa):

@@ -58,17 +58,14 @@ def test_each_model_of_colmap_gives_its_distortion_or_is_refused(data):
     np.testing.assert_allclose(distorted(colmap_lens(name, list(camera.params), "sparse/0")), expected, atol=1e-9)
 
 
-@each(
-    "keys, words",
-    [
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not understood"),
-        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye does not fit"),
-        ({"k1": 0.1, "k4": 0.01}, "k4 means one thing in a fisheye"),
-        ({"is_fisheye": True, "k1": 0.1, "p1": 0.01}, "a fisheye has k1 to k4"),
-        ({"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.2}, "distortion_params and the numbers by name differ"),
-        ({"camera_model": "PERSPECTIVE", "is_fisheye": True}, "is_fisheye does not fit"),
-    ],
-)
+@each("keys, words", [
+    ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not understood"),
+    ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye does not fit"),
+    ({"k1": 0.1, "k4": 0.01}, "k4 means one thing in a fisheye"),
+    ({"is_fisheye": True, "k1": 0.1, "p1": 0.01}, "a fisheye has k1 to k4"),
+    ({"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.2}, "distortion_params and the numbers by name differ"),
+    ({"camera_model": "PERSPECTIVE", "is_fisheye": True}, "is_fisheye does not fit"),
+])  # fmt: skip
 def test_other_lenses_are_refused_by_name(keys, words):
     with pytest.raises(BadInput, match=words):
         nerf_lens(keys, "transforms.json")
@@ -87,14 +84,11 @@ def test_a_list_of_another_length_is_refused(keys):
     assert nerf_lens({"distortion_params": [0.1, 0, 0, 0], "is_fisheye": True}, "file").fisheye
 
 
-@each(
-    "keys",
-    [
-        {"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False},
-        {"distortion": [0, 0], "distortion_params": [0] * 6, "K1": None, "camera_type": "perspective", "lens": {}},
-        {"rolling_shutter": [0.0] * 4, "equirectangular": False, "projection": "Pinhole", "camera": {"name": "mine"}},
-        {"applied_scale": 2.0, "aabb_scale": 16, "offset": [0.5] * 3, "sharpness": 30.1, "k": 5, "camera_angle_x": 0.7},
-    ],
-)
+@each("keys", [
+    {"camera_model": "OPENCV", "k1": 0, "k4": 0.0, "s1": 0.0, "is_fisheye": False},
+    {"distortion": [0, 0], "distortion_params": [0] * 6, "K1": None, "camera_type": "perspective", "lens": {}},
+    {"rolling_shutter": [0.0] * 4, "equirectangular": False, "projection": "Pinhole", "camera": {"name": "mine"}},
+    {"applied_scale": 2.0, "aabb_scale": 16, "offset": [0.5] * 3, "sharpness": 30.1, "k": 5, "camera_angle_x": 0.7},
+])  # fmt: skip
 def test_keys_without_a_lens_give_no_distortion(keys):
     assert not nerf_lens(keys, "file").has_distortion

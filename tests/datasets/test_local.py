@@ -40,15 +40,6 @@ def folder(tmp_path):
     return tmp_path / ODD_NAME
 
 
-def test_the_first_training_shape_of_one_file_is_the_mesh_itself(tmp_path):
-    dataset = local(write_box(tmp_path / "box.ply"))
-    mesh = dataset.mesh(Split.TRAIN, 0)
-    sides = np.array([1.0, 0.6, 0.4])
-    sides *= 2 * 0.97 / np.linalg.norm(sides)
-    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(sides, rel=1e-6)
-    assert mesh.volume == pytest.approx(sides.prod(), rel=1e-6) and dataset.name == "box"
-
-
 def test_all_other_shapes_of_one_file_differ_and_stay_closed_in_the_sphere(tmp_path):
     dataset = local(write_box(tmp_path / "box.ply"))
     shapes = [dataset.mesh(split, index) for split in Split for index in range(4)]
@@ -56,13 +47,6 @@ def test_all_other_shapes_of_one_file_differ_and_stay_closed_in_the_sphere(tmp_p
     for mesh in shapes:
         assert mesh.watertight and mesh.volume > 0
         assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(0.97, abs=1e-9)
-
-
-def test_shapes_do_not_depend_on_the_folder_of_the_file(tmp_path):
-    first = local(write_box(tmp_path / "box.ply"))
-    second = local(shutil.copy(tmp_path / "box.ply", tmp_path / "elsewhere.ply"))
-    for split, index in ((Split.TRAIN, 0), (Split.TRAIN, 3), (Split.TEST, 0)):
-        assert np.array_equal(first.mesh(split, index).vertices, second.mesh(split, index).vertices)
 
 
 def test_each_file_of_a_folder_is_in_one_split(folder):
@@ -94,26 +78,19 @@ def test_one_file_is_enough(tmp_path, count):
         assert not set(dataset.files(Split.TEST)) & set(dataset.files(Split.TRAIN))
 
 
-def test_paths_with_spaces_and_other_letters_work_and_name_the_dataset(tmp_path):
-    path = write_box(tmp_path / ODD_NAME / "Stuhl für Ümit.ply")
-    assert local(path).name == "Stuhl für Ümit" and local(path).mesh(Split.TEST, 0).watertight
-    assert local(path.parent).mesh(Split.TEST, 0).watertight
-
-
-def test_contents_decide_identity_not_the_path(tmp_path):
+def test_contents_decide_identity_and_shapes_and_not_the_path(tmp_path, folder):
     path = write_box(tmp_path / "box.ply")
-    moved = shutil.copy(path, tmp_path / ODD_NAME.replace("?", ".ply"))
-    other = write_box(tmp_path / "other" / "box.ply", (1.0, 0.6, 0.5))
-    assert local(path).identity() == local(moved).identity()
-    assert local(path).identity() != local(other).identity()
-    assert local(path).identity() != local(path, strength=0.5).identity()
-    assert local(path).identity() != LocalMeshes(str(path), radius=0.9, strength=1.0).identity()
-
-
-def test_identity_sees_a_file_that_is_added_to_the_folder(folder):
-    before = local(folder).identity()
+    moved = local(shutil.copy(path, tmp_path / ODD_NAME.replace("?", ".ply")))
+    assert local(path).identity() == moved.identity() and moved.name == ODD_NAME.replace("?", "")
+    for split, index in ((Split.TRAIN, 0), (Split.TRAIN, 3), (Split.TEST, 0)):
+        assert np.array_equal(local(path).mesh(split, index).vertices, moved.mesh(split, index).vertices)
+    other = local(write_box(tmp_path / "other" / "box.ply", (1.0, 0.6, 0.5)))
+    smaller = LocalMeshes(str(path), radius=0.9, strength=1.0)
+    identities = [
+        str(dataset.identity()) for dataset in (local(path), other, local(path, strength=0.5), smaller, local(folder))
+    ]
     write_box(folder / "one more.stl")
-    assert local(folder).identity() != before
+    assert len({*identities, str(local(folder).identity())}) == 6
 
 
 def test_no_strength_leaves_the_mesh_as_it_is(tmp_path):

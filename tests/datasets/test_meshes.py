@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from bench.tasks.reconstruction.surfaces import poisson
-from datasets.files.meshes import find_meshes, load_mesh, read_mesh, read_pieces, read_points, repair
+from datasets.files.meshes import find_meshes, load_mesh, read_mesh, read_points, repair
 from datasets.files.repair import NOT_CHECKED_NOTE
 from datasets.mesh import Mesh, concatenate_meshes
 from datasets.scene import Truth, sample_surface
@@ -54,15 +54,11 @@ def test_a_folder_gives_its_meshes_sorted_and_a_file_itself(tmp_path, monkeypatc
     assert find_meshes(str(tmp_path / "b.OBJ")) == [tmp_path / "b.OBJ"]
 
 
-@each(
-    "name, message",
-    [
-        ("teapt.obj", r"found nothing at .*teapt.obj'; did you mean '.*teapot\.obj'\?"),
-        ("nowhere/zebra.obj", "check the spelling and the current folder"),
-        ("empty", "found none directly in"),
-        ("notes.txt", r"must end in one of \.obj .* \.glb, found 'notes\.txt'"),
-    ],
-)
+@each("name, message", [
+    ("teapt.obj", r"found nothing at .*teapt.obj'; did you mean '.*teapot\.obj'\?"),
+    ("nowhere/zebra.obj", "check the spelling and the current folder"), ("empty", "found none directly in"),
+    ("notes.txt", r"must end in one of \.obj .* \.glb, found 'notes\.txt'"),
+])  # fmt: skip
 def test_paths_that_hold_no_mesh_are_refused_with_a_remedy(tmp_path, name, message):
     for file in ("teapot.obj", "notes.txt"):
         (tmp_path / file).write_text("x")
@@ -82,28 +78,6 @@ def test_a_closed_mesh_keeps_its_surface_in_every_format(name, tmp_path):
     assert mesh.vertices.mean(axis=0) == pytest.approx([3, 0, 0])
 
 
-def test_texture_seams_are_welded(tmp_path):
-    corners = box().triangles.reshape(-1, 3)  # each face has its own three vertices, as at seams
-    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"vt 0.{i:02d} 0.5" for i in range(36)]
-    lines += [f"f {i}/{i} {i + 1}/{i + 1} {i + 2}/{i + 2}" for i in range(1, 37, 3)]
-    (tmp_path / "seams.obj").write_text("\n".join(lines))
-    mesh = load_mesh(tmp_path / "seams.obj")
-    assert (len(mesh.vertices), mesh.watertight, mesh.repairs) == (8, True, ())
-
-
-def test_a_scene_is_placed_by_its_transforms_and_its_lines_ignored(tmp_path):
-    scene = trimesh.Scene()
-    mirror = np.diag([-2.0, 2, 2, 1])
-    mirror[:3, 3] = [5, 0, 0]
-    scene.add_geometry(box(), node_name="one")
-    scene.add_geometry(box(), node_name="two", transform=mirror)
-    scene.add_geometry(trimesh.load_path([[[0, 0, 0], [99, 0, 0]]]))
-    scene.export(tmp_path / "scene.glb")
-    mesh = load_mesh(tmp_path / "scene.glb")
-    assert mesh.volume == pytest.approx(1 + 8) and mesh.part_volumes.min() > 0
-    assert mesh.vertices[:, 0].max() == pytest.approx(6)
-
-
 @each("scale", [1e-6, 1.0, 1e6])
 def test_whether_a_mesh_has_an_area_does_not_depend_on_its_scale(tmp_path, scale):
     path = tmp_path / "sliver.obj"
@@ -111,13 +85,6 @@ def test_whether_a_mesh_has_an_area_does_not_depend_on_its_scale(tmp_path, scale
         path.write_text(f"v 0 0 0\nv {scale} 0 0\nv 0 {width * scale} 0\nf 1 2 3\n")
         with pytest.raises(ValueError, match="must have an area") if is_flat else nullcontext():
             assert len(read_mesh(path).faces) == 1
-
-
-def test_the_meshes_of_a_folder_are_read_as_one_mesh(tmp_path):
-    for name, size in (("a.ply", 1), ("b.obj", 2), ("c.stl", 3)):
-        box(size=size).export(tmp_path / name)
-    assert read_pieces(tmp_path).area == pytest.approx(6 * (1 + 4 + 9))
-    assert read_pieces(tmp_path / "c.stl").area == pytest.approx(6 * 9)
 
 
 BALL = trimesh.creation.icosphere(2)  # 162 vertices, 320 faces
@@ -158,28 +125,22 @@ REPAIRED = {  # a mesh, its volume after repair, and the notes without a warning
     "a part twice": (joined(box(), box(centre=(2, 0, 0)), box()), 2, (f"1 part {DROPPED}",)),
     "three times, and another part": (joined(box(), box(), box(), box(centre=(1, 0, 0))), 2, (f"2 parts {DROPPED}",)),
     "a part twice, and two of its faces three times": (
-        with_faces(np.concatenate([box().faces, box().faces[:2]])),
-        1,
-        (f"1 part {DROPPED}", "2 doubled faces dropped"),
+        with_faces(np.concatenate([box().faces, box().faces[:2]])), 1, (f"1 part {DROPPED}", "2 doubled faces dropped"),
     ),
     "separate": (joined(box(), box(centre=(2, 0, 0))), 2, ()),
     "overlapping": (joined(box(), box(centre=(0.1, 0.1, 0.1))), 2 - 0.9**3, ("2 overlapping parts merged into 1",)),
+    "overlapping, and one inside out": (
+        joined(box(), box(centre=(0.5, 0.1, 0.2), inverted=True)), 2 - 0.5 * 0.9 * 0.8,
+        ("1 part turned outward", "2 overlapping parts merged into 1")),
     "nested": (joined(box(), box(size=0.4)), 1, ("2 overlapping parts merged into 1",)),
     "hollow": (joined(box(), box(size=0.4, inverted=True)), 1 - 0.064, ()),
     "hollow, inside out": (joined(box(inverted=True), box(size=0.4)), 1 - 0.064, ("2 parts turned outward",)),
-}
+}  # fmt: skip
 
 
+@each("scale", [1e-6, 1.0, 1e3])
 @each("name", REPAIRED)
-def test_a_repair_gives_the_intended_solid_and_a_note(name):
-    mesh, volume, notes = REPAIRED[name]
-    repaired = repair(mesh)
-    assert repaired.watertight and repaired.volume == pytest.approx(volume) and repaired.repairs == notes
-
-
-@each("scale", [1e-6, 1e3])
-@each("name", REPAIRED)
-def test_a_repair_does_not_depend_on_the_scale(name, scale):
+def test_a_repair_gives_the_intended_solid_and_a_note_at_each_scale(name, scale):
     mesh, volume, notes = REPAIRED[name]
     repaired = repair(replace(mesh, vertices=scale * mesh.vertices))
     assert repaired.watertight and repaired.volume / scale**3 == pytest.approx(volume) and repaired.repairs == notes
@@ -218,17 +179,6 @@ def test_functions_that_need_pymeshlab_name_it_if_it_is_missing(monkeypatch):
     for call in (lambda: repair(sheet(np.sin)), lambda: poisson(points, points, depth=3, trim=0)):
         with pytest.raises(BadInput, match=r"needs PyMeshLab \(GPL-3\).*: pip install pymeshlab"):
             call()
-
-
-@each("inverted", [False, True])
-def test_overlapping_boxes_are_inside_where_either_is(inverted):
-    mesh = repair(joined(box(), box(centre=(0.5, 0.1, 0.2), inverted=inverted)))
-    assert mesh.volume == pytest.approx(2 - 0.5 * 0.9 * 0.8)
-    assert mesh.repairs[-1] == "2 overlapping parts merged into 1"
-    points = np.random.default_rng(0).uniform(-0.8, 1.3, (2000, 3))
-    in_first = (np.abs(points) < 0.5).all(axis=1)
-    in_second = (np.abs(points - [0.5, 0.1, 0.2]) < 0.5).all(axis=1)
-    assert np.array_equal(Truth(mesh).signed_distance(points) < 0, in_first | in_second)
 
 
 def test_a_sheet_is_wrapped_closely_with_a_note_and_a_warning():

@@ -25,7 +25,7 @@ from tests.documentation import code_of
 from tests.looped import each
 from tests.made_networks import RADIUS, arrays, deepsdf_folder, npz, octahedron
 from tests.renderers.test_published import CODE, occupancy
-from tests.tiny import camera_of, cell_from
+from tests.tiny import cell_from
 
 NET = """
 import torch
@@ -47,12 +47,12 @@ def checkpoint(folder: Path, state: Any, name: str = "shape.pth") -> NetworkFile
 
 
 def field_of(file: NetworkFile, index: int = 0) -> Field:
-    known = file.network(index)
-    return known.decoder.at(known.codes[index])
+    network = file.network(index)
+    return network.decoder.at(network.codes[index])
 
 
-def near(found: Tensor, expected: Tensor, most: float = 1e-6) -> None:
-    torch.testing.assert_close(found, expected, rtol=0, atol=most)
+def near(values: Tensor, expected: Tensor, most: float = 1e-6) -> None:
+    torch.testing.assert_close(values, expected, rtol=0, atol=most)
 
 
 def test_a_distance_is_found_to_be_one_and_its_values_stay(tmp_path):
@@ -91,7 +91,7 @@ def test_values_between_0_and_1_are_probabilities_only_where_that_is_said(tmp_pa
     assert "at the level 0.3" in file.network(0).notes[0]
 
 
-def test_a_network_of_a_code_is_not_read_without_one_and_its_level_is_told(tmp_path):
+def test_a_network_of_a_code_needs_its_codes_and_states_its_level(tmp_path):
     torch.manual_seed(0)
     path = tmp_path / "code.npy"
     state, logits = occupancy("shift")
@@ -118,9 +118,9 @@ def test_the_surface_is_the_true_mesh_closed_where_it_leaves_the_sphere(tmp_path
     mesh = file.mesh(Split.TEST, 0)
     assert mesh.watertight and octahedron(torch.from_numpy(mesh.vertices.copy())).abs().max() < 0.02
     large = replace(file, scale=1.4)
-    mesh, known = large.mesh(Split.TRAIN, 0), large.network(0)
+    mesh, network = large.mesh(Split.TRAIN, 0), large.network(0)
     assert mesh.watertight and np.linalg.norm(mesh.vertices, axis=1).max() < 1.01
-    assert "of the unit sphere's surface is inside" in known.notes[0]
+    assert "of the unit sphere's surface is inside" in network.notes[0]
 
 
 @each("codes, dtype, most", [
@@ -230,23 +230,6 @@ def test_settings_are_checked(tmp_path_factory, settings, words):
         replace(file, **settings)
 
 
-@each("name", (
-    "dist", "dvr", "idr", "mesh_proxy", "naive", "neus", "newton", "range_analysis", "relaxed_boundary", "unisurf",
-    "volsdf",
-))  # fmt: skip
-def test_every_renderer_takes_a_plain_module_of_the_users(name):
-    class Ball(torch.nn.Module):
-        def forward(self, points: Tensor) -> Tensor:
-            return points.norm(dim=-1, keepdim=True) - RADIUS
-
-    rays = camera_of(16).rays()
-    field = from_module(Ball())
-    assert field.kind is Kind.DISTANCE
-    hit = load("renderer", name).render(field, rays).hit
-    closest = torch.linalg.vector_norm(torch.linalg.cross(rays.origins, rays.directions), dim=-1)
-    assert (hit == (closest < RADIUS)).float().mean() > 0.97
-
-
 def test_a_module_whose_values_are_no_shape_is_refused_and_half_floats_are_rendered():
     for wrong in (lambda points: 0.5 - points.norm(dim=-1), lambda points: octahedron(points).sigmoid()):
         with pytest.raises(BadInput, match="negate them, subtract the level of the surface"):
@@ -265,22 +248,22 @@ def test_a_module_that_is_no_distance_becomes_a_bound_by_its_slope():
     assert from_module(module, kind=Kind.LEVEL).kind is Kind.LEVEL
 
 
-@each("given, composed", [
+@each("overrides, composed", [
     (["field=file", "field_path=a.npz", "index=3"], ["dataset=network", "dataset.path=a.npz", "index=3"]),
     (["-m", "field=sphere", "dataset=sofa"], ["-m", "field=sphere", "dataset=sofa"]),
 ])  # fmt: skip
-def test_a_file_as_the_field_is_a_dataset(given, composed):
-    assert expand_field_file(given) == composed
+def test_a_file_as_the_field_is_a_dataset(overrides, composed):
+    assert expand_field_file(overrides) == composed
 
 
-@each("given, words", [
+@each("overrides, words", [
     (["field=file"], "field=file field_path=PATH"),
     (["field_path=a.npz"], "field=file field_path=PATH"),
     (["field=file", "field_path=a.npz", "dataset=sofa"], "remove dataset"),
 ])  # fmt: skip
-def test_half_of_the_two_is_refused(given, words):
+def test_half_of_the_two_is_refused(overrides, words):
     with pytest.raises(ValueError, match=words):
-        expand_field_file(given)
+        expand_field_file(overrides)
 
 
 def composed_inputs(*overrides: str) -> RunInputs:
@@ -318,30 +301,30 @@ def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkey
     monkeypatch.syspath_prepend(tmp_path)
     state = {"weight": torch.tensor([[0.6, 0.0, 0.8]]), "bias": torch.tensor([0.25])}
     torch.save({"model": {f"net.inner.{key}": value for key, value in state.items()}, "step": 3}, tmp_path / "a.pth")
-    given = expand_field_file(
+    overrides = expand_field_file(
         ["field=file", f"field_path={tmp_path}/a.pth", "field._target_=mynet.Net", "field.scale=2"]
     )
-    inputs = composed_inputs(*given, "task=ablation", "packages=[mynet]")
+    inputs = composed_inputs(*overrides, "task=ablation", "packages=[mynet]")
     near(inputs.prior.decoder.at(inputs.prior.codes[0])(POINTS), POINTS @ state["weight"][0] + 0.25)
-    several = {f"{of}.inner.{key}": value for of in "ab" for key, value in state.items()}
+    several = {f"{name}.inner.{key}": value for name in "ab" for key, value in state.items()}
     for wrong, words in (
         (several, r"it has several networks, a\., b\.: save the state_dict"),
         ({"net.inner.bias": state["bias"]}, r"not those of Net: .* Missing key.*inner\.weight"),
     ):
         torch.save(wrong, tmp_path / "a.pth")
         with pytest.raises(BadInput, match=words):
-            composed_inputs(*given, "task=ablation", "packages=[mynet]")
+            composed_inputs(*overrides, "task=ablation", "packages=[mynet]")
     with pytest.raises(ValueError, match=r"type packages=\[mynet\] if you trust it"):
-        composed_inputs(*given, "task=ablation")
+        composed_inputs(*overrides, "task=ablation")
 
 
 def test_a_stress_that_a_network_has_no_part_in_is_refused(tmp_path):
-    given = ("task=stability", "dataset=network", f"dataset.path={npz(tmp_path, arrays()).path}")
+    overrides = ("task=stability", "dataset=network", f"dataset.path={npz(tmp_path, arrays()).path}")
     with pytest.raises(BadInput, match="the stress gap renders no network: remove field=file, or set stress="):
-        composed_inputs(*given, "stress=gap")
+        composed_inputs(*overrides, "stress=gap")
     with pytest.raises(BadInput, match="no code that the stress far_code could change: set stress=noisy_weights"):
-        composed_inputs(*given, "stress=far_code")
-    composed_inputs(*given, "stress=noisy_weights")
+        composed_inputs(*overrides, "stress=far_code")
+    composed_inputs(*overrides, "stress=noisy_weights")
 
 
 def test_a_network_of_ones_own_is_trained_and_read_as_the_page_says(tmp_path, monkeypatch):

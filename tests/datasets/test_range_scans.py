@@ -85,16 +85,13 @@ def test_points_across_a_gap_are_not_joined(folder):
     assert np.linalg.norm(edges, axis=2).max() < 0.04 and torn.area < complete.area - 0.8 * 0.08 * 2 * RADIUS
 
 
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda f: (f / "ball.conf").unlink(), "must have one .conf file"),
-        (lambda f: (f / "ball.conf").write_text("camera 0 0 0"), "names no scan: it needs lines 'bmesh FILE"),
-        (lambda f: (f / "scan_90.ply").unlink(), "names 'scan_90.ply', which is not beside it"),
-        (lambda f: (f / "ball_whole.ply").unlink(), "no mesh beside its scans"),
-        (lambda f: (f / "ball.conf").write_text("bmesh scan_0.ply 0 0 0 0 0 0 0"), "line 1, must be 'bmesh FILE"),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "message"), [
+    (lambda f: (f / "ball.conf").unlink(), "must have one .conf file"),
+    (lambda f: (f / "ball.conf").write_text("camera 0 0 0"), "names no scan: it needs lines 'bmesh FILE"),
+    (lambda f: (f / "scan_90.ply").unlink(), "names 'scan_90.ply', which is not beside it"),
+    (lambda f: (f / "ball_whole.ply").unlink(), "no mesh beside its scans"),
+    (lambda f: (f / "ball.conf").write_text("bmesh scan_0.ply 0 0 0 0 0 0 0"), "line 1, must be 'bmesh FILE"),
+])  # fmt: skip
 def test_an_incomplete_folder_is_refused(tmp_path, spoil, message):
     spoil(write_scans(tmp_path))
     with pytest.raises(ValueError, match=message):

@@ -31,12 +31,6 @@ class Boxes:
         return {"moved": self.moved}
 
 
-def bearings(height, width, focal):
-    """Camera coordinates, on the plane z = 1, of the pixel centres, computed without Camera."""
-    rows, columns = np.mgrid[:height, :width] + 0.5
-    return np.stack([(columns - width / 2) / focal, (rows - height / 2) / focal, np.ones((height, width))], axis=-1)
-
-
 def test_a_sphere_off_the_axis_in_an_oblong_image_has_its_closed_form_depth():
     radius, centre = 0.6, np.array([0.3, 0.2, -0.1])
     mesh = mesh_of(trimesh.creation.icosphere(subdivisions=5, radius=radius).apply_translation(centre))
@@ -44,7 +38,8 @@ def test_a_sphere_off_the_axis_in_an_oblong_image_has_its_closed_form_depth():
     camera = Camera(torch.tensor([[30.0, 0, 20], [0, 30, 12], [0, 0, 1]]), motion, height=24, width=40)
     view = see(Truth(mesh), camera)
     assert (view.depth.dtype, view.normals.dtype, view.mask.dtype) == (torch.float32, torch.float32, torch.bool)
-    along = bearings(24, 40, 30.0)
+    rows, columns = np.mgrid[:24, :40] + 0.5
+    along = np.stack([(columns - 20) / 30, (rows - 12) / 30, np.ones((24, 40))], axis=-1)  # of the pixels, at z = 1
     middle = motion.numpy().astype(float)[:3, :3] @ centre + motion.numpy()[:3, 3]
     half, square = along @ middle, (along**2).sum(-1)
     chord = half**2 - square * (middle @ middle - radius**2)

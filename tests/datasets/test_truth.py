@@ -29,26 +29,15 @@ def test_rays_hit_a_box_where_they_must(box):
     assert {hits.distance.dtype, hits.normals.dtype} == {np.dtype(np.float32)}
 
 
-def test_no_rays_give_no_hits_and_a_direction_of_no_length_is_refused(box):
+def test_no_rays_give_no_hits(box):
     assert Truth(box).cast(np.zeros((0, 3)), np.zeros((0, 3))).distance.shape == (0,)
-    with pytest.raises(ValueError, match="directions: must be finite and not zero"):
-        Truth(box).cast(np.zeros((1, 3)), np.zeros((1, 3)))
 
 
-def test_signed_distance_of_a_box_is_exact_and_keeps_leading_shape(box):
-    points = np.random.default_rng(0).uniform(-1, 1, (20, 50, 3))
-    distance = Truth(box).signed_distance(points)
-    assert distance.dtype == np.float32 and distance == pytest.approx(box_distance(points), abs=1e-5)
-
-
-def test_the_sign_holds_where_rays_meet_edges_and_vertices(box):
-    points = np.stack(np.meshgrid(*[np.linspace(-0.75, 0.75, 7)] * 3), axis=-1)  # in line with edges and diagonals
-    assert Truth(box).signed_distance(points) == pytest.approx(box_distance(points), abs=1e-5)
-
-
-def test_an_open_mesh_has_no_truth(box):
-    with pytest.raises(ValueError, match="mesh: must be watertight"):
-        Truth(Mesh(box.vertices, box.faces[1:]))
+def test_signed_distance_of_a_box_is_exact_also_in_line_with_edges_and_keeps_leading_shape(box):
+    aligned = np.stack(np.meshgrid(*[np.linspace(-0.75, 0.75, 7)] * 3), axis=-1)
+    for points in (np.random.default_rng(0).uniform(-1, 1, (20, 50, 3)), aligned):
+        distance = Truth(box).signed_distance(points)
+        assert distance.dtype == np.float32 and distance == pytest.approx(box_distance(points), abs=1e-5)
 
 
 def test_samples_lie_on_the_surface_evenly_by_area_with_outward_normals():
@@ -67,8 +56,6 @@ def test_samples_follow_the_seed(box):
     assert np.array_equal(sample_surface(box, 10, seed=1).points, sample_surface(box, 10, seed=1).points)
     assert not np.array_equal(sample_surface(box, 10, seed=1).points, sample_surface(box, 10, seed=2).points)
     assert sample_surface(box, 0, seed=1).points.shape == (0, 3)
-    with pytest.raises(ValueError, match="count: must be 0 or more, found -1"):
-        sample_surface(box, -1, seed=0)
 
 
 def test_the_distance_to_an_open_mesh_has_no_sign():

@@ -45,8 +45,8 @@ def inputs(tmp_path_factory) -> RunInputs:
     camera = camera_of(24, angles=(30.0, 20.0))
     scene = scene_of(icosphere(RADIUS), camera)
     renderer = load("renderer", "naive", steps=40, epsilon=1e-4)
-    found = run_of(tmp_path_factory.mktemp("run"), renderer, ball_prior(), camera, make_scene=lambda: scene).inputs
-    return replace(found, evaluation=replace(found.evaluation, grid=48, points=3000, fscore_threshold=0.05))
+    result = run_of(tmp_path_factory.mktemp("run"), renderer, ball_prior(), camera, make_scene=lambda: scene).inputs
+    return replace(result, evaluation=replace(result.evaluation, grid=48, points=3000, fscore_threshold=0.05))
 
 
 def test_the_truth_itself_scores_best(inputs):
@@ -61,13 +61,6 @@ def test_the_truth_itself_scores_best(inputs):
     assert metrics["depth_mae"] < 3e-3
     assert metrics["mask_iou"] > 0.98
     assert np.linalg.norm(judgement.mesh.vertices, axis=1) == pytest.approx(RADIUS, abs=2e-3)
-
-
-def test_the_true_mesh_has_the_distance_of_two_independent_samplings(inputs):
-    state = State(sphere(RADIUS), inputs)
-    vars(state)["mesh"] = inputs.scene.mesh  # in place of the extracted one
-    expected = 0.5 * (4 * np.pi * RADIUS**2 / 3000) ** 0.5  # mean distance to the nearest of so many even samples
-    assert chamfer_only(state)["chamfer_l1"] == pytest.approx(expected, rel=0.15)
 
 
 def test_a_part_of_the_truth_only_judges_whether_it_is_in_the_prediction(inputs):
@@ -130,10 +123,10 @@ def test_the_colour_error_is_the_mean_absolute_difference_over_the_true_surface(
 def test_no_renderer_judges_itself(inputs):
     """One that sees a fattened outline, as a large epsilon does, changes its own metrics and no other."""
     fat = replace(inputs, renderer=load("renderer", "idr", epsilon=0.05))
-    thin, found = evaluate(State(sphere(RADIUS), inputs)).metrics, evaluate(State(sphere(RADIUS), fat)).metrics
-    differing = {name for name in thin if found[name] != thin[name]}
+    thin, result = evaluate(State(sphere(RADIUS), inputs)).metrics, evaluate(State(sphere(RADIUS), fat)).metrics
+    differing = {name for name in thin if result[name] != thin[name]}
     assert differing == {"own_mask_iou", "own_depth_mae"}
-    assert found["own_mask_iou"] < 0.95 < thin["own_mask_iou"]
+    assert result["own_mask_iou"] < 0.95 < thin["own_mask_iou"]
 
 
 def test_a_field_is_not_evaluated_outside_the_unit_sphere(inputs):
@@ -185,7 +178,8 @@ def test_pictures_are_of_the_fields_own_surface_also_where_it_is_no_distance(inp
     view, on_mesh = State(squares, inputs).refined_view(camera), State(squares, inputs).view_from(camera)
     points = camera.rays().at(camera.distance(view.depth))[view.mask]
     off = [
-        (camera.rays().at(camera.distance(one.depth))[one.mask].norm(dim=-1) - RADIUS).abs() for one in (view, on_mesh)
+        (camera.rays().at(camera.distance(seen.depth))[seen.mask].norm(dim=-1) - RADIUS).abs()
+        for seen in (view, on_mesh)
     ]
     assert off[0].median() < 1e-5 < 1e-4 < off[1].median()
     assert off[0].max() < 0.01
@@ -194,12 +188,12 @@ def test_pictures_are_of_the_fields_own_surface_also_where_it_is_no_distance(inp
     assert view.normals[~view.mask].abs().sum() == 0
 
 
-def dipped(place: tuple[float, float, float], width: float) -> Shape:
+def dipped(middle: tuple[float, float, float], width: float) -> Shape:
     """The distance to a sphere, with a local dip: a small surface floats where the rest of the field says far."""
     rest = sphere(RADIUS)
 
     def value(points: torch.Tensor) -> torch.Tensor:
-        squares = (points - torch.tensor(place)).square().sum(-1)
+        squares = (points - torch.tensor(middle)).square().sum(-1)
         return rest(points) - 0.5 * torch.exp(-squares / (2 * width**2))
 
     return Shape(value, lipschitz=None)
@@ -211,29 +205,22 @@ def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inp
     scene = replace(inputs.scene, view=State(sphere(RADIUS), fine).view_from(camera))
     fine = replace(fine, make_scene=lambda: scene)
     state = State(dipped((0.8, 0.3, 0.1), 0.03), fine)
-    found = evaluate(state)
+    result = evaluate(state)
     assert state.mesh.parts.max() == 1
     floating = state.refined_view(camera).mask & ~scene.view.mask
     assert floating.sum() > 8
     assert not (render_view(state.field, camera, fine).mask & floating).any()
-    (note,) = found.notes
+    (note,) = result.notes
     rays = int((state.view_from(camera).mask & ~scene.view.mask).sum())
     assert "misses 1 part of the mesh, at most 0.1" in note and f"{rays} of its rays" in note
     assert evaluate(State(sphere(RADIUS) | sphere(0.1, (0.8, 0.3, 0.1)), fine)).notes == ()
 
 
-@each(
-    "of_renderer, error, noted",
-    [
-        (3.95, 0.126, True),
-        (np.inf, 0.126, True),
-        (0.31, 0.1, True),
-        (0.29, 0.1, False),
-        (0.0094, 0.003, False),  # of a plane by a shipped renderer: less than a pixel decides it
-        (0.5, 0.0, True),
-        (np.inf, np.inf, False),
-    ],
-)
+@each("of_renderer, error, noted", [
+    (3.95, 0.126, True), (np.inf, 0.126, True), (0.31, 0.1, True), (0.29, 0.1, False),
+    (0.0094, 0.003, False),  # of a plane by a shipped renderer: less than a pixel decides it
+    (0.5, 0.0, True), (np.inf, np.inf, False),
+])  # fmt: skip
 def test_a_renderers_own_image_that_shows_another_surface_is_noted(of_renderer, error, noted):
     notes = depth_gap_note({"depth_mae": error, "own_depth_mae": of_renderer, "own_mask_iou": 0.1, "mask_iou": 0.9})
     both = f"is {of_renderer:.3g}, and that of the mesh is {error:.3g} scene units. The renderer does not"
@@ -263,13 +250,3 @@ def test_a_hit_moves_to_the_surface_at_most_the_longest_step_but_where_it_grazes
         step = min(max(off, -0.1), 0.1)
         torch.testing.assert_close(moved - (3.0 - off), torch.tensor([step, step, 0.0]), rtol=0, atol=2e-6)
     torch.testing.assert_close(gradients, scale * torch.tensor([[0.0, 0, 1]]).expand(3, 3))
-
-
-def test_a_rendered_view_is_that_of_the_mesh(inputs):
-    seen, truth = render_view(sphere(RADIUS), inputs.scene.view.camera, inputs), inputs.scene.view
-    both = seen.mask & truth.mask
-    assert both.sum() > 0.97 * truth.mask.sum()
-    assert (seen.depth - truth.depth)[both].abs().max() < 0.02
-    assert (seen.normals * truth.normals).sum(-1)[both].min() > 0.98
-    assert seen.depth[~seen.mask].abs().sum() == 0
-    assert seen.normals[~seen.mask].abs().sum() == 0

@@ -31,8 +31,8 @@ def test_the_reference_agrees_with_dense_sampling():
     assert reference.hit.sum() > 20
     assert torch.equal(reference.hit, inside.any(-1))
     sampled = t[inside.int().argmax(-1)][reference.hit]
-    found = reference.distance[reference.hit]
-    assert ((sampled - found >= 0) & (sampled - found <= 5.1e-4)).all()
+    traced = reference.distance[reference.hit]
+    assert ((sampled - traced >= 0) & (sampled - traced <= 5.1e-4)).all()
     points = rays.at(reference.distance)[reference.hit]
     assert field(points).abs().max() < 1e-12
     assert (reference.normals[reference.hit].norm(dim=-1) - 1).abs().max() < 1e-12
@@ -80,22 +80,18 @@ def other_code(row: int) -> Prior:
     return Prior(PRIOR.decoder, codes)
 
 
-@each(
-    "prior, camera, new",
-    [
-        (other_weights(), CAMERA, True),
-        (other_code(0), CAMERA, True),
-        (other_code(1), CAMERA, False),  # it is the first shape's
-        (PRIOR, CAMERA.resized(13, 12), True),
-        (PRIOR, Camera(CAMERA.intrinsics, CAMERA.world_to_camera, 12, 13), True),  # the same rays, and one more column
-        (PRIOR, camera_of(12, angles=(70.1, 20.0)), True),
-        (PRIOR, camera_of(12, angles=(70.0, 20.0), field_of_view=49.0), True),
-        (ball_prior(), camera_of(12, angles=(70.0, 20.0)), False),
-    ],
-)
+@each("prior, camera, new", [
+    (other_weights(), CAMERA, True), (other_code(0), CAMERA, True),
+    (other_code(1), CAMERA, False),  # it is the first shape's
+    (PRIOR, CAMERA.resized(13, 12), True),
+    (PRIOR, Camera(CAMERA.intrinsics, CAMERA.world_to_camera, 12, 13), True),  # the same rays, and one more column
+    (PRIOR, camera_of(12, angles=(70.1, 20.0)), True),
+    (PRIOR, camera_of(12, angles=(70.0, 20.0), field_of_view=49.0), True),
+    (ball_prior(), camera_of(12, angles=(70.0, 20.0)), False),
+])  # fmt: skip
 def test_the_key_depends_on_weights_and_camera(monkeypatch, tmp_path_factory, prior, camera, new):
     monkeypatch.setattr(reference_store, "make_reference", lambda field, camera: BLANK)
     folder = tmp_path_factory.mktemp("cache")
-    for one, seen in ((PRIOR, CAMERA), (prior, camera)):
-        reference_for(one, seen, folder)
+    for fitted, seen in ((PRIOR, CAMERA), (prior, camera)):
+        reference_for(fitted, seen, folder)
     assert len(list(folder.glob("[!.]*"))) == (2 if new else 1)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from renderers.camera import Rays
 from renderers.fields.analytic import Shape, box, plane, sphere, torus
@@ -43,7 +44,7 @@ class Case:
 
     def rays(self, dtype: torch.dtype = torch.float64) -> Rays:
         """The ray, with the leading shape [1]."""
-        direction = torch.nn.functional.normalize(vector(self.direction), dim=0)
+        direction = normalize(vector(self.direction), dim=0)
         return Rays(vector(self.origin).to(dtype)[None], direction.to(dtype)[None])
 
     @property
@@ -66,6 +67,21 @@ def beam(*origins: tuple[float, float, float]) -> Rays:
     """Rays along z."""
     starts = vector(sum(origins, ())).view(-1, 3)
     return Rays(starts, vector((0, 0, 1)).expand_as(starts))
+
+
+def aimed(seed: int, count: int = 12, *, spread: float = 0.1) -> Rays:
+    """Rays from all directions, 2.2 away, to points at the distance `spread` from the origin."""
+    generator = torch.Generator().manual_seed(seed)
+    around, targets = (normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
+                       for _ in range(2))  # fmt: skip
+    return Rays(2.2 * around, normalize(spread * targets - 2.2 * around, dim=-1))
+
+
+def sheet(x: Tensor, y: Tensor, *batch: int) -> Rays:
+    """An image of rays along z from z = -2, with columns at x and rows at y."""
+    down, across = torch.meshgrid(y, x, indexing="ij")
+    origins = torch.stack([across, down, torch.full_like(across, -2.0)], dim=-1).expand(*batch, len(y), len(x), 3)
+    return Rays(origins, vector((0, 0, 1)).to(origins).expand_as(origins), image=True)
 
 
 def along_z(*heights: float) -> Rays:

@@ -25,21 +25,15 @@ def bracket(*ends: tuple[float, float]) -> Bracket:
     return Bracket(near, far, 2 - near, 2 - far)
 
 
-@each(
-    "values, first",
-    [
-        ((3, 1, -1, -2), 1),
-        ((3, -1, 2, -2), 0),  # the first of two
-        ((3, 1, 0, 1), 1),  # zero is occupied
-        ((-1, 2, -1, 3), 1),  # out of the shape, and in again
-        ((3, 2, 1, 0.5), None),
-        ((-3, -2, -1, -1), None),
-        ((-1, 1, 2, 3), None),  # leaving is no crossing
-        ((0, -1, -1, -1), None),  # no sample is free
-        ((3, NAN, -1, -1), None),  # a crossing may lie between, or none
-        ((3, NAN, 1, -1), 2),
-    ],
-)
+@each("values, first", [
+    ((3, 1, -1, -2), 1), ((3, -1, 2, -2), 0),  # the first of two
+    ((3, 1, 0, 1), 1),  # zero is occupied
+    ((-1, 2, -1, 3), 1),  # out of the shape, and in again
+    ((3, 2, 1, 0.5), None), ((-3, -2, -1, -1), None), ((-1, 1, 2, 3), None),  # leaving is no crossing
+    ((0, -1, -1, -1), None),  # no sample is free
+    ((3, NAN, -1, -1), None),  # a crossing may lie between, or none
+    ((3, NAN, 1, -1), 2),
+])  # fmt: skip
 def test_the_first_fall_from_free_to_occupied(values, first):
     distances = vector((0, 10, 20, 30))[None]
     crosses, ends = first_crossing(distances, vector(values)[None])

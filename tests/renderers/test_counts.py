@@ -1,7 +1,7 @@
 """Field evaluations of renderers on planes and spheres, against closed forms and counts by hand."""
 
 from dataclasses import replace
-from math import ceil, cos, log, radians, sin, sqrt
+from math import ceil, cos, log, radians, sin
 
 import pytest
 import torch
@@ -61,35 +61,6 @@ def test_evaluations_of_dist_on_a_plane_follow_equation_8(degrees, alpha):
     assert forward(renderer, GROUND, down(degrees, 3)) == 3 * plane_evaluations(degrees, alpha)
     if alpha == 1:
         assert forward(load("renderer", "idr"), GROUND, down(degrees, 3)) == 3 * plane_evaluations(degrees, 1.0)
-
-
-def marched(rays: Rays, radius: float, *, alpha: float, steps: int) -> int:
-    """Evaluations of sphere tracing on a sphere about the origin, ray by ray, from the geometry of a triangle."""
-    evaluations = 0
-    middle = -(rays.origins * rays.directions).sum(-1).flatten()
-    for passing, along in zip(distance_to_origin(rays).flatten().tolist(), middle.tolist(), strict=True):
-        if passing >= 1 or along < 0:
-            continue
-        half = sqrt(1 - passing**2)
-        t = -half  # from the middle of the chord
-        for _ in range(steps):
-            value = sqrt(passing**2 + t**2) - radius
-            evaluations += 1
-            if abs(value) < EPSILON:
-                break
-            t += alpha * value
-            if t > half:
-                break
-    return evaluations
-
-
-@each("alpha", [1.0, 1.5])
-def test_the_evaluations_of_an_image_are_the_sum_of_its_rays(alpha):
-    rays = picture()
-    expected = marched(rays, 0.5, alpha=alpha, steps=50)
-    assert forward(replace(PLAIN, alpha=alpha), sphere(0.5), rays) == expected
-    if alpha == 1:
-        assert forward(load("renderer", "idr"), sphere(0.5), rays) == expected
 
 
 @each("name", FULL)

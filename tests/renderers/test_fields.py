@@ -4,6 +4,8 @@ from math import sqrt
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from renderers.field import Counts, Field, Flops, Kind, Meter, autograd_normals
 from renderers.fields.analytic import Shape, box, capsule, cylinder, plane, rounded_box, smooth_union, sphere, torus
@@ -42,8 +44,7 @@ BOX, ROUNDED, TORUS, CYLINDER = box((1, 2, 3)), rounded_box((1, 2, 3), 0.5), tor
 CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
 
 
-@each(
-    "shape, point, distance",
+@each("shape, point, distance",
     [
         (sphere(0.5, (1, 0, 0)), (1, 0, 0), -0.5),
         (sphere(), (3, 4, 0), 4),
@@ -70,7 +71,7 @@ CAPSULE = capsule((0, 0, 0), (0, 2, 0), 0.5)
         (plane((3, 0, 4)), (1, 5, 1), 1.4),  # the normal is normalised
         (plane((0, 2, 0), 1), (3, 2.5, 4), 2),  # the offset belongs to the normal before it is normalised
     ],
-)
+)  # fmt: skip
 def test_distances_worked_out_by_hand(shape, point, distance):
     assert value(shape, *point) == pytest.approx(distance, abs=1e-12) and shape.kind is Kind.DISTANCE
 
@@ -119,14 +120,16 @@ def test_every_shape_states_its_kind():
     assert all(isinstance(shape, Field) for shape in (A, LEVEL, Meter(A)))
 
 
-def test_moves_take_the_surface_along():
-    ball = sphere(0.25, (1, 0, 0))
-    assert value(ball.rotate(QUARTER_TURN), 0, 1, 0) == pytest.approx(-0.25)  # x goes to y, not to -y
-    assert value(ball.translate((0, 2, 0)), 1, 2, 0) == pytest.approx(-0.25)
-    assert value(ball.scale(3.0), 3, 0, 0) == pytest.approx(-0.75)
-    assert value(BOX.rotate(QUARTER_TURN), 5, 0, 0) == pytest.approx(3)  # 2 wide along x now
-    assert value(BOX.scale(2.0), 8, 0, 0) == pytest.approx(6)
-    assert value(BOX.translate((1, 0, 0)).scale(2.0), 8, 0, 0) == pytest.approx(4)  # in the order as written
+@settings(max_examples=10)
+@given(angle=st.floats(-3, 3), shift=st.tuples(*[st.floats(-2, 2)] * 3), factor=st.floats(0.3, 3))
+def test_a_moved_shape_has_the_distances_of_the_shape_at_the_points_moved_back(angle, shift, factor):
+    points = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    turn = rotation(torch.tensor(angle, dtype=torch.float64))
+    moved = BOX.rotate(turn).scale(factor).translate(shift)(factor * points @ turn.T + vector(shift))
+    torch.testing.assert_close(moved, factor * BOX(points), rtol=1e-9, atol=1e-9)
+
+
+def test_a_stretched_shape_is_a_bound():
     stretched = sphere(1.0).stretch((1, 2, 4))
     assert [value(stretched, *p) for p in ((1, 0, 0), (0, 2, 0), (0, 0, 4))] == pytest.approx([0, 0, 0])
     assert value(stretched, 3, 0, 0) == pytest.approx(2)  # exact along the least stretched axis
@@ -137,24 +140,16 @@ def tensor(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers if len(numbers) > 1 else numbers[0], dtype=torch.float64, requires_grad=True)
 
 
-@each(
-    "make, parameters",
-    [
-        (sphere, (tensor(0.5), tensor(0.1, 0.2, 0.3))),
-        (plane, (tensor(1.0, 2.0, 0.5), tensor(0.2))),
-        (box, (tensor(0.3, 0.4, 0.5),)),
-        (rounded_box, (tensor(0.3, 0.4, 0.5), tensor(0.1))),
-        (torus, (tensor(0.5), tensor(0.2))),
-        (capsule, (tensor(-0.3, 0.1, 0.2), tensor(0.4, 0.3, -0.5), tensor(0.15))),
-        (cylinder, (tensor(0.4), tensor(0.3))),
-        (lambda offset: A.translate(offset), (tensor(0.1, 0.2, 0.3),)),
-        (lambda factor: A.scale(factor), (tensor(1.5),)),
-        (lambda factors: B.stretch(factors), (tensor(0.5, 1.5, 2.0),)),
-        (lambda angle: A.rotate(rotation(angle)), (tensor(0.3),)),
-        (lambda radius: smooth_union(A, B, radius=radius), (tensor(0.4),)),
-        (lambda radius: A - sphere(radius), (tensor(0.4),)),
-    ],
-)
+@each("make, parameters", [
+    (sphere, (tensor(0.5), tensor(0.1, 0.2, 0.3))), (plane, (tensor(1.0, 2.0, 0.5), tensor(0.2))),
+    (box, (tensor(0.3, 0.4, 0.5),)), (rounded_box, (tensor(0.3, 0.4, 0.5), tensor(0.1))),
+    (torus, (tensor(0.5), tensor(0.2))), (capsule, (tensor(-0.3, 0.1, 0.2), tensor(0.4, 0.3, -0.5), tensor(0.15))),
+    (cylinder, (tensor(0.4), tensor(0.3))), (lambda offset: A.translate(offset), (tensor(0.1, 0.2, 0.3),)),
+    (lambda factor: A.scale(factor), (tensor(1.5),)), (lambda factors: B.stretch(factors), (tensor(0.5, 1.5, 2.0),)),
+    (lambda angle: A.rotate(rotation(angle)), (tensor(0.3),)),
+    (lambda radius: smooth_union(A, B, radius=radius), (tensor(0.4),)),
+    (lambda radius: A - sphere(radius), (tensor(0.4),)),
+])  # fmt: skip
 def test_gradients_flow_to_tensor_parameters(make, parameters):
     points = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda p, *rest: make(*rest)(p), (points, *parameters))

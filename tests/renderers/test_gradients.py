@@ -8,7 +8,6 @@ from torch import Tensor
 
 from bench.config import load
 from renderers.camera import Rays
-from renderers.field import Meter
 from renderers.fields.analytic import Shape, sphere
 from renderers.gradients import attach_approximate_gradient
 from renderers.rendering import Status
@@ -71,23 +70,6 @@ def test_dist_is_biased_by_alpha_samples_and_cosine(case, alpha, samples):
     torch.testing.assert_close(by_origin, bias * case.origin_rate, rtol=1e-4, atol=1e-4)
     # The direction is right at each pixel.
     assert torch.cosine_similarity(by_origin, case.origin_rate, dim=0).item() == pytest.approx(1, abs=1e-6)
-
-
-@each("steps", [30, 300])
-@each("samples", [1, 3])
-def test_dist_differentiates_one_value_per_sample_for_any_number_of_steps(steps, samples):
-    case = CASES[2]
-    parameter = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    meter = Meter(sphere(parameter))
-    dist = replace(DIST_PLAIN, epsilon=1e-3, steps=steps, n_gradient_samples=samples)
-    rendering = dist.render(meter, case.rays())
-    assert rendering.hit.all() and meter.counts.value > 10 + samples
-    rendering.distance.sum().backward()
-    assert meter.counts.gradient == samples
-    naive = Meter(sphere(parameter))
-    replace(NAIVE, steps=steps).render(naive, case.rays()).distance.sum().backward()
-    assert naive.counts.value == steps
-    assert samples < naive.counts.gradient <= steps  # steps after the last have no gradient
 
 
 PASSING_RAY = Rays(vector((0.7, 0, -2))[None], vector((0, 0, 1))[None])  # passes a sphere of radius 0.5 by 0.2

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from jaxtyping import TypeCheckError
 
 from renderers.camera import rigid
 from renderers.field import Kind, Moved, autograd_gradients
@@ -49,12 +48,6 @@ def test_the_field_outside_is_a_continuous_bound_of_the_distance():
     assert (field(far)[far.abs().amax(-1) > REACH] > 0).all()
     edge = torch.tensor([[REACH, 0.1, -0.2]])
     assert field(edge * 1.0001).item() == pytest.approx(field(edge).item(), abs=1e-3)
-
-
-@each("shape", [(3, 3, 4), (3, 3), (1, 1, 1)])
-def test_values_of_a_wrong_shape_are_an_error(shape):
-    with pytest.raises((ValueError, TypeCheckError), match="values"):
-        Grid(torch.zeros(shape), 1.0)
 
 
 SIMILARITY = torch.tensor([0.1, -0.2, 0.05, 0.3, 0.2, -0.4, math.log(1.25)])

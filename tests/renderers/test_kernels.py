@@ -7,17 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from bench.config import load
 from bench.machine import environment
 from bench.machine.environment import using_threads
-from bench.shape_prior import initialise_to_sphere
-from datasets.views import ViewSampler
-from renderers.field import Counts, Meter
-from renderers.fields import mlp
 from renderers.fields.mlp import BoundDecoder, Decoder
-from renderers.kernels import decoder as of_decoders
+from renderers.kernels import decoder as decoder_kernels
 from renderers.kernels import library
 from renderers.kernels.library import kernels
 from tests.looped import each
@@ -32,19 +26,19 @@ NETWORKS = {
 
 
 def by_default() -> library.Kernels:
-    """What a process finds that asks for nothing."""
+    """The kernels of a process that chooses nothing."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv(library.KERNELS_VARIABLE, raising=False)
         return kernels.__wrapped__()
 
 
-THERE = by_default()
-with_compiler = pytest.mark.skipif(THERE.library is None, reason=f"nothing is compiled here: {THERE.description}")
+COMPILED = by_default()
+with_compiler = pytest.mark.skipif(COMPILED.library is None, reason=f"nothing is compiled here: {COMPILED.description}")
 
 
 @pytest.fixture(autouse=True)
 def compiled_code(monkeypatch):
-    monkeypatch.setattr(of_decoders, "kernels", lambda: THERE)
+    monkeypatch.setattr(decoder_kernels, "kernels", lambda: COMPILED)
 
 
 def make(name: str) -> Decoder:
@@ -53,7 +47,7 @@ def make(name: str) -> Decoder:
 
 
 def fresh(monkeypatch: pytest.MonkeyPatch, cache: Path, **environment: str) -> library.Kernels:
-    """What a new process would find."""
+    """The kernels of a new process."""
     for name, value in {"XDG_CACHE_HOME": str(cache), library.KERNELS_VARIABLE: "", **environment}.items():
         monkeypatch.setenv(name, value)
     return kernels.__wrapped__()
@@ -75,7 +69,7 @@ def test_values_are_those_of_torch(name, count):
 
 @with_compiler
 def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatch):
-    monkeypatch.setattr(environment, "kernels", lambda: THERE)
+    monkeypatch.setattr(environment, "kernels", lambda: COMPILED)
     monkeypatch.setattr(BoundDecoder, "_compiled", lambda self: pytest.fail("compiled code was asked"))
     points, code = torch.rand(5, 3), torch.zeros(4)
     with using_threads(1):
@@ -102,35 +96,6 @@ def test_values_follow_weights_that_are_being_learnt():
         torch.testing.assert_close(make("skip").at(torch.zeros(4))(points), make("skip").at(torch.zeros(4))(points))
 
 
-def ball() -> BoundDecoder:
-    decoder = Decoder(layers=4, width=128, code_length=4, skip=2, narrow=False)
-    torch.manual_seed(0)
-    initialise_to_sphere(decoder, radius=0.5)
-    return decoder.requires_grad_(False).at(torch.full((4,), 0.1))
-
-
-def rendered(name: str) -> tuple[Tensor, Tensor, Counts]:
-    field = Meter(ball(), Counts())
-    rays = ViewSampler(1.2, 70.0, (0.0, 360.0), (15.0, 35.0), 48).camera(30.0, 25.0).rays()
-    with torch.no_grad():
-        rendering = load("renderer", name).render(field, rays)
-    return rendering.status, rendering.distance, field.counts
-
-
-@with_compiler
-@each("name", ["dist", "newton", "idr", "neus", "relaxed_boundary"])
-def test_a_rendering_is_the_same_but_for_rays_at_a_threshold(name, monkeypatch):
-    with using_threads(1):
-        status, distance, counts = rendered(name)
-        monkeypatch.setattr(mlp, "compile_decoder", lambda *_: None)
-        status_of_torch, distance_of_torch, counts_of_torch = rendered(name)
-        monkeypatch.undo()
-    alike = status == status_of_torch
-    assert (~alike).sum() <= 2 and len(status.unique()) > 1
-    assert counts.value == pytest.approx(counts_of_torch.value, rel=2e-3)
-    assert (distance - distance_of_torch)[alike].abs().quantile(0.99) < 1e-4
-
-
 def test_torch_alone_is_left_to_torch_and_nothing_else_can_be_asked_for(monkeypatch, tmp_path):
     assert fresh(monkeypatch, tmp_path, **{library.KERNELS_VARIABLE: "torch"}) == library.Kernels(None, "torch")
     with pytest.raises(ValueError, match=f"{library.KERNELS_VARIABLE} must be torch or compiled, not 'cuda'"):
@@ -155,11 +120,11 @@ def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(mo
 
 @with_compiler
 def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
-    asked = "from renderers.kernels.library import kernels; print(kernels().description)"
+    program = "from renderers.kernels.library import kernels; print(kernels().description)"
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.KERNELS_VARIABLE: ""}
-    command = [sys.executable, "-c", asked]
+    command = [sys.executable, "-c", program]
     several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    assert [one.communicate()[0].strip() for one in several] == ["compiled"] * 3
+    assert [process.communicate()[0].strip() for process in several] == ["compiled"] * 3
     (built,) = (tmp_path / "implicit-bench" / "kernels").iterdir()
     whole = built.read_bytes()
     built.unlink()

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from bench.config import load
 from renderers.camera import Rays
-from renderers.field import Counts, Kind, Meter
+from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
 from renderers.march import RayFront, Stepping, march_coarse_to_fine, march_front, ray_pyramid
 from renderers.rendering import Status
 from tests.looped import each
-from tests.renderers.analytic_cases import beam, sphere_hits, vector
+from tests.renderers.analytic_cases import beam, sheet, sphere_hits, vector
 from tests.tiny import camera_of
 
 PLAIN = Stepping(epsilon=5e-5)
@@ -24,13 +24,10 @@ FINE = load("renderer", "dist", coarse_to_fine=False)
 COARSE = replace(FINE, coarse_to_fine=True)
 
 
-def sheet(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
-    """An image of rays along z from z = -2, `pitch` apart; with the default pitch all rays run through the centre."""
-    rows = (torch.arange(height, dtype=torch.float64) - (height - 1) / 2) * pitch
-    columns = (torch.arange(width, dtype=torch.float64) - (width - 1) / 2) * pitch
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    origins = torch.stack([x, y, torch.full_like(x, -2)], -1).expand(*batch, height, width, 3)
-    return Rays(origins, vector((0, 0, 1)).expand_as(origins), image=True)
+def square(height: int, width: int, *batch: int, pitch: float = 0.0) -> Rays:
+    """An image of rays along z, `pitch` apart; with the default pitch all rays run through the centre."""
+    x, y = (pitch * (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) for count in (width, height))
+    return sheet(x, y, *batch)
 
 
 def trace(field: Shape, rays: Rays, stepping: Stepping, *, steps: int = 50, samples: int = 1) -> tuple[RayFront, int]:
@@ -54,14 +51,6 @@ VIEW = camera_of(64).double().rays()  # an image of the whole unit sphere
 UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # rotates the axis of a torus from y to z
 
 
-def test_a_wall_head_on_takes_two_evaluations():
-    # The ray enters at z = -1, where the value is 1. The next point is z = 0, where the value is 0.
-    front, count = trace(WALL, HEAD_ON, PLAIN, samples=3)
-    assert count == 2 and front.distance.item() == 2
-    assert front.status.item() == Status.HIT and front.sample_value.tolist() == [[0, 1, torch.inf]]
-    assert front.sample_distance[0, :2].tolist() == [2, 1]
-
-
 def test_aggressive_steps_halve_the_distance_and_change_side():
     # Values 1, -1/2, 1/4, ...: the first below 5e-5 is 2^-15, the 16th. The last moves without alpha (Eq. 1).
     front, count = trace(WALL, HEAD_ON, AGGRESSIVE, samples=4)
@@ -70,16 +59,12 @@ def test_aggressive_steps_halve_the_distance_and_change_side():
     assert front.sample_value.tolist() == [[-(2**-15), 2**-14, -(2**-13), 2**-12]]
 
 
-@each(
-    "alpha, cap, clamp, expected",
-    [
-        (1.0, None, None, [1, 0.1, 0, -0.1, -1]),
-        (1.5, None, None, [1.5, 0.15, 0, -0.15, -1.5]),
-        (1.5, 0.25, None, [1.25, 0.15, 0, -0.15, -1.25]),
-        (1.5, None, 0.125, [0.1875, 0.15, 0, -0.15, -0.1875]),  # the value is clamped, then multiplied
-        (1.5, 0.2, 0.5, [0.7, 0.15, 0, -0.15, -0.7]),
-    ],
-)
+@each("alpha, cap, clamp, expected", [
+    (1.0, None, None, [1, 0.1, 0, -0.1, -1]), (1.5, None, None, [1.5, 0.15, 0, -0.15, -1.5]),
+    (1.5, 0.25, None, [1.25, 0.15, 0, -0.15, -1.25]),
+    (1.5, None, 0.125, [0.1875, 0.15, 0, -0.15, -0.1875]),  # the value is clamped, then multiplied
+    (1.5, 0.2, 0.5, [0.7, 0.15, 0, -0.15, -0.7]),
+])  # fmt: skip
 def test_a_step_by_cap_and_clamp(alpha, cap, clamp, expected):
     stepping = replace(PLAIN, alpha=alpha, extra_step_cap=cap, step_clamp=clamp)
     assert stepping.length(vector((1, 0.1, 0, -0.1, -1))).tolist() == pytest.approx(expected)
@@ -98,40 +83,21 @@ def test_finished_rays_are_evaluated_only_without_active_only():
     assert active.status.tolist() == [Status.HIT, Status.HIT, Status.MISS, Status.MISS]
 
 
-def test_finished_rays_are_evaluated_within_the_sphere():
-    def strict(points):
-        assert points.norm(dim=-1).max() < 1.01
-        return WALL(points)
-
-    within = beam((0, 0, -0.5), (0.6, 0, -2), (0, 0, 0.9))
-    trace(Shape(strict, WALL.kind), within, replace(PLAIN, active_only=False), steps=20)
-
-
-@each("steps, evaluations", [(2, 2 * 4), (4, 12 + 16), (10, 12 + 48 + 4 * 64)])
-def test_coarse_to_fine_marches_blocks_of_16_then_of_4_then_pixels(steps, evaluations):
+@each("size, steps, evaluations", [
+    ((8, 8), 2, 2 * 4), ((8, 8), 4, 12 + 16), ((8, 8), 10, 12 + 48 + 4 * 64),
+    ((5, 6), 8, 12 + 3 * 9 + 2 * 30), ((5, 6, 2), 8, 2 * (12 + 3 * 9 + 2 * 30)),
+])  # fmt: skip
+def test_coarse_to_fine_marches_blocks_of_16_then_of_4_then_pixels(size, steps, evaluations):
     # 8 x 8 pixels: 2 x 2 rays for three steps, 4 x 4 for three, then 8 x 8. With steps of 0.01 no ray ends.
-    front, count = trace(constant(0.01), sheet(8, 8), PLAIN, steps=steps)
+    front, count = trace(constant(0.01), square(*size), PLAIN, steps=steps)
     assert count == evaluations and (front.status == Status.OUT_OF_STEPS).all()
-    torch.testing.assert_close(front.distance, torch.full((64,), 1 + 0.01 * steps, dtype=torch.float64))
-
-
-def test_coarse_to_fine_fills_up_odd_sizes_and_takes_batches_of_images():
-    # 5 x 6 pixels: 2 x 2, 3 x 3, 5 x 6 rays.
-    assert trace(constant(0.01), sheet(5, 6), PLAIN, steps=8)[1] == 3 * 4 + 3 * 9 + 2 * 30
-    assert trace(constant(0.01), sheet(5, 6, 2), PLAIN, steps=8)[1] == 2 * (3 * 4 + 3 * 9 + 2 * 30)
+    assert front.distance.tolist() == pytest.approx([1 + 0.01 * steps] * len(front.distance))
 
 
 def test_a_ray_continues_the_coarse_ray_that_covers_it():
-    for level, (columns, across) in zip(ray_pyramid(sheet(7, 10, pitch=0.1)), [(5, 3), (10, 5)], strict=True):
+    for level, (columns, across) in zip(ray_pyramid(square(7, 10, pitch=0.1)), [(5, 3), (10, 5)], strict=True):
         for ray, parent in enumerate(level.parent.tolist()):
             assert parent == ray // columns // 2 * across + ray % columns // 2
-
-
-def test_coarse_to_fine_on_a_sphere_head_on():
-    # 4 rays hit after 2 evaluations (0.5, 0). Their children begin at the hit, with one evaluation each: 16 and 64.
-    front, count = trace(sphere(0.5), sheet(8, 8), PLAIN)
-    assert count == 2 * 4 + 16 + 64 and front.distance.tolist() == [1.5] * 64
-    assert (front.status == Status.HIT).all()
 
 
 def test_a_careful_split_keeps_the_outline_that_a_plain_split_loses():
@@ -142,14 +108,11 @@ def test_a_careful_split_keeps_the_outline_that_a_plain_split_loses():
     assert 0 < (plain != fine).sum() < 0.1 * (fine == Status.HIT).sum()
 
 
-@each(
-    "apart, careful, start",
-    [
-        (0.02, True, 2.0),  # 0.05 is more than twice 0.02: the coarse ray passed at a safe distance
-        (0.03, True, 1.2),  # the finer ray may hit what the coarse ray passed: back to its closest sample
-        (0.03, False, 2.0),
-    ],
-)
+@each("apart, careful, start", [
+    (0.02, True, 2.0),  # 0.05 is more than twice 0.02: the coarse ray passed at a safe distance
+    (0.03, True, 1.2),  # the finer ray may hit what the coarse ray passed: back to its closest sample
+    (0.03, False, 2.0),
+])  # fmt: skip
 def test_where_a_split_ray_goes_on(apart, careful, start):
     # The coarse ray stands at 2.0, and had its least value, 0.05, at 1.2. The unit sphere begins at 1.
     front = RayFront.on_sphere(HEAD_ON, radius=1.0, samples=2)
@@ -160,33 +123,6 @@ def test_where_a_split_ray_goes_on(apart, careful, start):
     assert child.distance[0].item() == start and child.active.all() and not child.not_evaluated.any()
     # A ray far apart enters the sphere at 1.4 only.
     assert child.distance[1].item() == pytest.approx(1.4 if careful else 2.0)
-
-
-def test_coarse_to_fine_keeps_the_soft_silhouette():
-    # The distance differs by less than 0.15 between a coarse ray and the rays of its block, which is their spacing.
-    shape, rays = sphere(0.5), VIEW
-    coarse, fine = COARSE.render(shape, rays), FINE.render(shape, rays)
-    missed = ~coarse.hit & ~fine.hit
-    assert (coarse.closest - fine.closest)[missed].abs().max() < 0.15
-
-
-def test_rays_begin_at_the_sphere_if_their_coarse_ray_missed_it():
-    # 4 x 4 rays at x of 0.7, 1.1, 1.5 and 1.9: their coarse ray, at 1.3, misses the unit sphere; the first does not.
-    rays = sheet(4, 4, pitch=0.4)
-    rays = Rays(rays.origins + vector((1.3, 0, 0)), rays.directions, image=True)
-    coarse, fine = COARSE.render(sphere(0.95), rays), FINE.render(sphere(0.95), rays)
-    assert fine.hit.any() and torch.equal(coarse.status, fine.status)
-    torch.testing.assert_close(coarse.distance[fine.hit], fine.distance[fine.hit], rtol=0, atol=4e-4)  # cosine 1/4
-
-
-def test_rays_that_start_inside_have_that_status_also_coarse_to_fine():
-    # Parallel rays from z = -0.3, at x of -0.45, -0.15, 0.15 and 0.45: the middle two start inside the sphere.
-    rays = sheet(4, 4, pitch=0.3)
-    origins = rays.origins * vector((1, 0.01, 0)) + vector((0, 0, -0.3))
-    rays = Rays(origins, rays.directions, image=True)
-    coarse, fine = COARSE.render(sphere(0.4), rays), FINE.render(sphere(0.4), rays)
-    assert fine.status[0].tolist() == [Status.MISS, Status.STARTED_INSIDE, Status.STARTED_INSIDE, Status.MISS]
-    assert torch.equal(coarse.status, fine.status) and (coarse.distance >= 0).all()
 
 
 def nan_beyond(limit: float) -> Shape:
@@ -207,6 +143,8 @@ def nan_beyond(limit: float) -> Shape:
         (plane((0, 0, -1), -1.5), (0, 0, -2), 50, Status.MISS, 3),  # the wall is behind the unit sphere
         (nan_beyond(-5.0), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),  # NaN from the start
         (constant(torch.inf), (0, 0, -2), 50, Status.OUT_OF_STEPS, 1),
+        (plane((0, 0, -1), 1 - 2e-5), (0, 0, -2), 50, Status.HIT, 1 + 2e-5),  # a hit at the first evaluation,
+        (plane((0, 0, -1), 1 + 2e-5), (0, 0, -2), 50, Status.HIT, 1 - 2e-5),  # also just before the sphere
     ],
 )  # fmt: skip
 def test_how_rays_end(renderer, field, origin, steps, status, distance):
@@ -219,14 +157,6 @@ def test_how_rays_end(renderer, field, origin, steps, status, distance):
     for tensor in (rendering.distance, rendering.points, rendering.residual, rendering.closest):
         assert tensor.isfinite().all()
     torch.testing.assert_close(rendering.points, rays.at(rendering.distance))
-
-
-def test_a_hit_at_the_first_evaluation_is_a_hit_and_not_started_inside():
-    for offset in (-1 + 2e-5, -1 - 2e-5):  # the wall is just behind and just before the entry into the unit sphere
-        for renderer in (NAIVE, FINE):
-            rendering = renderer.render(plane((0, 0, -1), -offset), HEAD_ON)
-            assert rendering.status.item() == Status.HIT
-            assert rendering.distance.item() == pytest.approx(1 + (offset + 1))
 
 
 @each("renderer", [NAIVE, replace(FINE, alpha=1.0)])
@@ -247,17 +177,6 @@ def test_closest_is_the_value_of_least_magnitude_with_its_sign(renderer):
     assert renderer.render(sphere(0.5), beam((0.3, 0, 0))).closest.item() == pytest.approx(-0.2)
 
 
-def test_only_the_kept_samples_are_evaluated_again():
-    # A hit has two evaluations and up to K with a graph. A miss has one evaluation with a graph.
-    for samples, again in ((1, 1), (2, 2), (5, 2)):
-        meter = Meter(WALL)
-        replace(FINE, alpha=1.0, n_gradient_samples=samples).render(meter, HEAD_ON)
-        assert meter.counts == Counts(value=2 + again)
-    meter = Meter(constant(0.5))
-    replace(FINE, alpha=1.0, n_gradient_samples=3).render(meter, HEAD_ON)
-    assert meter.counts == Counts(value=5 + 1)
-
-
 def marched(field: Shape, rays: Rays, stepping: Stepping, steps: int = 50) -> RayFront:
     front = RayFront.on_sphere(rays, radius=1.0, samples=1)
     march_front(field, rays, front, stepping, steps)
@@ -276,17 +195,6 @@ def test_a_step_over_a_plate_is_taken_back(middle):
     kept = marched(thin, rays, replace(AGGRESSIVE, step_back=True))
     assert kept.status.item() == Status.HIT
     assert kept.distance.item() == pytest.approx(2 + middle - 0.02, abs=1e-4)
-
-
-def test_a_step_that_passed_no_surface_is_not_taken_back():
-    rays, counts = beam((0, 0, -2)), [0, 0]
-    for index, stepping in enumerate((AGGRESSIVE, replace(AGGRESSIVE, step_back=True))):
-        shape = Meter(
-            plate(0.0, 1.9)
-        )  # thick: a step that overshoots ends inside, and the empty spheres of its ends meet
-        assert marched(shape, rays, stepping).status.item() == Status.HIT
-        counts[index] = shape.counts.value
-    assert counts[0] == counts[1]
 
 
 def test_a_least_step_brings_a_grazing_ray_to_its_surface():
@@ -330,10 +238,3 @@ def test_a_relaxed_step_towards_a_plane_touches_its_next_empty_sphere():
         value = field(ray.at(before))
         march_front(field, ray, front, stepping, 1)
         assert (front.distance - before).item() == pytest.approx(value.item() * (1.0 if steps == 1 else 4 / 3))
-
-
-def test_relaxation_without_stepping_back_is_refused():
-    with pytest.raises(ValueError, match="relaxation needs step_back=true"):
-        load("renderer", "dist", relaxation=0.3)
-    with pytest.raises(ValueError, match="relaxation must lie between 0"):
-        load("renderer", "dist", relaxation=1.3, step_back=True)

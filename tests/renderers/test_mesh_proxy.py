@@ -13,23 +13,15 @@ from renderers.field import Counts, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Status
 from tests.looped import each
-from tests.renderers.analytic_cases import vector
+from tests.renderers.analytic_cases import aimed, vector
 
 RENDERER = load("renderer", "mesh_proxy", grid=48)
 SPACING = 2 * RENDERER.sphere_radius / (RENDERER.grid - 1)
 
 
-def aimed(count: int) -> Rays:
-    """Rays at points well within a sphere of radius 0.5."""
-    generator = torch.Generator().manual_seed(1)
-    origins = 2 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
-    targets = 0.3 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
-    return Rays(origins, normalize(targets - origins, dim=-1))
-
-
 def test_gradients_are_those_of_the_field_up_to_the_grid(steep=5.0):
     """The field is a level set: the gradient of a vertex must be divided by the slope of the field."""
-    radius, rays = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), aimed(60)
+    radius, rays = torch.tensor(0.5, dtype=torch.float64, requires_grad=True), aimed(1, 60, spread=0.3)
     origins = rays.origins.requires_grad_(True)
     field = Shape(lambda p: steep * sphere(radius)(p), Kind.LEVEL, None)
     rendering, exact = (
@@ -46,7 +38,7 @@ def test_gradients_are_those_of_the_field_up_to_the_grid(steep=5.0):
 
 
 def test_a_finer_grid_is_closer():
-    rays, errors = aimed(100), []
+    rays, errors = aimed(1, 100, spread=0.3), []
     truth = load("renderer", "idr").render(sphere(0.5), rays).distance
     for grid in (12, 24, 48):
         errors.append((replace(RENDERER, grid=grid).render(sphere(0.5), rays).distance - truth).abs().max().item())
@@ -86,13 +78,13 @@ def test_closest_values_of_misses_are_right_and_a_shape_behind_the_camera_is_mis
 def test_the_cost_is_that_of_the_grid_for_any_number_of_rays():
     for count in (1, 100):
         counts = Counts()
-        RENDERER.render(Meter(sphere(0.5), counts), aimed(count))
+        RENDERER.render(Meter(sphere(0.5), counts), aimed(1, count, spread=0.3))
         assert 48**3 < counts.value < 48**3 + 1000
 
 
 @each("value", [1.0, -1.0, float("nan")])
 def test_a_field_without_a_surface_has_no_mesh(value):
     field = Shape(lambda p: value + 0 * p[..., 0], Kind.LEVEL, None)
-    rendering = RENDERER.render(field, aimed(5))
+    rendering = RENDERER.render(field, aimed(1, 5, spread=0.3))
     assert (rendering.status == (Status.STARTED_INSIDE if value < 0 else Status.MISS)).all()
     assert rendering.distance.isfinite().all()

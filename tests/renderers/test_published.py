@@ -42,7 +42,7 @@ def directly(weight: Tensor) -> State:
 def named(prefix: str, layers: dict[str, tuple[Tensor, Tensor]], written: Any) -> State:
     """The state of layers by name."""
     parts = {name: written(weight) | {"bias": bias} for name, (weight, bias) in layers.items()}
-    return {f"{prefix}{name}.{key}": value for name, part in parts.items() for key, value in part.items()}
+    return {f"{prefix}{name}.{key}": value for name, layer in parts.items() for key, value in layer.items()}
 
 
 SPECS = {"dims": [16, 12, 16], "norm_layers": [0, 1, 2], "latent_in": [2], "weight_norm": True, "dropout": [0, 1]}
@@ -51,12 +51,12 @@ CODE = torch.tensor([0.3, -0.2])
 
 def deepsdf(specs: dict[str, Any], written: Any, prefix: str) -> tuple[State, dict[str, Any], Tensor]:
     """The state of a DeepSDF decoder of 2 code numbers, its specs, and its values, as its own code computes them."""
-    widths, given = [5, *specs["dims"], 1], torch.cat([CODE.expand(len(POINTS), -1), POINTS], dim=1)
+    widths, inputs = [5, *specs["dims"], 1], torch.cat([CODE.expand(len(POINTS), -1), POINTS], dim=1)
     again, every, norm = specs.get("latent_in", []), specs.get("xyz_in_all", False), not specs.get("weight_norm")
-    layers, extra, x = {}, {}, given
+    layers, extra, x = {}, {}, inputs
     for n in range(len(widths) - 1):
         if n in again:
-            x = torch.cat([x, given], dim=1)
+            x = torch.cat([x, inputs], dim=1)
         elif n and every:
             x = torch.cat([x, POINTS], dim=1)
         outputs = widths[n + 1] - (5 if n + 1 in again else 3 if every and n < len(widths) - 2 else 0)
@@ -132,10 +132,10 @@ def test_an_adjusted_field_has_coarse_values_and_bounds_that_are_adjusted_as_its
 def implicit(prefix: str, frequencies: int, written: Any) -> tuple[State, Tensor]:
     """The state of IDR's network, four layers of 40 with a skip at the third and 7 outputs, and its values."""
     waves = [wave(POINTS * 2**n) for n in range(frequencies) for wave in (torch.sin, torch.cos)]
-    given = torch.cat([POINTS, *waves], dim=1)
-    inputs, layers, x = given.shape[1], {}, given
+    encoded = torch.cat([POINTS, *waves], dim=1)
+    inputs, layers, x = encoded.shape[1], {}, encoded
     for n, (width, outputs) in enumerate([(inputs, 40), (40, 40 - inputs), (40, 40), (40, 7)]):
-        x = torch.cat([x, given], dim=1) / sqrt(2) if n == 2 else x
+        x = torch.cat([x, encoded], dim=1) / sqrt(2) if n == 2 else x
         layers[f"lin{n}"] = weight, bias = drawn(outputs, width), drawn(outputs)
         x = linear(x, weight, bias)
         x = softplus(x, beta=100) if n < 3 else x
@@ -158,23 +158,23 @@ def test_a_network_of_idr_neus_or_volsdf_has_the_values_of_its_own_code(prefix, 
 
 def occupancy(kind: str) -> tuple[State, Tensor]:
     """The state of an occupancy network of two blocks of 8, and its logits at the code: dvr, shift, cbn or cbn2."""
-    state, width, name = {}, 8, "decoder."
+    state, width, prefix = {}, 8, "decoder."
     cbn, code = kind in ("cbn", "cbn2"), CODE
 
     def layer(key: str, outputs: int, inputs: int, *rest: int) -> tuple[Tensor, Tensor]:
         weight, bias = drawn(outputs, inputs), drawn(outputs)
-        state.update({f"{name}{key}.weight": weight.view(outputs, inputs, *rest), f"{name}{key}.bias": bias})
+        state.update({f"{prefix}{key}.weight": weight.view(outputs, inputs, *rest), f"{prefix}{key}.bias": bias})
         return weight, bias
 
     def normed(key: str, x: Tensor) -> Tensor:
-        gamma, beta = (linear(code, *layer(f"{key}.conv_{one}", width, 2, 1)) for one in ("gamma", "beta"))
+        gamma, beta = (linear(code, *layer(f"{key}.conv_{name}", width, 2, 1)) for name in ("gamma", "beta"))
         mean, variance = drawn(width), torch.rand(width)
         stored = {"running_mean": mean, "running_var": variance, "num_batches_tracked": torch.tensor(7)}
-        state.update({f"{name}{key}.bn.{part}": value for part, value in stored.items()})
+        state.update({f"{prefix}{key}.bn.{name}": value for name, value in stored.items()})
         return gamma * batch_norm(x, mean, variance) + beta
 
-    one, letters = (1,) if cbn else (), "conv" if kind == "cbn2" else "fc"
-    x = linear(POINTS, *layer(f"{letters}_p", width, 3, *one))
+    kernel, letters = (1,) if cbn else (), "conv" if kind == "cbn2" else "fc"
+    x = linear(POINTS, *layer(f"{letters}_p", width, 3, *kernel))
     if kind == "cbn2":
         code = CODE + layer("fc_z", 2, 4)[1]
     elif kind != "dvr":
@@ -186,11 +186,11 @@ def occupancy(kind: str) -> tuple[State, Tensor]:
         if kind == "dvr":
             x = x + linear(CODE, *layer(f"fc_c.{n}", width, 2))
         inner = normed(f"{block}.bn_0", x) if cbn else x
-        inner = linear(inner.relu(), *layer(f"{block}.fc_0", width, width, *one))
+        inner = linear(inner.relu(), *layer(f"{block}.fc_0", width, width, *kernel))
         inner = normed(f"{block}.bn_1", inner) if cbn else inner
-        x = x + linear(inner.relu(), *layer(f"{block}.fc_1", width, width, *one))
+        x = x + linear(inner.relu(), *layer(f"{block}.fc_1", width, width, *kernel))
     x = normed("bn", x) if cbn else x
-    x = linear(x.relu(), *layer(f"{letters}_out", 4 if kind == "dvr" else 1, width, *one))
+    x = linear(x.relu(), *layer(f"{letters}_out", 4 if kind == "dvr" else 1, width, *kernel))
     return state, x[:, 0]
 
 
@@ -230,13 +230,13 @@ def without(state: State, key: str) -> State:
 
 def deepsdf_with(state: Any, **changed: Any) -> Any:
     """Reads a DeepSDF decoder whose state is changed by a function, and its specs."""
-    found, settings, _ = deepsdf(SPECS, as_of_2019, "")
-    return published.load_deepsdf(state(found), settings | {"NetworkSpecs": SPECS | changed})
+    weights, settings, _ = deepsdf(SPECS, as_of_2019, "")
+    return published.load_deepsdf(state(weights), settings | {"NetworkSpecs": SPECS | changed})
 
 
 def implicit_with(changed: State) -> Any:
     state = implicit("sdf_network.", 0, directly)[0]
-    return published.load_sdf_network(state | {f"sdf_network.{key}": one for key, one in changed.items()})
+    return published.load_sdf_network(state | {f"sdf_network.{key}": weight for key, weight in changed.items()})
 
 
 def cbn_with(state: Any) -> Any:

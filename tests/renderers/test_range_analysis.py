@@ -50,16 +50,6 @@ def test_all_values_of_a_segment_lie_within_its_bounds(seed, length):
     assert (values >= low[:, None]).all() and (values <= high[:, None]).all()
 
 
-def test_bounds_of_a_short_segment_are_those_of_its_line():
-    """If no ReLU changes its sign, the network is linear, and the bounds are the values at the ends."""
-    field = network(0)
-    middle, half = segments(200, 1e-9)
-    low, high = field.bounds(middle, half)
-    ends = torch.stack([field(middle - half), field(middle + half)])
-    torch.testing.assert_close(low, ends.amin(0), rtol=0, atol=1e-10)
-    torch.testing.assert_close(high, ends.amax(0), rtol=0, atol=1e-10)
-
-
 def from_all_sides(count: int) -> Rays:
     generator = torch.Generator().manual_seed(3)
     origins = 2 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)

@@ -21,7 +21,7 @@ from renderers.field import Kind
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Blurred, Renderer, Rendering, Status, Unsupported, closest_values
 from tests.looped import each
-from tests.renderers.analytic_cases import CASES, box_hits, sphere_hits, vector
+from tests.renderers.analytic_cases import CASES, aimed, box_hits, sphere_hits, vector
 
 # The presets with separate code; the others differ in numbers only.
 VARIANTS = [
@@ -92,14 +92,6 @@ def mixed(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Ray
     targets = 0.6 * torch.randn(count, 3, dtype=torch.float64, generator=generator)
     directions = normalize(targets - origins, dim=-1)
     return Rays(origins.view(*shape, 3).to(dtype), directions.view(*shape, 3).to(dtype))
-
-
-def aimed(seed: int, count: int = 12) -> Rays:
-    """Rays from all directions to points near the origin, so that no ray is grazing."""
-    generator = torch.Generator().manual_seed(seed)
-    around = normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
-    targets = 0.1 * normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
-    return Rays(2.2 * around, normalize(targets - 2.2 * around, dim=-1))
 
 
 def pinhole(height: int, width: int, dtype: torch.dtype = torch.float32) -> Camera:

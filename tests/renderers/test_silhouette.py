@@ -12,8 +12,9 @@ from renderers.boundary import BrokenContract
 from renderers.camera import Rays
 from renderers.fields.analytic import sphere
 from renderers.rendering import Capabilities, RayObservation, Renderer, at_iteration
-from renderers.silhouette import AVERAGES, Hinge, SilhouetteLoss
+from renderers.silhouette import Hinge, SilhouetteLoss
 from tests.looped import each
+from tests.renderers.analytic_cases import sheet
 
 # Threshold 0.1. Soft silhouettes |closest| - 0.1: 0.4, -0.07, 0.2, -0.06.
 CLOSEST = torch.tensor([0.5, 0.03, -0.3, -0.04], dtype=torch.float64)
@@ -48,21 +49,6 @@ def loss(mask, *, signed=False, average="all", closest=CLOSEST):
 )
 def test_values_worked_out_by_hand(mask, signed, average, expected):
     assert loss(mask, signed=signed, average=average).item() == pytest.approx(expected)
-
-
-def test_a_background_ray_just_inside_is_pushed_out_with_its_sign_and_deeper_without():
-    def slope(signed: bool) -> float:
-        closest = torch.tensor([-0.04], dtype=torch.float64, requires_grad=True)
-        loss(NONE[:1], signed=signed, closest=closest).backward()
-        return closest.grad.item()
-
-    assert slope(signed=True) == -1  # descent raises the field's value: out of the shape
-    assert slope(signed=False) == 1  # descent lowers it: deeper
-
-
-@each("average", AVERAGES)
-def test_no_rays_cost_nothing(average):
-    assert loss(ALL[:0], average=average, closest=CLOSEST[:0]).item() == 0
 
 
 LOSSES = names("silhouette")
@@ -112,20 +98,6 @@ def test_under_one_loss_renderers_agree(renderer):
     assert of_sphere(load("renderer", renderer), hinge, mask) == pytest.approx(expected, rel=0.05)
 
 
-@each(
-    "loss, values, message",
-    [
-        ("hinge", {"average": "some"}, "average must be one of all, violating, missed_plus_spurious, not 'some'"),
-        ("cross_entropy", {"sharpness": -1.0}, "sharpness must be positive, not -1.0"),
-        ("occupancy", {"weight": -1.0}, "weight must be at least 0, not -1.0"),
-        ("occupancy", {"occupied_at": "hull"}, "occupied_at must be one of random, depth, not 'hull'"),
-    ],
-)
-def test_invalid_settings_are_refused(loss, values, message):
-    with pytest.raises(ValueError, match=message):
-        load("silhouette", loss, **values)
-
-
 def test_a_correct_hit_costs_nothing_for_any_threshold_of_the_renderer():
     """A hit may have a value far above the threshold of the loss. The weight of a spurious hit must not change."""
     rough = load("renderer", "idr", epsilon=0.05)  # also rays that pass the sphere by 0.005 are hits
@@ -137,10 +109,7 @@ def test_a_correct_hit_costs_nothing_for_any_threshold_of_the_renderer():
 def test_each_spurious_hit_shrinks_the_shape_whatever_its_closest_value(name):
     """The least value of a volume renderer may lie in front of the surface, and would cost nothing at a hit."""
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    side = torch.linspace(-0.45, 0.45, 12, dtype=torch.float64)
-    x, y = torch.meshgrid(side, side, indexing="xy")
-    origins = torch.stack([x, y, torch.full_like(x, -2.0)], dim=-1)
-    rays = Rays(origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(origins))
+    rays = sheet(*[torch.linspace(-0.45, 0.45, 12, dtype=torch.float64)] * 2)
     rendering = at_iteration(load("renderer", name), 0).render(sphere(radius), rays)
     assert (rendering.hit & (rendering.closest > 5e-5)).sum() > 10
     loss = Hinge(5e-5, signed=True, average="all").of_rendering(

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -127,9 +126,3 @@ def test_views_without_normals_have_no_normal_loss_and_selections_keep_normals()
     plain = ObservedView(WEIGHTS, RENDERERS["idr"], CAMERA.rays(), view.depth, view.depth_per_distance, ALL, None)
     assert set(plain.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth"}
     assert concatenate_views([plain]).normals is None
-
-
-def test_pixels_without_observed_normals_have_no_loss():
-    normals = torch.tensor([[0.0, 0, 1], [0, 1, 0]])
-    assert normal_error(normals, torch.tensor([[0.0, 0, 0], [0, 0.6, 0.8]])).item() == pytest.approx(0.4)
-    assert normal_error(normals, torch.zeros(2, 3)).item() == 0

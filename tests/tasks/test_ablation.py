@@ -21,9 +21,9 @@ from bench.tasks.ablation import BASE, DEFINITIONS, SHRINK_FACTOR, WARM_UP_PIXEL
 from renderers import waits
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
-from renderers.rendering import Capabilities, Renderer, Rendering, Status, Unsupported
+from renderers.rendering import Capabilities, Renderer, Rendering, Status
 from tests.looped import each
-from tests.tiny import PEAK, Blind, ball_prior, camera_of, run_of
+from tests.tiny import PEAK, ball_prior, camera_of, run_of
 
 SETTINGS = Ablation(repeats=2, limits=Limits(values=1e6, memory=8), smallest=2, wrong=0.02)
 PRIOR = ball_prior()
@@ -267,14 +267,6 @@ def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, v
     run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
     assert run.record.status is RunStatus.OK and run.record.metrics["repeats"] == times
     assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
-
-
-def test_renderers_that_cannot_are_unsupported(tmp_path):
-    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
-        measured(tmp_path, Blind())
-    picky = Fake(capabilities=Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True))
-    with pytest.raises(Unsupported, match="Fake needs a level field, not a distance field"):
-        measured(tmp_path, picky)
 
 
 TURNS = replace(SETTINGS, repeats=1, beside=["newton", "dvr"], rounds=2, size=16, threads=1)

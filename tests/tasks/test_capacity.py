@@ -11,7 +11,6 @@ from bench.records.record import Record, RunStatus
 from bench.runner.execute import execute
 from bench.runner.process import RunRequest
 from bench.runner.summary import print_run_summary
-from bench.setup.fields import FieldChoice, ModelSettings
 from bench.tasks.capacity.candidates import candidate
 from bench.tasks.capacity.field import failure_of
 from bench.tasks.capacity.growth import grow
@@ -19,10 +18,9 @@ from bench.tasks.capacity.held_out import HeldOutError
 from bench.tasks.capacity.model import Evidence, Size
 from bench.tasks.capacity.study import CheckSettings, shares
 from bench.tasks.capacity.task import Capacity, savings
-from renderers.rendering import Unsupported
 from renderers.silhouette import Own
-from tests.tasks.capacity.test_models import FIT, GROWTH, VIEWS, fitter_of
-from tests.tiny import Blind, ball_prior, camera_of, curve_of, plain, run_of, silent
+from tests.tasks.capacity.test_models import GROWTH, fitter_of
+from tests.tiny import curve_of, plain, silent
 
 TINY = (
     "scale=smoke", "view.resolution=16", "evaluation.picture=null", "evaluation.grid=24", "device=cpu",
@@ -107,14 +105,6 @@ def test_a_users_renderer_without_epsilon_works(compose_config, tmp_path):
     assert not [note for note in record.notes if note.startswith("pixel precision: renderer.")]
 
 
-def test_a_renderer_without_a_gradient_is_unsupported(tmp_path):
-    ladder = ModelSettings(("sphere",), "stored", FIT, GROWTH, VIEWS)
-    run = run_of(tmp_path, Blind(), ball_prior(), camera_of(8), field=FieldChoice("prior", ladder))
-    task = Capacity("depth", 10.0, Own(), 10.0, 1, 0.5, CheckSettings(4, 2, 2))
-    with pytest.raises(Unsupported, match="no gradient towards the field"):
-        task.execute(run)
-
-
 def test_saved_time_is_given_only_where_the_network_was_fitted():
     error = HeldOutError(np.array([[0.1, 10, 0, 10]] * 3), 0.1)
     chosen = Evidence("sphere", Size(4, 4), 10, error, seconds=2.0)
@@ -144,14 +134,10 @@ def test_hits_off_the_surface_are_noted_once_of_all_candidates(compose_config, t
     assert note.startswith("at the first iteration, WrongHits.render: ")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "ends"),
-    [
-        (("task=completion", "dataset=box", "task.points=dense"), "box"),
-        (("task=completion", "dataset=sphere", "field=sphere", "task.points=50", "task.mask=false"), "sphere"),
-    ],
-    ids=["auto", "one candidate, without a mask"],
-)
+@pytest.mark.parametrize(("overrides", "ends"), [
+    (("task=completion", "dataset=box", "task.points=dense"), "box"),
+    (("task=completion", "dataset=sphere", "field=sphere", "task.points=50", "task.mask=false"), "sphere"),
+], ids=["auto", "one candidate, without a mask"])  # fmt: skip
 def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
     default_field = () if any(override.startswith("field=") for override in overrides) else ("field=auto",)
     record = run(tmp_path, compose_config, *overrides, *default_field, *BETTER)

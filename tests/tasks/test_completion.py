@@ -17,7 +17,7 @@ from renderers.camera import Camera
 from renderers.field import Kind
 from renderers.fields.mlp import Decoder
 from renderers.fields.textured import TexturedDecoder
-from renderers.rendering import Capabilities, Rendering, Status, Unsupported, check_kind
+from renderers.rendering import Capabilities, Rendering, Status
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.tiny import CPU, TRIANGLE
@@ -112,8 +112,8 @@ def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
     """See tests/solve/test_observed_view.py for the term itself."""
     assert problem_of().compare.__self__.normals is None
     problem = problem_of(normal_weight=3.0)
-    terms, given = values(problem), problem.compare.__self__
-    assert (given.normal_weight, given.normal_width) == (3.0, 0.02) and torch.equal(given.normals, scene.view.normals)
+    terms, view = values(problem), problem.compare.__self__
+    assert (view.normal_weight, view.normal_width) == (3.0, 0.02) and torch.equal(view.normals, scene.view.normals)
     assert terms["total"] == pytest.approx(sum(terms[name] for name in terms if name != "total"))
 
 
@@ -124,8 +124,8 @@ def test_colours_are_compared_where_the_shape_is_shown_and_hit(problem_of, scene
     red = replace(scene, texture=lambda points, normals: np.tile([0.9, 0.2, 0.2], (len(points), 1)))
     problem = replace(SETTINGS, colour_weight=3.0).problem(red, textured, Fake(), seed=0, device=CPU)
     terms = problem.loss(0)
-    found = problem.field().paint(red.view.camera.rays().at(torch.tensor(DISTANCE))[0])
-    assert terms["colour"].item() == pytest.approx(3 * (found - torch.tensor([0.9, 0.2, 0.2])).abs().mean().item())
+    painted = problem.field().paint(red.view.camera.rays().at(torch.tensor(DISTANCE))[0])
+    assert terms["colour"].item() == pytest.approx(3 * (painted - torch.tensor([0.9, 0.2, 0.2])).abs().mean().item())
     terms["colour"].backward()
     assert (problem.code.grad[:2] != 0).any() and (problem.code.grad[2:] != 0).all()
 
@@ -148,7 +148,7 @@ def test_the_code_is_held_short(problem_of, average, expected):
 
 
 @dataclass
-class Told(Fake):
+class TakesDistances(Fake):
     """A fake whose loss takes the given distances as well."""
 
     def observed_loss(self, field, rays, rendering, observed):
@@ -157,18 +157,18 @@ class Told(Fake):
 
 
 def test_the_mask_is_compared_where_it_is_given_by_the_loss_that_is_chosen(problem_of):
-    sparse, dense, other, told = Fake(), Fake(), Fake(), Told()
+    sparse, dense, other, taking = Fake(), Fake(), Fake(), TakesDistances()
     assert set(values(problem_of(sparse, points="3", mask=False))) == {"total", "depth", "code"}
     assert sparse.asked is None
     assert "silhouette" in values(problem_of(dense, points="dense", mask=False))  # which implies it
     assert dense.asked.tolist() == MASK
     chosen = values(problem_of(other, silhouette=load("silhouette", "hinge")))
     assert other.asked is None and chosen["silhouette"] != pytest.approx(4.0 * SILHOUETTE)
-    problem = problem_of(told, points="2")
+    problem = problem_of(taking, points="2")
     values(problem)
-    given = told.asked.isfinite()
-    assert torch.equal(given, problem.observed) and given.sum() == 2
-    assert told.asked[given].tolist() == pytest.approx([2.0 / COSINE] * 2)
+    taken = taking.asked.isfinite()
+    assert torch.equal(taken, problem.observed) and taken.sum() == 2
+    assert taking.asked[taken].tolist() == pytest.approx([2.0 / COSINE] * 2)
 
 
 def test_the_gradient_is_that_of_the_loss(problem_of, prior, scene):
@@ -195,18 +195,18 @@ def test_evaluations_are_counted_and_judging_is_not(problem_of):
 class Scheduled(Fake):
     """A renderer with a schedule: what was asked of it, and at which iteration."""
 
-    at: int | None = None
+    iteration_asked: int | None = None
     log: list = field(default_factory=list)
 
     def at_iteration(self, iteration):
-        return replace(self, at=iteration)
+        return replace(self, iteration_asked=iteration)
 
     def render(self, field, rays):
-        self.log.append(("render", self.at))
+        self.log.append(("render", self.iteration_asked))
         return super().render(field, rays)
 
     def silhouette_loss(self, field, rays, rendering, mask):
-        self.log.append(("silhouette", self.at))
+        self.log.append(("silhouette", self.iteration_asked))
         return super().silhouette_loss(field, rays, rendering, mask)
 
 
@@ -216,15 +216,6 @@ def test_a_renderer_with_a_schedule_is_as_it_is_at_the_iteration(problem_of):
     problem.loss(7)
     assert renderer.log == [("render", 7), ("silhouette", 7)]
     renderer.log.clear()
-    assert renderer.at is None  # what is judged and drawn is by the renderer as configured
+    assert renderer.iteration_asked is None  # what is judged and drawn is by the renderer as configured
     optimise(problem, OptimiserSettings(3, 0.01, "constant"), CPU, history=History(), on_step=lambda line: None)
-    assert [at for what, at in renderer.log if what == "render"] == [0, 0, 1, 2]  # the first is the warm-up
-
-
-def test_a_renderer_without_a_gradient_or_for_another_kind_of_field_is_unsupported(problem_of):
-    with pytest.raises(Unsupported, match="Fake has no gradient towards the field"):
-        problem_of(Fake(capabilities=Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True)))
-    picky = Fake(capabilities=Capabilities((Kind.BOUND, Kind.LEVEL), field_gradient=True, ray_gradient=True))
-    with pytest.raises(Unsupported, match="Fake needs a bound or level field, not a distance field"):
-        check_kind(picky, problem_of().field())
-    check_kind(Fake(), problem_of().field())
+    assert [iteration for what, iteration in renderer.log if what == "render"] == [0, 0, 1, 2]  # the warm-up first

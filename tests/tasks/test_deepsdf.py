@@ -26,7 +26,7 @@ SETTINGS = DeepSDF(
 )  # fmt: skip
 FIT = PriorFit(
     distances=2000, batch=500, surface_width=0.05, code=CodePenalty(0.0, "sum"),
-    optimiser=OptimiserSettings(200, 0.02, "cosine"),
+    optimiser=OptimiserSettings(80, 0.05, "cosine"),
 )  # fmt: skip
 
 
@@ -48,24 +48,11 @@ def problem_of(scene, prior, **changed):
     return replace(SETTINGS, **changed).problem(scene, prior, RENDERER, seed=0, device=CPU)
 
 
-def test_the_true_plane_costs_nothing(wall):
-    terms = problem_of(wall, plane(0.2)).loss(0)
-    assert {name: term.item() for name, term in terms.items()} == pytest.approx(
-        {"total": 0, "distance": 0, "code": 0}, abs=1e-6
-    )
-
-
 def test_a_shifted_plane_costs_its_shift_at_every_sample(wall):
     problem = problem_of(wall, plane(0.25))
     assert problem.loss(0)["distance"].item() == pytest.approx(2.0 * 0.05, rel=1e-4)
     problem.loss(0)["total"].backward()
     assert problem.code.grad.item() == pytest.approx(2.0, rel=1e-4)  # both samples of a point are off to one side
-
-
-def test_the_samples_lie_on_both_sides_at_the_offset(wall):
-    recorded = []
-    problem_of(wall, plane(0.2)).compare(lambda points: recorded.append(points) or points[:, 2], 0)
-    assert recorded[0][:, 2].sort().values.tolist() == pytest.approx([0.1] * 16 + [0.3] * 16, abs=1e-5)
 
 
 def test_free_space_before_the_surface_must_not_be_inside(wall):

@@ -24,7 +24,7 @@ from bench.tasks.gradients.task import (
 )
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Kind
-from renderers.rendering import Capabilities, Renderer, Rendering, Unsupported
+from renderers.rendering import Capabilities, Renderer, Rendering
 from tests.looped import each
 from tests.tiny import ball_prior, camera_of, plane_decoder, run_of
 
@@ -149,18 +149,6 @@ def test_the_scale_of_dist_is_alpha_times_the_cosine_times_the_slope(tmp_path, a
         assert metrics["colour.texture_pooled_scale"] == pytest.approx(1, abs=1e-5)
 
 
-def test_where_a_band_is_empty_it_says_so(tmp_path):
-    """All is hit, at one angle: there is no outline either."""
-    prior, camera = plane_prior(50.0, 1.0), camera_of(8, field_of_view=0.5)
-    metrics = judged(tmp_path, EXACT["idr"], prior, camera).record.metrics
-    for band in ("frontal", "grazing"):
-        assert {name: value for name, value in metrics.items() if name.startswith(band)} == {
-            f"{band}.pixels": 0, f"{band}.excluded": 0,
-        }  # fmt: skip
-    assert {name: value for name, value in metrics.items() if name.startswith("silhouette")} == {"silhouette.pixels": 0}
-    assert metrics["oblique.pixels"] == SETTINGS.pixels
-
-
 @dataclass
 class Changed:
     """A renderer that answers as another one does, but for what is changed."""
@@ -193,14 +181,6 @@ def test_pixels_whose_hit_lies_on_another_surface_are_excluded_and_counted(tmp_p
     # A bias on the same surface is an error of the renderer, and compared.
     off = judged(tmp_path, Changed(EXACT["idr"], EXACT["idr"].capabilities, -2 * SAME_SURFACE_DISTANCE)).record.metrics
     assert min(off[f"{band}.pixels"] for band in HITS) >= SETTINGS.pixels - 3
-
-
-def test_renderers_that_cannot_are_unsupported(tmp_path):
-    inner = EXACT["idr"]
-    with pytest.raises(Unsupported, match="Changed has no gradient towards the field"):
-        judged(tmp_path, Changed(inner, Capabilities((Kind.DISTANCE,), field_gradient=False, ray_gradient=True)))
-    with pytest.raises(Unsupported, match="Changed needs a level field, not a distance field"):
-        judged(tmp_path, Changed(inner, Capabilities((Kind.LEVEL,), field_gradient=True, ray_gradient=True)))
 
 
 def test_bands_are_of_the_angle_between_ray_and_inward_normal():

@@ -95,12 +95,12 @@ def test_random_starts_differ_and_share_the_budget(scene):
 
 
 def test_an_encoder_is_trained_once_and_gives_the_code_about_which_starts_are_drawn(tmp_path):
-    prior, camera = Prior(PRIOR.decoder, 3 * PRIOR.codes), camera_of(32, angles=(0.0, 20.0))
-    encoder = EncoderSettings((8,), 1, 32, 6, 4, 8, OptimiserSettings(80, 0.01, "cosine"))
+    prior, camera = Prior(PRIOR.decoder, 3 * PRIOR.codes), CAMERA
+    encoder = EncoderSettings((8,), 1, 16, 6, 4, 8, OptimiserSettings(80, 0.01, "cosine"))
     scene = scene_of(extract(prior.decoder.at(prior.codes[0]), grid=24, reach=1.0), camera)
     task = replace(SETTINGS, optimiser=OptimiserSettings(1, 1e-9, "constant"))
     run = run_of(tmp_path, RENDERER, prior, camera, make_scene=lambda: scene)
-    run = altered(run, {"inputs.evaluation.points": 1000})
+    run = altered(run, {"inputs.evaluation.points": 500})
     task.execute(run)
     at_zero = run.record.metrics_start["chamfer_l1"]
     trained = ["training the encoder" in phases_of(run, replace(task, encoder=encoder)) for _ in range(2)]
@@ -173,8 +173,8 @@ def test_a_linear_image_is_sampled_exactly_and_nothing_outside_is_read():
 
 def test_gradients_reach_the_pixels():
     image = torch.rand(5, 5, 2, generator=torch.Generator().manual_seed(1)).double()
-    places = (0.7 + 3.5 * torch.rand(20, 2, generator=torch.Generator().manual_seed(2))).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: sample(image, p)[0], places)
+    positions = (0.7 + 3.5 * torch.rand(20, 2, generator=torch.Generator().manual_seed(2))).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: sample(image, p)[0], positions)
 
 
 def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is_put_there(tmp_path):

@@ -15,10 +15,9 @@ from bench.tasks.baselines.pose_icp import PoseICP, world_points
 from bench.tasks.pose import Pose, PoseProblem, build_shape_field, pose_error
 from datasets.scene import Scene
 from renderers.fields.analytic import box
-from renderers.rendering import Unsupported
 from renderers.silhouette import Own
 from tests.looped import each
-from tests.tiny import CPU, Blind, altered, ball_prior, camera_of, curve_of, mesh_of, run_of, scene_of
+from tests.tiny import CPU, ball_prior, camera_of, curve_of, mesh_of, run_of, scene_of
 
 SIZES = (0.5, 0.35, 0.2)
 CAMERA = camera_of(24, angles=(30.0, 20.0))
@@ -141,12 +140,6 @@ def test_a_known_shape_is_the_scenes(run):
     assert torch.equal(network, prior.decoder.at(prior.codes[0])(points))
 
 
-def test_a_renderer_without_a_gradient_towards_rays_is_unsupported(run):
-    blind = altered(run, {"inputs.renderer": Blind()})
-    with pytest.raises(Unsupported, match="Blind has no gradient towards rays"):
-        SETTINGS.execute(blind)
-
-
 @pytest.mark.parametrize("method", ["point_to_point", "point_to_plane"])
 def test_closest_points_find_a_near_pose(run, method):
     replace(ICP, method=method).execute(run)
@@ -166,14 +159,11 @@ def test_points_that_never_come_near_are_told(run):
     assert run.record.status is RunStatus.NOT_REACHED and run.record.metrics["success"] == 0.0
 
 
-@each(
-    "settings, changed, message",
-    [
-        (SETTINGS, {"degrees": 200.0}, r"task\.degrees must lie between 0 and 180"),
-        (SETTINGS, {"starts": 12}, r"task\.optimiser\.iterations must be more than"),
-        (ICP, {"reach": ()}, r"task\.reach must have one pass or more"),
-    ],
-)
+@each("settings, changed, message", [
+    (SETTINGS, {"degrees": 200.0}, r"task\.degrees must lie between 0 and 180"),
+    (SETTINGS, {"starts": 12}, r"task\.optimiser\.iterations must be more than"),
+    (ICP, {"reach": ()}, r"task\.reach must have one pass or more"),
+])  # fmt: skip
 def test_what_cannot_be_is_told(settings, changed, message):
     with pytest.raises(ValueError, match=message):
         replace(settings, **changed)

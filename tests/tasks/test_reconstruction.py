@@ -31,8 +31,7 @@ from tests.looped import each
 from tests.made_dtu import CENTRE as DTU_CENTRE
 from tests.made_dtu import ball, on_ball, write_dtu
 from tests.made_photographs import CENTRE, RADIUS, nerf
-from tests.runner.driving import SMALLEST, command, record_of
-from tests.tiny import Blind, altered, ball_prior, camera_of, curve_of, icosphere, run_of, scene_of
+from tests.tiny import altered, ball_prior, camera_of, curve_of, icosphere, run_of, scene_of
 
 PICTURES = ("summary.png", "input.png", "strip.png", "curve.png")
 SETTINGS = Reconstruction(
@@ -161,11 +160,6 @@ def test_a_guide_reaches_the_loss_of_occupancy(scene, tmp_path):
         executed(run, guide="hull", masks=False)
 
 
-def test_a_renderer_without_a_gradient_is_unsupported(scene, tmp_path):
-    with pytest.raises(Unsupported, match="Blind has no gradient towards the field"):
-        executed(altered(run_in(tmp_path, scene), {"inputs.renderer": Blind()}))
-
-
 @each("field", ["union_3", "prior"])
 def test_a_field_without_colours_is_told(scene, tmp_path, field):
     words = f"field={field} has no colours: task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
@@ -239,20 +233,3 @@ def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
     assert set(record.metrics) <= defined
     named = executed(without_pictures(run_in(folder(tmp_path, "named"), scene, field=name)))
     assert named.metrics["psnr"] == record.metrics["psnr"] and named.evaluations == record.evaluations
-
-
-def test_a_command_learns_photographs(tmp_path):
-    nerf(tmp_path)
-    overrides = (
-        "dataset=photos",
-        f"dataset.path={tmp_path}",
-        "dataset.masks=false",
-        f"results_dir={tmp_path / 'results'}",
-    )
-    small = (*SMALLEST, "task.optimiser.iterations=4", "task.rays=64", "field=grid_8", "task.longest=16")
-    code, out, err = command(*overrides, "task=reconstruction", "renderer=idr", *small)
-    assert code == 0 or "did not fall" in err, err
-    record = record_of(out)
-    assert record["scene"] == tmp_path.name and record["task"] == "reconstruction"
-    assert "psnr" in record["metrics"] and "mask_iou" not in record["metrics"]
-    assert any("without masks" in note for note in record["notes"])

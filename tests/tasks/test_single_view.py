@@ -173,16 +173,13 @@ def test_a_picture_that_changed_is_seen_anew(folder, network, picture, tmp_path)
     assert not record_of(command(*TINY, *files).out)["reused"]
 
 
-@each(
-    "image, mask, says",
-    [
-        ("opaque", None, "opaque.png has no mask: give task.mask_path=FILE"),
-        ("opaque", "half", "has 120 x 40 pixels, its image 120 x 80"),
-        ("opaque", "white", "is white everywhere: make it black beside the object"),
-        ("opaque", "black", "shows no object of 16 pixels"),
-        ("opaque", "inverted", "is white along the border, as an inverted one"),
-    ],
-)
+@each("image, mask, says", [
+    ("opaque", None, "opaque.png has no mask: give task.mask_path=FILE"),
+    ("opaque", "half", "has 120 x 40 pixels, its image 120 x 80"),
+    ("opaque", "white", "is white everywhere: make it black beside the object"),
+    ("opaque", "black", "shows no object of 16 pixels"),
+    ("opaque", "inverted", "is white along the border, as an inverted one"),
+])  # fmt: skip
 def test_a_picture_that_cannot_be_is_told(picture, image, mask, says):
     with pytest.raises(BadInput, match=says):
         read_picture(picture.with_name(f"{image}.png"), mask and picture.with_name(f"{mask}.png"), 32, 0.5)

@@ -13,7 +13,7 @@ from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.solve.observed_view import ObservedView
-from bench.tasks.capacity.candidates import PAPER_NETWORK, REACH, by_size, candidate
+from bench.tasks.capacity.candidates import REACH, by_size, candidate
 from bench.tasks.capacity.field import rendered_curve
 from bench.tasks.capacity.fit import SCREENING, FitProblem, Fitter, scatter_points
 from bench.tasks.capacity.growth import _is_better, cost, grow
@@ -97,16 +97,12 @@ def test_a_candidate_has_the_number_of_parameters_of_its_name(name):
         assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters)
 
 
-@each(
-    "changed, message",
-    [
-        ({"candidates": ("unoin_3",)}, "did you mean union_3"),
-        ({"candidates": ("union_1",)}, "union_2 is the smallest"),
-        ({"candidates": ("grid_4",)}, "between 8 and 256"),
-        ({"candidates": ("sphere", "box", "sphere")}, "name each candidate once"),
-        ({"size": "parameters"}, r"models\.size must be one of stored, free, bytes, not 'parameters'"),
-    ],
-)
+@each("changed, message", [
+    ({"candidates": ("unoin_3",)}, "did you mean union_3"), ({"candidates": ("union_1",)}, "union_2 is the smallest"),
+    ({"candidates": ("grid_4",)}, "between 8 and 256"),
+    ({"candidates": ("sphere", "box", "sphere")}, "name each candidate once"),
+    ({"size": "parameters"}, r"models\.size must be one of stored, free, bytes, not 'parameters'"),
+])  # fmt: skip
 def test_invalid_settings_are_refused(changed, message):
     settings = {"candidates": ("sphere",), "size": "stored", "fit": FIT, "growth": GROWTH, "views": VIEWS}
     with pytest.raises(ValueError, match=message):
@@ -381,10 +377,8 @@ def test_a_warm_start_counts_evaluations_of_the_previous_field():
     fitter = fitter_of("ball", warm_iterations=10)
     ball = fitter.begin(candidate("sphere"), None)
     grid = fitter.begin(candidate("grid_16"), ball.model)
-    previous_evaluations = (
-        12 * 128 + 16**3
-    )  # evaluations of the sphere in each iteration, the warm-up, the final loss, and on the grid
-    assert grid.evidence.evaluations == 10 * 128 + previous_evaluations
+    # Those of the sphere are of each iteration, the warm-up, the final loss, and the grid.
+    assert grid.evidence.evaluations == 10 * 128 + 12 * 128 + 16**3
     network = fitter.begin(candidate("network_1x16"), ball.model)
     assert network.evidence.evaluations == 10 * 128 + 12 * 128
     assert network.evidence.flops > 10 * 128 * (10 + candidate("network_1x16").flops)
@@ -403,14 +397,10 @@ GRID, NETWORK = Size(free=4_427, stored=32_768, sparse_bytes=40_000), Size(free=
 
 @each("measure, chosen", [("free", "grid_32"), ("stored", "network_4x64"), ("bytes", "network_4x64")])
 def test_free_and_stored_numbers_disagree_and_the_measure_decides(measure, chosen):
+    assert str(GRID) == "32,768 numbers, 4,427 of them free" and str(NETWORK) == "12,801 numbers"
     fits = [evidence_of("grid_32", GRID, an_error(0.008)), evidence_of("network_4x64", NETWORK, an_error(0.009))]
     choice = choose(fits, 0.01, measure)
     assert (choice.chosen.candidate, choice.measure, choice.best.candidate) == (chosen, measure, "grid_32")
-
-
-def test_sizes_in_words():
-    assert str(GRID) == "32,768 numbers, 4,427 of them free" and str(NETWORK) == "12,801 numbers"
-    assert (GRID.bytes, NETWORK.bytes) == (131_072, 51_204) and candidate(PAPER_NETWORK).stored == 1_839_614
 
 
 def test_candidates_are_tried_in_the_order_of_the_measure():
@@ -450,20 +440,10 @@ def test_a_first_round_is_kept_although_the_warm_start_imitates_a_better_field()
 
 
 def test_the_seconds_of_a_fit_continue_those_of_its_trial():
-    def line(candidate: str, phase: str, seconds: float) -> dict[str, object]:
-        return {"candidate": candidate, "phase": phase, "part": "growth", "seconds": seconds, "total": seconds}
-
-    trial = [line("box", "warm", 9.0), line("box", "fit", 1.0), line("box", "fit", 2.5)]
-    rest = [
-        line("sphere", "fit", 7.0),
-        line("box", "fit", 0.5),
-        line("box", "fit", 2.0),
-    ]  # the seconds begin at 0 again
-    curve = rendered_curve([*trial, *rest], "box")
-    assert [point["seconds"] for point in curve] == [1.0, 2.5, 3.0, 4.5]
-    assert [point["iteration"] for point in curve] == [0, 1, 2, 3] and [point["total"] for point in curve] == [
-        1,
-        2.5,
-        0.5,
-        2,
-    ]
+    """In the second part the seconds begin at 0 again."""
+    rows = [("box", "warm", 9.0), ("box", "fit", 1.0), ("box", "fit", 2.5), ("sphere", "fit", 7.0), ("box", "fit", 0.5)]
+    lines = [{"candidate": name, "phase": phase, "part": "growth", "seconds": n, "total": n} for name, phase, n in rows]
+    curve = rendered_curve(lines, "box")
+    assert [(point["iteration"], point["seconds"], point["total"]) for point in curve] == [
+        (0, 1.0, 1.0), (1, 2.5, 2.5), (2, 3.0, 0.5),
+    ]  # fmt: skip

@@ -68,15 +68,11 @@ def test_points_outside_one_of_two_photographs_are_not_matched(sphere):
             assert (depth > 0).all() and pixels.min() > -1e-3 and pixels.max() < PIXELS + 1e-3
 
 
-@each(
-    "matching, pairs",
-    [
-        (Matching(2, 45.0), ["0-10", "0-25", "1-10", "1-25", "10-1", "10-0", "25-10", "25-1", "60-25"]),
-        (Matching(1, 45.0), ["0-10", "1-10", "10-1", "25-10", "60-25"]),
-        (Matching(4, 12.0), ["0-10", "1-10", "10-1", "10-0"]),
-        (Matching(4, 5.0), []),
-    ],
-)
+@each("matching, pairs", [
+    (Matching(2, 45.0), ["0-10", "0-25", "1-10", "1-25", "10-1", "10-0", "25-10", "25-1", "60-25"]),
+    (Matching(1, 45.0), ["0-10", "1-10", "10-1", "25-10", "60-25"]),
+    (Matching(4, 12.0), ["0-10", "1-10", "10-1", "10-0"]), (Matching(4, 5.0), []),
+])  # fmt: skip
 def test_neighbours_are_the_nearest_by_angle_within_bounds(sphere, monkeypatch, matching, pairs):
     shots = [shot_of(ball(), camera_of(8, angles=(turn, 0.0)), f"{turn:g}") for turn in (0.0, 1.0, 10.0, 25.0, 60.0)]
     matched_pairs = []

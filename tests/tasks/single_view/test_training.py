@@ -316,16 +316,13 @@ def test_the_overlap_is_that_of_volumes(images):
         assert overlap(model.at(torch.zeros(6)), shape, CPU) == pytest.approx(expected, abs=0.1)
 
 
-@each(
-    "kind, changed, message",
-    [
-        (NETWORK, {"channels": (12,)}, "task.network.channels must be multiples of 8"),
-        (NETWORK, {"reads": "density"}, "task.network.reads must be one of occupancy, distance"),
-        (RGB, {"hull": 1.5}, "supervision.hull must be a share of the steps, 0 to 1, not 1.5"),
-        (RGB, {"losses": replace(LOSSES, colour_gradient=1.0)}, "colour_gradient must be 0: no patches are drawn"),
-        (VOLUME, {"occupancy": 0.0}, "supervision has no term after the hull's steps: give a weight"),
-    ],
-)
+@each("kind, changed, message", [
+    (NETWORK, {"channels": (12,)}, "task.network.channels must be multiples of 8"),
+    (NETWORK, {"reads": "density"}, "task.network.reads must be one of occupancy, distance"),
+    (RGB, {"hull": 1.5}, "supervision.hull must be a share of the steps, 0 to 1, not 1.5"),
+    (RGB, {"losses": replace(LOSSES, colour_gradient=1.0)}, "colour_gradient must be 0: no patches are drawn"),
+    (VOLUME, {"occupancy": 0.0}, "supervision has no term after the hull's steps: give a weight"),
+])  # fmt: skip
 def test_invalid_settings_are_refused(kind, changed, message):
     with pytest.raises(ValueError, match=message):
         replace(kind, **changed)

@@ -227,15 +227,6 @@ def test_a_disturbed_fit_ends_further_off(scene):
     assert mild.success and severe.numbers["surface_error"] > mild.numbers["surface_error"]
 
 
-def test_a_severity_may_be_a_setting_of_the_fit(monkeypatch):
-    fits, draw_spheres = [], fit._draw_parameters
-    monkeypatch.setattr(fit, "_draw_parameters", lambda draw, offset: fits.append(offset) or draw_spheres(draw, offset))
-    for name in ("far_start", "a_ball"):
-        few = replace(conditions(), fit=replace(FIT, resolution=8, iterations=1))
-        judge_fit(name, 0.7, drawn(), renderer=load("renderer", "dist"), conditions=few)
-    assert fits == [0.7, FIT.offset]
-
-
 def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
     held = replace(conditions(), limits=Limits(1, 8))
     assert stress_named("thin_plate").trial(load("renderer", "idr"), 0.0, 0, held).failure is Failure.TIMEOUT
@@ -302,14 +293,6 @@ def test_the_interval_of_a_noisy_breakdown_holds(width, least):
         holds += result.low <= middle <= result.high
         assert len(search.trials) <= search.max_trials
     assert holds / 20 >= least
-
-
-@each("succeeds, end", [(True, 32), (False, 0)])
-def test_an_end_without_a_breakdown_is_tried_repeatedly(succeeds, end):
-    search = searched(DESK, lambda level: succeeds)
-    result = search.result()
-    assert result.low > 1 if succeeds else result.high < 0
-    assert search.trials.count((end, succeeds)) >= DESK.repeats
 
 
 def bisected(succeeds, levels: int = 33) -> Bisection:

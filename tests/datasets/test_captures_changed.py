@@ -1,4 +1,4 @@
-"""Photographs that cannot be used are refused with their cause: common mistakes in each format."""
+"""Photographs as people write them: read with the same cameras, or refused with their cause, in each format."""
 
 import re
 import shutil
@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from datasets.files.captures.frames import OPENGL
 from datasets.files.own_photographs import ReadSettings, read_capture
 from renderers.checks import BadInput
 from tests.made_photographs import (
+    FOCAL,
+    MIDDLE,
     PLAIN,
     READ,
     SIZE,
@@ -23,12 +26,14 @@ from tests.made_photographs import (
     middlebury,
     moved,
     nerf,
+    off,
     renamed,
     repainted,
     rewritten,
 )
 
 Spoil = Callable[[Path], object]
+IMAGES, MATRICES, LINES = "sparse/0/images.txt", "cameras_sphere.npz", "ball_par.txt"
 FIFTH = slice(4, 5)
 
 
@@ -68,9 +73,15 @@ def masks(change: Callable[[np.ndarray], np.ndarray], selected: slice = slice(No
     return lambda folder: repainted(sorted((folder / "mask").iterdir())[selected], change)
 
 
-def text(name: str, old: str, new: str) -> Spoil:
+def text(name: str, old: str, new: str | Callable[[re.Match], str]) -> Spoil:
     """Replaces the matches of a pattern."""
-    return lambda folder: (folder / name).write_text(re.sub(old, new, (folder / name).read_text()))
+
+    def replaced(folder: Path) -> None:
+        content, count = re.subn(old, new, (folder / name).read_text())
+        assert count
+        (folder / name).write_text(content)
+
+    return replaced
 
 
 def rotated(folder: Path) -> None:
@@ -81,11 +92,93 @@ def rotated(folder: Path) -> None:
         Image.open(file).transpose(Image.Transpose.ROTATE_90).save(file, exif=exif)
 
 
+def without_focal_length(**values) -> Spoil:
+    return stored(lambda data: data.update(fl_x=None, fl_y=None) or data.update(values))
+
+
+def own_cameras(folder: Path) -> None:
+    """Each frame has the camera, and the head of the file has another one."""
+    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    changed(folder, lambda data: [frame.update({key: data[key] for key in keys}) for frame in data["frames"]])
+    wrong = {"fl_x": 1.0, "fl_y": 1.0, "camera_angle_x": 1.0, "y_fov": 9.0, "intrinsic_matrix": np.eye(3).tolist()}
+    changed(folder, lambda data: data.update(wrong, cx=0.0, cy=0.0))
+
+
+def flagged(axes: np.ndarray, **flag: bool) -> Spoil:
+    """Other axes of the cameras, with the flag that says so."""
+    return lambda folder: (moved(folder, lambda matrix: matrix @ axes), changed(folder, lambda data: data.update(flag)))
+
+
+def other_models(folder: Path) -> None:
+    """A model of four images, before the whole one; and an image without a camera."""
+    shutil.copytree(folder / "sparse" / "0", folder / "sparse" / "1")
+    lines = (folder / IMAGES).read_text().splitlines()
+    (folder / IMAGES).write_text("\n".join(lines[:8]) + "\n")
+    for name in ("images", "mask"):
+        shutil.copy(folder / name / "003.png", folder / name / "100.png")
+
+
+def files_of_a_mac(folder: Path) -> None:
+    for file in [*folder.rglob("*.png")]:
+        file.with_name(f"._{file.name}").write_bytes(b"AppleDouble")
+
+
+def doubled(match: re.Match) -> str:
+    """A line with a quaternion of twice the length."""
+    return f"{match[1]} {' '.join(str(2 * float(number)) for number in match[2].split())}"
+
+
+ANGLES = [2 * np.arctan(SIZE[1 - i] / 2 / FOCAL) for i in (0, 1)]  # fields of view, across and down
+MATRIX = [[FOCAL, 0, MIDDLE[0], 0], [0, FOCAL, MIDDLE[1], 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])  # x left, y up, z forward
+INTRINSICS = {f"camera_mat_{i}": np.diag([FOCAL, FOCAL, 1.0, 1.0]) for i in range(10)}
+UNREAD = "has keys that are not read, {}: if they describe a lens"
+LENS_KEYS = ("s1", "ftheta_p0", "equirectangular", "distortion", "K1", "camera_type", "lens", "rolling_shutter")
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
 FETCH = "is a Git LFS pointer; fetch it with 'git lfs pull'"
-IMAGES, MATRICES, LINES = "sparse/0/images.txt", "cameras_sphere.npz", "ball_par.txt"
 TRANSPOSED = [[80.0, 0, 0], [0, 80, 0], [20, 15, 1]]
 WIDE, FLAT = np.diag([2.0, 2.0, 1.0, 1.0]), np.diag([1.0, 1.0, 0.7, 1.0])
+READ_ALIKE = {  # a change that keeps the cameras, and a part of the note on it
+    idr: [
+        (files_of_a_mac, ""),
+        (cameras(lambda data: {key: data[key] for key in data if key[:5] == "world" or key[-2:] == "_0"}),
+         "scale_mat_0 is that of all cameras: 9 have none"),
+        (cameras(lambda data: data | {"dist_": [0.1], "world_mat_inv_0": np.eye(4)}), UNREAD.format("dist_")),
+        (cameras(lambda data: data | INTRINSICS), ""),
+        (lambda f: (cameras(lambda data: data | INTRINSICS)(f), (f / MATRICES).rename(f / "cameras.npz")), ""),
+    ],
+    nerf: [
+        (own_cameras, ""),
+        (without_focal_length(camera_angle_x=ANGLES[0], camera_angle_y=ANGLES[1]), ""),
+        (without_focal_length(camera_angle_y=ANGLES[1]), ""),
+        (without_focal_length(x_fov=np.degrees(ANGLES[0])), ""),
+        (without_focal_length(intrinsic_matrix=MATRIX), ""),
+        (without_focal_length(fl_x=FOCAL, w=None, h=None), "transforms.json states no w and h"),
+        (flagged(OPENGL, from_na=True), ""),
+        (flagged(MITSUBA, from_mitsuba=True), ""),
+        (poses(lambda matrix: matrix.round(6)), ""),
+        *((frame_3(**{key: 0.1, "rotation": 0.01}), UNREAD.format(key)) for key in LENS_KEYS),
+    ],
+    middlebury: [(text(LINES, r"^10\n", ""), "")],
+    colmap: [
+        (other_models, "no camera for 1 of the images, such as 100.png"),
+        (other_models, "sparse/1 with 10 images is taken, not sparse/0 with 4"),
+        (text(IMAGES, r"(?m)^(\d+) (\S+ \S+ \S+ \S+)", doubled), ""),
+        (text(IMAGES, "png\n\n", "png\n1.5 2.5 -1 3e1 4.5 -1\n"), ""),
+        (text(IMAGES, "\n", "\r\n"), ""),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("write, change, note", [(write, *row) for write, rows in READ_ALIKE.items() for row in rows])
+def test_cameras_stay_those_that_were_written(tmp_path, write, change, note):
+    write(tmp_path)
+    change(tmp_path)
+    capture = read_capture(tmp_path, READ if note else PLAIN)
+    assert off(capture) < 0.01 and len(capture.shots) == 10
+    assert any(note in line for line in capture.notes) if note else capture.notes == ()
+
+
 REFUSED = {
     idr: [
         (removed(MATRICES), r"has no cameras that are known.*transforms\.json.*poses_bounds\.npy"),
