@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from pkgutil import iter_modules
+from pkgutil import walk_packages
 from typing import Any
 
 import psutil
@@ -78,7 +78,7 @@ def run_isolated(request: RunRequest, limits: RunLimits, receive: Callable[[Mess
 def preloaded_modules() -> list[str]:
     """Slow modules that runs import; bench first, because it sets variables that torch reads at its import."""
     packages = bench.tasks, datasets
-    names = [module.name for package in packages for module in iter_modules(package.__path__, f"{package.__name__}.")]
+    names = [module.name for package in packages for module in walk_packages(package.__path__, f"{package.__name__}.")]
     return ["bench", "open3d", "bench.runner.execute", *names]
 
 

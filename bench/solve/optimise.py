@@ -233,7 +233,7 @@ def _update_status(history: History, parameters: list[Tensor], least_reference: 
     iteration = history.curve[-1]["iteration"]
     (largest,) = _to_floats([_largest(parameters)])
     if history.status is RunStatus.OK and not isfinite(largest):
-        history.status, history.reason = RunStatus.NAN, f"a parameter is not a number at iteration {iteration}"
+        history.status, history.reason = RunStatus.NAN, f"a parameter is not finite at iteration {iteration}"
     elif loss > DIVERGENCE_FACTOR * first:
         history.status = RunStatus.DIVERGED
         initial = history.curve[0]["total"]
@@ -255,7 +255,7 @@ class StartSettings:
     trial: int
 
     def __post_init__(self) -> None:
-        check_at_least("task.starts", self.count, 1, "1 is a single start; conf/method has rows with more")
+        check_at_least("task.starts", self.count, 1, "1 is a single start; conf/methods.yaml has rows with more")
         check_at_least("task.trial", self.trial, 1, "8 separate good starts from bad ones")
 
     @property

@@ -216,7 +216,7 @@ def test_a_parameter_that_is_nan_ends_the_loop():
             return {"total": (self.radius - 1.0).abs().sqrt()}  # 0 with an infinite slope at the start
 
     history = go(Cornered())
-    assert history.status is RunStatus.NAN and history.reason == "a parameter is not a number at iteration 0"
+    assert history.status is RunStatus.NAN and history.reason == "a parameter is not finite at iteration 0"
     assert len(history.curve) == 1
 
 

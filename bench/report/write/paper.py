@@ -279,13 +279,15 @@ def key_of(name: str) -> str:
 
 
 def _short(answer: str) -> str:
-    """The first sentence of an answer; a longer one ends after a clause, or else after so many words."""
+    """The first sentence of an answer; a longer one ends after a clause with a number, or else after so many words."""
     sentence = re.split(r"(?<=[.!?]) (?=[A-Z])", answer)[0]
     ends = [word.end() for word in re.finditer(r"\w(\S*\w)?", sentence)]
     if len(ends) <= MAX_ANSWER_WORDS:
         return sentence
     start = sentence[: ends[MAX_ANSWER_WORDS - 1]]
-    return f"{start.rpartition('; ')[0]}; ..." if "; " in start else f"{start} ..."
+    outside = re.sub(r"\([^()]*\)?", lambda inner: " " * len(inner[0]), start)  # commas in parentheses end no clause
+    clauses = [start[: outside.rfind(mark)] for mark in ("; ", ": ", ", ") if mark in outside]
+    return next((f"{clause}." for clause in clauses if re.search(r"\d", clause)), f"{start} ...")
 
 
 def _line(page: Page) -> str:
