@@ -49,6 +49,11 @@ class MeshProxy(SurfaceRenderer):
         check_at_least("grid", self.grid, 4, "96 has cells of .02 scene units")
         check_at_least("ray_samples", self.ray_samples, 2, "64 are a sample a cell and a half")
 
+    @property
+    def accuracy(self) -> float:
+        """The error of a hit times the cosine of its incidence, in scene units: the grid's spacing; for tests."""
+        return 2 * self.sphere_radius / (self.grid - 1)
+
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Makes the mesh without a graph, casts the rays, then attaches the gradient of the triangles."""
         flat = rays.flat()

@@ -108,7 +108,7 @@ def _verdict(runs: Runs) -> str:
         shares,
         conditions.shapes_text(misplaced),
         show=table.percent,
-        most=True,
+        largest_first=True,
     )
 
 

@@ -32,7 +32,7 @@ def make(runs: Runs) -> Result:
         "folder and the median.",
         question="Which method is best on real photographs?",
         verdict=format.ends(
-            "PSNR of held-out photographs (dB)", medians.comparable_medians(lines, "psnr"), folders, most=True
+            "PSNR of held-out photographs (dB)", medians.comparable_medians(lines, "psnr"), folders, largest_first=True
         ),
         remarks=records.definitions(runs.records, DEFINED),
         columns=(table.text("method", "Method"), *truth_columns, *COLUMNS),

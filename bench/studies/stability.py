@@ -76,7 +76,7 @@ def make(runs: Runs) -> Result:
             cells.groupby("row", sort=False)["never"].sum().to_dict(),
             f"{trials:.0f} trials on {len(axes)} axes",
             show=table.integer,
-            most=True,
+            largest_first=True,
         ),
         n=f"{trials:.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
         interval="95 % credible intervals, the milder end first",

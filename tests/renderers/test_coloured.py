@@ -4,12 +4,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers.field import Field, Kind, Meter, autograd_gradients
+from renderers.field import Coloured, Field, Kind, Meter, autograd_gradients
 from renderers.fields.networks import coloured
 from renderers.fields.networks.coloured import (
     COLOUR_LOGIT_SCALE,
     LOGIT_WIDTH,
-    Coloured,
     ColouredDistance,
     ColouredGrid,
     ColouredOccupancy,

@@ -25,6 +25,7 @@ from bench.setup.inputs import RunContext, RunInputs
 from bench.solve import solve
 from bench.solve.optimise import History, OptimiserSettings
 from datasets.scene import Scene
+from renderers.fields.analytic import sphere
 from renderers.rendering import Unsupported
 from tests.looped import each
 from tests.report.page_data import Page
@@ -235,9 +236,17 @@ def test_each_line_of_the_curve_is_json_and_written_at_once(tmp_path):
 )
 def test_checkpoints_have_the_chamfer_distance_and_cost_no_runtime(clock, tmp_path, interval, iterations, checkpoints):
     class Slow(Toy):
+        observed = torch.ones(1, 1, dtype=torch.bool)
+
         def loss(self, iteration):
             clock.sleep(1.0)
             return super().loss(iteration)
+
+        def field(self):
+            return sphere(self.radius.detach())
+
+        def objective(self):
+            return None
 
     toy = Slow()
     radii = []
