@@ -10,7 +10,7 @@ import pytest
 import bench.studies
 from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
-from bench.report.data.runs import choose
+from bench.report.data.runs import Selection, choose
 from bench.report.write import paper
 from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.paper import find_paper, papers, studies, write_paper
@@ -126,6 +126,15 @@ def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path,
 def test_every_study_can_be_read_and_has_pages_of_its_own():
     assert [study.problem for study in studies() if study.problem or not study.reads] == []
     assert sum(len(study.pages) for study in studies()) >= 23
+
+
+@each("conditions, resolutions", [((), [32]), (("view.resolution",), [16, 32])])
+def test_sizes_are_cells_of_a_row_if_the_study_says_so(tmp_path, conditions, resolutions):
+    for minute, resolution in enumerate((16, 32)):
+        settings = {"view": {"resolution": resolution}}
+        write_run(tmp_path, "sizes", DYNAMIC, metrics=costs(), minute=minute, settings=settings)
+    runs = choose(read_records(tmp_path)[0], Selection("sizes", conditions), tmp_path)
+    assert sorted(record["config"]["view"]["resolution"] for record in runs.records) == resolutions
 
 
 def test_a_run_that_failed_stays_a_row_and_the_newest_of_a_cell_counts(tmp_path):

@@ -286,7 +286,8 @@ def _row_key(record: Record) -> Hashable:
 def _row_settings(record: Record, selection: Selection) -> Any:
     """The settings of a row: renderer, task and silhouette loss without conditions, and the resolution."""
     settings = [_without_conditions(record, key, selection) for key in ("renderer", "task", "silhouette")]
-    return [*settings, setting(record["config"], "view", "resolution")]
+    resolution = None if "view.resolution" in selection.conditions else setting(record["config"], "view", "resolution")
+    return [*settings, resolution]
 
 
 def _cell_key(record: Record, selection: Selection) -> Hashable:

@@ -129,7 +129,7 @@ def write_paper(
                 (name, result, result.shown(100 * study.order + number, experiments))
                 for number, (name, result) in enumerate(results.items())
             ]
-        except RECORD_ERRORS as error:
+        except Exception as error:
             if problems is None:
                 raise
             description = f"{', '.join(study.pages)} ({type(error).__name__}: {error})"

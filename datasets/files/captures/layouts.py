@@ -21,8 +21,13 @@ READ_ERRORS += (RuntimeError,)
 @cache
 def known_formats() -> list[Format]:
     """The formats of the files in `captures/formats`, in the order in which they are tried."""
-    modules = [import_module(f"{formats.__name__}.{module.name}") for module in iter_modules(formats.__path__)]
-    return sorted((module.FORMAT for module in modules), key=lambda format: format.rank)
+    listed = []
+    for module in iter_modules(formats.__path__):
+        try:
+            listed.append(import_module(f"{formats.__name__}.{module.name}").FORMAT)
+        except (ImportError, AttributeError, SyntaxError) as error:
+            raise BadInput(f"captures/formats/{module.name}.py cannot be used: {error}") from error
+    return sorted(listed, key=lambda format: format.rank)
 
 
 def find_layout(folder: Path, images: str | None = None, *, masks: bool = True) -> Layout:
