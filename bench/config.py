@@ -93,7 +93,7 @@ class EvaluationSettings:
 
 @dataclass
 class Config:
-    """The top level of conf/config.yaml. Nodes of type Any are built by `build` from their `_target_`."""
+    """The top level of conf/config.yaml. `build` makes the objects of nodes, by `_target_` or `CLASS_OF_NODE`."""
 
     task: Any = MISSING
     renderer: Any = MISSING

@@ -36,7 +36,7 @@ def main(request: RunRequest, channel: Connection, parent: Connection) -> None:
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:
-        execute(request, progress=_Progress(channel), checkpoint=channel.send)
+        execute(request, progress=_Progress(channel), save_record=channel.send)
     except KeyboardInterrupt:
         channel.send(request.record)  # as far as it is filled; then ends by SIGTERM, so that the exit code is right
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -46,11 +46,11 @@ def main(request: RunRequest, channel: Connection, parent: Connection) -> None:
 
 
 @environment.flushing_denormals()
-def execute(request: RunRequest, *, progress: Report, checkpoint: Callable[[Record], None]) -> None:
+def execute(request: RunRequest, *, progress: Report, save_record: Callable[[Record], None]) -> None:
     """Runs a request; its record gets a status, and a reason if that is not ok.
 
     Args:
-        checkpoint: receives the record as soon as the machine is known.
+        save_record: receives the record as soon as the machine is known.
 
     Raises:
         KeyboardInterrupt: if the run was stopped; the record is filled as far as possible.
@@ -66,7 +66,7 @@ def execute(request: RunRequest, *, progress: Report, checkpoint: Callable[[Reco
         inputs = prepared.inputs
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
-        checkpoint(record)
+        save_record(record)
         try:
             prepared.task.execute(RunContext(inputs, folder, record, progress))
         finally:

@@ -170,7 +170,7 @@ def _execute(request: RunRequest, limits: RunLimits, progress: Report, on_ready:
     if request.record.config["isolation"] == Isolation.off:
         from bench.runner.execute import execute  # imports torch, which a launcher's worker does not need
 
-        execute(request, progress=progress, checkpoint=lambda record: record.write(request.folder))
+        execute(request, progress=progress, save_record=lambda record: record.write(request.folder))
         return
 
     def receive(message: messages.Message) -> None:

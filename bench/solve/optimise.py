@@ -78,7 +78,7 @@ class Optimisable(Protocol):
 
 
 @dataclass
-class FirstChecked:
+class WithCheckedHits:
     """A problem that checks the hits of its renderings at the first loss, the warm-up of `optimise`.
 
     The check evaluates the field once. This is neither counted nor timed.
@@ -323,7 +323,6 @@ class Starts:
         return True
 
     def _score(self, start: int) -> float:
-        """The mean loss of a start at the end of a round; infinite if it is NaN."""
+        """The mean loss of a start at the end of a round; infinite after `give_up`."""
         last = [self.losses[start][step] for step in range(max(self.steps_before - SCORED_STEPS, 0), self.steps_before)]
-        mean = float(torch.stack(last).mean())
-        return inf if isnan(mean) else mean
+        return float(torch.stack(last).mean())

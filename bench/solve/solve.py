@@ -19,7 +19,7 @@ from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.optimise import CannotContinue, FirstChecked, History, Optimisable, OptimiserSettings, optimise
+from bench.solve.optimise import CannotContinue, History, Optimisable, OptimiserSettings, WithCheckedHits, optimise
 from datasets.mesh import Mesh
 from datasets.saved_field import FIELD_FILE, save_field
 from datasets.scene import Scene
@@ -259,7 +259,7 @@ def run_optimisation(
             check(0)
         try:
             note_objective()
-            checked = FirstChecked(problem, notes)
+            checked = WithCheckedHits(problem, notes)
             optimise(
                 checked, settings, run.inputs.device, history=history, on_step=on_step, least_reference=least_reference
             )
@@ -273,7 +273,7 @@ def run_optimisation(
 
 
 def checkpoints_of(interval: int | str | None, iterations: int) -> set[int]:
-    """The iterations, counted from 0, before which the current state is evaluated, with the first and the last."""
+    """The numbers of steps taken when the state is evaluated: 0, all but one, and some between."""
     if interval is None:
         return set()
     last = iterations - 1

@@ -11,11 +11,11 @@ from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import (
     DIVERGENCE_FACTOR,
-    FirstChecked,
     History,
     OptimiserSettings,
     Starts,
     StartSettings,
+    WithCheckedHits,
     optimise,
 )
 from renderers.boundary import render_checked
@@ -174,7 +174,7 @@ def checked(how: str, problem: type[RenderedSphere] = RenderedSphere) -> tuple[R
     """Runs a loop that checks the hits of its first loss; gives the problem, the history and the notes."""
     notes: list[str] = []
     instance = problem(renderer=WrongHits(how) if how else load("renderer", "dist"))
-    return instance, go(FirstChecked(instance, notes), 3), notes
+    return instance, go(WithCheckedHits(instance, notes), 3), notes
 
 
 def test_the_first_hits_are_checked_once_and_neither_counted_nor_changed():

@@ -36,7 +36,7 @@ def run(folder, compose_config, *overrides: str) -> Record:
     """The record of a run in this process, and its files in the folder."""
     config = compose_config(*TINY, *overrides)
     record = Record("id", "task", "dist", config.dataset.name, 0, plain(config))
-    execute(RunRequest(folder, record), progress=silent, checkpoint=lambda record: None)
+    execute(RunRequest(folder, record), progress=silent, save_record=lambda record: None)
     return record
 
 
