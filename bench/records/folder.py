@@ -75,8 +75,12 @@ class Identity:
         listed = [str(package) for package in self.config.get("packages") or []] if self._user_packages else []
         packages = sorted({*listed, *self._user_packages} - {*OUR_PACKAGES})  # a class may import a listed package
         dataset = self.config.get("dataset") or {}
-        deep = () if "synset" in dataset else ("path", "images")  # a folder of ShapeNet has thousands of folders
-        inputs = [(path, key in deep) for key in INPUT_FILE_KEYS for path in _values_of_key(self.config, key)]
+        shapenet = dataset["path"] if "synset" in dataset else None  # thousands of folders: only counted
+        inputs = [
+            (path, key in ("path", "images") and path != shapenet)
+            for key in INPUT_FILE_KEYS
+            for path in _values_of_key(self.config, key)
+        ]
         for split in map(Path, _values_of_key(dataset, "split")):  # a list of shapes, with others in the same folder
             inputs += [(str(path), False) for path in sorted(split.parent.glob(f"*{split.suffix or split.name}"))]
         files = [_file_hash(Path(path), deep=is_deep) for path, is_deep in inputs]

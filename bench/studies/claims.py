@@ -203,7 +203,7 @@ CLAIMS = (
         "stereo_5", SEEN_ERROR,
     ),
     Claim(
-        "DVR, Table 2", "depth improves on RGB", 
+        "DVR, Table 2", "depth improves on RGB",
         lambda: DVR_TABLE2["DVR (RGB and depth)"][-1] / DVR_TABLE2["DVR (RGB)"][-1],
         "dvr_table2", "dvr_paper_depth", "dvr_paper", SEEN_ERROR,
     ),

@@ -7,10 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from renderers.field import Bounds, Field, Wrapper, field_bounds
+from renderers.field import Bounds, Field, Vectors, Wrapper, field_bounds
 from renderers.fields.mlp import BoundDecoder, Decoder
-
-Vectors = Float[Tensor, "*batch 3"]
 
 
 class TexturedDecoder(nn.Module):

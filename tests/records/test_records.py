@@ -135,6 +135,22 @@ def test_a_run_is_another_one_if_a_photograph_in_a_folder_of_its_dataset_has_cha
     assert code("before") == code("before") != code("after")
 
 
+def test_the_network_of_a_prior_counts_beside_a_folder_of_shapenet(tmp_path):
+    weights = tmp_path / "deepsdf" / "ModelParameters" / "latest.pth"
+    weights.parent.mkdir(parents=True)
+    names = {"task": "completion", "renderer": "dist", "dataset": "shapenet"}
+    config = {
+        "dataset": {"path": str(tmp_path / "shapes"), "synset": "sofa"},
+        "prior": {"path": str(tmp_path / "deepsdf")},
+    }
+
+    def code(text: str) -> str:
+        weights.write_text(text)
+        return Identity(names, config).code
+
+    assert code("before") == code("before") != code("after")
+
+
 def test_a_package_is_in_the_identity_of_runs_with_a_class_of_the_user():
     names = {"task": "completion", "renderer": "dist", "dataset": "sofa"}
 

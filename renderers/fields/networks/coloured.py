@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Flops, Kind, OccupancyField
+from renderers.field import Flops, Kind, OccupancyField, Vectors
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import flops_of, split_into_passes
 from renderers.fields.networks.occupancy import BoundOccupancy, OccupancyNetwork
@@ -22,7 +22,6 @@ DIRECTION_OCTAVES = 2  # see `positional_encoding`
 LOGIT_WIDTH = 0.1  # scene units over which the initial occupancy logit changes by 1
 OCCUPANCY_THRESHOLD = 0.5  # tau in DVR
 COLOUR_LOGIT_SCALE = 20.0  # makes one step size of Adam suit the colours and the distances of a grid
-Vectors = Float[Tensor, "*batch 3"]
 
 
 class ColouredDistance(nn.Module):
