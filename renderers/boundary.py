@@ -13,7 +13,7 @@ from renderers.checks import BrokenContract
 from renderers.field import Field, Meter, carries_gradient
 from renderers.hits import record_hits
 from renderers.rendering import RayObservation, Renderer, Rendering, UsesDistances
-from renderers.waits import LazyCount
+from renderers.tracing.waits import LazyCount
 
 RENDERING_TENSORS = ("distance", "status", "points", "residual", "closest")
 GRADIENT_TARGETS = {"field_gradient": "the field's parameters", "ray_gradient": "the rays"}

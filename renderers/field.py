@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import rigid
-from renderers.waits import LazyCount, active_mask
+from renderers.tracing.waits import LazyCount, active_mask
 
 EVALUATIONS_PER_BOUND = 3  # bounds on a segment multiply by a network's weights three times; see `fields.affine`
 GRADIENT_COST, COARSE_COST = 2.0, 0.125  # as multiples of a field evaluation; see `Counts.cost`
@@ -171,8 +171,8 @@ class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
 
     `coarse` are points whose value was computed by `Coarse`; `value` does not include them. `masked` are points of
-    finished rays, whose values, coarse or not, were thrown away (`waits.evaluate_masked`); no other count includes
-    them. `hits` are the hits of all renderings of the metered field by `boundary.render_checked`.
+    finished rays, whose values, coarse or not, were thrown away (`tracing.waits.evaluate_masked`); no other count
+    includes them. `hits` are the hits of all renderings of the metered field by `boundary.render_checked`.
     """
 
     value: int = cast(int, LazyCount())

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import PointFunction
-from renderers.march import ResolutionPair, ray_pyramid
-from renderers.waits import compaction_interval, evaluate_masked
+from renderers.tracing.bracket import Bracket
+from renderers.tracing.march import ResolutionPair, ray_pyramid
+from renderers.tracing.waits import compaction_interval, evaluate_masked
 
 MAX_STEPS_PER_LEVEL = 5  # more steps are wasted near silhouettes, where both the coarse and the fine ray advance slowly
 PARENT_SPHERE_FACTOR = 2.0  # coarse rays stop while their empty sphere is this many times the distance to finer rays

@@ -4,11 +4,11 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from renderers import waits
 from renderers.boundary import RENDERING_TENSORS, render_checked
 from renderers.field import Coarse, Counts, Flops, Kind, Meter
 from renderers.fields.analytic import torus
 from renderers.rendering import Renderer, Rendering, with_empty_memory
+from renderers.tracing import waits
 from tests.looped import each
 from tests.tiny import camera_of
 
