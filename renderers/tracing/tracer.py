@@ -138,8 +138,8 @@ class Tracer:
             restarted = table.select(index).restarted(doubtful, resumes, radius=self.sphere_radius)
             march_table(field, doubtful, restarted, self.stride(), COARSE_STEP_FACTOR * self._max_steps(field))
         second = self._crossings(field, doubtful, restarted).reindexed(index)
-        table.scatter(index, restarted)
-        table.path_clearance -= error
+        table.replace_rays(index, restarted)
+        table.path_clearance = table.path_clearance - error
         return first.select(certain[first.index]).concatenate(second)
 
     def _solve_near_hits(self, field: Field, rays: Rays, table: RayTable) -> "Crossings":
@@ -226,7 +226,7 @@ class Tracer:
         searched.update_smallest_sample(nearest, smallest)
         inside = value[:, 0] < 0
         searched.stop = torch.where(inside, Stop.INSIDE, searched.stop)
-        table.table[index] = searched.table
+        table.replace_rays(index, searched)
         spacing = (searched.leave - start) / (self.search_samples - 1)
         resampled = ((smallest < spacing / 2) & ~inside).nonzero().squeeze(-1)
         low, high = torch.maximum(nearest - spacing, start), torch.minimum(nearest + spacing, searched.leave)

@@ -207,7 +207,7 @@ def _solve_cached(tracer: Tracer, memory: Memory, field: Field, rays: Rays, cach
         differing = compared & _differing(solved, marched, compared)
         if memory.audit(*torch.stack([compared.sum(), differing.sum()]).tolist()):
             return None
-        table.scatter(index, marching)
+        table.replace_rays(index, marching)
         marched_at = cache.movement_when_marched
         marched_at[index] = torch.where(resumes[index], marched_at[index], cache.total_movement)
     return solved.select((certain & ~audited)[solved.index]).concatenate(marched)
