@@ -45,11 +45,8 @@ RC = {
 # For pictures in run folders, which are viewed on a screen: larger type, no grid.
 SCREEN = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
 SCREEN_DPI = 110  # pixels per inch
-# Pixels in the true silhouette only, in the rendered silhouette only, in both, in neither; pixels with a wrong surface.
-MISSED, SPURIOUS, BOTH, PAPER, WRONG = "#d6262b", "#1f77b4", "#d1d1d1", "#ffffff", "#f2a600"
-# Colours of kinds of pixels; a stress test's images.npz stores the index of the kind. Names for readers, if different.
-PIXELS = {"background": PAPER, "right": BOTH, "lost": MISSED, "false": SPURIOUS, "wrong surface": WRONG}
-PIXEL_NAMES = {"lost": "missed", "false": "spurious"}
+# Pixels in the true silhouette only, in the rendered silhouette only, in both, in neither.
+MISSED, SPURIOUS, BOTH, PAPER = "#d6262b", "#1f77b4", "#d1d1d1", "#ffffff"
 
 
 @dataclass(frozen=True)
