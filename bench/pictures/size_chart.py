@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from bench.pictures import style
+from bench.pictures import figure_style, style
 
 KINDS = {  # from the beginning of a candidate's name to label, colour and marker
     "network": ("networks", "#0072b2", "s"),
@@ -107,4 +107,4 @@ def _panels(axes: np.ndarray, candidates: Candidates) -> None:
         axis.set(xscale="log", yscale="log", xlabel=AXES[key])
         style.log_axis(axis, "y", [result.error for result in fitted])
     axes[0].set_ylabel("held-out error (scene units)")
-    style.legend_below(axes[0].figure, axes[-1])
+    figure_style.legend_below(axes[0].figure, axes[-1])

@@ -77,7 +77,7 @@ class RayTable:
         free_value: that value; infinite before the first.
         entry: to the ray's start.
         leave: to where it leaves the sphere.
-        stop: a Stop.
+        stop: a Stop, as a floating-point number like all columns.
         path_clearance: a lower bound of the field along the path so far, except on the final descent. It is the
             smallest value at which this ray, or its coarse ray, turned from falling to rising; for the coarse ray minus
             the distance between the two.
@@ -175,7 +175,7 @@ class RayTable:
         inside = (value < 0) & self.free_value.isinf() & (self.distance <= self.entry)
         stop = torch.where(inside, Stop.INSIDE, torch.where(value < -epsilon, Stop.CROSSED, Stop.NEAR_SURFACE))
         stop = torch.where(self.distance > self.leave, Stop.LEFT, stop)
-        self.stop = torch.where(value.isfinite(), stop, Stop.NOT_FINITE)
+        self.stop = torch.where(value.isfinite(), stop, Stop.NOT_FINITE).to(value.dtype)
         self.value = value.nan_to_num(0.0, 0.0, 0.0)
 
     def advance(self, value: Float[Tensor, " n"], stride: Stride) -> tuple["RayTable", Bool[Tensor, " n"]]:
