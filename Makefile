@@ -25,7 +25,7 @@ benchmark: .venv/ready-dev ## renderers in turn, then speed and memory against t
 	$(BIN)/python -m bench.report
 	$(BIN)/python -m pytest -o addopts="-q -s -p no:dash" tests/benchmarks
 
-mutants: .venv/ready-dev ## installs mutmut, then changes the code in one place at a time (a night); ONLY='renderers.bracket*'
+mutants: .venv/ready-dev ## installs mutmut, then changes the code in one place at a time (a night); ONLY='renderers.tracing.bracket*'
 	@.ci/setup mutants
 	$(BIN)/mutmut run $(if $(ONLY),'$(ONLY)')
 	$(BIN)/mutmut results

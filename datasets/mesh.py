@@ -1,6 +1,6 @@
 """The triangle mesh, and its extraction from a field."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -173,13 +173,6 @@ class Mesh:
         if self.colours is not None:
             vertices["colour"] = (255 * self.colours.clip(0, 1)).round()
         path.write_bytes(header.encode("ascii") + vertices.tobytes() + faces.tobytes())
-
-
-def concatenate_meshes(meshes: Sequence[Mesh]) -> Mesh:
-    """Concatenates meshes into one, without colours."""
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)]
-    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def normalise(mesh: Mesh, radius: float) -> Mesh:

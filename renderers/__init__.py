@@ -1,18 +1,23 @@
 """Differentiable renderers of implicit surfaces (implicit-bench): from a field and rays to a rendering."""
 
+from typing import TYPE_CHECKING, Any
+
 from renderers.camera import Camera, Rays
 from renderers.dist import DIST
 from renderers.dvr import DVR
 from renderers.field import Field, Kind, Meter
 from renderers.idr import IDR
+from renderers.later.neus import NeuS
+from renderers.later.range_analysis import RangeAnalysis
+from renderers.later.relaxed_boundary import RelaxedBoundary
+from renderers.later.unisurf import UNISURF
+from renderers.later.volsdf import VolSDF
 from renderers.naive import Naive
 from renderers.newton import Newton
-from renderers.range_analysis import RangeAnalysis
-from renderers.relaxed_boundary import RelaxedBoundary
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
-from renderers.volumes.neus import NeuS
-from renderers.volumes.unisurf import UNISURF
-from renderers.volumes.volsdf import VolSDF
+
+if TYPE_CHECKING:
+    from renderers.later.mesh_proxy import MeshProxy
 
 __all__ = [
     "DIST",
@@ -23,6 +28,7 @@ __all__ = [
     "Capabilities",
     "Field",
     "Kind",
+    "MeshProxy",
     "Meter",
     "Naive",
     "NeuS",
@@ -35,3 +41,12 @@ __all__ = [
     "Status",
     "VolSDF",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Imports MeshProxy at its first use: open3d and scikit-image take more than a second."""
+    if name == "MeshProxy":
+        from renderers.later.mesh_proxy import MeshProxy
+
+        return MeshProxy
+    raise AttributeError(f"module 'renderers' has no attribute {name!r}")

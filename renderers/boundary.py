@@ -13,7 +13,6 @@ from renderers.checks import BrokenContract
 from renderers.field import Field, Meter, carries_gradient
 from renderers.hits import record_hits
 from renderers.rendering import RayObservation, Renderer, Rendering, UsesDistances
-from renderers.waits import LazyCount
 
 RENDERING_TENSORS = ("distance", "status", "points", "residual", "closest")
 GRADIENT_TARGETS = {"field_gradient": "the field's parameters", "ray_gradient": "the rays"}
@@ -36,7 +35,7 @@ def render_checked(renderer: Renderer, field: Field, rays: Rays) -> Rendering:
     if (capability := _missing_gradient(renderer, field, rays, rendering.distance)) and bool(rendering.hit.any()):
         raise _missing_gradient_error(renderer, capability, "the distances of its hits carry")
     if isinstance(field, Meter):
-        LazyCount.add(field.counts, "hits", rendering.hit.sum())
+        field.counts.add("hits", rendering.hit.sum())
     record_hits(renderer, field, rays, rendering)
     return rendering
 

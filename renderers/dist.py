@@ -11,9 +11,9 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, estimate_lipschitz, marching_values
 from renderers.gradients import approximate_rendering
-from renderers.march import RayFront, Stepping, march_coarse_to_fine, march_front
 from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, check_kind
 from renderers.silhouette import AVERAGES, Hinge
+from renderers.tracing.march import RayFront, Stepping, march_coarse_to_fine, march_front
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class DIST:
     Args:
         steps: maximum marching steps per ray.
         epsilon, alpha, extra_step_cap, step_clamp, active_only, careful_split, step_back, least_step, relaxation: see
-            `march.Stepping`.
+            `tracing.march.Stepping`.
         slope_samples: points at which the Lipschitz constant is estimated before the march
             (`field.estimate_lipschitz`); values are divided by it. 0 trusts the field.
         coarse_to_fine: start with one ray per 4 x 4 pixels.

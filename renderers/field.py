@@ -6,14 +6,14 @@ from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import lru_cache, partial
 from math import log
-from typing import Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from renderers.camera import rigid
-from renderers.waits import LazyCount, active_mask
+from renderers.tracing.waits import active_mask
 
 EVALUATIONS_PER_BOUND = 3  # bounds on a segment multiply by a network's weights three times; see `fields.affine`
 GRADIENT_COST, COARSE_COST = 2.0, 0.125  # as multiples of a field evaluation; see `Counts.cost`
@@ -166,27 +166,47 @@ def counted_bounds(field: Field, on_evaluate: Callable[[int], None]) -> Bounds |
     return bounds
 
 
+class LateInt:
+    """A field of a dataclass whose number a GPU may still be computing: reading it waits, `Counts.add` does not.
+
+    See "descriptor-typed fields" in Python's documentation of dataclasses. The default is 0.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.stored_name = f"_{name}"
+
+    def __get__(self, counts: Any, owner: type) -> int:
+        return 0 if counts is None else int(getattr(counts, self.stored_name))
+
+    def __set__(self, counts: Any, number: int | Tensor) -> None:
+        setattr(counts, self.stored_name, number)
+
+
 @dataclass
 class Counts:
     """Evaluations counted by a Meter: points whose value, and points whose gradient, was computed.
 
     `coarse` are points whose value was computed by `Coarse`; `value` does not include them. `masked` are points of
-    finished rays, whose values, coarse or not, were thrown away (`waits.evaluate_masked`); no other count includes
-    them. `hits` are the hits of all renderings of the metered field by `boundary.render_checked`.
+    finished rays, whose values, coarse or not, were thrown away (`tracing.waits.evaluate_masked`); no other count
+    includes them. `hits` are the hits of all renderings of the metered field by `boundary.render_checked`.
     """
 
-    value: int = cast(int, LazyCount())
-    gradient: int = cast(int, LazyCount())
-    hits: int = field(default=cast(int, LazyCount()), repr=False, compare=False)
-    coarse: int = cast(int, LazyCount())
-    masked: int = field(default=cast(int, LazyCount()), repr=False, compare=False)
+    value: int = cast(int, LateInt())
+    gradient: int = cast(int, LateInt())
+    hits: int = cast(int, LateInt())
+    coarse: int = cast(int, LateInt())
+    masked: int = cast(int, LateInt())
 
-    def add(self, name: str, points: int) -> None:
-        """Adds the active points to the counter `name`, and the points of finished rays to `masked`."""
+    def add(self, name: str, number: int | Tensor) -> None:
+        """Adds to a count, without waiting for a GPU that computes the number."""
+        vars(self)[f"_{name}"] += number
+
+    def add_points(self, name: str, points: int) -> None:
+        """Adds the active points to the count `name`, and the points of finished rays to `masked`."""
         active = active_mask(points)
         active_points = points if active is None else active.count_nonzero()
-        LazyCount.add(self, name, active_points)
-        LazyCount.add(self, "masked", points - active_points)
+        self.add(name, active_points)
+        self.add("masked", points - active_points)
 
     @property
     def cost(self) -> float:
@@ -252,7 +272,7 @@ class Meter(Wrapper):
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         values = self.inner(points)
-        self.counts.add("value", values.numel())
+        self.counts.add_points("value", values.numel())
         if values.requires_grad:
             values.register_hook(self._count_backward)
         return values
@@ -261,15 +281,15 @@ class Meter(Wrapper):
     def coarse(self) -> Coarse | None:
         """The coarse values of the field, counted separately."""
         uncounted = coarse_version(self.inner)
-        return uncounted and uncounted.with_counter(partial(self.counts.add, "coarse"))
+        return uncounted and uncounted.with_counter(partial(self.counts.add_points, "coarse"))
 
     @property
     def bounds(self) -> Bounds | None:
         """The field's bounds; each counts as `EVALUATIONS_PER_BOUND` field evaluations."""
-        return counted_bounds(self.inner, partial(self.counts.add, "value"))
+        return counted_bounds(self.inner, partial(self.counts.add_points, "value"))
 
     def _count_backward(self, gradient: Tensor) -> None:
-        LazyCount.add(self.counts, "gradient", gradient.count_nonzero())
+        self.counts.add("gradient", gradient.count_nonzero())
 
 
 @dataclass(frozen=True)

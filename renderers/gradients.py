@@ -8,8 +8,8 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field, carries_gradient
-from renderers.march import RayFront
 from renderers.rendering import Rendering, Status, assemble
+from renderers.tracing.march import RayFront
 
 
 def attach_approximate_gradient(

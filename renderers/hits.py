@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from renderers.bracket import equally_spaced
 from renderers.camera import Rays, sphere_span
 from renderers.checks import BrokenContract
 from renderers.field import Field, Meter, values_and_gradients
 from renderers.rendering import Renderer, Rendering, Status
+from renderers.tracing.bracket import equally_spaced
 
 # Scene units by which a hit may lie further off the surface than its residual. Distances that are 5 % too short from
 # 2.5 away are 0.05 to 0.1 off; hits of shipped renderers are at most 0.01 off.

@@ -8,9 +8,9 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, marching_values
 from renderers.gradients import implicit_rendering
-from renderers.march import RayFront, Stepping, march_front
 from renderers.rendering import Rendering, check_kind
 from renderers.silhouette import SurfaceRenderer
+from renderers.tracing.march import RayFront, Stepping, march_front
 
 
 @dataclass(frozen=True)

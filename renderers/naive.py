@@ -11,9 +11,9 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field
 from renderers.gradients import approximate_rendering
-from renderers.march import RayFront, Stepping, march_front
 from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, Status, assemble, check_kind
 from renderers.silhouette import AVERAGES, Hinge
+from renderers.tracing.march import RayFront, Stepping, march_front
 
 
 @dataclass(frozen=True)

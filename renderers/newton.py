@@ -11,8 +11,8 @@ from renderers.checks import check_choice, check_positive
 from renderers.field import Field
 from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, check_kind
 from renderers.silhouette import AVERAGES, Hinge
-from renderers.tracer import Tracer
-from renderers.warm import Memory, render_warm
+from renderers.tracing.tracer import Tracer
+from renderers.tracing.warm import Memory, render_warm
 
 
 @dataclass(frozen=True)

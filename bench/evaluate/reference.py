@@ -14,7 +14,7 @@ from bench.records.record import digest
 from bench.shape_prior import Prior, load_or_make
 from renderers.camera import Camera
 from renderers.field import Field, autograd_normals, estimate_lipschitz
-from renderers.reference import trace
+from renderers.tracing.reference import trace
 
 VERSION = 1  # raise it when the reference changes
 MIN_STEP = 2e-4  # scene units: thinner parts along a ray may be missed; a pixel at 512 x 512 is 4.6e-3 wide

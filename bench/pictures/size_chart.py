@@ -1,11 +1,14 @@
 """Reads the candidates of a capacity run from its metrics, and draws their errors over their costs."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
-from bench.pictures import style
+from bench.pictures import figure_style, style
 
 KINDS = {  # from the beginning of a candidate's name to label, colour and marker
     "network": ("networks", "#0072b2", "s"),
@@ -74,7 +77,16 @@ class Candidates:
         return Candidates(list(results.values()), chosen, best, measure, footprint)
 
 
-def panels(axes: np.ndarray, candidates: Candidates) -> None:
+@rc_context(style.SCREEN)
+def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
+    """Writes ladder.png into a run folder."""
+    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+    _panels(figure.subplots(1, 2, sharey=True), Candidates.of(metrics))
+    figure.suptitle(title)
+    style.save(figure, folder / "ladder.png")
+
+
+def _panels(axes: np.ndarray, candidates: Candidates) -> None:
     """Draws errors over size and over FLOPs per query, with standard errors, half a pixel and the recommendation."""
     fitted = [result for result in candidates.results if result.error is not None]
     for axis, key in zip(axes, (candidates.measure, FLOPS), strict=True):
@@ -95,4 +107,4 @@ def panels(axes: np.ndarray, candidates: Candidates) -> None:
         axis.set(xscale="log", yscale="log", xlabel=AXES[key])
         style.log_axis(axis, "y", [result.error for result in fitted])
     axes[0].set_ylabel("held-out error (scene units)")
-    style.legend_below(axes[0].figure, axes[-1])
+    figure_style.legend_below(axes[0].figure, axes[-1])

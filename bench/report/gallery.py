@@ -17,7 +17,7 @@ from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from bench.pictures import style
+from bench.pictures import figure_style, style
 from bench.records.format import plural
 from bench.report.data.records import Record, family, grouped, index, row_of
 from bench.report.data.runs import Runs
@@ -155,7 +155,7 @@ def difference_pictures(largest: float) -> Paint:
     """Paints angles to the reference's normals, up to `largest` degrees, and missed and spurious pixels."""
 
     def paint(arrays: Arrays) -> Sequence[np.ndarray]:
-        shown = style.error_colours()(np.ma.masked_invalid(angles(arrays)) / largest)[..., :3]
+        shown = figure_style.error_colours()(np.ma.masked_invalid(angles(arrays)) / largest)[..., :3]
         shown[arrays["reference_hit"] & ~arrays["hit"]] = to_rgb(style.MISSED)
         shown[arrays["hit"] & ~arrays["reference_hit"]] = to_rgb(style.SPURIOUS)
         return [shown]
@@ -185,7 +185,7 @@ def compare_with_reference(runs: Runs, max_columns: int) -> ComparedPictures:
     counts = [count_pixels(arrays) if arrays else {} for arrays in arrays_of_runs]
     all_angles = np.concatenate([np.empty(0), *(angles(arrays).ravel() for arrays in arrays_of_runs if arrays)])
     finite = all_angles[np.isfinite(all_angles)]
-    largest = style.rounded_up(float(np.percentile(finite, 99))) if finite.size else 90.0
+    largest = figure_style.rounded_up(float(np.percentile(finite, 99))) if finite.size else 90.0
     sizes = [arrays.get("size", 0) for arrays in counts]
     by_size = sorted(zip(sizes, range(len(records)), strict=True), key=lambda pair: (-pair[0], pair[1]))
     named = zip(runs.names(), sizes, strict=True)
@@ -217,7 +217,7 @@ def first_shapes(runs: Runs, max_shapes: int, presets: Sequence[str] = ()) -> Ru
     return replace(runs, records=chosen, left_out=runs.left_out + len(runs.records) - len(chosen))
 
 
-@style.styled
+@figure_style.styled
 def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = None) -> Figure:
     """Draws blocks one above the other.
 
@@ -229,7 +229,9 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
     lengths = [min(len(name), ROW_NAME_LETTERS) for block in blocks for name in block.rows]
     names = MAX_ROW_NAME_INCHES * max(lengths, default=0) / ROW_NAME_LETTERS
     columns = max([1, *(len(block.columns) for block in blocks)])
-    inches = min((style.WIDTH - bar - names) / (columns * across), MAX_COMPARED_INCHES if bar else MAX_PICTURE_INCHES)
+    inches = min(
+        (figure_style.WIDTH - bar - names) / (columns * across), MAX_COMPARED_INCHES if bar else MAX_PICTURE_INCHES
+    )
     wide = max(round(inches * across * HEADING_LETTERS_PER_INCH), 6)
     blocks = [replace(block, columns=[_wrapped(name, wide) for name in block.columns]) for block in blocks]
     heads = [0.33 + 0.12 * max((name.count("\n") for name in block.columns), default=0) for block in blocks]
@@ -276,14 +278,14 @@ def _show(axis: Axes, picture: np.ndarray, window: Window | None, corner: tuple[
     (top, left, side), (x, y) = window or ((height - 1) / 2, (width - 1) / 2, 1.0), corner
     edges = (x - left / side, x + (width - left) / side, y + (height - top) / side, y - top / side)
     # Large pictures are averaged, so that single pixels stay visible; small ones keep their pixels.
-    sharp = side * max(picture.shape[:2]) <= inches * style.RC["savefig.dpi"]
+    sharp = side * max(picture.shape[:2]) <= inches * figure_style.RC["savefig.dpi"]
     shown = axis.imshow(picture, extent=edges, interpolation="nearest" if sharp else "auto")
     shown.set_clip_path(Rectangle((x + 0.01, y + 0.01), 0.98, 0.98, transform=axis.transData))
 
 
 def _explain(figure: Figure, axes: Sequence[Axes], largest: float) -> None:
     """Draws the colour bar and the legend of `difference_pictures`."""
-    colours = ScalarMappable(Normalize(0, largest), style.error_colours())
+    colours = ScalarMappable(Normalize(0, largest), figure_style.error_colours())
     label = "angle between\nnormals (degrees)"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.9 / len(axes), aspect=25, extend="max", pad=0.01)
     missed = Patch(color=style.MISSED, label="missed: only the reference hits")

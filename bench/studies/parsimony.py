@@ -5,7 +5,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from bench.pictures.size_chart import AXES, FLOPS, KINDS, Candidates
-from bench.report.study import Result, Runs, Selection, chart, format, medians, records, style, table
+from bench.report.study import Result, Runs, Selection, chart, figure_style, format, medians, records, table
 
 PLACE = 160
 READS = (Selection("parsimony", setup=("scenes", "pixels", "machine"), alike=("models", "task")),)
@@ -97,7 +97,7 @@ def _verdict(lines: list[Line]) -> str:
     )
 
 
-@style.styled
+@figure_style.styled
 def draw(lines: list[Line], size: str) -> Figure:
     """Draws the candidates of each scene over their size: filled if sufficient, with a ring if recommended."""
     figure, ((axis,),) = chart.sheet(0.26 * len(lines) + 1.2)
@@ -121,7 +121,7 @@ def draw(lines: list[Line], size: str) -> Figure:
     axis.set(xscale="log", xlabel=AXES[size], ylim=(len(lines) - 0.5, -0.5))
     names = [f"{line['scene']} ({line['problem']})" if line["problem"] else line["scene"] for line in lines]
     axis.set_yticks(range(len(lines)), names)
-    style.legend_below(figure, axis, columns=4)
+    figure_style.legend_below(figure, axis, columns=4)
     return figure
 
 

@@ -9,7 +9,18 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, format, merge_runs, records, statistics, style, table
+from bench.report.study import (
+    Result,
+    Runs,
+    Selection,
+    chart,
+    figure_style,
+    format,
+    merge_runs,
+    records,
+    statistics,
+    table,
+)
 from bench.report.write.caption import undefined
 
 PLACE = 80
@@ -143,7 +154,7 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
     return ""
 
 
-@style.styled
+@figure_style.styled
 def draw(panels: list[chart.Panel], fronts: list[list[Line]]) -> Figure:
     """Draws a panel per trial; settings on the front are numbered, with their names below."""
     figure = chart.draw(panels, 4.4, legend=5)

@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.records.read import curve_lines
-from bench.report.study import Result, Runs, Selection, chart, format, records, statistics, style, table
+from bench.report.study import Result, Runs, Selection, chart, figure_style, format, records, statistics, table
 
 PLACE = 120
 READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
@@ -258,12 +258,12 @@ def _atlas(cells: pd.DataFrame, axes: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-@style.styled
+@figure_style.styled
 def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
     """Draws the heat map: red if a renderer breaks at a mild severity, blue if it does not break."""
     shades, words = (_grid(cells, axes, name) for name in ("shade", "short"))
     rows, n = list(shades.columns), len(axes)
-    width = max(style.WIDTH, 0.39 * len(rows) + 2.2)  # inches: a number has room in its cell
+    width = max(figure_style.WIDTH, 0.39 * len(rows) + 2.2)  # inches: a number has room in its cell
     figure, ((panel,),) = chart.sheet(0.19 * n + 1.7, width=width)
     image = panel.imshow(np.ma.masked_invalid(shades.to_numpy(float)), cmap="RdYlBu", vmin=0, vmax=1, aspect="auto")
     panel.set_facecolor("#f2f2f2")

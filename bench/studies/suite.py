@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, format, merge_runs, style, table
+from bench.report.study import Result, Runs, Selection, chart, figure_style, format, merge_runs, table
 from bench.report.suite import standing
 from bench.report.suite.attempts import EXPERIMENT_PREFIX, PROBLEM_SETTINGS, attempts_folder, gather, suite
 from bench.report.suite.standing import ALPHA, AREA, AT_1, AT_10, AT_SECONDS, BUDGETS, END, OUTCOMES, Ranking, Standing
@@ -179,7 +179,7 @@ def _line(runs: pd.DataFrame) -> chart.Series | None:
     return chart.curve(runs["row"].iloc[0], runs["preset"].iloc[0], costs, mean, symbol="", failed=failed)
 
 
-@style.styled
+@figure_style.styled
 def draw(panels: Sequence[chart.Panel], ranks: Mapping[str, Mapping[str, str]]) -> Figure:
     """Draws the first panel large, with the names of its lines, the ranks to its right, and the other panels below.
 
@@ -187,7 +187,7 @@ def draw(panels: Sequence[chart.Panel], ranks: Mapping[str, Mapping[str, str]]) 
         panels: fractions from 0 to 1 over costs, on a logarithmic axis.
         ranks: by their titles, the rank of each row, such as 5, or the ranks that it can have, such as 1–4.
     """
-    figure = Figure(figsize=(style.WIDTH, 5.6), layout="constrained")
+    figure = Figure(figsize=(figure_style.WIDTH, 5.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.55, 1))
     lead, *others = above.subplots(1, 1 + len(ranks), width_ratios=(5.6, *[1.0] * len(ranks)))
     _fractions(lead, panels[0])
@@ -222,7 +222,7 @@ def _name_lines(axis: Axes, lines: Sequence[chart.Series]) -> None:
     position = -1.0
     for line in sorted(lines, key=lambda line: line["x"][-1]):
         end, name = (line["x"][-1], line["y"][-1]), line["name"].partition(",")[0]
-        look = {"color": line["colour"], "fontsize": style.RC["legend.fontsize"]}
+        look = {"color": line["colour"], "fontsize": figure_style.RC["legend.fontsize"]}
         if end[1] < 0.5:
             axis.annotate(name, end, (4, 0), textcoords="offset points", va="center", **look)
             continue

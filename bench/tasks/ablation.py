@@ -41,7 +41,7 @@ from renderers.field import (
     field_bounds,
 )
 from renderers.rendering import RayObservation, Renderer, Rendering, check_kind
-from renderers.waits import active_mask
+from renderers.tracing.waits import active_mask
 
 BASE = "base"  # the run's renderer, if it is compared with others
 SHRINK_FACTOR = 8  # after a limit was reached, the image's side is divided by this

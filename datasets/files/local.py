@@ -13,9 +13,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from datasets.deform import Deformation
 from datasets.extras import referenced_files, version
 from datasets.files.colours import FileColours
+from datasets.files.deform import Deformation
 from datasets.files.meshes import find_meshes, load_mesh
 from datasets.mesh import Mesh, normalise
 from datasets.scene import Split, seed_of

@@ -1,7 +1,7 @@
 """Finds, reads and checks the user's mesh files, and makes them closed solids by `repair`."""
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from zipfile import BadZipFile
@@ -14,7 +14,7 @@ from datasets.files.readers.ply import read_ply
 from datasets.files.readers.polygons import Polygons
 from datasets.files.readers.text import read_obj, read_off, read_stl, wrong_kind_message
 from datasets.files.repair import repair
-from datasets.mesh import Mesh, concatenate_meshes
+from datasets.mesh import Mesh
 from renderers.checks import BadInput
 
 READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off, ".glb": read_glb}
@@ -94,6 +94,13 @@ def read_surface(path: str | Path) -> tuple[Mesh, Polygons]:
 def read_pieces(path: str | Path) -> Mesh:
     """The mesh of a file, or of all files of a folder, such as BlendedMVS's `textured_mesh`; see `read_mesh`."""
     return concatenate_meshes([read_mesh(file) for file in find_meshes(path)])
+
+
+def concatenate_meshes(meshes: Sequence[Mesh]) -> Mesh:
+    """Concatenates meshes into one, without colours."""
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"] | None:

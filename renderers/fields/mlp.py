@@ -256,13 +256,6 @@ class _FrozenDecoder(torch.autograd.Function):
         return None, towards_points, *towards_biases
 
 
-def flops_of(network: nn.Module) -> Flops:
-    """A multiplication and an addition per weight of matrices; the gradient costs as much, or twice with weights."""
-    value = 2 * sum(weight.numel() for weight in network.parameters() if weight.dim() > 1)
-    has_gradient = any(weight.requires_grad for weight in network.parameters())
-    return Flops(value, 2 * value if has_gradient else value)
-
-
 def split_into_passes(
     points: Float[Tensor, "n 3"], width: int, dtype: torch.dtype | None = None
 ) -> Sequence[Float[Tensor, "chunk 3"]]:

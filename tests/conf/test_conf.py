@@ -9,8 +9,8 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import CLASS_OF_NODE, build, check_draw, check_names, load
-from bench.pictures import style
-from bench.pictures.style import look
+from bench.pictures import figure_style
+from bench.pictures.figure_style import look
 from bench.runner.compose import Composer, composing
 from bench.setup.inputs import Task
 from bench.tables import CONF, GROUP_OF_TABLE, choice, names, read_yaml
@@ -280,7 +280,7 @@ def label_of(group: str, name: str) -> str:
 
 
 def test_rows_of_one_label_have_one_look():
-    looks: dict[str, set[style.Look]] = {}
+    looks: dict[str, set[figure_style.Look]] = {}
     for group in ("method", "renderer"):
         for name in names(group):
             looks.setdefault(label_of(group, name) or name, set()).add(look(name))
@@ -292,7 +292,7 @@ def test_an_unknown_row_has_a_colour_of_no_renderer():
     class_colours = {(look(name).colour, cls) for name, cls in classes.items()}
     colours = {colour for colour, _ in class_colours}
     assert len(class_colours) == len(colours) > 20  # each colour has one class
-    assert not colours & {*style.FALLBACK_COLOURS}
+    assert not colours & {*figure_style.FALLBACK_COLOURS}
 
 
 def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from datasets.deform import MAX_LOG_SCALE, MAX_TAPER, MAX_TWIST_RADIANS, Deformation
+from datasets.files.deform import MAX_LOG_SCALE, MAX_TAPER, MAX_TWIST_RADIANS, Deformation
 from tests.looped import each
 from tests.tiny import icosphere
 

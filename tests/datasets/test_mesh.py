@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets.mesh import Mesh, concatenate_meshes, normalise
+from datasets.files.meshes import concatenate_meshes
+from datasets.mesh import Mesh, normalise
 from tests.looped import each
 from tests.tiny import mesh_of
 

@@ -11,9 +11,9 @@ import pytest
 import trimesh
 
 from bench.tasks.reconstruction.surfaces import poisson
-from datasets.files.meshes import find_meshes, load_mesh, read_mesh, read_points, repair
+from datasets.files.meshes import concatenate_meshes, find_meshes, load_mesh, read_mesh, read_points, repair
 from datasets.files.repair import NOT_CHECKED_NOTE
-from datasets.mesh import Mesh, concatenate_meshes
+from datasets.mesh import Mesh
 from datasets.scene import Truth, sample_surface
 from renderers.checks import BadInput
 from tests.looped import each

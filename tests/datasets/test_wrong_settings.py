@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bench.config import load
-from datasets.deform import Deformation
+from datasets.files.deform import Deformation
 from datasets.mesh import Mesh, normalise
 from datasets.scene import SPLIT_STRIDE, Split, Truth, sample_surface, seed_of
 from datasets.views import look_at, observed_pixels

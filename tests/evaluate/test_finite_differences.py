@@ -11,7 +11,7 @@ from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder
 from renderers.fields.networks.network import Coded, Published
 from renderers.fields.networks.published import Layered
-from renderers.reference import trace
+from renderers.tracing.reference import trace
 from tests.looped import each
 from tests.tiny import camera_of, plane_decoder
 

@@ -13,9 +13,9 @@ from PIL import Image
 from bench.config import load
 from bench.evaluate.evaluate import view_metrics
 from bench.evaluate.state import State
+from bench.pictures.figure_style import legend_below
 from bench.pictures.filmstrip import MAX_STRIP_COLUMNS, SILHOUETTE_ROW, Filmstrip, Shown
 from bench.pictures.run_figures import InputView, ViewPair, _show_depth, draw_curve, draw_run, enlarged, save_gallery
-from bench.pictures.style import legend_below
 from bench.report.site.files import PICTURE_TEXTS
 from bench.tasks.pose import TRACKED
 from bench.tasks.reconstruction.problem import ReconstructionProblem

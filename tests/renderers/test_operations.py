@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from renderers import waits
 from renderers.boundary import render_checked
 from renderers.fields.analytic import Shape, torus
 from renderers.rendering import at_iteration, with_empty_memory
+from renderers.tracing import waits
 from tests.looped import each
 from tests.operations import Operations
 from tests.tiny import camera_of

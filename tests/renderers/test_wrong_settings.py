@@ -17,8 +17,8 @@ from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
 from renderers.fields.networks.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
 from renderers.fields.networks.occupancy import OccupancyNetwork
-from renderers.reference import trace
 from renderers.rendering import RayObservation
+from renderers.tracing.reference import trace
 from tests.looped import each
 from tests.renderers.analytic_cases import along_z, vector
 from tests.renderers.test_camera import camera, motion

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.pictures import style
+from bench.pictures import figure_style
 from bench.report.__main__ import main
 from bench.report.write import paper
 
@@ -14,7 +14,7 @@ from bench.report.write import paper
 def coarse_pictures() -> Iterator[None]:
     """A picture takes longer to write than all else together."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(style.RC, "savefig.dpi", 50)
+        patch.setitem(figure_style.RC, "savefig.dpi", 50)
         yield
 
 

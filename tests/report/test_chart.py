@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PolyCollection
 
-from bench.pictures import style
+from bench.pictures import figure_style
 from bench.records.format import ends
 from bench.report.data.statistics import Interval
 from bench.report.write.chart import curve, draw, level, panel_data, series
@@ -24,7 +24,7 @@ def axis_of(*drawn, **panel):
 def test_a_row_has_its_preset_s_look_in_the_figure_and_on_the_page():
     made = curve("DIST", "dist", [1, 2], [0, 5])
     (line,) = axis_of(made).lines
-    assert made["colour"] == line.get_color() == style.look("dist").colour == "#0072b2"
+    assert made["colour"] == line.get_color() == figure_style.look("dist").colour == "#0072b2"
     assert made["symbol"] == line.get_marker() and made["dash"] == line.get_linestyle() == "-"
     assert line.get_label() == "DIST" and list(line.get_ydata()) == [0, 5]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.pictures import style
+from bench.pictures import figure_style
 from bench.records.read import read_records
 from bench.report.__main__ import main
 from bench.report.data import curves
@@ -427,8 +427,8 @@ def test_same_records_give_the_same_files(reported, tmp_path, capsys):
 
 
 def test_row_keeps_its_look_and_known_rows_differ():
-    assert style.look("mine") == style.look("mine") != style.look("yours")  # that nobody listed
-    strategies = [style.look(preset) for preset in published("dist_table1")]
+    assert figure_style.look("mine") == figure_style.look("mine") != figure_style.look("yours")  # that nobody listed
+    strategies = [figure_style.look(preset) for preset in published("dist_table1")]
     assert len({look.colour for look in strategies}) == len({look.marker for look in strategies}) == 7
 
 

@@ -18,10 +18,10 @@ from bench.records.record import RunStatus, to_json
 from bench.setup.inputs import RunContext
 from bench.tasks import ablation
 from bench.tasks.ablation import BASE, DEFINITIONS, SHRINK_FACTOR, WARM_UP_PIXELS, Ablation, Timings
-from renderers import waits
 from renderers.camera import Camera, Rays
 from renderers.field import Counts, Field, Kind, Meter
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
+from renderers.tracing import waits
 from tests.looped import each
 from tests.tiny import PEAK, ball_prior, camera_of, run_of
 

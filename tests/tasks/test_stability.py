@@ -12,7 +12,7 @@ from bench.records.record import RunStatus
 from bench.tasks.stability.search import SearchSettings
 from bench.tasks.stability.task import Stability
 from renderers import IDR
-from renderers.march import Stepping
+from renderers.tracing.march import Stepping
 from tests.tasks.stability.test_stress import CRITERIA, FIT, stress_named
 from tests.tiny import ball_prior, camera_of, curve_of, run_of
 

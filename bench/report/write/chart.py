@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.pictures import style
+from bench.pictures import figure_style, style
 from bench.report.data.statistics import Interval
 
 REFERENCE_COLOUR = "#777777"
@@ -25,7 +25,7 @@ def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[fl
             small points show its shapes.
         more: further data for the page, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
     """
-    look, x, y = style.look(preset), list(x), list(y)
+    look, x, y = figure_style.look(preset), list(x), list(y)
     points = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
     estimates = [estimate for estimate in (*x, *y) if isinstance(estimate, Interval)]
     if any(estimate.has_ends for estimate in estimates):
@@ -44,7 +44,7 @@ def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[fl
 
 def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
     """A `series` whose points a line joins."""
-    return series(name, preset, x, y, **{"dash": style.look(preset).line} | more)
+    return series(name, preset, x, y, **{"dash": figure_style.look(preset).line} | more)
 
 
 def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
@@ -71,14 +71,14 @@ def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) ->
 
 
 def sheet(
-    height: float, lines: int = 1, columns: int = 1, *, width: float = style.WIDTH, **how: Any
+    height: float, lines: int = 1, columns: int = 1, *, width: float = figure_style.WIDTH, **how: Any
 ) -> tuple[Figure, np.ndarray]:
     """A figure of that size in inches, and its axes [lines, columns]."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(lines, columns, squeeze=False, **how)
 
 
-@style.styled
+@figure_style.styled
 def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int = 4, **how: Any) -> Figure:
     """Draws panels as a figure: `height` in inches, `lines` lines of panels, one legend below.
 
@@ -96,7 +96,7 @@ def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int 
     for axis in axes[:, 1:].flat if "sharey" in how else ():
         axis.set_ylabel("")
     if legend:
-        style.legend_below(figure, *axes.flat, columns=legend)
+        figure_style.legend_below(figure, *axes.flat, columns=legend)
     return figure
 
 

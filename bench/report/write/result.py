@@ -14,7 +14,7 @@ import pandas as pd
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from bench.pictures.style import RC
+from bench.pictures.figure_style import RC
 from bench.records.record import to_json_values
 from bench.report.data import age
 from bench.report.data.runs import Runs

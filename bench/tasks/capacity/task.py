@@ -6,7 +6,7 @@ from typing import Any
 from bench.evaluate.evaluate import DEFINITIONS, evaluate
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import Filmstrip
-from bench.pictures.run_figures import draw_candidates
+from bench.pictures.size_chart import draw_candidates
 from bench.records.record import curve_file
 from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext

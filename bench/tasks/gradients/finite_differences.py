@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import equally_spaced
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Field, autograd_gradients
 from renderers.fields.mlp import Decoder
 from renderers.fields.networks.network import Published
-from renderers.reference import trace
+from renderers.tracing.bracket import equally_spaced
+from renderers.tracing.reference import trace
 
 PAINT_NEURONS = 16
 MAX_SECOND_DIFFERENCE = 1e-9  # smooth colours have about 1e-12

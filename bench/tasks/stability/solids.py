@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from renderers import reference
 from renderers.camera import Rays, sphere_span
 from renderers.field import Field, autograd_normals
 from renderers.fields import analytic
 from renderers.fields.analytic import Shape
 from renderers.rendering import Status
+from renderers.tracing import reference
 
 Spans = Float[Tensor, "n _ 2"]  # entry and exit along each ray; for a missing span the exit comes first
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bench.machine.limits import Limits
-from bench.pictures.run_figures import draw_failure
-from bench.pictures.style import PIXEL_NAMES
 from bench.records.record import RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.tasks.stability import fit, judge
 from bench.tasks.stability.axes import Stress
 from bench.tasks.stability.distortions import NETWORK_DISTORTIONS
+from bench.tasks.stability.picture import PIXEL_NAMES, draw_failure
 from bench.tasks.stability.search import Bisection, Search, SearchSettings
 from bench.tasks.stability.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from datasets.scene import HasNetwork

@@ -13,7 +13,8 @@ from torch.nn.functional import softplus
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Flops, Kind, OccupancyField, Vectors
 from renderers.fields.grid import FLOPS, Grid
-from renderers.fields.mlp import flops_of, split_into_passes
+from renderers.fields.mlp import split_into_passes
+from renderers.fields.networks.network import flops_of
 from renderers.fields.networks.occupancy import BoundOccupancy, OccupancyNetwork
 
 SOFTPLUS_BETA = 100.0  # as in IDR: nearly a ReLU, with a second derivative

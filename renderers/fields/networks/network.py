@@ -23,7 +23,7 @@ from renderers.field import (
     points_in_sphere,
 )
 from renderers.fields.analytic import Shape
-from renderers.fields.mlp import Decoder, flops_of, split_into_passes
+from renderers.fields.mlp import Decoder, split_into_passes
 
 SAMPLES = 2**14  # points in the unit sphere, for values and slopes
 SPHERE_POINTS, OTHER_CODE_POINTS = 4096, 512  # points on the unit sphere, for the field and for each other code
@@ -337,3 +337,10 @@ def scale_shapes(network: Decoder | Coded, scale: float) -> None:
         assert isinstance(layer, nn.Linear)
         if index in (0, network.skip):
             layer.weight[:, -3:].div_(scale)
+
+
+def flops_of(network: nn.Module) -> Flops:
+    """A multiplication and an addition per weight of matrices; the gradient costs as much, or twice with weights."""
+    value = 2 * sum(weight.numel() for weight in network.parameters() if weight.dim() > 1)
+    has_gradient = any(weight.requires_grad for weight in network.parameters())
+    return Flops(value, 2 * value if has_gradient else value)

@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from renderers.checks import check_at_least
 from renderers.field import Flops
-from renderers.fields.mlp import flops_of, split_into_passes
+from renderers.fields.mlp import split_into_passes
+from renderers.fields.networks.network import flops_of
 
 BLOCKS = 5  # DVR, Sec. 3.5
 

@@ -17,7 +17,8 @@ from bench.tasks.reconstruction.subject import (
     given_distances,
     hull_distances,
 )
-from datasets.mesh import Mesh, concatenate_meshes
+from datasets.files.meshes import concatenate_meshes
+from datasets.mesh import Mesh
 from datasets.photographs import around
 from datasets.scene import Surface, sample_surface
 from renderers.checks import BadInput

@@ -20,10 +20,10 @@ from bench.tasks.stability.scenes import CAMERA_DISTANCE, SCENES
 from bench.tasks.stability.search import Bisection, Search, SearchSettings
 from bench.tasks.stability.solids import box, half_space, rod, sphere_solid
 from bench.tasks.stability.trial import Conditions, Criteria, Failure, FitSettings
-from renderers import reference
 from renderers.camera import Rays
 from renderers.rendering import Status, Unsupported
 from renderers.silhouette import Own
+from renderers.tracing import reference
 from tests.looped import each
 from tests.tiny import CPU, Blind, ball_prior, camera_of
 

@@ -6,12 +6,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from renderers.bracket import equally_spaced
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
+from renderers.later.volumes import Samples, VolumeRenderer, render_volume, resample, schedule, weights
 from renderers.rendering import Rendering, check_kind
-from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, resample, schedule, weights
+from renderers.tracing.bracket import equally_spaced
 
 
 @dataclass(frozen=True)

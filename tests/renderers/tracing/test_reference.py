@@ -5,8 +5,8 @@ import pytest
 from renderers.camera import Rays
 from renderers.field import estimate_lipschitz
 from renderers.fields.analytic import Shape, box, plane, sphere
-from renderers.reference import trace
 from renderers.rendering import Status
+from renderers.tracing.reference import trace
 from tests.looped import each
 from tests.renderers.analytic_cases import CASES, along_z, sphere_hits, vector
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from renderers.bracket import REFINEMENTS, Bracket, first_crossing, narrow, refine
 from renderers.camera import Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, plane, sphere
+from renderers.tracing.bracket import REFINEMENTS, Bracket, first_crossing, narrow, refine
 from tests.looped import each
 from tests.renderers.analytic_cases import vector
 

@@ -1,22 +1,21 @@
 """A march that stops at the surface, or right behind it: if the field's magnitude is small, or its sign changes.
 
-The marching rays are rows of one table, so that a step costs few operations. Nothing here builds a graph; `tracer.py`
-finds the surface from where the rays stopped.
+The columns of marching rays are packed in one tensor, so that a step costs few operations. Nothing here builds a
+graph; `tracer.py` finds the surface from where the rays stopped.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import Bracket
 from renderers.camera import Rays, sphere_span
 from renderers.field import PointFunction
-from renderers.march import ResolutionPair, ray_pyramid
-from renderers.waits import compaction_interval, evaluate_masked
+from renderers.tracing.bracket import Bracket
+from renderers.tracing.march import ResolutionPair, ray_pyramid
+from renderers.tracing.waits import compaction_interval, evaluate_masked
 
 MAX_STEPS_PER_LEVEL = 5  # more steps are wasted near silhouettes, where both the coarse and the fine ray advance slowly
 PARENT_SPHERE_FACTOR = 2.0  # coarse rays stop while their empty sphere is this many times the distance to finer rays
@@ -65,45 +64,43 @@ class Stride:
         return torch.where(value > 0, torch.minimum(step, value + MAX_OVERSTEP), value)
 
 
-@dataclass(frozen=True)
-class TableColumn:
-    """A column of `RayTable.table`, to read and to write."""
-
-    index: int
-
-    def __get__(self, rays: "RayTable", owner: type) -> Float[Tensor, " n"]:
-        return rays.table[:, self.index]
-
-    def __set__(self, rays: "RayTable", values: Tensor) -> None:
-        rays.table[:, self.index] = values
-
-
 @dataclass
 class RayTable:
-    """The state of n rays, one row per ray, so that one indexing operation selects rays.
+    """The state of n marching rays, a tensor for each column of the table. Distances are along the ray.
 
     Args:
-        table: the columns below. Distances are along the ray.
+        distance: to where the ray stopped, or is evaluated next; beyond its end if it has LEFT.
+        value: the last value of the field.
+        least_distance: to the sample of smallest magnitude, which may be on the coarse ray.
+        least: the value of that sample, with its sign; infinite before the first.
+        free: to the ray's own last value above the threshold; before the first, to the ray's start.
+        free_value: that value; infinite before the first.
+        entry: to the ray's start.
+        leave: to where it leaves the sphere.
+        stop: a Stop, as a floating-point number like all columns.
+        path_clearance: a lower bound of the field along the path so far, except on the final descent. It is the
+            smallest value at which this ray, or its coarse ray, turned from falling to rising; for the coarse ray minus
+            the distance between the two.
+        restart_distance: to the last sample with `path_clearance` > `CLEARANCE_THRESHOLD`; else `entry`.
+        clear_from: if it has LEFT: to where samples stay above `CLEARANCE_THRESHOLD`, or to `leave`.
+        ray_clearance: as `path_clearance`, of the ray's own values alone; infinite before the first.
+        step_back_limit: to the last sample behind a surface that was stepped back from; else infinite.
     """
 
-    table: Float[Tensor, "n 14"]
-
-    distance = TableColumn(0)  # to where the ray stopped, or is evaluated next; beyond its end if it has LEFT
-    value = TableColumn(1)  # the last value of the field
-    least_distance = TableColumn(2)  # to the sample of smallest magnitude, which may be on the coarse ray
-    least = TableColumn(3)  # the value of that sample, with its sign; infinite before the first
-    free = TableColumn(4)  # to the ray's own last value above the threshold; before the first, to the ray's start
-    free_value = TableColumn(5)  # that value; infinite before the first
-    entry = TableColumn(6)  # to the ray's start
-    leave = TableColumn(7)  # to where it leaves the sphere
-    stop = TableColumn(8)  # a Stop
-    # A lower bound of the field along the path so far, except on the final descent. It is the smallest value at which
-    # this ray, or its coarse ray, turned from falling to rising; for the coarse ray minus the distance between the two.
-    path_clearance = TableColumn(9)
-    restart_distance = TableColumn(10)  # to the last sample with `path_clearance` > `CLEARANCE_THRESHOLD`; else `entry`
-    clear_from = TableColumn(11)  # if it has LEFT: to where samples stay above `CLEARANCE_THRESHOLD`, or to `leave`
-    ray_clearance = TableColumn(12)  # as `path_clearance`, of the ray's own values alone; infinite before the first
-    step_back_limit = TableColumn(13)  # to the last sample behind a surface that was stepped back from; else infinite
+    distance: Float[Tensor, " n"]
+    value: Float[Tensor, " n"]
+    least_distance: Float[Tensor, " n"]
+    least: Float[Tensor, " n"]
+    free: Float[Tensor, " n"]
+    free_value: Float[Tensor, " n"]
+    entry: Float[Tensor, " n"]
+    leave: Float[Tensor, " n"]
+    stop: Float[Tensor, " n"]
+    path_clearance: Float[Tensor, " n"]
+    restart_distance: Float[Tensor, " n"]
+    clear_from: Float[Tensor, " n"]
+    ray_clearance: Float[Tensor, " n"]
+    step_back_limit: Float[Tensor, " n"]
 
     @staticmethod
     def on_sphere(rays: Rays, radius: float) -> "RayTable":
@@ -111,8 +108,22 @@ class RayTable:
         entry, leave, intersects = sphere_span(rays, radius)
         zero, infinite = torch.zeros_like(entry), torch.full_like(entry, torch.inf)
         stop = torch.where(intersects, Stop.MARCHING, Stop.LEFT).to(entry.dtype)
-        columns = (entry, zero, entry, infinite, entry, infinite, entry, leave, stop, infinite, entry, entry)
-        return RayTable(torch.stack([*columns, infinite, infinite], dim=1))
+        return RayTable(
+            distance=entry,
+            value=zero,
+            least_distance=entry,
+            least=infinite,
+            free=entry,
+            free_value=infinite,
+            entry=entry,
+            leave=leave,
+            stop=stop,
+            path_clearance=infinite,
+            restart_distance=entry,
+            clear_from=entry,
+            ray_clearance=infinite,
+            step_back_limit=infinite,
+        )
 
     def stopped(self, stop: Stop) -> Bool[Tensor, " n"]:
         """Which rays have this Stop."""
@@ -120,7 +131,11 @@ class RayTable:
 
     def select(self, index: Int[Tensor, " m"]) -> "RayTable":
         """A copy of the rays in `index`."""
-        return RayTable(self.table.index_select(0, index))
+        return RayTable(*self.packed().index_select(1, index))
+
+    def packed(self) -> Float[Tensor, "14 n"]:
+        """All columns in one tensor, so that one indexing operation selects rays; `RayTable(*packed)` unpacks it."""
+        return torch.stack([getattr(self, column.name) for column in fields(self)])
 
     def restarted(self, rays: Rays, resumes: Bool[Tensor, " n"], *, radius: float) -> "RayTable":
         """The rays, ready to march again: from `restart_distance` if the ray `resumes`, else from their start.
@@ -137,10 +152,12 @@ class RayTable:
         restarted.leave = torch.where(resumes & self.stopped(Stop.LEFT), self.clear_from, restarted.leave)
         return restarted
 
-    def scatter(self, index: Int[Tensor, " m"], others: "RayTable") -> None:
-        """Replaces the rays in `index` by `others`; both keep the `leave` of these rays."""
-        others.leave = self.leave[index]
-        self.table[index] = others.table
+    def replace_rays(self, index: Int[Tensor, " m"], others: "RayTable") -> None:
+        """Replaces the rays in `index` by `others`, except for their `leave`."""
+        packed = self.packed().index_copy_(1, index, others.packed())
+        for column, values in zip(fields(self), packed, strict=True):
+            if column.name != "leave":
+                setattr(self, column.name, values)
 
     def bracket(self) -> Bracket:
         """Between `free` and where each ray stopped; meant for rays that have CROSSED."""
@@ -158,8 +175,51 @@ class RayTable:
         inside = (value < 0) & self.free_value.isinf() & (self.distance <= self.entry)
         stop = torch.where(inside, Stop.INSIDE, torch.where(value < -epsilon, Stop.CROSSED, Stop.NEAR_SURFACE))
         stop = torch.where(self.distance > self.leave, Stop.LEFT, stop)
-        self.stop = torch.where(value.isfinite(), stop, Stop.NOT_FINITE)
+        self.stop = torch.where(value.isfinite(), stop, Stop.NOT_FINITE).to(value.dtype)
         self.value = value.nan_to_num(0.0, 0.0, 0.0)
+
+    def advance(self, value: Float[Tensor, " n"], stride: Stride) -> tuple["RayTable", Bool[Tensor, " n"]]:
+        """The rays after a step by the field's values at the rays' distances, and which rays go on.
+
+        A ray that continues from its coarse ray may start behind the surface: it goes back until the field is positive,
+        at most to its start. A ray that stops stays at the sample; if it has left the sphere, it ends beyond `leave`.
+        """
+        distance, safe, magnitude, negative = self.distance, self.free_value, value.abs(), value < 0
+        travelled, finite = distance - self.free, magnitude < torch.inf
+        above, behind = (value > stride.epsilon) & finite, (value < -stride.epsilon) & finite
+        too_far = finite & (travelled - safe - magnitude > GAP_TOLERANCE_FACTOR * stride.unseen)
+        from_behind = too_far & negative
+        closer = finite & ~from_behind & (magnitude < self.least.abs())
+        limit = torch.where(from_behind, distance, self.step_back_limit)
+        positive, end = above & ~too_far, distance + value
+        left = positive & (end > self.leave) & self.step_back_limit.isinf()
+        first = safe.isinf() & (distance > self.entry)
+        goes_on = too_far | (behind & first) | (above & ~left)
+        slope = ((safe - value) / travelled).nan_to_num(1.0)  # a step too short for the dtype has no slope
+        moved = torch.where(too_far, self.free + safe, distance + stride.length(value, slope))
+        moved = torch.minimum(torch.maximum(moved, self.entry), torch.minimum(self.leave, limit))
+        rises = value > safe
+        lower = torch.where(rises, safe, value)
+        minimum = torch.where(rises | left, lower, torch.inf)
+        clear_from = torch.where(left & (value <= CLEARANCE_THRESHOLD), self.leave, distance)
+        clear = torch.minimum(self.path_clearance, lower) > CLEARANCE_THRESHOLD
+        advanced = RayTable(
+            distance=torch.where(goes_on, moved, torch.where(left, end, distance)),
+            value=value,
+            least_distance=torch.where(closer, distance, self.least_distance),
+            least=torch.where(closer, value, self.least),
+            free=torch.where(positive, distance, self.free),
+            free_value=torch.where(positive, value, safe),
+            entry=self.entry,
+            leave=self.leave,
+            stop=self.stop,
+            path_clearance=torch.minimum(self.path_clearance, minimum),
+            restart_distance=torch.where(clear, distance, self.restart_distance),
+            clear_from=torch.where(lower <= CLEARANCE_THRESHOLD, clear_from, self.clear_from),
+            ray_clearance=torch.minimum(self.ray_clearance, minimum),
+            step_back_limit=limit,
+        )
+        return advanced, goes_on
 
     def split(
         self, parent: Int[Tensor, " m"], parent_distance: Float[Tensor, " m"], child: "RayTable", *, error: float
@@ -226,96 +286,35 @@ def march_rays(
 def march_table(values: PointFunction, rays: Rays, table: RayTable, stride: Stride, steps: int) -> None:
     """Moves flat rays [n, 3] by at most `steps` steps, in place."""
     index = table.stopped(Stop.MARCHING).nonzero().squeeze(-1)
-    origins, directions, columns = rays.origins[index], rays.directions[index], table.table[index].T.contiguous()
-    finished: list[tuple[Tensor, Tensor]] = []  # rays that have stopped, and their columns
+    origins, directions, packed = rays.origins[index], rays.directions[index], table.packed().index_select(1, index)
+    finished: list[tuple[Tensor, Tensor]] = []  # rays that have stopped: their index, and their packed columns
     going, interval = torch.ones_like(index, dtype=torch.bool), compaction_interval(index.device)
     for step in range(steps):
         if index.numel() == 0:
             break
-        state = StepColumns(*columns)
+        state = RayTable(*packed)
         if step % interval:  # some rays may have stopped, and stay where they are
             distance = torch.minimum(state.distance, state.leave)
             value = evaluate_masked(going, values, origins + distance[:, None] * directions)
             advanced, goes_on = state.advance(value, stride)
-            columns, going = torch.where(going, advanced, columns), going & goes_on
+            packed, going = torch.where(going, advanced.packed(), packed), going & goes_on
         else:
-            columns, going = state.advance(values(origins + state.distance[:, None] * directions), stride)
+            advanced, going = state.advance(values(origins + state.distance[:, None] * directions), stride)
+            packed = advanced.packed()
         if (step + 1) % interval:
             continue
         onward = going.nonzero().squeeze(-1)
         if len(onward) < len(index):
             stopped = (~going).nonzero().squeeze(-1)
-            finished.append((index[stopped], columns.index_select(1, stopped)))
+            finished.append((index[stopped], packed.index_select(1, stopped)))
             index, origins, directions = (tensor.index_select(0, onward) for tensor in (index, origins, directions))
-            columns, going = columns.index_select(1, onward), going.index_select(0, onward)
+            packed, going = packed.index_select(1, onward), going.index_select(0, onward)
     marching = torch.nn.functional.pad(going, (sum(len(stopped) for stopped, _ in finished), 0))
-    index, columns = (torch.cat(tensors, -1) for tensors in zip(*finished, (index, columns), strict=True))
-    marched = RayTable(columns.T)
+    index, packed = (torch.cat(tensors, -1) for tensors in zip(*finished, (index, packed), strict=True))
+    marched = RayTable(*packed)
     marched.set_stops(stride.epsilon)
     marched.stop = torch.where(marching, Stop.MARCHING, marched.stop)
-    table.table.index_copy_(0, index, marched.table)
-
-
-class StepColumns(NamedTuple):
-    """The columns of `RayTable.table`, in their order, of m rays that go on."""
-
-    distance: Tensor
-    value: Tensor
-    least_distance: Tensor
-    least: Tensor
-    free: Tensor
-    free_value: Tensor
-    entry: Tensor
-    leave: Tensor
-    stop: Tensor
-    path_clearance: Tensor
-    restart_distance: Tensor
-    clear_from: Tensor
-    ray_clearance: Tensor
-    step_back_limit: Tensor
-
-    def advance(self, value: Float[Tensor, " m"], stride: Stride) -> tuple[Float[Tensor, "14 m"], Bool[Tensor, " m"]]:
-        """The columns after a step by the field's values at the rays' distances, and which rays go on.
-
-        A ray that continues from its coarse ray may start behind the surface: it goes back until the field is positive,
-        at most to its start. A ray that stops stays at the sample; if it has left the sphere, it ends beyond `leave`.
-        """
-        distance, safe, magnitude, negative = self.distance, self.free_value, value.abs(), value < 0
-        travelled, finite = distance - self.free, magnitude < torch.inf
-        above, behind = (value > stride.epsilon) & finite, (value < -stride.epsilon) & finite
-        too_far = finite & (travelled - safe - magnitude > GAP_TOLERANCE_FACTOR * stride.unseen)
-        from_behind = too_far & negative
-        closer = finite & ~from_behind & (magnitude < self.least.abs())
-        limit = torch.where(from_behind, distance, self.step_back_limit)
-        positive, end = above & ~too_far, distance + value
-        left = positive & (end > self.leave) & self.step_back_limit.isinf()
-        first = safe.isinf() & (distance > self.entry)
-        goes_on = too_far | (behind & first) | (above & ~left)
-        slope = ((safe - value) / travelled).nan_to_num(1.0)  # a step too short for the dtype has no slope
-        moved = torch.where(too_far, self.free + safe, distance + stride.length(value, slope))
-        moved = torch.minimum(torch.maximum(moved, self.entry), torch.minimum(self.leave, limit))
-        rises = value > safe
-        lower = torch.where(rises, safe, value)
-        minimum = torch.where(rises | left, lower, torch.inf)
-        clear_from = torch.where(left & (value <= CLEARANCE_THRESHOLD), self.leave, distance)
-        clear = torch.minimum(self.path_clearance, lower) > CLEARANCE_THRESHOLD
-        columns = StepColumns(
-            distance=torch.where(goes_on, moved, torch.where(left, end, distance)),
-            value=value,
-            least_distance=torch.where(closer, distance, self.least_distance),
-            least=torch.where(closer, value, self.least),
-            free=torch.where(positive, distance, self.free),
-            free_value=torch.where(positive, value, safe),
-            entry=self.entry,
-            leave=self.leave,
-            stop=self.stop,
-            path_clearance=torch.minimum(self.path_clearance, minimum),
-            restart_distance=torch.where(clear, distance, self.restart_distance),
-            clear_from=torch.where(lower <= CLEARANCE_THRESHOLD, clear_from, self.clear_from),
-            ray_clearance=torch.minimum(self.ray_clearance, minimum),
-            step_back_limit=limit,
-        )
-        return torch.stack(columns), goes_on
+    table.replace_rays(index, marched)
 
 
 def _parent_distance(level: ResolutionPair, coarse_start: RayTable) -> Float[Tensor, " n"]:

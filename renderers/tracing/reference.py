@@ -2,11 +2,11 @@
 
 import torch
 
-from renderers.bracket import Bracket, narrow, refine
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_positive
 from renderers.field import Field
 from renderers.rendering import Rendering, Status, assemble
+from renderers.tracing.bracket import Bracket, narrow, refine
 
 BISECTION_STEPS, SECANT_STEPS = 12, 8  # bisection is safe, the secant method is exact for a linear field
 

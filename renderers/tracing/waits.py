@@ -1,8 +1,7 @@
-"""Fewer synchronisations with a GPU: marches keep finished rays for some steps, and counts are read late."""
+"""Fewer synchronisations with a GPU: marches keep finished rays for some steps."""
 
 from collections.abc import Callable
 from contextvars import ContextVar
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,25 +35,3 @@ def active_mask(points: int) -> Bool[Tensor, " n"] | None:
     """The mask of `evaluate_masked`, if it is running and has this number of points; None if all points are active."""
     active = _active.get()
     return active if active is not None and len(active) == points else None
-
-
-class LazyCount:
-    """A number of a dataclass that a device may still be counting: reading waits for the device, `add` does not."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.attribute = f"_{name}"
-
-    def __get__(self, counts: Any, owner: type) -> int:
-        if counts is None:
-            return 0  # the default of the dataclass
-        number = int(vars(counts)[self.attribute])
-        vars(counts)[self.attribute] = number
-        return number
-
-    def __set__(self, counts: Any, number: "int | LazyCount") -> None:
-        vars(counts)[self.attribute] = 0 if isinstance(number, LazyCount) else number  # a LazyCount is the default
-
-    @staticmethod
-    def add(counts: Any, name: str, number: int | Tensor) -> None:
-        """Adds to the number of that name."""
-        vars(counts)[f"_{name}"] += number

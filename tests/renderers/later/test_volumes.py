@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bench.config import load
-from renderers.bracket import equally_spaced
 from renderers.camera import Rays, sphere_span
 from renderers.field import Meter
 from renderers.fields.analytic import Shape, box, plane, sphere
-from renderers.relaxed_boundary import _parabola_vertex
+from renderers.later.relaxed_boundary import _parabola_vertex
+from renderers.later.volsdf import OpacityErrorBound, _clearance, _log_transmittance
+from renderers.later.volumes import Samples, resample, weights
 from renderers.rendering import Blurred, Status, Volume, at_iteration
-from renderers.volumes.integrate import Samples, resample, weights
-from renderers.volumes.volsdf import OpacityErrorBound, _clearance, _log_transmittance
+from renderers.tracing.bracket import equally_spaced
 from tests.renderers.analytic_cases import CASES, Case, sheet, vector
 
 NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "unisurf"))

@@ -10,13 +10,13 @@ from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from renderers.bracket import SAMPLES_PER_BATCH, equally_spaced
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least
 from renderers.field import Field, carries_gradient
 from renderers.gradients import zero_with_gradient
 from renderers.rendering import LEVEL_SET_CAPABILITIES, NON_FINITE_VALUE, Capabilities, Rendering, Status, assemble
 from renderers.silhouette import SurfaceRenderer
+from renderers.tracing.bracket import SAMPLES_PER_BATCH, equally_spaced
 
 MIN_COSINE = 1e-3  # between a ray and a triangle's normal: gradients are divided by the cosine, but at least by this
 

@@ -10,8 +10,8 @@ from bench.config import load
 from renderers.camera import Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, capsule, plane, sphere, torus
-from renderers.march import RayFront, Stepping, march_coarse_to_fine, march_front, ray_pyramid
 from renderers.rendering import Status
+from renderers.tracing.march import RayFront, Stepping, march_coarse_to_fine, march_front, ray_pyramid
 from tests.looped import each
 from tests.renderers.analytic_cases import beam, sheet, sphere_hits, vector
 from tests.tiny import camera_of

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from bench.config import load
-from renderers import warm as warm_module
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Field, Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, sphere
 from renderers.rendering import Rendering, at_iteration, final_notes, with_empty_memory
 from renderers.silhouette import Hinge
-from renderers.warm import AUDIT_STRIDE, MIN_AUDITED_RAYS, Memory
+from renderers.tracing import warm as warm_module
+from renderers.tracing.warm import AUDIT_STRIDE, MIN_AUDITED_RAYS, Memory
 from tests.tiny import camera_of
 
 SIZE = 48  # pixels per side
@@ -82,7 +82,7 @@ def test_a_field_that_becomes_steep_loses_nothing(warm):
 
 
 def test_the_audit_detects_a_surface_that_appears_without_measured_movement(warm, monkeypatch):
-    monkeypatch.setattr("renderers.warm.PROBE_STRIDE", SIZE * SIZE)  # movement is measured on the first ray only
+    monkeypatch.setattr(warm_module, "PROBE_STRIDE", SIZE * SIZE)  # movement is measured on the first ray only
     plate = ball(0.5) | box((0.9, 0.9, 0.01)).translate((0.0, 0.0, 0.7))
 
     def values(points):

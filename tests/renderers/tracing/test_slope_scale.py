@@ -6,7 +6,13 @@ from torch import Tensor
 
 from renderers.field import Coarse, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere, torus
-from renderers.tracer import MAX_DISTANCE_SLOPE, SLOPE_PAIR_COUNT, SlopeNormalised, measure_slope_scale, normalise_slope
+from renderers.tracing.tracer import (
+    MAX_DISTANCE_SLOPE,
+    SLOPE_PAIR_COUNT,
+    SlopeNormalised,
+    measure_slope_scale,
+    normalise_slope,
+)
 from tests.looped import each
 
 LIKE = torch.zeros(0, 3)

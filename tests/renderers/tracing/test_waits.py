@@ -1,14 +1,16 @@
 """Marches that remove finished rays only now and then, as on a GPU, which has to be waited for."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from bench.config import load
-from renderers import waits
 from renderers.boundary import RENDERING_TENSORS, render_checked
 from renderers.field import Coarse, Counts, Flops, Kind, Meter
 from renderers.fields.analytic import torus
 from renderers.rendering import Renderer, Rendering, with_empty_memory
+from renderers.tracing import waits
 from tests.looped import each
 from tests.tiny import camera_of
 
@@ -68,7 +70,7 @@ def test_the_interval_of_removing_finished_rays_changes_no_number(name, monkeypa
     for tensor in RENDERING_TENSORS:
         assert torch.equal(getattr(first, tensor), getattr(second, tensor)), tensor
     assert torch.equal(gradient, second_gradient)
-    assert counts == second_counts and counts.hits == second_counts.hits > 100
+    assert counts == replace(second_counts, masked=0) and counts.hits > 100
     assert counts.masked == 0 < second_counts.masked
     assert shape.evaluated == second_counts.value + second_counts.coarse + second_counts.masked
     assert shape.furthest <= plain.furthest + 1e-4  # a field may be undefined outside the sphere

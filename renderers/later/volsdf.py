@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import equally_spaced
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, Kind
+from renderers.later.volumes import Samples, VolumeRenderer, render_volume, resample, schedule, weights
 from renderers.rendering import Capabilities, Rendering, check_kind
-from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, resample, schedule, weights
+from renderers.tracing.bracket import equally_spaced
 
 BISECTION_STEPS = 10  # for the least width, as in the paper
 MAX_EXPONENT = 14.0  # clamps the error bound: larger bounds need not be distinguished

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderers.bracket import SAMPLES_PER_BATCH, Bracket, equally_spaced, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import (
@@ -21,8 +20,9 @@ from renderers.field import (
     points_in_sphere,
 )
 from renderers.gradients import evaluate_crossing
-from renderers.packed_march import RayTable, Stop, Stride, march_rays, march_table
 from renderers.rendering import Deferred, Rendering, Status, assemble
+from renderers.tracing.bracket import SAMPLES_PER_BATCH, Bracket, equally_spaced, first_crossing, refine
+from renderers.tracing.packed_march import RayTable, Stop, Stride, march_rays, march_table
 
 # Scene units, times the slope along the ray: after a longer Newton step the field is evaluated again, since a step is
 # off by its square over the slope, times half the field's curvature.
@@ -138,8 +138,8 @@ class Tracer:
             restarted = table.select(index).restarted(doubtful, resumes, radius=self.sphere_radius)
             march_table(field, doubtful, restarted, self.stride(), COARSE_STEP_FACTOR * self._max_steps(field))
         second = self._crossings(field, doubtful, restarted).reindexed(index)
-        table.scatter(index, restarted)
-        table.path_clearance -= error
+        table.replace_rays(index, restarted)
+        table.path_clearance = table.path_clearance - error
         return first.select(certain[first.index]).concatenate(second)
 
     def _solve_near_hits(self, field: Field, rays: Rays, table: RayTable) -> "Crossings":
@@ -226,7 +226,7 @@ class Tracer:
         searched.update_smallest_sample(nearest, smallest)
         inside = value[:, 0] < 0
         searched.stop = torch.where(inside, Stop.INSIDE, searched.stop)
-        table.table[index] = searched.table
+        table.replace_rays(index, searched)
         spacing = (searched.leave - start) / (self.search_samples - 1)
         resampled = ((smallest < spacing / 2) & ~inside).nonzero().squeeze(-1)
         low, high = torch.maximum(nearest - spacing, start), torch.minimum(nearest + spacing, searched.leave)

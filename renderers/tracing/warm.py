@@ -20,9 +20,9 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
-from renderers.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable
 from renderers.rendering import Rendering
-from renderers.tracer import Crossings, Tracer, normalise_slope
+from renderers.tracing.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable
+from renderers.tracing.tracer import Crossings, Tracer, normalise_slope
 
 MOVEMENT_SAFETY_FACTOR = 2.0  # elsewhere the field may have moved further than at the samples
 MAX_REUSABLE_SLOPE = -0.1  # hits with a flatter slope along the ray are marched again, since they may vanish suddenly
@@ -207,7 +207,7 @@ def _solve_cached(tracer: Tracer, memory: Memory, field: Field, rays: Rays, cach
         differing = compared & _differing(solved, marched, compared)
         if memory.audit(*torch.stack([compared.sum(), differing.sum()]).tolist()):
             return None
-        table.scatter(index, marching)
+        table.replace_rays(index, marching)
         marched_at = cache.movement_when_marched
         marched_at[index] = torch.where(resumes[index], marched_at[index], cache.total_movement)
     return solved.select((certain & ~audited)[solved.index]).concatenate(marched)

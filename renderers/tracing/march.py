@@ -15,7 +15,7 @@ from torch import Tensor
 from renderers.camera import Rays, sphere_span
 from renderers.field import PointFunction
 from renderers.rendering import Status
-from renderers.waits import compaction_interval, evaluate_masked
+from renderers.tracing.waits import compaction_interval, evaluate_masked
 
 COARSE_BLOCK_SIZES = (4, 2)  # pixels per side of a coarse ray's block, by level (DIST, Sec. 3.2)
 STEPS_PER_COARSE_LEVEL = 3

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float, Int8
 from torch import Tensor
 
-from renderers.bracket import Bracket, refine
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Bounds, Field, field_bounds
 from renderers.gradients import attach_implicit_gradient, reevaluate_with_graph
 from renderers.rendering import Rendering, Status, assemble, check_kind
 from renderers.silhouette import SurfaceRenderer
+from renderers.tracing.bracket import Bracket, refine
 
 SEGMENT_GROWTH = 2.0  # factor after an empty segment
 SECANT_STEPS = 6  # to the root, within the last segment

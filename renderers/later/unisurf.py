@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from renderers.bracket import equally_spaced, first_crossing, refine
 from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, occupancy_logits
+from renderers.later.volumes import Samples, VolumeRenderer, render_volume, schedule
 from renderers.rendering import Rendering, check_kind
-from renderers.volumes.integrate import Samples, VolumeRenderer, render_volume, schedule
+from renderers.tracing.bracket import equally_spaced, first_crossing, refine
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from renderers.camera import Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field
 from renderers.gradients import implicit_rendering, reevaluate_with_graph
-from renderers.march import RayFront, Stepping, march_front
 from renderers.rendering import Rendering, Status, Volume, check_kind
 from renderers.silhouette import SurfaceRenderer
+from renderers.tracing.march import RayFront, Stepping, march_front
 
 # Times the band: samples above it are no candidates. A sample of a distance is at most 1.16 times the ray's minimum.
 CANDIDATE_FACTOR = 1.5

@@ -13,8 +13,8 @@ from renderers.field import Counts, Kind, Meter, Moved, estimate_lipschitz, fiel
 from renderers.fields.affine import segment_bounds
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
-from renderers.reference import trace
 from renderers.rendering import Status
+from renderers.tracing.reference import trace
 from tests.looped import each
 from tests.renderers.analytic_cases import vector
 

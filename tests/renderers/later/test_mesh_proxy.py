@@ -14,8 +14,14 @@ from renderers.fields.analytic import Shape, box, sphere
 from renderers.rendering import Status
 from tests.looped import each
 from tests.renderers.analytic_cases import aimed, vector
+from tests.runner.driving import by_program
 
 RENDERER = load("renderer", "mesh_proxy", grid=48)
+FIRST_USE = """
+import sys, renderers
+assert "open3d" not in sys.modules, "import renderers imports open3d"
+assert renderers.MeshProxy.__module__ == "renderers.later.mesh_proxy" and not hasattr(renderers, "Mesh")
+"""
 SPACING = 2 * RENDERER.sphere_radius / (RENDERER.grid - 1)
 
 
@@ -88,3 +94,8 @@ def test_a_field_without_a_surface_has_no_mesh(value):
     rendering = RENDERER.render(field, aimed(1, 5, spread=0.3))
     assert (rendering.status == (Status.STARTED_INSIDE if value < 0 else Status.MISS)).all()
     assert rendering.distance.isfinite().all()
+
+
+def test_libraries_of_meshes_are_imported_at_the_first_use_only():
+    result = by_program("-c", FIRST_USE)
+    assert result.code == 0, result.err

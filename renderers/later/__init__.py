@@ -1,0 +1,1 @@
+"""Renderers that are newer than the papers of the core: volumes, meshes, bands and range analysis."""
