@@ -10,7 +10,7 @@ from bench.records.metrics import DVR_TABLE2
 from bench.records.record import as_number
 from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
-from bench.report.tuning import TUNED_PREFIX
+from bench.report.suite.attempts import TUNED_PREFIX
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
