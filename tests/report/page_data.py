@@ -64,7 +64,6 @@ class Page:
             "environment": [texts[row] for row in run["environment"]],
             "metrics": [[texts[name], *values, texts[words]] for name, *values, words in run["metrics"]],
             "files": {name: address + name for name in texts[run["files"]]},
-            "python": texts[run["python"]].replace("\0", folder),
         }
 
     def paper(self, name: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from bench.records.record import as_number
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
 from bench.report.site.files import PICTURE_TEXTS, Folder
-from bench.report.site.words import STATUSES, command, lines_open, request_sentence
+from bench.report.site.words import STATUSES, command, request_sentence
 
 MAX_CURVE_POINTS = 240  # longer curves are thinned, but keep their ends and checkpoints
 PHASES = {
@@ -27,7 +27,6 @@ LEADING_KEYS = ("label", "field", "split", "index", "seed", "device", "threads",
 
 def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
     """The data of a run's page, except name, scene and status, which are in the list of runs."""
-    files = folder.links()
     return {
         "asked": request_sentence(record),
         "reason": record["reason"],
@@ -38,11 +37,10 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "costs": _costs(record),
         "environment": [(text(key), text(value)) for key, value in record["environment"].items()],
         "settings": settings(record),
-        "files": files,
+        "files": folder.links(),
         "pictures": [[name, folder.link(name), PICTURE_TEXTS.get(name, "")] for name in folder.pictures()],
         "curve": curve(folder),
         "command": command(record, results_dir),
-        "python": lines_open(record, results_dir / "runs" / folder.name, files),
     }
 
 
@@ -50,7 +48,7 @@ def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
     """Details of runs by key, for a script of the page. Content that runs share is stored once, in `texts`.
 
     Numbers of entries in `texts` replace the settings of each top-level key, a row of the machine, the name and the
-    definition of a metric, the names of files, and the Python lines, in which NUL replaces the name of the folder.
+    definition of a metric, and the names of files.
     """
     numbers: dict[Hashable, int] = {}
 
@@ -65,7 +63,6 @@ def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
             "environment": [number(row) for row in content["environment"]],
             "metrics": [[number(name), *values, number(words)] for name, *values, words in content["metrics"]],
             "files": number(tuple(content["files"])),
-            "python": number(content["python"].replace(f'"{folder.name}"', '"\0"')),
         }
     return {"texts": list(numbers), "runs": runs}
 

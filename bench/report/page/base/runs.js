@@ -63,7 +63,6 @@
         environment: run.environment.map((row) => texts[row]),
         metrics: run.metrics.map(([name, before, after, words]) => [texts[name], before, after, texts[words]]),
         files: Object.fromEntries(texts[run.files].map((name) => [name, data.address[index] + name])),
-        python: texts[run.python].replaceAll("\0", data.folder[index]),
       };
     }
 
