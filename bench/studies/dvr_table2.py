@@ -124,7 +124,6 @@ def _partial_rows(lines: list[dict[str, Any]]) -> str:
 
 
 def _error(line: dict[str, Any]) -> float:
-    """The median error on the seen surface, for sorting; infinite if it is missing."""
     return math.inf if line[SEEN_ERROR] is None else line[SEEN_ERROR]
 
 

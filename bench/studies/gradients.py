@@ -168,7 +168,6 @@ def draw_visibility(data: pd.DataFrame) -> Figure:
 
 
 def _cosine(value: float | None) -> str:
-    """A cosine with five decimals, to show small differences from 1."""
     return format.number(value) if value is None else f"{value:.5f}"
 
 

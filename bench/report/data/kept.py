@@ -79,7 +79,6 @@ def _rank(name: str) -> str:
 
 
 def _cells(value: Any, name: str = "") -> dict[str, str]:
-    """The cells of a value by their columns."""
     if _has_columns(value, name):
         inner = [_cells(item, f"{name}.{key}".lstrip(".")) for key, item in value.items()]
         return {column: cell for cells in inner for column, cell in cells.items()}

@@ -166,7 +166,6 @@ def safe_json(data: Any) -> str:
 
 
 def remove_others(folder: Path, keys: Iterable[str]) -> None:
-    """Removes the scripts of other keys."""
     current = {f"{key}.js" for key in keys}
     if folder.is_dir():
         with os.scandir(folder) as entries:
@@ -176,7 +175,6 @@ def remove_others(folder: Path, keys: Iterable[str]) -> None:
 
 
 def write_script(data: Path, kind: str, key: str, content: Any) -> None:
-    """Writes the script that hands the content of a kind and key to the page."""
     write_file(data / kind / f"{key}.js", to_script(kind, key, content).encode("ascii"))
 
 

@@ -98,7 +98,6 @@ class Study:
 
 @cache
 def _experiments() -> frozenset[str]:
-    """The experiments of this project."""
     return frozenset(read_yaml(file).get("experiment") for file in (CONF / "experiment").glob("*.yaml"))
 
 
