@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import started, write_bytes
-from bench.report.data.lines import READ_ERRORS
 from bench.report.data.records import Record, grouped, setting
 
 SUFFIX = ".runs.csv.gz"
@@ -26,6 +25,7 @@ CONFIG = "config."
 FROM_RUNS_CSV = "kept"  # the field that marks a record read from such a file
 UNFINISHED = ("not_run", "killed")
 UNMEASURED = (*UNFINISHED, "refused")  # statuses that say nothing about a renderer
+READ_ERRORS = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)
 LOCAL_FIELDS = ("log", "overrides", "environment.diff", "environment.platform", FROM_RUNS_CSV)
 LOCAL_FIELDS += ("config.results_dir", "config.priors_dir")  # they depend on the machine, or follow from other fields
 
