@@ -1,8 +1,6 @@
 """The data of a run's page: request, status, metrics, costs, settings, curve and pictures."""
 
-from collections.abc import Hashable, Iterable
 from functools import cache, lru_cache
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -42,29 +40,6 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "curve": curve(folder),
         "command": command(record, results_dir),
     }
-
-
-def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
-    """Details of runs by key, for a script of the page. Content that runs share is stored once, in `texts`.
-
-    Numbers of entries in `texts` replace the settings of each top-level key, a row of the machine, the name and the
-    definition of a metric, and the names of files.
-    """
-    numbers: dict[Hashable, int] = {}
-
-    def number(entry: Hashable) -> int:
-        return numbers.setdefault(entry, len(numbers))
-
-    runs = {}
-    for folder, content in details:
-        settings_by_section = groupby(content["settings"], key=lambda row: row[0].partition(".")[0])
-        runs[folder.key] = content | {
-            "settings": [number(tuple(rows)) for _, rows in settings_by_section],
-            "environment": [number(row) for row in content["environment"]],
-            "metrics": [[number(name), *values, number(words)] for name, *values, words in content["metrics"]],
-            "files": number(tuple(content["files"])),
-        }
-    return {"texts": list(numbers), "runs": runs}
 
 
 def settings(record: Record) -> list[tuple[str, str]]:

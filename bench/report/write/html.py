@@ -20,7 +20,7 @@ from bench.records.read import check_results, read_records
 from bench.records.record import file_lock, to_json_values, write_bytes, write_text
 from bench.report.data.records import grouped
 from bench.report.site.columns import columns
-from bench.report.site.detail import bundle, detail
+from bench.report.site.detail import detail
 from bench.report.site.files import Folder
 from bench.report.site.renderers import renderers
 from bench.report.write.paper import papers
@@ -79,7 +79,7 @@ def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: 
     _copy_assets(results_dir / PAGE_FOLDER)
     bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:KEY_PREFIX_LETTERS])
     details = (
-        (name, bundle((folder, detail(record, folder, results_dir)) for folder, record in runs))
+        (name, {folder.key: detail(record, folder, results_dir) for folder, record in runs})
         for name, runs in bundles.items()
     )
     _write_all(data, "run", details)
