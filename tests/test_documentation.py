@@ -163,6 +163,7 @@ def test_the_study_of_contributing_is_a_table(task_results, tmp_path, monkeypatc
         paper.studies.cache_clear()
         sys.modules.pop("bench.studies.coverage", None)
     assert page.columns[0] == "Run" and len(page.rows) == 2 and page.question
+    assert "pixels;" not in page.caption  # the size of the view, which the task does not use
     assert not list((task_results / "sweeps").glob("*/table.csv"))  # a page shows it
 
 

@@ -67,7 +67,6 @@ class Gap:
     shapes: int
 
     def __str__(self) -> str:
-        """The ratio with its interval, and the shapes."""
         return f"{self.ratio}; {self.better:g} of {self.shapes}"
 
 
@@ -407,6 +406,5 @@ def heading(condition: str) -> str:
 
 
 def _evaluation_settings(config: dict[str, Any]) -> list[Any]:
-    """The settings that an evaluation depends on."""
     paths = (("split",), ("prior",), ("evaluation", "grid"), ("evaluation", "points"))
     return [setting(config, *path) for path in paths]

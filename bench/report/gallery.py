@@ -214,7 +214,7 @@ def first_shapes(runs: Runs, max_shapes: int, presets: Sequence[str] = ()) -> Ru
         numbers = sorted({index(record) for record in records})[:max_shapes]
         seed = min(record["seed"] for record in records)
         chosen += [record for record in records if index(record) in numbers and record["seed"] == seed]
-    return replace(runs, records=chosen, left_out=runs.left_out + len(runs.records) - len(chosen))
+    return runs.only(chosen)
 
 
 @figure_style.styled

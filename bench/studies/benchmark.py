@@ -63,12 +63,10 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
 
 
 def _size_and_threads(record: Record) -> tuple[int, int]:
-    """The size of the image and the number of threads."""
     return setting(record["config"], "task", "size"), setting(record["config"], "task", "threads")
 
 
 def _lines(record: Record) -> list[dict[str, Any]]:
-    """A line per renderer of a run."""
     numbers: dict[str, dict[str, Any]] = {}
     for key in record["metrics"]:
         name, _, metric = key.rpartition(".")
@@ -84,8 +82,6 @@ def _lines(record: Record) -> list[dict[str, Any]]:
 
 
 def _ratio(cost: str) -> table.Column:
-    """The median of a ratio, with its minimum and maximum."""
-
     def text(line: dict[str, Any]) -> str:
         median, low, high = (line.get(f"{cost}_ratio{end}") for end in ("", "_low", "_high"))
         if median is None:

@@ -241,7 +241,6 @@ CHECKED, UNTESTED, AS_CLAIMED = "checked by a test", "not tested", "as claimed"
 
 
 def make(*sources: Runs | None) -> Result:
-    """A line per claim."""
     experiments: dict[str, Runs | None] = dict(zip(EXPERIMENTS, sources, strict=True))
     lines = [_line(claim, experiments.get(claim.experiment)) for claim in CLAIMS]
     return Result(

@@ -10,7 +10,7 @@ from bench.records.metrics import DVR_TABLE2
 from bench.records.record import as_number
 from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
-from bench.report.tuning import TUNED_PREFIX
+from bench.report.suite.attempts import TUNED_PREFIX
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
@@ -124,7 +124,6 @@ def _partial_rows(lines: list[dict[str, Any]]) -> str:
 
 
 def _error(line: dict[str, Any]) -> float:
-    """The median error on the seen surface, for sorting; infinite if it is missing."""
     return math.inf if line[SEEN_ERROR] is None else line[SEEN_ERROR]
 
 

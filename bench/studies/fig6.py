@@ -82,7 +82,6 @@ def _verdict(poses: pd.DataFrame) -> str:
 
 
 def _line(row: str, poses: pd.DataFrame) -> dict[str, Any]:
-    """The runs of a method by angle, and its median costs."""
     costs = poses[["seconds", "evaluations"]].median()
     return {"method": row, **costs, **{str(angle): angle_poses for angle, angle_poses in poses.groupby("degrees")}}
 
@@ -98,7 +97,6 @@ def _share(poses: pd.DataFrame | None) -> str:
 
 
 def draw(rows: dict[tuple[str, str], pd.DataFrame]) -> Figure:
-    """Draws success over the initial angle."""
     lines = []
     for (row, preset), poses in rows.items():
         rates = {angle: _rate(angle_poses).times(100) for angle, angle_poses in poses.groupby("degrees")}

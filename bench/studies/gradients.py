@@ -84,7 +84,10 @@ def make_visibility(runs: Runs) -> Result:
 def _band_lines(runs: Runs, bands: Iterable[str], names: Sequence[str]) -> pd.DataFrame:
     """A line per run and band, with the run's preset and readable name."""
     identity = table.to_data(table.IDENTITY, runs.records).assign(preset=list(runs.frame.preset), name=runs.names())
-    tables = [identity.assign(band=band, **{name: runs.number(f"{band}.{name}") for name in names}) for band in bands]
+    tables = [
+        identity.assign(band=band, **{name: runs.number(f"{band}.{name}", optional=True) for name in names})
+        for band in bands
+    ]
     return pd.concat(tables).sort_index(kind="stable")
 
 
@@ -165,7 +168,6 @@ def draw_visibility(data: pd.DataFrame) -> Figure:
 
 
 def _cosine(value: float | None) -> str:
-    """A cosine with five decimals, to show small differences from 1."""
     return format.number(value) if value is None else f"{value:.5f}"
 
 

@@ -21,7 +21,6 @@ RUNS = (table.FAMILY, *table.IDENTITY, *table.metrics(*NAMES, *TRUTH, "own_psnr"
 
 
 def make(runs: Runs) -> Result:
-    """A line per row."""
     lines, folders = medians.medians(runs, (*NAMES, *TRUTH)), format.plural(len(runs.families()), "folder")
     measured = {key for line in lines for key in TRUTH if line[key] is not None and isfinite(line[key])}
     truth_columns = [column for column in TRUTH_COLUMNS if column.key in measured]

@@ -34,7 +34,6 @@ Line = dict[str, Any]
 
 
 def make(runs: Runs) -> Result:
-    """A line per row."""
     counted = runs.executed
     pairs = {metric: _pairs(counted, metric) for metric in METRICS}
     lines = [_line(row.name, counted, pairs) for row in runs.rows()]

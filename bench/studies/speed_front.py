@@ -115,7 +115,7 @@ def _cells(runs: Runs, trial: Trial, keys: list[records.RunKey]) -> pd.DataFrame
     Rows of a renderer with equal errors after equal numbers of field evaluations compute the same. They share their
     times, because otherwise noise would rank them.
     """
-    values, *coarse_values = map(runs.number, trial.values)
+    values, *coarse_values = (runs.number(name, optional=True) for name in trial.values)
     quantities = {
         "seconds": runs.number(trial.seconds),
         "error": runs.error(trial.error).clip(lower=records.CHAMFER_SCALE * MIN_PLOTTED_ERROR),

@@ -157,7 +157,6 @@ def make_curves(runs: Runs) -> Result:
 
 
 def title(axis: str) -> str:
-    """An axis's readable name."""
     return axis.replace("_", " ")
 
 

@@ -1,5 +1,6 @@
 """The suite: progress of each renderer over its cost, significant differences, and the cost of a run in each set."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -59,7 +60,7 @@ def make(*several: Runs | None) -> Result:
         for name in BUDGETS
     }
     return Result(
-        replace(runs, records=[], left_out=0),  # kept attempts count even if their run folders are gone
+        replace(runs, records=[], left_out=Counter()),  # kept attempts count even if their run folders are gone
         "The suite.",
         "Progress of each renderer from the initial to the best possible error, over its cost; in brackets, its "
         "possible ranks. A cross: all runs failed.",
@@ -100,7 +101,7 @@ def make_sets(*several: Runs | None) -> Result:
     seconds = {row: cost.value for row, cost in zip(lines["row"], lines["seconds"], strict=True) if cost}
     scenes = format.plural(ranked.scenes, "scene")
     return Result(
-        replace(runs, records=[], left_out=0),
+        replace(runs, records=[], left_out=Counter()),
         "The suite, set by set.",
         "Progress of each renderer in each problem set, and costs of a whole run relative to DIST on the same problem.",
         question="What does a run of each renderer cost, and how much progress fits in the runtime of one DIST run?",

@@ -78,7 +78,6 @@ def _requested(record: records.Record) -> int | None:
 
 
 def _at_size(record: records.Record, metric: str) -> float | None:
-    """A metric at the requested size."""
     return records.measured(record, metric) if records.measured(record, "size") == _requested(record) else None
 
 

@@ -29,12 +29,13 @@ RUNS = (
     table.Column(f"{records.ONE_WAY}_start", value=lambda record: record["metrics_start"].get(records.ONE_WAY)),
     *table.LOOP,
 )
+START = f"start_{records.ONE_WAY}"
 MAX_SHAPES = 4  # per family in pictures
 
 
 def _above(compared: compare.Compared) -> compare.Above:
     """The initial errors, by the kind of initial code, and the oracle."""
-    runs, errors = compared.runs, records.CHAMFER_SCALE * compared.runs.number(f"start_{records.ONE_WAY}")
+    runs, errors = compared.runs, records.CHAMFER_SCALE * compared.runs.number(START, optional=True)
     encoded = runs.setting(ENCODER_KEY) != ""
     starts = {"initial error, random": errors[~encoded], "initial error, encoder": errors[encoded]}
     medians_of = {

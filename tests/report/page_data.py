@@ -55,17 +55,8 @@ class Page:
 
     def run(self, folder: str) -> dict[str, Any]:
         """The details of a run."""
-        place = self.folders.index(folder)
-        key, address = (self.runs[column][place] for column in ("key", "address"))
-        whole = self.read("run", key[: self.beginning])
-        texts, run = whole["texts"], whole["runs"][key]
-        return run | {
-            "settings": [row for part in run["settings"] for row in texts[part]],
-            "environment": [texts[row] for row in run["environment"]],
-            "metrics": [[texts[name], *values, texts[words]] for name, *values, words in run["metrics"]],
-            "files": {name: address + name for name in texts[run["files"]]},
-            "python": texts[run["python"]].replace("\0", folder),
-        }
+        key = self.runs["key"][self.folders.index(folder)]
+        return self.read("run", key[: self.beginning])[key]
 
     def paper(self, name: str) -> dict[str, Any]:
         """The details of a table or figure."""

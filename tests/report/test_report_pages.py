@@ -11,10 +11,10 @@ import bench.studies
 from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import Selection, choose
-from bench.report.write import paper
+from bench.report.write import paper, table
 from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.paper import find_paper, papers, studies, write_paper
-from bench.report.write.result import Shown, read_shown
+from bench.report.write.result import Result, Shown, read_shown
 from bench.studies import table1
 from tests.looped import each
 from tests.report.test_report_paper import DYNAMIC, NAIVE, costs, write_run
@@ -72,6 +72,24 @@ def test_two_presets_under_one_label_are_two_rows(tmp_path):
         write_run(tmp_path, "table1", "same", metrics=costs(queries), renderer=preset)
     made = table1.make(choose(read_records(tmp_path)[0], table1.READS[0], tmp_path), None)
     assert list(made.data["queries"]) == [5, 7] and list(made.data["row"]) == ["same, dist", "same, mine"]
+
+
+def test_a_mistyped_metric_is_an_error_with_the_nearest_name(tmp_path):
+    write_run(tmp_path, "mine", "A", metrics={"hits": 3})
+    runs = choose(read_records(tmp_path)[0], Selection("mine"), tmp_path)
+    with pytest.raises(ValueError, match=r"no run of the experiment mine has a metric 'hist': did you mean hits\?"):
+        runs.number("hist")
+    with pytest.raises(ValueError, match=r"did you mean hits\?"):
+        Result(runs, "T.", "P.", columns=[table.metric("hist", "Pixels")], lines=runs.records)
+
+
+def test_a_mistyped_experiment_is_a_problem_with_the_nearest_name(tmp_path, monkeypatch):
+    mine = paper.Study(1, (Selection("tabel2"),), {"mine": lambda runs: runs})
+    monkeypatch.setattr(paper, "studies", lambda: (mine,))
+    problems: list[str] = []
+    assert write_paper([], tmp_path, problems=problems) == []
+    (problem,) = problems
+    assert "mine (ValueError: no run and no file of conf/experiment has experiment: tabel2: did you mean" in problem
 
 
 def test_a_study_is_found_by_its_file_and_one_that_cannot_be_read_costs_no_other(tmp_path, monkeypatch):
@@ -145,7 +163,7 @@ def test_a_run_that_failed_stays_a_row_and_the_newest_of_a_cell_counts(tmp_path)
     write_run(tmp_path, "table1", NAIVE, metrics=costs(1), settings=smoke, minute=0)
     runs = choose(read_records(tmp_path)[0], table1.READS[0], tmp_path)
     assert list(runs.frame.row) == [DYNAMIC, NAIVE] and list(runs.frame.status) == ["ok", "timeout"]
-    assert list(runs.error("queries", 1.0)) == [7.0, math.inf] and runs.left_out == 2
+    assert list(runs.error("queries", 1.0)) == [7.0, math.inf] and runs.left_out.total() == 2
 
 
 PAPER = Path(__file__).parents[2] / "results" / "paper"

@@ -6,6 +6,7 @@ import pytest
 
 from bench.records.read import read_records
 from bench.report.data.runs import Runs, Selection, choose, merge_runs
+from bench.report.write.caption import warnings
 from tests.report.test_report_paper import write_run
 
 
@@ -46,7 +47,7 @@ def test_a_row_has_the_setting_that_was_requested_last_not_the_one_that_ran_last
             write_run(tmp_path, "mine", "A", index=index, asked=f"2025-04-0{day}T10:00:00+00:00", settings=renderer)
     runs = read(tmp_path)
     assert [record["config"]["renderer"]["epsilon"] for record in runs.records] == [1e-3, 1e-3]
-    assert runs.left_out == 2
+    assert runs.left_out.total() == 2
 
 
 @pytest.mark.parametrize("strength, solids, views", [(0.0, [None, None], [0, 1]), (1.0, [0, 1], [0, 0])])
@@ -56,15 +57,26 @@ def test_each_view_or_deformation_of_a_mesh_file_is_a_cell(tmp_path, strength, s
         write_run(tmp_path, "mine", "A", index=index, settings=dataset)
     runs = read(tmp_path)
     assert runs.frame["solid"].tolist() == [*map(str, solids)] and runs.frame["view"].tolist() == views
-    assert runs.left_out == 1
+    assert runs.left_out.total() == 1
 
 
 def test_runs_of_several_experiments_together_leave_out_what_each_leaves_out(tmp_path):
     for experiment in ("mine", "other", "mine", "other", "other"):
         write_run(tmp_path, experiment, "A")
     both = merge_runs(read(tmp_path), None, read(tmp_path, "other"))
-    assert (len(both.records), both.left_out) == (2, 3)
+    assert (len(both.records), both.left_out) == (2, {"mine": 1, "other": 2})
     assert [record["config"]["experiment"] for record in both.records] == ["mine", "other"]
+    assert any(note.startswith("Not shown: 1 run of mine, 2 runs of other at") for note in warnings(both))
+
+
+def test_settings_that_share_a_label_are_named(tmp_path):
+    for steps in (40, 50, 50):
+        write_run(tmp_path, "mine", "same", settings={"renderer": {"steps": steps}})
+    notes = " ".join(warnings(read(tmp_path)))
+    assert "Several settings have the same label: same (renderer.steps)." in notes and "label=NAME" in notes
+    assert warnings(read(tmp_path, conditions=("renderer.steps",))) == [
+        "Not shown: 1 run of mine at another scale or on another scene, or replaced by newer ones."
+    ]
 
 
 def test_only_the_split_of_the_run_requested_last_is_read_unless_it_is_a_condition(tmp_path):
@@ -79,7 +91,7 @@ def test_the_newest_scene_is_one_shape_at_one_seed(tmp_path):
         write_run(tmp_path, "mine", f"A {index} {seed} {len(list(tmp_path.glob('runs/*')))}", index=index, seed=seed)
     newest = read(tmp_path).of_newest_scene()
     assert [(record["config"]["index"], record["seed"]) for record in newest.records] == [(1, 1), (1, 1)]
-    assert newest.left_out == 3
+    assert newest.left_out.total() == 3
 
 
 def test_runs_of_other_processors_threads_or_engines_are_of_other_machines(tmp_path):

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import started, write_bytes
-from bench.report.data.lines import READ_ERRORS
 from bench.report.data.records import Record, grouped, setting
 
 SUFFIX = ".runs.csv.gz"
@@ -26,6 +25,7 @@ CONFIG = "config."
 FROM_RUNS_CSV = "kept"  # the field that marks a record read from such a file
 UNFINISHED = ("not_run", "killed")
 UNMEASURED = (*UNFINISHED, "refused")  # statuses that say nothing about a renderer
+READ_ERRORS = (OSError, ValueError, TypeError, KeyError, RecursionError, csv.Error)
 LOCAL_FIELDS = ("log", "overrides", "environment.diff", "environment.platform", FROM_RUNS_CSV)
 LOCAL_FIELDS += ("config.results_dir", "config.priors_dir")  # they depend on the machine, or follow from other fields
 
@@ -79,7 +79,6 @@ def _rank(name: str) -> str:
 
 
 def _cells(value: Any, name: str = "") -> dict[str, str]:
-    """The cells of a value by their columns."""
     if _has_columns(value, name):
         inner = [_cells(item, f"{name}.{key}".lstrip(".")) for key, item in value.items()]
         return {column: cell for cells in inner for column, cell in cells.items()}

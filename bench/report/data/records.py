@@ -107,7 +107,6 @@ def setting(config: dict[str, Any], *path: str) -> Any:
 
 
 def shape(record: Record) -> tuple[str, Any]:
-    """The family and the index of a run's shape."""
     return family(record), index(record)
 
 

@@ -1,6 +1,7 @@
 """The runs that a study reads: the newest run of each cell of its experiment, as records and as a typed table."""
 
-from collections.abc import Hashable
+from collections import Counter
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.records.metrics import MEASUREMENT_METRICS, better_direction
 from bench.records.names import flat
 from bench.records.record import requested, row_name, started
 from bench.report.data.frame import to_frame
@@ -24,11 +26,14 @@ from bench.report.data.records import (
     index,
     row_of,
     setting,
+    shape,
     solid,
     view,
 )
+from bench.tables import nearest
 
 MACHINE_KEYS = ("cpu", "device", "threads")
+ROW_SECTIONS = ("renderer", "task", "silhouette", "field")  # settings in which rows of equal names may differ
 
 
 @dataclass(frozen=True)
@@ -60,13 +65,16 @@ class NoFolder(LookupError):
 class Runs:
     """The runs of an experiment in the order of their rows, including failed and planned ones.
 
-    `left_out` is the number of its runs at another scale, or replaced by a newer run of the same cell.
+    Args:
+        left_out: by experiment, the number of runs at another scale, or replaced by a newer run of the same cell.
+        renamed: the rows of which runs with other settings are left out, with the keys of these settings.
     """
 
     selection: Selection
     results_dir: Path
     records: list[Record]
-    left_out: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    renamed: dict[str, list[str]] = field(default_factory=dict)
     everything: list[Record] = field(default_factory=list, repr=False)
 
     @cached_property
@@ -97,10 +105,24 @@ class Runs:
         ok = (self.frame.status == "ok").to_numpy(bool)
         return self.number(metric).where(ok, np.inf).fillna(np.inf) * scale
 
-    def number(self, column: str) -> pd.Series:
-        """A column as floats; nan for missing values and text."""
+    def number(self, column: str, *, optional: bool = False) -> pd.Series:
+        """A column as floats; nan for missing values and text.
+
+        Raises:
+            ValueError: no run has this metric, and it is not optional.
+        """
+        if not optional:
+            self.check_metric(column)
         values = self.frame[column] if column in self.frame else pd.Series(np.nan, self.frame.index)
         return pd.to_numeric(values.astype(object).where(values.notna(), np.nan), errors="coerce").astype(float)
+
+    def check_metric(self, name: str) -> None:
+        """Raises ValueError if runs have metrics, but none of this name, and the name is no metric of this project."""
+        names = list(dict.fromkeys(key for run in self.records for key in run["metrics"]))
+        if names and name not in self.frame and not better_direction(name) and name not in MEASUREMENT_METRICS:
+            raise ValueError(
+                f"no run of the experiment {self.selection.experiment} has a metric {name!r}{nearest(name, names)}"
+            )
 
     @property
     def timed(self) -> bool:
@@ -201,7 +223,12 @@ class Runs:
         """The runs with the seed and the shape of the run that was requested last."""
         newest = max(self.records, key=requested)
         kept = [r for r in self.records if (r["seed"], index(r)) == (newest["seed"], index(newest))]
-        return replace(self, records=kept, left_out=self.left_out + len(self.records) - len(kept))
+        return self.only(kept)
+
+    def only(self, kept: list[Record]) -> "Runs":
+        """These runs; the others count as left out."""
+        others = Counter({self.selection.experiment: len(self.records) - len(kept)})
+        return replace(self, records=kept, left_out=self.left_out + others)
 
 
 def choose(records: list[Record], selection: Selection, results_dir: Path) -> Runs | None:
@@ -217,21 +244,26 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ru
     shared = [key for key in ("scale.name", "split", *selection.alike) if key not in selection.conditions]
     newest = max(candidates, key=requested)
     wanted = [_without_conditions(newest, key, selection) for key in shared]
-    chosen = [run for run in candidates if [_without_conditions(run, key, selection) for key in shared] == wanted]
+    same_scale = [run for run in candidates if [_without_conditions(run, key, selection) for key in shared] == wanted]
+    chosen = same_scale
     if "dataset" not in selection.alike:
         newest = {_row_key(run): _row_settings(run, selection) for run in sorted(chosen, key=requested)}
         chosen = [record for record in chosen if _row_settings(record, selection) == newest[_row_key(record)]]
     cells: dict[Hashable, Record] = {}
     for record in chosen:  # a cell keeps the position of its first record, with the content of the newest
         cells[_cell_key(record, selection)] = record
-    return Runs(selection, results_dir, named_rows(list(cells.values())), len(candidates) - len(cells), records)
+    left_out = Counter({selection.experiment: len(candidates) - len(cells)})
+    renamed = _renamed(same_scale, list(cells.values()), selection)
+    return Runs(selection, results_dir, named_rows(list(cells.values())), +left_out, renamed, records)
 
 
 def merge_runs(*runs_or_none: Runs | None) -> Runs:
     """The runs of several experiments as one object, for a common caption."""
     present = [runs for runs in runs_or_none if runs is not None]
     records = sorted((record for runs in present for record in runs.records), key=started)
-    return replace(present[0], records=records, left_out=sum(runs.left_out for runs in present))
+    left_out = sum((runs.left_out for runs in present), Counter())
+    renamed = {row: keys for runs in present for row, keys in runs.renamed.items()}
+    return replace(present[0], records=records, left_out=left_out, renamed=renamed)
 
 
 def shared_loss(records: list[Record]) -> str:
@@ -276,6 +308,20 @@ def _without_conditions(record: Record, key: str, selection: Selection) -> Any:
         return node
     names = [name for name in node if f"{key}.{name}" not in selection.conditions]
     return {name: _without_conditions(record, f"{key}.{name}", selection) for name in names}
+
+
+def _renamed(runs: Iterable[Record], kept: list[Record], selection: Selection) -> dict[str, list[str]]:
+    """The rows of which runs with other settings than those of a kept run are left out, with the keys that differ."""
+    newest, kept_ids = {(_row_key(run), shape(run)): run for run in kept}, {run["id"] for run in kept}
+    renamed: dict[str, list[str]] = {}
+    for run in runs:
+        other = newest.get((_row_key(run), shape(run)))
+        if run["id"] not in kept_ids and other is not None:
+            settings, others = (flat({key: r["config"].get(key) for key in ROW_SECTIONS}) for r in (run, other))
+            keys = [key for key in settings if key in others and str(settings[key]) != str(others[key])]
+            differing = [key for key in keys if key not in selection.conditions and not key.endswith("seed")]
+            renamed |= {row_of(run).name: differing} if differing else {}
+    return renamed
 
 
 def _row_key(record: Record) -> Hashable:

@@ -44,7 +44,6 @@ class Interval:
 
     @property
     def has_ends(self) -> bool:
-        """Whether there is an interval."""
         return not math.isnan(self.low)
 
     def times(self, scale: float) -> "Interval":
@@ -60,7 +59,6 @@ class Interval:
         return f"{self.alone()} {self.ends()}"
 
     def alone(self) -> str:
-        """The estimate without its interval."""
         return format.number(None if math.isnan(self.value) else self.value)
 
 
@@ -189,7 +187,6 @@ def _sign_test_p_value(points: Sequence[float]) -> float:
 
 
 def _shape_means(groups: Groups) -> np.ndarray:
-    """The geometric mean of each shape's runs."""
     return np.array([geometric_mean(flat([group])) for group in groups])
 
 

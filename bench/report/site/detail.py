@@ -1,8 +1,6 @@
 """The data of a run's page: request, status, metrics, costs, settings, curve and pictures."""
 
-from collections.abc import Hashable, Iterable
 from functools import cache, lru_cache
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ from bench.records.record import as_number
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
 from bench.report.site.files import PICTURE_TEXTS, Folder
-from bench.report.site.words import STATUSES, command, lines_open, request_sentence
+from bench.report.site.words import STATUSES, command, request_sentence
 
 MAX_CURVE_POINTS = 240  # longer curves are thinned, but keep their ends and checkpoints
 PHASES = {
@@ -27,7 +25,6 @@ LEADING_KEYS = ("label", "field", "split", "index", "seed", "device", "threads",
 
 def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
     """The data of a run's page, except name, scene and status, which are in the list of runs."""
-    files = folder.links()
     return {
         "asked": request_sentence(record),
         "reason": record["reason"],
@@ -38,36 +35,11 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "costs": _costs(record),
         "environment": [(text(key), text(value)) for key, value in record["environment"].items()],
         "settings": settings(record),
-        "files": files,
+        "files": folder.links(),
         "pictures": [[name, folder.link(name), PICTURE_TEXTS.get(name, "")] for name in folder.pictures()],
         "curve": curve(folder),
         "command": command(record, results_dir),
-        "python": lines_open(record, results_dir / "runs" / folder.name, files),
     }
-
-
-def bundle(details: Iterable[tuple[Folder, dict[str, Any]]]) -> dict[str, Any]:
-    """Details of runs by key, for a script of the page. Content that runs share is stored once, in `texts`.
-
-    Numbers of entries in `texts` replace the settings of each top-level key, a row of the machine, the name and the
-    definition of a metric, the names of files, and the Python lines, in which NUL replaces the name of the folder.
-    """
-    numbers: dict[Hashable, int] = {}
-
-    def number(entry: Hashable) -> int:
-        return numbers.setdefault(entry, len(numbers))
-
-    runs = {}
-    for folder, content in details:
-        settings_by_section = groupby(content["settings"], key=lambda row: row[0].partition(".")[0])
-        runs[folder.key] = content | {
-            "settings": [number(tuple(rows)) for _, rows in settings_by_section],
-            "environment": [number(row) for row in content["environment"]],
-            "metrics": [[number(name), *values, number(words)] for name, *values, words in content["metrics"]],
-            "files": number(tuple(content["files"])),
-            "python": number(content["python"].replace(f'"{folder.name}"', '"\0"')),
-        }
-    return {"texts": list(numbers), "runs": runs}
 
 
 def settings(record: Record) -> list[tuple[str, str]]:

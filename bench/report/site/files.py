@@ -30,12 +30,10 @@ class Folder:
 
     @property
     def key(self) -> str:
-        """The name of the run's files in the page's data."""
         return key_of(self.name)
 
     @cached_property
     def _linked(self) -> dict[str, bool]:
-        """The names of its files, and whether each is a link."""
         try:
             with os.scandir(self.path) as entries:
                 return {entry.name: entry.is_symlink() for entry in entries if entry.is_file()}

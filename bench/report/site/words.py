@@ -1,11 +1,9 @@
-"""Texts on a run: its request, the meaning of its status, the command that repeats it, Python lines that open it."""
+"""Texts on a run: its request, the meaning of its status, the command that repeats it."""
 
-import json
 import shlex
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.records import metrics
 from bench.records.read import RESULTS
 from bench.records.record import NOT_RUN, RunStatus
 from bench.report.data.records import Record, iterations_of, setting
@@ -28,7 +26,6 @@ TASKS = {
     "capacity": "Measure how much model a shape needs",
 }
 OMITTED_KEYS = ("results_dir", "rerun")  # the command names no folder but the default one
-MAX_PRINTED_METRICS = 4
 
 
 class Help(NamedTuple):
@@ -107,31 +104,3 @@ def command(record: Record, results_dir: Path) -> str:
     overrides = map(str, record.get("overrides") or [])
     kept = [text for text in overrides if text.partition("=")[0] not in OMITTED_KEYS]
     return shlex.join(["python", "-m", "bench", *kept, *folder])
-
-
-def lines_open(record: Record, folder: Path, files: dict[str, str]) -> str:
-    """The Python lines that open the run: its row in the table of runs, its curve, its mesh and its field."""
-    results, name = _quoted(folder.parents[1].as_posix()), _quoted(folder.name)
-    names = [metric for metric in metrics.TABLE_METRICS if metric in record["metrics"]]
-    shown = ["status", *names[:MAX_PRINTED_METRICS]]
-    opened = {
-        "curve.jsonl": ("import pandas as pd", 'curve = pd.read_json(folder / "curve.jsonl", lines=True)'),
-        "mesh.ply": ("import trimesh", 'mesh = trimesh.load(folder / "mesh.ply")'),
-        "field.safetensors": ("", "field = bench.load_field(folder)"),
-    }
-    others = [lines for file, lines in opened.items() if file in files]
-    imports = ["import bench", *(first for first, _ in others if first)]
-    lines = [
-        f"runs = bench.load({results})",
-        f"run = runs[runs.folder == {name}].iloc[0]",
-        f"print(run[{json.dumps(shown)}])",
-    ]
-    if others:
-        imports.insert(0, "from pathlib import Path\n")
-        lines += ["", f'folder = Path({results}) / "runs" / {name}', *(line for _, line in others)]
-    return "\n".join([*imports, "", *lines])
-
-
-def _quoted(text: str) -> str:
-    """A text as a Python literal, in double quotes if possible."""
-    return json.dumps(text, ensure_ascii=False) if text.isprintable() else repr(text)

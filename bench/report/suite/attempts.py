@@ -4,10 +4,13 @@ Attempts are made from runs, and stored as CSV files: a file per renderer, a lin
 run folders, and can be merged from several days and machines.
 """
 
+import csv
+import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
+from io import StringIO
 from itertools import product
 from math import inf, isnan
 from pathlib import Path
@@ -15,9 +18,16 @@ from typing import Any
 
 from bench.records.names import flat
 from bench.records.read import curve_lines
-from bench.records.record import RunStatus, as_number, digest, renderer_name
-from bench.report.data.kept import UNMEASURED
-from bench.report.data.lines import READ_ERRORS, read_lines, write_lines
+from bench.records.record import (
+    RunStatus,
+    as_number,
+    digest,
+    from_json_values,
+    renderer_name,
+    to_json_values,
+    write_text,
+)
+from bench.report.data.kept import READ_ERRORS, UNMEASURED
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml
 
@@ -224,7 +234,31 @@ def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]
     ordered = sorted(newest_attempts([*stored, *attempts]), key=lambda attempt: attempt.key)
     files = grouped(ordered, lambda attempt: re.sub(r"[^a-z0-9]+", "_", attempt.row.lower()).strip("_") or "row")
     folder.mkdir(parents=True, exist_ok=True)
-    return [write_lines(folder / f"{name}.csv", Attempt, group) for name, group in sorted(files.items())]
+    return [_write_lines(folder / f"{name}.csv", group) for name, group in sorted(files.items())]
+
+
+def _write_lines(path: Path, attempts: list[Attempt]) -> Path:
+    """Writes a line per attempt: text unchanged, other values as JSON."""
+    text = StringIO()
+    table = csv.DictWriter(text, [field.name for field in fields(Attempt)], lineterminator="\n")
+    table.writeheader()
+    for attempt in attempts:
+        cells = asdict(attempt).items()
+        table.writerow({k: cell if isinstance(cell, str) else json.dumps(to_json_values(cell)) for k, cell in cells})
+    write_text(path, text.getvalue())
+    return path
+
+
+def _read_lines(path: Path) -> list[Attempt]:
+    """Reads the attempts of a file; one of `READ_ERRORS` if it is damaged, or its columns are not those of today."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return [
+            Attempt(**{f.name: _value(line[f.name], f.type) for f in fields(Attempt)}) for line in csv.DictReader(file)
+        ]
+
+
+def _value(cell: str, kind: Any) -> Any:
+    return cell if kind is str else from_json_values(json.loads(cell))
 
 
 def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
@@ -232,7 +266,7 @@ def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
     attempts, problems = list[Attempt](), list[str]()
     for path in (path for folder in folders for path in sorted(attempts_folder(folder).glob("[!.]*.csv"))):
         try:
-            attempts += [*map(_checked, read_lines(path, Attempt))]
+            attempts += [*map(_checked, _read_lines(path))]
         except READ_ERRORS as error:
             problems.append(f"{path.name}: {error!r}")
     return attempts, problems

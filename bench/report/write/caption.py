@@ -58,7 +58,7 @@ def undefined(values: Iterable[float]) -> str:
 def warnings(runs: Runs) -> list[str]:
     """Notes on differing settings, incomparable or doubtful times, old runs and missing runs."""
     timing = (_machines(runs), _loaded(runs)) if "machine" in runs.selection.setup else ()  # else it shows no times
-    notes = (_mixed(runs), *timing, *age.notes(runs.records), _omitted(runs))
+    notes = (_mixed(runs), *timing, *age.notes(runs.records), _omitted(runs), _renamed(runs))
     return [note for note in notes if note]
 
 
@@ -115,8 +115,16 @@ def _outcome(runs: Runs) -> str:
 
 
 def _omitted(runs: Runs) -> str:
-    reason = "of this experiment at another scale or on another scene, or replaced by newer ones"
-    return f"Not shown: {plural(runs.left_out, 'run')} {reason}." if runs.left_out else ""
+    if not runs.left_out:
+        return ""
+    counts = [f"{plural(count, 'run')} of {name}" for name, count in runs.left_out.items()]
+    return f"Not shown: {', '.join(counts)} at another scale or on another scene, or replaced by newer ones."
+
+
+def _renamed(runs: Runs) -> str:
+    rows = [f"{row} ({_listed(keys)})" for row, keys in runs.renamed.items()]
+    remedy = "Only the settings requested last are shown: run each setting with another label=NAME"
+    return f"Several settings have the same label: {_listed(rows)}. {remedy}." if rows else ""
 
 
 def _mixed(runs: Runs) -> str:

@@ -20,7 +20,7 @@ from bench.records.read import check_results, read_records
 from bench.records.record import file_lock, to_json_values, write_bytes, write_text
 from bench.report.data.records import grouped
 from bench.report.site.columns import columns
-from bench.report.site.detail import bundle, detail
+from bench.report.site.detail import detail
 from bench.report.site.files import Folder
 from bench.report.site.renderers import renderers
 from bench.report.write.paper import papers
@@ -79,7 +79,7 @@ def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: 
     _copy_assets(results_dir / PAGE_FOLDER)
     bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:KEY_PREFIX_LETTERS])
     details = (
-        (name, bundle((folder, detail(record, folder, results_dir)) for folder, record in runs))
+        (name, {folder.key: detail(record, folder, results_dir) for folder, record in runs})
         for name, runs in bundles.items()
     )
     _write_all(data, "run", details)
@@ -166,7 +166,6 @@ def safe_json(data: Any) -> str:
 
 
 def remove_others(folder: Path, keys: Iterable[str]) -> None:
-    """Removes the scripts of other keys."""
     current = {f"{key}.js" for key in keys}
     if folder.is_dir():
         with os.scandir(folder) as entries:
@@ -176,7 +175,6 @@ def remove_others(folder: Path, keys: Iterable[str]) -> None:
 
 
 def write_script(data: Path, kind: str, key: str, content: Any) -> None:
-    """Writes the script that hands the content of a kind and key to the page."""
     write_file(data / kind / f"{key}.js", to_script(kind, key, content).encode("ascii"))
 
 

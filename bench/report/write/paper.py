@@ -20,6 +20,7 @@ from bench.report.data.kept import FROM_RUNS_CSV, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
 from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.result import Result, Shown, as_markdown, latex, read_shown, write, write_shown
+from bench.tables import CONF, nearest, read_yaml
 
 FOLDER = "paper"
 SWEEPS, TABLE = "sweeps", "table"  # the table of a sweep is next to its plan
@@ -68,7 +69,14 @@ class Study:
         """The result of each page; empty if there are neither runs nor kept rows.
 
         A page that needs run folders uses the runs that have them; it is left out if these are the minority.
+
+        Raises:
+            ValueError: the study reads an experiment that neither a run nor a file of `conf/experiment` names.
         """
+        experiments = {record["config"].get("experiment") for record in records} | _experiments()
+        for name in (selection.experiment for selection in self.reads if selection.experiment not in experiments):
+            options = sorted(filter(None, experiments))
+            raise ValueError(f"no run and no file of conf/experiment has experiment: {name}{nearest(name, options)}")
         chosen: list[Runs | None] = [choose(records, selection, results_dir) for selection in self.reads]
         if not any(runs is not None for runs in chosen):
             if self.keeps is None or not self.keeps(results_dir).is_dir():
@@ -86,6 +94,11 @@ class Study:
 
     def _count(self, records: list[dict[str, Any]], results_dir: Path) -> int:
         return sum(len(runs.records) for selection in self.reads if (runs := choose(records, selection, results_dir)))
+
+
+@cache
+def _experiments() -> frozenset[str]:
+    return frozenset(read_yaml(file).get("experiment") for file in (CONF / "experiment").glob("*.yaml"))
 
 
 @cache

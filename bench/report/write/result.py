@@ -99,6 +99,9 @@ class Result:
     atlas: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        for column in self.columns:
+            if column.is_metric and column.heading:
+                self.runs.check_metric(column.key)
         if self.data is None:
             listed = (self.run_columns, self.runs.records) if self.run_columns else (self.columns, self.lines)
             object.__setattr__(self, "data", to_data(*listed))

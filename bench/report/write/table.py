@@ -54,6 +54,7 @@ class Column:
         show: converts the value to text for readers.
         words: returns the text of a line for readers, if it depends on more than the value.
         better: "lower" or "higher" if the best values of the column are bold; else empty.
+        is_metric: whether the key is a metric, which some run must have if the column is in the readable table.
     """
 
     key: str
@@ -62,6 +63,7 @@ class Column:
     show: Callable[[Any], str] = format.number
     words: Callable[[Any], str] | None = None
     better: str = ""
+    is_metric: bool = False
 
     def of(self, line: Any) -> Any:
         return line.get(self.key) if self.value is None else self.value(line)
@@ -148,7 +150,7 @@ def joined_cell(get: Callable[[Any, str], Any], show: Callable[[Any], str], *key
 
 
 def metric(name: str, heading: str = "", show: Callable[[Any], str] = format.number) -> Column:
-    return Column(name, heading, lambda record: measured(record, name), show)
+    return Column(name, heading, lambda record: measured(record, name), show, is_metric=True)
 
 
 def metrics(*names: str) -> tuple[Column, ...]:

@@ -50,7 +50,6 @@ class DeepSDF:
         check_at_least("task.free_space", self.free_space, 0, "0 switches the samples of free space off")
 
     def execute(self, run: RunContext) -> None:
-        """Optimises the code, and evaluates the shape before and after."""
         run.record.notes.append("task=deepsdf fits without a renderer: it was used for pictures and evaluation only")
         solve_task(self, run)
 

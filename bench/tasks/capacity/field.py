@@ -101,7 +101,6 @@ def rendered_curve(lines: list[dict[str, Any]], candidate: str) -> list[dict[str
 
 
 def final_field_metrics(growth: Growth) -> dict[str, Any]:
-    """The final field of growth, as metrics."""
     evidence = growth.fitted.evidence
     error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
     return {
@@ -129,7 +128,6 @@ def failure_of(growth: Growth, after: Evaluation) -> tuple[RunStatus, str] | Non
 
 
 def note_fits(record: Record, fits: list[Evidence], fitter: Fitter) -> None:
-    """Writes the costs of fits into the record."""
     observations = fitter.observations
     iterations, values = sum(fit.iterations for fit in fits), sum(fit.evaluations for fit in fits)
     evaluations = {

@@ -177,7 +177,6 @@ class Fitter:
         return len(history.curve)
 
     def _evaluate(self, fitted: Fitted) -> None:
-        """Evaluates a candidate on the held-out rays, and adds a checkpoint."""
         evidence = fitted.evidence
         if not fitted.failed:
             evidence.error = self.observations.error(fitted.model.frozen())
@@ -199,11 +198,9 @@ class FitProblem:
 
     @property
     def parameters(self) -> list[Tensor]:
-        """The parameters that the optimiser changes."""
         return self.model.parameters
 
     def loss(self, iteration: int) -> Terms:
-        """The renderer's terms, the eikonal term, and their sum."""
         metered, settings = Meter(self.model.field(), self.counts), self.settings
         step = self.iterations_before + iteration
         self.error = self.error if iteration else inf  # iteration 0 runs twice, first as warm-up
@@ -248,11 +245,9 @@ class WarmStart:
 
     @property
     def parameters(self) -> list[Tensor]:
-        """The parameters that the optimiser changes."""
         return self.model.parameters
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
-        """The mean error of the values."""
         return {"total": self._loss(Meter(self.model.field(), self.counts), iteration)}
 
     def _loss(self, shape: Field, iteration: int) -> Float[Tensor, ""]:

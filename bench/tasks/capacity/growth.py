@@ -81,7 +81,6 @@ class Growth:
     end: str
 
     def summary(self, requested: str) -> list[str]:
-        """The result, in words."""
         error = self.fitted.evidence.mean
         path, size = " -> ".join(self.fields), self.fitted.model.size
         summary = f"field={requested}: {path}, {size}, held-out error {error:.3g}"

@@ -35,7 +35,6 @@ class HeldOutError:
 
     @property
     def mean(self) -> float:
-        """The mean error, in scene units."""
         return float(_means(self.sums.sum(0, keepdims=True), self.missed)[0])
 
     @property
@@ -51,7 +50,6 @@ class HeldOutError:
         return _jackknife(self._without_each() - other._without_each())
 
     def select(self, groups: Int[np.ndarray, " n"]) -> "HeldOutError":
-        """The error over the groups with these indices."""
         return HeldOutError(self.sums[groups], self.missed)
 
     def _without_each(self) -> Float[np.ndarray, " groups"]:
@@ -80,7 +78,6 @@ class HeldOut:
 
     @torch.no_grad()
     def error(self, field: Field, renderer: Renderer) -> HeldOutError:
-        """The error of a field, rendered by a renderer."""
         missed = MISSED_FOOTPRINTS * self.footprint
         rendering = render_checked(renderer, field, self.rays)
         compared = rendering.hit & self.observed

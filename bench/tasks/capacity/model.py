@@ -34,11 +34,9 @@ class Size:
 
     @property
     def bytes(self) -> int:
-        """The size of a file with all stored numbers."""
         return FLOAT_BYTES * self.stored
 
     def by(self, measure: str) -> int:
-        """The size by a measure of `models.size`."""
         assert measure in SIZE_WORDS
         return getattr(self, measure)
 

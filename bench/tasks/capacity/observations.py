@@ -64,7 +64,6 @@ class RayObservations:
         return intersects.nonzero().squeeze(-1)
 
     def with_renderer(self, renderer: Renderer) -> "RayObservations":
-        """The same observations, compared by another renderer."""
         return replace(self, fitted=replace(self.fitted, renderer=renderer))
 
     def terms(self, field: Field, iteration: int, share: float) -> Terms:
@@ -77,7 +76,6 @@ class RayObservations:
             return sampled.compare(field, iteration)
 
     def error(self, field: Field) -> HeldOutError:
-        """The error of a field on the held-out rays."""
         return self.held_out.error(field, self.renderer)
 
     def depth_error(self, terms: Terms) -> float:
@@ -184,7 +182,6 @@ class Views:
 
 
 def concatenate_views(views: list[ObservedView]) -> ObservedView:
-    """Concatenates the rays of several views into one row."""
     tensors = {
         name: torch.cat([getattr(view, name).flatten() for view in views])
         for name in ("depth", "depth_per_distance", "observed")

@@ -179,7 +179,6 @@ def savings(chosen: Evidence, evidence: list[Evidence]) -> dict[str, float]:
 
 
 def precision_text(precise: Evidence, plain: Evidence) -> str:
-    """Text that compares the fit at pixel precision with the plain one."""
     if precise.error is None:
         return f"the fit ended as {precise.status}: {precise.reason}"
     fraction = precise.evaluations / max(plain.evaluations, 1)
@@ -188,7 +187,6 @@ def precision_text(precise: Evidence, plain: Evidence) -> str:
 
 
 def summary(choice: Choice, growth: Growth) -> str:
-    """The recommendation as text."""
     chosen, best = choice.chosen, choice.best
     rules = {"within one standard error of the best": choice.within, "under half a pixel": choice.enough}
     why = " and ".join(rule for rule, holds in rules.items() if holds)

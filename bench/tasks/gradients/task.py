@@ -88,7 +88,6 @@ class Gradients:
         inputs.check_fitted()
 
     def execute(self, run: RunContext) -> None:
-        """Compares the gradients, and fills the record."""
         inputs, record = run.inputs, run.record
         record.definitions = DEFINITIONS
         prior = in_float64(inputs.fitted())

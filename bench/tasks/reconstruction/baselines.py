@@ -53,7 +53,6 @@ class Fusing:
         check_at_least("task.fusing.trim", self.trim, 0, "0 trims nothing; DVR has 5 and 7 as well")
 
     def surface(self, clouds: Sequence[Cloud]) -> Mesh | None:
-        """The surface of all points."""
         return poisson(*fuse_clouds(clouds), depth=self.octree, trim=self.trim)
 
 
@@ -72,7 +71,6 @@ class Hull(_Surface):
         super().__post_init__()
 
     def surface(self, subject: Subject) -> Mesh | None:
-        """The mesh of the hull."""
         if any(shot.mask is None for shot in subject.input_shots):
             raise BadInput(f"{NO_HULL}, or set task=stereo")
         return hull_mesh(subject.input_shots, self.samples)
@@ -91,12 +89,10 @@ class Poisson(_Surface):
     cloud: str | None = None
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput if the file does not exist."""
         if self.cloud is not None and not Path(self.cloud).is_file():
             raise BadInput(f"task.cloud={self.cloud} is no file: check the path")
 
     def surface(self, subject: Subject) -> Mesh | None:
-        """The fused points."""
         if self.cloud is not None:
             return self.fusing.surface(measured_clouds(self.cloud, subject))
         if all(shot.depth is None for shot in subject.input_shots):
@@ -117,5 +113,4 @@ class Stereo(_Surface):
     fusing: Fusing
 
     def surface(self, subject: Subject) -> Mesh | None:
-        """The fused points on which the photographs agree."""
         return self.fusing.surface(stereo_clouds(subject.input_shots, self.matching))

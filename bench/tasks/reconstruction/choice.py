@@ -149,17 +149,14 @@ class Choice:
 
     @property
     def kept(self) -> Evidence:
-        """The trial of the chosen field."""
         return self.trials.kept[-1]
 
     @property
     def seconds(self) -> float:
-        """The total runtime of all trials."""
         return sum(trial.seconds for trial in self.trials.tried)
 
     @property
     def note(self) -> str:
-        """The result as text, for the record."""
         errors = ", ".join(f"{trial.candidate} {trial.mean:.3g}" for trial in self.trials.tried)
         values = sum(trial.evaluations for trial in self.trials.tried)
         text = f"field=auto: {self.kept.candidate}, {self.kept.size.free:,} numbers"

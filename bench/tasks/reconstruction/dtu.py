@@ -64,7 +64,6 @@ class DtuScan:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """The points, for queries of the nearest one."""
         return cKDTree(self.points)
 
     @property
@@ -73,7 +72,6 @@ class DtuScan:
         return self.corners + np.array([[-VOLUME_MARGIN_MM], [2 * VOLUME_MARGIN_MM]])
 
     def points_above_plane(self) -> Float[np.ndarray, "m 3"]:
-        """The points above the plane."""
         return self.points[self.points @ self.plane[:3] + self.plane[3] > 0]
 
     def in_observed_cell(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -232,7 +230,6 @@ def _file(folder: Path, name: str, archive: str) -> Path:
 
 
 def _matrices(file: Path, *names: str) -> list[Any]:
-    """Reads matrices of a .mat file by their names."""
     try:
         matrices = loadmat(file)
     except (MatReadError, zlib.error, OSError, ValueError, NotImplementedError, TypeError, LookupError) as error:

@@ -69,12 +69,10 @@ class MultiviewOnPhotographs(Multiview, PhotographTask):
         subject.finish(run)
 
     def subject(self, inputs: RunInputs) -> Subject:
-        """See `PhotographTask`; with `similarity`, the subject is set upright."""
         subject = super().subject(inputs)
         return upright(subject) if self.similarity else subject
 
     def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
         subject = self.subject(run.inputs)
         evaluation = judge_mesh(coloured(field, subject, run.inputs), subject, run.inputs)
         return evaluation.metrics | subject.point_metrics(evaluation.mesh, run.inputs)

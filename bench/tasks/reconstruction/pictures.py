@@ -138,7 +138,6 @@ def _error(render: RenderColours, shot: Shot) -> Float[np.ndarray, "height width
 
 
 def _input(subject: Subject) -> Figure:
-    """A figure of at most `MAX_INPUTS_SHOWN` input photographs."""
     shots = evenly_spaced(subject.input_shots, MAX_INPUTS_SHOWN)
     columns = min(len(shots), 4)
     rows = -(-len(shots) // columns)

@@ -45,7 +45,6 @@ class ReconstructionProblem:
 
     @property
     def parameters(self) -> list[Tensor]:
-        """The parameters of the field and its colours."""
         return list(self.model.parameters())
 
     @property
@@ -73,21 +72,17 @@ class ReconstructionProblem:
         return deepcopy(self.model).field
 
     def camera(self) -> Camera:
-        """The first held-out camera."""
         return self.subject.held_out[0].camera
 
     def evaluate(self, state: State) -> Evaluation:
-        """Compares the current shape with held-out photographs and the truth."""
         return judge(state, self.subject)
 
     def checkpoint(self, state: State) -> dict[str, float]:
-        """The `tracked` metrics of the current shape."""
         scores = surface_scores(state.mesh, self.subject, state.inputs)
         scores |= field_scores(state, self.subject.held_out)
         return {name: scores[name] for name in self.tracked}
 
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
-        """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
         draw_reconstruction(folder, states[1], self.subject, curve, title)
 
     def loss(self, iteration: int) -> Terms:

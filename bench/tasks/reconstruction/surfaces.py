@@ -27,7 +27,6 @@ FACING_EXPONENT = 4.0  # a photograph's weight is this power of the cosine betwe
 
 
 def given_clouds(shots: Sequence[Shot]) -> list[Cloud]:
-    """The points of all given depths."""
     return [
         Cloud(shot.camera.rays().at(shot.camera.distance(shot.depth))[shot.depth > 0].double().numpy(), shot.camera)
         for shot in shots

@@ -67,7 +67,6 @@ class Reconstruction(PhotographTask):
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
 
     def execute(self, run: RunContext) -> None:
-        """Learns the field, and evaluates it before and after."""
         name, inputs = run.inputs.field.name, run.inputs
         check_field_gradient(inputs.renderer)
         with torch.random.fork_rng():
@@ -95,13 +94,11 @@ class Reconstruction(PhotographTask):
         seconds["trials"] = choice.seconds
 
     def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of a run's final field; see `bench.setup.inputs.EvaluatesField`."""
         subject = self.subject(run.inputs)
         evaluation = judge(State(field, run.inputs), subject)
         return evaluation.metrics | subject.point_metrics(evaluation.mesh, run.inputs)
 
     def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
-        """The problem of learning the named field from photographs."""
         inputs = run.inputs
         model = self.appearance.make(name).to(inputs.device)
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)

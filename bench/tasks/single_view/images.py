@@ -58,16 +58,13 @@ class ShapeImages:
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
-        """The camera of each image."""
         height, width = self.masks.shape[1:]
         return tuple(Camera(self.intrinsics, motion, height, width) for motion in self.motions)
 
     def image(self, view: int) -> Float[Tensor, "4 height width"]:
-        """An image as encoder input; see `as_input`."""
         return as_input(self.colours[view].float() / 255, self.masks[view])
 
     def images(self) -> Float[Tensor, "views 4 height width"]:
-        """All images as encoder input."""
         return torch.stack([self.image(view) for view in range(len(self.cameras))])
 
     def first(self, views: int) -> "ShapeImages":
@@ -75,7 +72,6 @@ class ShapeImages:
         return replace(self, **{name: getattr(self, name)[:views] for name in PER_VIEW_FIELDS})
 
     def shots(self) -> tuple[Shot, ...]:
-        """The images as photographs."""
         images = zip(self.cameras, self.colours, self.masks, self.depths, strict=True)
         return tuple(
             Shot(str(index), camera, colours.float() / 255, mask, depth)

@@ -72,7 +72,6 @@ class SingleView(nn.Module):
         return CODE_STD * torch.nn.functional.layer_norm(code, code.shape[-1:])
 
     def at(self, code: Float[Tensor, " code_length"]) -> OccupancyOf:
-        """The shape of a code, with colours."""
         return FIELD_CLASSES[self.settings.reads](self.decoder.at(code))
 
 

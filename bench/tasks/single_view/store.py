@@ -62,7 +62,6 @@ class Recipe:
 
     @property
     def stem(self) -> str:
-        """The name of the network's files, without suffix."""
         return f"single_view-{self.dataset.name}-{self.key}"
 
     def find(self, cache: Path) -> Path | None:

@@ -115,7 +115,6 @@ class OneImage:
 
     @property
     def knows_colours(self) -> bool:
-        """Whether the training uses colours."""
         return self.supervision.losses.colour > 0
 
     def recipe(self, inputs: RunInputs, config: dict[str, Any]) -> Recipe:
@@ -141,7 +140,6 @@ class OneImage:
         )
 
     def execute(self, run: RunContext) -> None:
-        """Infers the shape and evaluates it."""
         inputs, record = run.inputs, run.record
         recipe = self.recipe(inputs, record.config)
         record.evaluations = {"value": 0, "gradient": 0}

@@ -96,8 +96,6 @@ class TrainingSettings:
 
 @dataclass
 class TrainingHistory:
-    """The losses and the cost of a training's steps."""
-
     losses: list[float] = field(default_factory=list)
     seconds: float = 0.0
     counts: Counts = field(default_factory=Counts)

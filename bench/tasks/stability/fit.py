@@ -35,8 +35,6 @@ DEFINITIONS = {
 
 @dataclass(frozen=True)
 class Observation:
-    """The observations for a fit."""
-
     camera: Camera  # assumed by the fit
     depth: Float[Tensor, "height width"]
     observed: Bool[Tensor, "height width"]
@@ -145,13 +143,11 @@ class SphereProblem:
         self.watched = self.limits.watch(self.field(), self.sphere.device)  # the limit is on the whole fit
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
-        """The terms and their sum."""
         self.watched.inner = _sphere(self.sphere).field
         terms = self.view.compare(Meter(self.watched, self.counts), iteration)
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
     def field(self) -> Field:
-        """The current sphere."""
         return _sphere(self.sphere.detach()).field
 
 

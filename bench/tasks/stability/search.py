@@ -92,14 +92,12 @@ class Search:
         return self._most_informative()
 
     def note(self, index: int, success: bool) -> None:
-        """Updates the table with the outcome of a trial at a level's index."""
         self.trials.append((index, success))
         chance = self._success[index]
         self.probabilities = self.probabilities * (chance if success else 1 - chance)
         self.probabilities /= self.probabilities.sum()
 
     def result(self) -> Breakdown:
-        """The breakdown according to the current table."""
         low, high = self._interval()
         return Breakdown(self._quantile(0.5), low, high, WIDTHS[int(self.probabilities.sum(axis=0).argmax())])
 
@@ -139,7 +137,6 @@ class Bisection:
         return (success + failure) // 2 if failure - success > 1 else None
 
     def note(self, index: int, success: bool) -> None:
-        """Stores the outcome of a trial at a level's index."""
         self.outcomes[index] = success
 
     def result(self) -> Breakdown:

@@ -80,8 +80,6 @@ def incidence_cosines(field: Field, rays: Rays, first: FirstHit) -> Float[Tensor
 
 
 def sphere_solid(radius: analytic.Numbers) -> Solid:
-    """A sphere about the origin."""
-
     def spans(rays: Rays) -> Spans:
         approach = -(rays.origins * rays.directions).sum(-1)
         closest = rays.origins + approach[:, None] * rays.directions

@@ -160,12 +160,10 @@ class _Trials:
         return notes
 
     def successes_at(self, level: float) -> tuple[int, int]:
-        """The number of successful trials at a level, and of all trials there."""
         outcomes = [trial.outcome.success for trial in self.all if trial.level == level]
         return sum(outcomes), len(outcomes)
 
     def line(self) -> dict[str, object]:
-        """The last trial as a line of the curve."""
         last = self.all[-1]
         numbers = {"level": last.level, "severity": last.severity, "success": last.outcome.success}
         failed = {"failure": str(last.outcome.failure), "message": last.outcome.message}

@@ -107,7 +107,6 @@ class Outcome:
 
     @property
     def success(self) -> bool:
-        """Whether the trial succeeded."""
         return self.failure is Failure.NONE
 
 

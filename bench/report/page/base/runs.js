@@ -54,19 +54,6 @@
       }
     }
 
-    /* The details of a run, with the numbers of shared texts replaced by the texts. */
-    function expanded({texts, runs}, index) {
-      const run = runs[data.key[index]];
-      return {
-        ...run,
-        settings: run.settings.flatMap((part) => texts[part]),
-        environment: run.environment.map((row) => texts[row]),
-        metrics: run.metrics.map(([name, before, after, words]) => [texts[name], before, after, texts[words]]),
-        files: Object.fromEntries(texts[run.files].map((name) => [name, data.address[index] + name])),
-        python: texts[run.python].replaceAll("\0", data.folder[index]),
-      };
-    }
-
     const {meshes} = bench.store.have("list", "about");
     const unmade = `Made for the newest ${meshes} runs: python -m bench.report meshes=all makes all.`;
 
@@ -79,7 +66,7 @@
       reason: (index) => data.reason[index],
       reused: (index) => reused.has(index),
       indexOf: (name) => indices.get(name),
-      detail: (index) => bench.store.load("run", data.key[index].slice(0, 2)).then((content) => expanded(content, index)),
+      detail: (index) => bench.store.load("run", data.key[index].slice(0, 2)).then((runs) => runs[data.key[index]]),
       mesh: (index) => bench.store.load("mesh", data.key[index]).catch((error) => (meshes === null ? Promise.reject(error) : {none: unmade})),
       picture: (index) => text(index, "thumb") && data.address[index] + text(index, "thumb"),
       link: (index) => bench.address.to(["run", name(index)]),

@@ -1,9 +1,9 @@
-/* A renderer's own page: its standing in each set, where it fails and where others make more progress, its settings and source. */
+/* A renderer's own page: its standing in each set, where it fails and and where others make more progress. */
 (function (bench) {
   "use strict";
 
-  const {element, fill, section, details, facts, later, code, copied} = bench.dom;
-  const {plural, MISSING} = bench.format;
+  const {element, fill, section, facts, later, copied} = bench.dom;
+  const {plural} = bench.format;
 
   function renderer(home, row) {
     const suite = (bench.store.have("list", "papers") || []).find(({name}) => name === "suite");
@@ -25,8 +25,6 @@
       table.chart && bench.chart(table.chart, {label: `${own.row} in each set`, focus: own.row}),
       section("Where others make more progress", behind(own, data)),
       section("Run it", copied(own.command, "Copy the command")),
-      section("Source", element("p", null, code(own.file || MISSING)), own.source && element("pre.source", null, own.source)),
-      own.settings.length > 0 && details(`Its ${plural(own.settings.length, "setting")}`, facts(own.settings)),
     ];
   }
 

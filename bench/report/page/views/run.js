@@ -41,7 +41,6 @@
       section("Make it again",
         copied(detail.command, "Copy the command"),
         element("p.soft", null, "Configurations are code: read one that is not yours first.")),
-      section("Open it in Python", copied(detail.python, "Copy the lines that open it")),
       section("Files", element("p.files", null, element("code", null, bench.runs.folder(index)), " ", links)),
       details(`All ${detail.settings.length} settings`, facts(detail.settings)),
       detail.environment.length > 0 && details("Machine and versions", facts(detail.environment)),

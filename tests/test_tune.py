@@ -8,9 +8,8 @@ import yaml
 
 from bench.records.read import read_records
 from bench.report.data.runs import choose
-from bench.report.tuning import TUNING, left_out, tunings
 from bench.tables import CONF, choices_of, read_yaml
-from bench.tune import HEADER, LINE_WIDTH, main, write
+from bench.tune import HEADER, LINE_WIDTH, TUNING, left_out, main, tunings, write
 from tests.report.test_report_paper import write_run
 
 VALIDATION, TEST = (4.0, 1.0, 3.0, 2.0), (5.0, 2.0, 9.0, 1.0)  # errors of four draws
