@@ -2,11 +2,11 @@
 
 import sys
 
-from bench.records.folder import Identity
+from bench.records.read import PlannedRun
 from bench.runner.command import command_line
 
 
-def train(run: Identity) -> None:
+def train(run: PlannedRun) -> None:
     """Finds or trains the prior; prints its path.
 
     Raises:

@@ -19,7 +19,7 @@ import torch
 from bench.evaluate.evaluate import evaluate
 from bench.evaluate.state import State
 from bench.machine.environment import describe, flushing_denormals
-from bench.records.folder import Identity
+from bench.records.folder import code_hash
 from bench.records.format import number, plural
 from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, bad_link, read_record
@@ -138,7 +138,7 @@ def _relative_difference(first: float, second: float) -> float:
 
 def _changes(record: Record, environment: dict[str, Any]) -> list[str]:
     """The differences in code and machine between a record and this process, as texts."""
-    code = Identity({}, record.config).code
+    code = code_hash(record.config)
     differences = [f"the code differs: {record.code[:12]} then, {code[:12]} now"] if code != record.code else []
     for name in MACHINE_KEYS:
         then, now = record.environment.get(name), environment.get(name)

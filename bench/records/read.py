@@ -42,8 +42,11 @@ WRITABLE_PATTERNS = ("*", "paper/*", "suite/*", "suite/*/*", "sweeps/*/*", "page
 
 
 @dataclass(frozen=True)
-class PlannedCell:
-    """A cell of a sweep: the name of its run folder, its overrides, and its resolved configuration."""
+class PlannedRun:
+    """A run to be made: the name of its folder, its overrides, its choices, and its resolved configuration.
+
+    A stress replaces the dataset, and the method may be empty.
+    """
 
     id: str
     overrides: list[str]
@@ -54,6 +57,11 @@ class PlannedCell:
     config: dict[str, Any]
     method: str = ""
 
+    @property
+    def folder(self) -> Path:
+        """The folder of the run."""
+        return Path(self.config["results_dir"]) / "runs" / self.id
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -61,7 +69,7 @@ class Plan:
 
     name: str
     results_dir: Path
-    cells: list[PlannedCell]
+    cells: list[PlannedRun]
     asked: str = field(default_factory=now)
 
     @property
@@ -74,7 +82,7 @@ class Plan:
         """The overrides that all cells share."""
         return set.intersection(*(set(cell.overrides) for cell in self.cells))
 
-    def distinct_overrides(self, cell: PlannedCell) -> list[str]:
+    def distinct_overrides(self, cell: PlannedRun) -> list[str]:
         """The overrides of a cell that not all cells share."""
         return [override for override in cell.overrides if override not in self.common]
 
@@ -86,7 +94,7 @@ class Plan:
         cells = ",\n".join(to_json(vars(cell)).rstrip() for cell in self.cells)  # encoded one by one to save memory
         write_text(self.folder / PLAN_FILE, f"{head}\n{cells}\n]}}\n")
 
-    def record(self, cell: PlannedCell) -> dict[str, Any] | None:
+    def record(self, cell: PlannedRun) -> dict[str, Any] | None:
         """The record of a cell, if it was requested after the plan was made and has ended, else None."""
         return ended_record(self.results_dir / "runs" / cell.id, self.asked)
 
@@ -118,8 +126,8 @@ def _read_plan(path: Path, results_dir: Path) -> tuple[Plan | None, str]:
         if plan["name"] != path.parent.name:
             raise ValueError(f"its name must be that of its folder, found {plan['name']!r}")
         datetime.fromisoformat(plan["asked"])
-        names = [item.name for item in fields(PlannedCell)]
-        cells = [PlannedCell(**{name: cell[name] for name in names if name in cell}) for cell in plan["cells"]]
+        names = [item.name for item in fields(PlannedRun)]
+        cells = [PlannedRun(**{name: cell[name] for name in names if name in cell}) for cell in plan["cells"]]
         if not all(map(_is_valid_cell, cells)):
             raise ValueError("each cell's id must be the name of a folder, and its config an object")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -231,7 +239,7 @@ def check_links(results_dir: Path) -> None:
             raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")
 
 
-def _is_valid_cell(cell: PlannedCell) -> bool:
+def _is_valid_cell(cell: PlannedRun) -> bool:
     """Whether the fields of a planned cell have the right types, and its id is a plain file name."""
     has_types = isinstance(cell.overrides, list) and isinstance(cell.config, dict)
     texts = (cell.task, cell.renderer, cell.dataset, cell.method, *cell.overrides) if has_types else (None,)
@@ -261,7 +269,7 @@ def _parse_line(text: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def not_run_record(cell: PlannedCell, plan: Plan) -> dict[str, Any]:
+def not_run_record(cell: PlannedRun, plan: Plan) -> dict[str, Any]:
     """A record for a planned cell that has not been run."""
     reason = f"planned by sweep {plan.name}; the same command runs it"
     record = Record(**vars(cell), started=plan.asked, asked=plan.asked, status=NOT_RUN, reason=reason)

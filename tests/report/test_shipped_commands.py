@@ -55,7 +55,7 @@ def planned(experiment: str) -> list[tuple[tuple[str, ...], dict[str, str]]]:
         if not file.exists() or OmegaConf.load(file).get("experiment") != experiment:
             continue
         cells = cells_of(f"+experiment={name}", *words)
-        found += [described(cell.config, cell.choices["dataset"], cell.choices["renderer"]) for cell in cells]
+        found += [described(cell.config, cell.dataset, cell.renderer) for cell in cells]
     return found
 
 
