@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import FIT_MODULE, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_draw
+from bench.config import FIT_MODULE, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references
 from bench.records.imports import ROOT, imported_files
 from bench.records.read import PlannedRun
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
@@ -80,9 +80,9 @@ def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, 
         choices: the names of the chosen files and rows, by group.
 
     Raises:
-        ValueError: if the command line removes a group that every run needs, or sets a draw that nothing uses.
+        ValueError: if the command line removes a group that every run needs; see also `check_references`.
     """
-    check_draw(config)
+    check_references(config)
     for group in ("task", "renderer", "dataset"):
         if group not in choices:
             raise ValueError(f"every run needs one {group}: remove ~{group} or a list; several are -m {group}=A,B")

@@ -181,8 +181,11 @@ def compose_choices(overrides: Sequence[str]) -> DictConfig:
         raise unknown_choice(group, path, [*(error.options or group_choices(nested))]) from error
     except (HydraException, OmegaConfBaseException) as error:
         for override in map(parse_override, overrides):
-            if (group := override.key_or_group) in OPTIONAL_GROUPS and not override.is_add():
+            group, has_plus = override.key_or_group, str(override.input_line).startswith("+")
+            if group in OPTIONAL_GROUPS and not has_plus:
                 raise ValueError(f"{group} is not chosen by default: write +{group}=NAME, with a plus") from error
+            if has_plus and group in compose_choices([]).hydra.runtime.choices and group not in OPTIONAL_GROUPS:
+                raise ValueError(f"{group} is chosen by default: write {group}=NAME, without a plus") from error
         for cause in (error, error.__cause__, error.__context__):
             if isinstance(cause, ConfigKeyError | ConfigAttributeError) and cause.full_key:
                 raise unknown_key(str(cause.full_key), compose_choices([])) from error
