@@ -48,7 +48,7 @@ CLASS_OF_NODE = {  # for nodes without a _target_
     "view": "datasets.views.ViewSampler",
     "auto": "bench.setup.auto.AutoSettings",
     "prior": "bench.shape_prior.PriorSettings",
-    "models": "bench.setup.fields.ModelSettings",
+    "models": "bench.tasks.capacity.settings.ModelSettings",
     "evaluation": "bench.config.EvaluationSettings",
 }
 PRIOR_FIELD = "prior"  # value of `field`: a latent code of the prior
