@@ -15,8 +15,9 @@ import numpy as np
 import yaml
 
 from bench.records.format import number
-from bench.records.read import RESULTS, read_records
+from bench.records.read import read_records
 from bench.records.record import is_plain_name, write_text
+from bench.records.results import RESULTS
 from bench.report.data.records import Record
 from bench.report.data.runs import Runs, choose, shared_loss
 from bench.report.tuning import (

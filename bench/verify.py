@@ -21,8 +21,8 @@ from bench.evaluate.state import State
 from bench.machine.environment import describe, flushing_denormals
 from bench.records.folder import code_hash
 from bench.records.format import number, plural
-from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, bad_link, read_record
+from bench.records.results import run_folders
 from bench.setup.inputs import EvaluatesField, RunContext, prepare_run
 from datasets.files.field_files import load_field
 from datasets.saved_field import FIELD_FILE
@@ -121,12 +121,12 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.dev
         notes = [note for note in record.notes if FIELD_FILE in note]
         status = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
         raise NothingToCompare(notes[0] if notes else f"it has no {FIELD_FILE}, since it optimised no field{status}")
-    prepared = prepare_run(record.config)
-    prepared.configure_process()
-    field = load_field(folder, prepared.inputs.device)
-    run = RunContext(prepared.inputs, folder, record, lambda *_: None)
-    metrics = prepared.task.field_metrics(field, run) if isinstance(prepared.task, EvaluatesField) else None
-    return evaluate(State(field, prepared.inputs)).metrics if metrics is None else metrics, prepared.inputs.device
+    task, inputs = prepare_run(record.config)
+    inputs.configure_process()
+    field = load_field(folder, inputs.device)
+    run = RunContext(inputs, folder, record, lambda *_: None)
+    metrics = task.field_metrics(field, run) if isinstance(task, EvaluatesField) else None
+    return evaluate(State(field, inputs)).metrics if metrics is None else metrics, inputs.device
 
 
 def _relative_difference(first: float, second: float) -> float:

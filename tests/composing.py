@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from bench.records.read import PlannedRun
+from bench.records.results import PlannedRun
 from bench.runner.command import options_of
 from bench.runner.compose import Composer, composing, without_hydra
 

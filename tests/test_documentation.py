@@ -16,7 +16,7 @@ import bench
 import bench.studies
 from bench import tables
 from bench.config import build, check_names
-from bench.records.read import PlannedRun
+from bench.records.results import PlannedRun
 from bench.report.__main__ import main as report
 from bench.report.write import paper
 from bench.runner.command import config_dirs, expand_field_file, options_of

@@ -14,7 +14,7 @@ from bench.verify import main
 from datasets.saved_field import FIELD_FILE
 from tests.composing import composed
 from tests.runner.driving import command
-from tests.tiny import cell_from
+from tests.tiny import inputs_from
 
 SMALL = (
     "renderer=dist", "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200",
@@ -107,7 +107,7 @@ def test_a_folder_without_runs_is_an_error(tmp_path, capsys):
 @pytest.mark.parametrize("name", RUNS)
 def test_the_field_of_a_run_can_be_a_scene(runs, name):
     folder = runs[name]
-    inputs = cell_from(composed("task=ablation", "dataset=network", f"dataset.path={folder}")).inputs
+    inputs = inputs_from(composed("task=ablation", "dataset=network", f"dataset.path={folder}"))
     fitted, field = inputs.fitted(), bench.load_field(folder)
     points = torch.rand(100, 3) - 0.5
     values, field_values = fitted.decoder.at(fitted.codes[0])(points), field(points)

@@ -15,8 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.config import FIT_MODULE, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references
 from bench.records.imports import ROOT, imported_files
-from bench.records.read import PlannedRun
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
+from bench.records.results import PlannedRun
 from bench.tables import without_row_keys
 from datasets.extras import referenced_files, version
 
@@ -165,16 +165,6 @@ def archive_run(folder: Path, earlier: Path) -> None:
             shutil.rmtree(folder)
         else:
             folder.rename(target)
-
-
-def copy_atomically(target: Path, folder: Path) -> None:
-    """Copies a folder to `target` atomically; does nothing if `target` exists."""
-    if target.exists():
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    scratch = target.with_name(f".{target.name}.{os.getpid()}")
-    shutil.copytree(folder, scratch)
-    scratch.rename(target)
 
 
 def content_hash(folder: Path) -> str:

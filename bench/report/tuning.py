@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.records.names import flat
-from bench.records.record import NEUTRAL_KEYS
+from bench.records.record import NEUTRAL_KEYS, flat
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import CHAMFER_SCALE, Record, RunKey, error, grouped, run_key
 from bench.report.data.runs import Runs, Selection

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import type_of
 from bench.progress import notice
-from bench.records.read import PlannedRun
+from bench.records.results import PlannedRun
 from bench.runner.compose import Composer, composing, parse_override, without_hydra
 from bench.runner.library import OPTIONAL_GROUPS
 from bench.runner.messages import Interrupted, write_error_message

@@ -59,16 +59,15 @@ def execute(record: Record, send: Callable[[Message], None]) -> None:
     schedule_before = environment.scheduled()
     try:
         try:
-            prepared = prepare_run(record.config, progress=progress)
+            task, inputs = prepare_run(record.config, progress=progress)
         except (ValueError, OSError) as error:  # the configuration is invalid
             raise BadInput(reason_of(error)) from error
-        prepared.configure_process()
-        inputs = prepared.inputs
+        inputs.configure_process()
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
         send(record)
         try:
-            prepared.task.execute(RunContext(inputs, folder, record, progress))
+            task.execute(RunContext(inputs, folder, record, progress))
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:

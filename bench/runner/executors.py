@@ -17,8 +17,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from bench.progress import notice
-from bench.records.read import PlannedRun
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
+from bench.records.results import PlannedRun
 from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed, stop_signal
 from datasets.extras import install_command
 

@@ -6,7 +6,7 @@ from statistics import median
 from typing import Any
 
 from bench.records.format import plural
-from bench.records.read import Plan, PlannedRun
+from bench.records.results import Plan, PlannedRun
 from bench.runner.plan import duration_group, durations_of_similar_runs
 
 CLUSTERS = ("slurm", "local")

@@ -14,8 +14,8 @@ from typing import Any
 from bench.config import Isolation
 from bench.records.folder import reusable_record
 from bench.records.format import plural, seconds
-from bench.records.read import Plan, PlannedRun, read_run, run_folders
 from bench.records.record import digest, row_name
+from bench.records.results import Plan, PlannedRun, read_run, run_folders
 from bench.runner.messages import reason_of
 from bench.runner.process import run_in_child
 

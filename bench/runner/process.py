@@ -48,8 +48,8 @@ class RunInProgress:
     """
 
     record: Record
-    report: Report
-    started: float = field(default_factory=lambda: time.perf_counter())
+    report: Report = lambda *_: None
+    started: float = field(default_factory=time.perf_counter)
     is_ready: bool = False
     phase: str = "while setting up"
 

@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from bench.config import Isolation, build
 from bench.progress import run_progress
 from bench.records.folder import code_hash, config_hash, free_reserve, locked_folder
-from bench.records.read import Plan, PlannedRun
 from bench.records.record import Record, RunStatus, now, read_record, write_text
+from bench.records.results import Plan, PlannedRun, ended_record
 from bench.runner.messages import Interrupted, reason_of, write_error_message
 from bench.runner.plan import refusal_reasons, reused_ids, show_plan
 from bench.runner.process import RunInProgress, run_isolated, signals_delayed, stopped_by
@@ -64,9 +64,14 @@ def run_one(run: PlannedRun) -> str:
 def run_cell(cell: PlannedRun, planned_at: str) -> list[str]:
     """Makes the run of a sweep's cell, or reuses it; returns a message if it has no record.
 
+    Nothing is done if the cell has ended since its sweep was planned, so that a requeued job continues.
+
     Raises:
         RunInterrupted: after Ctrl-C or SIGTERM.
     """
+    record = ended_record(cell.folder, planned_at)
+    if record is not None and record["status"] != RunStatus.KILLED:
+        return []
     try:
         _print_log(make_or_reuse(cell, planned_at))
     except OSError as error:
@@ -107,28 +112,27 @@ def make_or_reuse(run: PlannedRun, planned_at: str = "") -> Record:
 
 def _make(record: Record) -> Record:
     """Makes the run of a record, which has the status killed until the end, then the final status."""
-    folder, stopped, tracker = record.folder, "", None
-    with run_progress(record.name) as report:
-        run = RunInProgress(record, report)
-        try:
-            record.write(folder)  # inside the try, because a signal may follow immediately
-            tracker = build(record.config["tracker"], "tracker", record.config["packages"])
-            write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
+    folder, stopped, tracker, run = record.folder, "", None, RunInProgress(record)
+    try:
+        record.write(folder)  # inside the try, because a signal may follow immediately
+        tracker = build(record.config["tracker"], "tracker", record.config["packages"])
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
+        with run_progress(record.name) as run.report:
             _execute(run)
-        except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness, such as a full disk
-            stopped = stopped_by(error)
-            record.status, record.reason = RunStatus.CRASHED, reason_of(error, folder)
-            if stopped:
-                record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
-        finally:
-            with signals_delayed():  # a signal now must not lose the record
-                record.seconds["total"] = time.perf_counter() - run.started
-                record.ended = now()
-                if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
-                    record.log = _log_tail(folder / "log.txt")
-                free_reserve(folder)
-                record.write(folder)
-                write_log(folder, record)
+    except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness, such as a full disk
+        stopped = stopped_by(error)
+        record.status, record.reason = RunStatus.CRASHED, reason_of(error, folder)
+        if stopped:
+            record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
+    finally:
+        with signals_delayed():  # a signal now must not lose the record
+            record.seconds["total"] = time.perf_counter() - run.started
+            record.ended = now()
+            if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
+                record.log = _log_tail(folder / "log.txt")
+            free_reserve(folder)
+            record.write(folder)
+            write_log(folder, record)
     if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:
         _export(tracker, folder, record)
     if stopped:

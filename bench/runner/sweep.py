@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,8 @@ from bench.config import Isolation
 from bench.progress import display, notice
 from bench.records.format import number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
-from bench.records.read import Plan, PlannedRun, ended_record
-from bench.records.record import RunStatus, row_name
+from bench.records.record import row_name
+from bench.records.results import Plan, PlannedRun
 from bench.runner.compose import Composer
 from bench.runner.executors import Launcher, execute, print_errors, run_in_turn
 from bench.runner.jobs import check_jobs, describe_jobs, split_into_jobs
@@ -34,18 +33,6 @@ FOLLOW_INTERVAL_SECONDS = 0.5
 
 class LauncherStopped(RuntimeError):
     """An executor cannot go on, because a cluster is missing or a process is lost."""
-
-
-@dataclass(frozen=True)
-class RunOnce:
-    """Runs a cell unless it has ended since its sweep was planned, so that a requeued job continues."""
-
-    planned_at: str
-
-    def __call__(self, cell: PlannedRun) -> list[str]:
-        """Returns a message if the cell has no record."""
-        record = ended_record(cell.folder, self.planned_at)
-        return run_cell(cell, self.planned_at) if record is None or record["status"] == RunStatus.KILLED else []
 
 
 def run_sweep(composer: Composer, config: DictConfig, summarise: Callable[[Plan], list[str]]) -> list[str]:
@@ -103,7 +90,7 @@ def _print_plan(plan: Plan, reused: set[str], launcher: Launcher) -> None:
 
 def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
     """Makes all runs of a plan by the executor; this process marks the reused runs as requested."""
-    make, cells = RunOnce(plan.asked), plan.cells
+    make, cells = partial(run_cell, planned_at=plan.asked), plan.cells
     try:
         if launcher.executor != "basic":
             print_errors(run_in_turn(make, [cell for cell in cells if cell.id in reused]))

@@ -92,9 +92,7 @@ class History:
     counts: Counts = field(default_factory=Counts)
     peak_memory_bytes: int | None = None
     objectives: list[float] = field(default_factory=list)  # before and after, if the problem has an objective
-    notes: list[str] | None = (
-        None  # receives one if hits of the warm-up lie off the surface; None: they are not checked
-    )
+    notes: list[str] | None = None  # on hits of the warm-up that lie off the surface; None does not check them
 
     @property
     def first_loss(self) -> float:

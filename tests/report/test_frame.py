@@ -7,7 +7,7 @@ import pytest
 
 import bench
 from bench.records import read as read_module
-from bench.records.read import Plan, PlannedRun
+from bench.records.results import Plan, PlannedRun
 from bench.report.__main__ import main as report
 from bench.report.data.frame import FIXED_COLUMNS, to_frame
 from tests.report.test_report import crashed, record, write_run

@@ -8,7 +8,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from bench.records.read import Plan, PlannedRun, read_plans, read_records
+from bench.records.read import read_plans, read_records
+from bench.records.results import Plan, PlannedRun
 from bench.report.__main__ import main as report
 from bench.report.sweeps import lines, of_plan, write_sweep, write_sweeps
 from bench.report.write.html import ASSETS

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from bench.records.names import flat
-from bench.records.record import row_name
+from bench.records.record import flat, row_name
 from bench.report.data.kept import read_rows
 from bench.report.write.paper import FOLDER, SHIPPED
 from bench.tables import CONF

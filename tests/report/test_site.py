@@ -14,8 +14,9 @@ import trimesh
 
 from bench.merge import merge
 from bench.records.names import differences
-from bench.records.read import RESULTS, Plan, PlannedRun, not_run_record, read_records
+from bench.records.read import not_run_record, read_records
 from bench.records.record import NOT_RUN, RunStatus, file_lock
+from bench.records.results import RESULTS, Plan, PlannedRun
 from bench.report.__main__ import main
 from bench.report.data.records import definition
 from bench.report.site.columns import columns, names

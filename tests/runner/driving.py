@@ -18,8 +18,8 @@ import torch
 
 from bench.__main__ import main
 from bench.machine.environment import using_threads
-from bench.records.read import PlannedRun
 from bench.records.record import Record, RunStatus
+from bench.records.results import PlannedRun
 from bench.runner import process
 from bench.runner.library import CommandResult
 

@@ -8,8 +8,8 @@ from hydra import compose
 
 from bench.prior import main as prior_main
 from bench.records.folder import code_hash, config_hash, planned_run, resolve_config
-from bench.records.read import Plan, PlannedRun
 from bench.records.record import Record, RunStatus
+from bench.records.results import Plan, PlannedRun
 from bench.runner import plan as plan_module
 from bench.runner import run as run_module
 from bench.runner import sweep

@@ -90,7 +90,7 @@ def test_a_process_that_is_lost_before_the_first_measurement_of_its_memory_is_re
     record = Record("id", "task", "renderer", "dataset", 0, {"time_limit": None, "memory_limit": None})
     pipes = [Pipe(), Pipe()]
     lost = Mock(pid=ended.pid, sentinel=pipes[0][0], exitcode=-signal.SIGKILL, is_alive=lambda: next(alive))
-    failure = process._watch(lost, pipes[1][0], process.RunInProgress(record, Mock()))
+    failure = process._watch(lost, pipes[1][0], process.RunInProgress(record))
     assert failure is not None and "ended by SIGKILL" in failure[1]
 
 

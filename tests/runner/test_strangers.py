@@ -10,8 +10,9 @@ import trimesh
 from bench.config import build, find_class, load
 from bench.merge import merge
 from bench.records.folder import locked_folder
-from bench.records.read import Plan, PlannedRun, check_links, read_plans, read_records
+from bench.records.read import read_plans, read_records
 from bench.records.record import SCHEMA
+from bench.records.results import Plan, PlannedRun, check_links
 from bench.report.write.html import write_index
 from bench.turntable import main as turntable
 from tests.looped import each

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from bench.records.names import flat
+from bench.records.record import flat
 from bench.report.data.records import OURS, Record
 from bench.report.suite.attempts import TUNED_PREFIX, Attempt, attempts_of, gather, suite
 from bench.report.suite.standing import KEY, Standing

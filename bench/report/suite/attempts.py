@@ -13,9 +13,8 @@ from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
-from bench.records.names import flat
-from bench.records.read import curve_lines
-from bench.records.record import RunStatus, as_number, digest, renderer_name
+from bench.records.record import RunStatus, as_number, digest, flat, renderer_name
+from bench.records.results import curve_lines
 from bench.report.data.kept import UNMEASURED
 from bench.report.data.lines import READ_ERRORS, read_lines, write_lines
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
