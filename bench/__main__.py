@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from bench.records.read import Plan
+    from bench.records.results import Plan
 
 
 def main() -> int:

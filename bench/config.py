@@ -25,6 +25,7 @@ REMEDY_IF_NOT_POSITIVE = {
     "memory_limit": "8 is 8 GiB, null all but a tenth",
 }
 DOUBLING = "doubling"
+SILHOUETTE_REFERENCE = "${silhouette}"
 SELF_ENTRY = "_self_"  # the file itself, in a list of defaults
 GROUP_MARK = "@_here_"  # follows a choice of another group, in a list of defaults
 OUR_PACKAGES = ("renderers", "datasets", "bench")  # a `_target_` may always name them
@@ -47,7 +48,7 @@ CLASS_OF_NODE = {  # for nodes without a _target_
     "view": "datasets.views.ViewSampler",
     "auto": "bench.setup.auto.AutoSettings",
     "prior": "bench.shape_prior.PriorSettings",
-    "models": "bench.setup.fields.ModelSettings",
+    "models": "bench.tasks.capacity.settings.ModelSettings",
     "evaluation": "bench.config.EvaluationSettings",
 }
 PRIOR_FIELD = "prior"  # value of `field`: a latent code of the prior
@@ -147,28 +148,25 @@ def check_label(config: Mapping[str, Any], overrides: Sequence[str]) -> None:
         )
 
 
-def check_draw(config: DictConfig) -> None:
-    """Raises ValueError if a draw is set and no value of the unresolved configuration uses it."""
-    if config.get("draw") is not None and "${drawn:" not in str(OmegaConf.to_container(config, resolve=False)):
+def check_references(config: DictConfig) -> None:
+    """Raises ValueError if a draw or a silhouette loss is set, and no value of the unresolved configuration uses it."""
+    is_own_loss = str((config.get("silhouette") or {}).get("_target_", ".Own")).endswith(".Own")
+    if config.get("draw") is None and is_own_loss:
+        return
+    text = str(OmegaConf.to_container(config, resolve=False))
+    if config.get("draw") is not None and "${drawn:" not in text:
         raise ValueError("only a method of method/space reads draw: add +method=space/NAME, or remove draw")
+    if not is_own_loss and SILHOUETTE_REFERENCE not in text:
+        tasks = [name for name in names("task") if SILHOUETTE_REFERENCE in str(choice("task", name))]
+        raise ValueError(f"silhouette is read only by task={', '.join(tasks)}: remove it, or set one of these tasks")
 
 
 def check_names(config: Mapping[str, Any]) -> None:
-    """Raises ValueError for an unknown key of the top level, and for a silhouette loss that the task does not read."""
+    """Raises ValueError for an unknown key of the top level."""
     keys = [item.name for item in fields(Config)]
     for key in map(str, config):
         if key not in keys:
             raise ValueError(f"unknown key {key!r}{nearest(key, keys)}")
-    loss, task = config.get("silhouette") or {}, config.get("task") or {}
-    if not str(loss.get("_target_", ".Own")).endswith(".Own") and "silhouette" not in {
-        *task,
-        *task.get("fit", {}),
-        *task.get("losses", {}),
-        *(task.get("supervision") or {}).get("losses", {}),
-    }:
-        raise ValueError(
-            "only task=completion, pose, capacity, stability, reconstruction and single_view read silhouette: remove it"
-        )
 
 
 def check_top_level(config: Mapping[str, Any]) -> None:
@@ -217,7 +215,8 @@ def build(
         role = find_class(target, name, packages, object)
     if node.get("_target_") == MISSING:
         raise ValueError(f"{name}._target_ must be given: set {name}._target_=PACKAGE.CLASS")
-    class_package = [str(node[CLASS_PACKAGE_KEY])] if name == "renderer" and CLASS_PACKAGE_KEY in node else []
+    is_custom = name == "renderer" and CLASS_PACKAGE_KEY in node
+    class_package = [str(node[CLASS_PACKAGE_KEY])] if is_custom else []
     cls = find_class(node.get("_target_", target), name, [*packages, *class_package], role)
     arguments = {str(key): value for key, value in node.items() if key not in ("_target_", *MARKS)}
     argument_names = _argument_names(cls)
@@ -225,7 +224,9 @@ def build(
         raise ValueError(_missing_value_message(cls, name, str(key)))
     for key in arguments:
         if argument_names is not None and key not in argument_names:
-            raise ValueError(f"{name} has no key {key!r}{nearest(str(key), argument_names)}")
+            is_foreign = name == "renderer" and not is_custom and cls.__module__.partition(".")[0] not in OUR_PACKAGES
+            hint = f"; {custom_renderer_hint(_class_path(cls))}" if is_foreign else ""
+            raise ValueError(f"{name} has no key {key!r}{nearest(key, argument_names)}{hint}")
     return _build_dataclass(cls, arguments, name, packages) if is_dataclass(cls) else cls(**arguments)
 
 
@@ -245,6 +246,8 @@ def find_class(path: Any, name: str, packages: Sequence[str], role: type | None)
     module, _, class_name = str(path).rpartition(".")
     if (package := module.partition(".")[0]) not in (*OUR_PACKAGES, *packages):
         remedy = f"type packages=[{package}] if you trust it" if package else "it must be PACKAGE.CLASS"
+        if package and name == "renderer":
+            remedy += f"; {custom_renderer_hint(path)}"
         raise ValueError(f"{name}._target_ names {path!r}: {remedy}")
     try:
         cls = getattr(import_module(module), class_name)
@@ -257,6 +260,11 @@ def find_class(path: Any, name: str, packages: Sequence[str], role: type | None)
     if role is not None and (fault := _role_fault(cls, role)):
         raise ValueError(f"{name}._target_ names {path!r}, which is no {role.__name__}: {fault}")
     return cls
+
+
+def custom_renderer_hint(path: str) -> str:
+    """The remedy for a class of the user that replaces that of another renderer."""
+    return f"a class with arguments of its own is renderer=custom renderer._target_={path}"
 
 
 def _role_fault(cls: type, role: type) -> str:

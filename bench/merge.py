@@ -6,13 +6,16 @@ higher rank, and `earlier` gets the other, with a hash of its content in its nam
 
 import argparse
 import json
+import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
-from bench.records.folder import archive_run, content_hash, copy_atomically
-from bench.records.read import check_links, read_plans, read_run, run_folders
+from bench.records.folder import archive_run, content_hash
+from bench.records.read import read_plans
 from bench.records.record import bad_link, file_lock, is_outside, read_record, write_text
+from bench.records.results import check_links, read_run, run_folders
 from bench.report.suite.attempts import attempts_folder, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
@@ -50,7 +53,7 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
             if link := bad_link(folder, source):
                 faults.append(f"{folder}: not copied, since {link} is a link out of its results folder")
             elif folder.parent.name == "earlier":
-                copy_atomically(into / "earlier" / folder.name, folder)
+                _copy_atomically(into / "earlier" / folder.name, folder)
             else:
                 lines += _copy_run(folder, into)
                 if fault := read_run(folder, source)[1]:
@@ -61,6 +64,16 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
                 (into / "sweeps" / plan.parent.name).mkdir(parents=True, exist_ok=True)
                 _keep_later(into / "sweeps" / plan.parent.name / plan.name, plan)
     return lines, faults
+
+
+def _copy_atomically(target: Path, folder: Path) -> None:
+    """Copies a folder to `target` atomically; does nothing if `target` exists."""
+    if target.exists():
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    scratch = target.with_name(f".{target.name}.{os.getpid()}")
+    shutil.copytree(folder, scratch)
+    scratch.rename(target)
 
 
 def _keep_later(target: Path, path: Path) -> None:
@@ -81,7 +94,7 @@ def _copy_run(folder: Path, into: Path) -> list[str]:
     target, earlier = into / "runs" / folder.name, into / "earlier"
     with file_lock(into, folder.name):
         if not target.exists():
-            copy_atomically(target, folder)
+            _copy_atomically(target, folder)
             return []
         (target_rank, kept), (folder_rank, archived) = _rank(target), _rank(folder)
         if target_rank[-1] == folder_rank[-1]:  # the same run
@@ -90,9 +103,9 @@ def _copy_run(folder: Path, into: Path) -> list[str]:
         if folder_rank > target_rank:
             kept, archived = archived, kept
             archive_run(target, earlier)
-            copy_atomically(target, folder)
+            _copy_atomically(target, folder)
         else:
-            copy_atomically(earlier / f"{folder.name}-{folder_rank[-1]}", folder)
+            _copy_atomically(earlier / f"{folder.name}-{folder_rank[-1]}", folder)
     return [f"{folder.name}: kept {kept}, set aside in earlier: {archived}"]
 
 

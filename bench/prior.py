@@ -2,11 +2,11 @@
 
 import sys
 
-from bench.records.folder import Identity
+from bench.records.results import PlannedRun
 from bench.runner.command import command_line
 
 
-def train(run: Identity) -> None:
+def train(run: PlannedRun) -> None:
     """Finds or trains the prior; prints its path.
 
     Raises:
@@ -17,7 +17,7 @@ def train(run: Identity) -> None:
     from bench.setup.inputs import prepare_run
     from bench.shape_prior import PriorSettings, prior_file
 
-    inputs = prepare_run(run.config).inputs
+    _, inputs = prepare_run(run.config)
     choice = inputs.prior_choice
     if not isinstance(choice.source, PriorSettings):
         raise ValueError("the codes of a network are the prior already: there is nothing to train")

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.format import MISSING, number, plural
-from bench.records.read import RESULTS, read_records
+from bench.records.read import read_records
+from bench.records.results import RESULTS
 from bench.report.suite.attempts import (
     EXPERIMENT_PREFIX,
     FIXED_KEYS,

@@ -6,9 +6,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from bench.records.names import flat
-from bench.records.read import curve_lines
-from bench.records.record import NUMERIC_FIELDS, as_number, started
+from bench.records.record import NUMERIC_FIELDS, as_number, flat, started
+from bench.records.results import curve_lines
 from datasets.extras import install_command
 
 MAX_METRICS_PER_CALL, MAX_PARAMETERS_PER_CALL, MAX_PARAMETER_CHARACTERS = 1000, 100, 500  # limits of MLflow

@@ -2,11 +2,11 @@
 
 import sys
 
-from bench.records.folder import Identity
+from bench.records.results import PlannedRun
 from bench.runner.command import command_line
 
 
-def train(run: Identity) -> None:
+def train(run: PlannedRun) -> None:
     """Finds or trains the network; prints its path. A stopped training continues.
 
     Raises:
@@ -17,16 +17,15 @@ def train(run: Identity) -> None:
     from bench.setup.inputs import prepare_run
     from bench.tasks.single_view.task import OneImage, describe_training
 
-    prepared = prepare_run(run.config)
-    if not isinstance(prepared.task, OneImage):
+    task, inputs = prepare_run(run.config)
+    if not isinstance(task, OneImage):
         raise ValueError(
             "bench.train trains the network of task=single_view: python -m bench.train +method=single_view "
             "dataset=car; python -m bench.prior trains a prior"
         )
     with flushing_denormals(), run_progress("single_view") as progress:
-        prepared.configure_process()
-        inputs = prepared.inputs
-        recipe = prepared.task.recipe(inputs, run.config)
+        inputs.configure_process()
+        recipe = task.recipe(inputs, run.config)
         path = recipe.make(inputs.cache, inputs.device, progress)
     print(describe_training(recipe.load(path)[1]), file=sys.stderr)
     print(path)

@@ -18,9 +18,9 @@ import pandas as pd
 import yaml
 
 from bench.records.format import number
-from bench.records.names import flat
-from bench.records.read import RESULTS, read_records
-from bench.records.record import NEUTRAL_KEYS, is_plain_name, write_text
+from bench.records.read import read_records
+from bench.records.record import NEUTRAL_KEYS, flat, is_plain_name, write_text
+from bench.records.results import RESULTS
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import CHAMFER_SCALE, Record, RunKey, error, grouped, run_key
 from bench.report.data.runs import Runs, Selection, choose, shared_loss

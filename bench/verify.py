@@ -19,10 +19,10 @@ import torch
 from bench.evaluate.evaluate import evaluate
 from bench.evaluate.state import State
 from bench.machine.environment import describe, flushing_denormals
-from bench.records.folder import Identity
+from bench.records.folder import code_hash
 from bench.records.format import number, plural
-from bench.records.read import run_folders
 from bench.records.record import Record, RunStatus, bad_link, read_record
+from bench.records.results import run_folders
 from bench.setup.inputs import EvaluatesField, RunContext, prepare_run
 from datasets.files.field_files import load_field
 from datasets.saved_field import FIELD_FILE
@@ -121,12 +121,12 @@ def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.dev
         notes = [note for note in record.notes if FIELD_FILE in note]
         status = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
         raise NothingToCompare(notes[0] if notes else f"it has no {FIELD_FILE}, since it optimised no field{status}")
-    prepared = prepare_run(record.config)
-    prepared.configure_process()
-    field = load_field(folder, prepared.inputs.device)
-    run = RunContext(prepared.inputs, folder, record, lambda *_: None)
-    metrics = prepared.task.field_metrics(field, run) if isinstance(prepared.task, EvaluatesField) else None
-    return evaluate(State(field, prepared.inputs)).metrics if metrics is None else metrics, prepared.inputs.device
+    task, inputs = prepare_run(record.config)
+    inputs.configure_process()
+    field = load_field(folder, inputs.device)
+    run = RunContext(inputs, folder, record, lambda *_: None)
+    metrics = task.field_metrics(field, run) if isinstance(task, EvaluatesField) else None
+    return evaluate(State(field, inputs)).metrics if metrics is None else metrics, inputs.device
 
 
 def _relative_difference(first: float, second: float) -> float:
@@ -138,7 +138,7 @@ def _relative_difference(first: float, second: float) -> float:
 
 def _changes(record: Record, environment: dict[str, Any]) -> list[str]:
     """The differences in code and machine between a record and this process, as texts."""
-    code = Identity({}, record.config).code
+    code = code_hash(record.config)
     differences = [f"the code differs: {record.code[:12]} then, {code[:12]} now"] if code != record.code else []
     for name in MACHINE_KEYS:
         then, now = record.environment.get(name), environment.get(name)

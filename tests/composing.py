@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from bench.records.folder import Identity
+from bench.records.results import PlannedRun
 from bench.runner.command import options_of
 from bench.runner.compose import Composer, composing, without_hydra
 
@@ -20,14 +20,14 @@ def composed(*overrides: str, hydra: bool = False) -> DictConfig:
     return config if hydra else without_hydra(config)
 
 
-def identified(*arguments: str) -> Identity:
+def identified(*arguments: str) -> PlannedRun:
     """The run that a command line describes."""
     with composing():
         composer = Composer(options_of([*arguments]).overrides)
         return composer.single_run(composer.shared_config())
 
 
-def cells_of(*overrides: str, folder: Path | None = None) -> list[Identity]:
+def cells_of(*overrides: str, folder: Path | None = None) -> list[PlannedRun]:
     """The cells of a sweep, with a folder of a user's configurations as after `--config-dir`."""
     with composing(*([folder] if folder else [])):
         composer = Composer(overrides)

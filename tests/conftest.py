@@ -46,7 +46,7 @@ settings.load_profile("implicit-bench")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Adds the renderer that the contract tests: `-k custom --renderer=mypkg.Mine`."""
-    parser.addoption("--renderer", default="tests.user_renderer.Mine", help="class of a renderer, as PACKAGE.CLASS")
+    parser.addoption("--renderer", help="class of a renderer, as PACKAGE.CLASS")
 
 
 SLOWEST = ("runner/test_launchers.py", "runner/test_resume.py", "conf/", "runner/")  # files that take longest
@@ -64,6 +64,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Ignores beartype's warning about OmegaConf's classes, which build on `typing`; other warnings are errors."""
+    if config.getoption("keyword") == "custom" and config.getoption("--renderer") is None:
+        raise pytest.UsageError("-k custom tests a renderer of yours: add --renderer=PACKAGE.CLASS")
     config.option.loadscopereorder = False  # of pytest-xdist, which would begin with the files that have most tests
     config.addinivalue_line("filterwarnings", "ignore::beartype.roar.BeartypeDecorHintPep585DeprecationWarning")
 

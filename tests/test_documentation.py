@@ -16,7 +16,7 @@ import bench
 import bench.studies
 from bench import tables
 from bench.config import build, check_names
-from bench.records.folder import Identity
+from bench.records.results import PlannedRun
 from bench.report.__main__ import main as report
 from bench.report.write import paper
 from bench.runner.command import config_dirs, expand_field_file, options_of
@@ -57,7 +57,7 @@ def placeholder_paths(tmp_path_factory) -> Iterator[dict[str, str]]:
         yield named
 
 
-def first_cell(arguments: list[str]) -> Identity:
+def first_cell(arguments: list[str]) -> PlannedRun:
     """The first cell of a command."""
     options = options_of(arguments)
     with composing(*config_dirs(options)):

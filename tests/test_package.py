@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from bench.__main__ import console
-from bench.records.read import RESULTS
+from bench.records.results import RESULTS
 from bench.runner.executors import EXTRA_BY_EXECUTOR
 from datasets.extras import install_command, version
 from tests.runner.driving import by_program

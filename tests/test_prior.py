@@ -25,7 +25,7 @@ from bench.shape_prior import (
 )
 from datasets.families import FAMILIES
 from datasets.scene import Split
-from tests.tiny import CPU, cell_from, mesh_of, silent
+from tests.tiny import CPU, inputs_from, mesh_of, silent
 
 SETTINGS = PriorSettings(
     network=NetworkSettings(layers=3, width=48, code_length=4, skip=1, narrow=False),
@@ -189,8 +189,8 @@ def shipped_records() -> list[dict]:
 @pytest.mark.parametrize("truncation", ["null", 0.1])
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_the_shipped_priors_match_the_configuration(family, truncation, compose_config, tmp_path, monkeypatch):
-    desk = cell_from(compose_config(f"dataset={family}", "scale=desk", f"prior.truncation={truncation}"))
-    dataset, settings = desk.inputs.dataset, desk.inputs.prior_choice.source
+    desk = inputs_from(compose_config(f"dataset={family}", "scale=desk", f"prior.truncation={truncation}"))
+    dataset, settings = desk.dataset, desk.prior_choice.source
     (record,) = (record for record in shipped_records() if record["key"] == prior_key(dataset, settings))
     assert (record["dataset"]["name"], record["settings"]) == (family, settings.identity)
     assert probe(dataset) == pytest.approx(record["probe"], rel=1e-4)  # the family has not changed
@@ -205,8 +205,8 @@ def test_the_shipped_priors_match_the_configuration(family, truncation, compose_
 
 
 def test_every_shipped_file_belongs_to_a_family_and_serves_both_scales(compose_config):
-    desk, smoke = (cell_from(compose_config("dataset=sofa", f"scale={scale}")) for scale in ("desk", "smoke"))
-    assert desk.inputs.prior_choice == smoke.inputs.prior_choice
+    desk, smoke = (inputs_from(compose_config("dataset=sofa", f"scale={scale}")) for scale in ("desk", "smoke"))
+    assert desk.prior_choice == smoke.prior_choice
     keys = {f"{record['dataset']['name']}-{record['key']}" for record in shipped_records()}
     names = {path.name for path in SHIPPED.iterdir()}
     assert names == {f"{key}.{suffix}" for key in keys for suffix in ("json", "safetensors")}

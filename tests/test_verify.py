@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import bench
-from bench.records.folder import Identity
+from bench.records.folder import code_hash
 from bench.verify import main
 from datasets.saved_field import FIELD_FILE
 from tests.composing import composed
 from tests.runner.driving import command
-from tests.tiny import cell_from
+from tests.tiny import inputs_from
 
 SMALL = (
     "renderer=dist", "scale=smoke", "isolation=off", "threads=1", "evaluation.grid=24", "evaluation.points=200",
@@ -92,11 +92,11 @@ def test_an_edited_metric_is_reported_with_its_cause(copied, capsys, spoil, word
 
 def test_only_the_field_of_a_run_that_is_read_decides_whether_its_reader_runs_again(copied):
     config = {"dataset": {"path": str(copied)}}
-    first = Identity({}, config).code
+    first = code_hash(config)
     edit(copied, asked="later")
-    assert Identity({}, config).code == first
+    assert code_hash(config) == first
     (copied / FIELD_FILE).write_bytes(b"other")
-    assert Identity({}, config).code != first
+    assert code_hash(config) != first
 
 
 def test_a_folder_without_runs_is_an_error(tmp_path, capsys):
@@ -107,7 +107,7 @@ def test_a_folder_without_runs_is_an_error(tmp_path, capsys):
 @pytest.mark.parametrize("name", RUNS)
 def test_the_field_of_a_run_can_be_a_scene(runs, name):
     folder = runs[name]
-    inputs = cell_from(composed("task=ablation", "dataset=network", f"dataset.path={folder}")).inputs
+    inputs = inputs_from(composed("task=ablation", "dataset=network", f"dataset.path={folder}"))
     fitted, field = inputs.fitted(), bench.load_field(folder)
     points = torch.rand(100, 3) - 0.5
     values, field_values = fitted.decoder.at(fitted.codes[0])(points), field(points)

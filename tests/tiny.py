@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import EvaluationSettings
 from bench.records.record import Record
 from bench.setup.fields import FieldChoice
-from bench.setup.inputs import PreparedRun, RunContext, RunInputs, prepare_run
+from bench.setup.inputs import RunContext, RunInputs, prepare_run
 from bench.setup.priors import PriorChoice
 from bench.shape_prior import Prior
 from datasets.mesh import Mesh
@@ -66,9 +66,9 @@ def plain(config: DictConfig) -> Any:
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
 
 
-def cell_from(config: DictConfig) -> PreparedRun:
-    """The prepared run of a composed configuration."""
-    return prepare_run(plain(config))
+def inputs_from(config: DictConfig) -> RunInputs:
+    """The inputs of the run of a composed configuration."""
+    return prepare_run(plain(config))[1]
 
 
 def silent(phase: str, finished: int, total: int, loss: float | None = None) -> None:

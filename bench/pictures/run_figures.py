@@ -17,7 +17,7 @@ from torch import Tensor
 from bench.evaluate.state import State, empty_view
 from bench.pictures import style
 from bench.pictures.style import MISSED, SCREEN, SPURIOUS, bare, save, silhouette_image
-from bench.records.read import NOT_LOSS_TERMS
+from bench.records.results import NOT_LOSS_TERMS
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import Scene, Truth, View, see

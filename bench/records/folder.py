@@ -7,16 +7,16 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import FIT_MODULE, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_draw
+from bench.config import FIT_MODULE, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references
 from bench.records.imports import ROOT, imported_files
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
+from bench.records.results import PlannedRun
 from bench.tables import without_row_keys
 from datasets.extras import referenced_files, version
 
@@ -34,63 +34,42 @@ RESERVE_FILE = ".reserve"
 LIMIT_KEYS = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun", "plan", "tracker"}
 
 
-@dataclass(frozen=True)
-class Identity:
-    """The run that a configuration describes.
+def config_hash(config: Mapping[str, Any]) -> str:
+    """Hash of a resolved configuration without the keys that change no result; the order of keys does not matter.
 
-    Args:
-        choices: names of the chosen YAMLs of task, renderer, dataset and method. A stress replaces the dataset, and the
-            method may be empty.
-        config: the resolved configuration, as plain data.
-        overrides: the overrides of the command line.
+    `packages` is left out if the run uses no class of the user.
     """
+    hashed = {key: value for key, value in config.items() if key not in NEUTRAL_KEYS}
+    return digest(hashed if _user_packages(config) else {**hashed, "packages": []})
 
-    choices: dict[str, str]
-    config: dict[str, Any]
-    overrides: list[str] = field(default_factory=list)
 
-    @cached_property
-    def config_hash(self) -> str:
-        """Hash of the configuration without the keys that change no result; the order of keys does not matter.
+def code_hash(config: Mapping[str, Any]) -> str:
+    """Hash of our code, the user's packages, library versions and the files that `INPUT_FILE_KEYS` name."""
+    used_packages = _user_packages(config)
+    listed = [str(package) for package in config.get("packages") or []] if used_packages else []
+    packages = sorted({*listed, *used_packages} - {*OUR_PACKAGES})  # a class may import a listed package
+    dataset = config.get("dataset") or {}
+    shapenet = dataset["path"] if "synset" in dataset else None  # thousands of folders: only counted
+    inputs = [
+        (path, key in ("path", "images") and path != shapenet)
+        for key in INPUT_FILE_KEYS
+        for path in _values_of_key(config, key)
+    ]
+    for split in map(Path, _values_of_key(dataset, "split")):  # a list of shapes, with others in the same folder
+        inputs += [(str(path), False) for path in sorted(split.parent.glob(f"*{split.suffix or split.name}"))]
+    files = [_file_hash(Path(path), deep=is_deep) for path, is_deep in inputs]
+    files += [_class_counts_hash(str(dataset.get(key))) for key in ("path", "renders") if "synset" in dataset]
+    hashed = {key: value for key, value in config.items() if key not in NEUTRAL_KEYS}
+    targets = {*_values_of_key(hashed, "_target_")}
+    targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}
+    targets |= {FIT_MODULE} if hashed.get("field", PRIOR_FIELD) != PRIOR_FIELD else set()
+    code = _our_code_hash(frozenset(targets), bool(packages))
+    return digest([code, *(_package_hash(name) for name in packages), *files])
 
-        `packages` is left out if the run uses no class of the user.
-        """
-        hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
-        return digest(hashed if self._user_packages else {**hashed, "packages": []})
 
-    @property
-    def name(self) -> str:
-        """The name of the run's folder."""
-        choices = [choice.replace("/", "_") for choice in self.choices.values() if choice]  # some are NAME/NAME
-        return "-".join([*choices, self.config_hash])
-
-    @cached_property
-    def _user_packages(self) -> set[str]:
-        """The packages of the user whose classes the run uses."""
-        return {target.split(".")[0] for target in _values_of_key(self.config, "_target_")} - {*OUR_PACKAGES}
-
-    @cached_property
-    def code(self) -> str:
-        """Hash of our code, the user's packages, library versions and the files that `INPUT_FILE_KEYS` name."""
-        listed = [str(package) for package in self.config.get("packages") or []] if self._user_packages else []
-        packages = sorted({*listed, *self._user_packages} - {*OUR_PACKAGES})  # a class may import a listed package
-        dataset = self.config.get("dataset") or {}
-        shapenet = dataset["path"] if "synset" in dataset else None  # thousands of folders: only counted
-        inputs = [
-            (path, key in ("path", "images") and path != shapenet)
-            for key in INPUT_FILE_KEYS
-            for path in _values_of_key(self.config, key)
-        ]
-        for split in map(Path, _values_of_key(dataset, "split")):  # a list of shapes, with others in the same folder
-            inputs += [(str(path), False) for path in sorted(split.parent.glob(f"*{split.suffix or split.name}"))]
-        files = [_file_hash(Path(path), deep=is_deep) for path, is_deep in inputs]
-        files += [_class_counts_hash(str(dataset.get(key))) for key in ("path", "renders") if "synset" in dataset]
-        hashed = {key: value for key, value in self.config.items() if key not in NEUTRAL_KEYS}
-        targets = {*_values_of_key(hashed, "_target_")}
-        targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}
-        targets |= {FIT_MODULE} if hashed.get("field", PRIOR_FIELD) != PRIOR_FIELD else set()
-        code = _our_code_hash(frozenset(targets), bool(packages))
-        return digest([code, *(_package_hash(name) for name in packages), *files])
+def _user_packages(config: Mapping[str, Any]) -> set[str]:
+    """The packages of the user whose classes a run uses."""
+    return {target.split(".")[0] for target in _values_of_key(config, "_target_")} - {*OUR_PACKAGES}
 
 
 def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, Any]:
@@ -101,9 +80,9 @@ def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, 
         choices: the names of the chosen files and rows, by group.
 
     Raises:
-        ValueError: if the command line removes a group that every run needs, or sets a draw that nothing uses.
+        ValueError: if the command line removes a group that every run needs; see also `check_references`.
     """
-    check_draw(config)
+    check_references(config)
     for group in ("task", "renderer", "dataset"):
         if group not in choices:
             raise ValueError(f"every run needs one {group}: remove ~{group} or a list; several are -m {group}=A,B")
@@ -113,22 +92,26 @@ def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, 
     return values
 
 
-def identify(values: dict[str, Any], choices: Mapping[str, Any], overrides: Sequence[str]) -> Identity:
-    """The identity of the run of a resolved configuration, after all checks that need no torch.
+def planned_run(values: dict[str, Any], choices: Mapping[str, Any], overrides: Sequence[str]) -> PlannedRun:
+    """The run of a resolved configuration, after all checks that need no torch. Its id has the names of its choices.
+
+    A stress replaces the dataset among them.
 
     Raises:
         ValueError: if a value is invalid.
     """
-    scene_choice = choices["dataset"] if choices.get("stress", NO_STRESS) == NO_STRESS else choices["stress"]
-    named = {"task": choices["task"], "renderer": choices["renderer"], "dataset": scene_choice}
-    named["method"] = choices.get("method") or ""
     check(values, overrides)
-    return Identity({name: str(choice) for name, choice in named.items()}, values, list(overrides))
+    scene_group = "dataset" if choices.get("stress", NO_STRESS) == NO_STRESS else "stress"
+    names = {"task": choices["task"], "renderer": choices["renderer"], "dataset": choices[scene_group]}
+    names = {key: str(name) for key, name in (names | {"method": choices.get("method") or ""}).items()}
+    parts = [name.replace("/", "_") for name in names.values() if name]  # some are NAME/NAME
+    folder = "-".join([*parts, config_hash(values)])
+    return PlannedRun(folder, [*overrides], seed=values["seed"], config=values, **names)
 
 
 @contextmanager
-def locked_folder(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterator[tuple[Path, dict[str, Any] | None]]:
-    """Waits for the lock of a run's folder; yields the folder and the record to reuse, or None.
+def locked_folder(run: PlannedRun) -> Iterator[dict[str, Any] | None]:
+    """Waits for the lock of a run's folder; yields the record to reuse, or None and makes an empty folder.
 
     A finished run of the same code is kept to be reused. Any other run is moved to `results_dir/earlier`.
 
@@ -136,38 +119,39 @@ def locked_folder(results_dir: Path, identity: Identity, rerun: Rerun) -> Iterat
         OSError: if the results folder cannot be written.
         ValueError: if a link in it leads out of it.
     """
-    folder = results_dir / "runs" / identity.name
-    for path in (folder, results_dir / "earlier", results_dir / ".locks" / identity.name):
+    folder, results_dir = run.folder, Path(run.config["results_dir"])
+    for path in (folder, results_dir / "earlier", results_dir / ".locks" / run.id):
         if is_outside(path, results_dir):
             raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")
     if link := bad_link(folder, results_dir):
         raise ValueError(f"{folder / link} is a link out of the results folder: remove that folder")
-    with file_lock(results_dir, identity.name):
-        record = reusable_record(folder, identity, rerun)
+    with file_lock(results_dir, run.id):
+        record = reusable_record(run)
         if record is None:
             archive_run(folder, results_dir / "earlier")
             folder.mkdir(parents=True)
             _reserve_bytes(folder)
         try:
-            yield folder, record
+            yield record
         finally:
             free_reserve(folder)
 
 
-def reusable_record(folder: Path, identity: Identity, rerun: Rerun) -> dict[str, Any] | None:
+def reusable_record(run: PlannedRun) -> dict[str, Any] | None:
     """The record of a finished run of the same configuration and code; None if it must be run."""
+    rerun = run.config["rerun"]
     if rerun == Rerun.all:
         return None
     try:
-        record = read_record(folder)
-        status = RunStatus(record["status"])
+        record = read_record(run.folder)
     except (OSError, ValueError, RecursionError):
         return None
-    is_same = (record.get("config_hash"), record.get("code")) == (identity.config_hash, identity.code)
-    if not is_same or not record.get("ended") or status == RunStatus.KILLED:
+    if not record.get("ended") or record["status"] == RunStatus.KILLED:
         return None
-    if status != RunStatus.OK:
-        limits = [{key: config.get(key) for key in LIMIT_KEYS} for config in (record["config"], identity.config)]
+    if (record.get("config_hash"), record.get("code")) != (config_hash(run.config), code_hash(run.config)):
+        return None
+    if record["status"] != RunStatus.OK:
+        limits = [{key: config.get(key) for key in LIMIT_KEYS} for config in (record["config"], run.config)]
         return record if rerun == Rerun.none and limits[0] == limits[1] else None
     return record
 
@@ -181,16 +165,6 @@ def archive_run(folder: Path, earlier: Path) -> None:
             shutil.rmtree(folder)
         else:
             folder.rename(target)
-
-
-def copy_atomically(target: Path, folder: Path) -> None:
-    """Copies a folder to `target` atomically; does nothing if `target` exists."""
-    if target.exists():
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    scratch = target.with_name(f".{target.name}.{os.getpid()}")
-    shutil.copytree(folder, scratch)
-    scratch.rename(target)
 
 
 def content_hash(folder: Path) -> str:
@@ -262,10 +236,17 @@ def _file_hash(path: Path, *, deep: bool = False) -> str:
             children = sorted(path.rglob("*") if deep else path.glob("*"))
             files = [child for child in children if child.is_file() and child.suffix not in ARCHIVE_SUFFIXES]
             return digest([[child.relative_to(path).as_posix(), _file_hash(child)] for child in files])
-        name_and_hash = [path.name, hashlib.sha256(path.read_bytes()).hexdigest()]
-        return digest([*name_and_hash, *map(_file_hash, referenced_files(path))])
+        status = path.stat()
+        bytes_hash = _bytes_hash(path, status.st_size, status.st_mtime_ns)
+        return digest([path.name, bytes_hash, *map(_file_hash, referenced_files(path))])
     except OSError:
         return ""
+
+
+@cache
+def _bytes_hash(path: Path, size: int, changed: int) -> str:
+    """Hash of a file's content. The runs of a sweep share files, which are read once, unless they change."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @lru_cache

@@ -5,11 +5,10 @@ from collections.abc import Callable, Container, Hashable, Iterable, Iterator, S
 from functools import cache
 from typing import Any
 
-from bench.records.record import NEUTRAL_KEYS, renderer_name, row_name
+from bench.records.record import NEUTRAL_KEYS, flat, renderer_name, row_name
 
 CHOICE_FIELDS = ("task", "method", "renderer", "dataset")  # fields of a record whose values need no key
 KEY_LABELS = {"index": "shape", "dataset.path": "", "_target_": ""}  # text before the value, instead of the key
-MAX_DEPTH = 20
 EXCLUDED_KEYS = NEUTRAL_KEYS | {"label", "packages"}
 
 
@@ -85,17 +84,6 @@ def settings_of(config: dict[str, Any], without: Container[str] = EXCLUDED_KEYS)
     """The settings that may be in a name, as text by dotted keys, without those of the top-level keys `without`."""
     flat_settings = flat({key: value for key, value in config.items() if key not in without})
     return {key: _as_typed(value) for key, value in flat_settings.items() if _is_named(key)}
-
-
-def flat(node: dict[str, Any], prefix: str = "", depth: int = MAX_DEPTH) -> dict[str, Any]:
-    """The values of nested settings by dotted keys; nodes deeper than `depth` levels are replaced by "…"."""
-    values: dict[str, Any] = {}
-    for key, value in node.items():
-        if isinstance(value, dict) and depth:
-            values |= flat(value, f"{prefix}{key}.", depth - 1)
-        else:
-            values[f"{prefix}{key}"] = "…" if isinstance(value, dict) else value
-    return values
 
 
 def _name_parts(

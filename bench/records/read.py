@@ -1,13 +1,10 @@
-"""Reads a results folder: the records of its runs, and the plans of its sweeps."""
+"""Reads all records of a results folder, and the plans of its sweeps."""
 
 import json
 import marshal
-import os
 import sys
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, fields
 from datetime import datetime
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,88 +13,11 @@ from bench.records.record import (
     NOT_RUN,
     SCHEMA,
     Record,
-    bad_link,
-    from_json_values,
     is_outside,
     is_plain_name,
-    now,
-    read_record,
     started,
-    to_json,
-    write_text,
 )
-
-RESULTS = "results/local"  # the default results folder; conf/config.yaml has the same
-PLAN_FILE = "plan.json"
-NON_FINITE_STRINGS = ('"inf"', '"-inf"', '"nan"')
-CURVE_COST_KEYS = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "cost")
-NOT_LOSS_TERMS = (
-    *CURVE_COST_KEYS,
-    *("chamfer_l1", "chamfer_l2", "psnr", "seen_chamfer_l1", "rotation_error_deg", "translation_error", "success"),
-)
-PAGE_FOLDERS = ("page", "base", "parts", "views", "data", "list", "run", "mesh")
-SUBFOLDERS = ("runs", "sweeps", "earlier", "paper", "suite", ".locks", *PAGE_FOLDERS)
-# The files and folders of a results folder that this project writes.
-WRITABLE_PATTERNS = ("*", "paper/*", "suite/*", "suite/*/*", "sweeps/*/*", "page/*", "page/data/*")
-
-
-@dataclass(frozen=True)
-class PlannedCell:
-    """A cell of a sweep: the name of its run folder, its overrides, and its resolved configuration."""
-
-    id: str
-    overrides: list[str]
-    task: str
-    renderer: str
-    dataset: str
-    seed: int
-    config: dict[str, Any]
-    method: str = ""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """All cells of a sweep, in order."""
-
-    name: str
-    results_dir: Path
-    cells: list[PlannedCell]
-    asked: str = field(default_factory=now)
-
-    @property
-    def folder(self) -> Path:
-        """The folder of the plan; the same sweep has the same folder."""
-        return self.results_dir / "sweeps" / self.name
-
-    @cached_property
-    def common(self) -> set[str]:
-        """The overrides that all cells share."""
-        return set.intersection(*(set(cell.overrides) for cell in self.cells))
-
-    def distinct_overrides(self, cell: PlannedCell) -> list[str]:
-        """The overrides of a cell that not all cells share."""
-        return [override for override in cell.overrides if override not in self.common]
-
-    def write(self) -> None:
-        """Writes `plan.json`."""
-        check_links(self.results_dir)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        head = to_json({"schema": SCHEMA, "name": self.name, "asked": self.asked, "cells": []}).rstrip(" \n]}")
-        cells = ",\n".join(to_json(vars(cell)).rstrip() for cell in self.cells)  # encoded one by one to save memory
-        write_text(self.folder / PLAN_FILE, f"{head}\n{cells}\n]}}\n")
-
-    def record(self, cell: PlannedCell) -> dict[str, Any] | None:
-        """The record of a cell, if it was requested after the plan was made and has ended, else None."""
-        return ended_record(self.results_dir / "runs" / cell.id, self.asked)
-
-
-def ended_record(folder: Path, since: str) -> dict[str, Any] | None:
-    """The record of a run that was requested at the time `since` or later, and has ended, else None."""
-    try:
-        record = read_record(folder)
-    except (OSError, ValueError, RecursionError):
-        return None
-    return record if record.get("ended") and record.get("asked", "") >= since else None
+from bench.records.results import PLAN_FILE, Plan, PlannedRun, check_links, read_run, run_folders
 
 
 def read_plans(results_dir: Path) -> tuple[list[Plan], list[str]]:
@@ -118,8 +38,8 @@ def _read_plan(path: Path, results_dir: Path) -> tuple[Plan | None, str]:
         if plan["name"] != path.parent.name:
             raise ValueError(f"its name must be that of its folder, found {plan['name']!r}")
         datetime.fromisoformat(plan["asked"])
-        names = [item.name for item in fields(PlannedCell)]
-        cells = [PlannedCell(**{name: cell[name] for name in names if name in cell}) for cell in plan["cells"]]
+        names = [item.name for item in fields(PlannedRun)]
+        cells = [PlannedRun(**{name: cell[name] for name in names if name in cell}) for cell in plan["cells"]]
         if not all(map(_is_valid_cell, cells)):
             raise ValueError("each cell's id must be the name of a folder, and its config an object")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -198,70 +118,14 @@ def check_results(results_dir: Path) -> None:
     check_links(results_dir)
 
 
-def run_folders(results_dir: Path) -> list[Path]:
-    """The folders of all runs in the order of their names, without hidden folders."""
-    runs = results_dir / "runs"
-    if not runs.is_dir():
-        return []
-    with os.scandir(runs) as entries:
-        names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
-    return [runs / name for name in sorted(names)]
-
-
-def read_run(folder: Path, results_dir: Path) -> tuple[dict[str, Any] | None, str]:
-    """The record of a run's folder, or None and a message with the folder's name and the reason."""
-    if link := bad_link(folder, results_dir):
-        return None, f"{folder.name}: not read, since {link} is a link out of the results folder"
-    try:
-        return read_record(folder), ""
-    except FileNotFoundError:
-        return None, f"{folder.name}: no record.json; the run has not finished, or its record was removed"
-    except (OSError, ValueError, RecursionError) as error:
-        return None, f"{folder.name}: {error}"
-
-
-def check_links(results_dir: Path) -> None:
-    """Checks that no link leads writes out of a results folder, which may come from somebody else.
-
-    Raises:
-        ValueError: if a folder or file that this project writes is a link that leads out.
-    """
-    for path in (path for pattern in WRITABLE_PATTERNS for path in results_dir.glob(pattern)):
-        if path.is_symlink() and (path.name in SUBFOLDERS or not path.is_dir()) and is_outside(path, results_dir):
-            raise ValueError(f"{path} is a link out of the results folder: remove it, or set results_dir to another")
-
-
-def _is_valid_cell(cell: PlannedCell) -> bool:
+def _is_valid_cell(cell: PlannedRun) -> bool:
     """Whether the fields of a planned cell have the right types, and its id is a plain file name."""
     has_types = isinstance(cell.overrides, list) and isinstance(cell.config, dict)
     texts = (cell.task, cell.renderer, cell.dataset, cell.method, *cell.overrides) if has_types else (None,)
     return all(isinstance(text, str) for text in texts) and is_plain_name(cell.id)
 
 
-def curve_lines(folder: Path) -> list[dict[str, Any]] | None:
-    """The lines of `curve.jsonl`, {} for an unreadable line; None if the file does not exist."""
-    try:
-        text = (folder / "curve.jsonl").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return None
-    lines = text.splitlines()
-    if not any(text_of_number in text for text_of_number in NON_FINITE_STRINGS):
-        with suppress(ValueError, RecursionError):  # all lines at once, if all are valid
-            objects = json.loads(f"[{','.join(lines)}]")
-            if len(objects) == len(lines) and all(isinstance(line, dict) for line in objects):
-                return objects
-    return [_parse_line(line) for line in lines]
-
-
-def _parse_line(text: str) -> dict[str, Any]:
-    try:
-        value = from_json_values(json.loads(text))
-    except (ValueError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}
-
-
-def not_run_record(cell: PlannedCell, plan: Plan) -> dict[str, Any]:
+def not_run_record(cell: PlannedRun, plan: Plan) -> dict[str, Any]:
     """A record for a planned cell that has not been run."""
     reason = f"planned by sweep {plan.name}; the same command runs it"
     record = Record(**vars(cell), started=plan.asked, asked=plan.asked, status=NOT_RUN, reason=reason)

@@ -28,6 +28,7 @@ NEUTRAL_KEYS = frozenset(
     )
 )
 CONCURRENT_RUNS_VARIABLE = "IMPLICIT_BENCH_BESIDE"  # environment variable: number of runs at a time in a cluster job
+MAX_SETTINGS_DEPTH = 20
 MAX_WAIT_FRACTION = 0.05  # if threads waited for a larger fraction of their ready time, the machine was loaded
 NUMERIC_FIELDS = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
 # Fields that old records may lack.
@@ -323,3 +324,14 @@ def from_json_values(value: Any) -> Any:
     if isinstance(value, list):
         return [from_json_values(item) for item in value]
     return _NON_FINITE.get(value, value) if isinstance(value, str) else value
+
+
+def flat(node: dict[str, Any], prefix: str = "", depth: int = MAX_SETTINGS_DEPTH) -> dict[str, Any]:
+    """The values of nested settings by dotted keys; nodes deeper than `depth` levels are replaced by "…"."""
+    values: dict[str, Any] = {}
+    for key, value in node.items():
+        if isinstance(value, dict) and depth:
+            values |= flat(value, f"{prefix}{key}.", depth - 1)
+        else:
+            values[f"{prefix}{key}"] = "…" if isinstance(value, dict) else value
+    return values

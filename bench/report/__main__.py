@@ -3,7 +3,8 @@
 import sys
 from pathlib import Path
 
-from bench.records.read import RESULTS, check_results, read_records
+from bench.records.read import check_results, read_records
+from bench.records.results import RESULTS
 from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MAX_MESHES, page_lock, write_page

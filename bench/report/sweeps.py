@@ -9,7 +9,8 @@ from typing import Any
 from bench.records import format
 from bench.records.metrics import HIGHER, LOWER, TABLE_METRICS, Metric, better_direction
 from bench.records.names import differences
-from bench.records.read import Plan, not_run_record, read_plans, read_run
+from bench.records.read import not_run_record, read_plans
+from bench.records.results import Plan, read_run
 from bench.report.data import records
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import type_of
 from bench.progress import notice
-from bench.records.folder import Identity
+from bench.records.results import PlannedRun
 from bench.runner.compose import Composer, composing, parse_override, without_hydra
 from bench.runner.library import OPTIONAL_GROUPS
 from bench.runner.messages import Interrupted, write_error_message
@@ -45,7 +45,7 @@ FIELD_FILE_ALIASES = {"dataset.path: ": "field_path: ", "dataset.module.": "fiel
 KERNELS_VARIABLE = "IMPLICIT_BENCH_KERNELS"  # defined in renderers/kernels/library.py, which imports torch
 SWEEP_OPTIONS = ("--multirun", "-m")
 OPTIONS = (*SWEEP_OPTIONS, "--config-dir", "-cd", "--cfg", "-c", "--resolve", "--help", "-h")
-Work = Callable[[Identity], object]  # of one configuration; returns the status if that is a run
+Work = Callable[[PlannedRun], object]  # of one configuration; returns the status if that is a run
 Sweep = Callable[[Composer, DictConfig], list[str]]  # makes the runs of a sweep; returns their statuses
 
 
@@ -110,10 +110,10 @@ def _compose_and_run(arguments: list[str], work: Work, sweep: Sweep | None) -> b
             return work_per_cell(composer, config, work)
         params = OmegaConf.select(config, "hydra.sweeper.params")
         os.environ |= {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
-        identity = composer.single_run(config)
+        run = composer.single_run(config)
     if params and sweep is not None:
         notice("note: this is one run; with -m in the command it is all runs of the table")
-    return work(identity) in (None, "ok")
+    return work(run) in (None, "ok")
 
 
 def _help_text(arguments: list[str], about: str) -> str | None:

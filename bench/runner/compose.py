@@ -29,7 +29,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from bench.config import CLASS_PACKAGE_KEY, Config, type_of, wrong_type_message
-from bench.records.folder import Identity, identify, resolve_config
+from bench.records.folder import planned_run, resolve_config
+from bench.records.results import PlannedRun
 from bench.runner.library import OPTIONAL_GROUPS
 from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
@@ -180,8 +181,11 @@ def compose_choices(overrides: Sequence[str]) -> DictConfig:
         raise unknown_choice(group, path, [*(error.options or group_choices(nested))]) from error
     except (HydraException, OmegaConfBaseException) as error:
         for override in map(parse_override, overrides):
-            if (group := override.key_or_group) in OPTIONAL_GROUPS and not override.is_add():
+            group, has_plus = override.key_or_group, str(override.input_line).startswith("+")
+            if group in OPTIONAL_GROUPS and not has_plus:
                 raise ValueError(f"{group} is not chosen by default: write +{group}=NAME, with a plus") from error
+            if has_plus and group in compose_choices([]).hydra.runtime.choices and group not in OPTIONAL_GROUPS:
+                raise ValueError(f"{group} is chosen by default: write {group}=NAME, without a plus") from error
         for cause in (error, error.__cause__, error.__context__):
             if isinstance(cause, ConfigKeyError | ConfigAttributeError) and cause.full_key:
                 raise unknown_key(str(cause.full_key), compose_choices([])) from error
@@ -253,7 +257,7 @@ class Composer:
                 self.lacking_keys.setdefault(override.key_or_group, config)
         return config
 
-    def single_run(self, config: DictConfig) -> Identity:
+    def single_run(self, config: DictConfig) -> PlannedRun:
         """The run of the configuration `shared_config`.
 
         Raises:
@@ -267,7 +271,7 @@ class Composer:
                 raise ValueError(f"{key} has several values: add -m for a run of each{hint}")
         self.check_keys()
         config, choices = _split_off_choices(config)
-        return identify(resolve_config(config, choices), choices, self.run_overrides)
+        return planned_run(resolve_config(config, choices), choices, self.run_overrides)
 
     def swept(self, config: DictConfig) -> list[list[str]]:
         """The overrides of each cell of the sweep with the configuration `shared_config`.
@@ -285,22 +289,22 @@ class Composer:
         self.mixed_groups = _groups_with_custom(swept)
         return swept
 
-    def cells(self, swept: Sequence[list[str]]) -> list[Identity]:
+    def cells(self, swept: Sequence[list[str]]) -> list[PlannedRun]:
         """The runs of a sweep. A value goes to the cells that have its key; equal cells are merged.
 
         Raises:
             ValueError: if a cell is invalid, or no cell has a key.
         """
         common = set.intersection(*map(set, swept))
-        cells: dict[tuple[str, ...], Identity] = {}
+        cells: dict[tuple[str, ...], PlannedRun] = {}
         for number, overrides in enumerate(swept, 1):
             try:
-                identity = self.identity(overrides)
+                cell = self.planned_cell(overrides)
             except ValueError as error:
                 differing = " ".join(override for override in overrides if override not in common)
                 where = f"cell {number} of {len(swept)} ({differing}): " if differing else ""
                 raise ValueError(f"{where}{error}; nothing was run") from error
-            cells.setdefault(tuple(identity.overrides), identity)
+            cells.setdefault(tuple(cell.overrides), cell)
         self.check_keys()
         return [*cells.values()]
 
@@ -310,7 +314,7 @@ class Composer:
             if key not in self.used_keys:
                 raise unknown_key(key, config)
 
-    def identity(self, cell: list[str]) -> Identity:
+    def planned_cell(self, cell: list[str]) -> PlannedRun:
         """The run of a cell; it shares nodes of its configuration with other cells.
 
         Raises:
@@ -323,7 +327,7 @@ class Composer:
             if INDEX_OR_SEED_REFERENCE.search(str(OmegaConf.to_container(config))) is None:
                 self.resolved_cells[cache_key] = resolved
         overrides = [text for text in cell if parse_override(text).get_key_element() not in resolved.left_out]
-        return identify(resolved.values | numbers, resolved.choices, overrides)
+        return planned_run(resolved.values | numbers, resolved.choices, overrides)
 
     def _resolve(self, cell: list[str]) -> tuple[DictConfig, ResolvedCells]:
         """A cell's configuration, unresolved and resolved."""

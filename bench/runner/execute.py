@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 
 from bench.machine import environment
-from bench.progress import Report, notices_to
+from bench.progress import notices_to
 from bench.records.record import Record, RunStatus, append_to_log, now
-from bench.runner.messages import FinalRecordSent, Notice, RunRequest, Started, Step, reason_of
+from bench.runner.messages import Message, Notice, Started, Step, reason_of
 from bench.setup.inputs import RunContext, prepare_run
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
@@ -23,8 +23,8 @@ from renderers.rendering import Unsupported
 PROGRESS_INTERVAL_SECONDS = 0.05
 
 
-def main(request: RunRequest, channel: Connection, parent: Connection) -> None:
-    """Runs a request to its end in the process of a run; its output goes to `log.txt`.
+def main(record: Record, channel: Connection, parent: Connection) -> None:
+    """Makes the run of a record in the process of that run; its output goes to `log.txt`.
 
     Args:
         parent: the reading end of a pipe that only the parent holds open, and never writes to.
@@ -32,43 +32,42 @@ def main(request: RunRequest, channel: Connection, parent: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
     signal.signal(signal.SIGTERM, _stop)
     _exit_with_parent(parent)
-    _redirect_output(request.folder / "log.txt")
+    _redirect_output(record.folder / "log.txt")
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:
-        execute(request, progress=_Progress(channel), save_record=channel.send)
+        execute(record, channel.send)
     except KeyboardInterrupt:
-        channel.send(request.record)  # as far as it is filled; then ends by SIGTERM, so that the exit code is right
+        record.status = RunStatus.KILLED
+        channel.send(record)  # as far as it is filled; then ends by SIGTERM, so that the exit code is right
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTERM)
-    channel.send(request.record)
-    channel.send(FinalRecordSent())
+    channel.send(record)
 
 
 @environment.flushing_denormals()
-def execute(request: RunRequest, *, progress: Report, save_record: Callable[[Record], None]) -> None:
-    """Runs a request; its record gets a status, and a reason if that is not ok.
+def execute(record: Record, send: Callable[[Message], None]) -> None:
+    """Makes the run of a record, which gets a status, and a reason if that is not ok.
 
     Args:
-        save_record: receives the record as soon as the machine is known.
+        send: receives the progress, and the record as soon as the machine is known.
 
     Raises:
         KeyboardInterrupt: if the run was stopped; the record is filled as far as possible.
     """
-    folder, record = request.folder, request.record
+    folder, progress = record.folder, _Progress(send)
     schedule_before = environment.scheduled()
     try:
         try:
-            prepared = prepare_run(record.config, progress=progress)
+            task, inputs = prepare_run(record.config, progress=progress)
         except (ValueError, OSError) as error:  # the configuration is invalid
             raise BadInput(reason_of(error)) from error
-        prepared.configure_process()
-        inputs = prepared.inputs
+        inputs.configure_process()
         record.scene, record.notes = inputs.scene_name, [*record.notes, *inputs.notes]
         record.environment |= environment.describe(inputs.device)
-        save_record(record)
+        send(record)
         try:
-            prepared.task.execute(RunContext(inputs, folder, record, progress))
+            task.execute(RunContext(inputs, folder, record, progress))
         finally:
             record.notes = [*record.notes, *inputs.last_notes]
     except BadInput as error:
@@ -89,16 +88,16 @@ def execute(request: RunRequest, *, progress: Report, save_record: Callable[[Rec
 
 
 class _Progress:
-    """Sends progress to the parent when a phase begins or ends, and between at intervals."""
+    """Sends progress when a phase begins or ends, and between at intervals."""
 
-    def __init__(self, channel: Connection) -> None:
-        self.channel, self.sent, self.phase = channel, 0.0, ""
+    def __init__(self, send: Callable[[Message], None]) -> None:
+        self.send, self.sent, self.phase = send, 0.0, ""
 
     def __call__(self, phase: str, finished: int, total: int, loss: float | None = None) -> None:
         moment = time.perf_counter()
         if moment - self.sent > PROGRESS_INTERVAL_SECONDS or finished == total or phase != self.phase:
             self.sent, self.phase = moment, phase
-            self.channel.send(Step(phase, finished, total, loss))
+            self.send(Step(phase, finished, total, loss))
 
 
 def _stop(number: int, frame: object) -> None:

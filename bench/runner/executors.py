@@ -17,13 +17,13 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from bench.progress import notice
-from bench.records.folder import Identity
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
+from bench.records.results import PlannedRun
 from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed, stop_signal
 from datasets.extras import install_command
 
-Make = Callable[[Identity], list[str]]  # runs a cell; returns messages if it leaves no record
-Jobs = Sequence[Sequence[Identity]]  # the cells, in groups that one job of a cluster runs one after another
+Make = Callable[[PlannedRun], list[str]]  # runs a cell; returns messages if it leaves no record
+Jobs = Sequence[Sequence[PlannedRun]]  # the cells, in groups that one job of a cluster runs one after another
 Messages = Generator[list[str], None, None]  # of each cell or task that has ended
 EXTRA_BY_EXECUTOR = {"slurm": "submitit", "ray": "ray"}  # each extra has the name of its package
 # Keys of conf/hydra/launcher/slurm.yaml: those that submitit does not know, and those that all its clusters share.
@@ -111,10 +111,10 @@ def print_errors(results: Iterable[list[str]]) -> bool:
     return succeeded
 
 
-def run_in_turn(make: Make, cells: Iterable[Identity]) -> Messages:
+def run_in_turn(make: Make, cells: Iterable[PlannedRun]) -> Messages:
     """Runs cells in this process."""
-    for identity in cells:
-        yield make(identity)
+    for cell in cells:
+        yield make(cell)
         raise_if_stopped()  # a library may have swallowed the exception
 
 
@@ -160,8 +160,8 @@ def _worker_main(make: Make, channel: Connection) -> None:
     catch_signals()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent passes it on
     try:
-        while (identity := channel.recv()) is not None:
-            channel.send(make(identity))
+        while (cell := channel.recv()) is not None:
+            channel.send(make(cell))
     except (KeyboardInterrupt, EOFError):
         return
 
@@ -176,7 +176,7 @@ class PackedJob:
     """
 
     make: Make
-    cells: Sequence[Identity]
+    cells: Sequence[PlannedRun]
     folder: str
     variables: dict[str, str]
 
@@ -191,8 +191,8 @@ class PackedJob:
         for number in (signal.SIGUSR1, signal.SIGUSR2):  # a scheduler sends them before it ends a job
             signal.signal(number, signal.getsignal(signal.SIGTERM))
         try:
-            for identity in self.cells[job.global_rank :: job.num_tasks]:
-                messages += self.make(identity)
+            for cell in self.cells[job.global_rank :: job.num_tasks]:
+                messages += self.make(cell)
         except KeyboardInterrupt:
             messages.append(f"job {job.job_id}: {stop_signal()}; the same command goes on")
         return messages
@@ -244,11 +244,11 @@ def _run_by_ray(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
         yield from map(ray.get, ended)
 
 
-def _make_in_folder(make: Make, identity: Identity, folder: str, variables: dict[str, str]) -> list[str]:
+def _make_in_folder(make: Make, cell: PlannedRun, folder: str, variables: dict[str, str]) -> list[str]:
     """Runs a cell in the folder of the command."""
     os.chdir(folder)
     os.environ |= variables
-    return make(identity)
+    return make(cell)
 
 
 EXECUTORS: dict[str, Callable[[Make, Jobs, Launcher], Messages]] = {

@@ -6,14 +6,14 @@ from statistics import median
 from typing import Any
 
 from bench.records.format import plural
-from bench.records.read import Plan, PlannedCell
+from bench.records.results import Plan, PlannedRun
 from bench.runner.plan import duration_group, durations_of_similar_runs
 
 CLUSTERS = ("slurm", "local")
 POSITIVE_KEYS = ("minutes_per_job", "minutes_per_run", "array_size", "tasks_per_node")
 
 
-def check_jobs(cells: Sequence[PlannedCell], settings: Mapping[str, Any]) -> None:
+def check_jobs(cells: Sequence[PlannedRun], settings: Mapping[str, Any]) -> None:
     """Checks the settings of a launcher for the cells to run.
 
     Raises:
@@ -38,7 +38,7 @@ def check_jobs(cells: Sequence[PlannedCell], settings: Mapping[str, Any]) -> Non
         raise ValueError(f"hydra.launcher.cluster must be {' or '.join(CLUSTERS)}, not {settings['cluster']!r}")
 
 
-def split_into_jobs(plan: Plan, settings: Mapping[str, Any], reused: set[str]) -> list[list[PlannedCell]]:
+def split_into_jobs(plan: Plan, settings: Mapping[str, Any], reused: set[str]) -> list[list[PlannedRun]]:
     """The cells of each job, without reused cells."""
     measured, default = durations_of_similar_runs(plan, reused), [60 * settings["minutes_per_run"]]
     cells = [cell for cell in plan.cells if cell.id not in reused]
@@ -61,7 +61,7 @@ def group_by_duration(seconds: Sequence[float], max_seconds: float) -> list[list
     return jobs
 
 
-def describe_jobs(jobs: Sequence[Sequence[PlannedCell]], settings: Mapping[str, Any]) -> str:
+def describe_jobs(jobs: Sequence[Sequence[PlannedRun]], settings: Mapping[str, Any]) -> str:
     """The number of runs and jobs, as text."""
     text = f"{plural(sum(map(len, jobs)), 'run')} in {plural(len(jobs), 'job')}"
     at_once = f", {settings['tasks_per_node']} at a time in each" if settings["tasks_per_node"] > 1 else ""

@@ -8,14 +8,6 @@ from bench.records.record import Record
 
 
 @dataclass(frozen=True)
-class RunRequest:
-    """A run that a child process makes: the folder for its files, and the record, which has the configuration."""
-
-    folder: Path
-    record: Record
-
-
-@dataclass(frozen=True)
 class Step:
     """Progress within a phase; see `bench.progress.Report`."""
 
@@ -42,12 +34,7 @@ class Started:
     """The child is ready: the time limit counts from now on."""
 
 
-@dataclass(frozen=True)
-class FinalRecordSent:
-    """The child has sent its final record."""
-
-
-Message = Started | Step | Notice | Record | FinalRecordSent
+Message = Started | Step | Notice | Record  # the status of a record is killed until the run ends
 
 
 class Interrupted(KeyboardInterrupt):

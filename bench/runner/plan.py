@@ -11,11 +11,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from bench.config import Isolation, Rerun
-from bench.records.folder import Identity, reusable_record
+from bench.config import Isolation
+from bench.records.folder import reusable_record
 from bench.records.format import plural, seconds
-from bench.records.read import Plan, PlannedCell, read_run, run_folders
 from bench.records.record import digest, row_name
+from bench.records.results import Plan, PlannedRun, read_run, run_folders
 from bench.runner.messages import reason_of
 from bench.runner.process import run_in_child
 
@@ -25,29 +25,16 @@ MAX_SIMILAR_RUNS, MAX_RECORDS_READ = 100, 300  # per group of similar runs
 LOCAL_EXECUTORS = ("basic", "workers")  # they run on this machine
 
 
-def plan_of(cells: Sequence[Identity]) -> Plan:
+def plan_of(cells: list[PlannedRun]) -> Plan:
     """The plan of a sweep of these runs."""
     first = cells[0]
-    name = f"{first.config['experiment'] or first.choices['task']}-{digest([cell.name for cell in cells])}"
-    return Plan(name, Path(first.config["results_dir"]), [*map(planned_cell, cells)])
+    name = f"{first.config['experiment'] or first.task}-{digest([cell.id for cell in cells])}"
+    return Plan(name, Path(first.config["results_dir"]), cells)
 
 
-def planned_cell(identity: Identity) -> PlannedCell:
-    """The planned cell of a run."""
-    config = identity.config
-    return PlannedCell(identity.name, identity.overrides, **identity.choices, seed=config["seed"], config=config)
-
-
-def identity_of(cell: PlannedCell) -> Identity:
-    """The identity of a planned cell's run, the inverse of `planned_cell`."""
-    choices = {name: getattr(cell, name) for name in ("task", "renderer", "dataset", "method")}
-    return Identity(choices, cell.config, cell.overrides)
-
-
-def is_reused(plan: Plan, cell: PlannedCell) -> bool:
-    """Whether a finished run of a cell exists and will be reused."""
-    folder = plan.results_dir / "runs" / cell.id
-    return reusable_record(folder, identity_of(cell), Rerun(cell.config["rerun"])) is not None
+def reused_ids(cells: Sequence[PlannedRun]) -> set[str]:
+    """The ids of the runs that exist, are finished, and will be reused."""
+    return {cell.id for cell in cells if reusable_record(cell) is not None}
 
 
 def refusal_reason(config: Mapping[str, Any], built: dict[str, Any] | None = None) -> str:
@@ -98,7 +85,7 @@ def check_plan(plan: Plan, executor: str, reused: set[str]) -> None:
         raise ValueError(_refusal_message(plan, *refused[0], len(refused)))
 
 
-def _refusal_message(plan: Plan, cell: PlannedCell, reason: str, count: int) -> str:
+def _refusal_message(plan: Plan, cell: PlannedRun, reason: str, count: int) -> str:
     """The message for a refused sweep: its first invalid cell, the reason, and the number of invalid cells."""
     if count == len(plan.cells):
         return reason
@@ -130,7 +117,7 @@ def durations_of_similar_runs(plan: Plan, reused: set[str]) -> dict[Any, list[fl
 
 
 def _name_may_match(folder: str, task: str, renderer: str, method: str) -> bool:
-    """Whether the name of a folder may be that of a run of a task, renderer and method; see `Identity.name`."""
+    """Whether the name of a folder may be that of a run of a task, renderer and method; see `planned_run`."""
     task, renderer, method = (name.replace("/", "_") for name in (task, renderer, method))
     return folder.startswith(f"{task}-{renderer}-") and (not method or f"-{method}-" in folder)
 

@@ -5,7 +5,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -19,8 +19,9 @@ import psutil
 
 import bench.tasks
 import datasets
-from bench.records.record import RunStatus
-from bench.runner.messages import FinalRecordSent, Message, RunRequest, Started, Step
+from bench.progress import Report, notice
+from bench.records.record import Record, RunStatus
+from bench.runner.messages import Message, Started, Step
 
 POLL_INTERVAL_SECONDS = 0.05
 TERMINATION_GRACE_SECONDS = 0.5  # for a child to send its record after SIGTERM
@@ -34,45 +35,56 @@ _stopped = ""  # the signal that stopped this command, in words
 _delayed = False  # within `signals_delayed`
 
 
-@dataclass(frozen=True)
-class RunLimits:
-    """Limits on a run's time and memory.
+@dataclass
+class RunInProgress:
+    """A run in progress, as its parent sees it.
 
     Args:
-        seconds: wall-clock time after the child process is ready; None for no limit.
-        memory: resident memory of the process in GiB; None for nine tenths of the machine's.
+        record: the run's record, which the messages of the child fill.
+        report: receives the progress.
+        started: when the clock of the run started: when its child had imported its modules.
+        is_ready: whether the child has imported its modules.
+        phase: for the reason of a failure.
     """
 
-    seconds: float | None
-    memory: float | None
+    record: Record
+    report: Report = lambda *_: None
+    started: float = field(default_factory=time.perf_counter)
+    is_ready: bool = False
+    phase: str = "while setting up"
 
-    @property
-    def bytes(self) -> float:
-        return 0.9 * machine_memory() if self.memory is None else self.memory * GIB
+    def receive(self, message: Message) -> None:
+        """Handles a message of the child."""
+        if isinstance(message, Started):
+            self.started, self.is_ready = time.perf_counter(), True
+        elif isinstance(message, Step):
+            self.phase = message.phase_text
+            self.report(message.phase, message.finished, message.total, message.loss)
+        elif isinstance(message, Record):
+            vars(self.record).update(vars(message))
+            self.record.write(self.record.folder)
+        else:
+            notice(message.text)
 
 
-def run_isolated(request: RunRequest, limits: RunLimits, receive: Callable[[Message], None]) -> Failure | None:
-    """Runs a request in a child process, and passes every message of the child to `receive` as it arrives.
-
-    Returns:
-        None if the child sent its final record, else how it ended.
-    """
+def run_isolated(run: RunInProgress) -> Failure | None:
+    """Makes a run in a child process, within its limits; returns how it ended if it sent no final record, else None."""
     context = warm_up()
     channel, child_channel = context.Pipe()
     child_lifeline, lifeline = context.Pipe(duplex=False)  # closes whenever this process ends, and the child notices
-    process = context.Process(target=_run, args=(request, child_channel, child_lifeline))
+    process = context.Process(target=_run, args=(run.record, child_channel, child_lifeline))
     with channel, lifeline:
         try:
             with signals_delayed():  # an interrupted start would end the fork server
                 process.start()
                 child_channel.close()
                 child_lifeline.close()
-            failure = _watch(process, channel, limits, receive)
+            failure = _watch(process, channel, run)
             process.join(TERMINATION_GRACE_SECONDS if failure is None else 0.0)
             return failure
         finally:
             if process.pid is not None:
-                _terminate(process, channel, receive)
+                _terminate(process, channel, run)
 
 
 def preloaded_modules() -> list[str]:
@@ -128,20 +140,19 @@ def _send_result(work: Callable[[Any], Any], argument: Any, sender: Connection) 
     sender.send(work(argument))
 
 
-def _run(request: RunRequest, channel: Connection, lifeline: Connection) -> None:
+def _run(record: Record, channel: Connection, lifeline: Connection) -> None:
     for module in preloaded_modules():  # before `Started`, so that the run's time excludes it
         with suppress(ImportError):
             import_module(module)
     from bench.runner.execute import main
 
-    main(request, channel, lifeline)
+    main(record, channel, lifeline)
 
 
-def _watch(
-    process: BaseProcess, channel: Connection, limits: RunLimits, receive: Callable[[Message], None]
-) -> Failure | None:
-    start, is_ready, max_bytes = time.perf_counter(), False, limits.bytes
-    phase = "while setting up"  # until the first step is reported
+def _watch(process: BaseProcess, channel: Connection, run: RunInProgress) -> Failure | None:
+    """Receives messages until the final record, or until a limit is reached; returns the failure if there is one."""
+    time_limit, memory_limit = run.record.config["time_limit"], run.record.config["memory_limit"]
+    max_bytes = 0.9 * machine_memory() if memory_limit is None else memory_limit * GIB
     while True:
         raise_if_stopped()
         wait([channel, process.sentinel], timeout=POLL_INTERVAL_SECONDS)
@@ -152,34 +163,30 @@ def _watch(
                     message = channel.recv()
             except (EOFError, OSError):
                 return _exit_reason(process)
-            if isinstance(message, FinalRecordSent):
+            run.receive(message)
+            if isinstance(message, Record) and message.status != RunStatus.KILLED:
                 return None
-            if isinstance(message, Started):
-                start, is_ready = time.perf_counter(), True
-            elif isinstance(message, Step):
-                phase = message.phase_text
-            receive(message)
         if not is_alive:
             return _exit_reason(process)
-        spent = time.perf_counter() - start
-        if is_ready and limits.seconds is not None and spent > limits.seconds:
-            return RunStatus.TIMEOUT, f"more than time_limit={limits.seconds:g} s, {phase}"
-        if not is_ready and spent > STARTUP_TIMEOUT_SECONDS:
+        spent = time.perf_counter() - run.started
+        if run.is_ready and time_limit is not None and spent > time_limit:
+            return RunStatus.TIMEOUT, f"more than time_limit={time_limit:g} s, {run.phase}"
+        if not run.is_ready and spent > STARTUP_TIMEOUT_SECONDS:
             return RunStatus.CRASHED, f"its process was not ready within {STARTUP_TIMEOUT_SECONDS:g} s"
         with suppress(psutil.NoSuchProcess):
             if psutil.Process(process.pid).memory_info().rss > max_bytes:
                 process.kill()  # at once, before the machine runs out of memory
-                return RunStatus.OOM, f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {phase}"
+                return RunStatus.OOM, f"more than {max_bytes / GIB:.3g} GiB of memory (memory_limit), {run.phase}"
 
 
-def _terminate(process: BaseProcess, channel: Connection, receive: Callable[[Message], None]) -> None:
+def _terminate(process: BaseProcess, channel: Connection, run: RunInProgress) -> None:
     """Sends the child SIGTERM, receives its last messages, and ends it."""
     if process.is_alive():
         process.terminate()
     deadline = time.perf_counter() + TERMINATION_GRACE_SECONDS
     with suppress(EOFError, OSError):
         while (left := deadline - time.perf_counter()) > 0 and channel.poll(left):
-            receive(channel.recv())
+            run.receive(channel.recv())
     process.join(max(deadline - time.perf_counter(), 0.0))
     if process.is_alive():
         process.kill()

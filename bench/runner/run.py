@@ -3,22 +3,19 @@
 import shutil
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from omegaconf import OmegaConf
 
 from bench.config import Isolation, build
-from bench.progress import Report, notice, run_progress
-from bench.records.folder import Identity, free_reserve, locked_folder, reusable_record
-from bench.records.read import Plan
+from bench.progress import run_progress
+from bench.records.folder import code_hash, config_hash, free_reserve, locked_folder
 from bench.records.record import Record, RunStatus, now, read_record, write_text
-from bench.runner import messages
-from bench.runner.messages import Interrupted, RunRequest, reason_of, write_error_message
-from bench.runner.plan import planned_cell, refusal_reasons, show_plan
-from bench.runner.process import RunLimits, run_isolated, signals_delayed, stopped_by
+from bench.records.results import Plan, PlannedRun, ended_record
+from bench.runner.messages import Interrupted, reason_of, write_error_message
+from bench.runner.plan import refusal_reasons, reused_ids, show_plan
+from bench.runner.process import RunInProgress, run_isolated, signals_delayed, stopped_by
 from bench.runner.summary import print_run_summary, write_log
 from bench.trackers import Nothing, Tracker
 
@@ -28,12 +25,12 @@ LOG_TAIL_LINES, LOG_TAIL_BYTES = 80, 16_384  # limits of the log in the record o
 class RunInterrupted(Interrupted):
     """Ctrl-C or SIGTERM ended a run, and its record has been written."""
 
-    def __init__(self, folder: Path, record: Record) -> None:
+    def __init__(self, record: Record) -> None:
         super().__init__(f"killed: {record.reason}")
-        self.folder, self.record = folder, record
+        self.record = record
 
 
-def run_one(identity: Identity) -> str:
+def run_one(run: PlannedRun) -> str:
     """Makes a single run, prints its summary and returns its status; with plan=true only lists it.
 
     Raises:
@@ -41,36 +38,44 @@ def run_one(identity: Identity) -> str:
         ValueError: if the configuration cannot be run; its folder is removed.
         OSError: if the results folder cannot be written.
     """
-    config = identity.config
-    if config["plan"] or config["isolation"] == Isolation.process:
-        _check(identity)
+    config = run.config
+    if config["plan"] or config["isolation"] == Isolation.process:  # else the run itself is the check
+        reused = reused_ids([run])
+        if not reused and (reason := refusal_reasons([config])[0]):
+            raise ValueError(reason)
     if config["plan"]:
+        show_plan(Plan("", Path(config["results_dir"]), [run]), reused, 1)
         return RunStatus.OK
     try:
-        folder, record = run(identity)
+        record = make_or_reuse(run)
     except RunInterrupted as error:
-        print_run_summary(error.folder, error.record)
+        print_run_summary(run.folder, error.record)
         raise
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), error.filename or config["results_dir"]) from error
     _print_log(record)
     if record.status == RunStatus.REFUSED:
-        shutil.rmtree(folder)
+        shutil.rmtree(run.folder)
         raise ValueError(record.reason)
-    print_run_summary(folder, record)
+    print_run_summary(run.folder, record)
     return record.status
 
 
-def run_cell(identity: Identity) -> list[str]:
+def run_cell(cell: PlannedRun, planned_at: str) -> list[str]:
     """Makes the run of a sweep's cell, or reuses it; returns a message if it has no record.
+
+    Nothing is done if the cell has ended since its sweep was planned, so that a requeued job continues.
 
     Raises:
         RunInterrupted: after Ctrl-C or SIGTERM.
     """
+    record = ended_record(cell.folder, planned_at)
+    if record is not None and record["status"] != RunStatus.KILLED:
+        return []
     try:
-        _print_log(run(identity)[1])
+        _print_log(make_or_reuse(cell, planned_at))
     except OSError as error:
-        return [write_error_message(error, identity.config["results_dir"])]
+        return [write_error_message(error, cell.config["results_dir"])]
     except ValueError as error:
         return [str(error)]
     return []
@@ -82,64 +87,38 @@ def _print_log(record: Record) -> None:
         print("\n".join(record.log), file=sys.stderr, flush=True)
 
 
-def _check(identity: Identity) -> None:
-    """Checks a run that is not reused, before it has a folder; with plan=true, prints its estimated duration.
+def make_or_reuse(run: PlannedRun, planned_at: str = "") -> Record:
+    """Makes a run in its folder, or reuses the finished run there; returns the record.
 
-    Raises:
-        ValueError: if it would be refused.
-    """
-    config = identity.config
-    results_dir = Path(config["results_dir"])
-    reused = reusable_record(results_dir / "runs" / identity.name, identity, config["rerun"]) is not None
-    if not reused and (reason := refusal_reasons([config])[0]):
-        raise ValueError(reason)
-    if config["plan"]:
-        cell = planned_cell(identity)
-        show_plan(Plan("", results_dir, [cell]), {cell.id} if reused else set(), 1)
-
-
-def run(identity: Identity) -> tuple[Path, Record]:
-    """Makes a run in its folder, or reuses the finished run there; returns the folder and the record.
+    Args:
+        planned_at: when the sweep was planned. The clock of this machine may be behind that of the planning machine,
+            but the time of the request is never before the plan.
 
     Raises:
         OSError: if the results folder cannot be written.
         RunInterrupted: after Ctrl-C or SIGTERM, with the record that was written.
     """
-    config = identity.config
-    with locked_folder(Path(config["results_dir"]), identity, config["rerun"]) as (folder, finished):
-        if finished is not None:
-            return folder, _reuse(folder, finished)
-        hashes = {"config_hash": identity.config_hash, "code": identity.code}
-        settings = {"seed": config["seed"], "config": config, "overrides": identity.overrides}
-        return folder, _start_run(RunRequest(folder, Record(identity.name, **identity.choices, **settings, **hashes)))
+    request_time = max(now(), planned_at)
+    with locked_folder(run) as finished:
+        if finished is None:
+            hashes = {"config_hash": config_hash(run.config), "code": code_hash(run.config)}
+            return _make(Record(**vars(run), **hashes, asked=request_time))
+        record = Record.of(finished)
+        record.reused, record.asked = True, request_time
+        with suppress(OSError):  # a read-only folder is enough
+            record.write(run.folder)
+        return record
 
 
-def _reuse(folder: Path, finished: dict[str, Any]) -> Record:
-    """The record of a finished run with its original times, marked as reused."""
-    record = Record.of(finished)
-    record.reused, record.asked = True, now()
-    with suppress(OSError):  # a read-only folder is enough
-        record.write(folder)
-    return record
-
-
-def _start_run(request: RunRequest) -> Record:
-    """Runs a request; the record has the status killed until the end, then the final status."""
-    folder, record = request.folder, request.record
-    started, stopped, tracker = time.perf_counter(), "", None
-
-    def restart_clock() -> None:
-        nonlocal started
-        started = time.perf_counter()
-
+def _make(record: Record) -> Record:
+    """Makes the run of a record, which has the status killed until the end, then the final status."""
+    folder, stopped, tracker, run = record.folder, "", None, RunInProgress(record)
     try:
         record.write(folder)  # inside the try, because a signal may follow immediately
-        config = record.config
-        limits = RunLimits(config["time_limit"], config["memory_limit"])
-        tracker = build(config["tracker"], "tracker", config["packages"])
-        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
-        with run_progress(record.name) as progress:
-            _execute(request, limits, progress, restart_clock)
+        tracker = build(record.config["tracker"], "tracker", record.config["packages"])
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(record.config)))
+        with run_progress(record.name) as run.report:
+            _execute(run)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - of the harness, such as a full disk
         stopped = stopped_by(error)
         record.status, record.reason = RunStatus.CRASHED, reason_of(error, folder)
@@ -147,7 +126,7 @@ def _start_run(request: RunRequest) -> Record:
             record.status, record.reason = RunStatus.KILLED, f"{stopped}; the same command starts it anew"
     finally:
         with signals_delayed():  # a signal now must not lose the record
-            record.seconds["total"] = time.perf_counter() - started
+            record.seconds["total"] = time.perf_counter() - run.started
             record.ended = now()
             if record.status not in (RunStatus.OK, RunStatus.UNSUPPORTED):
                 record.log = _log_tail(folder / "log.txt")
@@ -157,35 +136,18 @@ def _start_run(request: RunRequest) -> Record:
     if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:
         _export(tracker, folder, record)
     if stopped:
-        raise RunInterrupted(folder, record)
+        raise RunInterrupted(record)
     return record
 
 
-def _execute(request: RunRequest, limits: RunLimits, progress: Report, on_ready: Callable[[], None]) -> None:
-    """Runs the request in a child process or, for debugging, in this one, and fills its record.
-
-    Args:
-        on_ready: called when the child has imported its modules.
-    """
-    if request.record.config["isolation"] == Isolation.off:
+def _execute(run: RunInProgress) -> None:
+    """Makes the run in a child process or, for debugging, in this one, and fills its record."""
+    if run.record.config["isolation"] == Isolation.off:
         from bench.runner.execute import execute  # imports torch, which a launcher's worker does not need
 
-        execute(request, progress=progress, save_record=lambda record: record.write(request.folder))
-        return
-
-    def receive(message: messages.Message) -> None:
-        if isinstance(message, messages.Started):
-            on_ready()
-        elif isinstance(message, Record):
-            vars(request.record).update(vars(message))
-            request.record.write(request.folder)
-        elif isinstance(message, messages.Step):
-            progress(message.phase, message.finished, message.total, message.loss)
-        elif isinstance(message, messages.Notice):
-            notice(message.text)
-
-    if (failure := run_isolated(request, limits, receive)) is not None:
-        request.record.status, request.record.reason = failure
+        execute(run.record, run.receive)
+    elif (failure := run_isolated(run)) is not None:
+        run.record.status, run.record.reason = failure
 
 
 def _export(tracker: Tracker, folder: Path, record: Record) -> None:

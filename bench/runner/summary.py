@@ -13,8 +13,8 @@ from rich.table import Table
 
 from bench.records.format import count, number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
-from bench.records.read import RESULTS, Plan
 from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus, append_to_log
+from bench.records.results import RESULTS, Plan
 
 CUSTOM_RENDERER = "custom"  # the choice of renderer for a class of the user
 # See CONTRIBUTING.md.

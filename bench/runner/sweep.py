@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,16 +12,15 @@ from omegaconf import DictConfig
 
 from bench.config import Isolation
 from bench.progress import display, notice
-from bench.records.folder import Identity
 from bench.records.format import number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
-from bench.records.read import Plan, ended_record
-from bench.records.record import RunStatus, row_name
+from bench.records.record import row_name
+from bench.records.results import Plan, PlannedRun
 from bench.runner.compose import Composer
 from bench.runner.executors import Launcher, execute, print_errors, run_in_turn
 from bench.runner.jobs import check_jobs, describe_jobs, split_into_jobs
 from bench.runner.messages import Interrupted, reason_of
-from bench.runner.plan import check_plan, identity_of, is_reused, plan_of, show_plan
+from bench.runner.plan import check_plan, plan_of, reused_ids, show_plan
 from bench.runner.process import stopped_by, warm_up
 from bench.runner.run import run_cell
 
@@ -35,18 +33,6 @@ FOLLOW_INTERVAL_SECONDS = 0.5
 
 class LauncherStopped(RuntimeError):
     """An executor cannot go on, because a cluster is missing or a process is lost."""
-
-
-@dataclass(frozen=True)
-class RunOnce:
-    """Runs a cell unless it has ended since its sweep was planned, so that a requeued job continues."""
-
-    planned_at: str
-
-    def __call__(self, identity: Identity) -> list[str]:
-        """Returns a message if the cell has no record."""
-        record = ended_record(Path(identity.config["results_dir"]) / "runs" / identity.name, self.planned_at)
-        return run_cell(identity) if record is None or record["status"] == RunStatus.KILLED else []
 
 
 def run_sweep(composer: Composer, config: DictConfig, summarise: Callable[[Plan], list[str]]) -> list[str]:
@@ -71,7 +57,7 @@ def run_sweep(composer: Composer, config: DictConfig, summarise: Callable[[Plan]
         warm_up()
     plan = plan_of(composer.cells(swept))
     _print_partial_overrides(swept[0], plan)
-    reused = {cell.id for cell in plan.cells if is_reused(plan, cell)}
+    reused = reused_ids(plan.cells)
     check_jobs([cell for cell in plan.cells if cell.id not in reused], launcher.settings)
     check_plan(plan, launcher.executor, reused)
     if config.plan:
@@ -104,15 +90,15 @@ def _print_plan(plan: Plan, reused: set[str], launcher: Launcher) -> None:
 
 def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
     """Makes all runs of a plan by the executor; this process marks the reused runs as requested."""
-    make, cells = RunOnce(plan.asked), plan.cells
+    make, cells = partial(run_cell, planned_at=plan.asked), plan.cells
     try:
         if launcher.executor != "basic":
-            print_errors(run_in_turn(make, [identity_of(cell) for cell in cells if cell.id in reused]))
+            print_errors(run_in_turn(make, [cell for cell in cells if cell.id in reused]))
             cells = [cell for cell in cells if cell.id not in reused]
         jobs = [[cell] for cell in cells]
         if launcher.packs_runs and (jobs := split_into_jobs(plan, launcher.settings, reused)):
             notice(describe_jobs(jobs, launcher.settings))
-        execute(make, [[*map(identity_of, job)] for job in jobs], launcher)
+        execute(make, jobs, launcher)
     except (ValueError, OSError):
         raise
     except (KeyboardInterrupt, Exception) as error:
@@ -121,7 +107,7 @@ def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
         raise LauncherStopped(f"the launcher stopped: {reason_of(error)}; the same command goes on") from error
 
 
-def work_per_cell(composer: Composer, config: DictConfig, work: Callable[[Identity], object]) -> bool:
+def work_per_cell(composer: Composer, config: DictConfig, work: Callable[[PlannedRun], object]) -> bool:
     """Does work that is not a run, for each cell of a sweep; returns whether all succeeded.
 
     Raises:
@@ -132,9 +118,9 @@ def work_per_cell(composer: Composer, config: DictConfig, work: Callable[[Identi
     return execute(partial(_work, work), [[cell] for cell in cells], Launcher.of(config))
 
 
-def _work(work: Callable[[Identity], object], identity: Identity) -> list[str]:
+def _work(work: Callable[[PlannedRun], object], cell: PlannedRun) -> list[str]:
     try:
-        work(identity)
+        work(cell)
     except (OSError, ValueError) as error:
         return [reason_of(error)]
     return []

@@ -62,6 +62,7 @@ class RunInputs:
     prior_choice: PriorChoice
     dataset: Dataset | None = None  # of the scene
     notes: tuple[str, ...] = ()  # on settings with the value `auto`, and on the network of a scene or prior
+    threads: int | None = None  # of the CPU; None: see `configure_process`
 
     @property
     def photographed(self) -> Photographed | None:
@@ -89,6 +90,17 @@ class RunInputs:
         """The prior of the dataset, loaded or trained at its first use, since some tasks need none."""
         with torch.random.fork_rng():  # training a prior must not change later random draws
             return self.make_prior()
+
+    def configure_process(self) -> None:
+        """Sets the threads and the seed of this process.
+
+        Without `threads`, a narrow network takes one thread, and others take PyTorch's default. Evaluations of a narrow
+        network are so short that threads mostly wait for each other: at 64 x 64 pixels and 4 layers of 128, the loop of
+        a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
+        """
+        is_narrow = self.prior_choice.width < MIN_MULTITHREADED_WIDTH
+        torch.set_num_threads(self.threads or (1 if is_narrow else DEFAULT_THREADS))
+        torch.manual_seed(self.seed)
 
     def check_prior(self) -> None:
         """Raises BadInput for an object of the user without a prior, if the configuration names no other prior."""
@@ -179,34 +191,10 @@ class EvaluatesField(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class PreparedRun:
-    """A task and its inputs, built and checked without any slow step.
-
-    Args:
-        threads: of the CPU; None: see `configure_process`.
-    """
-
-    task: Task
-    inputs: RunInputs
-    threads: int | None
-
-    def configure_process(self) -> None:
-        """Sets the threads and the seed of this process.
-
-        Without `threads`, a narrow network takes one thread, and others take PyTorch's default. Evaluations of a narrow
-        network are so short that threads mostly wait for each other: at 64 x 64 pixels and 4 layers of 128, the loop of
-        a completion took 4.0 s with one thread, and 7.5 s with two that sleep while they wait.
-        """
-        is_narrow = self.inputs.prior_choice.width < MIN_MULTITHREADED_WIDTH
-        torch.set_num_threads(self.threads or (1 if is_narrow else DEFAULT_THREADS))
-        torch.manual_seed(self.inputs.seed)
-
-
 def prepare_run(
     config: Node, built: dict[str, Any] | None = None, *, progress: Report = lambda *_: None
-) -> PreparedRun:
-    """Builds and checks everything that a configuration names, before the first slow step.
+) -> tuple[Task, RunInputs]:
+    """The task and its inputs, with all objects that a configuration names, checked before the first slow step.
 
     Args:
         config: of a run, resolved, as plain data; `bench.config.check_top_level` has checked it.
@@ -237,9 +225,10 @@ def prepare_run(
         prior_choice=prior,
         dataset=dataset,
         notes=(*notes, *prior.notes),
+        threads=threads,
     )
     _check(task, inputs, index)
-    return PreparedRun(task, inputs, threads)
+    return task, inputs
 
 
 @dataclass(frozen=True)

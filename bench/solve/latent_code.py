@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import log, pi
+from math import log, nan, pi
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -141,9 +141,9 @@ class CodeProblem:
         try:
             terms = self.compare(Meter(self._shape(start), self.counts), step) | penalty
         except CannotContinue:
-            if not self.starts.give_up(start, step):
+            if self.starts.is_alone:
                 raise
-            return {"total": penalty["code"], **penalty}
+            terms = {"code": nan * penalty["code"]}  # this start takes no step
         total = torch.stack(list(terms.values())).sum()
         self.starts.note(start, step, total)
         return {"total": total, **terms}

@@ -5,7 +5,8 @@ Several starts share one budget of iterations: successive halving keeps the bett
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from math import cos, inf, isfinite, isnan, pi
+from functools import partial
+from math import cos, inf, isfinite, isnan, nan, pi
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -67,7 +68,10 @@ class OptimiserSettings:
 
 @runtime_checkable
 class Optimisable(Protocol):
-    """Parameters and their loss, which the optimisation loop minimises. `counts` counts all its field evaluations."""
+    """Parameters and their loss, which the optimisation loop minimises. `counts` counts all its field evaluations.
+
+    A problem with several starts has an attribute `starts`, see `Starts`.
+    """
 
     parameters: list[Tensor]
     counts: Counts
@@ -75,49 +79,6 @@ class Optimisable(Protocol):
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The loss of an iteration, counted from 0, under "total", and its weighted terms."""
         ...
-
-
-@dataclass
-class WithCheckedHits:
-    """A problem that checks the hits of its renderings at the first loss, the warm-up of `optimise`.
-
-    The check evaluates the field once. This is neither counted nor timed.
-
-    Args:
-        problem: the problem without the check.
-        notes: receives a note if hits lie off the surface; the run continues.
-    """
-
-    problem: Optimisable
-    notes: list[str]
-    checked: bool = False
-
-    @property
-    def parameters(self) -> list[Tensor]:
-        """The problem's parameters."""
-        return self.problem.parameters
-
-    @property
-    def counts(self) -> Counts:
-        """The problem's counts."""
-        return self.problem.counts
-
-    def loss(self, iteration: int) -> dict[str, Tensor]:
-        """The problem's loss.
-
-        Raises:
-            BrokenContract: the first loss is a number, but the distance of a hit is not finite or is negative.
-        """
-        if self.checked:
-            return self.problem.loss(iteration)
-        self.checked = True
-        with collect_hits() as all_hits:
-            terms = self.problem.loss(iteration)
-        if not bool(terms["total"].isnan()):  # else `optimise` ends before the step, with the reason
-            for hits in all_hits:
-                hits.check()
-            self.notes += [f"at the first iteration, {note}" for hits in all_hits if (note := hits.off_surface())][:1]
-        return terms
 
 
 @dataclass
@@ -131,6 +92,12 @@ class History:
     counts: Counts = field(default_factory=Counts)
     peak_memory_bytes: int | None = None
     objectives: list[float] = field(default_factory=list)  # before and after, if the problem has an objective
+    notes: list[str] | None = None  # on hits of the warm-up that lie off the surface; None does not check them
+
+    @property
+    def first_loss(self) -> float:
+        """The first loss that is a number."""
+        return next((line["total"] for line in self.curve if not isnan(line["total"])), nan)
 
 
 def optimise(
@@ -144,6 +111,8 @@ def optimise(
 ) -> None:
     """Runs Adam on the problem's parameters.
 
+    The first loss is a warm-up. A start whose loss or gradient is NaN takes no step, and other starts go on.
+
     Args:
         problem: returns the loss; its parameters are changed in place.
         device: synchronised when the clock is read.
@@ -151,9 +120,30 @@ def optimise(
             becomes NaN or diverges ends the loop and sets the status. No step is taken if the loss is NaN.
         on_step: receives each line of the curve and may extend it. Its time and memory are not counted.
         least_reference: lower bound of the first loss in the divergence test, for starts that are almost correct.
+
+    Raises:
+        BrokenContract: the history has notes, and the distance of a hit of the warm-up is not finite or is negative.
     """
-    optimiser = _Adam(problem.parameters)
-    history.seconds["warmup"] = _timed(device, lambda: problem.loss(0)["total"].backward())
+    optimiser, starts = _Adam(problem.parameters), getattr(problem, "starts", None) or Starts(StartSettings(1, 1))
+
+    def warm_up() -> None:
+        with collect_hits() as all_hits:
+            loss = problem.loss(0)["total"]
+        if history.notes is not None and not bool(loss.isnan()):  # else the loop ends before the step, with the reason
+            for hits in all_hits:
+                hits.check()
+            notes = [f"at the first iteration, {note}" for hits in all_hits if (note := hits.off_surface())]
+            history.notes.extend(notes[:1])
+        loss.backward()
+
+    def step(loss: Tensor, rate: float) -> None:
+        loss.backward()
+        if starts.is_alone or optimiser.gradients_are_finite():
+            optimiser.step(rate)
+        else:
+            starts.note(*starts.latest, torch.full_like(loss, nan))
+
+    history.seconds["warmup"] = _timed(device, warm_up)
     before = replace(problem.counts)
     memory = MemoryPeak(device)
     for iteration in range(settings.iterations):
@@ -162,12 +152,10 @@ def optimise(
         with collect_hits() as all_hits:
             history.seconds["forward"] += _timed(device, lambda i=iteration, t=terms: t.update(problem.loss(i)))
         numbers = dict(zip(terms, _to_floats([*terms.values()]), strict=True))
-        if isnan(numbers["total"]):
+        if not isnan(numbers["total"]):
+            history.seconds["backward"] += _timed(device, partial(step, terms["total"], rate))
+        elif starts.is_alone:
             history.status, history.reason = RunStatus.NAN, _not_a_number(numbers, iteration, all_hits)
-        else:
-            history.seconds["backward"] += _timed(
-                device, lambda rate=rate, loss=terms["total"]: (loss.backward(), optimiser.step(rate))
-            )
         history.counts = problem.counts - before
         line = {
             "iteration": iteration,
@@ -197,6 +185,9 @@ class _Adam:
     def forget_gradients(self) -> None:
         for parameter in self.parameters:
             parameter.grad = None
+
+    def gradients_are_finite(self) -> bool:
+        return all(bool(value.grad.isfinite().all()) for value in self.parameters if value.grad is not None)
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
@@ -229,15 +220,14 @@ def _not_a_number(numbers: dict[str, float], iteration: int, all_hits: Sequence[
 
 def _update_status(history: History, parameters: list[Tensor], least_reference: float) -> bool:
     """Sets status and reason in the history if the loop must end; returns whether it must."""
-    loss, first = history.curve[-1]["total"], max(history.curve[0]["total"], least_reference)
+    loss, first = history.curve[-1]["total"], max(history.first_loss, least_reference)
     iteration = history.curve[-1]["iteration"]
     (largest,) = _to_floats([_largest(parameters)])
     if history.status is RunStatus.OK and not isfinite(largest):
         history.status, history.reason = RunStatus.NAN, f"a parameter is not finite at iteration {iteration}"
     elif loss > DIVERGENCE_FACTOR * first:
         history.status = RunStatus.DIVERGED
-        initial = history.curve[0]["total"]
-        history.reason = f"the loss rose from {initial:.3g} to {loss:.3g} by iteration {iteration}"
+        history.reason = f"the loss rose from {history.first_loss:.3g} to {loss:.3g} by iteration {iteration}"
     return history.status is not RunStatus.OK
 
 
@@ -293,6 +283,8 @@ class Starts:
     remaining: list[int] = field(init=False)  # the best first after a round
     round_start: int = 0  # first iteration of this round
     steps_before: int = 0  # steps of each remaining start before this round
+    latest: tuple[int, int] = 0, 0  # the start and the step of the latest assignment
+    is_alone: bool = True  # whether the latest assignment had no other start
 
     def __post_init__(self) -> None:
         self.losses = [{} for _ in range(self.settings.count)]
@@ -301,11 +293,13 @@ class Starts:
     def assignment(self, iteration: int) -> tuple[int, int]:
         """The start of an iteration, and the index of the start's step, from 0."""
         offset = iteration - self.round_start
-        return self.remaining[offset % len(self.remaining)], self.steps_before + offset // len(self.remaining)
+        self.latest = self.remaining[offset % len(self.remaining)], self.steps_before + offset // len(self.remaining)
+        self.is_alone = len(self.remaining) == 1
+        return self.latest
 
     def note(self, start: int, step: int, loss: Tensor) -> None:
-        """Records the loss of a start's step; the last loss of a round ends the round."""
-        self.losses[start][step] = loss.detach()
+        """Records the loss of a start's step, NaN as infinite; the last loss of a round ends the round."""
+        self.losses[start][step] = loss.detach().nan_to_num(inf, inf)
         end = self.steps_before + self.settings.trial
         if len(self.remaining) > 1 and all(end - 1 in self.losses[index] for index in self.remaining):
             self.round_start, self.steps_before = self.round_start + len(self.remaining) * self.settings.trial, end
@@ -315,14 +309,7 @@ class Starts:
         """The last start; during the rounds, the best start of the last completed round."""
         return self.remaining[0]
 
-    def give_up(self, start: int, step: int) -> bool:
-        """Gives an infinite loss to a start that cannot continue; returns False if no other start remains."""
-        if len(self.remaining) == 1:
-            return False
-        self.note(start, step, torch.tensor(inf))
-        return True
-
     def _score(self, start: int) -> float:
-        """The mean loss of a start at the end of a round; infinite after `give_up`."""
+        """The mean loss of a start at the end of a round; infinite if a loss was NaN."""
         last = [self.losses[start][step] for step in range(max(self.steps_before - SCORED_STEPS, 0), self.steps_before)]
         return float(torch.stack(last).mean())

@@ -19,7 +19,7 @@ from bench.pictures.run_figures import save_gallery
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.optimise import CannotContinue, History, Optimisable, OptimiserSettings, WithCheckedHits, optimise
+from bench.solve.optimise import CannotContinue, History, Optimisable, OptimiserSettings, optimise
 from datasets.mesh import Mesh
 from datasets.saved_field import FIELD_FILE, save_field
 from datasets.scene import Scene
@@ -233,10 +233,9 @@ def run_optimisation(
             of a line belong to the parameters before its step.
         least_reference: see `bench.solve.optimise.optimise`.
     """
-    history = History()
+    history = History(notes=[])
     checkpoints = checkpoints_of(run.inputs.evaluation.every, settings.iterations)
     checkpoint_errors: dict[int, dict[str, float]] = {}
-    notes: list[str] = []
 
     def check(iteration: int) -> None:
         with run.off_clock():
@@ -259,15 +258,13 @@ def run_optimisation(
             check(0)
         try:
             note_objective()
-            checked = WithCheckedHits(problem, notes)
-            optimise(
-                checked, settings, run.inputs.device, history=history, on_step=on_step, least_reference=least_reference
-            )
+            device = run.inputs.device
+            optimise(problem, settings, device, history=history, on_step=on_step, least_reference=least_reference)
             note_objective()
         except CannotContinue as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
         finally:
-            run.record.notes = [*run.record.notes, *notes]
+            run.record.notes = [*run.record.notes, *history.notes]
             _note_history(run.record, problem, history)
     return history
 
@@ -330,7 +327,7 @@ def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | N
         return history.status, history.reason
     if after.failure is not None:
         return after.failure
-    first, last = history.objectives or (history.curve[0]["total"], history.curve[-1]["total"])
+    first, last = history.objectives or (history.first_loss, history.curve[-1]["total"])
     if last >= first and last > 0 and len(history.curve) > 1:
         measure = "objective" if history.objectives else "loss"
         return RunStatus.NOT_REACHED, f"the {measure} did not fall: {first:.4g} at the start, {last:.4g} at the end"

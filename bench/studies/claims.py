@@ -27,8 +27,9 @@ from bench.report.study import (
 
 PLACE = 5
 EXPERIMENTS = ("table1_large", "table2_claims", "table3", "fig5", "fig10", "fig12", "dvr_table1", "dvr_table2")
-CONDITIONS = tuple(
-    f"task.{name}" for name in ("points", "focal", "start_scale", "similarity", "degrees", "shift", "scale")
+CONDITIONS = (
+    *(f"task.{name}" for name in ("points", "focal", "start_scale", "similarity", "degrees", "shift", "scale")),
+    "task.training.seed",
 )
 OF_ROWS = ("prior.truncation", "view.resolution", "field")  # a claim names rows that compare
 READS = tuple(Selection(name, CONDITIONS, setup=(), may_differ=OF_ROWS) for name in EXPERIMENTS)

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.records.read import curve_lines
+from bench.records.results import curve_lines
 from bench.report.study import Result, Runs, Selection, chart, figure_style, format, records, statistics, table
 
 PLACE = 120

@@ -22,7 +22,7 @@ EXPECTED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.is_file() else {
 def summary(experiment: str, scale: str) -> dict[str, int | str]:
     """The number of cells of an experiment, and a digest of their names and overrides."""
     cells = cells_of(f"+experiment={experiment}", f"scale={scale}")
-    return {"cells": len(cells), "digest": digest([[cell.name, cell.overrides] for cell in cells])}
+    return {"cells": len(cells), "digest": digest([[cell.id, cell.overrides] for cell in cells])}
 
 
 @pytest.mark.parametrize("scale", [SCALES[0], pytest.param(SCALES[1], marks=pytest.mark.slow)])

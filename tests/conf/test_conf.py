@@ -8,7 +8,7 @@ import trimesh
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CLASS_OF_NODE, build, check_draw, check_names, load
+from bench.config import CLASS_OF_NODE, build, check_references, load
 from bench.pictures import figure_style
 from bench.pictures.figure_style import look
 from bench.runner.compose import Composer, composing
@@ -385,13 +385,13 @@ def test_the_message_on_a_nested_setting_names_its_path(compose_config):
 
 
 def test_a_silhouette_loss_is_refused_if_the_task_does_not_read_it(compose_config):
-    with pytest.raises(ValueError, match=r"only task=completion, .*reconstruction and single_view read silhouette"):
-        check_names(compose_config("task=gradients", "silhouette=hinge"))
+    with pytest.raises(ValueError, match=r"silhouette is read only by task=capacity, .*single_view, stability"):
+        check_references(compose_config("task=gradients", "silhouette=hinge"))
     for task in ("completion", "stability", "gradients"):
-        check_names(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
+        check_references(compose_config(f"task={task}", f"silhouette={'own' if task == 'gradients' else 'hinge'}"))
 
 
 def test_a_draw_is_refused_if_no_setting_is_drawn(compose_config):
     with pytest.raises(ValueError, match=r"only a method of method/space reads draw: add \+method=space/NAME"):
-        check_draw(compose_config("renderer=dist", "draw=3"))
-    check_draw(compose_config("+method=space/dist_mask", "draw=3"))
+        check_references(compose_config("renderer=dist", "draw=3"))
+    check_references(compose_config("+method=space/dist_mask", "draw=3"))

@@ -8,8 +8,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.config import build
-from bench.records.read import Plan
 from bench.records.record import row_name
+from bench.records.results import Plan
 from bench.runner import compose
 from bench.runner.plan import plan_of
 from bench.tables import group_choices, names, register_rows

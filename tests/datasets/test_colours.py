@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from bench.records.folder import Identity
+from bench.records.folder import code_hash
 from datasets.files.colours import FileColours
 from datasets.files.local import LocalMeshes
 from datasets.files.meshes import read_mesh
@@ -114,7 +114,7 @@ def test_a_changed_texture_is_another_run(tmp_path):
     cube.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd t.png\n")
     (tmp_path / "t.png").write_bytes(b"red")
-    before = Identity({}, {"dataset": {"path": str(cube)}}).code
-    assert Identity({}, {"dataset": {"path": str(cube)}}).code == before
+    before = code_hash({"dataset": {"path": str(cube)}})
+    assert code_hash({"dataset": {"path": str(cube)}}) == before
     (tmp_path / "t.png").write_bytes(b"blue")
-    assert Identity({}, {"dataset": {"path": str(cube)}}).code != before
+    assert code_hash({"dataset": {"path": str(cube)}}) != before

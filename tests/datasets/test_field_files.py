@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 import bench
-from bench.records.read import RESULTS
+from bench.records.results import RESULTS
 from bench.tasks.capacity.candidates import PRIMITIVES
 from datasets import saved_field
 from datasets.files.field_files import _read, load_field, load_network

@@ -25,7 +25,7 @@ from tests.documentation import code_of
 from tests.looped import each
 from tests.made_networks import RADIUS, arrays, deepsdf_folder, npz, octahedron
 from tests.renderers.test_published import CODE, occupancy
-from tests.tiny import cell_from
+from tests.tiny import inputs_from
 
 NET = """
 import torch
@@ -267,7 +267,7 @@ def test_half_of_the_two_is_refused(overrides, words):
 
 
 def composed_inputs(*overrides: str) -> RunInputs:
-    return cell_from(composed(*overrides, "scale=smoke")).inputs
+    return inputs_from(composed(*overrides, "scale=smoke"))
 
 
 def test_its_field_is_that_of_the_scene_and_its_codes_are_the_prior(tmp_path):

@@ -10,7 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from bench.records.folder import Identity, _class_counts_hash
+from bench.records.folder import _class_counts_hash, code_hash
 from bench.report.data.records import family
 from bench.tasks.single_view.images import Imaging
 from datasets.files import repair
@@ -196,7 +196,7 @@ def test_another_list_or_other_shapes_on_disk_are_another_run(tmp_path):
     def code() -> str:
         _class_counts_hash.cache_clear()  # the cache holds for one command
         dataset = {"path": str(folder), "synset": "sofa", "split": str(split)}
-        return Identity(dict.fromkeys(("task", "renderer", "dataset"), "x"), {"dataset": dataset}).code
+        return code_hash({"dataset": dataset})
 
     first = code()
     (folder / "02958343.zip").write_bytes(b"packed")

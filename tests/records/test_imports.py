@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from bench.records.folder import Identity
+from bench.records.folder import code_hash
 from bench.records.imports import ROOT, imported_files
 
 COMPLETION = ("bench.tasks.completion.Completion", "renderers.DIST", "datasets.families.Family")
@@ -51,7 +51,5 @@ def test_a_target_outside_of_this_project_adds_no_file(target):
 
 def test_a_run_that_loads_choices_by_name_depends_on_all_of_them():
     config = {"task": {"_target_": "bench.tasks.ablation.Ablation"}, "prior": {}}
-    alone, beside_others = (
-        Identity({}, config | {"task": config["task"] | {"beside": names}}) for names in ([], ["dvr"])
-    )
-    assert alone.code != beside_others.code
+    alone, beside_others = (code_hash(config | {"task": config["task"] | {"beside": names}}) for names in ([], ["dvr"]))
+    assert alone != beside_others

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.records.folder import Identity
+from bench.records.folder import code_hash, config_hash
 from bench.records.metrics import metric_fault
 from bench.records.read import read_records
 from bench.records.record import Record, RunStatus, digest, to_json, write_text
@@ -111,10 +111,9 @@ def test_a_run_is_another_one_if_a_file_that_it_reads_has_changed(tmp_path, key)
     file, other = tmp_path / "file", tmp_path / "other"
     file.write_text("before")
     other.write_text("before")
-    names = {"task": "single_view", "renderer": "dist", "dataset": "sofa"}
 
     def code() -> str:
-        return Identity(names, {"task": {key: str(file), "not_read": str(other)}}).code
+        return code_hash({"task": {key: str(file), "not_read": str(other)}})
 
     before = code()
     other.write_text("after")
@@ -126,19 +125,24 @@ def test_a_run_is_another_one_if_a_file_that_it_reads_has_changed(tmp_path, key)
 def test_a_run_is_another_one_if_a_photograph_in_a_folder_of_its_dataset_has_changed(tmp_path):
     photograph = tmp_path / "image" / "a.png"
     photograph.parent.mkdir()
-    names = {"task": "multiview", "renderer": "dist", "dataset": "photos"}
 
     def code(text: str) -> str:
         photograph.write_text(text)
-        return Identity(names, {"dataset": {"path": str(tmp_path)}}).code
+        return code_hash({"dataset": {"path": str(tmp_path)}})
 
     assert code("before") == code("before") != code("after")
+
+
+def test_runs_of_one_command_read_a_photograph_once(tmp_path, monkeypatch):
+    (tmp_path / "a.png").write_bytes(b"photograph")
+    first = code_hash({"dataset": {"path": str(tmp_path)}, "seed": 0})
+    monkeypatch.setattr(Path, "read_bytes", pytest.fail)
+    assert code_hash({"dataset": {"path": str(tmp_path)}, "seed": 1}) == first
 
 
 def test_the_network_of_a_prior_counts_beside_a_folder_of_shapenet(tmp_path):
     weights = tmp_path / "deepsdf" / "ModelParameters" / "latest.pth"
     weights.parent.mkdir(parents=True)
-    names = {"task": "completion", "renderer": "dist", "dataset": "shapenet"}
     config = {
         "dataset": {"path": str(tmp_path / "shapes"), "synset": "sofa"},
         "prior": {"path": str(tmp_path / "deepsdf")},
@@ -146,17 +150,15 @@ def test_the_network_of_a_prior_counts_beside_a_folder_of_shapenet(tmp_path):
 
     def code(text: str) -> str:
         weights.write_text(text)
-        return Identity(names, config).code
+        return code_hash(config)
 
     assert code("before") == code("before") != code("after")
 
 
 def test_a_package_is_in_the_identity_of_runs_with_a_class_of_the_user():
-    names = {"task": "completion", "renderer": "dist", "dataset": "sofa"}
-
     def identity(target: str, *packages: str) -> tuple[str, str]:
-        run = Identity(names, {"renderer": {"_target_": target}, "packages": [*packages]})
-        return run.config_hash, run.code
+        config = {"renderer": {"_target_": target}, "packages": [*packages]}
+        return config_hash(config), code_hash(config)
 
     shipped, users = "renderers.dist.Dist", "tests.user_renderer.Mine"
     assert identity(shipped, "tests") == identity(shipped)

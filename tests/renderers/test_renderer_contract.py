@@ -41,7 +41,7 @@ VARIANTS = [
 )
 def renderer(request, compose_config) -> Renderer:
     if request.param == "custom":
-        target = f"renderer._target_={request.config.getoption('--renderer')}"
+        target = f"renderer._target_={request.config.getoption('--renderer') or 'tests.user_renderer.Mine'}"
         return build(compose_config("renderer=custom", target).renderer, "renderer")
     changed = {"mesh_proxy": {"grid": 48}}  # an eighth of the evaluations; the renderer states its accuracy
     return load("renderer", request.param, **changed.get(request.param, {}))

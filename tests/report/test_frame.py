@@ -7,7 +7,7 @@ import pytest
 
 import bench
 from bench.records import read as read_module
-from bench.records.read import Plan, PlannedCell
+from bench.records.results import Plan, PlannedRun
 from bench.report.__main__ import main as report
 from bench.report.data.frame import FIXED_COLUMNS, to_frame
 from tests.report.test_report import crashed, record, write_run
@@ -21,7 +21,7 @@ def results(tmp_path):
     write_run(tmp_path, record("one", metrics=metrics, config=config, seed=1, started="2025-03-02T10:00:00Z"), "one")
     other = {"renderer": {"epsilon": 1e-3, "steps": 7, "early": True}, "label": "Mine"}
     write_run(tmp_path, crashed("two", config=other, seed=None, reason="why"), "two")
-    cell = PlannedCell("three", [], "completion", "dvr", "plane", 0, {"seed": 0, "index": 0})
+    cell = PlannedRun("three", [], "completion", "dvr", "plane", 0, {"seed": 0, "index": 0})
     Plan("planned", tmp_path, [cell], asked="2025-03-03T10:00:00Z").write()
     return tmp_path
 

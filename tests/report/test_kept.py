@@ -7,7 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from bench.records.read import read_record, read_records
+from bench.records.read import read_records
+from bench.records.record import read_record
 from bench.report.__main__ import main
 from bench.report.data.kept import FROM_RUNS_CSV, LOCAL_FIELDS, join, read_rows, write_rows
 from bench.report.data.records import family

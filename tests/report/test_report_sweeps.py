@@ -8,7 +8,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from bench.records.read import Plan, PlannedCell, read_plans, read_records
+from bench.records.read import read_plans, read_records
+from bench.records.results import Plan, PlannedRun
 from bench.report.__main__ import main as report
 from bench.report.sweeps import lines, of_plan, write_sweep, write_sweeps
 from bench.report.write.html import ASSETS
@@ -16,17 +17,17 @@ from bench.report.write.paper import find_sweeps
 from tests.report.test_report import record, write_run
 
 
-def cell(renderer: str, *, seed: int = 0, index: int = 0, dataset: str = "sofa", **asked: str) -> PlannedCell:
+def cell(renderer: str, *, seed: int = 0, index: int = 0, dataset: str = "sofa", **asked: str) -> PlannedRun:
     """A planned cell; `asked` are keys of its renderer that the sweep asked for."""
     renderer_node = {"_label_": renderer.upper(), **asked}
     config = {"renderer": renderer_node, "seed": seed, "index": index, "experiment": None, "label": None}
     overrides = [f"renderer={renderer}", f"dataset={dataset}", f"seed={seed}", f"index={index}"]
     overrides += [f"+renderer.{key}={value}" for key, value in asked.items()]
     name = "-".join(override.replace("=", "") for override in overrides)
-    return PlannedCell(name, overrides, "completion", renderer, dataset, seed, config)
+    return PlannedRun(name, overrides, "completion", renderer, dataset, seed, config)
 
 
-def ran(results: Path, planned: PlannedCell, chamfer: float | None, **changed) -> None:
+def ran(results: Path, planned: PlannedRun, chamfer: float | None, **changed) -> None:
     """The run of a cell; without an error it crashed."""
     metrics = {} if chamfer is None else {"steps_taken": 9, "fscore": 1 - chamfer, "chamfer_l2": chamfer}
     ended = {"status": "ok"} if chamfer is not None else {"status": "crashed", "reason": "as planned"}
@@ -35,7 +36,7 @@ def ran(results: Path, planned: PlannedCell, chamfer: float | None, **changed) -
     write_run(results, content, planned.id)
 
 
-def swept(results: Path, cells: list[PlannedCell], name: str = "completion-1") -> None:
+def swept(results: Path, cells: list[PlannedRun], name: str = "completion-1") -> None:
     Plan(name, results, cells).write()
 
 

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from bench.records.names import flat
-from bench.records.record import row_name
+from bench.records.record import flat, row_name
 from bench.report.data.kept import read_rows
 from bench.report.write.paper import FOLDER, SHIPPED
 from bench.tables import CONF
@@ -55,7 +54,7 @@ def planned(experiment: str) -> list[tuple[tuple[str, ...], dict[str, str]]]:
         if not file.exists() or OmegaConf.load(file).get("experiment") != experiment:
             continue
         cells = cells_of(f"+experiment={name}", *words)
-        found += [described(cell.config, cell.choices["dataset"], cell.choices["renderer"]) for cell in cells]
+        found += [described(cell.config, cell.dataset, cell.renderer) for cell in cells]
     return found
 
 

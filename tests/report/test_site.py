@@ -13,8 +13,9 @@ import trimesh
 
 from bench.merge import merge
 from bench.records.names import differences
-from bench.records.read import RESULTS, Plan, PlannedCell, not_run_record, read_records
+from bench.records.read import not_run_record, read_records
 from bench.records.record import NOT_RUN, RunStatus, file_lock
+from bench.records.results import RESULTS, Plan, PlannedRun
 from bench.report.__main__ import main
 from bench.report.data.records import definition
 from bench.report.site.columns import columns, names
@@ -127,7 +128,7 @@ def test_the_command_is_what_was_typed_and_safe_to_paste():
 
 
 def test_a_planned_cell_has_the_command_that_its_sweep_planned():
-    cell = PlannedCell("a", ["+experiment=fig5", "index=1"], "completion", "dist", "car", 0, {})
+    cell = PlannedRun("a", ["+experiment=fig5", "index=1"], "completion", "dist", "car", 0, {})
     assert (
         command(not_run_record(cell, Plan("fig5-1", Path(RESULTS), [cell])), Path(RESULTS))
         == "python -m bench +experiment=fig5 index=1"

@@ -18,8 +18,8 @@ import torch
 
 from bench.__main__ import main
 from bench.machine.environment import using_threads
-from bench.records.read import PlannedCell
 from bench.records.record import Record, RunStatus
+from bench.records.results import PlannedRun
 from bench.runner import process
 from bench.runner.library import CommandResult
 
@@ -54,9 +54,9 @@ def stored(results: Path, name: str, status: str = "ok", **changed: Any) -> Path
     return folder
 
 
-def planned(*names: str) -> list[PlannedCell]:
+def planned(*names: str) -> list[PlannedRun]:
     """The cells of a plan with these names."""
-    return [PlannedCell(name, [], "completion", "dist", "sofa", 0, {"seed": 0}) for name in names]
+    return [PlannedRun(name, [], "completion", "dist", "sofa", 0, {"seed": 0}) for name in names]
 
 
 def by_program(*arguments: str, cwd: Path = ROOT, **environment: str) -> CommandResult:

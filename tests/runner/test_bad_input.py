@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from bench.runner.command import message_of, options_of, quote_text
 from bench.runner.plan import refusal_reason
 from bench.setup import priors
 from tests.composing import identified
+from tests.conftest import pytest_configure
 from tests.looped import each
 from tests.runner.driving import ROOT, by_program, driver, errors, lines_of_curves, record_of, wait_for
 
@@ -65,6 +67,11 @@ def assert_one_line(err: str, *words: str) -> None:
     ("--seed", ("settings have no dashes, write seed=VALUE",)),
     ("renderer=[dist,dvr]", ("one renderer", "-m renderer=A,B")),
     ("renderer=custom renderer.steps=3", ("+renderer.steps=VALUE",)),
+    ("renderer._target_=mypkg.Mine", ("packages=[mypkg]", "is renderer=custom renderer._target_=mypkg.Mine")),
+    ("renderer._target_=tests.user_renderer.Mine packages=[tests]", ("has no key 'epsilon'", "is renderer=custom")),
+    ("+scale=smoke", ("scale is chosen by default: write scale=NAME, without a plus",)),
+    ("++renderer=dvr", ("write renderer=NAME, without a plus",)),
+    ("task=multiview silhouette=hinge", ("silhouette is read only by task=capacity, completion",)),
     ("task.colour_weight=1", ("set prior=textured field=prior",)),
     ("task.colour_weight=1 prior=textured field=grid_8", ("set prior=textured field=prior",)),
 ])  # fmt: skip
@@ -292,3 +299,9 @@ def test_a_stopped_run_keeps_its_record_and_curve(tmp_path):
     assert "stopped by SIGTERM" in record["reason"] and record["metrics_start"]
     assert [json.loads(line)["iteration"] for line in lines] == list(range(len(lines))) and len(lines) > 3
     assert record["evaluations"]["iterations"] - len(lines) in (0, 1)  # an iteration counts before its line is written
+
+
+def test_the_contract_test_of_renderer_custom_needs_a_class():
+    options = {"keyword": "custom", "--renderer": None}
+    with pytest.raises(pytest.UsageError, match=r"add --renderer=PACKAGE\.CLASS"):
+        pytest_configure(Mock(getoption=options.get))

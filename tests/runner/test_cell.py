@@ -11,7 +11,7 @@ from bench.machine.environment import using_threads
 from bench.records.record import Record
 from bench.setup.inputs import RunContext, RunInputs, prepare_run
 from renderers.checks import BadInput
-from tests.tiny import cell_from, plain, silent
+from tests.tiny import inputs_from, plain, silent
 
 
 @pytest.fixture(autouse=True)
@@ -54,27 +54,27 @@ def test_a_node_that_cells_share_is_built_once_also_an_invalid_one(compose_confi
 
 
 def test_a_shape_has_a_code_of_the_prior_if_its_training_had_the_shape(compose_config):
-    cells = [cell_from(compose_config("split=train", "prior.shapes=2", f"index={index}")) for index in range(3)]
-    assert [cell.inputs.prior_choice.scene_code for cell in cells] == [0, 1, None]
+    cells = [inputs_from(compose_config("split=train", "prior.shapes=2", f"index={index}")) for index in range(3)]
+    assert [cell.prior_choice.scene_code for cell in cells] == [0, 1, None]
     with pytest.raises(BadInput, match="at the shape that it was fitted to"):
-        cells[2].inputs.check_fitted()
-    assert cell_from(compose_config("split=test", "prior.shapes=2", "index=0")).inputs.prior_choice.scene_code is None
+        cells[2].check_fitted()
+    assert inputs_from(compose_config("split=test", "prior.shapes=2", "index=0")).prior_choice.scene_code is None
 
 
 def test_a_narrow_network_takes_one_thread_and_a_wide_one_all(compose_config, monkeypatch):
     monkeypatch.setattr("bench.setup.inputs.DEFAULT_THREADS", 3)
     for width, threads in ((128, 1), (512, 3)):
-        cell_from(compose_config("scale=smoke", f"scale.network.width={width}")).configure_process()
+        inputs_from(compose_config("scale=smoke", f"scale.network.width={width}")).configure_process()
         assert torch.get_num_threads() == threads
 
 
 def test_the_run_takes_its_threads_and_its_check_does_not(compose_config):
     torch.set_num_threads(1)
-    cell = cell_from(compose_config("scale=smoke", "threads=2"))
+    cell = inputs_from(compose_config("scale=smoke", "threads=2"))
     assert torch.get_num_threads() == 1
     cell.configure_process()
     assert torch.get_num_threads() == 2
-    cell_from(compose_config("scale=smoke")).configure_process()
+    inputs_from(compose_config("scale=smoke")).configure_process()
     assert torch.get_num_threads() == 1
 
 

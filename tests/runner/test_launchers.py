@@ -69,7 +69,7 @@ def swept(tmp_path_factory) -> Swept:
     results = tmp_path_factory.mktemp("workers")
     arguments = ("hydra/launcher=workers", *LIMITED, "threads=null")
     cell = identified(*FAILING, *arguments, f"+renderer.how={NO_FOLDER}", f"results_dir={results}")
-    blocked = results / "runs" / cell.name
+    blocked = results / "runs" / cell.id
     blocked.parent.mkdir()
     blocked.symlink_to(results / "nowhere")
     cells = f"+renderer.how={','.join(HOWS)}"

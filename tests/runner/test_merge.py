@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.merge import main, merge
-from bench.records.read import Plan, read_records
+from bench.records.read import read_records
+from bench.records.results import Plan
 from bench.report.suite.attempts import attempts_folder
 from tests.looped import each
 from tests.runner.driving import planned, stored

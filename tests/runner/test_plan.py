@@ -7,9 +7,9 @@ import pytest
 from hydra import compose
 
 from bench.prior import main as prior_main
-from bench.records.folder import identify, resolve_config
-from bench.records.read import Plan, PlannedCell
+from bench.records.folder import code_hash, config_hash, planned_run, resolve_config
 from bench.records.record import Record, RunStatus
+from bench.records.results import Plan, PlannedRun
 from bench.runner import plan as plan_module
 from bench.runner import run as run_module
 from bench.runner import sweep
@@ -18,7 +18,6 @@ from bench.runner.plan import (
     check_plan,
     duration_group,
     durations_of_similar_runs,
-    identity_of,
     refusal_reason,
     refusal_reasons,
 )
@@ -46,7 +45,7 @@ def results(tmp_path, monkeypatch) -> Path:
     return tmp_path / "r"
 
 
-def planned(results: Path, *arguments: str) -> list[PlannedCell]:
+def planned(results: Path, *arguments: str) -> list[PlannedRun]:
     plans = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweep, "show_plan", lambda plan, *_: plans.append(plan))
@@ -54,12 +53,11 @@ def planned(results: Path, *arguments: str) -> list[PlannedCell]:
     return plans[0].cells
 
 
-def write(results: Path, cell: PlannedCell, seconds: float) -> None:
+def write(results: Path, cell: PlannedRun, seconds: float) -> None:
     names = ("id", "task", "renderer", "dataset", "seed", "config")
     record = Record(**{name: value for name, value in asdict(cell).items() if name in names}, status=RunStatus.OK)
     record.ended, record.seconds = record.started, {"total": seconds}
-    identity = identity_of(cell)
-    record.config_hash, record.code = identity.config_hash, identity.code
+    record.config_hash, record.code = config_hash(cell.config), code_hash(cell.config)
     (results / "runs" / cell.id).mkdir(parents=True)
     record.write(results / "runs" / cell.id)
 
@@ -114,8 +112,8 @@ def test_a_cell_is_as_hydra_composes_it(arguments):
         for cell, overrides in zip(cells, swept, strict=True):
             config = compose("config", overrides, return_hydra_config=True)
             choices = dict(config.hydra.runtime.choices)
-            assert cell == identify(resolve_config(without_hydra(config), choices), choices, overrides)
-    assert len({cell.name for cell in cells}) == len(cells)
+            assert cell == planned_run(resolve_config(without_hydra(config), choices), choices, overrides)
+    assert len({cell.id for cell in cells}) == len(cells)
 
 
 def test_a_value_goes_to_the_cells_that_have_its_key():
@@ -191,9 +189,7 @@ def times_of(tmp_path, monkeypatch):
             plan_module, "read_run", lambda folder, _: (read.append(folder), (folders[folder.name], ""))[1]
         )
         record = run(**like)
-        cells = [
-            PlannedCell("c", [], record["task"], record["renderer"], "sofa", 0, record["config"], record["method"])
-        ]
+        cells = [PlannedRun("c", [], record["task"], record["renderer"], "sofa", 0, record["config"], record["method"])]
         return durations_of_similar_runs(Plan("p", tmp_path, cells), set())[duration_group(record)], len(read)
 
     return similar_times
@@ -210,7 +206,7 @@ def test_similar_runs_have_the_same_task_renderer_and_scale_and_ended_by_themsel
 
 
 def test_a_plan_names_the_file_of_a_dataset(tmp_path, capsys):
-    cell = PlannedCell("c", [], "ablation", "dist", "module", 0, {"dataset": {"path": "mine/net.pth"}})
+    cell = PlannedRun("c", [], "ablation", "dist", "module", 0, {"dataset": {"path": "mine/net.pth"}})
     plan_module.show_plan(Plan("p", tmp_path, [cell]), {"c"}, 1)
     assert "ablation, dist, module net.pth  reused" in capsys.readouterr().out
 
@@ -294,7 +290,7 @@ def plan_of(plain, tmp_path):
         planned_cells = []
         for number, overrides in enumerate(cells):
             config = plain(*overrides, "isolation=off")
-            planned_cells.append(PlannedCell(f"c-{number}", list(overrides), "completion", "dist", "sofa", 0, config))
+            planned_cells.append(PlannedRun(f"c-{number}", list(overrides), "completion", "dist", "sofa", 0, config))
         return Plan("p", Path(tmp_path), planned_cells)
 
     return plan

@@ -14,7 +14,7 @@ import pytest
 
 from bench.records.record import Record
 from bench.runner import process
-from bench.runner.process import RunRequest, Step
+from bench.runner.messages import Step
 from tests.runner.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -87,18 +87,18 @@ def test_a_process_that_is_lost_before_the_first_measurement_of_its_memory_is_re
     alive = iter((True, False))
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
+    record = Record("id", "task", "renderer", "dataset", 0, {"time_limit": None, "memory_limit": None})
     pipes = [Pipe(), Pipe()]
     lost = Mock(pid=ended.pid, sentinel=pipes[0][0], exitcode=-signal.SIGKILL, is_alive=lambda: next(alive))
-    failure = process._watch(lost, pipes[1][0], process.RunLimits(None, None), lambda message: None)
+    failure = process._watch(lost, pipes[1][0], process.RunInProgress(record))
     assert failure is not None and "ended by SIGKILL" in failure[1]
 
 
-def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(tmp_path, monkeypatch):
+def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(monkeypatch):
     calls = []
     monkeypatch.setattr(process, "import_module", calls.append)
     monkeypatch.setattr("bench.runner.execute.main", lambda *_: calls.append("main"))
-    request = RunRequest(tmp_path, Record("id", "task", "renderer", "dataset", 0, {}))
-    process._run(request, *Pipe())
+    process._run(Record("id", "task", "renderer", "dataset", 0, {}), *Pipe())
     assert calls == [*process.preloaded_modules(), "main"] and "open3d" in calls
 
 

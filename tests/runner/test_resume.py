@@ -11,6 +11,9 @@ import pytest
 
 from bench.records.folder import _package_hash
 from bench.records.read import read_records
+from bench.records.results import ended_record
+from bench.runner.run import run_cell
+from tests.composing import cells_of
 from tests.runner.driving import FAILING, ROOT, command, driver, record_of, wait_for
 
 
@@ -139,3 +142,11 @@ def test_the_code_of_a_package_without_an_init_file_is_read(tmp_path, monkeypatc
         _package_hash.cache_clear()
         hashes.add(_package_hash("space"))
     assert len(hashes - {""}) == 2
+
+
+def test_a_run_on_a_machine_whose_clock_is_behind_counts_for_its_sweep(tmp_path):
+    (cell,) = cells_of(*FAILING, "+renderer.how=raise", "isolation=off", f"results_dir={tmp_path}")
+    for planned_at, reused in (("2999-01-01T00:00:00.000+00:00", False), ("2999-01-02T00:00:00.000+00:00", True)):
+        assert run_cell(cell, planned_at) == []
+        record = ended_record(cell.folder, planned_at)
+        assert record is not None and record["reused"] is reused

@@ -31,7 +31,7 @@ from tests.looped import each
 from tests.report.page_data import Page
 from tests.runner.driving import CommandResult, by_program
 from tests.solve.test_optimise import POINTS, Toy
-from tests.tiny import ball_prior, cell_from, curve_of
+from tests.tiny import ball_prior, curve_of, inputs_from
 
 TINY = (
     "scale=smoke", "task.optimiser.iterations=6", "view.resolution=16", "task.points=20",
@@ -293,13 +293,12 @@ def test_random_numbers_of_a_run_do_not_depend_on_whether_its_prior_was_cached(c
     monkeypatch.setattr(inputs_module, "make_scene", lambda *_, **__: Mock(spec=Scene))
     for used in (0, 1000):
         monkeypatch.setattr(priors_module, "prior_for", lambda *_, used=used: (torch.rand(used), prior)[1])
-        cell = cell_from(compose_config("threads=1", "seed=3"))
-        cell.configure_process()
-        stage = cell.inputs
+        stage = inputs_from(compose_config("threads=1", "seed=3"))
+        stage.configure_process()
         assert stage.prior is stage.prior is prior  # made once
         drawn.append(torch.rand(4).tolist())
     assert drawn[0] == drawn[1]
-    cell_from(compose_config("threads=1", "seed=4")).configure_process()
+    inputs_from(compose_config("threads=1", "seed=4")).configure_process()
     assert torch.rand(4).tolist() != drawn[0]
 
 

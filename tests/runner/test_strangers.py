@@ -9,9 +9,10 @@ import trimesh
 
 from bench.config import build, find_class, load
 from bench.merge import merge
-from bench.records import folder as run_folder
-from bench.records.read import Plan, check_links, read_plans, read_records
+from bench.records.folder import locked_folder
+from bench.records.read import read_plans, read_records
 from bench.records.record import SCHEMA
+from bench.records.results import Plan, PlannedRun, check_links
 from bench.report.write.html import write_index
 from bench.turntable import main as turntable
 from tests.looped import each
@@ -130,13 +131,14 @@ def test_nothing_is_written_through_a_link(theirs, tmp_path, name):
 
 @pytest.mark.parametrize("pattern", ["runs/{}", ".locks/{}", "runs/{}/record.json"])
 def test_a_run_is_not_resumed_through_a_link(theirs, tmp_path, pattern):
-    identity = run_folder.Identity({"task": "completion", "renderer": "dist", "dataset": "sofa"}, {"seed": 0})
-    link = theirs / pattern.format(identity.name)
+    config = {"seed": 0, "results_dir": str(theirs), "rerun": "none"}
+    run = PlannedRun("completion-dist-sofa-1", [], "completion", "dist", "sofa", 0, config)
+    link = theirs / pattern.format(run.id)
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(tmp_path / "mine" / ("" if pattern == "runs/{}" else "secret.png"))
     with (
         pytest.raises(ValueError, match="is a link out of the results folder"),
-        run_folder.locked_folder(theirs, identity, run_folder.Rerun.none),
+        locked_folder(run),
     ):
         raise AssertionError("it was claimed")
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["secret.png"]

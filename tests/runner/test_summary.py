@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from bench.records.read import RESULTS, Plan
 from bench.records.record import Record, RunStatus
+from bench.records.results import RESULTS, Plan
 from bench.runner import sweep
 from bench.runner.executors import Launcher
 from bench.runner.summary import print_run_summary, print_sweep_summary

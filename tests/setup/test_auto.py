@@ -17,7 +17,7 @@ from renderers import Meter
 from renderers.field import Field, Kind
 from renderers.fields.analytic import Shape, box, sphere
 from tests.looped import each
-from tests.tiny import cell_from
+from tests.tiny import inputs_from
 
 VIEW = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), 128)
 TEN = AutoSettings(10.0, spurious=0.01, area_over_perimeter=0.07)
@@ -88,7 +88,7 @@ def test_auto_without_an_equation_is_an_error():
 
 def test_a_run_has_the_resolved_number_and_a_note(compose_config):
     config = compose_config("renderer.epsilon=auto", "renderer.steps=auto", "view.resolution=128", "dataset=sphere")
-    inputs = cell_from(config).inputs
+    inputs = inputs_from(config)
     assert inputs.renderer.epsilon == pytest.approx(7e-4)
     assert inputs.notes[0].startswith("renderer.epsilon=auto is 0.0007, for 128 pixels")
 

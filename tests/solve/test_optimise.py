@@ -15,7 +15,6 @@ from bench.solve.optimise import (
     OptimiserSettings,
     Starts,
     StartSettings,
-    WithCheckedHits,
     optimise,
 )
 from renderers.boundary import render_checked
@@ -56,8 +55,8 @@ class Toy:
         return {"total": square, "square": square}
 
 
-def go(problem, iterations=10, *, rate=0.05, on_step=lambda line: None) -> History:
-    history = History()
+def go(problem, iterations=10, *, rate=0.05, on_step=lambda line: None, notes=None) -> History:
+    history = History(notes=notes)
     optimise(problem, OptimiserSettings(iterations, rate, "constant"), CPU, history=history, on_step=on_step)
     return history
 
@@ -174,7 +173,7 @@ def checked(how: str, problem: type[RenderedSphere] = RenderedSphere) -> tuple[R
     """Runs a loop that checks the hits of its first loss; gives the problem, the history and the notes."""
     notes: list[str] = []
     instance = problem(renderer=WrongHits(how) if how else load("renderer", "dist"))
-    return instance, go(WithCheckedHits(instance, notes), 3), notes
+    return instance, go(instance, 3, notes=notes), notes
 
 
 def test_the_first_hits_are_checked_once_and_neither_counted_nor_changed():
@@ -280,6 +279,41 @@ def test_the_first_start_is_best_until_all_were_tried():
     starts = Starts(StartSettings(2, 1))
     starts.note(1, 0, torch.tensor(0.0))
     assert starts.best() == 0
+
+
+class OneBadStart(Toy):
+    """Two starts; the first one has a loss or a gradient that is NaN."""
+
+    def __init__(self, bad: str):
+        super().__init__()
+        self.bad, self.starts = bad, Starts(StartSettings(2, 2))
+        self.radii = [torch.tensor(1.0, requires_grad=True) for _ in range(2)]
+        self.parameters = self.radii
+
+    def loss(self, iteration):
+        start, step = self.starts.assignment(iteration)
+        self.radius = self.radii[start]
+        total = super().loss(iteration)["total"]
+        if start == 0 and self.bad:
+            infinite_slope = (self.radius - 1.0).abs().sqrt()
+            total = total + (torch.nan if self.bad == "loss" else 0.0 * infinite_slope)
+        self.starts.note(start, step, total)
+        return {"total": total}
+
+
+@pytest.mark.parametrize("bad", ["loss", "gradient"])
+def test_other_starts_go_on_if_the_loss_or_the_gradient_of_a_start_is_nan(bad):
+    problem = OneBadStart(bad)
+    history = go(problem, 8)
+    assert (history.status, len(history.curve), problem.starts.best()) == (RunStatus.OK, 8, 1)
+    assert problem.radii[0].item() == 1.0 and problem.radii[1].item() > 1.2 and history.first_loss == 4.0
+
+
+def test_a_run_ends_with_nan_if_all_starts_are_nan():
+    problem = OneBadStart("")
+    problem.spoil = dict.fromkeys(range(20), torch.nan)
+    history = go(problem, 8)
+    assert (history.status, len(history.curve)) == (RunStatus.NAN, 5)  # two rounds of two starts, then the last start
 
 
 def test_rounds_must_leave_something_of_the_budget():

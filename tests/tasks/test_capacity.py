@@ -9,7 +9,6 @@ import pytest
 from bench.evaluate.evaluate import Evaluation
 from bench.records.record import Record, RunStatus
 from bench.runner.execute import execute
-from bench.runner.process import RunRequest
 from bench.runner.summary import print_run_summary
 from bench.tasks.capacity.candidates import candidate
 from bench.tasks.capacity.field import failure_of
@@ -20,7 +19,7 @@ from bench.tasks.capacity.study import CheckSettings, shares
 from bench.tasks.capacity.task import Capacity, savings
 from renderers.silhouette import Own
 from tests.tasks.capacity.test_models import GROWTH, fitter_of
-from tests.tiny import curve_of, plain, silent
+from tests.tiny import curve_of, plain
 
 TINY = (
     "scale=smoke", "view.resolution=16", "evaluation.picture=null", "evaluation.grid=24", "device=cpu",
@@ -33,17 +32,18 @@ BETTER = ("task.optimiser.iterations=20", "models.candidates=[sphere,box,union_2
 
 
 def run(folder, compose_config, *overrides: str) -> Record:
-    """The record of a run in this process, and its files in the folder."""
-    config = compose_config(*TINY, *overrides)
+    """The record of a run in this process, with its files in its folder."""
+    config = compose_config(*TINY, *overrides, f"results_dir={folder}")
     record = Record("id", "task", "dist", config.dataset.name, 0, plain(config))
-    execute(RunRequest(folder, record), progress=silent, save_record=lambda record: None)
+    record.folder.mkdir(parents=True)
+    execute(record, lambda message: None)
     return record
 
 
 def test_steps_that_cannot_reach_pixel_precision_are_told_before_any_fit(compose_config, tmp_path):
     record = run(tmp_path, compose_config, "task=capacity", "dataset=capsule", "renderer=dist", "renderer.alpha=2.5")
     assert record.status != "ok" and "renderer.alpha must lie between 0 and 2" in record.reason
-    assert (tmp_path / "curve.jsonl").read_text() == ""
+    assert (record.folder / "curve.jsonl").read_text() == ""
 
 
 def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
@@ -74,14 +74,14 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     values = 100 * metrics["frugal.evaluations"] / metrics["rounded_box.evaluations"]
     assert saved.endswith(f", {values:.0f} % of the field values")
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
-    lines = curve_of(tmp_path)
+    lines = curve_of(record.folder)
     assert {line["candidate"] for line in lines} == {"sphere", "rounded_box"}
     shares = {key: {line["rays_share"] for line in lines if line["part"] == key and line["phase"] == "fit"}
               for key in ("fit_all", "frugal")}  # fmt: skip
     assert shares["fit_all"] == {1.0} and 0 < min(shares["frugal"]) < 1
-    assert {path.name for path in tmp_path.iterdir()} >= {"mesh.ply", "ladder.png", "strip.png"}
+    assert {path.name for path in record.folder.iterdir()} >= {"mesh.ply", "ladder.png", "strip.png"}
     record.seconds["total"] = 1.0
-    print_run_summary(tmp_path, record)
+    print_run_summary(record.folder, record)
     assert re.search(r"recommended_field +rounded_box\b", capsys.readouterr().out)
 
 
@@ -148,7 +148,7 @@ def test_completion_takes_any_field(compose_config, tmp_path, overrides, ends):
     assert record.metrics["field_error"] < 3 * record.metrics["field_footprint"]
     assert record.evaluations["iterations"] >= 20 and record.evaluations["observed"] >= 50
     assert record.evaluations["value"] > record.evaluations["gradient"] > 0
-    assert record.seconds["forward"] > 0 < record.seconds["backward"] and (tmp_path / "mesh.ply").is_file()
+    assert record.seconds["forward"] > 0 < record.seconds["backward"] and (record.folder / "mesh.ply").is_file()
 
 
 def test_invalid_settings_are_told_with_their_reason(compose_config, tmp_path):

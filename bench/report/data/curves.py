@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.records.read import curve_lines
 from bench.records.record import as_number
+from bench.records.results import curve_lines
 from bench.report.data.records import CHAMFER_SCALE, Record, measured
 from bench.report.data.runs import Runs
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from bench.records.names import flat
-from bench.records.read import RESULTS, read_records
-from bench.records.record import row_name, started
+from bench.records.read import read_records
+from bench.records.record import flat, row_name, started
+from bench.records.results import RESULTS
 from bench.report.data.records import index
 
 TEXT, CATEGORY, INTEGER, NUMBER, BOOLEAN, TIME = (

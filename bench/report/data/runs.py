@@ -12,8 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bench.records.metrics import MEASUREMENT_METRICS, better_direction
-from bench.records.names import flat
-from bench.records.record import requested, row_name, started
+from bench.records.record import flat, requested, row_name, started
 from bench.report.data.frame import to_frame
 from bench.report.data.kept import FROM_RUNS_CSV, UNMEASURED
 from bench.report.data.records import (

@@ -4,9 +4,9 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from bench.records.names import SharedSettings, flat
-from bench.records.read import NOT_LOSS_TERMS, curve_lines
-from bench.records.record import as_number
+from bench.records.names import SharedSettings
+from bench.records.record import as_number, flat
+from bench.records.results import NOT_LOSS_TERMS, curve_lines
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
 from bench.report.site.files import PICTURE_TEXTS, Folder

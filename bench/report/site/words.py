@@ -4,8 +4,8 @@ import shlex
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.records.read import RESULTS
 from bench.records.record import NOT_RUN, RunStatus
+from bench.records.results import RESULTS
 from bench.report.data.records import Record, iterations_of, setting
 
 TASKS = {

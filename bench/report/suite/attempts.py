@@ -16,17 +16,17 @@ from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
-from bench.records.names import flat
-from bench.records.read import curve_lines
 from bench.records.record import (
     RunStatus,
     as_number,
     digest,
+    flat,
     from_json_values,
     renderer_name,
     to_json_values,
     write_text,
 )
+from bench.records.results import curve_lines
 from bench.report.data.kept import READ_ERRORS, UNMEASURED
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
 from bench.tables import CONF, read_yaml

@@ -13,8 +13,8 @@ from pkgutil import iter_modules
 from typing import Any
 from urllib.parse import quote
 
-from bench.records.read import PLAN_FILE
 from bench.records.record import is_outside, write_text
+from bench.records.results import PLAN_FILE
 from bench.report.data import age
 from bench.report.data.kept import FROM_RUNS_CSV, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose

@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bench.evaluate.state import REACH
-from bench.setup.fields import FREE, parse_field_name
+from bench.setup.fields import parse_field_name
 from bench.shape_prior import initialise_to_sphere
 from bench.tasks.capacity.model import FLOAT_BYTES, Candidate, Model, StartInputs
+from bench.tasks.capacity.settings import FREE
 from renderers.checks import BadInput
 from renderers.field import Flops
 from renderers.fields.analytic import Shape

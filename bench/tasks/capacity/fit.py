@@ -12,14 +12,14 @@ from torch import Tensor
 
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
-from bench.setup.fields import FitSettings
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import gradients_at
-from bench.solve.optimise import CannotContinue, History, OptimiserSettings, WithCheckedHits, optimise
+from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
 from bench.tasks.capacity.candidates import primitive_candidate
 from bench.tasks.capacity.model import Candidate, Evidence, Model, StartInputs
 from bench.tasks.capacity.observations import RayObservations, generator
+from bench.tasks.capacity.settings import FitSettings
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, Unsupported, check_kind, with_empty_memory
 
@@ -65,7 +65,7 @@ class Fitter:
     on_line: Callable[[str, dict[str, Any]], None]
     stage: str = "growth"  # of the run, in each line of the curve
     spent: dict[str, float] = field(default_factory=dict)  # seconds of all fits, by phase
-    notes: list[str] = field(default_factory=list)  # on the hits of first renderings, see `WithCheckedHits`
+    notes: list[str] = field(default_factory=list)  # on the hits of first renderings, see `History`
 
     def begin(self, candidate: Candidate, previous: Model | None, *, evaluate: bool = True) -> Fitted:
         """A candidate's model after its warm start; `evaluate` also computes its held-out error."""
@@ -149,7 +149,7 @@ class Fitter:
         self, fitted: Fitted, problem: "FitProblem | WarmStart", settings: OptimiserSettings, *, checkpoints: bool
     ) -> int:
         """Runs the optimisation loop, adds its cost to the evidence, and returns the number of its iterations."""
-        history, evidence = History(), fitted.evidence
+        history, evidence = History(notes=self.notes), fitted.evidence
         earlier, shape = {name: getattr(evidence, name) for name in COSTS}, fitted.model.field()
 
         def on_step(line: dict[str, Any]) -> None:
@@ -165,8 +165,7 @@ class Fitter:
             self.on_line(evidence.candidate, {**line, **where, **share})
 
         try:
-            checked = WithCheckedHits(problem, self.notes)
-            optimise(checked, settings, self.device, history=history, on_step=on_step, least_reference=LEAST_REFERENCE)
+            optimise(problem, settings, self.device, history=history, on_step=on_step, least_reference=LEAST_REFERENCE)
         except CannotContinue as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)
         for name, seconds in history.seconds.items():

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from math import ceil
 from typing import TypeVar
 
-from bench.setup.fields import GrowthSettings
 from bench.tasks.capacity.fit import EIKONAL_POINTS, SCREENING, Fitted, Fitter
 from bench.tasks.capacity.held_out import HeldOutError
 from bench.tasks.capacity.model import Candidate, Evidence
+from bench.tasks.capacity.settings import GrowthSettings
 from renderers.field import Field
 from renderers.rendering import final_notes
 

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench.records.record import RunStatus
-from bench.setup.fields import SIZE_WORDS
 from bench.tasks.capacity.held_out import HeldOutError
+from bench.tasks.capacity.settings import SIZE_WORDS
 from renderers.field import Counts, Field, Meter
 
 FLOAT_BYTES = 4  # float32

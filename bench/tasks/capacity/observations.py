@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.setup.auto import footprint
-from bench.setup.fields import ViewSettings
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import ObservedView, ViewLossSettings
 from bench.tasks.capacity.held_out import HeldOut, HeldOutError
+from bench.tasks.capacity.settings import ViewSettings
 from datasets.scene import Truth, see
 from datasets.views import ViewSampler
 from renderers.camera import Camera, Rays, sphere_span

@@ -8,7 +8,6 @@ from bench.evaluate.state import State
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.size_chart import draw_candidates
 from bench.records.record import curve_file
-from bench.setup.fields import SIZE_WORDS
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result
@@ -18,6 +17,7 @@ from bench.tasks.capacity.fit import Fitted, Fitter
 from bench.tasks.capacity.growth import Growth, grow
 from bench.tasks.capacity.model import Evidence, Size
 from bench.tasks.capacity.observations import Views
+from bench.tasks.capacity.settings import SIZE_WORDS
 from bench.tasks.capacity.study import CheckSettings, Choice, check, choose, fit_all, refit
 from renderers.checks import check_at_least, check_choice, check_fraction, check_positive
 from renderers.rendering import final_notes

@@ -11,7 +11,6 @@ import torch
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
-from bench.setup.fields import FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.solve.observed_view import ObservedView
 from bench.tasks.capacity.candidates import REACH, by_size, candidate
 from bench.tasks.capacity.field import rendered_curve
@@ -20,6 +19,7 @@ from bench.tasks.capacity.growth import _is_better, cost, grow
 from bench.tasks.capacity.held_out import MISSED_FOOTPRINTS, HeldOutError
 from bench.tasks.capacity.model import Evidence, Model, Size, StartInputs
 from bench.tasks.capacity.observations import FREE_POINTS_PER_RAY, Views, concatenate_views, hold_out
+from bench.tasks.capacity.settings import FitSettings, GrowthSettings, ModelSettings, ViewSettings
 from bench.tasks.capacity.study import choose, fit_all, refit
 from datasets.mesh import extract
 from datasets.scene import Truth, see

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from bench.setup.inputs import prepare_run
 from bench.tasks.single_view.store import SHIPPED, overlap
 from datasets.scene import Split
-from tests.tiny import CPU, cell_from, plain
+from tests.tiny import CPU, plain
 
 NETWORKS = sorted(SHIPPED.glob("*.safetensors"))
 LEAST_IOU = {"car": 0.6, "sofa": 0.6, "plane": 0.5, "table": 0.4}  # planes and tables are thin
@@ -23,9 +24,9 @@ def test_each_family_has_a_network():
 def test_a_network_belongs_to_the_default_settings_and_generalises(path, compose_config, tmp_path):
     family = path.stem.split("-")[1]
     config = compose_config("+method=single_view", f"dataset={family}", f"results_dir={tmp_path}")
-    cell = cell_from(config)
-    recipe = cell.task.recipe(cell.inputs, plain(config))
-    assert recipe.find(cell.inputs.cache) == path and path.stat().st_size < 3_500_000
+    task, inputs = prepare_run(plain(config))
+    recipe = task.recipe(inputs, plain(config))
+    assert recipe.find(inputs.cache) == path and path.stat().st_size < 3_500_000
     model, record = recipe.load(path)
     assert record["status"] == "ok" and record["key"] == recipe.key and record["filled"] > 0.2
     assert record["validation"]["iou_network"] > record["validation"]["iou_mean_code"] + 0.03
