@@ -59,14 +59,13 @@ class Shown:
 class Filmstrip:
     """Collects frames of a run, unless pictures are off."""
 
-    def __init__(self, inputs: RunInputs, over: str = "after iterations", truth: Shown | None = None):
+    def __init__(self, inputs: RunInputs, over: str = "after iterations"):
         """Starts without frames.
 
         Args:
             over: meaning of the frames' names, for the title.
-            truth: the picture for comparison; None for the scene's shape in its view.
         """
-        self.inputs, self.over, self.truth = inputs, over, truth
+        self.inputs, self.over = inputs, over
         self.frames: dict[int | str, Shown] = {}
 
     def add(self, name: int | str, state: State, camera: Camera | None = None) -> None:
@@ -82,26 +81,25 @@ class Filmstrip:
             self.frames[name] = Shown(view, state.colours(view))
 
     @rc_context(SCREEN)
-    def save(self, folder: Path, title: str, chosen: str | None = None) -> None:
+    def save(self, folder: Path, title: str, chosen: str | None = None, truth: Shown | None = None) -> None:
         """Writes strip.png into a run folder, and film.gif or film.webp if requested.
 
         Args:
             chosen: name of the frame of the run's result, if it is not the last: it is shown, with its name in bold.
+            truth: the picture for comparison; None for the scene's shape in its view.
         """
         if not self.frames:
             return
-        truth = self._truth()
-        name = "measured" if self.truth is None and self.inputs.scene.is_partial else "truth"
-        strip = _strip(self._selected_frames(chosen), {name: truth}, f"{title}; {self.over}", chosen)
+        scene, size = self.inputs.scene, self.inputs.evaluation.picture
+        name = "measured" if truth is None and scene.is_partial else "truth"
+        if truth is None:
+            true = Shown(true_view(scene, at_size(scene.view.camera, size)))
+        else:
+            true = truth.enlarged(at_size(truth.view.camera, size))
+        strip = _strip(self._selected_frames(chosen), {name: true}, f"{title}; {self.over}", chosen)
         save(strip, folder / "strip.png")
         if self.inputs.evaluation.film is not None:
-            _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), truth)
-
-    def _truth(self) -> Shown:
-        size = self.inputs.evaluation.picture
-        if self.truth is None:
-            return Shown(true_view(self.inputs.scene, at_size(self.inputs.scene.view.camera, size)))
-        return self.truth.enlarged(at_size(self.truth.view.camera, size))
+            _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), true)
 
     def _selected_frames(self, chosen: str | None) -> dict[int | str, Shown]:
         """Evenly spaced frames and the chosen one. A checkpoint one iteration before the last is left out."""

@@ -1,12 +1,11 @@
-"""Solves an inverse problem: evaluates it, optimises it, evaluates it again, and draws it."""
+"""Solves an inverse problem: evaluates it, optimises it, and evaluates it again."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -14,15 +13,12 @@ from bench.config import DOUBLING
 from bench.evaluate.evaluate import COLOUR_DEFINITIONS, DEFINITIONS, Evaluation, depth_gap_note
 from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
-from bench.pictures.filmstrip import Filmstrip, Shown
-from bench.pictures.run_figures import save_gallery
+from bench.pictures.filmstrip import Shown
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
-from bench.shape_prior import Prior
 from bench.solve.optimise import CannotContinue, History, Optimisable, OptimiserSettings, optimise
 from datasets.mesh import Mesh
 from datasets.saved_field import FIELD_FILE, save_field
-from datasets.scene import Scene
 from renderers.camera import Camera
 from renderers.field import Counts, Field
 from renderers.rendering import Renderer, Unsupported, check_kind
@@ -93,19 +89,20 @@ class Problem(Optimisable, Protocol):
         ...
 
 
-@runtime_checkable
-class InverseTask(Protocol):
-    """A task that is an inverse problem of a prior's code; `bench.solve.solve.solve_task` executes it."""
+@dataclass(frozen=True)
+class Solution:
+    """A solved problem.
 
-    optimiser: OptimiserSettings
+    Args:
+        states: before and after the optimisation.
+        meshes: of the evaluations before and after; None without a surface.
+        curve: a line per iteration.
+    """
 
-    def problem(self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device) -> Problem:
-        """The inverse problem of a scene.
-
-        Raises:
-            Unsupported: the renderer lacks a gradient that the task needs.
-        """
-        ...
+    problem: Problem
+    states: tuple[State, State]
+    meshes: tuple[Mesh | None, Mesh | None]
+    curve: list[dict[str, Any]]
 
 
 def check_field_gradient(renderer: Renderer) -> None:
@@ -119,15 +116,14 @@ def solve(
     settings: OptimiserSettings,
     run: RunContext,
     definitions: dict[str, str],
-    *,
-    gallery: bool = False,
-) -> State:
-    """Makes a problem, solves it, fills the run's record and folder, and returns the final state.
+    on_state: Callable[[int, State, Camera | None], None],
+) -> Solution:
+    """Makes a problem, solves it, and fills the run's record and folder.
 
     Args:
         run: its record receives the definitions first, so that it has them even if making the problem fails.
         definitions: of the metrics of the problem's `evaluate`.
-        gallery: whether pictures for galleries are written, if the configuration has a size for them.
+        on_state: receives the iteration and the state of each checkpoint and of the result, with `Problem.camera`.
 
     Raises:
         Unsupported: the renderer lacks what the problem's field needs.
@@ -140,7 +136,6 @@ def solve(
     with run.off_clock():
         before = problem.evaluate(first)
     record.metrics_start = before.metrics
-    filmstrip = Filmstrip(inputs, truth=problem.shown)
 
     def state() -> State:
         field = problem.field()
@@ -148,7 +143,7 @@ def solve(
 
     def errors_at(iteration: int) -> dict[str, float]:
         current = state() if iteration else first
-        filmstrip.add(iteration, current, problem.camera())
+        on_state(iteration, current, problem.camera())
         if iteration:
             return problem.checkpoint(current)
         return {name: before.metrics[name] for name in problem.tracked if name in before.metrics}
@@ -158,21 +153,8 @@ def solve(
         last = state()
         after = problem.evaluate(last)
         note_result(run, replace(after, failure=failure_of(history, after)))
-        filmstrip.add(len(history.curve), last, problem.camera())
-        draw(run, lambda title: problem.draw(run.folder, (first, last), history.curve, title), filmstrip)
-        if gallery and inputs.evaluation.gallery is not None:
-            save_gallery(run.folder, inputs, problem.observed, {"start": before.mesh, "found": after.mesh})
-    return last
-
-
-def solve_task(task: InverseTask, run: RunContext) -> State:
-    """Solves a task's inverse problem of a code, and returns the final state."""
-    inputs = run.inputs
-
-    def problem() -> Problem:
-        return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
-
-    return solve(problem, task.optimiser, run, metric_definitions(inputs), gallery=True)
+        on_state(len(history.curve), last, problem.camera())
+    return Solution(problem, (first, last), (before.mesh, after.mesh), history.curve)
 
 
 def metric_definitions(inputs: RunInputs) -> dict[str, str]:
@@ -204,18 +186,6 @@ def note_result(run: RunContext, after: Evaluation) -> None:
     if after.mesh is not None:
         record.notes += after.mesh.repairs
         after.mesh.save(run.folder / "mesh.ply")
-
-
-def draw(run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Filmstrip) -> None:
-    """Writes pictures and filmstrip of a run, after its result is in the record.
-
-    Args:
-        draw_pictures: writes the pictures with a title; not called if pictures are off.
-    """
-    record = run.record
-    if run.inputs.evaluation.picture is not None:
-        draw_pictures(record.outcome)
-    filmstrip.save(run.folder, record.outcome)
 
 
 def run_optimisation(

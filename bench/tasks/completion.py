@@ -10,10 +10,11 @@ from bench.pictures.colours import note_colours
 from bench.pictures.run_figures import InputView
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
+from bench.solve.draw import solve_task
 from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
 from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import OptimiserSettings, StartSettings
-from bench.solve.solve import check_field_gradient, save_in_world, solve_task
+from bench.solve.solve import check_field_gradient, save_in_world
 from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive

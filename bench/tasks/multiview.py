@@ -11,9 +11,10 @@ from torch import Tensor
 
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
+from bench.solve.draw import solve_and_draw
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
 from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings
-from bench.solve.solve import check_field_gradient, metric_definitions, solve
+from bench.solve.solve import check_field_gradient, metric_definitions
 from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.shot import Shot
@@ -143,7 +144,7 @@ class Multiview:
                     code.data += mean_code.to(code)
             return built
 
-        solve(problem, self.optimiser, run, metric_definitions(inputs), gallery=True)
+        solve_and_draw(problem, self.optimiser, run, metric_definitions(inputs), gallery=True)
 
     def problem(
         self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device

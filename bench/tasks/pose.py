@@ -21,9 +21,9 @@ from bench.evaluate.evaluate import (
 from bench.evaluate.state import REACH, State
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.draw import solve_and_draw
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings
-from bench.solve.solve import solve
 from datasets.scene import Scene, View, see
 from renderers.boundary import render_checked
 from renderers.camera import Camera
@@ -167,7 +167,7 @@ class Pose(PoseTask):
         def problem() -> PoseProblem:
             return PoseProblem(self, inputs.renderer, shape_field, view, cameras, inputs.device)
 
-        solve(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | RENDERER_DEFINITIONS)
+        solve_and_draw(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | RENDERER_DEFINITIONS)
 
 
 def build_shape_field(settings: Pose, inputs: RunInputs) -> Field:

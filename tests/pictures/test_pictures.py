@@ -111,10 +111,10 @@ def photograph(height: int, width: int, *, masked: bool = True) -> Shown:
 @pytest.mark.parametrize(("size", "masked"), [((10, 20), True), ((24, 15), False)])
 def test_coloured_frames_have_rows_of_what_the_photograph_knows(inputs, tmp_path, drawn, size, masked):
     true = photograph(*size, masked=masked)
-    filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=32)), truth=true)
+    filmstrip = Filmstrip(replace(inputs, evaluation=replace(inputs.evaluation, picture=32)))
     for iteration, radius in enumerate((0.3, 0.7)):
         filmstrip.add(iteration, State(cast(ball(radius, (0.0, 0.0, 0.0)), torch.float32), inputs), true.view.camera)
-    filmstrip.save(tmp_path, "a ball")
+    filmstrip.save(tmp_path, "a ball", truth=true)
     (figure,) = drawn
     axis = figure.axes[0]
     rows = [label.get_text() for label in axis.get_yticklabels()]
@@ -151,9 +151,9 @@ def test_a_photograph_is_enlarged_with_its_parts_in_place():
 
 def test_frames_without_colours_have_no_row_of_them(inputs, tmp_path, drawn):
     for true in (None, photograph(16, 16)):
-        filmstrip = Filmstrip(inputs, truth=true)
+        filmstrip = Filmstrip(inputs)
         filmstrip.add(0, State(sphere(0.5), inputs), CAMERA)
-        filmstrip.save(tmp_path, "a ball")
+        filmstrip.save(tmp_path, "a ball", truth=true)
         labels = [label.get_text() for label in drawn[-1].axes[0].get_yticklabels()]
         assert labels == ["normals", SILHOUETTE_ROW]
 

@@ -12,8 +12,9 @@ from bench.pictures.run_figures import InputView, draw_run
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
+from bench.solve.draw import draw
 from bench.solve.observed_view import ObservedView
-from bench.solve.solve import COST_DEFINITIONS, draw, note_costs, note_result
+from bench.solve.solve import COST_DEFINITIONS, note_costs, note_result
 from bench.tasks.capacity.candidates import by_size
 from bench.tasks.capacity.fit import FitProblem, Fitter
 from bench.tasks.capacity.growth import Growth, grow

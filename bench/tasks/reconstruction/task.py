@@ -8,8 +8,9 @@ import torch
 from bench.evaluate.state import State
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
+from bench.solve.draw import solve_and_draw
 from bench.solve.optimise import OptimiserSettings
-from bench.solve.solve import check_field_gradient, solve
+from bench.solve.solve import check_field_gradient
 from bench.tasks.reconstruction.choice import DEFINITIONS, Appearance, AutoField
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, judge
 from bench.tasks.reconstruction.losses import Losses
@@ -80,14 +81,14 @@ class Reconstruction(PhotographTask):
         warnings = [UNMASKED_WARNING] if subject.input_shots[0].mask is None else []
         run.record.notes = [*run.record.notes, subject.summary, *warnings]
         if name != AUTO:
-            solve(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
+            solve_and_draw(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
             subject.finish(run)
             return
         with torch.random.fork_rng():  # the final run is the same as a run of the chosen field alone
             sizes = {name: sum(tensor.numel() for tensor in model.parameters()) for name, model in models.items()}
             choice = self.auto.choose(lambda n, s: self.problem(n, s, run), sizes, subject, self.optimiser, run)
         run.record.notes.append(choice.note)
-        solve(lambda: self.problem(choice.kept.candidate, subject, run), self.optimiser, run, definitions)
+        solve_and_draw(lambda: self.problem(choice.kept.candidate, subject, run), self.optimiser, run, definitions)
         subject.finish(run)
         seconds = run.record.seconds
         run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
