@@ -134,9 +134,8 @@ class CodeProblem:
         observations = InputView(view, observed, self.photographs, self.mask, self.coloured)
         draw_run(folder, states, observations, curve, title)
 
-    def loss(self, iteration: int) -> Terms:
+    def loss(self, step: int, start: int = 0) -> Terms:
         """The terms and their sum."""
-        start, step = self.starts.assignment(iteration)
         penalty = {"code": self.penalty(self.codes[start])}
         try:
             terms = self.compare(Meter(self._shape(start), self.counts), step) | penalty
@@ -144,9 +143,7 @@ class CodeProblem:
             if self.starts.is_alone:
                 raise
             terms = {"code": nan * penalty["code"]}  # this start takes no step
-        total = torch.stack(list(terms.values())).sum()
-        self.starts.note(start, step, total)
-        return {"total": total, **terms}
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
     @torch.no_grad()
     def objective(self) -> float | None:

@@ -5,7 +5,6 @@ Several starts share one budget of iterations: successive halving keeps the bett
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from math import cos, inf, isfinite, isnan, nan, pi
 from typing import Any, Protocol, runtime_checkable
 
@@ -70,7 +69,8 @@ class OptimiserSettings:
 class Optimisable(Protocol):
     """Parameters and their loss, which the optimisation loop minimises. `counts` counts all its field evaluations.
 
-    A problem with several starts has an attribute `starts`, see `Starts`.
+    A problem with several starts has an attribute `starts`, see `Starts`, and its `loss` has a second argument, the
+    start; the iteration is then the start's.
     """
 
     parameters: list[Tensor]
@@ -111,24 +111,26 @@ def optimise(
 ) -> None:
     """Runs Adam on the problem's parameters.
 
-    The first loss is a warm-up. A start whose loss or gradient is NaN takes no step, and other starts go on.
+    The first loss is a warm-up. A start takes no step if its loss is NaN or its gradient is not finite. Other starts
+    go on; the last start ends the loop. It also ends the loop if its loss is far above its first one.
 
     Args:
         problem: returns the loss; its parameters are changed in place.
         device: synchronised when the clock is read.
-        history: an empty one, filled during the loop, so that it is complete if the loop is stopped. A loss that
-            becomes NaN or diverges ends the loop and sets the status. No step is taken if the loss is NaN.
+        history: an empty one, filled during the loop, so that it is complete if the loop is stopped.
         on_step: receives each line of the curve and may extend it. Its time and memory are not counted.
         least_reference: lower bound of the first loss in the divergence test, for starts that are almost correct.
 
     Raises:
         BrokenContract: the history has notes, and the distance of a hit of the warm-up is not finite or is negative.
     """
-    optimiser, starts = _Adam(problem.parameters), getattr(problem, "starts", None) or Starts(StartSettings(1, 1))
+    optimiser, own_starts = _Adam(problem.parameters), getattr(problem, "starts", None)
+    starts = own_starts or Starts(StartSettings(1, 1))
+    loss_of = problem.loss if own_starts else lambda step, start: problem.loss(step)
 
     def warm_up() -> None:
         with collect_hits() as all_hits:
-            loss = problem.loss(0)["total"]
+            loss = loss_of(0, 0)["total"]
         if history.notes is not None and not bool(loss.isnan()):  # else the loop ends before the step, with the reason
             for hits in all_hits:
                 hits.check()
@@ -136,26 +138,35 @@ def optimise(
             history.notes.extend(notes[:1])
         loss.backward()
 
-    def step(loss: Tensor, rate: float) -> None:
-        loss.backward()
-        if starts.is_alone or optimiser.gradients_are_finite():
-            optimiser.step(rate)
-        else:
-            starts.note(*starts.latest, torch.full_like(loss, nan))
-
-    history.seconds["warmup"] = _timed(device, warm_up)
+    stopwatch = Stopwatch(device)
+    warm_up()
+    history.seconds["warmup"] = stopwatch.seconds()
     before = replace(problem.counts)
     memory = MemoryPeak(device)
     for iteration in range(settings.iterations):
         optimiser.forget_gradients()
-        rate, terms = settings.rate(iteration), dict[str, Tensor]()
+        start, step = starts.assignment(iteration)
         with collect_hits() as all_hits:
-            history.seconds["forward"] += _timed(device, lambda i=iteration, t=terms: t.update(problem.loss(i)))
+            stopwatch = Stopwatch(device)
+            terms = loss_of(step, start)
+            history.seconds["forward"] += stopwatch.seconds()
         numbers = dict(zip(terms, _to_floats([*terms.values()]), strict=True))
-        if not isnan(numbers["total"]):
-            history.seconds["backward"] += _timed(device, partial(step, terms["total"], rate))
-        elif starts.is_alone:
-            history.status, history.reason = RunStatus.NAN, _not_a_number(numbers, iteration, all_hits)
+        failure = _not_a_number(numbers, iteration, all_hits) if isnan(numbers["total"]) else ""
+        if not failure:
+            stopwatch = Stopwatch(device)
+            terms["total"].backward()
+            if optimiser.gradients_are_finite():
+                optimiser.step(settings.rate(iteration))
+            else:
+                failure = f"the gradient is not finite at iteration {iteration}"
+            history.seconds["backward"] += stopwatch.seconds()
+        first_loss = starts.first_loss(start)
+        if starts.is_alone and failure:
+            history.status, history.reason = RunStatus.NAN, failure
+        elif starts.is_alone and numbers["total"] > DIVERGENCE_FACTOR * max(first_loss, least_reference):
+            history.status = RunStatus.DIVERGED
+            history.reason = f"the loss rose from {first_loss:.3g} to {numbers['total']:.3g} by iteration {iteration}"
+        starts.note(inf if failure else numbers["total"])
         history.counts = problem.counts - before
         line = {
             "iteration": iteration,
@@ -167,10 +178,9 @@ def optimise(
         }
         history.curve.append(line)
         history.peak_memory_bytes = memory.repeatable()
-        failed = _update_status(history, problem.parameters, least_reference)
         with memory.pause():
             on_step(line)
-        if failed or line["cost"] >= (settings.budget or inf):
+        if history.status is not RunStatus.OK or line["cost"] >= (settings.budget or inf):
             break
 
 
@@ -187,7 +197,8 @@ class _Adam:
             parameter.grad = None
 
     def gradients_are_finite(self) -> bool:
-        return all(bool(value.grad.isfinite().all()) for value in self.parameters if value.grad is not None)
+        gradients = [value.grad for value in self.parameters if value.grad is not None]
+        return isfinite(*_to_floats([get_total_norm(gradients, norm_type=inf)]))
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
@@ -198,11 +209,6 @@ class _Adam:
             values, gradients, averages, squares, steps = map(list, zip(*updates, strict=True))
             settings = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0}
             adam(values, gradients, averages, squares, [], steps, lr=rate, **settings, amsgrad=False, maximize=False)
-
-
-def _largest(parameters: list[Tensor]) -> Tensor:
-    """The largest magnitude of any parameter; not finite if a parameter is not."""
-    return get_total_norm([parameter.detach() for parameter in parameters], norm_type=inf)
 
 
 def _to_floats(numbers: list[Tensor]) -> list[float]:
@@ -216,25 +222,6 @@ def _not_a_number(numbers: dict[str, float], iteration: int, all_hits: Sequence[
     subject = f"the {' and the '.join(terms)} term{'s are' if len(terms) > 1 else ' is'}" if terms else "the loss is"
     misses = missing_distance_message(all_hits)
     return f"{subject} not a number at iteration {iteration}{f': {misses}' if misses else ''}"
-
-
-def _update_status(history: History, parameters: list[Tensor], least_reference: float) -> bool:
-    """Sets status and reason in the history if the loop must end; returns whether it must."""
-    loss, first = history.curve[-1]["total"], max(history.first_loss, least_reference)
-    iteration = history.curve[-1]["iteration"]
-    (largest,) = _to_floats([_largest(parameters)])
-    if history.status is RunStatus.OK and not isfinite(largest):
-        history.status, history.reason = RunStatus.NAN, f"a parameter is not finite at iteration {iteration}"
-    elif loss > DIVERGENCE_FACTOR * first:
-        history.status = RunStatus.DIVERGED
-        history.reason = f"the loss rose from {history.first_loss:.3g} to {loss:.3g} by iteration {iteration}"
-    return history.status is not RunStatus.OK
-
-
-def _timed(device: torch.device, work: Callable[[], Any]) -> float:
-    stopwatch = Stopwatch(device)
-    work()
-    return stopwatch.seconds()
 
 
 @dataclass(frozen=True)
@@ -279,7 +266,7 @@ class Starts:
     """Assigns iterations to starts, and keeps the starts with the smallest losses; ground truth is not used."""
 
     settings: StartSettings
-    losses: list[dict[int, Tensor]] = field(init=False)  # by start and step
+    losses: list[dict[int, float]] = field(init=False)  # by start and step
     remaining: list[int] = field(init=False)  # the best first after a round
     round_start: int = 0  # first iteration of this round
     steps_before: int = 0  # steps of each remaining start before this round
@@ -297,9 +284,14 @@ class Starts:
         self.is_alone = len(self.remaining) == 1
         return self.latest
 
-    def note(self, start: int, step: int, loss: Tensor) -> None:
-        """Records the loss of a start's step, NaN as infinite; the last loss of a round ends the round."""
-        self.losses[start][step] = loss.detach().nan_to_num(inf, inf)
+    def first_loss(self, start: int) -> float:
+        """The first finite loss of a start; infinite before."""
+        return next((loss for loss in self.losses[start].values() if isfinite(loss)), inf)
+
+    def note(self, loss: float) -> None:
+        """Records the loss of the latest assignment, infinite if it failed; the last loss of a round ends the round."""
+        start, step = self.latest
+        self.losses[start][step] = loss
         end = self.steps_before + self.settings.trial
         if len(self.remaining) > 1 and all(end - 1 in self.losses[index] for index in self.remaining):
             self.round_start, self.steps_before = self.round_start + len(self.remaining) * self.settings.trial, end
@@ -310,6 +302,6 @@ class Starts:
         return self.remaining[0]
 
     def _score(self, start: int) -> float:
-        """The mean loss of a start at the end of a round; infinite if a loss was NaN."""
+        """The mean loss of a start at the end of a round; infinite if one failed."""
         last = [self.losses[start][step] for step in range(max(self.steps_before - SCORED_STEPS, 0), self.steps_before)]
-        return float(torch.stack(last).mean())
+        return sum(last) / len(last)

@@ -229,9 +229,8 @@ class PoseProblem:
         camera = self.cameras[best].with_object_moved(twist) if bool(twist.isfinite().all()) else self.cameras[best]
         return camera.to(torch.device("cpu"))
 
-    def loss(self, iteration: int) -> dict[str, Tensor]:
+    def loss(self, step: int, start: int = 0) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
-        start, step = self.starts.assignment(iteration)
         camera = self.cameras[start].with_object_moved(self.parameters[start])
         renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.shape_field, self.counts)
         rendering = render_checked(renderer, metered, rays)
@@ -250,9 +249,7 @@ class PoseProblem:
         if self.settings.normal_weight:
             normals = in_camera_axes(autograd_normals(metered, rendering.points[compared].detach()), camera)
             terms["normals"] = self.settings.normal_weight * normal_error(normals, self.normals[compared])
-        total = torch.stack(list(terms.values())).sum()
-        self.starts.note(start, step, total)
-        return {"total": total, **terms}
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
 
 def in_camera_axes(normals: Float[Tensor, "*batch 3"], camera: Camera) -> Float[Tensor, "*batch 3"]:
