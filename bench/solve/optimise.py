@@ -112,7 +112,7 @@ def optimise(
     """Runs Adam on the problem's parameters.
 
     The first loss is a warm-up. A start takes no step if its loss is NaN or its gradient is not finite. Other starts
-    go on; the last start ends the loop. It also ends the loop if its loss is far above its first one.
+    go on. If one start remains, its failure ends the loop, and so does a loss far above its first one.
 
     Args:
         problem: returns the loss; its parameters are changed in place.
@@ -129,8 +129,9 @@ def optimise(
     loss_of = problem.loss if own_starts else lambda step, start: problem.loss(step)
 
     def warm_up() -> None:
+        step, start = 0, starts.assignment(0)[0]
         with collect_hits() as all_hits:
-            loss = loss_of(0, 0)["total"]
+            loss = loss_of(step, start)["total"]
         if history.notes is not None and not bool(loss.isnan()):  # else the loop ends before the step, with the reason
             for hits in all_hits:
                 hits.check()

@@ -11,6 +11,7 @@ from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import (
     DIVERGENCE_FACTOR,
+    CannotContinue,
     History,
     OptimiserSettings,
     Starts,
@@ -284,7 +285,7 @@ def test_the_first_start_is_best_until_all_were_tried():
 
 
 class OneBadStart(Toy):
-    """Two starts; the first one has a loss or a gradient that is NaN, or a loss that is large, from a step on."""
+    """Two starts; from a step on, the first one has a loss or a gradient that is NaN, a large loss, or no pixel."""
 
     def __init__(self, bad: str, since: int = 0):
         super().__init__()
@@ -297,13 +298,15 @@ class OneBadStart(Toy):
         self.radius = self.radii[start]
         total = super().loss(step)["total"]
         if start == 0 and self.bad and step >= self.since:
+            if self.bad == "blind" and self.starts.is_alone:
+                raise CannotContinue("no pixel is left")
             infinite_slope = (self.radius - self.radius.detach()).abs().sqrt()
-            total = total + {"loss": torch.nan, "gradient": 0.0 * infinite_slope, "large": 1e6}[self.bad]
+            total = total + {"gradient": 0.0 * infinite_slope, "large": 1e6}.get(self.bad, torch.nan)
         return {"total": total}
 
 
 @pytest.mark.parametrize("since", [0, 1])  # 1 is the last step of the round
-@pytest.mark.parametrize("bad", ["loss", "gradient", "large"])
+@pytest.mark.parametrize("bad", ["loss", "gradient", "large", "blind"])
 def test_other_starts_go_on_if_a_start_fails(bad, since):
     problem = OneBadStart(bad, since)
     history = go(problem, 8)
