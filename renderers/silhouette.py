@@ -87,7 +87,7 @@ class Hinge:
     def of_rendering(
         self, field: Field, rays: Rays, rendering: Rendering, mask: Bool[Tensor, "*rays"]
     ) -> Float[Tensor, ""]:
-        """The loss of a rendering. Foreground hits have no loss; background hits have one, whatever their value.
+        """The loss of a rendering. A hit has no loss on the foreground, and a positive loss on the background.
 
         Hits of volume renderers and meshes may have a `closest` value above `epsilon`. On the background such a hit
         counts as a value of 0: its violation is `epsilon`.

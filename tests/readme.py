@@ -69,11 +69,11 @@ def recommendation() -> str:
     return (
         f"**Start with `{hard[0]}`.** With as many field evaluations as one whole DIST run (1 ×), `{hard[0]}` and "
         f"`{other}` make significantly more progress than all other renderers.\nThe difference between these two is "
-        f"not significant. `{hard[0]}` stays first with any problem set left out. On "
+        f"not significant. If one of the four problem sets is left out, `{hard[0]}` is still first. On "
         f"[hard scenes](results/paper/stability_cost.md), `{other}` has the worst mean rank.\nIn the time of one DIST "
         "run, in depth completion, "
-        f"`{hard[0]}` is first, and {', '.join(near[:-1])} and {near[-1]} are not significantly behind. "
-        "All others are. At the end of their runs, no two renderers can be distinguished. "
+        f"`{hard[0]}` is first. {', '.join(near[:-1])} and {near[-1]} do not differ significantly from it; "
+        "all other renderers do. At the end of their runs, no two renderers can be distinguished. "
         f"Over all sets, a run needs {costs[least]:.2g} (`{least}`) to {costs[most]:.2g} (`{most}`) times the "
         "field evaluations of a DIST run. The table has these ratios for completion alone."
     )

@@ -30,7 +30,7 @@ FIELD_FILE = "field.safetensors"  # the only file of a run folder that another r
 HASHED_LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
 RESERVED_BYTES = 64 * 1024  # kept free, so that the record can still be written on a full disk
 RESERVE_FILE = ".reserve"
-# Keys that change no result, such as a limit, but can decide whether a failed run fails again.
+# Keys that do not change a result, such as a limit. They can decide whether a failed run fails again.
 LIMIT_KEYS = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun", "plan", "tracker"}
 
 

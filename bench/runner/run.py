@@ -111,7 +111,7 @@ def make_or_reuse(run: PlannedRun, planned_at: str = "") -> Record:
 
 
 def _make(record: Record) -> Record:
-    """Makes the run of a record, which has the status killed until the end, then the final status."""
+    """Makes the run of a record. Its status is killed during the run, and final at the end."""
     folder, stopped, tracker, run = record.folder, "", None, RunInProgress(record)
     try:
         record.write(folder)  # inside the try, because a signal may follow immediately

@@ -132,7 +132,7 @@ def optimise(
         step, start = 0, starts.assignment(0)[0]
         with collect_hits() as all_hits:
             loss = loss_of(step, start)["total"]
-        if history.notes is not None and not bool(loss.isnan()):  # else the loop ends before the step, with the reason
+        if history.notes is not None and not bool(loss.isnan()):  # a NaN is reported by the first iteration
             for hits in all_hits:
                 hits.check()
             notes = [f"at the first iteration, {note}" for hits in all_hits if (note := hits.off_surface())]

@@ -34,7 +34,7 @@ COST_DEFINITIONS = {
     "evaluations.per_ray": "value evaluations divided by rays times iterations",
     "evaluations.work_over_bound": "the operations of all evaluations, divided by those of one value and one gradient "
     "per hit; absent without hits",
-    "seconds.warmup": "one step's forward and backward pass before the clock starts, with the check of its hits; its "
+    "seconds.warmup": "one forward and backward pass before the first iteration, with the check of its hits; its "
     "evaluations are not counted",
     "seconds.forward": "rendering and loss, over all iterations; the device is synchronised at both ends",
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
