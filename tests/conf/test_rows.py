@@ -82,7 +82,7 @@ def test_the_command_line_narrows_and_replaces_the_rows():
 def test_the_name_of_a_run_has_its_method():
     plan = swept("+experiment=table3", "index=0", "dataset=car")
     methods = [cell.method for cell in plan.cells]
-    names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "encoder", "mesh_encoder")
+    names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "mesh_long", "encoder", "mesh_encoder")
     assert methods == [f"multiview_{name}" for name in names]
     ids = ["multiview-dist_paper-car-multiview_paper", "multiview-dist-car-multiview_dist"]
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == ids
