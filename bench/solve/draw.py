@@ -18,7 +18,7 @@ from renderers.rendering import Renderer
 
 @runtime_checkable
 class InverseTask(Protocol):
-    """A task that is an inverse problem of a prior's code; `bench.solve.solve.solve_task` executes it."""
+    """A task that is an inverse problem of a prior's code; `solve_task` executes it."""
 
     optimiser: OptimiserSettings
 
@@ -54,7 +54,8 @@ def solve_and_draw(
     Args:
         gallery: whether pictures for galleries are written, if the configuration has a size for them.
     """
-    filmstrip, inputs = Filmstrip(run.inputs), run.inputs
+    inputs = run.inputs
+    filmstrip = Filmstrip(inputs)
     solution = solve(make_problem, settings, run, definitions, filmstrip.add)
     problem, states = solution.problem, solution.states
     with run.off_clock():

@@ -129,7 +129,7 @@ def optimise(
     loss_of = problem.loss if own_starts else lambda step, start: problem.loss(step)
 
     def warm_up() -> None:
-        step, start = 0, starts.assignment(0)[0]
+        start, step = starts.assignment(0)
         with collect_hits() as all_hits:
             loss = loss_of(step, start)["total"]
         if history.notes is not None and not bool(loss.isnan()):  # a NaN is reported by the first iteration

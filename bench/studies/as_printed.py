@@ -1,5 +1,7 @@
 """The settings of shape completion (DIST), the paper's and ours, with changes."""
 
+from functools import partial
+
 import pandas as pd
 
 from bench.report.study import Result, Runs, Selection, compare
@@ -27,6 +29,7 @@ DEFAULT = (
     "split of rays stay. The row “both” is the paper's setting with two changes, see the page `as_printed`.",
 )
 ALSO_SHOWN = ("dist_mask", "as_printed_official_long", "deepsdf_truncated", "deepsdf_official")
+Page = partial(compare.Comparison, hidden=("dense",))  # all runs have dense depth
 BACK = "default_"  # begins the presets of our default with one change back
 
 
@@ -36,26 +39,24 @@ def _changes_of_default(runs: Runs) -> pd.Series:
 
 def of_paper(runs: Runs) -> Result:
     """The paper's setting with changes towards ours."""
-    page = compare.Comparison(
+    page = Page(
         title="The paper's setting of DIST on dense depth, with changes.",
         question="Which part of the paper's setting causes its error?",
         reference="as_printed",
         name="the paper's setting",
         notes=lambda _: (*NOTES, *PAPER),
-        hidden=("dense",),
     )
     return page(runs.where(~_changes_of_default(runs)))
 
 
 def of_default(runs: Runs) -> Result:
     """Our default with one change back to the paper's setting."""
-    page = compare.Comparison(
+    page = Page(
         title="Our default setting of DIST on dense depth, with a change.",
         question="Which part of our setting of DIST lowers the error?",
         reference="dist_mask",
         name="our default",
         notes=lambda _: (*NOTES, *DEFAULT),
-        hidden=("dense",),
     )
     return page(runs.where(_changes_of_default(runs) | runs.frame.preset.isin(ALSO_SHOWN)))
 
