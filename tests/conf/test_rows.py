@@ -82,9 +82,10 @@ def test_the_command_line_narrows_and_replaces_the_rows():
 def test_the_name_of_a_run_has_its_method():
     plan = swept("+experiment=table3", "index=0", "dataset=car")
     methods = [cell.method for cell in plan.cells]
-    names = ("paper", "dist", "restarts", "idr", "dvr", "naive", "mesh", "mesh_long", "encoder", "mesh_encoder")
+    rows = "paper paper_neither paper_clamp dist restarts idr dvr naive mesh mesh_long encoder mesh_encoder"
+    names = rows.split()
     assert methods == [f"multiview_{name}" for name in names]
-    ids = ["multiview-dist_paper-car-multiview_paper", "multiview-dist-car-multiview_dist"]
+    ids = [f"multiview-dist_paper-car-multiview_{name}" for name in names[:2]]
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == ids
     plan = swept("seed=0,1")
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells] == ["completion-dist-sofa"] * 2
