@@ -161,8 +161,10 @@ class BoundDecoder:
             values = _FrozenDecoder.apply(self, flat, *(bias for _, bias in self.hidden))
             assert isinstance(values, Tensor)
             return values.view(points.shape[:-1])
-        forward = self._forward if needs_graph else self._fastest_forward(flat)
-        chunks = [forward(chunk) for chunk in split_into_passes(flat, self._width)]
+        compiled = None if needs_graph else self.compiled_for(flat)
+        if compiled is not None:
+            return compiled.values(flat).view(points.shape[:-1])
+        chunks = [self._forward(chunk) for chunk in split_into_passes(flat, self._width)]
         values = torch.cat(chunks) if len(chunks) != 1 else chunks[0]
         return values.view(points.shape[:-1])
 
@@ -190,11 +192,10 @@ class BoundDecoder:
             self._copies[state] = compile_decoder(self.hidden, self.last, self.skip)
         return self._copies[state]
 
-    def _fastest_forward(self, points: Tensor) -> PointFunction:
-        """The fastest function from points to values without a graph: compiled code if available, on one thread."""
+    def compiled_for(self, points: Tensor) -> CompiledDecoder | None:
+        """The compiled decoder, if there is one for these points: float32 on a CPU with one thread."""
         is_supported = points.dtype == torch.float32 and points.device.type == "cpu" and torch.get_num_threads() == 1
-        compiled_decoder = self._compiled() if is_supported else None
-        return self._forward if compiled_decoder is None else compiled_decoder.values
+        return self._compiled() if is_supported else None
 
     def _forward(self, points: Tensor, gates: tuple[Tensor, ...] = ()) -> Tensor:
         """The values. Sets `gates`, unless empty, to True where a ReLU's output is positive."""
@@ -225,35 +226,53 @@ class BoundDecoder:
 class _FrozenDecoder(torch.autograd.Function):
     """A decoder whose weights need no gradient, with less memory and time than autograd.
 
-    The backward pass needs only the signs of the ReLUs' inputs: one byte per neuron. It works chunk by chunk, and skips
-    points whose value has a zero gradient.
+    Compiled code computes the features again in the backward pass. Without it, the forward pass keeps the signs of the
+    ReLUs' inputs, one byte per neuron, and the backward pass works chunk by chunk. Both skip points whose value has a
+    zero gradient. The gradients are linear in those of the values, and have a derivative towards these alone: the
+    second derivatives of a ReLU network are 0 almost everywhere.
     """
 
     @staticmethod
     def forward(ctx: Any, field: BoundDecoder, points: Tensor, *biases: Tensor) -> Tensor:
-        ctx.field = field
-        gates = [torch.empty(len(points), len(b), dtype=torch.bool, device=points.device) for b in biases]
-        values = points.new_empty(len(points))
-        size = points_per_pass(field._width, points.dtype, points.device)
-        for start in range(0, len(points), size):
-            batch = slice(start, start + size)
-            values[batch] = field._forward(points[batch], tuple(gate[batch] for gate in gates))
+        ctx.field, ctx.compiled = field, field.compiled_for(points)
+        if ctx.compiled is not None:
+            ctx.save_for_backward(points)
+            return ctx.compiled.values(points)
+        values, gates = _values_and_gates(field, points)
         ctx.save_for_backward(*gates)
         return values
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = gradients
+        (gradient,), all_gates = gradients, ctx.saved_tensors
+        if ctx.compiled is not None:
+            (points,) = ctx.saved_tensors
+            if not gradient.requires_grad:
+                to_points, to_biases = ctx.compiled.gradients(points, gradient, ctx.needs_input_grad[2:])
+                return None, to_points, *to_biases
+            _, all_gates = _values_and_gates(ctx.field, points.detach())
         towards_points = gradient.new_zeros(len(gradient), 3)
-        towards_biases = [gradient.new_zeros(gate.shape[1]) for gate in ctx.saved_tensors]
+        towards_biases = [gradient.new_zeros(gate.shape[1]) for gate in all_gates]
         size = points_per_pass(ctx.field._width, gradient.dtype, gradient.device)
         for rows in gradient.nonzero().squeeze(-1).split(size):
-            gates = [gate[rows] for gate in ctx.saved_tensors]
+            gates = [gate[rows] for gate in all_gates]
             point_gradient, bias_gradients = ctx.field._backward(gradient[rows], gates)
             towards_points.index_put_((rows,), point_gradient)
             for sum_of_gradients, bias_gradient in zip(towards_biases, bias_gradients, strict=True):
                 sum_of_gradients += bias_gradient.sum(0)
         return None, towards_points, *towards_biases
+
+
+@torch.no_grad()
+def _values_and_gates(field: BoundDecoder, points: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """The values, and whether each ReLU's input is positive [points, width], for each hidden layer."""
+    gates = [torch.empty(len(points), len(b), dtype=torch.bool, device=points.device) for _, b in field.hidden]
+    values = points.new_empty(len(points))
+    size = points_per_pass(field._width, points.dtype, points.device)
+    for start in range(0, len(points), size):
+        batch = slice(start, start + size)
+        values[batch] = field._forward(points[batch], tuple(gate[batch] for gate in gates))
+    return values, gates
 
 
 def split_into_passes(

@@ -1,8 +1,9 @@
 """Compiled code that replaces PyTorch, with equal values up to rounding; built once per machine, if possible.
 
-It computes values of float32 ReLU networks without a gradient, on one thread of a CPU; PyTorch computes all else, such
-as values with a gradient and coarse values. Renderers need these in different proportions, so ratios of runtimes depend
-on the engine; a record names it under `kernels`. `IMPLICIT_BENCH_KERNELS=torch` uses PyTorch for everything.
+It computes values of float32 ReLU networks, and their gradients towards points and biases, on one thread of a CPU.
+PyTorch computes all else, such as gradients towards weights and coarse values. Renderers need these in different
+proportions, so ratios of runtimes depend on the engine; a record names it under `kernels`.
+`IMPLICIT_BENCH_KERNELS=torch` uses PyTorch for everything.
 """
 
 import ctypes
@@ -58,6 +59,8 @@ def kernels() -> Kernels:
         return Kernels(None, f"{TORCH}: {' '.join(str(error).split())[:200]}")
     pointer, count = ctypes.c_void_p, ctypes.c_int64
     library.decoder_values.argtypes, library.decoder_values.restype = [pointer, pointer, count, pointer], None
+    library.decoder_gradients.argtypes = [pointer, pointer, count, pointer, pointer, pointer]
+    library.decoder_gradients.restype = None
     return Kernels(library, COMPILED)
 
 

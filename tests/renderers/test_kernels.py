@@ -1,4 +1,4 @@
-"""Compiled values against their plain twin; and that runs without a compiler do the same more slowly."""
+"""Compiled values and gradients against their plain twin; and that runs without a compiler do the same more slowly."""
 
 import os
 import subprocess
@@ -60,21 +60,72 @@ def test_values_are_those_of_torch(name, count):
     field = make(name).at(torch.linspace(-1, 1, 4))
     points = 2 * torch.rand(count, 3) - 1
     with using_threads(1):
-        assert field._fastest_forward(points) == field._compiled().values
+        assert field.compiled_for(points) is field._compiled()
         torch.testing.assert_close(field(points), field._forward(points), rtol=1e-6, atol=1e-6)
         if count > 5:
             points[2], points[4] = torch.nan, torch.inf
             assert torch.equal(field(points).isnan(), field._forward(points).isnan()) and field(points).isnan().any()
 
 
+def gradients(forward, points: torch.Tensor, code: torch.Tensor, to_values: torch.Tensor):
+    """The gradients of points and code, of values by `forward`."""
+    return torch.autograd.grad(forward(points), (points, code), to_values)
+
+
 @with_compiler
-def test_what_has_a_gradient_another_type_or_threads_is_left_to_torch(monkeypatch):
+@each("name", NETWORKS)
+@each("count", [1, 48, 301])
+def test_gradients_are_those_of_torch_in_float64(name, count):
+    """Of points and code, with zeros among the gradients of values; all values have a gradient, or one."""
+    decoder, generator = make(name), torch.Generator().manual_seed(1)
+    points = 2 * torch.rand(count, 3, generator=generator) - 1
+    to_values = torch.randn(count, generator=generator) * (torch.rand(count, generator=generator) > 0.3)
+    with using_threads(1):
+        for weights in (to_values, torch.zeros(count), torch.ones(count)):
+            leaf, code = points.clone().requires_grad_(), torch.linspace(-1, 1, 4).requires_grad_()
+            compiled = gradients(make(name).at(code), leaf, code, weights)
+            twin, code = decoder.double(), code.detach().double().requires_grad_()
+            leaf = leaf.detach().double().requires_grad_()
+            expected = gradients(twin.at(code)._forward, leaf, code, weights.double())
+            for gradient, truth in zip(compiled, expected, strict=True):
+                scale = max(float(truth.abs().max()), 1e-9)
+                torch.testing.assert_close(gradient.double(), truth, rtol=0, atol=3e-6 * scale)
+
+
+@with_compiler
+def test_a_nan_spoils_the_gradient_of_its_point_alone():
+    field, points = make("skip").at(torch.zeros(4)), torch.rand(50, 3)
+    points[7] = torch.nan
+    weights = torch.ones(50)
+    weights[9] = torch.nan
+    with using_threads(1):
+        leaf = points.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(field(leaf), leaf, weights)
+        without = torch.arange(50)[(torch.arange(50) != 7) & (torch.arange(50) != 9)]
+        other = points[without].requires_grad_()
+        (expected,) = torch.autograd.grad(field(other), other, torch.ones(48))
+    torch.testing.assert_close(gradient[without], expected)
+    assert gradient[9].isnan().all()
+
+
+@with_compiler
+def test_compiled_gradients_have_a_derivative_towards_those_of_the_values():
+    """Which the derivatives of a rendering by the points' motion use (task=gradients)."""
+    field, weights = make("skip").at(torch.zeros(4)), torch.linspace(1, 2, 5).requires_grad_()
+    points = torch.rand(5, 3, requires_grad=True)
+    with using_threads(1):
+        (gradient,) = torch.autograd.grad(field(points), points, weights, create_graph=True)
+        (derivative,) = torch.autograd.grad(gradient.sum(), weights)
+        (expected,) = torch.autograd.grad(field(points).sum(), points)
+    torch.testing.assert_close(derivative, expected.sum(1))
+
+
+@with_compiler
+def test_weights_with_a_gradient_another_type_or_threads_are_left_to_torch(monkeypatch):
     monkeypatch.setattr(environment, "kernels", lambda: COMPILED)
     monkeypatch.setattr(BoundDecoder, "_compiled", lambda self: pytest.fail("compiled code was asked"))
     points, code = torch.rand(5, 3), torch.zeros(4)
     with using_threads(1):
-        assert make("skip").at(code.clone().requires_grad_())(points).requires_grad
-        assert make("skip").at(code)(points.clone().requires_grad_()).requires_grad
         assert make("skip").requires_grad_(True).at(code)(points).requires_grad
         make("skip").double().at(code.double())(points.double())
     with using_threads(2), torch.no_grad():
