@@ -20,7 +20,9 @@ from renderers.fields.mlp import bfloat16_is_faster
 from renderers.kernels.library import kernels
 
 ROOT = Path(__file__).resolve().parents[2]
-GEMM_SIDE, GEMM_REPEATS = 1024, 6  # square matrices; the first product is a warm-up
+# Rows of the square matrices of `gemm_peak`: up to two threads reach the same rate with the smaller ones, in an eighth
+# of the time. The first product is a warm-up.
+GEMM_SIDE, SMALL_GEMM_SIDE, MAX_SMALL_GEMM_THREADS, GEMM_REPEATS = 1024, 512, 2, 6
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
 CODE_ONLY = ("--", ".", ":(exclude)results")  # arguments of git: results are written by reports
 DENORMAL_BITS = 713_623  # 1e-39, below float32's full precision, as bits, since the number itself may become 0
@@ -41,10 +43,11 @@ def pick_device(wanted: str) -> torch.device:
 
 def describe(device: torch.device) -> dict[str, Any]:
     """The environment as plain data for the record."""
+    diff = _git("diff", "HEAD", *CODE_ONLY)
     return {
         "commit": _git("rev-parse", "HEAD"),
-        "dirty": bool(_git("status", "--porcelain", "--untracked-files=no", *CODE_ONLY)),
-        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if (diff := _git("diff", "HEAD", *CODE_ONLY)) else "",
+        "dirty": bool(diff),
+        "diff": hashlib.sha256(diff.encode()).hexdigest()[:12] if diff else "",
         "implicit_bench": version("implicit-bench") or "",
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
@@ -107,13 +110,15 @@ def _denormals_flushed() -> bool:
 
 def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32) -> float:
     """Best rate of a matrix product on this device with the current threads, in operations per second."""
-    matrix = torch.rand(GEMM_SIDE, GEMM_SIDE, device=device).to(dtype)
+    small = device.type == "cpu" and torch.get_num_threads() <= MAX_SMALL_GEMM_THREADS
+    side = SMALL_GEMM_SIDE if small else GEMM_SIDE
+    matrix = torch.rand(side, side, device=device).to(dtype)
     least_seconds = float("inf")
     for _ in range(GEMM_REPEATS):
         stopwatch = Stopwatch(device)
         matrix @ matrix
         least_seconds = min(least_seconds, stopwatch.seconds())
-    return 2 * GEMM_SIDE**3 / least_seconds
+    return 2 * side**3 / least_seconds
 
 
 def seconds_at_peak(environment: dict[str, Any], flops: int, coarse_flops: int) -> float:
