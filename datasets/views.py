@@ -5,7 +5,7 @@ from math import asin, atan2, degrees, inf, nan, radians, tan
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderers.camera import Camera
@@ -89,6 +89,15 @@ def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor
     motion = torch.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation, -rotation @ eye
     return motion
+
+
+def pixel_of_each_block(height: int, width: int, side: int, generator: torch.Generator) -> Int[Tensor, " blocks"]:
+    """Indices of pixels by rows: a random one of each block of `side` x `side`; blocks at an edge are smaller."""
+    rows, columns = (torch.arange(0, length, side) for length in (height, width))
+    drawn = torch.rand(2, len(rows), len(columns), generator=generator)
+    row = rows[:, None] + (drawn[0] * (height - rows).clamp_max(side)[:, None]).long()
+    column = columns + (drawn[1] * (width - columns).clamp_max(side)).long()
+    return (row * width + column).flatten()
 
 
 def observed_pixels(mask: Bool[Tensor, "height width"], points: str | int, seed: int) -> Bool[Tensor, "height width"]:

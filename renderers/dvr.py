@@ -11,7 +11,15 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field
 from renderers.gradients import attach_implicit_gradient, reevaluate_with_graph
-from renderers.rendering import LEVEL_SET_CAPABILITIES, Capabilities, RayObservation, Rendering, Status, assemble
+from renderers.rendering import (
+    LEVEL_SET_CAPABILITIES,
+    Capabilities,
+    RayObservation,
+    Rendering,
+    Status,
+    assemble,
+    schedule_position,
+)
 from renderers.silhouette import OCCUPANCY_POINTS, Occupancy
 from renderers.tracing.bracket import REFINEMENTS, SAMPLES_PER_BATCH, equally_spaced, first_crossing, refine
 
@@ -70,7 +78,7 @@ class DVR:
 
     def at_iteration(self, iteration: int) -> "DVR":
         """The renderer of an iteration: n is halved for each future doubling (Sec. 3.5)."""
-        future_doublings = sum(iteration < doubling for doubling in self.doublings)
+        future_doublings = sum(schedule_position(iteration) < doubling for doubling in self.doublings)
         return replace(self, n_ray_samples=max(self.n_ray_samples // 2**future_doublings, 2))
 
     def render(self, field: Field, rays: Rays) -> Rendering:

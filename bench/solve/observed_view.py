@@ -21,6 +21,11 @@ DEPTH, POINTS = "depth", "points"  # errors averaged by a depth loss; see `bench
 DEPTH_LOSSES = (DEPTH, POINTS)
 
 
+def generator_of(seed: int, iteration: int) -> torch.Generator:
+    """The generator of an iteration's random draws, on the CPU."""
+    return torch.Generator().manual_seed(seed * 1_000_003 + iteration)
+
+
 def depth_error(
     loss: str, predicted: Float[Tensor, "*rays"], observed: Float[Tensor, "*rays"], per_distance: Float[Tensor, "*rays"]
 ) -> Float[Tensor, "*rays"]:
@@ -106,6 +111,10 @@ class ObservedView:
     def to(self, device: torch.device) -> "ObservedView":
         """The same observations on a device."""
         return self._map_tensors(lambda tensor: tensor.to(device))
+
+    def flat(self) -> "ObservedView":
+        """The same observations in one row."""
+        return self._map_tensors(lambda each: each.flat() if isinstance(each, Rays) else each.flatten(0, 1))
 
     def select(self, rays: Int[Tensor, " n"]) -> "ObservedView":
         """The observations of the rays with these indices, for rays in one row."""

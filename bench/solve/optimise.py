@@ -5,6 +5,7 @@ Several starts share one budget of iterations: successive halving keeps the bett
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from math import cos, inf, isfinite, isnan, nan, pi
 from typing import Any, Protocol, runtime_checkable
 
@@ -18,10 +19,13 @@ from bench.records.record import RunStatus
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
 from renderers.hits import Hits, collect_hits, missing_distance_message
+from renderers.rendering import Iteration, schedule_position
 
 DIVERGENCE_FACTOR = 100.0  # times the first loss, or `least_reference` if larger: a loss above it has diverged
 HALVING_FACTOR = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
 SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of a round, since each sees other views
+ITERATIONS, BUDGET = "iterations", "budget"  # what ends a loop
+MIN_BUDGET_ITERATIONS = 10  # with fewer, a run that its budget ends has no result
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
 RATE_DROP_FRACTIONS = (0.6, 0.8)  # the rate of "steps" falls to a fifth there (DVR: 750 and 1,000 epochs)
 WARMUP_FRACTION = 0.1  # the rate of "ramped" rises over this fraction of the iterations
@@ -41,22 +45,35 @@ class OptimiserSettings:
         schedule: "constant"; "cosine": the rate falls to zero along half a cosine; "ramped": a cosine that rises from
             zero over the first tenth, for a start that is almost correct; "steps": falls to a fifth twice.
         budget: largest cost, see `renderers.field.Counts.cost`; the step that reaches it is the last.
+        ends: "iterations", the number of steps, with the budget as a limit; "budget": whatever the number of steps, and
+            schedules over `iterations` follow the spent fraction of the budget.
     """
 
     iterations: int
     learning_rate: float
     schedule: str
     budget: float | None = None
+    ends: str = ITERATIONS
 
     def __post_init__(self) -> None:
         check_at_least("task.optimiser.iterations", self.iterations, 1, "the paper uses 100")
         check_positive("task.optimiser.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
         check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
         if self.budget is not None:
-            check_positive("task.optimiser.budget", self.budget, "the suite has 6e6 to 2e7, null is none")
+            check_positive("task.optimiser.budget", self.budget, "the suite has 2.5e5 to 1e7, null is none")
+        check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET))
+        if self.ends == BUDGET and self.budget is None:
+            raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
+
+    def at(self, index: int, cost: float) -> int:
+        """The iteration with this index, if the cost before it is `cost`."""
+        if self.ends == ITERATIONS or self.budget is None:
+            return index
+        return Iteration(index, min(int(self.iterations * cost / self.budget), self.iterations - 1))
 
     def rate(self, iteration: int) -> float:
         """The learning rate of an iteration, counted from 0."""
+        iteration = schedule_position(iteration)
         elapsed = iteration / self.iterations
         if self.schedule in ("constant", "steps"):
             drops = sum(elapsed >= fraction for fraction in RATE_DROP_FRACTIONS) if self.schedule == "steps" else 0
@@ -111,6 +128,8 @@ def optimise(
 ) -> None:
     """Runs Adam on the problem's parameters.
 
+    A run that a budget ends after fewer than `MIN_BUDGET_ITERATIONS` iterations is unsupported.
+
     The first loss is a warm-up. A start takes no step if its loss is NaN or its gradient is not finite. Other starts
     go on. If one start remains, its failure ends the loop, and so does a loss far above its first one.
 
@@ -144,33 +163,34 @@ def optimise(
     history.seconds["warmup"] = stopwatch.seconds()
     before = replace(problem.counts)
     memory = MemoryPeak(device)
-    for iteration in range(settings.iterations):
+    for index in range(settings.iterations) if settings.ends == ITERATIONS else count():
         optimiser.forget_gradients()
-        start, step = starts.assignment(iteration)
+        start, step = starts.assignment(index)
+        iteration = settings.at(step, history.counts.cost)
         with collect_hits() as all_hits:
             stopwatch = Stopwatch(device)
-            terms = loss_of(step, start)
+            terms = loss_of(iteration, start)
             history.seconds["forward"] += stopwatch.seconds()
         numbers = dict(zip(terms, _to_floats([*terms.values()]), strict=True))
-        failure = _not_a_number(numbers, iteration, all_hits) if isnan(numbers["total"]) else ""
+        failure = _not_a_number(numbers, index, all_hits) if isnan(numbers["total"]) else ""
         if not failure:
             stopwatch = Stopwatch(device)
             terms["total"].backward()
             if optimiser.gradients_are_finite():
-                optimiser.step(settings.rate(iteration))
+                optimiser.step(settings.rate(iteration if settings.ends == BUDGET else index))
             else:
-                failure = f"the gradient is not finite at iteration {iteration}"
+                failure = f"the gradient is not finite at iteration {index}"
             history.seconds["backward"] += stopwatch.seconds()
         first_loss = starts.first_loss(start)
         if starts.is_alone and failure:
             history.status, history.reason = RunStatus.NAN, failure
         elif starts.is_alone and numbers["total"] > DIVERGENCE_FACTOR * max(first_loss, least_reference):
             history.status = RunStatus.DIVERGED
-            history.reason = f"the loss rose from {first_loss:.3g} to {numbers['total']:.3g} by iteration {iteration}"
+            history.reason = f"the loss rose from {first_loss:.3g} to {numbers['total']:.3g} by iteration {index}"
         starts.note(inf if failure else numbers["total"])
         history.counts = problem.counts - before
         line = {
-            "iteration": iteration,
+            "iteration": index,
             "seconds": history.seconds["forward"] + history.seconds["backward"],
             "value_evaluations": history.counts.value + history.counts.coarse,
             "gradient_evaluations": history.counts.gradient,
@@ -181,8 +201,21 @@ def optimise(
         history.peak_memory_bytes = memory.repeatable()
         with memory.pause():
             on_step(line)
-        if history.status is not RunStatus.OK or line["cost"] >= (settings.budget or inf):
+        is_spent = line["cost"] >= (settings.budget or inf)
+        if history.status is RunStatus.OK and settings.ends == BUDGET:
+            history.reason = _budget_problem(len(history.curve), line["cost"], is_spent)
+            history.status = RunStatus.UNSUPPORTED if history.reason else RunStatus.OK
+        if is_spent or history.status is not RunStatus.OK:
             break
+
+
+def _budget_problem(iterations: int, cost: float, is_spent: bool) -> str:
+    """Why a budget cannot end a loop: it pays for too few iterations, or nothing is spent. Empty if it can."""
+    if not cost:
+        return "an iteration evaluates no field, so that a budget never ends: set task.optimiser.ends=iterations"
+    if is_spent and iterations < MIN_BUDGET_ITERATIONS:
+        return f"the budget paid for {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}: take a larger one"
+    return ""
 
 
 class _Adam:
@@ -253,8 +286,11 @@ class StartSettings:
         """The iterations of the last start, from a budget."""
         return iterations - self.trials + self.trial * len(self.rounds)
 
-    def check(self, iterations: int) -> None:
-        """Raises ValueError if the rounds would use up the budget."""
+    def check(self, settings: OptimiserSettings) -> None:
+        """Raises ValueError if the rounds would use up the iterations, or if their number is not known."""
+        iterations = settings.iterations
+        if self.count > 1 and settings.ends == BUDGET:
+            raise ValueError(f"{self.count} starts share a number of iterations: set task.optimiser.ends=iterations")
         if self.trials >= iterations:
             raise ValueError(
                 f"task.optimiser.iterations must be more than {self.trials}, not {iterations}: {self.count} starts "

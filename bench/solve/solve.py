@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,13 +17,14 @@ from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Shown
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.optimise import CannotContinue, History, Optimisable, OptimiserSettings, optimise
+from bench.solve.optimise import ITERATIONS, CannotContinue, History, Optimisable, OptimiserSettings, optimise
 from datasets.mesh import Mesh
 from datasets.saved_field import FIELD_FILE, save_field
 from renderers.camera import Camera
 from renderers.field import Counts, Field
-from renderers.rendering import Renderer, Unsupported, check_kind
+from renderers.rendering import Renderer, Unsupported, check_kind, schedule_position
 
+CHECKPOINT_BUDGET_SHARES = 0.03, 0.1, 0.2, 0.5
 COST_DEFINITIONS = {
     "evaluations.value": "points whose field value was computed in the optimisation loop, counted at the field",
     "evaluations.coarse": "points whose value was computed more cheaply, in bfloat16, where it decides nothing; absent "
@@ -204,7 +206,7 @@ def run_optimisation(
         least_reference: see `bench.solve.optimise.optimise`.
     """
     history = History(notes=[])
-    checkpoints = checkpoints_of(run.inputs.evaluation.every, settings.iterations)
+    checkpoints = Checkpoints(run.inputs.evaluation.every, settings)
     checkpoint_errors: dict[int, dict[str, float]] = {}
 
     def check(iteration: int) -> None:
@@ -220,11 +222,12 @@ def run_optimisation(
         def on_step(line: dict[str, Any]) -> None:
             line |= checkpoint_errors.get(line["iteration"], {})
             write_line(line)
-            if history.status is RunStatus.OK and line["iteration"] + 1 in checkpoints:
+            if history.status is RunStatus.OK and checkpoints.is_due(line["iteration"] + 1, line["cost"]):
                 check(line["iteration"] + 1)
-            run.progress("optimising", line["iteration"] + 1, settings.iterations, line["total"])
+            position = schedule_position(settings.at(line["iteration"], line["cost"]))
+            run.progress("optimising", position + 1, settings.iterations, line["total"])
 
-        if checkpoints:
+        if checkpoints.enabled:
             check(0)
         try:
             note_objective()
@@ -237,6 +240,28 @@ def run_optimisation(
             run.record.notes = [*run.record.notes, *history.notes]
             _note_history(run.record, problem, history)
     return history
+
+
+class Checkpoints:
+    """Decides when the state is evaluated: after some numbers of steps, or at fractions of a budget that ends the loop.
+
+    Args:
+        interval: see `checkpoints_of`; without one, there is no checkpoint.
+    """
+
+    def __init__(self, interval: int | str | None, settings: OptimiserSettings) -> None:
+        self.enabled, self.settings = interval is not None, settings
+        self.steps = checkpoints_of(interval, settings.iterations)
+        self.shares = [*CHECKPOINT_BUDGET_SHARES] if self.enabled else []
+
+    def is_due(self, steps: int, cost: float) -> bool:
+        """Whether the state after this number of steps, at this cost, is evaluated."""
+        if self.settings.ends == ITERATIONS:
+            return steps in self.steps
+        spent = cost / (self.settings.budget or inf)
+        passed = sum(share <= spent for share in self.shares)
+        self.shares = self.shares[passed:]
+        return passed > 0 and spent < 1
 
 
 def checkpoints_of(interval: int | str | None, iterations: int) -> set[int]:

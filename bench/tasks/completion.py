@@ -1,5 +1,6 @@
 """Shape completion: optimises a latent code to match a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -11,13 +12,14 @@ from bench.pictures.run_figures import InputView
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.draw import solve_task
-from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
-from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
+from bench.solve.observed_view import DEPTH_LOSSES, ObservedView, generator_of
 from bench.solve.optimise import OptimiserSettings, StartSettings
 from bench.solve.solve import check_field_gradient, save_in_world
 from datasets.scene import OneView, Scene, unshaded_image
-from datasets.views import observed_pixels, parse_amount
+from datasets.views import observed_pixels, parse_amount, pixel_of_each_block
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
+from renderers.field import Field
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
@@ -48,6 +50,7 @@ class Completion:
         rotations: number of initial rotations of the similarity, about the vertical axis.
         trial: iterations of each start; see `bench.solve.optimise.StartSettings`.
         optimiser: iterations and learning rates.
+        pixel_block: pixels per side of a block of which each iteration compares one random pixel; 1 compares all.
     """
 
     points: str
@@ -65,6 +68,7 @@ class Completion:
     rotations: int
     trial: int
     optimiser: OptimiserSettings
+    pixel_block: int = 1
 
     takes_field: ClassVar[bool] = True
     takes_one_view: ClassVar[bool] = True
@@ -76,9 +80,10 @@ class Completion:
         for name in ("depth_weight", "normal_weight", "colour_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
         check_positive("task.normal_width", self.normal_width, "0.02 is two thirds of a pixel at 64 x 64")
+        check_at_least("task.pixel_block", self.pixel_block, 1, "2 compares a quarter of the pixels")
         check_at_least("task.rotations", self.rotations, 1, "12 are 30 degrees apart")
         if self.similarity:
-            StartSettings(self.rotations, self.trial).check(self.optimiser.iterations)
+            StartSettings(self.rotations, self.trial).check(self.optimiser)
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput if the settings need a prior, or one with colours, and there is none."""
@@ -112,12 +117,24 @@ class Completion:
         check_field_gradient(renderer)
         observed_view = self._observed_view(scene, renderer, seed=seed, device=device)
         compared = observed_view.observed & (self.depth_weight > 0)
-        problem = partial(CodeProblem, prior, self.code, observed_view.compare, compared, compared.numel(), device)
+        rays = -(-compared.shape[0] // self.pixel_block) * -(-compared.shape[1] // self.pixel_block)
+        compare = observed_view.compare if self.pixel_block == 1 else self._compare_blocks(observed_view, seed)
+        problem = partial(CodeProblem, prior, self.code, compare, compared, rays, device)
         problem = partial(problem, mask=observed_view.mask is not None, coloured=self.colour_weight > 0)
         if not self.similarity:
             return problem()
         codes = torch.zeros(self.rotations, prior.decoder.code_length)
         return problem(initial=codes, initial_similarities=initial_rotations(self.rotations), trial=self.trial)
+
+    def _compare_blocks(self, view: ObservedView, seed: int) -> Callable[[Field, int], Terms]:
+        """Compares a random pixel of each block, drawn anew in each iteration."""
+        (height, width), flat = view.observed.shape, view.flat()
+
+        def compare(field: Field, iteration: int) -> Terms:
+            pixels = pixel_of_each_block(height, width, self.pixel_block, generator_of(seed, iteration))
+            return flat.select(pixels.to(view.observed.device)).compare(field, iteration)
+
+        return compare
 
     def _pictured(self, scene: Scene, view: ObservedView) -> InputView:
         """The observations for pictures."""

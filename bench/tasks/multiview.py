@@ -22,7 +22,7 @@ from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Field
-from renderers.rendering import RayObservation, Renderer, at_iteration
+from renderers.rendering import RayObservation, Renderer, at_iteration, schedule_position
 from renderers.silhouette import SilhouetteLoss
 
 MIN_SCALE, MAX_SHIFT = 0.8, 0.2
@@ -112,7 +112,7 @@ class Multiview:
             )
         check_at_least("task.rotations", self.rotations, 1, "12 are 30 degrees apart")
         check_at_least("task.silhouette_weight", self.silhouette_weight, 0, "0 switches the term off")
-        self.start_settings.check(self.optimiser.iterations)
+        self.start_settings.check(self.optimiser)
 
     @property
     def start_settings(self) -> StartSettings:
@@ -278,7 +278,7 @@ class PhotometricLoss:
     def images_at(self, iteration: int) -> Float[Tensor, "views height width 3"]:
         """The images at an iteration; `coarse_blur` blurs them in the first half."""
         iterations = self.settings.start_settings.iterations_of_last(self.settings.optimiser.iterations)
-        sigma = self.settings.coarse_blur * self.colours.shape[1] * (1 - 2 * iteration / iterations)
+        sigma = self.settings.coarse_blur * self.colours.shape[1] * (1 - 2 * schedule_position(iteration) / iterations)
         return self.colours if sigma <= 0 else blur(self.colours, sigma)
 
 

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from math import atan2, degrees, radians, sqrt
+from math import atan2, degrees, prod, radians, sqrt
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,9 +22,10 @@ from bench.evaluate.state import REACH, State
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.draw import solve_and_draw
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, generator_of, normal_error
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings
 from datasets.scene import Scene, View, see
+from datasets.views import pixel_of_each_block
 from renderers.boundary import render_checked
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
@@ -125,6 +126,7 @@ class Pose(PoseTask):
         normal_weight: weight of one minus the cosine between normals in camera axes, the mean over the same pixels. Its
             gradient rotates the normals and does not move the points.
         optimiser: iterations and learning rates.
+        pixel_block: see `bench.tasks.completion.Completion`.
     """
 
     trial: int
@@ -136,14 +138,16 @@ class Pose(PoseTask):
     silhouette_weight: float
     normal_weight: float
     optimiser: OptimiserSettings
+    pixel_block: int = 1
 
     def __post_init__(self) -> None:
+        check_at_least("task.pixel_block", self.pixel_block, 1, "2 compares a quarter of the pixels")
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         check_choice("task.shape", self.shape, ("grid", "prior"))
         check_at_least("task.grid", self.grid, 8, "96 keep thin parts")
         for name in ("depth_weight", "silhouette_weight", "normal_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
-        StartSettings(self.starts, self.trial).check(self.optimiser.iterations)
+        StartSettings(self.starts, self.trial).check(self.optimiser)
         super().__post_init__()
 
     def check(self, inputs: RunInputs) -> None:
@@ -165,7 +169,7 @@ class Pose(PoseTask):
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
 
         def problem() -> PoseProblem:
-            return PoseProblem(self, inputs.renderer, shape_field, view, cameras, inputs.device)
+            return PoseProblem(self, inputs.renderer, shape_field, view, cameras, inputs.device, inputs.seed)
 
         solve_and_draw(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | RENDERER_DEFINITIONS)
 
@@ -189,6 +193,7 @@ class PoseProblem:
     view: View
     cameras: list[Camera]  # one per start
     device: torch.device
+    seed: int = 0
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = TRACKED
@@ -199,7 +204,8 @@ class PoseProblem:
         self.parameters = [torch.zeros(6, device=self.device, requires_grad=True) for _ in self.cameras]
         self.starts = Starts(StartSettings(len(self.cameras), self.settings.trial))
         self.depth, self.observed = self.view.depth.to(self.device), self.view.mask.to(self.device)
-        self.rays_per_iteration = self.observed.numel()
+        self.depth_per_distance = self.cameras[0].depth(torch.ones_like(self.depth))  # all starts have its lens
+        self.rays_per_iteration = prod(-(-length // self.settings.pixel_block) for length in self.depth.shape)
         self.normals = in_camera_axes(self.view.normals.to(self.device), self.view.camera.to(self.device))
 
     def field(self) -> Field:
@@ -232,23 +238,27 @@ class PoseProblem:
     def loss(self, step: int, start: int = 0) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
         camera = self.cameras[start].with_object_moved(self.parameters[start])
-        renderer, rays, metered = at_iteration(self.renderer, step), camera.rays(), Meter(self.shape_field, self.counts)
+        renderer, metered = at_iteration(self.renderer, step), Meter(self.shape_field, self.counts)
+        rays, observations = camera.rays(), (self.depth, self.depth_per_distance, self.observed, self.normals)
+        if self.settings.pixel_block > 1:
+            draw = generator_of(self.seed, step)
+            pixels = pixel_of_each_block(*self.depth.shape, self.settings.pixel_block, draw).to(self.device)
+            rays, observations = rays.flat()[pixels], [tensor.flatten(0, 1)[pixels] for tensor in observations]
+        depth, depth_per_distance, observed, normals = observations
         rendering = render_checked(renderer, metered, rays)
-        compared = self.observed & rendering.hit
+        compared = observed & rendering.hit
         count = compared.sum().clamp_min(1)
-        depth, depth_per_distance = camera.depth(rendering.distance), camera.depth(torch.ones_like(self.depth))
-        error = depth_error(self.settings.depth_loss, depth, self.depth, depth_per_distance)
-        observation = RayObservation(
-            self.observed, torch.where(self.observed, self.depth / depth_per_distance, torch.nan)
-        )
+        rendered = rendering.distance * depth_per_distance
+        error = depth_error(self.settings.depth_loss, rendered, depth, depth_per_distance)
+        observation = RayObservation(observed, torch.where(observed, depth / depth_per_distance, torch.nan))
         silhouette = self.settings.silhouette(renderer, metered, rays, rendering, observation)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,
             "silhouette": self.settings.silhouette_weight * silhouette,
         }
         if self.settings.normal_weight:
-            normals = in_camera_axes(autograd_normals(metered, rendering.points[compared].detach()), camera)
-            terms["normals"] = self.settings.normal_weight * normal_error(normals, self.normals[compared])
+            rendered_normals = in_camera_axes(autograd_normals(metered, rendering.points[compared].detach()), camera)
+            terms["normals"] = self.settings.normal_weight * normal_error(rendered_normals, normals[compared])
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
 

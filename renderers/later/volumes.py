@@ -14,7 +14,16 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, carries_gradient
 from renderers.gradients import reevaluate_with_graph
-from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Deferred, Rendering, Status, Volume, assemble
+from renderers.rendering import (
+    DISTANCE_CAPABILITIES,
+    Capabilities,
+    Deferred,
+    Rendering,
+    Status,
+    Volume,
+    assemble,
+    schedule_position,
+)
 from renderers.tracing.bracket import SAMPLES_PER_BATCH
 
 MIN_LIGHT = 1e-5  # samples that absorb less of a ray's light have neither a weight nor a gradient
@@ -59,7 +68,7 @@ Search = Callable[[Field, Rays, Tensor, Tensor], Samples]  # field, rays, entry 
 
 def schedule(first: float, last: float, over: int, iteration: int) -> float:
     """A setting at an iteration from 0: from `first` to `last` in `over` iterations, by a constant factor."""
-    return last * (first / last) ** max(1 - iteration / over, 0) if over else last
+    return last * (first / last) ** max(1 - schedule_position(iteration) / over, 0) if over else last
 
 
 def weights(log_transmittance: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:

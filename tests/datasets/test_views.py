@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from datasets.views import ViewSampler, observed_pixels
+from datasets.views import ViewSampler, observed_pixels, pixel_of_each_block
 from tests.looped import each
 
 VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=33)
@@ -106,3 +106,15 @@ def test_every_pixel_of_the_foreground_can_be_drawn():
     times = torch.stack([observed_pixels(MASK, "20%", seed=seed) for seed in range(60)]).sum(0)[MASK]
     assert times.min() > 0
     assert times.max() < 30  # 12 on average
+
+
+@each("height, width, side", [(8, 12, 4), (7, 5, 3), (4, 4, 1), (3, 2, 8)])
+def test_each_block_of_an_image_gives_a_random_pixel(height, width, side):
+    blocks = (torch.arange(height) // side)[:, None] * 100 + torch.arange(width) // side
+    expected, seen = blocks.unique().tolist(), set()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(200):
+        pixels = pixel_of_each_block(height, width, side, generator)
+        assert sorted(blocks.flatten()[pixels].tolist()) == expected
+        seen |= {*pixels.tolist()}
+    assert seen == {*range(height * width)}

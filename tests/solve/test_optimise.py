@@ -10,6 +10,7 @@ import torch
 from bench.config import load
 from bench.records.record import RunStatus
 from bench.solve.optimise import (
+    BUDGET,
     DIVERGENCE_FACTOR,
     CannotContinue,
     History,
@@ -22,6 +23,7 @@ from renderers.boundary import render_checked
 from renderers.checks import BrokenContract
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
+from renderers.rendering import schedule_position
 from tests.looped import each
 from tests.operations import Operations
 from tests.tiny import camera_of
@@ -323,10 +325,10 @@ def test_a_run_ends_with_nan_if_all_starts_are_nan():
 
 
 def test_rounds_must_leave_something_of_the_budget():
-    StartSettings(4, 8).check(33)
+    StartSettings(4, 8).check(OptimiserSettings(33, 0.1, "constant"))
     with pytest.raises(ValueError, match=r"optimiser\.iterations must be more than 32, not 32: 4 starts share it"):
-        StartSettings(4, 8).check(32)
-    StartSettings(1, 8).check(1)
+        StartSettings(4, 8).check(OptimiserSettings(32, 0.1, "constant"))
+    StartSettings(1, 8).check(OptimiserSettings(1, 0.1, "constant"))
 
 
 def test_the_step_that_reaches_the_budget_is_the_last_one():
@@ -338,3 +340,60 @@ def test_the_step_that_reaches_the_budget_is_the_last_one():
     assert history.status is RunStatus.OK
     with pytest.raises(ValueError, match="budget"):
         replace(settings, budget=0.0)
+
+
+class Changing(Toy):
+    """A toy whose iterations cost four times as much from the fifth on; it notes the iterations that it is given."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.iterations = []
+
+    def loss(self, iteration):
+        self.iterations.append(iteration)
+        terms = super().loss(iteration)
+        for _ in range(3 * (iteration >= 5)):
+            Meter(sphere(self.radius.detach()), self.counts)(torch.zeros(POINTS, 3))
+        return terms
+
+
+def spend(problem, budget: float, *, iterations: int = 100) -> History:
+    """Ends at a budget in multiples of `POINTS`; an iteration costs three, for a value and a gradient."""
+    history, settings = History(), OptimiserSettings(iterations, 0.05, "cosine", budget * POINTS, BUDGET)
+    optimise(problem, settings, CPU, history=history, on_step=lambda line: None)
+    return history
+
+
+def test_a_loop_that_its_budget_ends_follows_its_schedules_by_what_is_spent():
+    toy = Changing()
+    history = spend(toy, 100)
+    assert history.status is RunStatus.OK
+    costs = [line["cost"] / POINTS for line in history.curve]
+    assert costs[:6] == [3, 6, 9, 12, 15, 21] and costs[-2] < 100 <= costs[-1]
+    given = toy.iterations[1:]  # without the warm-up
+    assert [int(iteration) for iteration in given] == list(range(len(costs)))
+    assert [schedule_position(iteration) for iteration in given] == [int(cost) for cost in (0, *costs[:-1])]
+    rates = OptimiserSettings(100, 0.05, "cosine")
+    assert rates.rate(given[6]) == rates.rate(int(costs[5])) != rates.rate(6)
+
+
+@each("budget, reason", [(29, "paid for 8 iterations, fewer than 10"), (40, "")])
+def test_a_budget_that_pays_for_few_iterations_has_no_result(budget, reason):
+    history = spend(Changing(), budget)
+    assert (history.status is RunStatus.UNSUPPORTED) == bool(reason) and reason in history.reason
+
+
+def test_a_budget_that_nothing_is_spent_of_ends_the_loop():
+    class Free(Toy):
+        def loss(self, iteration):
+            return {"total": self.radius**2}
+
+    history = spend(Free(), 100)
+    assert history.status is RunStatus.UNSUPPORTED and "task.optimiser.ends=iterations" in history.reason
+
+
+def test_a_loop_that_its_budget_ends_needs_a_budget_and_a_single_start():
+    with pytest.raises(ValueError, match=r"task\.optimiser\.budget"):
+        OptimiserSettings(10, 0.1, "constant", ends=BUDGET)
+    with pytest.raises(ValueError, match=r"task\.optimiser\.ends=iterations"):
+        StartSettings(4, 8).check(OptimiserSettings(100, 0.1, "constant", 1e5, BUDGET))

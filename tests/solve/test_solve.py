@@ -1,6 +1,7 @@
 """The iterations at which the state of a run is evaluated."""
 
-from bench.solve.solve import checkpoints_of
+from bench.solve.optimise import BUDGET, OptimiserSettings
+from bench.solve.solve import Checkpoints, checkpoints_of
 from tests.looped import each
 
 
@@ -10,3 +11,11 @@ from tests.looped import each
 ])  # fmt: skip
 def test_checkpoints_begin_with_the_first_iteration_and_end_with_the_last(interval, iterations, expected):
     assert checkpoints_of(interval, iterations) == expected
+
+
+def test_checkpoints_of_a_loop_that_its_budget_ends_lie_at_fractions_of_it():
+    settings = OptimiserSettings(100, 0.1, "constant", 1000.0, BUDGET)
+    checkpoints = Checkpoints(5, settings)
+    costs = [20, 40, 90, 150, 400, 600, 990, 1001]
+    assert [cost for cost in costs if checkpoints.is_due(1, cost)] == [40, 150, 400, 600]
+    assert not any(Checkpoints(None, settings).is_due(1, cost) for cost in costs)

@@ -219,3 +219,28 @@ def test_a_renderer_with_a_schedule_is_as_it_is_at_the_iteration(problem_of):
     assert renderer.iteration_asked is None  # what is judged and drawn is by the renderer as configured
     optimise(problem, OptimiserSettings(3, 0.01, "constant"), CPU, history=History(), on_step=lambda line: None)
     assert [iteration for what, iteration in renderer.log if what == "render"] == [0, 0, 1, 2]  # the warm-up first
+
+
+class Single(Fake):
+    """A renderer of rays in one row; it notes their directions and the mask that it compares with."""
+
+    def render(self, field, rays):
+        self.directions = rays.directions
+        closest = field(rays.at(torch.ones(rays.shape)))
+        status = torch.full(rays.shape, Status.MISS, dtype=torch.int8)
+        return Rendering(
+            torch.ones(rays.shape), status, rays.at(torch.ones(rays.shape)), torch.zeros(rays.shape), closest
+        )
+
+
+def test_a_pixel_of_each_block_is_compared(scene, problem_of):
+    """Another one in each iteration, with its own observations."""
+    renderer = Single()
+    problem, rays, seen = problem_of(renderer, pixel_block=2), scene.view.camera.rays().flat(), set()
+    assert problem.rays_per_iteration == 1
+    for iteration in range(20):
+        problem.loss(iteration)
+        (pixel,) = (rays.directions == renderer.directions).all(-1).nonzero().squeeze(-1).tolist()
+        assert renderer.asked.tolist() == [scene.view.mask.flatten()[pixel].item()]
+        seen.add(pixel)
+    assert seen == {0, 1, 2, 3}

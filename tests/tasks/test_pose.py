@@ -116,6 +116,14 @@ def test_it_finds_the_pose_and_leaves_a_record(run):
     assert (run.folder / "strip.png").stat().st_size > 1000
 
 
+def test_a_pixel_of_each_block_is_compared(scene):
+    problem, sampled = problem_of(scene), problem_of(scene, pixel_block=2)
+    assert 4 * sampled.rays_per_iteration == problem.rays_per_iteration
+    losses = [sampled.loss(step)["depth"].item() for step in (*range(60), 3)]
+    assert losses[3] == losses[-1] and len({*losses}) > 50
+    assert sum(losses) / len(losses) == pytest.approx(problem.loss(0)["depth"].item(), rel=0.1)
+
+
 def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
     optimiser = OptimiserSettings(iterations, 0.1, "cosine")
     settings = replace(SETTINGS, degrees=90.0, optimiser=optimiser, **changed)

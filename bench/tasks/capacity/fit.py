@@ -14,11 +14,11 @@ from bench.records.record import RunStatus
 from bench.setup.auto import rays_share
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import gradients_at
+from bench.solve.observed_view import generator_of, gradients_at
 from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
 from bench.tasks.capacity.candidates import primitive_candidate
 from bench.tasks.capacity.model import Candidate, Evidence, Model, StartInputs
-from bench.tasks.capacity.observations import RayObservations, generator
+from bench.tasks.capacity.observations import RayObservations
 from bench.tasks.capacity.settings import FitSettings
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, Unsupported, check_kind, with_empty_memory
@@ -207,7 +207,7 @@ class FitProblem:
         terms = self.observations.terms(metered, step, self.share)
         self.error = self.observations.depth_error(terms)
         if not self.model.metric and settings.eikonal_weight:
-            points = scatter_points(self.observations.points, EIKONAL_POINTS, generator(EIKONAL_SEED, step))
+            points = scatter_points(self.observations.points, EIKONAL_POINTS, generator_of(EIKONAL_SEED, step))
             norms = torch.linalg.vector_norm(gradients_at(metered, points), dim=-1)
             terms["eikonal"] = settings.eikonal_weight * (norms - 1).square().mean()
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
@@ -250,7 +250,7 @@ class WarmStart:
         return {"total": self._loss(Meter(self.model.field(), self.counts), iteration)}
 
     def _loss(self, shape: Field, iteration: int) -> Float[Tensor, ""]:
-        draw = generator(self.seed, iteration)
+        draw = generator_of(self.seed, iteration)
         if self.target is not None:
             points = scatter_points(self.surface, self.count, draw)
             with torch.no_grad():

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.setup.auto import footprint
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import ObservedView, ViewLossSettings
+from bench.solve.observed_view import ObservedView, ViewLossSettings, generator_of
 from bench.tasks.capacity.held_out import HeldOut, HeldOutError
 from bench.tasks.capacity.settings import ViewSettings
 from datasets.scene import Truth, see
@@ -69,10 +69,10 @@ class RayObservations:
     def terms(self, field: Field, iteration: int, share: float) -> Terms:
         """The weighted terms of the loss over the rays drawn for an iteration, a fraction `share` of `rays`."""
         count = max(round(share * self.rays), 1)
-        chosen = torch.randint(len(self.through_sphere), (count,), generator=generator(self.seed, iteration))
+        chosen = torch.randint(len(self.through_sphere), (count,), generator=generator_of(self.seed, iteration))
         sampled = self.fitted.select(self.through_sphere[chosen.to(self.through_sphere.device)])
         with torch.random.fork_rng():  # a renderer's draws are also the same for every candidate
-            torch.manual_seed(generator(self.seed, iteration).initial_seed())
+            torch.manual_seed(generator_of(self.seed, iteration).initial_seed())
             return sampled.compare(field, iteration)
 
     def error(self, field: Field) -> HeldOutError:
@@ -207,8 +207,3 @@ def tiles(height: int, width: int) -> Int[Tensor, " pixels"]:
     """The tile of each pixel of a view, from 0, by rows; a tile is a group of pixels."""
     rows, columns = torch.arange(height) * TILES_PER_SIDE // height, torch.arange(width) * TILES_PER_SIDE // width
     return (rows[:, None] * TILES_PER_SIDE + columns).flatten()
-
-
-def generator(seed: int, iteration: int) -> torch.Generator:
-    """The random generator of an iteration, the same for every candidate."""
-    return torch.Generator().manual_seed(seed * 1_000_003 + iteration)
