@@ -118,8 +118,10 @@ class Completion:
         observed_view = self._observed_view(scene, renderer, seed=seed, device=device)
         compared = observed_view.observed & (self.depth_weight > 0)
         rays = -(-compared.shape[0] // self.pixel_block) * -(-compared.shape[1] // self.pixel_block)
-        compare = observed_view.compare if self.pixel_block == 1 else self._compare_blocks(observed_view, seed)
-        problem = partial(CodeProblem, prior, self.code, compare, compared, rays, device)
+        compare, all_pixels = observed_view.compare, None
+        if self.pixel_block > 1:
+            compare, all_pixels = self._compare_blocks(observed_view, seed), self._loss_of_all_pixels(observed_view)
+        problem = partial(CodeProblem, prior, self.code, compare, compared, rays, device, progress_measure=all_pixels)
         problem = partial(problem, mask=observed_view.mask is not None, coloured=self.colour_weight > 0)
         if not self.similarity:
             return problem()
@@ -135,6 +137,10 @@ class Completion:
             return flat.select(pixels.to(view.observed.device)).compare(field, iteration)
 
         return compare
+
+    def _loss_of_all_pixels(self, view: ObservedView) -> Callable[[Field], float]:
+        """The loss at the end of the optimisation's schedules, since losses of different pixels are not comparable."""
+        return lambda field: float(torch.stack([*view.compare(field, self.optimiser.iterations).values()]).sum())
 
     def _pictured(self, scene: Scene, view: ObservedView) -> InputView:
         """The observations for pictures."""

@@ -1,7 +1,7 @@
 """Camera pose: optimises the camera of a depth image and mask of a known shape (DIST, Sec. 4.1, Fig. 6)."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import atan2, degrees, prod, radians, sqrt
 from pathlib import Path
 from typing import Any, ClassVar
@@ -212,8 +212,15 @@ class PoseProblem:
         """The known shape."""
         return self.shape_field
 
-    def objective(self) -> None:
-        """None: the losses of all iterations are comparable."""
+    @torch.no_grad()
+    def objective(self) -> float | None:
+        """The loss of all pixels, not counted as cost; None if each iteration has them and its loss is comparable."""
+        if self.settings.pixel_block == 1:
+            return None
+        problem = replace(self, settings=replace(self.settings, pixel_block=1), counts=Counts())
+        for copy, parameter in zip(problem.parameters, self.parameters, strict=True):
+            copy.copy_(parameter)
+        return float(problem.loss(self.settings.optimiser.iterations, self.starts.best())["total"])
 
     def evaluate(self, state: State) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""

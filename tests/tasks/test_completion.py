@@ -244,3 +244,5 @@ def test_a_pixel_of_each_block_is_compared(scene, problem_of):
         assert renderer.asked.tolist() == [scene.view.mask.flatten()[pixel].item()]
         seen.add(pixel)
     assert seen == {0, 1, 2, 3}
+    problem.objective()
+    assert torch.equal(renderer.directions, rays.directions.view(2, 2, 3)) and problem_of(renderer).objective() is None

@@ -122,6 +122,10 @@ def test_a_pixel_of_each_block_is_compared(scene):
     losses = [sampled.loss(step)["depth"].item() for step in (*range(60), 3)]
     assert losses[3] == losses[-1] and len({*losses}) > 50
     assert sum(losses) / len(losses) == pytest.approx(problem.loss(0)["depth"].item(), rel=0.1)
+    counts = replace(sampled.counts)
+    with torch.no_grad():
+        assert sampled.objective() == problem.loss(0)["total"].item()
+    assert sampled.counts == counts and problem.objective() is None
 
 
 def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
