@@ -6,7 +6,7 @@ Several starts share one budget of iterations: successive halving keeps the bett
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
-from math import cos, inf, isfinite, isnan, nan, pi
+from math import cos, inf, isfinite, isnan, pi
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -105,16 +105,12 @@ class History:
     status: RunStatus = RunStatus.OK
     reason: str = ""
     curve: list[dict[str, Any]] = field(default_factory=list)
+    first_loss: float = inf  # the first finite loss of the start of the curve's last line
     seconds: dict[str, float] = field(default_factory=lambda: {"warmup": 0.0, "forward": 0.0, "backward": 0.0})
     counts: Counts = field(default_factory=Counts)
     peak_memory_bytes: int | None = None
     objectives: list[float] = field(default_factory=list)  # before and after, if the problem has an objective
     notes: list[str] | None = None  # on hits of the warm-up that lie off the surface; None does not check them
-
-    @property
-    def first_loss(self) -> float:
-        """The first loss that is a number."""
-        return next((line["total"] for line in self.curve if not isnan(line["total"])), nan)
 
 
 def optimise(
@@ -188,6 +184,7 @@ def optimise(
             history.status = RunStatus.DIVERGED
             history.reason = f"the loss rose from {first_loss:.3g} to {numbers['total']:.3g} by iteration {index}"
         starts.note(inf if failure else numbers["total"])
+        history.first_loss = starts.first_loss(start)
         history.counts = problem.counts - before
         line = {
             "iteration": index,

@@ -309,7 +309,7 @@ def test_random_numbers_of_a_run_do_not_depend_on_whether_its_prior_was_cached(c
     ((RunStatus.DIVERGED, "why"), [1.0, 200.0], True, RunStatus.DIVERGED),
 ])  # fmt: skip
 def test_a_run_is_judged_by_its_loss_and_surface(ended, losses, mesh, status):
-    history = History(*ended, curve=[{"total": loss} for loss in losses])
+    history = History(*ended, curve=[{"total": loss} for loss in losses], first_loss=losses[0])
     after = Evaluation({}, failure=None if mesh else (RunStatus.EMPTY, "nothing is there"))
     result, reason = solve.failure_of(history, after) or (RunStatus.OK, "")
     assert result is status and bool(reason) is (status is not RunStatus.OK)

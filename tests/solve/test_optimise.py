@@ -315,6 +315,7 @@ def test_other_starts_go_on_if_a_start_fails(bad, since):
     assert (history.status, len(history.curve), problem.starts.best()) == (RunStatus.OK, 8, 1)
     assert problem.radii[1].item() > 1.2
     assert (problem.radii[0].item() == 1.0) == (bad != "large" and since == 0)
+    assert history.first_loss == pytest.approx(4.0) == problem.starts.first_loss(1)  # of the start that remains
 
 
 def test_a_run_ends_with_nan_if_all_starts_are_nan():
