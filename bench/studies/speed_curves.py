@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from bench.report.data.records import CHAMFER_SCALE, Record, base_renderer, family, index, median_or_none
+from bench.report.data.records import CHAMFER_SCALE, Record, base_renderer, median_or_none
 from bench.report.study import Result, Runs, Selection, chart, curves, format, statistics, table
 
 PLACE = 90
@@ -14,7 +14,8 @@ TARGET_ERROR = 1e-3  # Chamfer distance in squared scene units
 COST_AXES = {"seconds": "time (seconds)", "value_evaluations": "field evaluations"}
 ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
-    "The figure has a curve per run of the first setting of each renderer, up to the end of the run.",
+    "The figure has a curve for the first setting of each renderer: medians over runs of cost and error at the "
+    "checkpoints, after 1, 2, 4, ... iterations.",
     f"The table has all settings, the number of runs that reached {CHAMFER_SCALE * TARGET_ERROR:g} × 10⁻³, and the "
     "median time to this error. A run that failed or never reached it counts as infinite.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
@@ -47,7 +48,10 @@ def make(runs: Runs) -> Result:
         columns=COLUMNS,
         lines=lines,
         figure=chart.draw(panels, 2.9, legend=5, sharey=True),
-        chart={"panels": panels, "note": "A curve is a run. Click on it to open the run."},
+        chart={
+            "panels": panels,
+            "note": "A curve: medians over the runs of a setting. Click on it for the runs.",
+        },
     )
 
 
@@ -77,19 +81,20 @@ def _verdict(lines: list[Line]) -> str:
 
 
 def _panel(lines: list[Line], axis: str) -> dict[str, Any]:
-    """A line per run over seconds or field evaluations; only the first setting of each renderer is switched on."""
-    first_settings = {line["renderer"]: line["setting"] for line in reversed(lines)}
-    drawn = []
+    """A line per setting over seconds or field evaluations; only the first setting of each renderer is switched on."""
+    first_settings, drawn = {line["renderer"]: line["setting"] for line in reversed(lines)}, []
     for line in lines:
-        for record, history in zip(line["records"], line["histories"], strict=True):
-            shown = history[history[axis] > 0]
-            scene = f"{family(record)} {index(record)}, seed {record['seed']}"
-            costs = [
-                f"{format.seconds(s)}, error × 1000 {format.number(e)}" for s, e in shown[["seconds", "error"]].values
-            ]
-            look = {"text": [[scene, cost] for cost in costs], "link": [f"#/run/{record['folder']}"] * len(shown)}
-            look |= {"size": 4} | ({} if first_settings[line["renderer"]] == line["setting"] else {"off": True})
-            drawn.append(chart.curve(line["setting"], record["renderer"], shown[axis], shown["error"], **look))
+        failed = [record["status"] != "ok" for record in line["records"]]
+        medians = curves.median(line["histories"], failed, "error")
+        if axis != "seconds":
+            medians["seconds"] = curves.median(line["histories"], failed, axis)["median"]
+        medians = medians[(medians["seconds"] > 0) & medians["median"].map(math.isfinite)]
+        points = medians[["seconds", "median"]].values
+        show = format.seconds if axis == "seconds" else format.count
+        text = [[line["setting"], f"{show(cost)}, error × 1000 {format.number(error)}"] for cost, error in points]
+        look = {"text": text, "link": [chart.link_to_runs(line["setting"])] * len(points), "size": 4}
+        look |= {} if first_settings[line["renderer"]] == line["setting"] else {"off": True}
+        drawn.append(chart.curve(line["setting"], line["preset"], *medians[["seconds", "median"]].values.T, **look))
     return chart.panel_data("", COST_AXES[axis], ERROR, drawn, height=420)
 
 

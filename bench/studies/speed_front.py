@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlencode
 
 import numpy as np
 import pandas as pd
@@ -37,7 +36,6 @@ NOTES = (
     "that compute the same share their times.",
 )
 POINT = "Filled points are on the front, and hollow points are dominated. Click on a point for the runs of its setting."
-RUNS_PAGE = "#/runs?task=all&view=runs&"  # the page's list of runs
 Line = dict[str, Any]  # a setting
 
 
@@ -176,13 +174,14 @@ def _name(line: Line) -> str:
 def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
     """For each renderer a series on the front and a dominated series; and the line of the front."""
     drawn, axes = [], ("seconds", "error")
+    names = {line["renderer"]: line["setting"].partition(",")[0] for line in reversed(panel)}  # of the first setting
     for (renderer, dominated), settings in records.grouped(
         _finite(panel), lambda p: (p["renderer"], p["dominated"])
     ).items():
-        links = [RUNS_PAGE + urlencode({"q": p["setting"]}) for p in settings]
+        links = [chart.link_to_runs(p["setting"]) for p in settings]
         look = {"text": [*map(_hover, settings)], "link": links, "size": 11}
         look |= {"hollow": True} if dominated else {}
-        drawn.append(chart.series(renderer, renderer, *([p[key] for p in settings] for key in axes), **look))
+        drawn.append(chart.series(names[renderer], renderer, *([p[key] for p in settings] for key in axes), **look))
     line = {"colour": chart.REFERENCE_COLOUR, "symbol": "", "dash": "-", "step": True, "quiet": True}
     drawn.append(chart.series("front", "", *([p[key] for p in _front(panel)] for key in axes), **line))
     return chart.panel_data(trial.title, "time (seconds)", trial.heading, drawn, height=440)

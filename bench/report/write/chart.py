@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -45,6 +46,11 @@ def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[fl
 def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
     """A `series` whose points a line joins."""
     return series(name, preset, x, y, **{"dash": figure_style.look(preset).line} | more)
+
+
+def link_to_runs(text: str) -> str:
+    """A link to the page's list of runs that contain a text."""
+    return "#/runs?task=all&view=runs&" + urlencode({"q": text})
 
 
 def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
