@@ -90,11 +90,12 @@ class Filmstrip:
         """
         if not self.frames:
             return
-        scene, size = self.inputs.scene, self.inputs.evaluation.picture
-        name = "measured" if truth is None and scene.is_partial else "truth"
+        size, name = self.inputs.evaluation.picture, "truth"
         if truth is None:
+            scene = self.inputs.scene
+            name = "measured" if scene.is_partial else name
             true = Shown(true_view(scene, at_size(scene.view.camera, size)))
-        else:
+        else:  # the scene is not read, since photographs have none
             true = truth.enlarged(at_size(truth.view.camera, size))
         strip = _strip(self._selected_frames(chosen), {name: true}, f"{title}; {self.over}", chosen)
         save(strip, folder / "strip.png")

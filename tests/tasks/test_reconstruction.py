@@ -65,6 +65,7 @@ def run_in(folder: Path, scene: Scene | None, *, renderer: str = "idr", field: s
         nerf(folder)
         truth = {"truth": more.pop("truth", None), "scan": more.pop("scan", None)}
         more |= {"dataset": OwnPhotographs(str(folder), more.pop("stored_masks", True), "stated", None, False, **truth)}
+        more |= {"make_scene": lambda: pytest.fail("photographs have no scene")}
     else:
         more |= {"make_scene": lambda: scene}
     more |= {"field": FieldChoice(field, None)}
