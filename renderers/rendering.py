@@ -179,6 +179,9 @@ class Iteration(int):
         iteration.position = position
         return iteration
 
+    def __reduce__(self) -> tuple[type, tuple[int, int]]:
+        return Iteration, (int(self), self.position)  # for copies
+
 
 def schedule_position(iteration: int) -> int:
     """The iteration that schedules use; it differs from the index in a loop that a budget ends."""

@@ -292,7 +292,8 @@ class Compared:
             for line, mark in ((best, "*"), (quickest, ""))
         )
         other = "It is also the fastest." if best is quickest else f"The fastest row has {quickest_text})."
-        return f"The smallest median of {least_of} is *{best_text}); n = {format.plural(n, 'shape')}. {other}"
+        among = "The" if len(lines) == len(self.pooled) else "Among the rows with equal settings, the"
+        return f"{among} smallest median of {least_of} is *{best_text}); n = {format.plural(n, 'shape')}. {other}"
 
     def panels(self, ratio: str) -> list[chart.Panel]:
         """Panels of errors, of ratios (labelled `ratio`) and of costs: a line per row, the least error first."""

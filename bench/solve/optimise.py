@@ -37,7 +37,7 @@ class CannotContinue(Exception):
 
 @dataclass(frozen=True)
 class OptimiserSettings:
-    """Adam, for a fixed number of iterations.
+    """Adam, until a number of iterations or a budget is spent.
 
     Args:
         iterations: number of steps.
@@ -60,7 +60,7 @@ class OptimiserSettings:
         check_positive("task.optimiser.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
         check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
         if self.budget is not None:
-            check_positive("task.optimiser.budget", self.budget, "the suite has 2.5e5 to 1e7, null is none")
+            check_positive("task.optimiser.budget", self.budget, "the suite has 6e6 to 2e7, null is none")
         check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET))
         if self.ends == BUDGET and self.budget is None:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
@@ -124,7 +124,8 @@ def optimise(
 ) -> None:
     """Runs Adam on the problem's parameters.
 
-    A run that a budget ends after fewer than `MIN_BUDGET_ITERATIONS` iterations is unsupported.
+    A run that a budget ends after fewer than `MIN_BUDGET_ITERATIONS` iterations has no result, and neither has one that
+    spends nothing in as many iterations.
 
     The first loss is a warm-up. A start takes no step if its loss is NaN or its gradient is not finite. Other starts
     go on. If one start remains, its failure ends the loop, and so does a loss far above its first one.
@@ -200,18 +201,24 @@ def optimise(
             on_step(line)
         is_spent = line["cost"] >= (settings.budget or inf)
         if history.status is RunStatus.OK and settings.ends == BUDGET:
-            history.reason = _budget_problem(len(history.curve), line["cost"], is_spent)
-            history.status = RunStatus.UNSUPPORTED if history.reason else RunStatus.OK
+            history.reason = _budget_problem(history.curve, is_spent)
+            history.status = RunStatus.NOT_REACHED if history.reason else RunStatus.OK
         if is_spent or history.status is not RunStatus.OK:
             break
 
 
-def _budget_problem(iterations: int, cost: float, is_spent: bool) -> str:
-    """Why a budget cannot end a loop: it pays for too few iterations, or nothing is spent. Empty if it can."""
-    if not cost:
-        return "an iteration evaluates no field, so that a budget never ends: set task.optimiser.ends=iterations"
+def _budget_problem(curve: list[dict[str, Any]], is_spent: bool) -> str:
+    """Why a budget cannot end a loop: it pays for too few iterations, or nothing is spent any more. Empty if it can."""
+    iterations, cost = len(curve), curve[-1]["cost"]
+    before = curve[-1 - MIN_BUDGET_ITERATIONS]["cost"] if iterations > MIN_BUDGET_ITERATIONS else -1
+    if cost == before:
+        return f"{MIN_BUDGET_ITERATIONS} iterations have evaluated no field, so that the budget is never spent"
     if is_spent and iterations < MIN_BUDGET_ITERATIONS:
-        return f"the budget paid for {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}: take a larger one"
+        needed = f"{MIN_BUDGET_ITERATIONS * cost / iterations:.2g}"
+        return (
+            f"the budget paid for {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}: set "
+            f"task.optimiser.budget={needed} or more"
+        )
     return ""
 
 

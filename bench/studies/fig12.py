@@ -104,12 +104,19 @@ def _verdict(runs: Runs) -> str:
     """The fraction of successes of each row, over the runs that did not begin in place."""
     misplaced = [record for record in runs.records if any(c.value_of(record) != c.neutral for c in CONDITIONS)]
     shares = {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(misplaced, row_of).items()}
-    return format.ends(
+    unmoved = [record for record in runs.records if record not in misplaced and not is_place_known(record)]
+    others = sorted(
+        {table.percent(sum(map(_succeeded, group)) / len(group)) for group in grouped(unmoved, row_of).values()}
+    )
+    ends = format.ends(
         f"Misplaced runs that end with an error below {MAX_ERROR:g}",
         shares,
         conditions.shapes_text(misplaced),
         show=table.percent,
         largest_first=True,
+    )
+    return (
+        f"{ends} Of runs that start at the true place and optimise it too: {' to '.join(others)}." if others else ends
     )
 
 

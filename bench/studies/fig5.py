@@ -67,11 +67,9 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
     same = grouped(with_rank, lambda line: tuple(line.get(name) for name in numbers)).values()
     ranks = {" = ".join(line["row"] for line in group): group[0]["spearman"] for group in same}
     apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < curves.HIGH_RHO]
-    alike = (
-        f"{len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')} (ρ of {curves.HIGH_RHO} or more)"
-    )
+    alike = f"{curves.HIGH_RHO} or more in {len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')}"
     judgement = f"not in {', '.join(apart)}" if apart else "as in the paper"
-    return f"Loss and error fall together in {alike}; {judgement}." if ranks else ""
+    return f"The median ρ of loss and error is {alike}; {judgement}." if ranks else ""
 
 
 def _ends(lines: list[dict[str, Any]]) -> str:

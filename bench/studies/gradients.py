@@ -107,7 +107,8 @@ def _verdict(data: pd.DataFrame) -> str:
     hits = data[data["band"].isin(ANGLES)]
     cosines = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False)
     least = cosines.min(min_count=len(ANGLES))  # NaN if a band is missing
-    title = f"{(least >= 0.99).sum()} of {len(least)} reach a pooled cosine of 0.99 in all bands of hits. Smallest"
+    reached = f"{(least >= 0.99).sum()} of {len(least)}"
+    title = f"{reached} reach a pooled cosine of 0.99 in all bands of hits, for the code. Lowest band"
     return format.ends(title, least.to_dict(), "one shape", show=_cosine, largest_first=True)
 
 

@@ -17,7 +17,8 @@ NOTES = (
     "The figure has a curve for the first setting of each renderer: medians over runs of cost and error at the "
     "checkpoints, after 1, 2, 4, ... iterations.",
     f"The table has all settings, the number of runs that reached {CHAMFER_SCALE * TARGET_ERROR:g} × 10⁻³, and the "
-    "median time to this error. A run that failed or never reached it counts as infinite.",
+    "median time to this error, at the first checkpoint that has it: up to twice the true time. A run that failed or "
+    "never reached it counts as infinite.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (
@@ -85,16 +86,16 @@ def _panel(lines: list[Line], axis: str) -> dict[str, Any]:
     first_settings, drawn = {line["renderer"]: line["setting"] for line in reversed(lines)}, []
     for line in lines:
         failed = [record["status"] != "ok" for record in line["records"]]
-        medians = curves.median(line["histories"], failed, "error")
-        if axis != "seconds":
-            medians["seconds"] = curves.median(line["histories"], failed, axis)["median"]
-        medians = medians[(medians["seconds"] > 0) & medians["median"].map(math.isfinite)]
-        points = medians[["seconds", "median"]].values
+        medians = curves.median(line["histories"], failed, "error").set_index("iteration")
+        costs = curves.median(line["histories"], [False] * len(failed), axis).set_index("iteration")["median"]
+        medians = medians.assign(cost=costs)  # of an iteration that all runs have
+        medians = medians[(medians["cost"] > 0) & medians["median"].map(math.isfinite)]
+        points = medians[["cost", "median"]].values
         show = format.seconds if axis == "seconds" else format.count
         text = [[line["setting"], f"{show(cost)}, error × 1000 {format.number(error)}"] for cost, error in points]
         look = {"text": text, "link": [chart.link_to_runs(line["setting"])] * len(points), "size": 4}
         look |= {} if first_settings[line["renderer"]] == line["setting"] else {"off": True}
-        drawn.append(chart.curve(line["setting"], line["preset"], *medians[["seconds", "median"]].values.T, **look))
+        drawn.append(chart.curve(line["setting"], line["preset"], *points.T, **look))
     return chart.panel_data("", COST_AXES[axis], ERROR, drawn, height=420)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from bench.report.study import (
     Result,
@@ -25,6 +26,7 @@ from bench.report.write.caption import undefined
 PLACE = 80
 READS = (Selection("speed_completion"), Selection("speed_rendering", alike=("view",)))
 QUANTITIES = ("seconds", "error", "evaluations")
+LIKELY = 0.9  # the fraction of bootstrap draws from which on a setting is called likely on the front
 MIN_PLOTTED_ERROR = 1e-9  # smaller errors are raised to this, so that their logarithms are bounded
 NOTES = (
     "Left: the final error of a completion over its runtime. Right: the depth error of one rendering (95th percentile "
@@ -52,7 +54,7 @@ class Trial:
 
 COMPLETION = Trial("completing a shape", "chamfer_l2", "Chamfer × 1000 (scene units²)", "loop", ("values",))
 RENDERING = Trial(
-    *("rendering an image", "error_p95", "depth error, 95th percentile × 1000 (scene units)"),
+    *("rendering an image, without gradient", "error_p95", "depth error, 95th percentile × 1000 (scene units)"),
     *("forward_seconds", ("queries", "coarse_queries")),
 )
 
@@ -147,7 +149,9 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
                 for p in (front[0], *front[1:][-1:])
             ]
             n = format.plural(panel[0]["shapes"], "shape")
-            on_front = f"{len(front)} of {len(panel)} settings are on the front of {trial.title}; n = {n}."
+            sure = sum(line["on_front"] >= LIKELY for line in front)
+            on_front = f"{len(front)} of {len(panel)} settings are on the front of {trial.title}, {sure} of them in "
+            on_front += f"{100 * LIKELY:.0f} % of the bootstrap draws or more; n = {n}."
             return f"{on_front} From the fastest to the best: {' to '.join(ends)}."
     return ""
 
@@ -156,10 +160,15 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
 def draw(panels: list[chart.Panel], fronts: list[list[Line]]) -> Figure:
     """Draws a panel per trial; settings on the front are numbered, with their names below."""
     figure = chart.draw(panels, 4.4, legend=5)
+    for legend in figure.legends:
+        for handle in legend.legend_handles:
+            if isinstance(handle, Line2D):  # whether a point is filled says if it is on the front
+                handle.set_markerfacecolor("none")
     for axis, front in zip(figure.axes, fronts, strict=True):
-        for number, line in enumerate(front, 1):
+        numbers = records.grouped(enumerate(front, 1), lambda pair: (pair[1]["seconds"], pair[1]["error"]))
+        for point, numbered in numbers.items():
             how = {"textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 6}
-            axis.annotate(str(number), (line["seconds"], line["error"]), (-2, -3), **how)
+            axis.annotate(", ".join(str(number) for number, _ in numbered), point, (-2, -3), **how)
         names = [axis.plot([], [], ls="none", label=f"{i} {_name(line)}")[0] for i, line in enumerate(front, 1)]
         below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 2}
         axis.legend(handles=names, **below, handlelength=0, handletextpad=0, fontsize=6)

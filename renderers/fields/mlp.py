@@ -236,7 +236,7 @@ class _FrozenDecoder(torch.autograd.Function):
     def forward(ctx: Any, field: BoundDecoder, points: Tensor, *biases: Tensor) -> Tensor:
         ctx.field, ctx.compiled = field, field.compiled_for(points)
         if ctx.compiled is not None:
-            ctx.save_for_backward(points)
+            ctx.points = points.detach().clone()  # which may be changed, or be of inference mode
             return ctx.compiled.values(points)
         values, gates = _values_and_gates(field, points)
         ctx.save_for_backward(*gates)
@@ -244,13 +244,11 @@ class _FrozenDecoder(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,), all_gates = gradients, ctx.saved_tensors
-        if ctx.compiled is not None:
-            (points,) = ctx.saved_tensors
-            if not gradient.requires_grad:
-                to_points, to_biases = ctx.compiled.gradients(points, gradient, ctx.needs_input_grad[2:])
-                return None, to_points, *to_biases
-            _, all_gates = _values_and_gates(ctx.field, points.detach())
+        (gradient,) = gradients
+        if ctx.compiled is not None and not gradient.requires_grad:
+            to_points, to_biases = ctx.compiled.gradients(ctx.points, gradient, ctx.needs_input_grad[2:])
+            return None, to_points, *to_biases
+        all_gates = ctx.saved_tensors if ctx.compiled is None else _values_and_gates(ctx.field, ctx.points)[1]
         towards_points = gradient.new_zeros(len(gradient), 3)
         towards_biases = [gradient.new_zeros(gate.shape[1]) for gate in all_gates]
         size = points_per_pass(ctx.field._width, gradient.dtype, gradient.device)

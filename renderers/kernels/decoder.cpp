@@ -118,7 +118,7 @@ static void tile_gradients(const Decoder *net, Rows tile, int rows, const float 
       Vector sum = {};
       for (int r = 0; r < rows; r++) {
         Vector *gradient = (Vector *)(from.at(r) + k);
-        sum += *gradient = *(const Vector *)(features(l).at(r) + k) > 0 ? *gradient : Vector{};
+        sum += *gradient = *(const Vector *)(features(l).at(r) + k) > 0 ? *gradient : 0 * *gradient;  // NaN stays NaN
       }
       if (to_biases[l]) *(Vector *)(to_biases[l] + k) += sum;
     }

@@ -34,14 +34,14 @@ class CompiledDecoder:
         inputs, outputs = ([weight.shape[side] for weight in weights] for side in (1, 0))
         final = torch.nn.functional.pad(last[0].detach().flatten(), (0, outputs[-1] - last[0].shape[1]))
         columns = [weight.view(-1, block, weight.shape[1]).transpose(1, 2).contiguous() for weight in weights]
-        pairs = zip(weights[1:], outputs, strict=False)
-        transposed = [None, *(_transpose(weight, features, block) for weight, features in pairs)]
+        self.widths, self.padded_widths = [len(bias) for _, bias in hidden], outputs
+        pairs = zip(weights[1:], self.widths, outputs, strict=False)
+        transposed = [None, *(_transpose(weight[:, :width], padded, block) for weight, width, padded in pairs)]
         point_weights = [w[:, -3:].T.contiguous() if index in (0, skip) else None for index, w in enumerate(weights)]
         tables = [(ctypes.c_int * len(layers))(*sizes) for sizes in (inputs, outputs)]
         tables += [_addresses(tensors) for tensors in (columns, biases, transposed, point_weights)]
         pointers = [ctypes.addressof(table) for table in tables]
         self.library, self.network = library, _Decoder(len(layers), skip, *pointers, final.data_ptr(), float(last[1]))
-        self.widths, self.padded_widths = [len(bias) for _, bias in hidden], outputs
         self.referenced = columns, biases, transposed, point_weights, final, tables  # what the network points to
 
     def values(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
@@ -86,10 +86,9 @@ def _pad(weight: Tensor, bias: Tensor, block: int) -> Layer:
     return torch.nn.functional.pad(weight, (0, 0, 0, missing)), torch.nn.functional.pad(bias, (0, missing))
 
 
-def _transpose(weight: Tensor, features: int, block: int) -> Tensor:
-    """A layer's weights of the features before it, padded to `features`: [features / block][outputs][block]."""
-    columns = weight[:, : min(features, weight.shape[1])]
-    columns = torch.nn.functional.pad(columns, (0, features - columns.shape[1]))
+def _transpose(weight: Tensor, padded_width: int, block: int) -> Tensor:
+    """A layer's weights of the features before it: [padded width / block][outputs][block]."""
+    columns = torch.nn.functional.pad(weight, (0, padded_width - weight.shape[1]))
     return columns.view(len(weight), -1, block).transpose(0, 1).contiguous()
 
 

@@ -109,6 +109,29 @@ def test_a_nan_spoils_the_gradient_of_its_point_alone():
 
 
 @with_compiler
+def test_a_nan_passes_closed_relus_as_in_torch():
+    decoder = make("skip")
+    for layer in decoder.hidden:
+        layer.bias.fill_(-100.0)
+    code = torch.zeros(4, requires_grad=True)
+    with using_threads(1):
+        (gradient,) = torch.autograd.grad(decoder.at(code)(torch.rand(3, 3)), code, torch.full((3,), torch.nan))
+    assert gradient.isnan().all()
+
+
+@with_compiler
+def test_a_code_has_a_gradient_though_points_have_none_and_are_changed_afterwards():
+    decoder, points = make("skip"), torch.rand(20, 3)
+    code = torch.linspace(-1, 1, 4).requires_grad_()
+    with using_threads(1):
+        (expected,) = torch.autograd.grad(decoder.at(code)._forward(points).sum(), code)
+        values = decoder.at(code)(points)
+        points.mul_(2)
+        (gradient,) = torch.autograd.grad(values.sum(), code)
+    torch.testing.assert_close(gradient, expected, rtol=1e-5, atol=1e-6)
+
+
+@with_compiler
 def test_compiled_gradients_have_a_derivative_towards_those_of_the_values():
     """Which the derivatives of a rendering by the points' motion use (task=gradients)."""
     field, weights = make("skip").at(torch.zeros(4)), torch.linspace(1, 2, 5).requires_grad_()

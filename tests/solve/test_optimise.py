@@ -1,5 +1,6 @@
 """The optimisation loop on problems with a known solution."""
 
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from math import isnan
 from typing import Any
@@ -23,7 +24,7 @@ from renderers.boundary import render_checked
 from renderers.checks import BrokenContract
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
-from renderers.rendering import schedule_position
+from renderers.rendering import Iteration, at_iteration, schedule_position
 from tests.looped import each
 from tests.operations import Operations
 from tests.tiny import camera_of
@@ -381,16 +382,33 @@ def test_a_loop_that_its_budget_ends_follows_its_schedules_by_what_is_spent():
 @each("budget, reason", [(29, "paid for 8 iterations, fewer than 10"), (40, "")])
 def test_a_budget_that_pays_for_few_iterations_has_no_result(budget, reason):
     history = spend(Changing(), budget)
-    assert (history.status is RunStatus.UNSUPPORTED) == bool(reason) and reason in history.reason
+    assert (history.status is RunStatus.NOT_REACHED) == bool(reason) and reason in history.reason
 
 
-def test_a_budget_that_nothing_is_spent_of_ends_the_loop():
+@each("since, iterations", [(0, 11), (5, 15)])
+def test_a_budget_of_which_nothing_is_spent_any_more_ends_the_loop(since, iterations):
     class Free(Toy):
         def loss(self, iteration):
-            return {"total": self.radius**2}
+            return {"total": self.radius**2} if iteration >= since else super().loss(iteration)
 
-    history = spend(Free(), 100)
-    assert history.status is RunStatus.UNSUPPORTED and "task.optimiser.ends=iterations" in history.reason
+    history = spend(Free(), 1e4)
+    assert (history.status, len(history.curve)) == (RunStatus.NOT_REACHED, iterations)
+    assert "evaluated no field" in history.reason
+
+
+def test_an_iteration_keeps_its_position_in_a_copy():
+    iteration = deepcopy(Iteration(7, 3))
+    assert (iteration, schedule_position(iteration), schedule_position(7)) == (7, 3, 7)
+
+
+@each("name", ["neus", "volsdf", "unisurf", "dvr"])
+def test_schedules_follow_the_position_and_a_memory_the_index(name):
+    renderer = load("renderer", name)
+    assert at_iteration(renderer, Iteration(500, 0)) == at_iteration(renderer, 0) != at_iteration(renderer, 90)
+    newton = load("renderer", "newton")
+    newton.memory.audited = 5
+    at_iteration(newton, Iteration(3, 0))
+    assert newton.memory.audited == 5
 
 
 def test_a_loop_that_its_budget_ends_needs_a_budget_and_a_single_start():

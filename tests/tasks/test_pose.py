@@ -123,6 +123,8 @@ def test_a_pixel_of_each_block_is_compared(scene):
     assert losses[3] == losses[-1] and len({*losses}) > 50
     assert sum(losses) / len(losses) == pytest.approx(problem.loss(0)["depth"].item(), rel=0.1)
     counts = replace(sampled.counts)
+    for each_problem in (problem, sampled):
+        each_problem.parameters[0].data += 0.01
     with torch.no_grad():
         assert sampled.objective() == problem.loss(0)["total"].item()
     assert sampled.counts == counts and problem.objective() is None

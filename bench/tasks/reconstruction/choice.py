@@ -118,7 +118,8 @@ class AutoField:
         validation, device = subject.input_shots[::VALIDATION_STEP], run.inputs.device
         fitted = tuple(shot for index, shot in enumerate(subject.input_shots) if index % VALIDATION_STEP)
         trial_subject = replace(subject, input_shots=fitted)
-        trial_settings = replace(settings, iterations=max(round(self.trial * settings.iterations), 1))
+        iterations, budget = max(round(self.trial * settings.iterations), 1), settings.budget
+        trial_settings = replace(settings, iterations=iterations, budget=budget and self.trial * budget)
 
         def trial(name: str, trials: Trials) -> Evidence:
             torch.manual_seed(run.inputs.seed)  # each trial starts as it would alone

@@ -13,6 +13,7 @@ from bench.evaluate.evaluate import Evaluation
 from bench.evaluate.state import State, colours_at
 from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
+from bench.solve.observed_view import generator_of
 from bench.tasks.reconstruction.judge import field_scores, judge, surface_scores
 from bench.tasks.reconstruction.losses import Losses
 from bench.tasks.reconstruction.pictures import draw_reconstruction
@@ -88,7 +89,7 @@ class ReconstructionProblem:
     def loss(self, iteration: int) -> Terms:
         """The terms and their sum, over new random pixels in each iteration."""
         patches = self.losses.colour_gradient > 0
-        seed = self.seed * self.iterations + iteration
+        seed = generator_of(self.seed, iteration).initial_seed()
         pixels = self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed)
         shape = self.model.field
         return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
