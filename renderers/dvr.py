@@ -11,15 +11,8 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field
 from renderers.gradients import attach_implicit_gradient, reevaluate_with_graph
-from renderers.rendering import (
-    LEVEL_SET_CAPABILITIES,
-    Capabilities,
-    RayObservation,
-    Rendering,
-    Status,
-    assemble,
-    schedule_position,
-)
+from renderers.rendering import LEVEL_SET_CAPABILITIES, Capabilities, RayObservation, Rendering, Status, assemble
+from renderers.schedule import schedule_position
 from renderers.silhouette import OCCUPANCY_POINTS, Occupancy
 from renderers.tracing.bracket import REFINEMENTS, SAMPLES_PER_BATCH, equally_spaced, first_crossing, refine
 

@@ -1,6 +1,6 @@
 """Newton: a march across the surface, and a Newton step on the value and slope that its gradient needs."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from jaxtyping import Bool, Float
@@ -16,7 +16,7 @@ from renderers.tracing.warm import Memory, render_warm
 
 
 @dataclass(frozen=True)
-class Newton:
+class Newton(Tracer):
     """Coarse-to-fine marching until the sign changes, a dense search for the unfinished rays, and a Newton step.
 
     The implicit gradient needs the value and the slope at every hit. A Newton step on them gives the distance to second
@@ -47,15 +47,6 @@ class Newton:
         remembers: whether renderings are stored in the memory; set by `at_iteration`.
     """
 
-    steps: int
-    march_epsilon: float
-    unseen: float
-    newton_steps: int
-    search_samples: int
-    search_steps: int
-    least_slope: float
-    sphere_radius: float
-    coarse: bool
     silhouette_epsilon: float
     silhouette_signed: bool
     silhouette_average: str
@@ -66,14 +57,9 @@ class Newton:
     capabilities: ClassVar[Capabilities] = DISTANCE_CAPABILITIES
 
     def __post_init__(self) -> None:
-        _ = self.tracer  # its constructor checks the settings
+        super().__post_init__()
         check_positive("silhouette_epsilon", self.silhouette_epsilon, "DIST uses 5e-5")
         check_choice("silhouette_average", self.silhouette_average, AVERAGES)
-
-    @property
-    def tracer(self) -> Tracer:
-        """Finds the surface, with these settings."""
-        return Tracer(**{setting.name: getattr(self, setting.name) for setting in fields(Tracer)})
 
     def at_iteration(self, iteration: int) -> "Newton":
         """With `warm`, a renderer that starts where the same rays ended before; iteration 0 clears the memory."""
@@ -85,8 +71,8 @@ class Newton:
         """Marches and searches without a graph; the Newton steps carry the gradient."""
         check_kind(self, field)
         if self.remembers:
-            return render_warm(self.tracer, self.memory, field, rays)
-        return self.tracer.render_cold(field, rays)
+            return render_warm(self, self.memory, field, rays)
+        return self.render_cold(field, rays)
 
     def with_empty_memory(self) -> "Newton":
         """The same renderer, for another optimisation."""

@@ -24,7 +24,7 @@ FORBIDDEN = {  # what the modules of a package may not import
 }
 # The packages of bench in the order of imports: a package may use those before it, and none a command.
 PACKAGES = (
-    "tables", "config", "progress", "records", "machine", "trackers", "shape_prior",
+    "tables", "config", "progress", "records", "machine", "trackers", "exports", "shape_prior",
     "setup", "evaluate", "pictures", "solve", "tasks",
     "runner", "report", "studies",
 )  # fmt: skip
@@ -33,20 +33,20 @@ COMMANDS = (
     "bench.turntable", "bench.verify",
 )  # fmt: skip
 # Three layers: a file imports only from its layer and the layers below. Files that are not listed are the core.
-DATA_LAYER = ("datasets.files", "renderers.fields.networks", "renderers.fields.parts", "bench.photos")
+DATA_LAYER = ("datasets.files", "renderers.fields.networks", "renderers.fields.parts", "bench.photos", "bench.exports")
 STUDIES_LAYER = (
     "bench.report", "bench.studies", "bench.pictures.figure_style", "bench.pictures.size_chart", "renderers.later",
     "bench.records.names", "bench.records.read",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",
     "bench.tasks.single_view", "bench.tasks.stability",
-    *(f"bench.{command}" for command in ("judge", "merge", "suite", "train", "tune", "turntable", "verify")),
+    *(f"bench.{command}" for command in ("judge", "merge", "prior", "suite", "train", "tune", "turntable", "verify")),
 )  # fmt: skip
 LISTS = ("bench", "bench.__main__", "renderers")  # import from all layers, to list what there is
 MAX_CORE_LINES = 15_200
 CORE_MAY = {  # the libraries of the core
     "torch", "jaxtyping", "safetensors", "numpy", "scipy", "skimage", "trimesh", "open3d", "matplotlib", "PIL", "hydra",
     "omegaconf", "yaml", "rich", "filelock", "psutil",
-    "submitit", "ray", "mlflow",  # each in one function, if a user chooses it
+    "submitit", "ray",  # each in one function, if a user chooses it
 }  # fmt: skip
 # These modules decide what is run; no run imports them.
 STUDIES = "bench.studies"  # one file a question; this empty package is imported to list them

@@ -20,8 +20,7 @@ from renderers.fields.mlp import bfloat16_is_faster
 from renderers.kernels.library import kernels
 
 ROOT = Path(__file__).resolve().parents[2]
-# Rows of the square matrices of `gemm_peak`: up to two threads reach the same rate with the smaller ones, in an eighth
-# of the time. The first product is a warm-up.
+# Rows of the square matrices of `gemm_peak`: up to two threads reach the same rate with the smaller ones.
 GEMM_SIDE, SMALL_GEMM_SIDE, MAX_SMALL_GEMM_THREADS, GEMM_REPEATS = 1024, 512, 2, 6
 PACKAGES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image", "hydra-core")
 CODE_ONLY = ("--", ".", ":(exclude)results")  # arguments of git: results are written by reports

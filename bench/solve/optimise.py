@@ -19,7 +19,7 @@ from bench.records.record import RunStatus
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
 from renderers.hits import Hits, collect_hits, missing_distance_message
-from renderers.rendering import Iteration, schedule_position
+from renderers.schedule import Iteration, schedule_position
 
 DIVERGENCE_FACTOR = 100.0  # times the first loss, or `least_reference` if larger: a loss above it has diverged
 HALVING_FACTOR = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
@@ -124,11 +124,9 @@ def optimise(
 ) -> None:
     """Runs Adam on the problem's parameters.
 
-    A run that a budget ends after fewer than `MIN_BUDGET_ITERATIONS` iterations has no result, and neither has one that
-    spends nothing in as many iterations.
-
-    The first loss is a warm-up. A start takes no step if its loss is NaN or its gradient is not finite. Other starts
-    go on. If one start remains, its failure ends the loop, and so does a loss far above its first one.
+    A run that its budget ends after fewer than `MIN_BUDGET_ITERATIONS` has no result, nor one that spends nothing in as
+    many. The first loss is a warm-up. A start skips a step if its loss is NaN or its gradient not finite; others go on.
+    If one start remains, its failure ends the loop, and so does a loss far above its first one.
 
     Args:
         problem: returns the loss; its parameters are changed in place.
@@ -210,16 +208,12 @@ def optimise(
 def _budget_problem(curve: list[dict[str, Any]], is_spent: bool) -> str:
     """Why a budget cannot end a loop: it pays for too few iterations, or nothing is spent any more. Empty if it can."""
     iterations, cost = len(curve), curve[-1]["cost"]
-    before = curve[-1 - MIN_BUDGET_ITERATIONS]["cost"] if iterations > MIN_BUDGET_ITERATIONS else -1
-    if cost == before:
+    if iterations > MIN_BUDGET_ITERATIONS and cost == curve[-1 - MIN_BUDGET_ITERATIONS]["cost"]:
         return f"{MIN_BUDGET_ITERATIONS} iterations have evaluated no field, so that the budget is never spent"
-    if is_spent and iterations < MIN_BUDGET_ITERATIONS:
-        needed = f"{MIN_BUDGET_ITERATIONS * cost / iterations:.2g}"
-        return (
-            f"the budget paid for {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}: set "
-            f"task.optimiser.budget={needed} or more"
-        )
-    return ""
+    if not is_spent or iterations >= MIN_BUDGET_ITERATIONS:
+        return ""
+    few = f"the budget paid for {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}"
+    return f"{few}: set task.optimiser.budget={MIN_BUDGET_ITERATIONS * cost / iterations:.2g} or more"
 
 
 class _Adam:
@@ -292,13 +286,13 @@ class StartSettings:
 
     def check(self, settings: OptimiserSettings) -> None:
         """Raises ValueError if the rounds would use up the iterations, or if their number is not known."""
-        iterations = settings.iterations
         if self.count > 1 and settings.ends == BUDGET:
             raise ValueError(f"{self.count} starts share a number of iterations: set task.optimiser.ends=iterations")
-        if self.trials >= iterations:
+        if self.trials >= settings.iterations:
             raise ValueError(
-                f"task.optimiser.iterations must be more than {self.trials}, not {iterations}: {self.count} starts "
-                f"share it, with task.trial={self.trial} for each in rounds of {', '.join(map(str, self.rounds))}"
+                f"task.optimiser.iterations must be more than {self.trials}, not {settings.iterations}: {self.count} "
+                f"starts share it, with task.trial={self.trial} for each in rounds of "
+                f"{', '.join(map(str, self.rounds))}"
             )
 
 

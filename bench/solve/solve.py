@@ -17,12 +17,13 @@ from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Shown
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.optimise import ITERATIONS, CannotContinue, History, Optimisable, OptimiserSettings, optimise
+from bench.solve.optimise import BUDGET, CannotContinue, History, Optimisable, OptimiserSettings, optimise
 from datasets.mesh import Mesh
 from datasets.saved_field import FIELD_FILE, save_field
 from renderers.camera import Camera
 from renderers.field import Counts, Field
-from renderers.rendering import Renderer, Unsupported, check_kind, schedule_position
+from renderers.rendering import Renderer, Unsupported, check_kind
+from renderers.schedule import schedule_position
 
 CHECKPOINT_BUDGET_SHARES = 0.03, 0.1, 0.2, 0.5
 COST_DEFINITIONS = {
@@ -206,7 +207,7 @@ def run_optimisation(
         least_reference: see `bench.solve.optimise.optimise`.
     """
     history = History(notes=[])
-    checkpoints = Checkpoints(run.inputs.evaluation.every, settings)
+    checkpoints = checkpoints_of(run.inputs.evaluation.every, settings)
     checkpoint_errors: dict[int, dict[str, float]] = {}
 
     def check(iteration: int) -> None:
@@ -222,13 +223,16 @@ def run_optimisation(
         def on_step(line: dict[str, Any]) -> None:
             line |= checkpoint_errors.get(line["iteration"], {})
             write_line(line)
-            if history.status is RunStatus.OK and checkpoints.is_due(line["iteration"] + 1, line["cost"]):
+            reached = line["cost"] if settings.ends == BUDGET else line["iteration"] + 1
+            due = [checkpoint for checkpoint in checkpoints if checkpoint <= reached]
+            del checkpoints[: len(due)]
+            if due and history.status is RunStatus.OK and line["cost"] < (settings.budget or inf):
                 check(line["iteration"] + 1)
             position = schedule_position(settings.at(line["iteration"], line["cost"]))
             run.progress("optimising", position + 1, settings.iterations, line["total"])
 
-        if checkpoints.enabled:
-            check(0)
+        if checkpoints:
+            check(int(checkpoints.pop(0)))
         try:
             note_objective()
             device = run.inputs.device
@@ -242,36 +246,16 @@ def run_optimisation(
     return history
 
 
-class Checkpoints:
-    """Decides when the state is evaluated: after some numbers of steps, or at fractions of a budget that ends the loop.
-
-    Args:
-        interval: see `checkpoints_of`; without one, there is no checkpoint.
-    """
-
-    def __init__(self, interval: int | str | None, settings: OptimiserSettings) -> None:
-        self.enabled, self.settings = interval is not None, settings
-        self.steps = checkpoints_of(interval, settings.iterations)
-        self.shares = [*CHECKPOINT_BUDGET_SHARES] if self.enabled else []
-
-    def is_due(self, steps: int, cost: float) -> bool:
-        """Whether the state after this number of steps, at this cost, is evaluated."""
-        if self.settings.ends == ITERATIONS:
-            return steps in self.steps
-        spent = cost / (self.settings.budget or inf)
-        passed = sum(share <= spent for share in self.shares)
-        self.shares = self.shares[passed:]
-        return passed > 0 and spent < 1
-
-
-def checkpoints_of(interval: int | str | None, iterations: int) -> set[int]:
-    """The numbers of steps taken when the state is evaluated: 0, all but one, and some between."""
+def checkpoints_of(interval: int | str | None, settings: OptimiserSettings) -> list[float]:
+    """When the state is evaluated, in rising order: numbers of steps or, if a budget ends the loop, costs."""
     if interval is None:
-        return set()
-    last = iterations - 1
+        return []
+    if settings.ends == BUDGET:
+        return [0.0, *(share * (settings.budget or inf) for share in CHECKPOINT_BUDGET_SHARES)]
+    last = settings.iterations - 1
     if interval == DOUBLING:
-        return {0, last} | {2**power for power in range(last.bit_length()) if 2**power < last}
-    return {*range(0, last, int(interval)), last}
+        return sorted({0, last} | {2**power for power in range(last.bit_length()) if 2**power < last})
+    return sorted({*range(0, last, int(interval)), last})
 
 
 def note_costs(

@@ -120,7 +120,8 @@ class Completion:
         rays = -(-compared.shape[0] // self.pixel_block) * -(-compared.shape[1] // self.pixel_block)
         compare, all_pixels = observed_view.compare, None
         if self.pixel_block > 1:
-            compare, all_pixels = self._compare_blocks(observed_view, seed), self._loss_of_all_pixels(observed_view)
+            compare = self._compare_blocks(observed_view, seed)
+            all_pixels = partial(_loss_of_all_pixels, observed_view, self.optimiser.iterations)
         problem = partial(CodeProblem, prior, self.code, compare, compared, rays, device, progress_measure=all_pixels)
         problem = partial(problem, mask=observed_view.mask is not None, coloured=self.colour_weight > 0)
         if not self.similarity:
@@ -137,10 +138,6 @@ class Completion:
             return flat.select(pixels.to(view.observed.device)).compare(field, iteration)
 
         return compare
-
-    def _loss_of_all_pixels(self, view: ObservedView) -> Callable[[Field], float]:
-        """The loss at the end of the optimisation's schedules, since losses of different pixels are not comparable."""
-        return lambda field: float(torch.stack([*view.compare(field, self.optimiser.iterations).values()]).sum())
 
     def _pictured(self, scene: Scene, view: ObservedView) -> InputView:
         """The observations for pictures."""
@@ -160,3 +157,7 @@ class Completion:
             image = unshaded_image(view, scene.texture).where(view.mask[..., None], torch.nan)
             observed_view = replace(observed_view, colours=image.to(device), colour_weight=self.colour_weight)
         return observed_view
+
+
+def _loss_of_all_pixels(view: ObservedView, iteration: int, field: Field) -> float:
+    return float(torch.stack([*view.compare(field, iteration).values()]).sum())

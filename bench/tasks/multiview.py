@@ -22,7 +22,8 @@ from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Field
-from renderers.rendering import RayObservation, Renderer, at_iteration, schedule_position
+from renderers.rendering import RayObservation, Renderer, at_iteration
+from renderers.schedule import schedule_position
 from renderers.silhouette import SilhouetteLoss
 
 MIN_SCALE, MAX_SHIFT = 0.8, 0.2

@@ -1,7 +1,7 @@
 """Camera pose: optimises the camera of a depth image and mask of a known shape (DIST, Sec. 4.1, Fig. 6)."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import atan2, degrees, prod, radians, sqrt
 from pathlib import Path
 from typing import Any, ClassVar
@@ -217,10 +217,7 @@ class PoseProblem:
         """The loss of all pixels, not counted as cost; None if each iteration has them and its loss is comparable."""
         if self.settings.pixel_block == 1:
             return None
-        problem = replace(self, settings=replace(self.settings, pixel_block=1), counts=Counts())
-        for copy, parameter in zip(problem.parameters, self.parameters, strict=True):
-            copy.copy_(parameter)
-        return float(problem.loss(self.settings.optimiser.iterations, self.starts.best())["total"])
+        return float(self._compare(self.shape_field, self.settings.optimiser.iterations, self.starts.best())["total"])
 
     def evaluate(self, state: State) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""
@@ -244,27 +241,32 @@ class PoseProblem:
 
     def loss(self, step: int, start: int = 0) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
+        side, metered = self.settings.pixel_block, Meter(self.shape_field, self.counts)
+        pixels = pixel_of_each_block(*self.depth.shape, side, generator_of(self.seed, step)) if side > 1 else None
+        return self._compare(metered, step, start, pixels)
+
+    def _compare(self, shape: Field, step: int, start: int, pixels: Tensor | None = None) -> dict[str, Tensor]:
+        """The weighted terms of a start at the pixels [n] of an image by rows, or at all, and their sum."""
         camera = self.cameras[start].with_object_moved(self.parameters[start])
-        renderer, metered = at_iteration(self.renderer, step), Meter(self.shape_field, self.counts)
-        rays, observations = camera.rays(), (self.depth, self.depth_per_distance, self.observed, self.normals)
-        if self.settings.pixel_block > 1:
-            draw = generator_of(self.seed, step)
-            pixels = pixel_of_each_block(*self.depth.shape, self.settings.pixel_block, draw).to(self.device)
-            rays, observations = rays.flat()[pixels], [tensor.flatten(0, 1)[pixels] for tensor in observations]
+        renderer, rays = at_iteration(self.renderer, step), camera.rays()
+        observations = self.depth, self.depth_per_distance, self.observed, self.normals
+        if pixels is not None:
+            rays = rays.flat()[pixels.to(self.device)]
+            observations = [tensor.flatten(0, 1)[pixels.to(self.device)] for tensor in observations]
         depth, depth_per_distance, observed, normals = observations
-        rendering = render_checked(renderer, metered, rays)
+        rendering = render_checked(renderer, shape, rays)
         compared = observed & rendering.hit
         count = compared.sum().clamp_min(1)
         rendered = rendering.distance * depth_per_distance
         error = depth_error(self.settings.depth_loss, rendered, depth, depth_per_distance)
         observation = RayObservation(observed, torch.where(observed, depth / depth_per_distance, torch.nan))
-        silhouette = self.settings.silhouette(renderer, metered, rays, rendering, observation)
+        silhouette = self.settings.silhouette(renderer, shape, rays, rendering, observation)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,
             "silhouette": self.settings.silhouette_weight * silhouette,
         }
         if self.settings.normal_weight:
-            rendered_normals = in_camera_axes(autograd_normals(metered, rendering.points[compared].detach()), camera)
+            rendered_normals = in_camera_axes(autograd_normals(shape, rendering.points[compared].detach()), camera)
             terms["normals"] = self.settings.normal_weight * normal_error(rendered_normals, normals[compared])
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 

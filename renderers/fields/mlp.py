@@ -227,9 +227,8 @@ class _FrozenDecoder(torch.autograd.Function):
     """A decoder whose weights need no gradient, with less memory and time than autograd.
 
     Compiled code computes the features again in the backward pass. Without it, the forward pass keeps the signs of the
-    ReLUs' inputs, one byte per neuron, and the backward pass works chunk by chunk. Both skip points whose value has a
-    zero gradient. The gradients are linear in those of the values, and have a derivative towards these alone: the
-    second derivatives of a ReLU network are 0 almost everywhere.
+    ReLUs' inputs, one byte per neuron. Both skip points whose value has a zero gradient. The gradients depend on
+    those of the values alone: the second derivatives of a ReLU network are 0 almost everywhere.
     """
 
     @staticmethod

@@ -1,9 +1,8 @@
 """Compiled code that replaces PyTorch, with equal values up to rounding; built once per machine, if possible.
 
-It computes values of float32 ReLU networks, and their gradients towards points and biases, on one thread of a CPU.
-PyTorch computes all else, such as gradients towards weights and coarse values. Renderers need these in different
-proportions, so ratios of runtimes depend on the engine; a record names it under `kernels`.
-`IMPLICIT_BENCH_KERNELS=torch` uses PyTorch for everything.
+It computes values of float32 ReLU networks, and their gradients towards points and biases, on one thread of a CPU;
+PyTorch computes all else. Renderers need these in different proportions, so ratios of runtimes depend on the engine; a
+record names it under `kernels`. `IMPLICIT_BENCH_KERNELS=torch` uses PyTorch for everything.
 """
 
 import ctypes

@@ -14,16 +14,8 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, carries_gradient
 from renderers.gradients import reevaluate_with_graph
-from renderers.rendering import (
-    DISTANCE_CAPABILITIES,
-    Capabilities,
-    Deferred,
-    Rendering,
-    Status,
-    Volume,
-    assemble,
-    schedule_position,
-)
+from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Deferred, Rendering, Status, Volume, assemble
+from renderers.schedule import schedule_position
 from renderers.tracing.bracket import SAMPLES_PER_BATCH
 
 MIN_LIGHT = 1e-5  # samples that absorb less of a ray's light have neither a weight nor a gradient

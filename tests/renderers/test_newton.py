@@ -109,7 +109,7 @@ def test_the_search_brackets_a_plate_between_samples_if_values_are_below_half_th
     spacing = 2 / (NEWTON.search_samples - 1)
     middle = -1 + 7.5 * spacing
     plate = Shape(lambda p: (p[..., 2] - middle).abs() - (0.5 - share) * spacing, Kind.DISTANCE, 1.0)
-    crossing, bracket = NEWTON.tracer._search(plate, rays, RayTable.on_sphere(rays, 1.0), number)
+    crossing, bracket = NEWTON._search(plate, rays, RayTable.on_sphere(rays, 1.0), number)
     assert crossing.tolist() == [0]
     front = 2 + middle - (0.5 - share) * spacing
     assert bracket.near.item() < front < bracket.far.item() < front + spacing / 8
@@ -205,7 +205,7 @@ def test_an_image_has_the_hits_of_its_rays_each_alone(renderer, shape, rays):
 @by_shape
 def test_the_field_is_large_up_to_the_restart_distance(shape):
     rays = camera().rays()
-    table, _ = NEWTON.tracer.trace(shape, rays)
+    table, _ = NEWTON.trace(shape, rays)
     assert ((table.restart_distance >= table.entry) & (table.restart_distance <= table.leave)).all()
     assert (table.restart_distance > table.entry).sum() > 300
     shares = torch.linspace(0, 1, 100)
@@ -216,7 +216,7 @@ def test_the_field_is_large_up_to_the_restart_distance(shape):
 def marched(*values: float) -> RayTable:
     """The state of a ray that begins in the centre of the sphere and evaluates to these values."""
     rays, remaining = beam((0.0, 0.0, 0.0)), iter(values)
-    table, stride = RayTable.on_sphere(rays, 1.0), NEWTON.tracer.stride()
+    table, stride = RayTable.on_sphere(rays, 1.0), NEWTON.stride()
     march_table(lambda points: points.new_full(points.shape[:-1], next(remaining)), rays, table, stride, len(values))
     return table
 

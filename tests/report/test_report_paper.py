@@ -348,7 +348,7 @@ def test_fig5_data_holds_runs_medians_and_correlation(completions):
     assert rho.loc[PARALLEL, "spearman"] == pytest.approx(0.5) and rho.loc[PARALLEL, "n"] == 1
     assert rho.loc[DYNAMIC, "spearman"] == pytest.approx(1) and rho.loc[DYNAMIC, "n"] == 2  # runs, each by itself
     said = page_of(completions, "fig5").verdict
-    assert "in 1 of 2 different rows (ρ of 0.7 or more); not in + parallel (*0.50*)." in said
+    assert "0.7 or more in 1 of 2 different rows; not in + parallel (*0.50*)." in said
     assert rho.loc["+ aggressive", "spearman"] is None and rho.loc["+ aggressive", "n"] == 0
 
 
@@ -356,7 +356,7 @@ def test_fig5_counts_rows_that_are_one_computation_once(tmp_path):
     for label, losses in ((PARALLEL, [4, 3, 2, 1]), (DYNAMIC, [4, 3, 2, 1]), (NAIVE, [5, 4, 3, 2])):
         end = 0.2 if label == NAIVE else 0.1
         write_curve(write_run(tmp_path, "fig5", label), losses, {0: 0.4, 2: 0.3, 3: end})
-    assert "together in 2 of 2 different rows" in page_of(tmp_path, "fig5").verdict
+    assert "0.7 or more in 2 of 2 different rows" in page_of(tmp_path, "fig5").verdict
 
 
 def test_fig5_plots_the_numbers_of_its_csv(completions):

@@ -120,13 +120,18 @@ def test_gradients_have_a_row_for_each_renderer_and_band(tmp_path):
     assert (rows.loc["naive", "status"] == "oom").all() and rows.loc["naive", "code_scale"].isna().all()
     assert page.table.loc[0, ["Code pooled cosine", "Code scale", "Pixels"]].tolist() == ["0.99000", "1.00", "100"]
     assert "A pooled number compares the gradients of all pixels of a band" in told(page)
-    assert "0 of 3 reach a pooled cosine of 0.99 in all bands of hits. Smallest: *0.97000* (dist)" in page.verdict
+    assert (
+        "0 of 3 reach a pooled cosine of 0.99 in all bands of hits, for the code. Lowest band: *0.97000* (dist)"
+        in page.verdict
+    )
 
 
 def test_a_renderer_without_a_number_in_a_band_has_no_least_one():
     known = [("a", band, "ok", 0.995) for band in gradients.ANGLES] + [("b", "frontal", "ok", 0.999)]
     said = gradients._verdict(pd.DataFrame(known, columns=["name", "band", "status", "code_pooled_cosine"]))
-    assert "1 of 2 reach a pooled cosine of 0.99 in all bands of hits. Smallest: *0.99500* (a); " in said
+    assert (
+        "1 of 2 reach a pooled cosine of 0.99 in all bands of hits, for the code. Lowest band: *0.99500* (a); " in said
+    )
 
 
 def test_gradients_figure_plots_the_numbers_of_its_csv(tmp_path):

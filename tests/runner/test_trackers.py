@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from bench import trackers
+from bench import exports
+from bench.exports import MLflow, TensorBoard, curve, settings, values
 from bench.records.record import read_record
-from bench.trackers import MLflow, TensorBoard, curve, settings, values
 from datasets.extras import install_command
 from tests.runner.driving import FAILING, record_of
 
@@ -72,7 +72,7 @@ def test_tensorboard_has_the_run(finished, tmp_path):
 
 
 def test_a_tracker_that_is_not_installed_is_an_error_before_the_run(monkeypatch):
-    monkeypatch.setattr(trackers, "find_spec", lambda name: None)
+    monkeypatch.setattr(exports, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=re.escape(f": {install_command('mlflow')}")):
         MLflow("sqlite:///x.db", "e", "a")
 
@@ -84,7 +84,7 @@ def test_a_tracker_that_fails_is_noted_and_costs_no_run_and_a_reused_run_is_not_
         exported.append(folder)
         raise ConnectionError("the server\nis away")
 
-    monkeypatch.setattr(trackers, "find_spec", lambda name: True)
+    monkeypatch.setattr(exports, "find_spec", lambda name: True)
     monkeypatch.setattr(TensorBoard, "export", fail)
     for _ in range(2):
         _, out, _ = isolated(*FAILING, "+renderer.how=not", "isolation=off", "tracker=tensorboard")

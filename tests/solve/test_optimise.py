@@ -24,7 +24,8 @@ from renderers.boundary import render_checked
 from renderers.checks import BrokenContract
 from renderers.field import Counts, Meter
 from renderers.fields.analytic import sphere
-from renderers.rendering import Iteration, at_iteration, schedule_position
+from renderers.rendering import at_iteration
+from renderers.schedule import Iteration, schedule_position
 from tests.looped import each
 from tests.operations import Operations
 from tests.tiny import camera_of
