@@ -172,7 +172,7 @@ def optimise(
             stopwatch = Stopwatch(device)
             terms["total"].backward()
             if optimiser.gradients_are_finite():
-                optimiser.step(settings.rate(iteration if settings.ends == BUDGET else index))
+                optimiser.step(settings.rate(settings.at(index, history.counts.cost)))
             else:
                 failure = f"the gradient is not finite at iteration {index}"
             history.seconds["backward"] += stopwatch.seconds()

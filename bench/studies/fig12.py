@@ -101,23 +101,27 @@ def _successes(records: Sequence[Record]) -> str:
 
 
 def _verdict(runs: Runs) -> str:
-    """The fraction of successes of each row, over the runs that did not begin in place."""
-    misplaced = [record for record in runs.records if any(c.value_of(record) != c.neutral for c in CONDITIONS)]
-    shares = {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(misplaced, row_of).items()}
-    unmoved = [record for record in runs.records if record not in misplaced and not is_place_known(record)]
-    others = sorted(
-        {table.percent(sum(map(_succeeded, group)) / len(group)) for group in grouped(unmoved, row_of).values()}
-    )
+    """The fraction of successes of each row, over misplaced runs, and over those that start at the true place."""
+    misplaced, undisplaced = list[Record](), list[Record]()
+    for record in runs.records:
+        if any(c.value_of(record) != c.neutral for c in CONDITIONS):
+            misplaced.append(record)
+        elif not is_place_known(record):
+            undisplaced.append(record)
     ends = format.ends(
         f"Misplaced runs that end with an error below {MAX_ERROR:g}",
-        shares,
+        _shares(misplaced),
         conditions.shapes_text(misplaced),
         show=table.percent,
         largest_first=True,
     )
-    return (
-        f"{ends} Of runs that start at the true place and optimise it too: {' to '.join(others)}." if others else ends
-    )
+    others = " to ".join(sorted({*map(table.percent, _shares(undisplaced).values())}))
+    return f"{ends} Of runs that start at the true place and optimise it too: {others}." if others else ends
+
+
+def _shares(chosen: list[Record]) -> dict[str, float]:
+    """The fraction of successes of each row."""
+    return {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(chosen, row_of).items()}
 
 
 def pictures(runs: Runs) -> Result:

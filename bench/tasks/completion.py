@@ -117,7 +117,7 @@ class Completion:
         check_field_gradient(renderer)
         observed_view = self._observed_view(scene, renderer, seed=seed, device=device)
         compared = observed_view.observed & (self.depth_weight > 0)
-        rays = -(-compared.shape[0] // self.pixel_block) * -(-compared.shape[1] // self.pixel_block)
+        rays = len(pixel_of_each_block(*compared.shape, self.pixel_block, torch.Generator()))
         compare, all_pixels = observed_view.compare, None
         if self.pixel_block > 1:
             compare = self._compare_blocks(observed_view, seed)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from math import atan2, degrees, prod, radians, sqrt
+from math import atan2, degrees, radians, sqrt
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -205,7 +205,8 @@ class PoseProblem:
         self.starts = Starts(StartSettings(len(self.cameras), self.settings.trial))
         self.depth, self.observed = self.view.depth.to(self.device), self.view.mask.to(self.device)
         self.depth_per_distance = self.cameras[0].depth(torch.ones_like(self.depth))  # all starts have its lens
-        self.rays_per_iteration = prod(-(-length // self.settings.pixel_block) for length in self.depth.shape)
+        blocks = pixel_of_each_block(*self.depth.shape, self.settings.pixel_block, torch.Generator())
+        self.rays_per_iteration = len(blocks)
         self.normals = in_camera_axes(self.view.normals.to(self.device), self.view.camera.to(self.device))
 
     def field(self) -> Field:

@@ -161,7 +161,7 @@ class BoundDecoder:
             values = _FrozenDecoder.apply(self, flat, *(bias for _, bias in self.hidden))
             assert isinstance(values, Tensor)
             return values.view(points.shape[:-1])
-        compiled = None if needs_graph else self.compiled_for(flat)
+        compiled = None if needs_graph else self._compiled_for(flat)
         if compiled is not None:
             return compiled.values(flat).view(points.shape[:-1])
         chunks = [self._forward(chunk) for chunk in split_into_passes(flat, self._width)]
@@ -192,7 +192,7 @@ class BoundDecoder:
             self._copies[state] = compile_decoder(self.hidden, self.last, self.skip)
         return self._copies[state]
 
-    def compiled_for(self, points: Tensor) -> CompiledDecoder | None:
+    def _compiled_for(self, points: Tensor) -> CompiledDecoder | None:
         """The compiled decoder, if there is one for these points: float32 on a CPU with one thread."""
         is_supported = points.dtype == torch.float32 and points.device.type == "cpu" and torch.get_num_threads() == 1
         return self._compiled() if is_supported else None
@@ -233,7 +233,7 @@ class _FrozenDecoder(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, field: BoundDecoder, points: Tensor, *biases: Tensor) -> Tensor:
-        ctx.field, ctx.compiled = field, field.compiled_for(points)
+        ctx.field, ctx.compiled = field, field._compiled_for(points)
         if ctx.compiled is not None:
             ctx.points = points.detach().clone()  # which may be changed, or be of inference mode
             return ctx.compiled.values(points)

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <cstring>
 #include <memory>
+#include <utility>
 
 #if defined(__AVX512F__)
 constexpr int LANES = 16, VECTORS = 4;  // 24 of 32 registers hold sums
@@ -94,8 +95,7 @@ extern "C" void decoder_values(const Decoder *net, float *points, int64_t count,
     Rows tile = {points + 3 * first, 3}, from = {buffer.get(), stride}, to = {from.at(TILE), stride};
     for (int l = 0; l < net->layers; l++) {
       layer(net, l, tile, rows, from, to);
-      Rows swapped = from;
-      from = to, to = swapped;
+      std::swap(from, to);
     }
     for (int r = 0; r < rows; r++) values[first + r] = dot(from.at(r), net->last, width, net->last_bias);
   }
@@ -127,8 +127,7 @@ static void tile_gradients(const Decoder *net, Rows tile, int rows, const float 
         to_points.at(r)[c] = dot(from.at(r), net->point_weights[l] + (size_t)c * width, width, to_points.at(r)[c]);
     if (l == 0) return;
     product(from, rows, width, net->outputs[l - 1], net->transposed[l], nullptr, to);
-    Rows swapped = from;
-    from = to, to = swapped;
+    std::swap(from, to);
   }
 }
 

@@ -59,10 +59,8 @@ class CompiledDecoder:
         to_points = torch.zeros_like(points)
         widths = zip(self.padded_widths, wanted, strict=True)
         sums = [points.new_zeros(width) if is_wanted else None for width, is_wanted in widths]
-        addresses = [tensor.data_ptr() for tensor in (to_values, to_points)]
-        self.library.decoder_gradients(
-            ctypes.addressof(self.network), points.data_ptr(), len(points), *addresses, _addresses(sums)
-        )
+        arguments = points.data_ptr(), len(points), to_values.data_ptr(), to_points.data_ptr(), _addresses(sums)
+        self.library.decoder_gradients(ctypes.addressof(self.network), *arguments)
         return to_points, [None if s is None else s[:n] for s, n in zip(sums, self.widths, strict=True)]
 
 

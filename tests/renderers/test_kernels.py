@@ -60,7 +60,7 @@ def test_values_are_those_of_torch(name, count):
     field = make(name).at(torch.linspace(-1, 1, 4))
     points = 2 * torch.rand(count, 3) - 1
     with using_threads(1):
-        assert field.compiled_for(points) is field._compiled()
+        assert field._compiled_for(points) is field._compiled()
         torch.testing.assert_close(field(points), field._forward(points), rtol=1e-6, atol=1e-6)
         if count > 5:
             points[2], points[4] = torch.nan, torch.inf
