@@ -4,10 +4,11 @@ Several starts share one budget of iterations: successive halving keeps the bett
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import count
 from math import cos, inf, isfinite, isnan, pi
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -26,6 +27,8 @@ HALVING_FACTOR = 4  # one start of four is kept after each round (successive hal
 SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of a round, since each sees other views
 ITERATIONS, BUDGET = "iterations", "budget"  # what ends a loop
 MIN_BUDGET_ITERATIONS = 10  # with fewer, a run that its budget ends has no result
+AFFORDED_ITERATIONS = 40  # for which `with_affordable_rays` chooses the rays
+BLOCKS = (1, 2, 4, 8)  # pixels per side of a block of which an iteration has one ray
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
 RATE_DROP_FRACTIONS = (0.6, 0.8)  # the rate of "steps" falls to a fifth there (DVR: 750 and 1,000 epochs)
 WARMUP_FRACTION = 0.1  # the rate of "ramped" rises over this fraction of the iterations
@@ -96,6 +99,34 @@ class Optimisable(Protocol):
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The loss of an iteration, counted from 0, under "total", and its weighted terms."""
         ...
+
+
+class SampledTask(Protocol):
+    """A task of which an iteration compares one pixel of each block of `pixel_block` x `pixel_block`."""
+
+    optimiser: OptimiserSettings
+    pixel_block: int
+
+
+Sampled = TypeVar("Sampled", bound=SampledTask)
+Solvable = TypeVar("Solvable", bound=Optimisable)
+
+
+def with_affordable_rays(task: Sampled, make_problem: Callable[[Sampled], Solvable]) -> Solvable:
+    """The problem of a task; with `pixel_block` 0, of the smallest of `BLOCKS` with which the budget pays enough.
+
+    Enough are `AFFORDED_ITERATIONS`. The cost of an iteration is that of a first one, made for this and not counted.
+    """
+    if task.pixel_block:
+        return make_problem(task)
+    for block in BLOCKS:
+        sampled = replace(task, pixel_block=block)
+        problem = make_problem(sampled)
+        with suppress(CannotContinue):  # the loop reports it
+            problem.loss(0)["total"].backward()
+        if AFFORDED_ITERATIONS * problem.counts.cost <= (task.optimiser.budget or inf):
+            break
+    return make_problem(sampled)
 
 
 @dataclass

@@ -14,7 +14,7 @@ from bench.shape_prior import Prior
 from bench.solve.draw import solve_task
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
 from bench.solve.observed_view import DEPTH_LOSSES, ObservedView, generator_of
-from bench.solve.optimise import OptimiserSettings, StartSettings
+from bench.solve.optimise import OptimiserSettings, StartSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, save_in_world
 from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount, pixel_of_each_block
@@ -50,7 +50,8 @@ class Completion:
         rotations: number of initial rotations of the similarity, about the vertical axis.
         trial: iterations of each start; see `bench.solve.optimise.StartSettings`.
         optimiser: iterations and learning rates.
-        pixel_block: pixels per side of a block of which each iteration compares one random pixel; 1 compares all.
+        pixel_block: pixels per side of a block of which each iteration compares one random pixel; 1 compares all; 0:
+            the smallest block that the budget affords, see `bench.solve.optimise.with_affordable_rays`.
     """
 
     points: str
@@ -80,7 +81,7 @@ class Completion:
         for name in ("depth_weight", "normal_weight", "colour_weight", "silhouette_weight"):
             check_at_least(f"task.{name}", getattr(self, name), 0, "0 switches the term off")
         check_positive("task.normal_width", self.normal_width, "0.02 is two thirds of a pixel at 64 x 64")
-        check_at_least("task.pixel_block", self.pixel_block, 1, "2 compares a quarter of the pixels")
+        check_at_least("task.pixel_block", self.pixel_block, 0, "2 compares a quarter of the pixels")
         check_at_least("task.rotations", self.rotations, 1, "12 are 30 degrees apart")
         if self.similarity:
             StartSettings(self.rotations, self.trial).check(self.optimiser)
@@ -115,6 +116,9 @@ class Completion:
     ) -> CodeProblem:
         """The problem of a scene; it starts from code zero, the mean shape, in each rotation."""
         check_field_gradient(renderer)
+        if not self.pixel_block:
+            of_scene = {"seed": seed, "device": device}
+            return with_affordable_rays(self, lambda task: task.problem(scene, prior, renderer, **of_scene))
         observed_view = self._observed_view(scene, renderer, seed=seed, device=device)
         compared = observed_view.observed & (self.depth_weight > 0)
         rays = len(pixel_of_each_block(*compared.shape, self.pixel_block, torch.Generator()))

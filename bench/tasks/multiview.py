@@ -6,23 +6,25 @@ from math import radians
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.draw import solve_and_draw
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
-from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings
+from bench.solve.observed_view import generator_of
+from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, metric_definitions
 from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.shot import Shot
+from datasets.views import pixel_of_each_block
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Field
-from renderers.rendering import RayObservation, Renderer, at_iteration
+from renderers.rendering import RayObservation, Renderer, Rendering, at_iteration
 from renderers.schedule import schedule_position
 from renderers.silhouette import SilhouetteLoss
 
@@ -67,6 +69,7 @@ class Multiview:
             to the true one. If one is not neutral, a similarity transform is optimised too (DIST, Fig. 12).
         similarity: whether a similarity transform is optimised in any case.
         optimiser: iterations and learning rates.
+        pixel_block: see `bench.tasks.completion.Completion`; of each compared view.
         encoder: gives the mean of the initial codes, averaged over the photographs; None: zero, the mean shape.
     """
 
@@ -92,6 +95,7 @@ class Multiview:
     silhouette: SilhouetteLoss
     silhouette_weight: float
     optimiser: OptimiserSettings
+    pixel_block: int = 1
     encoder: CodeEncoder | None = None
 
     def __post_init__(self) -> None:
@@ -100,6 +104,7 @@ class Multiview:
         if self.neighbour % self.images.views == 0:
             reason = f"task.neighbour={self.neighbour} compares each of {self.images.views} views with itself"
             raise ValueError(f"{reason}: set task.neighbour=1")
+        check_at_least("task.pixel_block", self.pixel_block, 0, "2 compares a quarter of the pixels")
         check_positive("task.visible", self.visible, "the paper uses 0.001")
         check_positive("task.focal", self.focal, "1 is the scene's; from 1.07 on shapes may leave the image")
         check_positive("task.scale", self.scale, "1 is the true size")
@@ -152,10 +157,13 @@ class Multiview:
     ) -> CodeProblem:
         """The problem of a scene: the code and, if the initial shape is misplaced, a similarity transform."""
         check_field_gradient(renderer)
+        if not self.pixel_block:
+            of_scene = {"seed": seed, "device": device}
+            return with_affordable_rays(self, lambda task: task.problem(scene, prior, renderer, **of_scene))
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
         photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        return self.problem_of(prior, PhotometricLoss(self, renderer, photographs, device), generator)
+        return self.problem_of(prior, PhotometricLoss(self, renderer, photographs, device, seed=seed), generator)
 
     def problem_of(self, prior: Prior, photometric_loss: "PhotometricLoss", generator: torch.Generator) -> CodeProblem:
         """The problem of a loss; `generator` draws the initial codes."""
@@ -170,7 +178,7 @@ class Multiview:
             self.code,
             photometric_loss.compare,
             observed,
-            2 * photometric_loss.per_step * observed.numel(),
+            2 * photometric_loss.per_step * len(photometric_loss.pixels(0)),
             photometric_loss.colours.device,
             initial=codes,
             initial_similarities=initial_rotations(self.starts)
@@ -199,13 +207,17 @@ class PhotometricLoss:
         device: torch.device,
         *,
         from_user: bool = False,
+        seed: int = 0,
     ):
         """Stores the photographs. The user's photographs have any order: neighbours are chosen by distance.
+
+        Args:
+            seed: of the pixels that iterations compare.
 
         Raises:
             BadInput: if photographs differ in size.
         """
-        self.settings, self.renderer, self.from_user = settings, renderer, from_user
+        self.settings, self.renderer, self.from_user, self.seed = settings, renderer, from_user, seed
         if len({photograph.colours.shape for photograph in photographs}) > 1:
             raise BadInput("task=multiview compares photographs of one size, and these differ: leave others out")
         self.cameras = [photograph.camera.to(device) for photograph in photographs]
@@ -233,30 +245,56 @@ class PhotometricLoss:
         Raises:
             CannotContinue: if no pixel is visible in both views.
         """
-        renderer, pairs = at_iteration(self.renderer, iteration), self.pairs(iteration)
-        colours = self.images_at(iteration)
-        views, neighbours = map(list, zip(*pairs, strict=True))
-        rays = self._stack_rays(views)
+        renderer, images = at_iteration(self.renderer, iteration), self.images_at(iteration)
+        views, neighbours = map(list, zip(*self.pairs(iteration), strict=True))
+        rays, observed = self._stack_rays(views), images[views]
+        if self.settings.pixel_block > 1:
+            drawn = self.pixels(iteration)
+            rays = Rays(rays.origins.flatten(1, 2)[:, drawn], rays.directions.flatten(1, 2)[:, drawn])
+            observed = observed.flatten(1, 2)[:, drawn]
         rendering = render_checked(renderer, field, rays)
-        with torch.no_grad():
-            neighbour_rendering = render_checked(renderer, field, self._stack_rays(neighbours))
+        visible = self._visible(renderer, field, rendering, neighbours)
         differences = []
-        for k, (view, other) in enumerate(pairs):
-            pixels, depth = self.cameras[other].project(rendering.points[k])
-            with torch.no_grad():
-                neighbour_depth = self.cameras[other].depth(neighbour_rendering.distance[k])
-                visible = rendering.hit[k] & self._sees(neighbour_depth, neighbour_rendering.hit[k], pixels, depth)
-            warped, _ = sample(colours[other], pixels[visible])
-            differences.append((warped - colours[view][visible]).abs().mean(-1))
+        for k, other in enumerate(neighbours):
+            pixels, _ = self.cameras[other].project(rendering.points[k][visible[k]])
+            warped, inside = sample(images[other], pixels)
+            differences.append((warped - observed[k][visible[k]])[inside].abs().mean(-1))
         errors = torch.cat(differences)
         if not len(errors):
             raise CannotContinue(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
         terms = {"photometric": self.settings.photometric_weight * errors.mean()}
         if self.masks is not None:
-            observation = RayObservation(self.masks[views], torch.full_like(rendering.distance, torch.nan))
+            masks = self.masks[views] if self.settings.pixel_block == 1 else self.masks[views].flatten(1)[:, drawn]
+            observation = RayObservation(masks, torch.full_like(rendering.distance, torch.nan))
             silhouette = self.settings.silhouette(renderer, field, rays, rendering, observation)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
+
+    def pixels(self, iteration: int) -> Int[Tensor, " n"]:
+        """The pixels of each view that an iteration compares, by rows."""
+        block, generator = self.settings.pixel_block, generator_of(self.seed, iteration)
+        return pixel_of_each_block(*self.colours.shape[1:3], block, generator).to(self.colours.device)
+
+    @torch.no_grad()
+    def _visible(
+        self, renderer: Renderer, field: Field, rendering: Rendering, neighbours: list[int]
+    ) -> Bool[Tensor, "views ..."]:
+        """Whether the hits of views are seen by the neighbours, where depths agree (DIST, B.3).
+
+        The neighbours' depths are interpolated in their images or, of drawn pixels, rendered along rays to the hits.
+        """
+        if self.settings.pixel_block == 1:
+            seen = render_checked(renderer, field, self._stack_rays(neighbours))
+            depths = [self.cameras[other].depth(seen.distance[k]) for k, other in enumerate(neighbours)]
+            expected = [self.cameras[other].project(rendering.points[k]) for k, other in enumerate(neighbours)]
+            agree = [self._sees(depths[k], seen.hit[k], *expected[k]) for k in range(len(neighbours))]
+            return rendering.hit & torch.stack(agree)
+        centres = torch.stack([self.cameras[other].center for other in neighbours])
+        origins = centres[:, None].expand_as(rendering.points)[rendering.hit]
+        offsets = rendering.points[rendering.hit] - origins
+        seen = render_checked(renderer, field, Rays(origins, torch.nn.functional.normalize(offsets, dim=-1)))
+        close = (seen.distance - offsets.norm(dim=-1)).square() < self.settings.visible
+        return rendering.hit.clone().masked_scatter_(rendering.hit, seen.hit & close)
 
     def _sees(
         self,

@@ -23,7 +23,7 @@ from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.draw import solve_and_draw
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, generator_of, normal_error
-from bench.solve.optimise import OptimiserSettings, Starts, StartSettings
+from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
 from datasets.scene import Scene, View, see
 from datasets.views import pixel_of_each_block
 from renderers.boundary import render_checked
@@ -141,7 +141,7 @@ class Pose(PoseTask):
     pixel_block: int = 1
 
     def __post_init__(self) -> None:
-        check_at_least("task.pixel_block", self.pixel_block, 1, "2 compares a quarter of the pixels")
+        check_at_least("task.pixel_block", self.pixel_block, 0, "2 compares a quarter of the pixels")
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         check_choice("task.shape", self.shape, ("grid", "prior"))
         check_at_least("task.grid", self.grid, 8, "96 keep thin parts")
@@ -169,7 +169,8 @@ class Pose(PoseTask):
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
 
         def problem() -> PoseProblem:
-            return PoseProblem(self, inputs.renderer, shape_field, view, cameras, inputs.device, inputs.seed)
+            args = inputs.renderer, shape_field, view, cameras, inputs.device, inputs.seed
+            return with_affordable_rays(self, lambda task: PoseProblem(task, *args))
 
         solve_and_draw(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | RENDERER_DEFINITIONS)
 

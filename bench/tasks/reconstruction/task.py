@@ -9,7 +9,7 @@ from bench.evaluate.state import State
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
 from bench.solve.draw import solve_and_draw
-from bench.solve.optimise import OptimiserSettings
+from bench.solve.optimise import OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient
 from bench.tasks.reconstruction.choice import DEFINITIONS, Appearance, AutoField
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, judge
@@ -49,6 +49,8 @@ class Reconstruction(PhotographTask):
         auto: settings of `field=auto`.
         losses: losses of the renderings.
         optimiser: iterations and learning rates.
+        pixel_block: its square divides `rays`; 0: the smallest divisor that the budget affords, see
+            `bench.solve.optimise.with_affordable_rays`.
     """
 
     guide: str
@@ -57,12 +59,14 @@ class Reconstruction(PhotographTask):
     auto: AutoField
     losses: Losses
     optimiser: OptimiserSettings
+    pixel_block: int = 1
 
     takes_field: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("task.guide", self.guide, GUIDES)
+        check_at_least("task.pixel_block", self.pixel_block, 0, "2 draws a quarter of task.rays")
         check_at_least("task.rays", self.rays, 4, "1024 work")
         if self.losses.colour_gradient and self.rays % 4:
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
@@ -105,6 +109,10 @@ class Reconstruction(PhotographTask):
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
         stack = Stack.build(subject.input_shots, guide and guide(subject.input_shots), inputs.device)
         iterations = self.optimiser.iterations
-        return ReconstructionProblem(
-            subject, stack, model, self.losses, inputs.renderer, self.rays, iterations, inputs.seed
-        )
+
+        def problem(task: Reconstruction) -> ReconstructionProblem:
+            rays = max(self.rays // task.pixel_block**2, 4)
+            args = self.losses, inputs.renderer, rays, iterations, inputs.seed
+            return ReconstructionProblem(subject, stack, model, *args)
+
+        return with_affordable_rays(self, problem)
