@@ -22,6 +22,7 @@ from bench.records.format import MISSING, number, plural
 from bench.records.read import read_records
 from bench.records.results import RESULTS
 from bench.report.suite.attempts import (
+    BUDGET_KEY,
     EXPERIMENT_PREFIX,
     FIXED_KEYS,
     PROBLEM_SETTINGS,
@@ -33,7 +34,7 @@ from bench.report.suite.attempts import (
     suite,
     write_attempts,
 )
-from bench.report.suite.standing import BUDGETS, KEY, Standing
+from bench.report.suite.standing import KEY, Standing
 from bench.report.write import paper
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -43,6 +44,7 @@ PAGE = "suite"  # its file name in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
 TUNED_LABEL = f"label='${{renderer._label_}}{TUNED_SUFFIX}'"
 STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
+AXES = (BUDGET_KEY, *(key for key, _, _ in PROBLEM_SETTINGS.values()))  # may be typed, to run some problems only
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one
 SETTING_VALUES = ("stated", "tuned")  # the set's setting for all renderers, or that of conf/tuned.yaml
 
@@ -76,9 +78,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
         key, _, value = argument.partition("=")
         if key in ("suite", "set", "setting"):
             options[key] = value
-        elif re.match(STATED_KEYS_PATTERN, key) and key not in [
-            key_of_setting for key_of_setting, _ in PROBLEM_SETTINGS.values()
-        ]:
+        elif re.match(STATED_KEYS_PATTERN, key) and key not in AXES:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
         elif key == "label" and (value in shipped_rows() or value.endswith(TUNED_SUFFIX)):
             raise ValueError(
@@ -178,19 +178,22 @@ def print_standing(results_dir: Path) -> int:
 
 
 def _print_rows(standing: Standing, local: set[str]) -> None:
-    """Prints the progress and possible ranks of each row at each budget, the cost, and the number of failed runs."""
+    """Prints the progress and possible ranks of each row at each budget, and the number of failed runs."""
     available = plural(len(standing.everything[KEY].drop_duplicates()), "problem")
     compared = plural(len(standing.complete[KEY].drop_duplicates()), "problem")
     print(f"progress on the {compared} that all rows have, of {available} with results; with possible ranks:")
-    print(f"{'renderer':<28} {'at 1 x':<14}{'at 10 x':<14}{'at the end':<14} cost, DIST = 1  failed runs")
+    budgets = {budget: f"at {budget:g} {'unit' if budget == 1 else 'units'}" for budget in standing.budgets}
+    print(f"{'renderer':<28} {''.join(f'{title:<16}' for title in budgets.values())}failed runs")
     for row in standing.rows:
-        values = {name: standing.rankings[name].progress[row] for name in BUDGETS}
-        shown = {name: MISSING if row in standing.hidden[name] else percent(value) for name, value in values.items()}
-        cells = "".join(f"{f'{shown[name]:>5} ({standing.rankings[name].rank(row)})':<14}" for name in BUDGETS)
+        cells = [
+            f"{percent(ranked.progress[row]):>5} ({ranked.rank(row)})" if row in ranked.progress else f"{MISSING:>5}"
+            for ranked in standing.rankings.values()
+        ]
         failed = (~standing.complete.loc[standing.complete["row"] == row, "ok"]).sum()
-        print(f"{row + (' *' if row in local else ''):<28} {cells} {number(standing.costs[row]):>14}  {failed:>11}")
-    for row, missing in standing.lacking.items():
-        print(f"{row} lacks {plural(missing, 'problem')}, so it is not compared: run the suite for it without set=.")
+        print(f"{row + (' *' if row in local else ''):<28} {''.join(f'{cell:<16}' for cell in cells)}{failed:>11}")
+    for (budget, row), missing in standing.lacking.items():
+        lacks = f"{row} lacks {plural(missing, 'problem')} {budgets.get(budget, budget)}"
+        print(f"{lacks}, so it is not compared there: run the suite for it without set=.")
 
 
 def _print_errors(standing: Standing, local_rows: set[str]) -> None:
@@ -198,7 +201,7 @@ def _print_errors(standing: Standing, local_rows: set[str]) -> None:
     best_errors = standing.complete.groupby(KEY)["final"].min()
     for run in standing.reached[standing.reached["row"].isin(local_rows)].itertuples():
         errors = f"initial error {number(run.initial)}, final error {number(run.final)}"
-        best_error = f"best renderer {number(best_errors.get((run.set, run.problem, run.seed)))}"
+        best_error = f"best renderer {number(best_errors.get((run.set, run.problem, run.budget)))}"
         print(f"{run.row}, {run.set}, {run.problem}: {errors}; {best_error}, best possible {number(run.reference)}")
 
 

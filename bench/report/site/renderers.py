@@ -1,4 +1,4 @@
-"""The data of the page on each renderer of the suite: progress per problem, failures and command."""
+"""The data of the page on each renderer of the suite: progress on each problem, failures and command."""
 
 import shlex
 from pathlib import Path
@@ -49,13 +49,13 @@ def _row(
     row: str, runs: pd.DataFrame, problems: list[Any], attempts: dict[Any, Attempt], folders: dict[Any, str]
 ) -> dict[str, Any]:
     """A row's final progress on each problem (None without an attempt), its failures and the command."""
-    by_problem = {(run.set, run.problem, run.seed): run for run in runs.itertuples()}
+    by_problem = {(run.set, run.problem, run.budget): run for run in runs.itertuples()}
     solved = [by_problem.get(problem) for problem in problems]
-    keys = [run and (run.set, run.problem, run.seed, run.row, run.settings, run.started) for run in solved]
+    keys = [run and (run.set, run.problem, run.budget, run.row, run.settings, run.started) for run in solved]
     first = next(attempts[key] for key in keys if key)
     return {
         "row": row,
-        "progress": [run and round(run.end, 4) for run in solved],
+        "progress": [run and round(run.progress, 4) for run in solved],
         "failed": [[index, run.status, run.reason] for index, run in enumerate(solved) if run and not run.ok],
         "runs": [folders.get(key) for key in keys],
         "command": shlex.join(["python", "-m", "bench.suite", *_overrides_of_row(first)]),

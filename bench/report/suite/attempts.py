@@ -33,16 +33,17 @@ from bench.tables import CONF, read_yaml
 
 SUITE_FOLDER = "suite"  # it has a folder per version
 EXPERIMENT_PREFIX = "core_"  # before the name of a set
-PROBLEM_SETTINGS = {  # per set: the setting that distinguishes the problems of a scene, and its text
-    **{"complete": ("task.points", "{} points"), "pose": ("task.degrees", "{:g} degrees")},
-    **{"reconstruct": ("task.images.texture", "{}"), "render": ("task.size", "{} pixels")},
+PROBLEM_SETTINGS = {  # per set: the setting in which problems differ, its key under `sizes`, and its text
+    "complete": ("task.points", "points", "{} points"),
+    "pose": ("task.degrees", "degrees", "{:g} degrees"),
+    "reconstruct": ("task.images.texture", "textures", "{}"),
 }
-SETS_WITHOUT_CURVE = ("render",)
+BUDGET_KEY = "task.optimiser.budget"  # in field evaluations
 TUNED_PREFIX = "tuned/"  # before the name of a method with tuned settings
 TUNED_SUFFIX = ", tuned"  # after the name of a row with tuned settings
 TUNABLE_KEYS = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"
 # A set fixes these for all renderers; tuned settings may only change TUNABLE_KEYS.
-FIXED_KEYS = ("task", "view", "evaluation", "silhouette", "field", "prior", "split")
+FIXED_KEYS = ("task", "view", "evaluation", "silhouette", "field", "prior", "split", "seed")
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Suite:
     version: int
     sizes: dict[str, str]
     errors: dict[str, str]
+    units: dict[str, float]
+    budgets: tuple[float, ...]
     references: dict[str, dict[str, float]]
 
     @property
@@ -67,18 +70,24 @@ def suite() -> Suite:
 
 @cache
 def problems_of(size: str) -> set[tuple[Any, ...]]:
-    """The set, problem and seed of all cells of a size of the suite. A row needs all of them to be compared."""
+    """The set, problem and budget of all cells of a size of the suite. A row needs all of them to be compared."""
     keys: set[tuple[Any, ...]] = set()
     for name in suite().errors:
-        experiment = read_yaml(CONF / "experiment" / f"{EXPERIMENT_PREFIX}{name}.yaml")
-        sizes = {key: str(value).split(",") for key, value in experiment["sizes"][suite().sizes[size]].items()}
-        axes = [sizes.pop(key) for key in ("families", "shapes", "seeds")]
-        form = PROBLEM_SETTINGS.get(name, ("", ""))[1]
-        for family_name, index, seed, *amounts in product(*axes, *sizes.values()):
-            values = [float(text) if text.isdecimal() and ":g" in form else text for text in amounts]
-            problem = ", ".join([f"{family_name} {experiment.get('split', 'test')} {index}", *map(form.format, values)])
-            keys.add((name, problem, int(seed)))
+        sizes = read_yaml(CONF / "experiment" / f"{EXPERIMENT_PREFIX}{name}.yaml")["sizes"]
+        axes = {key: str(value).split(",") for key, value in sizes[suite().sizes[size]].items()}
+        _, amount_key, form = PROBLEM_SETTINGS.get(name, ("", "", ""))
+        degrees = [*map(float, axes.get(amount_key, ()))]  # an axis; other amounts are by the index of the shape
+        for family_name, index, budget in product(axes["families"], axes["shapes"], axes["budgets"]):
+            amounts = [sizes[amount_key][int(index)]] if amount_key in sizes else degrees
+            scene = f"{family_name} test {index}"
+            texts = [f"{scene}, {form.format(amount)}" for amount in amounts] or [scene]
+            keys |= {(name, text, _units(name, float(budget))) for text in texts}
     return keys
+
+
+def _units(set_name: str, budget: float) -> float:
+    """A budget in field evaluations as a multiple of its set's unit."""
+    return float(f"{budget / suite().units[set_name]:.3g}")
 
 
 @dataclass(frozen=True)
@@ -86,10 +95,12 @@ class Attempt:
     """A run of a renderer on a problem of the suite.
 
     Args:
-        set, problem, scene, seed: what was to be solved; a scene has a problem per value in `PROBLEM_SETTINGS`.
+        set, problem, scene: what was to be solved; a scene has a problem per value in `PROBLEM_SETTINGS`.
+        budget: the cost that the run could spend, in units of the set.
         row, preset: the renderer's name in tables, and the preset that decides its look.
         start, final: the errors before and after; `final` is infinite if the run did not end ok.
-        cost, operations, seconds: of the loop, or of one rendering; `cost` as `renderers.field.Counts.cost`.
+        iterations, rays: number of iterations, and of rays in each.
+        cost, operations, seconds: of the loop; `cost` as `renderers.field.Counts.cost`.
         waited: fraction of its time that the run waited for a processor.
         settings, code: hashes of the settings that the set fixes, and of the code.
         curve: cost, seconds and error at each checkpoint.
@@ -99,13 +110,15 @@ class Attempt:
     set: str
     problem: str
     scene: str
-    seed: int
+    budget: float
     row: str
     preset: str
     status: str
     reason: str
     start: float
     final: float
+    iterations: int
+    rays: int
     cost: float
     operations: float | None
     seconds: float | None
@@ -123,8 +136,8 @@ class Attempt:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """The identity of an attempt: set, problem, seed, row and settings."""
-        return self.set, self.problem, self.seed, self.row, self.settings
+        """The identity of an attempt: set, problem, budget, row and settings."""
+        return self.set, self.problem, self.budget, self.row, self.settings
 
     @property
     def ok(self) -> bool:
@@ -153,9 +166,11 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     set_name = {f"{EXPERIMENT_PREFIX}{name}": name for name in suite().errors}.get(config.get("experiment"))
     if set_name is None or record["status"] in UNMEASURED:
         return None
+    if setting(config, "task", "optimiser", "ends") != "budget":  # of an older version of the suite
+        return None
     error, ok = suite().errors[set_name], record["status"] == "ok"
     scene = f"{family(record)} {config.get('split')} {config.get('index')}"
-    amount_key, form = PROBLEM_SETTINGS.get(set_name, ("", ""))
+    amount_key, _, form = PROBLEM_SETTINGS.get(set_name, ("", "", ""))
     amount_texts = [form.format(setting(config, *amount_key.split(".")))] if amount_key else []
     final, start = (_finite(record[section].get(error)) for section in ("metrics", "metrics_start"))
     curve = _curve(record, folder, final if ok else None)
@@ -164,13 +179,16 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     changes = [text.removeprefix("renderer.") for text in overrides if re.match(r"renderer\.[^_]", text)]
     row = ", ".join([renderer_name(config, record["renderer"]), *changes])  # without the loss, which is the set's
     return Attempt(
-        **{"set": set_name, "problem": ", ".join([scene, *amount_texts]), "scene": scene, "seed": record["seed"]},
+        **{"set": set_name, "problem": ", ".join([scene, *amount_texts]), "scene": scene},
+        budget=_units(set_name, setting(config, *BUDGET_KEY.split("."))),
         row=row.removesuffix(TUNED_SUFFIX) + TUNED_SUFFIX if tuned else row,
         preset=record["renderer"] if tuned else record.get("method") or record["renderer"],
         status=str(record["status"]),
         reason=record["reason"],
         start=start,
         final=final if ok else inf,
+        iterations=record["evaluations"].get("iterations", 0),
+        rays=record["evaluations"].get("rays_per_iteration", 0),
         cost=curve[-1][0] if curve else 0.0,
         operations=record["flops"],
         seconds=loop_seconds(record),
@@ -198,18 +216,16 @@ def portable_overrides(overrides: Iterable[str]) -> list[str]:
 def settings_hash(config: dict[str, Any], set_name: str, tuned: bool) -> str:
     """A hash of the settings that a set fixes, without those in which problems or tuned settings differ."""
     values = flat({key: config.get(key) for key in FIXED_KEYS})
-    amount_key, _ = PROBLEM_SETTINGS.get(set_name, ("", ""))
-    varying = [key for key in values if key == amount_key or (tuned and re.match(TUNABLE_KEYS, key))]
+    amount_key, *_ = PROBLEM_SETTINGS.get(set_name, ("",))
+    varying = [key for key in values if key in (amount_key, BUDGET_KEY) or (tuned and re.match(TUNABLE_KEYS, key))]
     return digest({key: str(value) for key, value in values.items() if key not in varying})
 
 
 def _curve(record: Record, folder: Path, final: float | None) -> list[list[float]]:
     """The checkpoints and the end of a run. A line has the error before its step, and the costs after it."""
     error = suite().errors[record["config"]["experiment"].removeprefix(EXPERIMENT_PREFIX)]
-    lines = curve_lines(folder) or []
-    rendering_costs = record["metrics"].get("cost"), record["seconds"].get("forward")  # if the run has no loop
-    checkpoints, costs = list[list[float]](), [0.0 if lines else as_number(number) or 0.0 for number in rendering_costs]
-    for line in lines:
+    checkpoints, costs = list[list[float]](), [0.0, 0.0]
+    for line in curve_lines(folder) or []:
         if line.get(error) is not None:
             checkpoints.append([*costs, _finite(line[error])])
         costs = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]

@@ -28,7 +28,7 @@
     ];
   }
 
-  const named = ([of, problem, seed]) => `${of}: ${problem}, seed ${seed}`;
+  const named = ([of, problem, budget]) => `${of}: ${problem}, ${plural(budget, "unit")}`;
 
   /* How often it fails; the first failure, with its picture where its run is among these results. */
   function failure({failed, progress, runs}, {problems}) {
