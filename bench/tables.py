@@ -200,27 +200,6 @@ def _rows_of(path: Path, group: str, text: str) -> list[tuple[str, str, Node]]:
     return rows
 
 
-def look_of(name: str) -> Node:
-    """The keys `colour`, `marker` and `line` of a method or renderer, merged over those of its bases; {} for others.
-
-    A method has the colour of its renderer. Its tuned settings, and its space, look like the method.
-    """
-    name = name.rpartition("/")[2]
-    group = METHOD if name in names(METHOD) else "renderer"
-    candidates = [name, *(other for other in names("renderer") if other.replace("_", "") == name)]  # or a class name
-    return next((_look(group, candidate) for candidate in candidates if candidate in names(group)), {})
-
-
-def _look(group: str, name: str) -> Node:
-    node, look = choice(group, name), dict[str, Any]()
-    for base in node.get("defaults", ()):
-        if isinstance(base, str) and base != "_self_":
-            look |= _look(group, base.removeprefix(f"/{group}/"))
-        elif renderer := isinstance(base, dict) and base.get("override /renderer"):
-            look |= _look("renderer", renderer)
-    return look | node.get(LOOK_KEY, {})
-
-
 def _row_node(group: str, row: Node) -> Node:
     chosen = [key for key in METHOD_ROW_GROUPS if group.startswith(METHOD) and isinstance(row.get(key), str)]
     base = [row["base"]] if "base" in row else []
