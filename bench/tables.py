@@ -14,7 +14,7 @@ the named ones by `+method: ${spaces:NAME,...}`.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -79,13 +79,7 @@ class Choice:
 def _load_file(path: Path, text: str) -> tuple[DictConfig, str | None]:
     """The content of a file, and the package named in its first line."""
     package_line = PACKAGE_LINE.match(text)
-    try:
-        node = OmegaConf.create(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(node, DictConfig):
-        raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
-    return node, package_line and package_line[1]
+    return _parse(path, text, OmegaConf.create), package_line and package_line[1]
 
 
 _choices: dict[str, dict[str, Choice]] = {}  # by group and name, of conf and the user's folders
@@ -177,11 +171,15 @@ def _read_text(path: Path) -> str:
 
 @cache
 def _parse_mapping(path: Path, text: str) -> Node:
+    return _parse(path, text, lambda text: yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {})
+
+
+def _parse(path: Path, text: str, parse: Callable[[str], Any]) -> Any:
     try:
-        content = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
+        content = parse(text)
     except yaml.YAMLError as error:
         raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict):
+    if not isinstance(content, dict | DictConfig):
         raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
     return content
 
