@@ -16,7 +16,8 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
-__all__ = ["load", "load_field", "run"]
+MODULES = {"load": "bench.report.data.frame", "load_field": "datasets.files.field_files", "run": "bench.runner.library"}
+__all__ = [*MODULES]
 
 SIBLING_PACKAGES = ("conf", "datasets", "renderers")  # `datasets` is also the name of a Hugging Face package
 PROJECT = "implicit-bench"  # the first line of each sibling package contains it
@@ -24,12 +25,8 @@ PROJECT = "implicit-bench"  # the first line of each sibling package contains it
 
 def __getattr__(name: str) -> Any:
     """Imports the names of `__all__` at their first use: pandas alone takes half a second."""
-    if name == "load":
-        return import_module("bench.report.data.frame").load
-    if name == "load_field":
-        return import_module("datasets.files.field_files").load_field
-    if name == "run":
-        return import_module("bench.runner.library").run
+    if name in MODULES:
+        return getattr(import_module(MODULES[name]), name)
     raise AttributeError(f"module 'bench' has no attribute {name!r}")
 
 

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, subsample, surface_metrics
-from bench.records.record import Record, RunStatus, digest, is_plain_name, now, read_record
+from bench.records.read import is_plain_name
+from bench.records.record import Record, RunStatus, digest, now, read_record
 from bench.records.results import check_links
 from bench.report.write.html import write_index
 from bench.tables import choice

@@ -305,7 +305,15 @@ def prior_for(
     dataset: Dataset, settings: PriorSettings, priors_dir: Path, device: torch.device, progress: Report
 ) -> Prior:
     """The prior of a dataset; see `prior_file`."""
-    return _load(prior_file(dataset, settings, priors_dir, device, progress), settings)
+    path = prior_file(dataset, settings, priors_dir, device, progress)
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"the prior {path} cannot be read ({error}): delete it, and it is trained again") from error
+    decoder = settings.new_decoder()
+    codes = tensors.pop("codes")
+    decoder.load_state_dict(tensors)
+    return Prior(decoder.requires_grad_(False), codes)
 
 
 def prior_file(
@@ -403,14 +411,3 @@ def _surface_errors(
         "validation": fit_error(prior.decoder, validation, delta),
         "mean_shape": fit_error(prior.decoder, validation, delta, steps=0),
     }
-
-
-def _load(path: Path, settings: PriorSettings) -> Prior:
-    try:
-        tensors = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"the prior {path} cannot be read ({error}): delete it, and it is trained again") from error
-    decoder = settings.new_decoder()
-    codes = tensors.pop("codes")
-    decoder.load_state_dict(tensors)
-    return Prior(decoder.requires_grad_(False), codes)

@@ -14,7 +14,7 @@ the named ones by `+method: ${spaces:NAME,...}`.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -79,13 +79,7 @@ class Choice:
 def _load_file(path: Path, text: str) -> tuple[DictConfig, str | None]:
     """The content of a file, and the package named in its first line."""
     package_line = PACKAGE_LINE.match(text)
-    try:
-        node = OmegaConf.create(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(node, DictConfig):
-        raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
-    return node, package_line and package_line[1]
+    return _parse(path, text, OmegaConf.create), package_line and package_line[1]
 
 
 _choices: dict[str, dict[str, Choice]] = {}  # by group and name, of conf and the user's folders
@@ -177,11 +171,15 @@ def _read_text(path: Path) -> str:
 
 @cache
 def _parse_mapping(path: Path, text: str) -> Node:
+    return _parse(path, text, lambda text: yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {})
+
+
+def _parse(path: Path, text: str, parse: Callable[[str], Any]) -> Any:
     try:
-        content = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
+        content = parse(text)
     except yaml.YAMLError as error:
         raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict):
+    if not isinstance(content, dict | DictConfig):
         raise ValueError(f"{path} must hold keys and values: see conf/renderer/dist.yaml")
     return content
 
@@ -198,27 +196,6 @@ def _rows_of(path: Path, group: str, text: str) -> list[tuple[str, str, Node]]:
             bases = [f"/{METHOD}/{name}", f"/{METHOD}/_drawn", "_self_"]
             rows.append((SPACE, name, {"defaults": bases} | nest_keys(row["space"])))
     return rows
-
-
-def look_of(name: str) -> Node:
-    """The keys `colour`, `marker` and `line` of a method or renderer, merged over those of its bases; {} for others.
-
-    A method has the colour of its renderer. Its tuned settings, and its space, look like the method.
-    """
-    name = name.rpartition("/")[2]
-    group = METHOD if name in names(METHOD) else "renderer"
-    candidates = [name, *(other for other in names("renderer") if other.replace("_", "") == name)]  # or a class name
-    return next((_look(group, candidate) for candidate in candidates if candidate in names(group)), {})
-
-
-def _look(group: str, name: str) -> Node:
-    node, look = choice(group, name), dict[str, Any]()
-    for base in node.get("defaults", ()):
-        if isinstance(base, str) and base != "_self_":
-            look |= _look(group, base.removeprefix(f"/{group}/"))
-        elif renderer := isinstance(base, dict) and base.get("override /renderer"):
-            look |= _look("renderer", renderer)
-    return look | node.get(LOOK_KEY, {})
 
 
 def _row_node(group: str, row: Node) -> Node:

@@ -18,8 +18,8 @@ import pandas as pd
 import yaml
 
 from bench.records.format import number
-from bench.records.read import read_records
-from bench.records.record import NEUTRAL_KEYS, flat, is_plain_name, write_text
+from bench.records.read import is_plain_name, read_records
+from bench.records.record import NEUTRAL_KEYS, flat, write_text
 from bench.records.results import RESULTS
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import CHAMFER_SCALE, Record, RunKey, error, grouped, run_key

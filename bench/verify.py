@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from math import inf, isnan
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -23,10 +23,11 @@ from bench.records.folder import code_hash
 from bench.records.format import number, plural
 from bench.records.record import Record, RunStatus, bad_link, read_record
 from bench.records.results import run_folders
-from bench.setup.inputs import EvaluatesField, RunContext, prepare_run
+from bench.setup.inputs import RunContext, prepare_run
 from datasets.files.field_files import load_field
 from datasets.saved_field import FIELD_FILE
 from renderers.checks import BadInput
+from renderers.field import Field
 
 METRIC_TOLERANCE = 1e-4  # relative: other machines add numbers in another order
 ABSOLUTE_TOLERANCE = 1e-9
@@ -36,6 +37,15 @@ EXCLUDED_METRICS = re.compile(r"\.|seconds|overhead|saved|gemm")  # metrics of s
 
 class NothingToCompare(Exception):
     """A run has nothing to compare; the message has the reason."""
+
+
+@runtime_checkable
+class EvaluatesField(Protocol):
+    """A task with its own evaluation of a final field, in place of `bench.evaluate.evaluate.evaluate`."""
+
+    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
+        """The metrics of the final field of a run of the task."""
+        ...
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -118,17 +118,6 @@ class Mesh:
         heights = self.vertices[self.faces[:, 0]] - self.vertices.mean(axis=0)
         return np.bincount(self.parts, weights=(heights * self.area_normals).sum(axis=1) / 6)
 
-    @property
-    def holes(self) -> int:
-        """Number of loops of edges that have a face on one side only."""
-        import trimesh
-
-        directed = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, uses = np.unique(directed, axis=0, return_counts=True)
-        rim = edges[uses == 1]
-        labels = trimesh.graph.connected_component_labels(rim, node_count=len(self.vertices))
-        return len(np.unique(labels[rim]))
-
     def compact(self) -> "Mesh":
         """The mesh without unused vertices."""
         used, faces = np.unique(self.faces, return_inverse=True)

@@ -1,7 +1,6 @@
 """A photograph with its camera, rendered or real."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -9,7 +8,6 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from datasets.scene import Split
 from renderers.camera import Camera
 
 
@@ -68,12 +66,3 @@ def camera_in_world(camera: Camera, to_world: Float[np.ndarray, "4 4"]) -> Camer
     motion = camera.world_to_camera.double() @ torch.from_numpy(to_world)
     motion[:3] /= float(np.linalg.norm(to_world[:3, 0]))
     return replace(camera, intrinsics=camera.intrinsics.float(), world_to_camera=motion.float())
-
-
-@runtime_checkable
-class Pictured(Protocol):
-    """A dataset that includes rendered images of its shapes."""
-
-    def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
-        """The images of a shape with cameras in its mesh's world, at most `longest` pixels a side; None without any."""
-        ...

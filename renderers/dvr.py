@@ -106,7 +106,7 @@ class DVR:
     ) -> Float[Tensor, ""]:
         """DVR, Eqs. 14 and 15; see `silhouette.Occupancy`."""
         occupancy = Occupancy(self.occupancy_width, self.mask_weight, self.sphere_radius, self.occupied_at)
-        return occupancy.of(field, rays, rendering, observed)
+        return occupancy(self, field, rays, rendering, observed)
 
     def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> tuple[Tensor, ...]:
         """The status and distance of rays that meet the sphere; distance and value of their sample nearest to 0."""

@@ -222,10 +222,6 @@ class Occupancy:
     def __call__(
         self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
     ) -> Float[Tensor, ""]:
-        return self.of(field, rays, rendering, observed)
-
-    def of(self, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation) -> Float[Tensor, ""]:
-        """The loss of a rendering of the field along the rays."""
         flat, hit, foreground = rays.flat(), rendering.hit.flatten(), observed.mask.flatten()
         entry, leave, intersects = (tensor.detach() for tensor in sphere_span(flat, self.sphere_radius))
         distance = entry + torch.rand_like(entry) * (leave - entry)

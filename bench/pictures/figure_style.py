@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 
 from bench.pictures.style import PAPER
-from bench.tables import look_of
+from bench.tables import LOOK_KEY, METHOD, Node, choice, names
 
 WIDTH = 7.0  # inches: two columns of a paper
 RC = {
@@ -61,8 +62,29 @@ def look(preset: str) -> Look:
     checksum = crc32(preset.encode("utf-8", "backslashreplace"))
     choices = {"colour": (FALLBACK_COLOURS, 0), "marker": (FALLBACK_MARKERS, 8), "line": (FALLBACK_LINES, 16)}
     picks = {key: options[(checksum >> shift) % len(options)] for key, (options, shift) in choices.items()}
-    settings = look_of(preset)
+    settings = _settings_of(preset)
     return Look(**picks | ({"line": "-"} if settings else {}) | settings)
+
+
+def _settings_of(name: str) -> Node:
+    """The keys `colour`, `marker` and `line` of a method or renderer, merged over those of its bases; {} for others.
+
+    A method has the colour of its renderer. Its tuned settings, and its space, look like the method.
+    """
+    name = name.rpartition("/")[2]
+    group = METHOD if name in names(METHOD) else "renderer"
+    candidates = [name, *(other for other in names("renderer") if other.replace("_", "") == name)]  # or a class name
+    return next((_merged(group, candidate) for candidate in candidates if candidate in names(group)), {})
+
+
+def _merged(group: str, name: str) -> Node:
+    node, settings = choice(group, name), dict[str, Any]()
+    for base in node.get("defaults", ()):
+        if isinstance(base, str) and base != "_self_":
+            settings |= _merged(group, base.removeprefix(f"/{group}/"))
+        elif renderer := isinstance(base, dict) and base.get("override /renderer"):
+            settings |= _merged("renderer", renderer)
+    return settings | node.get(LOOK_KEY, {})
 
 
 def styled(function: Callable[..., Figure]) -> Callable[..., Figure]:

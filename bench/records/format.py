@@ -46,19 +46,6 @@ def count(n: int | float | None) -> str:
     return f"{number(n, 1000.0**-power)}{' kMGTP'[power]}"
 
 
-def queries(values: int | float | None, coarse: int | float | None) -> str:
-    """Counts of field evaluations and coarse evaluations, such as 39.9k + 123k coarse."""
-    return f"{count(values)} + {count(coarse)} coarse" if coarse else count(values)
-
-
-def size(n: int | float | None) -> str:
-    """A number of bytes with its unit, in powers of 1000, such as 512 B or 1.43 GB."""
-    if n is None or not math.isfinite(n):
-        return number(n)
-    text = count(n)
-    return f"{text} B" if text[-1].isdigit() else f"{text[:-1]} {text[-1]}B"
-
-
 def seconds(x: int | float | None) -> str:
     """A duration with its unit: 12.3 ms, 12.3 s, 34.5 min, 2.31 h; minutes from 120 s, hours from 120 min."""
     if x is None or not math.isfinite(x):
@@ -68,11 +55,6 @@ def seconds(x: int | float | None) -> str:
     if abs(x) < 120:
         return f"{number(x)} s"
     return f"{number(x, 1 / 60)} min" if abs(x) < 7200 else f"{number(x, 1 / 3600)} h"
-
-
-def interval(low: float | None, high: float | None) -> str:
-    """The ends of an interval, such as [0.12, 0.34]; empty if they are missing."""
-    return "" if low is None or math.isnan(low) else f"[{number(low)}, {number(high)}]"
 
 
 def ends(

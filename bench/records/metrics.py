@@ -39,18 +39,6 @@ TABLE_METRICS = {  # the order is that of tables
     "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
     "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),
 }
-MEASUREMENT_METRICS = {  # for tasks that measure without optimising
-    "forward_seconds": Metric("forward (s)", better=LOWER),
-    "step_seconds": Metric("step (s)", better=LOWER),
-    "queries": Metric("values of a rendering", better=LOWER),
-    "error_p95": Metric("depth error, 95 % (x1000)", 1000.0, LOWER),
-    "breakdown": Metric("breaks at"),
-    "trials": Metric("trials"),
-    "recommended_error": Metric("error of the chosen field (x1000)", 1000.0, LOWER),
-    "frontal.code_pooled_cosine": Metric("gradient's cosine, frontal", better=HIGHER),
-    "grazing.code_pooled_cosine": Metric("gradient's cosine, grazing", better=HIGHER),
-    "silhouette.image_cosine": Metric("cosine at the outline", better=HIGHER),
-}
 OTHER_DIRECTIONS = {  # which direction is better, for metrics that tables do not show
     **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred"), LOWER),
     **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
@@ -71,14 +59,6 @@ DVR_TABLE2 = {
     "Colmap + sPSR, trim 7": (0.446, 1.020, 0.733),
     "DVR (RGB)": (1.054, 0.760, 0.907),
     "DVR (RGB and depth)": (0.789, 0.775, 0.782),
-}
-# The metric by which the runs of a task are sorted. For other tasks it is the first table metric that the runs have.
-SORT_METRICS = {
-    "pose": "rotation_error_deg",
-    "pose_icp": "rotation_error_deg",
-    "reconstruction": "seen_chamfer_l1",
-    "single_view": "iou",
-    "ablation": "step_seconds",
 }
 
 

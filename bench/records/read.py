@@ -2,6 +2,7 @@
 
 import json
 import marshal
+import re
 import sys
 from dataclasses import asdict, fields
 from datetime import datetime
@@ -14,7 +15,6 @@ from bench.records.record import (
     SCHEMA,
     Record,
     is_outside,
-    is_plain_name,
     started,
 )
 from bench.records.results import PLAN_FILE, Plan, PlannedRun, check_links, read_run, run_folders
@@ -116,6 +116,11 @@ def check_results(results_dir: Path) -> None:
             f"python -m bench results_dir={results_dir}"
         )
     check_links(results_dir)
+
+
+def is_plain_name(text: Any) -> bool:
+    """Whether a text is a plain file name, which cannot lead to another folder."""
+    return isinstance(text, str) and re.fullmatch(r"[^./\\\0][^/\\\0]*", text) is not None
 
 
 def _is_valid_cell(cell: PlannedRun) -> bool:

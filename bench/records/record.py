@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import os
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
@@ -243,11 +242,6 @@ def bad_link(folder: Path, root: Path) -> str:
     except OSError:  # the reader of the folder will report the error
         return ""
     return ""
-
-
-def is_plain_name(text: Any) -> bool:
-    """Whether a text is a plain file name, which cannot lead to another folder."""
-    return isinstance(text, str) and re.fullmatch(r"[^./\\\0][^/\\\0]*", text) is not None
 
 
 def digest(data: Any) -> str:

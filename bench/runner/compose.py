@@ -80,11 +80,9 @@ class SearchPath(SearchPathPlugin):
             search_path.append("command-line", f"file://{folder.absolute()}")
 
 
-def register(*config_dirs: Path) -> None:
-    """Registers the schema of conf/config.yaml, the choices of all groups, and the resolvers with Hydra.
-
-    Args:
-        config_dirs: folders of the user, whose files and tables have more choices.
+@contextmanager
+def composing(*config_dirs: Path) -> Iterator[None]:
+    """The context in which a `Composer` can use conf and the user's folders.
 
     Raises:
         ValueError: if a folder does not exist, or a table cannot be read.
@@ -97,16 +95,6 @@ def register(*config_dirs: Path) -> None:
     Plugins.instance().register(SearchPath)
     register_rows(config_dirs)
     register_resolvers()
-
-
-@contextmanager
-def composing(*config_dirs: Path) -> Iterator[None]:
-    """The context in which a `Composer` can use conf and the user's folders.
-
-    Raises:
-        ValueError: if a folder does not exist, or a table cannot be read.
-    """
-    register(*config_dirs)
     with initialize_config_dir(str(CONF), version_base="1.3"):
         yield
 

@@ -143,7 +143,9 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     for number, cell in enumerate(plan.cells, 1):
         file = Path((cell.config["dataset"] or {}).get("path") or "").name
         title = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {f'{cell.dataset} {file}'.strip()}"
-        estimate = "reused" if cell.id in reused else duration_estimate(to_run[cell.id])
+        estimate = "reused" if cell.id in reused else "time unknown"
+        if similar := to_run.get(cell.id):
+            estimate = f"about {seconds(median(similar))} (median of {plural(len(similar), 'finished run')})"
         parts = (f"{number:>4}", " ".join(plan.distinct_overrides(cell)), title, estimate)
         print("  ".join(filter(None, parts)))
     counts = [f"{len(plan.cells)} planned: {len(to_run)} to run"]
@@ -158,10 +160,3 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
         text += f", without the {unknown} of unknown time" if unknown else ""
         text += "; the training of a missing prior is not counted"
     print(text)
-
-
-def duration_estimate(durations: list[float]) -> str:
-    """The estimated duration of a run in words, from the durations of similar runs."""
-    if not durations:
-        return "time unknown"
-    return f"about {seconds(median(durations))} (median of {plural(len(durations), 'finished run')})"

@@ -11,12 +11,12 @@ from omegaconf import OmegaConf
 from bench.config import Isolation, build
 from bench.progress import run_progress
 from bench.records.folder import code_hash, config_hash, free_reserve, locked_folder
-from bench.records.record import Record, RunStatus, now, read_record, write_text
+from bench.records.record import Record, RunStatus, append_to_log, now, read_record, write_text
 from bench.records.results import Plan, PlannedRun, ended_record
 from bench.runner.messages import Interrupted, reason_of, write_error_message
 from bench.runner.plan import refusal_reasons, reused_ids, show_plan
 from bench.runner.process import RunInProgress, run_isolated, signals_delayed, stopped_by
-from bench.runner.summary import print_run_summary, write_log
+from bench.runner.summary import log_lines, print_run_summary
 from bench.trackers import Nothing, Tracker
 
 LOG_TAIL_LINES, LOG_TAIL_BYTES = 80, 16_384  # limits of the log in the record of a failed run
@@ -132,7 +132,7 @@ def _make(record: Record) -> Record:
                 record.log = _log_tail(folder / "log.txt")
             free_reserve(folder)
             record.write(folder)
-            write_log(folder, record)
+            append_to_log(folder, "\n".join(log_lines(record)))
     if not isinstance(tracker, Nothing | None) and record.status != RunStatus.REFUSED:
         _export(tracker, folder, record)
     if stopped:

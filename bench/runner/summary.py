@@ -13,7 +13,7 @@ from rich.table import Table
 
 from bench.records.format import count, number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
-from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus, append_to_log
+from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus
 from bench.records.results import RESULTS, Plan
 
 CUSTOM_RENDERER = "custom"  # the choice of renderer for a class of the user
@@ -80,13 +80,8 @@ def _print_report_command(results_dir: Path) -> None:
     print(f"page and tables: python -m bench.report{option}")
 
 
-def write_log(folder: Path, record: Record) -> None:
-    """Appends the command, the machine and the results of a run to its `log.txt`."""
-    append_to_log(folder, "\n".join(_log_lines(record)))
-
-
-def _log_lines(record: Record) -> Iterator[str]:
-    """Lines on the command, the machine, the errors before and after, the times, the notes and the status."""
+def log_lines(record: Record) -> Iterator[str]:
+    """The end of a run's log: the command, the machine, the errors before and after, the times, notes and status."""
     machine = record.environment
     yield record.title
     yield f"command: {shlex.join(('python', '-m', 'bench', *record.overrides))}"

@@ -5,7 +5,7 @@ Each follows by an equation from the view and the other settings of the renderer
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import ceil, isnan, log, radians, sin
+from math import ceil, log, radians, sin
 from typing import Any
 
 from datasets.views import ViewSampler
@@ -76,20 +76,6 @@ def steps(view: ViewSampler, renderer: Node, settings: AutoSettings) -> int:
     if remaining >= 1:
         raise ValueError(f"renderer.alpha must lie between 0 and 2, not {alpha:g}: steps of others do not converge")
     return max(ceil(log(epsilon / UNIT_SPHERE_RADIUS) / log(remaining)), 1) if remaining > 0 else 1
-
-
-def rays_share(min_fraction: float, footprint: float, error: float) -> float:
-    """The fraction of an image's pixels at the resolution whose half pixel equals the current error.
-
-    Pixels finer than the error are not needed. The resolution follows from DIST, Eq. 10; its square is their number.
-
-    Args:
-        footprint: half a pixel of the whole image, in scene units.
-        error: in scene units.
-    """
-    if not footprint or isnan(error):
-        return 1.0
-    return min(max((footprint / max(error, footprint)) ** 2, min_fraction), 1.0)
 
 
 FORMULAS: dict[str, Callable[[ViewSampler, Node, AutoSettings], Any]] = {"epsilon": epsilon, "steps": steps}

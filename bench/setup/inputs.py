@@ -36,7 +36,6 @@ from datasets.scene import (
 )
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
-from renderers.field import Field
 from renderers.rendering import Renderer, final_notes
 
 MIN_MULTITHREADED_WIDTH = 256  # neurons per layer: a narrower network is evaluated by one thread
@@ -179,15 +178,6 @@ class ValidatesInputs(Protocol):
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput for inputs that the task cannot use."""
-        ...
-
-
-@runtime_checkable
-class EvaluatesField(Protocol):
-    """A task with its own evaluation of a final field, in place of `bench.evaluate.evaluate.evaluate`."""
-
-    def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
-        """The metrics of the final field of a run of the task."""
         ...
 
 

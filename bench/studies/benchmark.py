@@ -96,7 +96,7 @@ COLUMNS = (
     *table.columns(table.word, renderer="Renderer", status="", reason="", folder=""),
     *table.raw("rounds"),
     table.Column(
-        "queries", "Field evaluations", words=lambda x: format.queries(x.get("queries"), x.get("coarse_queries"))
+        "queries", "Field evaluations", words=lambda x: table.queries(x.get("queries"), x.get("coarse_queries"))
     ),
     *table.raw("coarse_queries"),
     *table.columns(format.seconds, forward_seconds="Forward", step_seconds="Step"),

@@ -167,7 +167,7 @@ COLUMNS = (  # a line is a run
     SCENE[0],
     table.shown("Recommended", lambda line: _label(line, "chosen")),
     *table.columns(_whole, **{"chosen.stored": "Stored numbers", "chosen.free": "Free numbers"}),
-    table.Column("chosen.bytes", "Size of the file", show=format.size),
+    table.Column("chosen.bytes", "Size of the file", show=table.size),
     table.shown("Error × 1000", lambda line: _spread(line, "chosen")),
     *(*table.columns(table.thousandfold, footprint="Half a pixel × 1000"), table.shown("Why", _why)),
     table.shown("Best candidate", lambda line: _label(line, "best")),

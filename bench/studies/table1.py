@@ -129,7 +129,7 @@ COLUMNS = (  # shown columns of a record; metrics are those of the largest finis
     table.configured("", "renderer", "steps", heading="Marching steps"),
     table.shown(
         "Field evaluations",
-        lambda r: format.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries")),
+        lambda r: table.queries(records.measured(r, "queries"), records.measured(r, "coarse_queries")),
     ),
     table.metric("forward_seconds", "Forward", format.seconds),
     table.metric("backward_seconds", "Backward", format.seconds),

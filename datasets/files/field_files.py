@@ -18,7 +18,7 @@ from renderers.checks import BadInput
 from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields.analytic import Shape
 from renderers.fields.grid import Grid
-from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.fields.mlp import BoundDecoder
 from renderers.fields.networks import coloured, network, occupancy, published
 from renderers.fields.parts import Formula
 from renderers.fields.textured import TexturedShape
@@ -58,7 +58,7 @@ def load_network(run: Path | str) -> network.Published:
     tree, tensors = _read(Path(run))
     field = _field(tree, tensors)
     if isinstance(field, BoundDecoder):
-        decoder = Decoder.of([*field.hidden, field.last], code_length=0, skip=field.skip)
+        decoder = published.decoder_of([*field.hidden, field.last], code_length=0, skip=field.skip)
         return network.Published(decoder)
     return network.Published(network.Coded(_StoredField(tree, tensors), code_length=0, width=ASSUMED_WIDTH))
 

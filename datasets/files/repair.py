@@ -111,10 +111,21 @@ def _close(mesh: Mesh) -> Mesh:
         fill = ("meshing_close_holes", {"maxholesize": len(mesh.vertices), "selfintersection": False})
         shells = apply(shells, cut, split, wind)
         closed = apply(shells, fill, wind)
-        if (count := shells.holes - closed.holes) > 0:
+        if (count := count_holes(shells) - count_holes(closed)) > 0:
             closed = with_note(closed, f"{_count(count, 'hole')} closed")
     faces = np.concatenate([mesh.faces[~is_open], closed.faces + len(mesh.vertices)])
     return replace(closed, vertices=np.concatenate([mesh.vertices, closed.vertices]), faces=faces).compact()
+
+
+def count_holes(mesh: Mesh) -> int:
+    """Number of loops of edges that have a face on one side only."""
+    import trimesh
+
+    directed = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, uses = np.unique(directed, axis=0, return_counts=True)
+    rim = edges[uses == 1]
+    labels = trimesh.graph.connected_component_labels(rim, node_count=len(mesh.vertices))
+    return len(np.unique(labels[rim]))
 
 
 def _drop_flat_parts(mesh: Mesh) -> Mesh | None:

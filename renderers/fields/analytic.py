@@ -13,7 +13,6 @@ from torch import Tensor
 from renderers.field import Flops, Kind
 
 Numbers = float | Sequence[float] | Tensor
-MIN_NORM_FRACTION = 1e-6  # parts of a norm below this fraction of the largest are raised to it: an error below 1e-6
 
 
 @dataclass(frozen=True)
@@ -39,15 +38,15 @@ class Shape:
 
     def translate(self, offset: Numbers) -> "Shape":
         """The shape moved by `offset` [3]."""
-        return self._replace(lambda p: self(p - _like(offset, p)))
+        return self._replace(lambda p: self(p - like(offset, p)))
 
     def rotate(self, rotation: Float[Tensor, "3 3"]) -> "Shape":
         """The shape turned by a rotation matrix: a surface point x goes to `rotation @ x`."""
-        return self._replace(lambda p: self(p @ _like(rotation, p)))
+        return self._replace(lambda p: self(p @ like(rotation, p)))
 
     def scale(self, factor: Numbers) -> "Shape":
         """The shape made `factor` times as large, `factor` a positive number; its kind is kept."""
-        return self._replace(lambda p: self(p / _like(factor, p)) * _like(factor, p))
+        return self._replace(lambda p: self(p / like(factor, p)) * like(factor, p))
 
     def stretch(self, factors: Numbers) -> "Shape":
         """The shape stretched along the axes by `factors` [3].
@@ -56,7 +55,7 @@ class Shape:
         """
 
         def stretched(points: Tensor) -> Tensor:
-            axes = _like(factors, points)
+            axes = like(factors, points)
             return self(points / axes) * axes.min()
 
         kind = Kind.LEVEL if self.kind is Kind.LEVEL else Kind.BOUND
@@ -73,7 +72,7 @@ def smooth_union(first: Shape, second: Shape, *, radius: Numbers) -> Shape:
     """
 
     def blend(a: Tensor, b: Tensor) -> Tensor:
-        width = _like(radius, a)
+        width = like(radius, a)
         overlap = (width - (a - b).abs()).clamp_min(0) / width
         return torch.minimum(a, b) - 0.25 * width * overlap**2
 
@@ -82,51 +81,30 @@ def smooth_union(first: Shape, second: Shape, *, radius: Numbers) -> Shape:
 
 def sphere(radius: Numbers = 1.0, center: Numbers = (0.0, 0.0, 0.0)) -> Shape:
     """A sphere; exact distance."""
-    return Shape(lambda p: torch.linalg.vector_norm(p - _like(center, p), dim=-1) - _like(radius, p))
+    return Shape(lambda p: torch.linalg.vector_norm(p - like(center, p), dim=-1) - like(radius, p))
 
 
 def plane(normal: Numbers = (0.0, 1.0, 0.0), offset: Numbers = 0.0) -> Shape:
     """The half space below `normal . x = offset`; exact distance. `normal` [3] need not have unit length."""
-    return Shape(lambda p: ((p * _like(normal, p)).sum(-1) - _like(offset, p)) / _norm(_like(normal, p)))
+    return Shape(lambda p: ((p * like(normal, p)).sum(-1) - like(offset, p)) / _norm(like(normal, p)))
 
 
 def box(half_sizes: Numbers) -> Shape:
     """An axis-aligned box about the origin, with half side lengths `half_sizes` [3]; exact distance."""
-    return Shape(lambda p: _box_distance(p.abs() - _like(half_sizes, p)))
+    return Shape(lambda p: _box_distance(p.abs() - like(half_sizes, p)))
 
 
 def rounded_box(half_sizes: Numbers, radius: Numbers) -> Shape:
     """A box whose edges are rounded by `radius`; `half_sizes` [3] include the rounding; exact distance."""
-    return Shape(lambda p: box(_like(half_sizes, p) - _like(radius, p))(p) - _like(radius, p))
-
-
-def superquadric(half_sizes: Numbers, exponents: Numbers) -> Shape:
-    """A superquadric (Barr 1981) of half sizes `half_sizes` [3] about the origin; a bound.
-
-    On its surface the norm ((|x|^p + |y|^p)^(q/p) + |z|^q)^(1/q) of the coordinates over the half sizes is 1. The
-    Lipschitz constant of this norm, by which values are divided, has a factor 2^(1/p - 1/2) per exponent p below 2.
-
-    Args:
-        half_sizes: along x, y and z, in scene units, positive.
-        exponents: p across x and y, q towards z, at least 1: 1 gives an octahedron, 2 an ellipsoid, 20 nearly a box.
-    """
-
-    def bound(points: Tensor) -> Tensor:
-        sizes = _like(half_sizes, points)
-        p, q = _like(exponents, points).unbind()
-        x, y, z = (points / sizes).abs().unbind(-1)
-        slope = 2 ** ((1 / p - 0.5).clamp_min(0) + (1 / q - 0.5).clamp_min(0))
-        return sizes.min() / slope * (_power_norm(torch.stack([_power_norm(torch.stack([x, y], -1), p), z], -1), q) - 1)
-
-    return Shape(bound, Kind.BOUND)
+    return Shape(lambda p: box(like(half_sizes, p) - like(radius, p))(p) - like(radius, p))
 
 
 def torus(major: Numbers, minor: Numbers) -> Shape:
     """A torus about the y axis: tube of radius `minor` around a circle of radius `major`; exact distance."""
 
     def distance(points: Tensor) -> Tensor:
-        ring = _norm(points[..., [0, 2]]) - _like(major, points)
-        return _norm(torch.stack([ring, points[..., 1]], -1)) - _like(minor, points)
+        ring = _norm(points[..., [0, 2]]) - like(major, points)
+        return _norm(torch.stack([ring, points[..., 1]], -1)) - like(minor, points)
 
     return Shape(distance)
 
@@ -135,9 +113,9 @@ def capsule(start: Numbers, end: Numbers, radius: Numbers) -> Shape:
     """All points within `radius` of the segment from `start` [3] to `end` [3]; exact distance."""
 
     def distance(points: Tensor) -> Tensor:
-        a, b = _like(start, points), _like(end, points)
+        a, b = like(start, points), like(end, points)
         along = ((points - a) @ (b - a) / (b - a).dot(b - a)).clamp(0, 1)
-        return _norm(points - a - along[..., None] * (b - a)) - _like(radius, points)
+        return _norm(points - a - along[..., None] * (b - a)) - like(radius, points)
 
     return Shape(distance)
 
@@ -148,8 +126,8 @@ def cylinder(radius: Numbers, half_height: Numbers) -> Shape:
     def distance(points: Tensor) -> Tensor:
         beyond = torch.stack(
             [
-                _norm(points[..., [0, 2]]) - _like(radius, points),
-                points[..., 1].abs() - _like(half_height, points),
+                _norm(points[..., [0, 2]]) - like(radius, points),
+                points[..., 1].abs() - like(half_height, points),
             ],
             -1,
         )
@@ -166,15 +144,9 @@ def _combine(function: Callable[[Tensor, Tensor], Tensor], first: Shape, second:
     return Shape(lambda p: function(first(p), second(p)), kind, lipschitz)
 
 
-def _like(value: Numbers, points: Tensor) -> Tensor:
+def like(value: Numbers, points: Tensor) -> Tensor:
+    """The value as a tensor of the dtype and device of the points."""
     return torch.as_tensor(value, dtype=points.dtype, device=points.device)
-
-
-def _power_norm(parts: Float[Tensor, "*batch 2"], power: Tensor) -> Float[Tensor, "*batch"]:
-    """The p-norm for p = `power` of non-negative parts; scaled by the largest part, so that no power overflows."""
-    largest = parts.amax(-1, keepdim=True).clamp_min(torch.finfo(parts.dtype).tiny)
-    fractions = (parts / largest).clamp_min(MIN_NORM_FRACTION)  # 0 ** power has no gradient towards power
-    return largest.squeeze(-1) * (fractions**power).sum(-1) ** (1 / power)
 
 
 def _box_distance(beyond: Tensor) -> Tensor:

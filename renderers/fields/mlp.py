@@ -93,28 +93,6 @@ class Decoder(nn.Module):
             layers.append((weight, bias))
         return BoundDecoder(tuple(layers), (self.last.weight, self.last.bias), self.skip, self.kind, self.lipschitz)
 
-    @staticmethod
-    def of(layers: Sequence[Layer], *, code_length: int, skip: int) -> "Decoder":
-        """A decoder with these weights and biases, the output layer last; widths may differ.
-
-        With `code_length` 0 the code is the position of the shape: a translation by three numbers.
-        """
-        *hidden, last = layers
-        decoder = Decoder(layers=len(hidden), width=1, code_length=code_length or 3, skip=skip, narrow=False)
-        decoder.width, decoder.code_is_position = max(len(bias) for _, bias in hidden), code_length == 0
-        for index, (weight, bias) in enumerate(hidden):
-            if not code_length and index in (0, skip):
-                weight = torch.cat([weight[:, :-3], -weight[:, -3:], weight[:, -3:]], dim=1)
-            decoder.hidden[index] = _linear(weight, bias)
-        decoder.last = _linear(*last)
-        return decoder
-
-
-def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    layer = nn.Linear(weight.shape[1], len(weight), dtype=weight.dtype)
-    layer.weight, layer.bias = nn.Parameter(weight.clone()), nn.Parameter(bias.clone())
-    return layer
-
 
 @dataclass(frozen=True)
 class BoundDecoder:

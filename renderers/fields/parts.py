@@ -10,9 +10,10 @@ from torch import Tensor
 
 from renderers.camera import rigid
 from renderers.field import Flops, Kind
-from renderers.fields.analytic import Shape, sphere, superquadric
+from renderers.fields.analytic import Numbers, Shape, like, sphere
 from renderers.fields.analytic import box as exact_box
 
+MIN_NORM_FRACTION = 1e-6  # parts of a norm below this fraction of the largest are raised to it: an error below 1e-6
 EXPONENT_RANGE = (1.0, 20.0)  # from an octahedron to nearly a box
 
 
@@ -63,6 +64,27 @@ def quadric(parameters: Float[Tensor, "11"]) -> Shape:
     return _apply_pose(superquadric(parameters[6:9].exp(), powers), parameters)
 
 
+def superquadric(half_sizes: Numbers, exponents: Numbers) -> Shape:
+    """A superquadric (Barr 1981) of half sizes `half_sizes` [3] about the origin; a bound.
+
+    On its surface the norm ((|x|^p + |y|^p)^(q/p) + |z|^q)^(1/q) of the coordinates over the half sizes is 1. The
+    Lipschitz constant of this norm, by which values are divided, has a factor 2^(1/p - 1/2) per exponent p below 2.
+
+    Args:
+        half_sizes: along x, y and z, in scene units, positive.
+        exponents: p across x and y, q towards z, at least 1: 1 gives an octahedron, 2 an ellipsoid, 20 nearly a box.
+    """
+
+    def bound(points: Tensor) -> Tensor:
+        sizes = like(half_sizes, points)
+        p, q = like(exponents, points).unbind()
+        x, y, z = (points / sizes).abs().unbind(-1)
+        slope = 2 ** ((1 / p - 0.5).clamp_min(0) + (1 / q - 0.5).clamp_min(0))
+        return sizes.min() / slope * (_power_norm(torch.stack([_power_norm(torch.stack([x, y], -1), p), z], -1), q) - 1)
+
+    return Shape(bound, Kind.BOUND)
+
+
 def _apply_pose(shape: Shape, parameters: Float[Tensor, " n"]) -> Shape:
     """Rotates a shape by the rotation vector, parameters 3 to 5, then translates it by parameters 0 to 2."""
     return shape.rotate(_rotations(parameters)).translate(parameters[:3])
@@ -72,6 +94,13 @@ def _rotations(parameters: Float[Tensor, "*parts n"]) -> Float[Tensor, "*parts 3
     """Rotation matrices of the rotation vectors, parameters 3 to 5."""
     vector = parameters[..., 3:6]
     return rigid(torch.cat([torch.zeros_like(vector), vector], dim=-1))[..., :3, :3]
+
+
+def _power_norm(parts: Float[Tensor, "*batch 2"], power: Tensor) -> Float[Tensor, "*batch"]:
+    """The p-norm for p = `power` of non-negative parts; scaled by the largest part, so that no power overflows."""
+    largest = parts.amax(-1, keepdim=True).clamp_min(torch.finfo(parts.dtype).tiny)
+    fractions = (parts / largest).clamp_min(MIN_NORM_FRACTION)  # 0 ** power has no gradient towards power
+    return largest.squeeze(-1) * (fractions**power).sum(-1) ** (1 / power)
 
 
 FORMULAS: dict[str, Callable[[Tensor], Shape]] = {  # all except the sphere begin with pose and log half sizes

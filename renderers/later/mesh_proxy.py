@@ -4,10 +4,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-import open3d
 import torch
 from jaxtyping import Float, Int
-from skimage.measure import marching_cubes
 from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
@@ -140,6 +138,8 @@ class _Mesh:
         """The zero set of values on a grid; without triangles if all values have one sign."""
         if not float(values.min()) < 0 < float(values.max()):
             return _Mesh(values.new_zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64, device=values.device))
+        from skimage.measure import marching_cubes  # here and in `cast`, as these imports take more than a second
+
         spacing = 2 * radius / (len(values) - 1)
         vertices, triangles, _, _ = marching_cubes(values.cpu().numpy(), 0.0, spacing=(spacing,) * 3)
         return _Mesh(
@@ -151,6 +151,8 @@ class _Mesh:
         """The distance of each ray's first crossing after `start`, or infinity, and its triangle, or -1."""
         if not len(self.triangles) or not len(start):
             return torch.full_like(start, torch.inf), torch.full_like(start, -1, dtype=torch.int64)
+        import open3d
+
         scene = open3d.t.geometry.RaycastingScene()
         scene.add_triangles(
             open3d.core.Tensor.from_numpy(self.vertices.cpu().float().numpy()),

@@ -9,8 +9,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from bench.config import build
-from bench.runner.compose import register
-from bench.tables import SOBOL_DIMENSIONS, SOBOL_DRAWS, choice, names, sobol_points
+from bench.tables import SOBOL_DIMENSIONS, SOBOL_DRAWS, choice, names, register_resolvers, sobol_points
 from tests.composing import composed
 from tests.looped import each
 
@@ -90,7 +89,7 @@ def test_an_invalid_draw_or_range_is_an_error():
 
 
 def test_a_whole_range_gives_whole_numbers():
-    register()
+    register_resolvers()
     values = [OmegaConf.create({"draw": draw, "x": "${drawn:3,25,100}"}).x for draw in range(16)]
     assert all(isinstance(value, int) and 25 <= value <= 100 for value in values) and len({*values}) > 8
     assert np.ptp(values) > 50

@@ -11,12 +11,13 @@ from bench.records import format
 from bench.records.read import read_records
 from bench.report.__main__ import main
 from bench.report.site.columns import machine
+from bench.report.write import table
 from bench.report.write.html import write_index
 from tests.looped import each
 from tests.report.page_data import Page, script
 
 ODD_NAME = "two words ünïcode 50% #1?"
-SHOWN = (format.number, format.count, format.size, format.seconds)
+SHOWN = (format.number, format.count, table.size, format.seconds)
 HOSTILE = "<script>alert('reason')</script> & \"quotes\""
 
 
@@ -234,8 +235,8 @@ def test_report_never_imports_torch():
         (format.count, 1_430_000, "1.43M"),
         (format.count, 999_999, "1.00M"),
         (format.count, 2e18, "2000P"),
-        (format.size, 512, "512 B"),
-        (format.size, 1_430_000_000, "1.43 GB"),
+        (table.size, 512, "512 B"),
+        (table.size, 1_430_000_000, "1.43 GB"),
         (format.seconds, 0, "0 s"),
         (format.seconds, 0.0123, "12.3 ms"),
         (format.seconds, 31.5, "31.5 s"),

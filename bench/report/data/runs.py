@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.records.metrics import MEASUREMENT_METRICS, better_direction
+from bench.records.metrics import HIGHER, LOWER, Metric, better_direction
 from bench.records.record import flat, requested, row_name, started
 from bench.report.data.frame import to_frame
 from bench.report.data.kept import FROM_RUNS_CSV, UNMEASURED
@@ -32,6 +32,18 @@ from bench.report.data.records import (
 from bench.tables import nearest
 
 MACHINE_KEYS = ("cpu", "device", "threads")
+MEASUREMENT_METRICS = {  # for tasks that measure without optimising
+    "forward_seconds": Metric("forward (s)", better=LOWER),
+    "step_seconds": Metric("step (s)", better=LOWER),
+    "queries": Metric("values of a rendering", better=LOWER),
+    "error_p95": Metric("depth error, 95 % (x1000)", 1000.0, LOWER),
+    "breakdown": Metric("breaks at"),
+    "trials": Metric("trials"),
+    "recommended_error": Metric("error of the chosen field (x1000)", 1000.0, LOWER),
+    "frontal.code_pooled_cosine": Metric("gradient's cosine, frontal", better=HIGHER),
+    "grazing.code_pooled_cosine": Metric("gradient's cosine, grazing", better=HIGHER),
+    "silhouette.image_cosine": Metric("cosine at the outline", better=HIGHER),
+}
 ROW_SECTIONS = ("renderer", "task", "silhouette", "field")  # settings in which rows of equal names may differ
 
 

@@ -52,7 +52,9 @@ class Interval:
 
     def ends(self, scale: float = 1.0) -> str:
         """The interval times `scale` as text; without an interval the number of shapes, such as (n = 4)."""
-        return format.interval(scale * self.low, scale * self.high) if self.has_ends else f"(n = {len(self.points)})"
+        if not self.has_ends:
+            return f"(n = {len(self.points)})"
+        return f"[{format.number(scale * self.low)}, {format.number(scale * self.high)}]"
 
     def __str__(self) -> str:
         """The estimate with its interval, or with the number of shapes."""

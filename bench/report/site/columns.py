@@ -6,10 +6,11 @@ from math import isfinite
 from typing import Any
 
 from bench.records.format import plural
-from bench.records.metrics import MEASUREMENT_METRICS, SORT_METRICS, TABLE_METRICS
+from bench.records.metrics import TABLE_METRICS
 from bench.records.names import SharedSettings, make_unique, ordered_settings, settings_of
 from bench.records.record import NEUTRAL_KEYS, as_number, digest, row_name, started, to_json_values
 from bench.report.data.records import OURS, Record, family, grouped, loop_seconds, run_key, setting, value_evaluations
+from bench.report.data.runs import MEASUREMENT_METRICS
 from bench.report.site.files import Folder
 
 SIGNIFICANT_DIGITS = 5  # a run's own page has all digits
@@ -18,6 +19,14 @@ OBSERVATION_KEYS = (
     *("points", "depths", "mask", "images", "stress", "degrees", "shift", "given", "held_out", "size", "longest"),
 )
 METRICS = TABLE_METRICS | MEASUREMENT_METRICS
+# The metric by which the runs of a task are sorted. For other tasks it is the first table metric that the runs have.
+SORT_METRICS = {
+    "pose": "rotation_error_deg",
+    "pose_icp": "rotation_error_deg",
+    "reconstruction": "seen_chamfer_l1",
+    "single_view": "iou",
+    "ablation": "step_seconds",
+}
 CUSTOM_RENDERER = "custom"  # the preset of a user's class
 MAX_NAMED_SETTINGS = 3
 # Keys of the configuration that have columns of their own, or follow from other keys.

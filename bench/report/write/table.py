@@ -28,6 +28,19 @@ def word(value: Any) -> str:
     return format.MISSING if value is None else str(value)
 
 
+def queries(values: int | float | None, coarse: int | float | None) -> str:
+    """Counts of field evaluations and coarse evaluations, such as 39.9k + 123k coarse."""
+    return f"{format.count(values)} + {format.count(coarse)} coarse" if coarse else format.count(values)
+
+
+def size(n: int | float | None) -> str:
+    """A number of bytes with its unit, in powers of 1000, such as 512 B or 1.43 GB."""
+    if n is None or not math.isfinite(n):
+        return format.number(n)
+    text = format.count(n)
+    return f"{text} B" if text[-1].isdigit() else f"{text[:-1]} {text[-1]}B"
+
+
 def percent(share: float | None) -> str:
     """A fraction in whole per cent."""
     return format.number(share) if share is None else f"{100 * share:.0f} %"

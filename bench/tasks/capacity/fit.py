@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench.records.record import RunStatus
-from bench.setup.auto import rays_share
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import generator_of, gradients_at
@@ -19,7 +18,7 @@ from bench.solve.optimise import CannotContinue, History, OptimiserSettings, opt
 from bench.tasks.capacity.candidates import primitive_candidate
 from bench.tasks.capacity.model import Candidate, Evidence, Model, StartInputs
 from bench.tasks.capacity.observations import RayObservations
-from bench.tasks.capacity.settings import FitSettings
+from bench.tasks.capacity.settings import FitSettings, rays_share
 from renderers.field import Counts, Field, Meter
 from renderers.rendering import Renderer, Unsupported, check_kind, with_empty_memory
 

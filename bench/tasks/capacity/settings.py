@@ -1,6 +1,7 @@
 """The settings of fields without a prior: their candidates, their fits, and the views that they are fitted to."""
 
 from dataclasses import dataclass
+from math import isnan
 
 from bench.setup.fields import parse_field_name
 from renderers.checks import check_at_least, check_choice, check_fraction
@@ -16,7 +17,7 @@ class FitSettings:
     Args:
         iterations: of the fit with the renderer's loss; with task=capacity, of a round.
         fewest_rays: smallest fraction of the rays in an iteration if their number follows the loss; 1 always takes
-            all. See `bench.setup.auto.rays_share`.
+            all. See `rays_share`.
         warm_iterations, warm_points: iterations and points per iteration of the warm start, which fits the observed
             points or the previous field without a renderer.
         eikonal_weight: of the mean square of |grad f| - 1 (Gropp et al. 2020), for fields that are not distances by
@@ -113,3 +114,17 @@ class ModelSettings:
         for name in self.candidates:
             parse_field_name(name)
         check_choice("models.size", self.size, tuple(SIZE_WORDS))
+
+
+def rays_share(min_fraction: float, footprint: float, error: float) -> float:
+    """The fraction of an image's pixels at the resolution whose half pixel equals the current error.
+
+    Pixels finer than the error are not needed. The resolution follows from DIST, Eq. 10; its square is their number.
+
+    Args:
+        footprint: half a pixel of the whole image, in scene units.
+        error: in scene units.
+    """
+    if not footprint or isnan(error):
+        return 1.0
+    return min(max((footprint / max(error, footprint)) ** 2, min_fraction), 1.0)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from datasets.files.captures.hull import carve
 from datasets.mesh import Mesh
 from datasets.photographs import BACKGROUND_GREY, Photography
 from datasets.scene import Dataset, Split, Truth, sample_surface, scene_name, see, seed_of
-from datasets.shot import Pictured, Shot, mask_iou
+from datasets.shot import Shot, mask_iou
 from datasets.views import ViewSampler
 from renderers.camera import Camera, sphere_span
 from renderers.checks import BadInput
@@ -33,6 +34,15 @@ MIN_MASK_OVERLAP = 0.85  # median IoU of masks and mesh over a shape's images
 MAX_INTRINSICS_DIFFERENCE = 1e-2  # pixels
 PER_VIEW_FIELDS = ("motions", "colours", "masks", "depths")
 STACKED_FIELDS = (*PER_VIEW_FIELDS, "points", "inside")  # a file stacks them over shapes
+
+
+@runtime_checkable
+class Pictured(Protocol):
+    """A dataset that includes rendered images of its shapes."""
+
+    def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
+        """The images of a shape with cameras in its mesh's world, at most `longest` pixels a side; None without any."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -220,7 +220,7 @@ def load_deepsdf(tensors: Mapping[str, Tensor], specs: Mapping[str, Any], *, squ
     if squash is None:
         squash = bool(network.get("use_tanh")) + ("geom_dimension" not in network)
     if not norms and list(again.values()) in ([], [True]) and len(dims) not in again:
-        return Published(Decoder.of(layers, code_length=code_length, skip=next(iter(again), 0)), squash)
+        return Published(decoder_of(layers, code_length=code_length, skip=next(iter(again), 0)), squash)
     body = Layered(layers, activation="relu", again=again, norms=norms)
     return Published(Coded(body, code_length=code_length, width=max(dims)), squash)
 
@@ -349,9 +349,25 @@ def load_mlp(tensors: Mapping[str, Tensor]) -> Published:
     if len(layers[-1][1]) != 1:
         raise BadInput(f"the network's last layer must give 1 number, not {len(layers[-1][1])}")
     if activations == {"relu"}:
-        return Published(Decoder.of(layers, code_length=0, skip=0))
+        return Published(decoder_of(layers, code_length=0, skip=0))
     body = Layered(layers, activation=activations.pop())
     return Published(Coded(body, code_length=0, width=max(len(bias) for _, bias in layers)))
+
+
+def decoder_of(layers: Sequence[Layer], *, code_length: int, skip: int) -> Decoder:
+    """A decoder with these weights and biases, the output layer last; widths may differ.
+
+    With `code_length` 0 the code is the position of the shape: a translation by three numbers.
+    """
+    *hidden, last = layers
+    decoder = Decoder(layers=len(hidden), width=1, code_length=code_length or 3, skip=skip, narrow=False)
+    decoder.width, decoder.code_is_position = max(len(bias) for _, bias in hidden), code_length == 0
+    for index, (weight, bias) in enumerate(hidden):
+        if not code_length and index in (0, skip):
+            weight = torch.cat([weight[:, :-3], -weight[:, -3:], weight[:, -3:]], dim=1)
+        decoder.hidden[index] = _linear((weight, bias))
+    decoder.last = _linear(last)
+    return decoder
 
 
 def _linear(values: Layer) -> nn.Linear:

@@ -10,7 +10,6 @@ import torch
 
 from bench.config import load
 from bench.records.record import RunStatus
-from bench.setup.auto import rays_share
 from bench.solve.observed_view import ObservedView
 from bench.tasks.capacity.candidates import REACH, by_size, candidate
 from bench.tasks.capacity.field import rendered_curve
@@ -19,14 +18,14 @@ from bench.tasks.capacity.growth import _is_better, cost, grow
 from bench.tasks.capacity.held_out import MISSED_FOOTPRINTS, HeldOutError
 from bench.tasks.capacity.model import Evidence, Model, Size, StartInputs
 from bench.tasks.capacity.observations import FREE_POINTS_PER_RAY, Views, concatenate_views, hold_out
-from bench.tasks.capacity.settings import FitSettings, GrowthSettings, ModelSettings, ViewSettings
+from bench.tasks.capacity.settings import FitSettings, GrowthSettings, ModelSettings, ViewSettings, rays_share
 from bench.tasks.capacity.study import choose, fit_all, refit
 from datasets.mesh import extract
 from datasets.scene import Truth, see
 from datasets.views import ViewSampler
 from renderers import Capabilities, Kind
-from renderers.fields.analytic import Shape, box, capsule, sphere, superquadric
-from renderers.fields.parts import FORMULAS
+from renderers.fields.analytic import Shape, box, capsule, sphere
+from renderers.fields.parts import FORMULAS, superquadric
 from renderers.silhouette import Own
 from tests.looped import each
 from tests.tiny import CPU
