@@ -193,7 +193,8 @@ def draw(panels: Sequence[chart.Panel], ranks: Mapping[str, Mapping[str, str]]) 
     """
     figure = Figure(figsize=(figure_style.WIDTH, 5.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.55, 1))
-    lead, *others = above.subplots(1, 1 + len(ranks), width_ratios=(5.6, *[1.0] * len(ranks)))
+    widths = 5.6, *[1.0] * len(ranks)
+    lead, *others = above.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
     _fractions(lead, panels[0])
     lead.set_title(panels[0]["title"], loc="left")
     lines = [*{line["name"]: line for line in panels[0]["series"]}.values()]
