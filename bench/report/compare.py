@@ -280,19 +280,23 @@ class Compared:
         return differing([(line["row"], ratio_of(line["ratio"])) for line in self.comparable], versus)
 
     def best(self, least_of: str) -> str:
-        """The verdict on the row with the least error and the fastest row; empty without comparable rows."""
+        """The verdict on the row with the least error and, if runs are timed, the fastest row; empty without rows."""
         lines = self.comparable
         complete = [line for line in lines if math.isfinite(line["error"].value) and line["seconds"] is not None]
         if not complete:
             return ""
         n = len(complete[0]["error"].points)
+        among = "The" if len(lines) == len(self.pooled) else "Among the rows with equal settings, the"
+        if not self.runs.timed:
+            best = min(complete, key=lambda line: line["error"].value)
+            text = f"*{format.number(best['error'].value)}* ({best['row']})"
+            return f"{among} smallest median of {least_of} is {text}; n = {format.plural(n, 'shape')}."
         best, quickest = (min(complete, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
         best_text, quickest_text = (
             f"{format.number(line['error'].value)}{mark} ({line['row']}, {format.seconds(line['seconds'])}"
             for line, mark in ((best, "*"), (quickest, ""))
         )
         other = "It is also the fastest." if best is quickest else f"The fastest row has {quickest_text})."
-        among = "The" if len(lines) == len(self.pooled) else "Among the rows with equal settings, the"
         return f"{among} smallest median of {least_of} is *{best_text}); n = {format.plural(n, 'shape')}. {other}"
 
     def panels(self, ratio: str) -> list[chart.Panel]:

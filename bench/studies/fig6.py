@@ -16,8 +16,8 @@ CAPTION = (
 NOTES = (
     "The initial camera is also shifted by {shift:g} scene units. All methods share the views and initial cameras.",
     "An interval counts the views of one shape as one trial. A failed run has not found the pose.",
-    "Runtimes include the trials of all starts. Iterative closest points (ICP) run every start to its end.",
-    "Runtimes and field evaluations are medians over runs that ended ok.",
+    "Costs include the trials of all starts, and are medians over runs that ended ok. Iterative closest points (ICP) "
+    "run every start to its end.",
     "The figure has no intervals, the table has them.",
 )
 RUNS = (

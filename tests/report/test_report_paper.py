@@ -213,8 +213,14 @@ def test_a_strategy_whose_forerunner_is_missing_is_not_credited_with_what_both_s
 
 def test_times_of_a_loaded_machine_are_in_doubt(tmp_path):
     write_run(tmp_path, "table1", NAIVE, metrics=costs(), notes=["loaded machine: threads waited 31% of their time"])
-    write_run(tmp_path, "table1", DYNAMIC, metrics=costs())
-    assert f"Times are not reliable, see the notes of the runs: {NAIVE}." in page_of(tmp_path, "table1").notes
+    for label in (DYNAMIC, PARALLEL):
+        write_run(tmp_path, "table1", label, metrics=costs())
+    page = page_of(tmp_path, "table1")
+    assert f"Times are not reliable, see the notes of the runs: {NAIVE}." in page.notes and "Forward" in page.table
+    write_run(tmp_path, "table1", DYNAMIC, metrics=costs(), notes=["loaded machine: it waited"])
+    page = page_of(tmp_path, "table1")
+    assert any(note.startswith("No runtimes, since the machine had load: ") for note in page.notes)
+    assert "Forward" not in page.table and page.data["forward_s"].notna().all()
 
 
 def test_hostile_words_are_escaped_everywhere(tmp_path):

@@ -144,7 +144,10 @@ def _loaded(runs: Runs) -> str:
     names = [record["name"] for record in runs.named() if doubtful(record)]
     few = _listed(names) if len(names) <= MAX_LISTED_NAMES else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
-    return f"Times are not reliable, see the notes of the runs: {rows}." if names else ""
+    says = (
+        "Times are not reliable, see the notes of the runs" if runs.timed else "No runtimes, since the machine had load"
+    )
+    return f"{says}: {rows}." if names else ""
 
 
 def _machine(cpu: Any, device: Any, threads: Any, compiled: bool) -> str:

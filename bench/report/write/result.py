@@ -15,6 +15,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.figure_style import RC
+from bench.records.format import seconds
 from bench.records.record import to_json_values
 from bench.report.data import age
 from bench.report.data.runs import Runs
@@ -107,8 +108,14 @@ class Result:
             object.__setattr__(self, "data", to_data(*listed))
 
     @cached_property
+    def shown_columns(self) -> list[Column]:
+        """The columns without runtimes, if most runs were on a loaded machine; the CSV has these too."""
+        hide = bool(self.runs.records) and not self.runs.timed
+        return [column for column in self.columns if not (hide and column.show is seconds)]
+
+    @cached_property
     def table(self) -> pd.DataFrame:
-        return to_table(self.columns, self.lines)
+        return to_table(self.shown_columns, self.lines)
 
     @cached_property
     def caption(self) -> str:
@@ -132,7 +139,7 @@ class Result:
             caption=self.caption,
             columns=list(self.table),
             rows=self.table.to_numpy().tolist(),
-            best=best(self.columns, self.lines),
+            best=best(self.shown_columns, self.lines),
             notes=self.notes,
             drawn=self.figure is not None,
             chart=self.chart,
