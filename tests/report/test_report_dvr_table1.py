@@ -40,8 +40,8 @@ def test_a_line_has_medians_costs_and_ratios_to_both_baselines_over_the_same_sha
     found = lines(tmp_path)
     rgb, mean = found["car", "RGB"], found["car", "Mean shape"]
     assert (rgb["IoU"], rgb["Chamfer-L1"], rgb["Failed"]) == ("0.800", "20.0", "0 of 3")
-    assert (rgb["Trained in"], rgb["Inference"]) == ("90.0 s", "600 ms")
-    assert (mean["Trained in"], mean["Inference"]) == ("–", "–")
+    assert (rgb["Training of a family"], rgb["Inference, with mesh"]) == ("90.0 s", "600 ms")
+    assert (mean["Training of a family"], mean["Inference, with mesh"]) == ("–", "–")
     assert rgb["Over the mean shape"] == "0.500 (n = 3)"  # of 1/4, 1 and 1/2
     assert rgb["Over the nearest image"] == "0.250 (n = 3)"
     assert (mean["Over the mean shape"], mean["Over the nearest image"]) == ("", "0.500 (n = 3)")
