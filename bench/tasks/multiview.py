@@ -279,22 +279,21 @@ class PhotometricLoss:
     def _visible(
         self, renderer: Renderer, field: Field, rendering: Rendering, neighbours: list[int]
     ) -> Bool[Tensor, "views ..."]:
-        """Whether the hits of views are seen by the neighbours, where depths agree (DIST, B.3).
-
-        The neighbours' depths are interpolated in their images or, of drawn pixels, rendered along rays to the hits.
-        """
+        """Whether the hits of views are seen by the neighbours. Of drawn pixels, only the needed ones are rendered."""
+        projected = [self.cameras[other].project(rendering.points[k]) for k, other in enumerate(neighbours)]
+        rays = self._stack_rays(neighbours)
         if self.settings.pixel_block == 1:
-            seen = render_checked(renderer, field, self._stack_rays(neighbours))
-            depths = [self.cameras[other].depth(seen.distance[k]) for k, other in enumerate(neighbours)]
-            expected = [self.cameras[other].project(rendering.points[k]) for k, other in enumerate(neighbours)]
-            agree = [self._sees(depths[k], seen.hit[k], *expected[k]) for k in range(len(neighbours))]
-            return rendering.hit & torch.stack(agree)
-        centres = torch.stack([self.cameras[other].center for other in neighbours])
-        origins = centres[:, None].expand_as(rendering.points)[rendering.hit]
-        offsets = rendering.points[rendering.hit] - origins
-        seen = render_checked(renderer, field, Rays(origins, torch.nn.functional.normalize(offsets, dim=-1)))
-        close = (seen.distance - offsets.norm(dim=-1)).square() < self.settings.visible
-        return rendering.hit.clone().masked_scatter_(rendering.hit, seen.hit & close)
+            seen = render_checked(renderer, field, rays)
+            distance, hit = seen.distance, seen.hit
+        else:
+            pixels = [of[rendering.hit[k]] for k, (of, _) in enumerate(projected)]
+            needed = torch.stack([pixels_around(of, *self.colours.shape[1:3]) for of in pixels])
+            seen = render_checked(renderer, field, rays[needed])
+            distance = torch.zeros_like(needed, dtype=seen.distance.dtype).masked_scatter(needed, seen.distance)
+            hit = needed.clone().masked_scatter(needed, seen.hit)
+        depths = [self.cameras[other].depth(distance[k]) for k, other in enumerate(neighbours)]
+        agree = [self._sees(depths[k], hit[k], *projected[k]) for k in range(len(neighbours))]
+        return rendering.hit & torch.stack(agree)
 
     def _sees(
         self,
@@ -331,6 +330,16 @@ def blur(images: Float[Tensor, "views height width 3"], sigma: float) -> Float[T
     horizontal = torch.nn.functional.conv2d(padded, weights.view(1, 1, 1, -1))
     smoothed = torch.nn.functional.conv2d(horizontal, weights.view(1, 1, -1, 1))
     return smoothed.view(len(images), 3, *images.shape[1:3]).permute(0, 2, 3, 1)
+
+
+def pixels_around(positions: Float[Tensor, "n 2"], height: int, width: int) -> Bool[Tensor, "height width"]:
+    """The pixels between whose centres `sample` interpolates at these positions (column, row)."""
+    around = torch.zeros(height, width, dtype=torch.bool, device=positions.device)
+    for shift in torch.cartesian_prod(torch.arange(2), torch.arange(2)).to(positions.device):
+        column, row = ((positions - 0.5).floor().long() + shift).unbind(-1)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        around[row[inside], column[inside]] = True
+    return around
 
 
 def sample(

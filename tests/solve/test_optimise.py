@@ -19,6 +19,7 @@ from bench.solve.optimise import (
     Starts,
     StartSettings,
     optimise,
+    with_affordable_rays,
 )
 from renderers.boundary import render_checked
 from renderers.checks import BrokenContract
@@ -417,3 +418,34 @@ def test_a_loop_that_its_budget_ends_needs_a_budget_and_a_single_start():
         OptimiserSettings(10, 0.1, "constant", ends=BUDGET)
     with pytest.raises(ValueError, match=r"task\.optimiser\.ends=iterations"):
         StartSettings(4, 8).check(OptimiserSettings(100, 0.1, "constant", 1e5, BUDGET))
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """A task whose iteration costs `POINTS` times 256 over the pixels of a block."""
+
+    optimiser: OptimiserSettings
+    pixel_block: int = 0
+
+
+@each("budget, block", [(None, 1), (40 * 256, 1), (40 * 256 - 1, 2), (40 * 16, 4), (40 * 16 - 1, 8), (1, 8)])
+def test_the_budget_chooses_the_smallest_block_with_which_it_pays_for_forty_iterations(budget, block):
+    class Costly(Toy):
+        def loss(self, iteration):
+            self.counts.add("value", self.cost)
+            return {"total": self.radius**2}
+
+    made = []
+
+    def make(task):
+        problem = Costly()
+        problem.cost = 256 // task.pixel_block**2
+        made.append((task.pixel_block, problem))
+        return problem
+
+    task = Sampled(OptimiserSettings(100, 0.05, "constant", budget))
+    problem = with_affordable_rays(task, make)
+    assert made[-1] == (block, problem) and problem.counts.cost == 0  # a new one
+    assert [blocks for blocks, _ in made[:-1]] == [side for side in (1, 2, 4, 8) if side <= block]
+    made.clear()
+    assert with_affordable_rays(replace(task, pixel_block=2), make) is made[0][1] and len(made) == 1

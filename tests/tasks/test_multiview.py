@@ -17,6 +17,8 @@ from bench.tasks.single_view.encoder import EncoderSettings
 from datasets.files.meshes import read_mesh
 from datasets.mesh import extract
 from datasets.scene import Scene, Truth
+from renderers.camera import Rays
+from renderers.field import Meter
 from renderers.fields.analytic import sphere
 from tests.datasets.test_photographs import PHOTOGRAPHY
 from tests.looped import each
@@ -63,6 +65,38 @@ def test_masks_are_compared_where_their_loss_has_a_weight_and_hold_what_a_shape_
     assert set(overrides(scene).compare(smaller, 0)) == {"photometric"}
     masked = overrides(scene, silhouette_weight=10.0)
     assert masked.compare(smaller, 0)["silhouette"] > 3 * masked.compare(sphere(0.5), 0)["silhouette"]
+
+
+def test_drawn_pixels_are_compared_as_among_all(scene):
+    """A neighbour's depths are interpolated as among all pixels, but only the needed pixels are rendered."""
+    everything, drawn = overrides(scene), overrides(scene, pixel_block=2, silhouette_weight=10.0)
+    assert drawn.pixels(0).tolist() != drawn.pixels(1).tolist() and len(drawn.pixels(0)) == 8 * 8
+    errors = [drawn.compare(sphere(0.5), iteration)["photometric"].item() for iteration in range(0, 32, 8)]
+    whole = [everything.compare(sphere(0.5), iteration)["photometric"].item() for iteration in range(0, 32, 8)]
+    assert np.mean(errors) == pytest.approx(np.mean(whole), rel=0.3)
+    costs = []
+    for photographs in (everything, drawn):
+        field = Meter(sphere(0.5))
+        photographs.compare(field, 0)
+        costs.append(field.counts.cost)
+    assert costs[1] < 0.9 * costs[0]
+    assert drawn.compare(sphere(0.4), 0)["silhouette"] > 3 * drawn.compare(sphere(0.5), 0)["silhouette"]
+    problem = problem_of(scene, pixel_block=2)
+    assert problem.rays_per_iteration * 4 == problem_of(scene).rays_per_iteration
+
+
+def test_drawn_pixels_are_seen_by_the_neighbour_as_among_all(scene):
+    drawn, everything = overrides(scene, pixel_block=2), overrides(scene)
+    views, neighbours = map(list, zip(*drawn.pairs(0), strict=True))
+    image, pixels = drawn._stack_rays(views), drawn.pixels(0)
+    sparse = Rays(image.origins.flatten(1, 2)[:, pixels], image.directions.flatten(1, 2)[:, pixels])
+    fields = sphere(0.5), sphere(0.5) | sphere(0.2).translate((0.5, 0.2, 0.5))
+    for field in fields:
+        seen = [
+            loss._visible(RENDERER, field, RENDERER.render(field, rays), neighbours)
+            for loss, rays in ((everything, image), (drawn, sparse))
+        ]
+        assert seen[1].equal(seen[0].flatten(1)[:, pixels]) and seen[1].any() and not seen[1].all()
 
 
 def test_views_move_on_and_are_spread_evenly(scene):

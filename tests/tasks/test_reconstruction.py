@@ -1,6 +1,6 @@
 """Reconstruction from photographs on disk and of a mesh: it improves, leaves a coloured mesh, and tells mistakes."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from bench.setup.fields import FieldChoice
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings
 from bench.tasks.reconstruction.choice import Appearance, AutoField
+from bench.tasks.reconstruction.distance_fit import DistanceFit
 from bench.tasks.reconstruction.dtu import METRIC_NAMES, dtu_metrics, read_scan
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS
 from bench.tasks.reconstruction.losses import Losses
@@ -234,3 +235,29 @@ def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
     assert set(record.metrics) <= defined
     named = executed(without_pictures(run_in(folder(tmp_path, "named"), scene, field=name)))
     assert named.metrics["psnr"] == record.metrics["psnr"] and named.evaluations == record.evaluations
+
+
+def test_the_fit_to_true_distances_is_better_than_a_short_reconstruction(scene, tmp_path):
+    shared = {each.name: getattr(SETTINGS, each.name) for each in fields(Reconstruction)}
+    settings = DistanceFit(**shared | {"optimiser": OptimiserSettings(60, 0.01, "cosine")}, distances=3000, batch=500)
+    errors = {}
+    for name, task in {"fit": settings, "photographs": SETTINGS}.items():
+        (tmp_path / name).mkdir()
+        run = altered(run_in(tmp_path / name, scene, field="network_2x16"), {"inputs.evaluation.points": 3000})
+        task.execute(run)
+        assert run.record.status == "ok"
+        errors[name] = run.record.metrics["seen_chamfer_l1"]
+    assert errors["fit"] < 0.5 * errors["photographs"]
+
+
+def test_the_block_of_pixels_divides_the_rays(scene, tmp_path):
+    run = run_in(tmp_path, scene, field="network_2x16")
+    subject = SETTINGS.subject(run.inputs)
+    rays = {
+        block: replace(SETTINGS, pixel_block=block).problem("network_2x16", subject, run).rays_per_iteration
+        for block in (1, 2, 8)
+    }
+    assert rays == {1: 192, 2: 48, 8: 4}
+    short = replace(SETTINGS.optimiser, budget=2e4)
+    sampled = replace(SETTINGS, pixel_block=0, optimiser=short).problem("network_2x16", subject, run)
+    assert sampled.rays_per_iteration in (4, 12, 48) and sampled.counts.cost == 0
