@@ -85,8 +85,8 @@ def make_sets(*several: Runs | None) -> Result:
     reached = made.reached[made.reached["complete"] | made.reached["tuned"]]
     groups, per_budget = reached.groupby(["set", "row"]), reached.groupby(["budget", "set", "row"])
     lines = groups[["preset"]].first()
-    for name, of in (("progress", "mean"), ("iterations", "median"), ("rays", "median")):
-        values = per_budget[name].agg(of).unstack("budget")
+    for name, statistic in (("progress", "mean"), ("iterations", "median"), ("rays", "median")):
+        values = per_budget[name].agg(statistic).unstack("budget")
         lines = lines.join(values.rename(columns=lambda budget, name=name: f"{name}_{budget:g}"))
     lines = lines.join(standing.seconds_per_unit(made.everything))
     order = [*made.sets, *made.rows, *reached["row"].unique()]

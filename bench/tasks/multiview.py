@@ -283,14 +283,15 @@ class PhotometricLoss:
         projected = [self.cameras[other].project(rendering.points[k]) for k, other in enumerate(neighbours)]
         rays = self._stack_rays(neighbours)
         if self.settings.pixel_block == 1:
-            seen = render_checked(renderer, field, rays)
-            distance, hit = seen.distance, seen.hit
+            neighbour = render_checked(renderer, field, rays)
+            distance, hit = neighbour.distance, neighbour.hit
         else:
-            pixels = [of[rendering.hit[k]] for k, (of, _) in enumerate(projected)]
-            needed = torch.stack([pixels_around(of, *self.colours.shape[1:3]) for of in pixels])
-            seen = render_checked(renderer, field, rays[needed])
-            distance = torch.zeros_like(needed, dtype=seen.distance.dtype).masked_scatter(needed, seen.distance)
-            hit = needed.clone().masked_scatter(needed, seen.hit)
+            positions = [pixels[rendering.hit[k]] for k, (pixels, _) in enumerate(projected)]
+            needed = torch.stack([pixels_around(centres, *self.colours.shape[1:3]) for centres in positions])
+            neighbour = render_checked(renderer, field, rays[needed])
+            distance = torch.zeros_like(needed, dtype=neighbour.distance.dtype)
+            distance = distance.masked_scatter(needed, neighbour.distance)
+            hit = needed.clone().masked_scatter(needed, neighbour.hit)
         depths = [self.cameras[other].depth(distance[k]) for k, other in enumerate(neighbours)]
         agree = [self._sees(depths[k], hit[k], *projected[k]) for k in range(len(neighbours))]
         return rendering.hit & torch.stack(agree)

@@ -38,7 +38,7 @@ PROBLEM_SETTINGS = {  # per set: the setting in which problems differ, its key u
     "pose": ("task.degrees", "degrees", "{:g} degrees"),
     "reconstruct": ("task.images.texture", "textures", "{}"),
 }
-BUDGET_KEY = "task.optimiser.budget"  # in field evaluations
+BUDGET_KEY = "task.optimiser.budget"
 TUNED_PREFIX = "tuned/"  # before the name of a method with tuned settings
 TUNED_SUFFIX = ", tuned"  # after the name of a row with tuned settings
 TUNABLE_KEYS = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"
