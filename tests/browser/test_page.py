@@ -118,7 +118,7 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     page.get_by_role("link", name="Other", exact=True).click()
     page.get_by_text("It fails in 2 of 2 runs.").wait_for()
     text = page.locator("main").inner_text()
-    assert "complete: car test 0, 20 points, seed 0: lost." in text and "python -m bench.suite" in text
+    assert "complete: car test 0, 20 points, 1 unit: lost." in text and "python -m bench.suite" in text
     assert page.locator("table.list tbody tr").count() == 2 and "2 of 2 complete (nan)" in text
     page.get_by_role("link", name="Suite").first.click()
     page.get_by_role("link", name="Dist", exact=True).click()
@@ -134,7 +134,7 @@ def test_a_renderer_of_a_run_has_the_picture_of_its_first_failure(tmp_path, tab)
     page = tab(tmp_path).open("#/renderer/Mine")
     page.get_by_text("It fails in 1 of 1 run.").wait_for()
     assert page.locator("main img").get_attribute("src").endswith("/failure.png")
-    assert "car test 0, 20 points, seed 0: the loss rose." in page.locator("main").inner_text()
+    assert "car test 0, 20 points, 1 unit: the loss rose." in page.locator("main").inner_text()
 
 
 def test_a_sweep_stands_on_the_first_screen_with_its_verdict_and_its_chart(tmp_path, tab):
