@@ -19,6 +19,7 @@ TASKS = {
     "pose_icp": "Find the camera of a known shape by closest points, without a renderer",
     "deepsdf": "Complete a shape from signed distances near the depth image, without a renderer",
     "prior_fit": "Fit a prior's code to the true distances: the best that a method can hope for",
+    "distance_fit": "Fit the field of a reconstruction to the true distances: the best that a method can hope for",
     "single_view": "Say shape and colour from one image, by a trained network",
     "ablation": "Measure what one rendering costs and how far it is from a float64 reference",
     "gradients": "Compare a renderer's gradients with float64 differences",
