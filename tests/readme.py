@@ -9,11 +9,6 @@ from typing import Any
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAPER = README.parent / "results" / "paper"
-COLUMNS = (
-    *("`renderer=`", "progress at 1 ×", "at the end", "failed runs"),
-    *("completion: field evaluations over DIST's", "completion: time over DIST's"),
-)
-HEAD = f"| {' | '.join(COLUMNS)} |\n|---|{'---:|' * (len(COLUMNS) - 1)}\n"
 MAX_LINES, MAX_NUMBERS, MAX_WORDS = 120, 60, 25  # the last is per sentence
 BLOCK = re.compile(r"^```[\s\S]*?^```$|^ {4}.*$|<[^>]*>", re.MULTILINE)  # what is typed, and HTML
 ADDRESS = re.compile(r"!?\[([^]]*)\]\([^)]*\)")  # the text of a link stays
@@ -37,64 +32,57 @@ def wrongs(text: str) -> list[str]:
 
 
 def recommendation() -> str:
-    """README's first answer: of the renderers that lead at 1 ×, the one among the best on hard scenes.
-
-    Raises:
-        ValueError: a sentence does not hold any more; another one must be written.
-    """
-    lines, presets = _lines("suite"), {line["row"]: line["preset"] for line in _lines("suite")}
-    page = json.loads((PAPER / "suite.json").read_text(encoding="utf-8"))
-    rows = r"(.*) \(\*.*\*\) and (.*) \(\*.*\*\) make significantly more progress than the \d+ others"
-    rest = "These 2 cannot be distinguished. At the end of the runs, none of"
-    leaders = re.search(rf"^At the cost of one DIST run, {rows}. {rest}", page["verdict"])
-    _check(leaders, "the leaders at the cost of one run, or the pairs at the end")
-    both = leaders.groups() if leaders else ()
-    hard = [presets[row] for row in both if row in _hardest()]
-    others = [presets[row] for row in both if row not in _hardest()]
-    _check(len(hard) == len(others) == 1 and presets[both[0]] == hard[0], "the leaders on hard scenes")
-    without = [note for note in page["notes"] if note.startswith("Without ")]
-    _check(without and all(f", at 1 ×, {both[0]} (" in note for note in without), "the first with a set left out")
-    other = others[0]
-    worst = max(_lines("stability_cost"), key=lambda line: float(line["rank"]))
-    _check(presets[worst["row"]] == other, "the last rank on hard scenes")
-    verdict = json.loads((PAPER / "suite_sets.json").read_text(encoding="utf-8"))["verdict"]
-    slower = re.search(
-        r"run, (.*) \(\*.*\*\) makes the most progress, significantly more than \d+ others?: (.*?)\. Run", verdict
-    )
-    _check(slower and presets[slower[1]] == hard[0], "the first in the time of one run")
-    behind = slower[2].split("; ") if slower else []
-    near = [f"`{preset}`" for row, preset in presets.items() if row not in behind and preset != hard[0]]
-    costs = {line["preset"]: float(line["cost"]) for line in lines}
-    least, most = min(costs, key=costs.__getitem__), max(costs, key=costs.__getitem__)
+    """README's first answer: the row with the most progress among those that none beats significantly at any cost."""
+    lines = _lines("suite")
+    leaders = {budget: [line for line in lines if _first_rank(line, budget)] for budget in _budgets()}
+    always = [line for line in lines if all(line in rows for rows in leaders.values())]
+    if not always:
+        raise ValueError("no row is among the best at all costs: README needs another sentence")
+    first = max(always, key=lambda line: float(line[_budgets()[-1]]))
+    sentences = [
+        f"At {_units(budget)} of cost, no renderer makes significantly more progress than {_either(rows)}."
+        for budget, rows in leaders.items()
+    ]
+    hard = "cannot be distinguished from the best" if first["row"] in _hardest() else "is significantly worse"
     return (
-        f"**Start with `{hard[0]}`.** With as many field evaluations as one whole DIST run (1 ×), `{hard[0]}` and "
-        f"`{other}` make significantly more progress than all other renderers.\nThe difference between these two is "
-        f"not significant. If one of the four problem sets is left out, `{hard[0]}` is still first. On "
-        f"[hard scenes](results/paper/stability_cost.md), `{other}` has the worst mean rank.\nIn the time of one DIST "
-        "run, in depth completion, "
-        f"`{hard[0]}` is first. {', '.join(near[:-1])} and {near[-1]} do not differ significantly from it; "
-        "all other renderers do. At the end of their runs, no two renderers can be distinguished. "
-        f"Over all sets, a run needs {costs[least]:.2g} (`{least}`) to {costs[most]:.2g} (`{most}`) times the "
-        "field evaluations of a DIST run. The table has these ratios for completion alone."
+        f"**Start with `{first['preset']}`.** All renderers spend the same number of field evaluations at each problem. "
+        f"{' '.join(sentences)}\n"
+        f"On [hard scenes](results/paper/stability_cost.md), the mean rank of `{first['preset']}` {hard}."
     )
 
 
-def _check(holds: Any, what: str) -> None:
-    if not holds:
-        raise ValueError(f"{what} have changed: README needs another sentence")
+def _budgets() -> list[str]:
+    """The budgets with results, as they are named in the CSV file of the suite."""
+    lines = _lines("suite")
+    return [name for name in lines[0] if name.isdigit() and any(line[name] for line in lines)]
+
+
+def _units(budget: str) -> str:
+    return f"{budget} unit" if budget == "1" else f"{budget} units"
+
+
+def _first_rank(line: dict[str, str], budget: str) -> bool:
+    return re.split(r"\D", line[f"{budget}_rank"])[0] == "1"
+
+
+def _either(lines: list[dict[str, str]]) -> str:
+    names = [f"`{line['preset']}`" for line in lines]
+    return " or ".join([", ".join(names[:-1]), names[-1]]) if names[1:] else names[0]
 
 
 def table() -> str:
     """README's table of renderers, from the committed CSV files of the suite."""
     sets = {(line["set"], line["row"]): line for line in _lines("suite_sets")}
+    costs = [f"progress at {_units(budget)}" for budget in _budgets()]
+    head = ["`renderer=`", *costs, "failed runs", "iterations of a completion at 1 unit", "rays of an iteration"]
     rows = []
     for line in _lines("suite"):
-        cost = sets["complete", line["row"]]
+        completion = sets["complete", line["row"]]
         failed = sum(map(int, re.findall(r"(\d+) of \d+", line["failed"]))) or "none"
-        progress = [_percent(line[name]) for name in ("at_1", "end")]
-        costs = [f"{float(cost[name]):.2g}" for name in ("evaluations", "seconds")]
-        rows.append(f"| `{line['preset']}` | {' | '.join([*progress, str(failed), *costs])} |")
-    return HEAD + "\n".join(rows)
+        progress = [f"{_percent(line[budget])} ({line[f'{budget}_rank']})" for budget in _budgets()]
+        counts = [f"{float(completion[f'{name}_1']):.0f}" for name in ("iterations", "rays")]
+        rows.append(f"| `{line['preset']}` | {' | '.join([*progress, str(failed), *counts])} |")
+    return f"| {' | '.join(head)} |\n|---|{'---:|' * (len(head) - 1)}\n" + "\n".join(rows)
 
 
 def hard_scenes() -> str:
