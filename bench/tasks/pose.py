@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from hashlib import sha256
 from math import atan2, degrees, radians, sqrt
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,7 +21,9 @@ from bench.evaluate.evaluate import (
 )
 from bench.evaluate.state import REACH, State
 from bench.pictures.run_figures import draw_curve
+from bench.records.record import digest
 from bench.setup.inputs import RunContext, RunInputs
+from bench.shape_prior import load_or_make
 from bench.solve.draw import solve_and_draw
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, generator_of, normal_error
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
@@ -176,12 +179,17 @@ class Pose(PoseTask):
 
 
 def build_shape_field(settings: Pose, inputs: RunInputs) -> Field:
-    """The field of the scene's shape, of the kind that `settings.shape` names."""
+    """The field of the scene's shape, of the kind that `settings.shape` names; a grid is stored in the cache."""
     if settings.shape == "prior":
         fitted = inputs.fitted()
         return fitted.decoder.to(inputs.device).requires_grad_(False).at(fitted.codes[0].to(inputs.device))
-    values = inputs.scene.raycaster.distance_grid(settings.grid, REACH)
-    return Grid(torch.from_numpy(values).to(inputs.device), REACH)
+
+    def distances() -> dict[str, Tensor]:
+        return {"values": torch.from_numpy(inputs.scene.raycaster.distance_grid(settings.grid, REACH))}
+
+    mesh = sha256(b"".join(array.tobytes() for array in (inputs.scene.mesh.vertices, inputs.scene.mesh.faces)))
+    key = digest({"mesh": mesh.hexdigest(), "samples": settings.grid, "reach": REACH})
+    return Grid(load_or_make(inputs.cache, f"distances-{key}", distances)["values"].to(inputs.device), REACH)
 
 
 @dataclass

@@ -154,6 +154,18 @@ def test_a_known_shape_is_the_scenes(run):
     assert torch.equal(network, prior.decoder.at(prior.codes[0])(points))
 
 
+def test_the_grid_of_a_shape_is_computed_once_for_each_shape_and_size(run, monkeypatch):
+    settings = replace(SETTINGS, shape="grid", grid=10)
+    first = build_shape_field(settings, run.inputs)
+    monkeypatch.setattr("datasets.scene.Truth.distance_grid", lambda *_: pytest.fail("it is stored"))
+    assert torch.equal(build_shape_field(settings, run.inputs).values, first.values)
+    with pytest.raises(pytest.fail.Exception, match="it is stored"):
+        build_shape_field(replace(settings, grid=11), run.inputs)
+    moved = run.inputs.scene.mesh.moved(np.diag([0.9, 1.0, 1.0, 1.0]))
+    with pytest.raises(pytest.fail.Exception, match="it is stored"):
+        build_shape_field(settings, replace(run.inputs, make_scene=lambda: replace(run.inputs.scene, mesh=moved)))
+
+
 @pytest.mark.parametrize("method", ["point_to_point", "point_to_plane"])
 def test_closest_points_find_a_near_pose(run, method):
     replace(ICP, method=method).execute(run)
