@@ -193,7 +193,7 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
         print(f"{row + (' *' if row in local else ''):<28} {''.join(f'{cell:<16}' for cell in cells)}{failed:>11}")
     for (budget, row), missing in standing.lacking.items():
         lacks = f"{row} lacks {plural(missing, 'problem')} {budgets.get(budget, budget)}"
-        print(f"{lacks}, so it is not compared there: run the suite for it without set=.")
+        print(f"{lacks}, so it is not compared there: run it with suite=core and without set=.")
 
 
 def _print_errors(standing: Standing, local_rows: set[str]) -> None:

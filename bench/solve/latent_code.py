@@ -68,8 +68,6 @@ class CodeProblem:
         initial_similarities: one per start, see `renderers.field.Moved`; None does not move the shape.
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the observed photographs, for pictures.
-        comparison_iteration: iteration whose settings the first and last loss use; None: each has the settings of its
-            own iteration.
         progress_measure: returns the number of a field that must decrease; None: the loss must.
         mask, coloured: whether a mask and colours are observed, for pictures.
     """
@@ -84,7 +82,6 @@ class CodeProblem:
     initial_similarities: Float[Tensor, "starts 7"] | None = None
     trial: int = 1
     photographs: Float[np.ndarray, "views height width 3"] | None = None
-    comparison_iteration: int | None = None
     progress_measure: Callable[[Field], float] | None = None
     mask: bool = True
     coloured: bool = False
@@ -147,14 +144,8 @@ class CodeProblem:
 
     @torch.no_grad()
     def objective(self) -> float | None:
-        """`progress_measure`, or the loss at `comparison_iteration`; None without either. It is not counted as cost."""
-        best = self.starts.best()
-        if self.progress_measure is not None:
-            return self.progress_measure(self._shape(best))
-        if self.comparison_iteration is None:
-            return None
-        terms = self.compare(self._shape(best), self.comparison_iteration)
-        return float(torch.stack(list(terms.values())).sum() + self.penalty(self.codes[best]))
+        """The current shape's `progress_measure`, not counted as cost; None without it."""
+        return None if self.progress_measure is None else self.progress_measure(self._shape(self.starts.best()))
 
     def _shape(self, start: int) -> Field:
         shape: Field = self.decoder.at(self.codes[start])

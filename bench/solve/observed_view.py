@@ -60,6 +60,20 @@ def central_differences(field: Field, points: Float[Tensor, "n 3"], width: float
     return (ahead - behind) / width
 
 
+def observed_hits(
+    hit: Bool[Tensor, "*rays"], observed: Bool[Tensor, "*rays"], expected: float | None = None
+) -> Float[Tensor, ""]:
+    """The number of observed rays that hit, which a sum of their errors is divided by; 1 if there are none.
+
+    Args:
+        expected: the mean number of observed rays in a draw, if the rays are drawn. It replaces their number in this
+            draw, so that the errors have the same weight on average as among all rays.
+    """
+    hits = (hit & observed).sum().to(torch.float32)
+    count = hits if expected is None else expected * hits / observed.sum().clamp_min(1)
+    return torch.where(hits > 0, count, 1.0)
+
+
 @runtime_checkable
 class ViewLossSettings(Protocol):
     """The settings of a view's loss: its terms and their weights."""
@@ -86,6 +100,7 @@ class ObservedView:
     normal_width: float = 0.0  # scene units, see `central_differences`
     colours: Float[Tensor, "*rays 3"] | None = None  # of an image; NaN outside of the shape
     colour_weight: float = 0.0  # of the mean absolute error of a `TexturedShape`'s colours
+    expected_observed: float | None = None  # of drawn rays, see `observed_hits`
 
     @staticmethod
     def of(
@@ -120,6 +135,11 @@ class ObservedView:
         """The observations of the rays with these indices, for rays in one row."""
         return self._map_tensors(lambda tensor: tensor[rays])
 
+    def drawn(self, rays: Int[Tensor, " n"]) -> "ObservedView":
+        """The observations of drawn rays in one row; terms have the same weights on average as among all rays."""
+        expected = float(self.observed.sum()) * len(rays) / self.observed.numel()
+        return replace(self.select(rays), expected_observed=expected)
+
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted loss terms of DIST, Eq. 5."""
         renderer = at_iteration(self.renderer, iteration)
@@ -127,7 +147,8 @@ class ObservedView:
         compared = self.observed & rendering.hit
         depth = rendering.distance * self.depth_per_distance
         error = depth_error(self.settings.depth_loss, depth, self.depth, self.depth_per_distance)
-        terms = {"depth": self.settings.depth_weight * (error * compared).sum() / compared.sum().clamp_min(1)}
+        count = observed_hits(rendering.hit, self.observed, self.expected_observed)
+        terms = {"depth": self.settings.depth_weight * (error * compared).sum() / count}
         if self.normals is not None:
             gradients = central_differences(field, rendering.points[compared], self.normal_width)
             error = normal_error(torch.nn.functional.normalize(gradients, dim=-1), self.normals[compared])

@@ -63,7 +63,7 @@ class OptimiserSettings:
         check_positive("task.optimiser.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
         check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
         if self.budget is not None:
-            check_positive("task.optimiser.budget", self.budget, "the suite has 6e6 to 2e7, null is none")
+            check_positive("task.optimiser.budget", self.budget, "the suite has 2.5e5 to 1e7, null is none")
         check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET))
         if self.ends == BUDGET and self.budget is None:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
@@ -115,7 +115,8 @@ Solvable = TypeVar("Solvable", bound=Optimisable)
 def with_affordable_rays(task: Sampled, make_problem: Callable[[Sampled], Solvable]) -> Solvable:
     """The problem of a task; with `pixel_block` 0, of the smallest of `BLOCKS` with which the budget pays enough.
 
-    Enough are `AFFORDED_ITERATIONS`. The cost of an iteration is that of a first one, made for this and not counted.
+    Enough are `AFFORDED_ITERATIONS`. The cost of an iteration is that of one with the first parameters at the end of
+    schedules, made for this and not counted. If no block is enough, it is the largest.
     """
     if task.pixel_block:
         return make_problem(task)
@@ -123,7 +124,7 @@ def with_affordable_rays(task: Sampled, make_problem: Callable[[Sampled], Solvab
         sampled = replace(task, pixel_block=block)
         problem = make_problem(sampled)
         with suppress(CannotContinue):  # the loop reports it
-            problem.loss(0)["total"].backward()
+            problem.loss(Iteration(0, task.optimiser.iterations - 1))["total"].backward()
         if AFFORDED_ITERATIONS * problem.counts.cost <= (task.optimiser.budget or inf):
             break
     return make_problem(sampled)

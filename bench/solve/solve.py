@@ -235,8 +235,9 @@ def run_optimisation(
             check(int(checkpoints.pop(0)))
         try:
             note_objective()
-            device = run.inputs.device
-            optimise(problem, settings, device, history=history, on_step=on_step, least_reference=least_reference)
+            # A loop of drawn pixels has a first loss that may be small by chance.
+            reference, device = max([least_reference, *history.objectives]), run.inputs.device
+            optimise(problem, settings, device, history=history, on_step=on_step, least_reference=reference)
             note_objective()
         except CannotContinue as error:
             history.status, history.reason = RunStatus.NOT_REACHED, str(error)

@@ -124,7 +124,7 @@ class Completion:
         rays = len(pixel_of_each_block(*compared.shape, self.pixel_block, torch.Generator()))
         compare, all_pixels = observed_view.compare, None
         if self.pixel_block > 1:
-            compare = self._compare_blocks(observed_view, seed)
+            compare = self._compare_blocks(observed_view, scene.seed(seed))
             all_pixels = partial(_loss_of_all_pixels, observed_view, self.optimiser.iterations)
         problem = partial(CodeProblem, prior, self.code, compare, compared, rays, device, progress_measure=all_pixels)
         problem = partial(problem, mask=observed_view.mask is not None, coloured=self.colour_weight > 0)
@@ -139,7 +139,7 @@ class Completion:
 
         def compare(field: Field, iteration: int) -> Terms:
             pixels = pixel_of_each_block(height, width, self.pixel_block, generator_of(seed, iteration))
-            return flat.select(pixels.to(view.observed.device)).compare(field, iteration)
+            return flat.drawn(pixels.to(view.observed.device)).compare(field, iteration)
 
         return compare
 

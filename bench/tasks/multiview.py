@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import radians
 from typing import Protocol, runtime_checkable
 
@@ -163,7 +164,7 @@ class Multiview:
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
         photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        return self.problem_of(prior, PhotometricLoss(self, renderer, photographs, device, seed=seed), generator)
+        return self.problem_of(prior, PhotometricLoss(self, renderer, photographs, device, seed=scene_seed), generator)
 
     def problem_of(self, prior: Prior, photometric_loss: "PhotometricLoss", generator: torch.Generator) -> CodeProblem:
         """The problem of a loss; `generator` draws the initial codes."""
@@ -186,8 +187,13 @@ class Multiview:
             else misplaced,
             trial=self.trial,
             photographs=photometric_loss.colours.cpu().numpy(),
-            comparison_iteration=self.optimiser.iterations,  # images are no longer blurred
+            progress_measure=partial(self._loss_of_all_pixels, photometric_loss),
         )
+
+    def _loss_of_all_pixels(self, photometric_loss: "PhotometricLoss", field: Field) -> float:
+        """The loss without the code's penalty, of images that are no longer blurred."""
+        terms = photometric_loss.compare(field, self.optimiser.iterations, every_pixel=True)
+        return float(torch.stack(list(terms.values())).sum())
 
     def _initial_similarity(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
         """A similarity transform of the set magnitude in random directions, the same for all starts."""
@@ -239,32 +245,39 @@ class PhotometricLoss:
         views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
         return [(view, self.neighbours[view]) for view in views]
 
-    def compare(self, field: Field, iteration: int) -> Terms:
+    def compare(self, field: Field, iteration: int, *, every_pixel: bool = False) -> Terms:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
 
+        Of drawn pixels, it is 0 if both views see none of them.
+
+        Args:
+            every_pixel: whether all pixels are compared, although each iteration draws some.
+
         Raises:
-            CannotContinue: if no pixel is visible in both views.
+            CannotContinue: if no pixel is visible in both views, of all pixels.
         """
         renderer, images = at_iteration(self.renderer, iteration), self.images_at(iteration)
         views, neighbours = map(list, zip(*self.pairs(iteration), strict=True))
         rays, observed = self._stack_rays(views), images[views]
-        if self.settings.pixel_block > 1:
+        is_drawn = self.settings.pixel_block > 1 and not every_pixel
+        if is_drawn:
             drawn = self.pixels(iteration)
             rays = Rays(rays.origins.flatten(1, 2)[:, drawn], rays.directions.flatten(1, 2)[:, drawn])
             observed = observed.flatten(1, 2)[:, drawn]
         rendering = render_checked(renderer, field, rays)
-        visible = self._visible(renderer, field, rendering, neighbours)
+        visible = self._visible(renderer, field, rendering, neighbours, is_drawn)
         differences = []
         for k, other in enumerate(neighbours):
             pixels, _ = self.cameras[other].project(rendering.points[k][visible[k]])
             warped, inside = sample(images[other], pixels)
             differences.append((warped - observed[k][visible[k]])[inside].abs().mean(-1))
         errors = torch.cat(differences)
-        if not len(errors):
+        if not len(errors) and not is_drawn:
             raise CannotContinue(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
-        terms = {"photometric": self.settings.photometric_weight * errors.mean()}
+        photometric = errors.mean() if len(errors) else errors.sum()  # of a draw without such a point: 0
+        terms = {"photometric": self.settings.photometric_weight * photometric}
         if self.masks is not None:
-            masks = self.masks[views] if self.settings.pixel_block == 1 else self.masks[views].flatten(1)[:, drawn]
+            masks = self.masks[views].flatten(1)[:, drawn] if is_drawn else self.masks[views]
             observation = RayObservation(masks, torch.full_like(rendering.distance, torch.nan))
             silhouette = self.settings.silhouette(renderer, field, rays, rendering, observation)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
@@ -277,12 +290,12 @@ class PhotometricLoss:
 
     @torch.no_grad()
     def _visible(
-        self, renderer: Renderer, field: Field, rendering: Rendering, neighbours: list[int]
+        self, renderer: Renderer, field: Field, rendering: Rendering, neighbours: list[int], is_drawn: bool
     ) -> Bool[Tensor, "views ..."]:
         """Whether the hits of views are seen by the neighbours. Of drawn pixels, only the needed ones are rendered."""
         projected = [self.cameras[other].project(rendering.points[k]) for k, other in enumerate(neighbours)]
         rays = self._stack_rays(neighbours)
-        if self.settings.pixel_block == 1:
+        if not is_drawn:
             neighbour = render_checked(renderer, field, rays)
             distance, hit = neighbour.distance, neighbour.hit
         else:

@@ -25,7 +25,7 @@ from bench.records.record import digest
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import load_or_make
 from bench.solve.draw import solve_and_draw
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error, generator_of, normal_error
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, generator_of, normal_error, observed_hits
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
 from datasets.scene import Scene, View, see
 from datasets.views import pixel_of_each_block
@@ -172,7 +172,7 @@ class Pose(PoseTask):
         cameras = self.cameras(view.camera, inputs.scene.seed(inputs.seed))
 
         def problem() -> PoseProblem:
-            args = inputs.renderer, shape_field, view, cameras, inputs.device, inputs.seed
+            args = inputs.renderer, shape_field, view, cameras, inputs.device, inputs.scene.seed(inputs.seed)
             return with_affordable_rays(self, lambda task: PoseProblem(task, *args))
 
         solve_and_draw(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | RENDERER_DEFINITIONS)
@@ -266,7 +266,8 @@ class PoseProblem:
         depth, depth_per_distance, observed, normals = observations
         rendering = render_checked(renderer, shape, rays)
         compared = observed & rendering.hit
-        count = compared.sum().clamp_min(1)
+        expected = None if pixels is None else float(self.observed.sum()) * len(pixels) / self.observed.numel()
+        count = observed_hits(rendering.hit, observed, expected)
         rendered = rendering.distance * depth_per_distance
         error = depth_error(self.settings.depth_loss, rendered, depth, depth_per_distance)
         observation = RayObservation(observed, torch.where(observed, depth / depth_per_distance, torch.nan))

@@ -3,11 +3,12 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pytest
 import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.solve.observed_view import ObservedView, central_differences, gradients_at, normal_error
+from bench.solve.observed_view import ObservedView, central_differences, gradients_at, normal_error, observed_hits
 from bench.tasks.capacity.observations import concatenate_views
 from datasets.scene import View
 from renderers.fields.analytic import Shape, sphere
@@ -126,3 +127,20 @@ def test_views_without_normals_have_no_normal_loss_and_selections_keep_normals()
     plain = ObservedView(WEIGHTS, RENDERERS["idr"], CAMERA.rays(), view.depth, view.depth_per_distance, ALL, None)
     assert set(plain.compare(ellipsoid(FACTORS, OFFSET), 0)) == {"depth"}
     assert concatenate_views([plain]).normals is None
+
+
+def test_the_depth_of_drawn_rays_has_the_weight_that_it_has_among_all():
+    """The mean over many draws, most of which have no observed ray, is the error of all observed rays."""
+    generator = torch.Generator().manual_seed(0)
+    observed, error = torch.zeros(400, dtype=torch.bool), torch.rand(400, generator=generator)
+    observed[:12] = True
+    hit = torch.ones_like(observed)
+    whole = (error * (hit & observed)).sum() / observed_hits(hit, observed)
+    draws = [torch.randperm(400, generator=generator)[:25] for _ in range(4000)]
+    parts = [
+        (error[rays] * (hit & observed)[rays]).sum() / observed_hits(hit[rays], observed[rays], 12 * 25 / 400)
+        for rays in draws
+    ]
+    assert sum(part == 0 for part in parts) > 0.4 * len(parts)
+    assert torch.stack(parts).mean().item() == pytest.approx(whole.item(), rel=0.1)
+    assert observed_hits(hit & False, observed) == 1 == observed_hits(hit & False, observed, 0.5)

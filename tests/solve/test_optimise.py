@@ -432,6 +432,7 @@ class Sampled:
 def test_the_budget_chooses_the_smallest_block_with_which_it_pays_for_forty_iterations(budget, block):
     class Costly(Toy):
         def loss(self, iteration):
+            assert schedule_position(iteration) == 99  # where a renderer has its final number of samples
             self.counts.add("value", self.cost)
             return {"total": self.radius**2}
 
