@@ -22,7 +22,6 @@ from bench.records.format import MISSING, number, plural
 from bench.records.read import read_records
 from bench.records.results import RESULTS
 from bench.report.suite.attempts import (
-    BUDGET_KEY,
     EXPERIMENT_PREFIX,
     FIXED_KEYS,
     PROBLEM_SETTINGS,
@@ -44,7 +43,7 @@ PAGE = "suite"  # its file name in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
 TUNED_LABEL = f"label='${{renderer._label_}}{TUNED_SUFFIX}'"
 STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
-AXES = (BUDGET_KEY, *(key for key, _, _ in PROBLEM_SETTINGS.values()))  # may be typed, to run some problems only
+AXES = tuple(key for key, _, _ in PROBLEM_SETTINGS.values())  # may be typed, to run some problems only
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one
 SETTING_VALUES = ("stated", "tuned")  # the set's setting for all renderers, or that of conf/tuned.yaml
 
@@ -191,6 +190,10 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
         ]
         failed = (~standing.complete.loc[standing.complete["row"] == row, "ok"]).sum()
         print(f"{row + (' *' if row in local else ''):<28} {''.join(f'{cell:<16}' for cell in cells)}{failed:>11}")
+    for (budget, row), sets in standing.cannot_run.items():
+        print(f"{row} cannot run in {sets} {budgets.get(budget, budget)}: it pays for too few iterations.")
+    for row, count in standing.other_settings.items():
+        print(f"{row}: {plural(count, 'run')} with other settings than the set's, not compared.")
     for (budget, row), missing in standing.lacking.items():
         lacks = f"{row} lacks {plural(missing, 'problem')} {budgets.get(budget, budget)}"
         print(f"{lacks}, so it is not compared there: run it with suite=core and without set=.")

@@ -25,19 +25,25 @@ READS = tuple(
     for name in suite().errors
 )
 COST = "field evaluations, in units"
+CANNOT_RUN = "cannot run"
 UNITS = ", ".join(f"{unit:.2g} ({name})" for name, unit in suite().units.items())
 PROGRESS = (
     "Every run spends the same number of field evaluations, whatever the number of its iterations. A gradient counts "
-    f"as two. One unit of cost is, in field evaluations: {UNITS}.",
+    f"as two. One unit of cost is, in field evaluations: {UNITS}. Not counted in reconstruct: colours, of which a "
+    "surface has one per hit and a volume one per sample, and second derivatives.",
     "Progress is 1 - log(error / best possible error) / log(initial error / best possible error), limited to 0 to "
     "100 %. All problem sets have the same weight. A failed run has a progress of 0 %.",
     "The best possible error is no renderer's: the error of the prior's fit to the true distances (complete, "
     "multiview), of the same network's fit to them (reconstruct), or 0.1 degrees (pose).",
-    "Each iteration compares all pixels, or one of each block of 2, 4 or 8 pixels per side: the smallest block with "
-    "which the budget pays for 40 iterations. With fewer than 10 iterations, a run has no result.",
+    "Each iteration compares all pixels, or a random one of each block of 2, 4 or 8 pixels per side: the smallest "
+    "block with which the budget pays for 40 iterations, else the largest. In reconstruct, it draws 256 rays, or 256 "
+    "divided by the pixels of such a block. With fewer than 10 iterations, a run has no result. A renderer for which "
+    "most runs of a set have none cannot run at this budget, and is not compared.",
     "Learning rates, blurs and sharpness follow the fraction of the budget that is spent, so a run over 10 units is "
-    "not the continuation of a run over 1 unit.",
-    f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:g}.",
+    "not the continuation of a run over 1 unit. All renderers have one learning rate in a set, which was chosen for "
+    "100 iterations (200 in reconstruct).",
+    f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:g}. "
+    "It holds for scenes of these four families.",
 )
 
 
@@ -124,10 +130,12 @@ def _lines(made: Standing) -> list[dict[str, Any]]:
     lines = []
     for row in made.rows:
         runs = made.complete[made.complete["row"] == row]
-        line = {"row": row, "preset": runs["preset"].iloc[0]}
+        line = {"row": row, "preset": made.compared.loc[made.compared["row"] == row, "preset"].iloc[0]}
         for budget, ranked in made.rankings.items():
             if row in ranked.progress:
                 line |= {f"{budget:g}": ranked.progress[row], f"{budget:g}_rank": ranked.rank(row)}
+            elif (budget, row) in made.cannot_run:
+                line[f"{budget:g}_rank"] = CANNOT_RUN
         counts = []
         for (budget, name), group in runs.groupby(["budget", "set"]):
             statuses = ", ".join(
@@ -140,8 +148,8 @@ def _lines(made: Standing) -> list[dict[str, Any]]:
 
 
 def _progress(line: dict[str, Any], budget: float) -> str:
-    value = line.get(f"{budget:g}")
-    return "" if value is None else f"{percent(value)} ({line[f'{budget:g}_rank']})"
+    value, rank = line.get(f"{budget:g}"), line.get(f"{budget:g}_rank", "")
+    return rank if value is None else f"{percent(value)} ({rank})"
 
 
 def _sample(made: Standing) -> str:
@@ -295,27 +303,34 @@ def _first_of_sets(made: Standing) -> str:
 
 def _notes(made: Standing) -> list[str]:
     """Notes that depend on the runs: the smallest p, bounds of errors, the order without each set, machines."""
-    notes = []
+    notes, runs = [], made.complete
     for budget, ranked in made.rankings.items():
-        runs = made.complete[made.complete["budget"] == budget]
+        at_budget = runs[runs["budget"] == budget]
         least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}."
         notes.append(f"{at(budget)}, {len(ranked.better)} of {ranked.pairs} pairs differ significantly. {least}")
         for name in made.sets:
-            if ends := standing.bounds(runs[runs["set"] == name]):
+            if ends := standing.bounds(at_budget[at_budget["set"] == name]):
                 notes.append(
                     f"{at(budget)}, in {name}, every renderer's mean final error is {ends[0]:.2f} to {ends[1]:.2f} "
                     "times DIST's (geometric means over scenes, simultaneous 95 % intervals of the sign-flip test)."
                 )
         for name in made.sets if len(made.sets) > 1 else ():
-            others = standing.ranking(runs[runs["set"] != name])
+            others = standing.ranking(at_budget[at_budget["set"] != name])
             lead = leaders(others, f"Without {name}, {at(budget).lower()}") if others.decidable else ""
             notes.append(f"{lead} The order is: {'; '.join(others.progress)}. Different pairs: {len(others.better)}.")
+    for (budget, row), sets in made.cannot_run.items():
+        notes.append(f"{at(budget)}, {row} cannot run in {sets}.")
+    if made.other_settings:
+        rows = ", ".join(f"{row} ({format.plural(n, 'run')})" for row, n in made.other_settings.items())
+        notes.append(f"Not compared, because their settings are not those of the set: {rows}.")
+    over = (runs["cost"] / runs["set"].map(suite().units) / runs["budget"] - 1).groupby(runs["row"]).max()
+    if len(over):
+        notes.append(f"The last step may exceed the budget: by at most {percent(over.max())} ({over.idxmax()}).")
     if made.lacking:
         rows = ", ".join(
             f"{row} {at(b).lower()} ({format.plural(n, 'problem')})" for (b, row), n in made.lacking.items()
         )
         notes.append(f"Not compared, because runs are missing: {rows}.")
-    runs = made.complete
     machines, loaded = runs.loc[runs["cpu"] != "", "machine"].nunique(), (~runs["timed"]).sum()
     code = f"{format.plural(runs['code'].nunique(), 'version')} of the code, {machines} machines or engines"
     notes.append(f"Runs: {code}; {loaded} of {len(runs)} have no runtime, because the machine had other load.")

@@ -12,9 +12,9 @@ MAX_EXACT_UNITS = 16  # up to here all sign vectors are tested, above it 2**15 r
 
 @cache
 def signs(units: int) -> np.ndarray:
-    """The sign vectors [flips, units]. The first unit is always positive, and so are all units of the first flip.
+    """The sign vectors [flips, units]; all units of the first flip are positive.
 
-    The other half of the sign vectors gives the same sums with the opposite sign.
+    Of all sign vectors, those with a positive first unit: the others give the same sums with the opposite sign.
     """
     if units <= MAX_EXACT_UNITS:
         return np.array([(1.0, *others)[:units] for others in product((1.0, -1.0), repeat=max(units - 1, 0))])

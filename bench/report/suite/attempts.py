@@ -8,7 +8,7 @@ import csv
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from io import StringIO
 from itertools import product
@@ -39,6 +39,7 @@ PROBLEM_SETTINGS = {  # per set: the setting in which problems differ, its key u
     "reconstruct": ("task.images.texture", "textures", "{}"),
 }
 BUDGET_KEY = "task.optimiser.budget"
+CUSTOM = "custom"  # the preset of renderers that a user names by their class
 TUNED_PREFIX = "tuned/"  # before the name of a method with tuned settings
 TUNED_SUFFIX = ", tuned"  # after the name of a row with tuned settings
 TUNABLE_KEYS = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"
@@ -173,7 +174,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     amount_key, _, form = PROBLEM_SETTINGS.get(set_name, ("", "", ""))
     amount_texts = [form.format(setting(config, *amount_key.split(".")))] if amount_key else []
     final, start = (_finite(record[section].get(error)) for section in ("metrics", "metrics_start"))
-    curve = _curve(record, folder, final if ok else None)
+    curve, spent = _curve(record, folder, final if ok else None)
     tuned = str(record.get("method") or "").startswith(TUNED_PREFIX)
     overrides = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
     changes = [text.removeprefix("renderer.") for text in overrides if re.match(r"renderer\.[^_]", text)]
@@ -189,7 +190,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         final=final if ok else inf,
         iterations=record["evaluations"].get("iterations", 0),
         rays=record["evaluations"].get("rays_per_iteration", 0),
-        cost=curve[-1][0] if curve else 0.0,
+        cost=spent,
         operations=record["flops"],
         seconds=loop_seconds(record),
         waited=environment.get("waited_share"),
@@ -221,8 +222,8 @@ def settings_hash(config: dict[str, Any], set_name: str, tuned: bool) -> str:
     return digest({key: str(value) for key, value in values.items() if key not in varying})
 
 
-def _curve(record: Record, folder: Path, final: float | None) -> list[list[float]]:
-    """The checkpoints and the end of a run. A line has the error before its step, and the costs after it."""
+def _curve(record: Record, folder: Path, final: float | None) -> tuple[list[list[float]], float]:
+    """The checkpoints and the end of a run, and its cost. A line has the error before its step, and the costs after."""
     error = suite().errors[record["config"]["experiment"].removeprefix(EXPERIMENT_PREFIX)]
     checkpoints, costs = list[list[float]](), [0.0, 0.0]
     for line in curve_lines(folder) or []:
@@ -230,7 +231,11 @@ def _curve(record: Record, folder: Path, final: float | None) -> list[list[float
             checkpoints.append([*costs, _finite(line[error])])
         costs = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]
     end = [[*costs, final]] if final is not None else []
-    return [[float(f"{number:.5g}") for number in point] for point in checkpoints + end]
+    return [[_rounded(number) for number in point] for point in checkpoints + end], _rounded(costs[0])
+
+
+def _rounded(number: float) -> float:
+    return float(f"{number:.5g}")
 
 
 def attempts_folder(results_dir: Path) -> Path:
@@ -326,4 +331,9 @@ def gather(shipped: Path, results_dir: Path, records: Iterable[Record] = ()) -> 
     shipped_attempts, problems = read_attempts(shipped)
     local, unread = ([], []) if results_dir.resolve() == shipped.resolve() else read_attempts(results_dir)
     local += attempts_of(records, results_dir)
+    names = {attempt.row for attempt in shipped_attempts}
+    local = [
+        replace(attempt, row=f"{attempt.row}, yours") if attempt.preset == CUSTOM and attempt.row in names else attempt
+        for attempt in local
+    ]
     return Gathered([*shipped_attempts, *local], local, [*problems, *unread])

@@ -21,6 +21,7 @@ from bench.tables import choice
 
 DIST = "dist"  # the preset whose problems a row needs to be compared, and whose errors others are related to
 MIN_LOG_ERROR = 1e-12  # lower bound before taking the logarithm
+FEW_ITERATIONS = "the budget paid for"  # begins the reason of a run that its budget ended too early
 KEY = ["set", "problem", "budget"]
 ALPHA = 0.05  # total over all tests at a budget
 
@@ -29,24 +30,31 @@ class Standing:
     """The attempts of the suite, the compared ones, their progress, and the ranking at each budget."""
 
     def __init__(self, gathered: Gathered) -> None:
-        self.everything = frame_of(gathered.everything)
+        self.everything, self.other_settings = frame_of(gathered.everything)
         self.compared = compared(self.everything, gathered.size)
         self.reached = with_progress(self.compared)
         self.complete = self.reached[self.reached["complete"]]
         self.rankings = {budget: ranking(runs) for budget, runs in self.complete.groupby("budget")}
         self.budgets = [*self.rankings]
-        self.rows = [*dict.fromkeys(row for ranked in self.rankings.values() for row in ranked.progress)]
+        ranked = [row for ranked in self.rankings.values() for row in ranked.progress]
+        self.rows = [*dict.fromkeys([*ranked, *(row for _, row in self.cannot_run)])]
         self.sets = [name for name in suite().errors if name in {*self.complete["set"]}]
 
     @cached_property
     def lacking(self) -> dict[tuple[float, str], int]:
         """The rows that are not compared at a budget, with the number of problems they lack there."""
-        rows = self.compared[~self.compared["complete"] & ~self.compared["tuned"]]
+        rows = self.compared[~self.compared["tuned"] & (self.compared["missing"] > 0)]
         return rows.groupby(["budget", "row"])["missing"].first().to_dict()
 
+    @cached_property
+    def cannot_run(self) -> dict[tuple[float, str], str]:
+        """The rows that are not compared at a budget, since it pays for too few iterations, with the sets."""
+        rows = self.compared[self.compared["too_expensive"] != ""]
+        return rows.groupby(["budget", "row"])["too_expensive"].first().to_dict()
 
-def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
-    """A line per attempt, the oldest first; a key may have several.
+
+def frame_of(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[str, int]]:
+    """A line per attempt, the oldest first; a key may have several. Also the number of attempts left out, by row.
 
     Its columns: the fields of the attempt, `ok`, `tuned`, `machine`, and `timed` (the machine was not busy). Attempts
     with other settings than most of their set are left out; settings of tuned rows are compared separately.
@@ -62,7 +70,8 @@ def frame_of(attempts: Iterable[Attempt]) -> pd.DataFrame:
     counts = frame.drop_duplicates([*KEY, "row", "settings"]).groupby(["set", "tuned", "settings"]).size()
     usual = {key[:2]: key[2] for key in counts.sort_values(kind="stable").index}  # the last is the most frequent
     keys = zip(frame["set"], frame["tuned"], frame["settings"], strict=True)
-    return frame.loc[np.array([usual[of_set, tuned] == settings for of_set, tuned, settings in keys], dtype=bool)]
+    is_usual = np.array([usual[of_set, tuned] == settings for of_set, tuned, settings in keys], dtype=bool)
+    return frame.loc[is_usual], frame.loc[~is_usual, "row"].value_counts().to_dict()
 
 
 def dist_row(runs: pd.DataFrame) -> str:
@@ -75,20 +84,22 @@ def dist_row(runs: pd.DataFrame) -> str:
 def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
     """The newest attempt of each row on the problems that all complete rows have at the same budget.
 
-    A row is complete at a budget if it has the problems of that size of the suite, or all of DIST's if these are fewer.
-    Other rows stay in the frame, but are not compared.
+    A row is complete at a budget if it has the problems of that size of the suite, or all of DIST's if these are fewer,
+    and if the budget pays for enough iterations in most problems of each set. Other rows stay in the frame, but are not
+    compared.
 
     Args:
         everything: the result of `frame_of`.
 
     Returns:
         A line per attempt with further columns: `missing`, the number of problems that its row lacks at the budget;
-        `complete`; and `initial` and `reference`, the errors that progress is measured between.
+        `too_expensive`, the sets in which it cannot run at the budget; `complete`; and `initial` and `reference`, the
+        errors that progress is measured between.
     """
     newest = everything.drop_duplicates([*KEY, "row"], keep="last")
     parts = [_compared_at_budget(runs, problems_of(size)) for _, runs in newest.groupby("budget")]
     if not parts:
-        columns = {"missing": int, "complete": bool, "initial": float, "reference": float}
+        columns = {"missing": int, "too_expensive": str, "complete": bool, "initial": float, "reference": float}
         return newest.assign(**{name: pd.Series(dtype=kind) for name, kind in columns.items()})
     return pd.concat(parts, ignore_index=True)
 
@@ -100,7 +111,11 @@ def _compared_at_budget(runs: pd.DataFrame, wanted: set[tuple[Any, ...]]) -> pd.
     wanted = {key for key in wanted if key[-1] == runs["budget"].iloc[0]}
     needed = wanted if wanted and wanted <= reachable else reachable
     missing = runs["row"].map({row: len(needed - problems) for row, problems in rows.items()})
-    runs = runs.assign(missing=missing, complete=(missing == 0) & ~runs["tuned"])
+    few = runs["reason"].str.startswith(FEW_ITERATIONS).groupby([runs["row"], runs["set"]]).mean()
+    sets = {row: ", ".join(of_set for _, of_set in group.index) for row, group in few[few > 0.5].groupby("row")}
+    expensive = runs["row"].map(lambda row: sets.get(row, ""))
+    complete = (missing == 0) & (expensive == "") & ~runs["tuned"]
+    runs = runs.assign(missing=missing, too_expensive=expensive, complete=complete)
     common = reachable.intersection(*(rows[row] for row in runs.loc[runs["complete"], "row"].unique()))
     return _with_errors(runs[keys.isin(common)])
 
