@@ -33,7 +33,7 @@ from bench.report.suite.attempts import (
     suite,
     write_attempts,
 )
-from bench.report.suite.standing import KEY, Standing
+from bench.report.suite.standing import KEY, Standing, units
 from bench.report.write import paper
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -181,8 +181,8 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
     available = plural(len(standing.everything[KEY].drop_duplicates()), "problem")
     compared = plural(len(standing.complete[KEY].drop_duplicates()), "problem")
     print(f"progress on the {compared} that all rows have, of {available} with results; with possible ranks:")
-    budgets = {budget: f"at {budget:g} {'unit' if budget == 1 else 'units'}" for budget in standing.budgets}
-    print(f"{'renderer':<28} {''.join(f'{title:<16}' for title in budgets.values())}failed runs")
+    titles = "".join(f"{f'at {units(budget)}':<16}" for budget in standing.budgets)
+    print(f"{'renderer':<28} {titles}failed runs")
     for row in standing.rows:
         cells = [
             f"{percent(ranked.progress[row]):>5} ({ranked.rank(row)})" if row in ranked.progress else f"{MISSING:>5}"
@@ -191,12 +191,12 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
         failed = (~standing.complete.loc[standing.complete["row"] == row, "ok"]).sum()
         print(f"{row + (' *' if row in local else ''):<28} {''.join(f'{cell:<16}' for cell in cells)}{failed:>11}")
     for (budget, row), sets in standing.cannot_run.items():
-        print(f"{row} cannot run in {sets} {budgets.get(budget, budget)}: it pays for too few iterations.")
+        print(f"{row} cannot run in {sets} at {units(budget)}: it pays for too few iterations.")
     for row, count in standing.other_settings.items():
         print(f"{row}: {plural(count, 'run')} with other settings than the set's, not compared.")
     for (budget, row), missing in standing.lacking.items():
-        lacks = f"{row} lacks {plural(missing, 'problem')} {budgets.get(budget, budget)}"
-        print(f"{lacks}, so it is not compared there: run it with suite=core and without set=.")
+        lacks = f"{row} lacks {plural(missing, 'problem')} at {units(budget)}"
+        print(f"{lacks}, so it is not compared there: run all sets{' with suite=core' if budget > 1 else ''}.")
 
 
 def _print_errors(standing: Standing, local_rows: set[str]) -> None:

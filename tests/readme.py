@@ -6,6 +6,8 @@ import re
 import sys
 from pathlib import Path
 
+from bench.report.suite.standing import units
+
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAPER = README.parent / "results" / "paper"
 MAX_LINES, MAX_NUMBERS, MAX_WORDS = 120, 60, 25  # the last is per sentence
@@ -39,7 +41,7 @@ def recommendation() -> str:
         raise ValueError("no row is among the best at all costs: README needs another sentence")
     first = max(always, key=lambda line: float(line[_budgets()[-1]]))
     sentences = [
-        f"At {_units(budget)} of cost, no renderer makes significantly more progress than {_either(rows)}."
+        f"At {units(float(budget))} of cost, no renderer makes significantly more progress than {_either(rows)}."
         for budget, rows in leaders.items()
     ]
     hard = "cannot be distinguished from the best" if first["row"] in _hardest() else "is significantly worse"
@@ -56,10 +58,6 @@ def _budgets() -> list[str]:
     return [name for name in lines[0] if name.isdigit() and any(line[name] for line in lines)]
 
 
-def _units(budget: str) -> str:
-    return f"{budget} unit" if budget == "1" else f"{budget} units"
-
-
 def _first_rank(line: dict[str, str], budget: str) -> bool:
     return re.split(r"\D", line[f"{budget}_rank"])[0] == "1"
 
@@ -72,7 +70,7 @@ def _either(lines: list[dict[str, str]]) -> str:
 def table() -> str:
     """README's table of renderers, from the committed CSV files of the suite."""
     sets = {(line["set"], line["row"]): line for line in _lines("suite_sets")}
-    costs = [f"progress at {_units(budget)}" for budget in _budgets()]
+    costs = [f"progress at {units(float(budget))}" for budget in _budgets()]
     head = ["`renderer=`", *costs, "failed runs", "iterations of a completion at 1 unit", "rays of an iteration"]
     rows = []
     for line in _lines("suite"):

@@ -28,6 +28,8 @@ NEUTRAL_KEYS = frozenset(
 )
 CONCURRENT_RUNS_VARIABLE = "IMPLICIT_BENCH_BESIDE"  # environment variable: number of runs at a time in a cluster job
 MAX_SETTINGS_DEPTH = 20
+MIN_BUDGET_ITERATIONS = 10  # with fewer, a run that its budget ends has no result
+TOO_EXPENSIVE = "the budget paid for"  # begins the reason of such a run
 MAX_WAIT_FRACTION = 0.05  # if threads waited for a larger fraction of their ready time, the machine was loaded
 NUMERIC_FIELDS = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
 # Fields that old records may lack.

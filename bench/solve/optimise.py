@@ -1,6 +1,6 @@
 """The optimisation loop, timed over the forward and backward passes only, and several starts in one loop.
 
-Several starts share one budget of iterations: successive halving keeps the better ones, and the last gets the rest.
+Several starts share one number of iterations: successive halving keeps the better ones, and the last gets the rest.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import count
 from math import cos, inf, isfinite, isnan, pi
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torch.nn.utils import get_total_norm
 from torch.optim.adam import adam
 
 from bench.machine.environment import MemoryPeak, Stopwatch
-from bench.records.record import RunStatus
+from bench.records.record import MIN_BUDGET_ITERATIONS, TOO_EXPENSIVE, RunStatus
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Counts
 from renderers.hits import Hits, collect_hits, missing_distance_message
@@ -26,7 +26,6 @@ DIVERGENCE_FACTOR = 100.0  # times the first loss, or `least_reference` if large
 HALVING_FACTOR = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
 SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of a round, since each sees other views
 ITERATIONS, BUDGET = "iterations", "budget"  # what ends a loop
-MIN_BUDGET_ITERATIONS = 10  # with fewer, a run that its budget ends has no result
 AFFORDED_ITERATIONS = 40  # for which `with_affordable_rays` chooses the rays
 BLOCKS = (1, 2, 4, 8)  # pixels per side of a block of which an iteration has one ray
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
@@ -69,7 +68,7 @@ class OptimiserSettings:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
 
     def at(self, index: int, cost: float) -> int:
-        """The iteration with this index, if the cost before it is `cost`."""
+        """The index, with the position in schedules that follows from the cost spent before it."""
         if self.ends == ITERATIONS or self.budget is None:
             return index
         return Iteration(index, min(int(self.iterations * cost / self.budget), self.iterations - 1))
@@ -108,15 +107,12 @@ class SampledTask(Protocol):
     pixel_block: int
 
 
-Sampled = TypeVar("Sampled", bound=SampledTask)
-Solvable = TypeVar("Solvable", bound=Optimisable)
+def with_affordable_rays(task: SampledTask, make_problem: Callable[[Any], Any]) -> Any:
+    """Makes the problem of a task.
 
-
-def with_affordable_rays(task: Sampled, make_problem: Callable[[Sampled], Solvable]) -> Solvable:
-    """The problem of a task; with `pixel_block` 0, of the smallest of `BLOCKS` with which the budget pays enough.
-
-    Enough are `AFFORDED_ITERATIONS`. The cost of an iteration is that of one with the first parameters at the end of
-    schedules, made for this and not counted. If no block is enough, it is the largest.
+    If `pixel_block` is 0, it becomes the smallest of `BLOCKS` with which the budget pays for `AFFORDED_ITERATIONS`,
+    else the largest. One uncounted iteration measures the cost, with the initial parameters and the final values of
+    schedules.
     """
     if task.pixel_block:
         return make_problem(task)
@@ -127,7 +123,7 @@ def with_affordable_rays(task: Sampled, make_problem: Callable[[Sampled], Solvab
             problem.loss(Iteration(0, task.optimiser.iterations - 1))["total"].backward()
         if AFFORDED_ITERATIONS * problem.counts.cost <= (task.optimiser.budget or inf):
             break
-    return make_problem(sampled)
+    return make_problem(sampled)  # a new one, whose counts are 0
 
 
 @dataclass
@@ -244,7 +240,7 @@ def _budget_problem(curve: list[dict[str, Any]], is_spent: bool) -> str:
         return f"{MIN_BUDGET_ITERATIONS} iterations have evaluated no field, so that the budget is never spent"
     if not is_spent or iterations >= MIN_BUDGET_ITERATIONS:
         return ""
-    few = f"the budget paid for {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}"
+    few = f"{TOO_EXPENSIVE} {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}"
     return f"{few}: set task.optimiser.budget={MIN_BUDGET_ITERATIONS * cost / iterations:.2g} or more"
 
 
@@ -313,7 +309,7 @@ class StartSettings:
         return self.trial * sum(self.rounds)
 
     def iterations_of_last(self, iterations: int) -> int:
-        """The iterations of the last start, from a budget."""
+        """The iterations of the last start, out of all iterations."""
         return iterations - self.trials + self.trial * len(self.rounds)
 
     def check(self, settings: OptimiserSettings) -> None:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from bench.report.study import Result, Runs, Selection, chart, figure_style, format, merge_runs, table
 from bench.report.suite import standing
 from bench.report.suite.attempts import EXPERIMENT_PREFIX, PROBLEM_SETTINGS, attempts_folder, gather, suite
-from bench.report.suite.standing import ALPHA, Ranking, Standing
+from bench.report.suite.standing import ALPHA, Ranking, Standing, units
 from bench.report.write import paper
 from bench.report.write.table import percent
 
@@ -29,8 +29,8 @@ CANNOT_RUN = "cannot run"
 UNITS = ", ".join(f"{unit:.2g} ({name})" for name, unit in suite().units.items())
 PROGRESS = (
     "Every run spends the same number of field evaluations, whatever the number of its iterations. A gradient counts "
-    f"as two. One unit of cost is, in field evaluations: {UNITS}. Not counted in reconstruct: colours, of which a "
-    "surface has one per hit and a volume one per sample, and second derivatives.",
+    f"as two. One unit of cost is, in field evaluations: {UNITS}. In reconstruct, colours and second derivatives are "
+    "not counted. A surface has one colour per hit, a volume one per sample.",
     "Progress is 1 - log(error / best possible error) / log(initial error / best possible error), limited to 0 to "
     "100 %. All problem sets have the same weight. A failed run has a progress of 0 %.",
     "The best possible error is no renderer's: the error of the prior's fit to the true distances (complete, "
@@ -39,17 +39,13 @@ PROGRESS = (
     "block with which the budget pays for 40 iterations, else the largest. In reconstruct, it draws 256 rays, or 256 "
     "divided by the pixels of such a block. With fewer than 10 iterations, a run has no result. A renderer for which "
     "most runs of a set have none cannot run at this budget, and is not compared.",
-    "Learning rates, blurs and sharpness follow the fraction of the budget that is spent, so a run over 10 units is "
-    "not the continuation of a run over 1 unit. All renderers have one learning rate in a set, which was chosen for "
-    "100 iterations (200 in reconstruct).",
+    "Learning rates, blurs, samples and sharpness follow the fraction of the budget that is spent. So a run over 10 "
+    "units is not the continuation of a run over 1 unit. In a set, all renderers have one learning rate and one "
+    "silhouette loss, which were chosen in runs of fixed length: 100 iterations in complete, 200 in reconstruct. Pose "
+    "and multiview have the defaults of their tasks, multiview without a silhouette loss.",
     f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:g}. "
     "It holds for scenes of these four families.",
 )
-
-
-def at(budget: float) -> str:
-    """The heading of a budget."""
-    return f"At {budget:g} {'unit' if budget == 1 else 'units'}"
 
 
 def make(*several: Runs | None) -> Result:
@@ -59,8 +55,7 @@ def make(*several: Runs | None) -> Result:
     made = Standing(gathered)
     panels = [_panel(made, name) for name in (None, *made.sets)]
     ranks = {
-        at(budget).removeprefix("At "): {row: ranked.rank(row) for row in ranked.progress}
-        for budget, ranked in made.rankings.items()
+        units(budget): {row: ranked.rank(row) for row in ranked.progress} for budget, ranked in made.rankings.items()
     }
     return Result(
         replace(runs, records=[], left_out=Counter()),  # kept attempts count even if their run folders are gone
@@ -74,7 +69,7 @@ def make(*several: Runs | None) -> Result:
         remarks=[*PROGRESS, *_notes(made), *(f"Not read: {problem}" for problem in gathered.problems)],
         columns=[
             table.text("row", "Renderer"),
-            *(table.Column(f"{b:g}", at(b), words=partial(_progress, budget=b)) for b in suite().budgets),
+            *(table.Column(f"{b:g}", f"At {units(b)}", words=partial(_progress, budget=b)) for b in suite().budgets),
             *(table.text(f"{b:g}_rank") for b in suite().budgets),
             *(table.text("failed", "Failed"), table.PRESET),
         ],
@@ -109,16 +104,17 @@ def make_sets(*several: Runs | None) -> Result:
         interval="none; the test is over all sets together",
         remarks=[
             *PROGRESS,
-            "Iterations and rays are medians over problems. Runtimes are medians over runs on a machine without other "
+            "Iterations and rays are medians over problems. In multiview, neighbouring views count as one ray "
+            "per pixel. Runtimes are medians over runs on a machine without other "
             f"load: {format.plural(int(lines['timed'].sum()), 'run')}, others are not timed.",
             "Tuned: the settings of conf/tuned.yaml, chosen on validation shapes. They may have another silhouette "
             "loss. The effects of settings and loss are not separated.",
         ],
         columns=[
             *(table.text("set", "Set"), table.text("row", "Renderer")),
-            *(table.Column(f"progress_{b:g}", at(b), show=percent) for b in budgets),
-            *(table.Column(f"iterations_{b:g}", f"Iterations, {at(b).lower()}", show=table.integer) for b in budgets),
-            *(table.Column(f"rays_{b:g}", f"Rays, {at(b).lower()}", show=table.integer) for b in budgets),
+            *(table.Column(f"progress_{b:g}", f"At {units(b)}", show=percent) for b in budgets),
+            *(table.Column(f"iterations_{b:g}", f"Iterations, at {units(b)}", show=table.integer) for b in budgets),
+            *(table.Column(f"rays_{b:g}", f"Rays, at {units(b)}", show=table.integer) for b in budgets),
             table.Column("seconds", "Runtime of 1 unit (s)"),
             *(table.Column("timed", "Timed runs", show=table.integer), table.PRESET),
         ],
@@ -142,7 +138,7 @@ def _lines(made: Standing) -> list[dict[str, Any]]:
                 f"{n} {status}" for status, n in group.loc[~group["ok"], "status"].value_counts().items()
             )
             if statuses:
-                counts.append(f"{(~group['ok']).sum()} of {len(group)} {name} {at(budget).lower()} ({statuses})")
+                counts.append(f"{(~group['ok']).sum()} of {len(group)} {name} at {units(budget)} ({statuses})")
         lines.append(line | {"failed": "; ".join(counts)})
     return lines
 
@@ -161,7 +157,7 @@ def _sample(made: Standing) -> str:
             format.plural(runs[name].nunique(), word) for name, word in (("scene", "scene"), ("row", "renderer"))
         )
         failed = f"{(~runs['ok']).sum() or 'none'} of {format.plural(len(runs), 'run')} failed"
-        parts.append(f"{at(budget).lower()}, {problems} ({scenes}), {renderers}, {failed}")
+        parts.append(f"at {units(budget)}, {problems} ({scenes}), {renderers}, {failed}")
     return f"{suite().id}: {'; '.join(parts) or 'no runs'}"
 
 
@@ -186,6 +182,7 @@ def _line(runs: pd.DataFrame) -> chart.Series:
     costs = budget * np.geomspace(0.03, 1, 40)
     curves = pd.Series([np.interp(costs, *standing.progress_curve(run)) for run in runs.itertuples()], runs.index)
     mean = np.mean([np.mean([*group], axis=0) for _, group in curves.groupby(runs["set"])], axis=0)
+    # The last step exceeds the budget, so the curve would miss its end.
     mean[-1] = runs.groupby("set")["progress"].mean().mean()
     failed = not runs["ok"].any()
     return chart.curve(runs["row"].iloc[0], runs["preset"].iloc[0], costs, mean, symbol="", failed=failed)
@@ -197,7 +194,7 @@ def draw(panels: Sequence[chart.Panel], ranks: Mapping[str, Mapping[str, str]]) 
 
     Args:
         panels: fractions from 0 to 1 over costs, on a logarithmic axis.
-        ranks: by their titles, the rank of each row, such as 5, or the ranks that it can have, such as 1–4.
+        ranks: by panel title, the rank of each row as text: one rank (5), or a range (1–4).
     """
     figure = Figure(figsize=(figure_style.WIDTH, 5.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.55, 1))
@@ -234,7 +231,8 @@ def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[char
     for number, line in enumerate(lines):
         if line["name"] not in rows:
             continue
-        low, *_, high = [int(rank) for rank in 2 * rows[line["name"]].split("–")]
+        ends = [int(rank) for rank in rows[line["name"]].split("–")]
+        low, high = ends[0], ends[-1]
         axis.barh(number, high - low + 0.7, left=low - 0.35, height=0.55, color=line["colour"])
     count = len(lines)
     axis.set(xlim=(0.3, count + 0.7), ylim=(count - 0.4, -0.6), xticks=[1, count], xlabel="rank")
@@ -254,11 +252,11 @@ def verdict(made: Standing) -> str:
     for budget, ranked in made.rankings.items():
         if ranked.decidable:
             pairs = f"{len(ranked.better) or 'None'} of {ranked.pairs} pairs"
-            parts.append(f"{leaders(ranked, at(budget))} {pairs} differ significantly.")
+            parts.append(f"{leaders(ranked, f'At {units(budget)}')} {pairs} differ significantly.")
         else:
             scenes = format.plural(ranked.scenes, "scene")
             rows = f"{len(ranked.progress)} renderers, whatever their results"
-            parts.append(f"{at(budget)}, {scenes} cannot decide between {rows}.")
+            parts.append(f"At {units(budget)}, {scenes} cannot decide between {rows}.")
     return " ".join([*parts, failures(made)])
 
 
@@ -286,7 +284,7 @@ def failures(made: Standing) -> str:
     if most.empty:
         return f"{failed or 'None'} of {runs} runs failed."
     names = [
-        f"{row} failed in {line.failed} of {line.runs} problems of {name} {at(budget).lower()}"
+        f"{row} failed in {line.failed} of {line.runs} problems of {name} at {units(budget)}"
         for (row, budget, name), line in most.iterrows()
     ]
     return f"{'; '.join(names)}; {failed or 'none'} of the other {runs} runs failed."
@@ -297,7 +295,7 @@ def _first_of_sets(made: Standing) -> str:
     means, parts = made.complete.groupby(["budget", "set", "row"])["progress"].mean(), []
     for (budget, name), rows in means.groupby(["budget", "set"], sort=False):
         best = rows.droplevel(["budget", "set"])
-        parts.append(f"{at(budget)}, the most progress in {name}: {best.idxmax()} (*{percent(best.max())}*).")
+        parts.append(f"At {units(budget)}, the most progress in {name}: {best.idxmax()} (*{percent(best.max())}*).")
     return " ".join(parts)
 
 
@@ -307,19 +305,20 @@ def _notes(made: Standing) -> list[str]:
     for budget, ranked in made.rankings.items():
         at_budget = runs[runs["budget"] == budget]
         least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}."
-        notes.append(f"{at(budget)}, {len(ranked.better)} of {ranked.pairs} pairs differ significantly. {least}")
+        notes.append(f"At {units(budget)}, {len(ranked.better)} of {ranked.pairs} pairs differ significantly. {least}")
         for name in made.sets:
             if ends := standing.bounds(at_budget[at_budget["set"] == name]):
                 notes.append(
-                    f"{at(budget)}, in {name}, every renderer's mean final error is {ends[0]:.2f} to {ends[1]:.2f} "
-                    "times DIST's (geometric means over scenes, simultaneous 95 % intervals of the sign-flip test)."
+                    f"At {units(budget)}, in {name}, mean final errors are {ends[0]:.2f} to {ends[1]:.2f} times DIST's "
+                    "(geometric means over scenes, simultaneous 95 % intervals). Renderers that failed in more than "
+                    "half of their runs are left out. Other failed runs count with their initial error."
                 )
         for name in made.sets if len(made.sets) > 1 else ():
             others = standing.ranking(at_budget[at_budget["set"] != name])
-            lead = leaders(others, f"Without {name}, {at(budget).lower()}") if others.decidable else ""
+            lead = leaders(others, f"Without {name}, at {units(budget)}") if others.decidable else ""
             notes.append(f"{lead} The order is: {'; '.join(others.progress)}. Different pairs: {len(others.better)}.")
     for (budget, row), sets in made.cannot_run.items():
-        notes.append(f"{at(budget)}, {row} cannot run in {sets}.")
+        notes.append(f"At {units(budget)}, {row} cannot run in {sets}.")
     if made.other_settings:
         rows = ", ".join(f"{row} ({format.plural(n, 'run')})" for row, n in made.other_settings.items())
         notes.append(f"Not compared, because their settings are not those of the set: {rows}.")
@@ -327,13 +326,12 @@ def _notes(made: Standing) -> list[str]:
     if len(over):
         notes.append(f"The last step may exceed the budget: by at most {percent(over.max())} ({over.idxmax()}).")
     if made.lacking:
-        rows = ", ".join(
-            f"{row} {at(b).lower()} ({format.plural(n, 'problem')})" for (b, row), n in made.lacking.items()
-        )
+        rows = ", ".join(f"{row} at {units(b)} ({format.plural(n, 'problem')})" for (b, row), n in made.lacking.items())
         notes.append(f"Not compared, because runs are missing: {rows}.")
     machines, loaded = runs.loc[runs["cpu"] != "", "machine"].nunique(), (~runs["timed"]).sum()
-    code = f"{format.plural(runs['code'].nunique(), 'version')} of the code, {machines} machines or engines"
-    notes.append(f"Runs: {code}; {loaded} of {len(runs)} have no runtime, because the machine had other load.")
+    versions, kinds = format.plural(runs["code"].nunique(), "version"), format.plural(machines, "machine")
+    notes.append(f"Runs: {versions} of the code, {kinds} (counted apart by threads and kernels).")
+    notes.append(f"{loaded} of {len(runs)} runs have no runtime, because the machine had other load.")
     return [note.replace("*", "") for note in notes]  # without the marks of numbers in verdicts
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from bench import merge
 from bench.records.read import read_records
+from bench.records.record import TOO_EXPENSIVE
 from bench.report.data.flips import p_values, signs
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import holm
@@ -548,7 +549,7 @@ def test_settings_are_one_at_all_budgets_and_tuned_ones_are_free_in_weights_and_
 
 
 def test_a_row_that_its_budget_pays_too_few_iterations_for_cannot_run_and_is_not_compared(tmp_path, monkeypatch):
-    reason = "the budget paid for 4 iterations, fewer than 10: set task.optimiser.budget=1e6 or more"
+    reason = f"{TOO_EXPENSIVE} 4 iterations, fewer than 10: set task.optimiser.budget=1e6 or more"
     dear = [
         attempt("Mesh", scene, {0: 1.0, 9: 1.0}, status="not_reached", final=inf, reason=reason) for scene in SCENES
     ]
@@ -578,7 +579,7 @@ def test_a_class_of_ones_own_with_the_name_of_a_shipped_row_is_another_row(tmp_p
 
 def test_every_problem_has_a_reference_that_no_renderer_wrote():
     for name, problem, _ in attempts.problems_of("core"):
-        assert standing._reference(name, problem, problem.split(",")[0]) > 0
+        assert standing._reference(name, problem.split(",")[0]) > 0
 
 
 def test_a_failed_run_has_the_cost_of_its_loop(tmp_path):

@@ -71,7 +71,7 @@ def suite() -> Suite:
 
 @cache
 def problems_of(size: str) -> set[tuple[Any, ...]]:
-    """The set, problem and budget of all cells of a size of the suite. A row needs all of them to be compared."""
+    """The set, problem and budget of all cells of a size of the suite."""
     keys: set[tuple[Any, ...]] = set()
     for name in suite().errors:
         sizes = read_yaml(CONF / "experiment" / f"{EXPERIMENT_PREFIX}{name}.yaml")["sizes"]
@@ -96,7 +96,7 @@ class Attempt:
     """A run of a renderer on a problem of the suite.
 
     Args:
-        set, problem, scene: what was to be solved; a scene has a problem per value in `PROBLEM_SETTINGS`.
+        set, problem, scene: names. A scene has one problem in each set, in `pose` one per initial angle.
         budget: the cost that the run could spend, in units of the set.
         row, preset: the renderer's name in tables, and the preset that decides its look.
         start, final: the errors before and after; `final` is infinite if the run did not end ok.
@@ -173,14 +173,16 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     scene = f"{family(record)} {config.get('split')} {config.get('index')}"
     amount_key, _, form = PROBLEM_SETTINGS.get(set_name, ("", "", ""))
     amount_texts = [form.format(setting(config, *amount_key.split(".")))] if amount_key else []
-    final, start = (_finite(record[section].get(error)) for section in ("metrics", "metrics_start"))
-    curve, spent = _curve(record, folder, final if ok else None)
+    final, start = (_error(record[section].get(error)) for section in ("metrics", "metrics_start"))
+    curve, spent = _curve(folder, error, final if ok else None)
     tuned = str(record.get("method") or "").startswith(TUNED_PREFIX)
     overrides = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
     changes = [text.removeprefix("renderer.") for text in overrides if re.match(r"renderer\.[^_]", text)]
     row = ", ".join([renderer_name(config, record["renderer"]), *changes])  # without the loss, which is the set's
     return Attempt(
-        **{"set": set_name, "problem": ", ".join([scene, *amount_texts]), "scene": scene},
+        set=set_name,
+        problem=", ".join([scene, *amount_texts]),
+        scene=scene,
         budget=_units(set_name, setting(config, *BUDGET_KEY.split("."))),
         row=row.removesuffix(TUNED_SUFFIX) + TUNED_SUFFIX if tuned else row,
         preset=record["renderer"] if tuned else record.get("method") or record["renderer"],
@@ -196,15 +198,16 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         waited=environment.get("waited_share"),
         **{name: environment.get(name, "") for name in ("cpu", "device", "kernels", "commit")},
         threads=environment.get("threads"),
-        **{"started": record["started"], "code": record.get("code", "")},
+        started=record["started"],
+        code=record.get("code", ""),
         settings=settings_hash(config, set_name, tuned),
         curve=curve,
         overrides=portable_overrides(record.get("overrides", ())),
     )
 
 
-def _finite(value: Any) -> float:
-    """The value as a number; infinite if it is nan or no number."""
+def _error(value: Any) -> float:
+    """The value as an error; infinite if it is missing or not a number."""
     number = as_number(value)
     return inf if number is None or isnan(number) else number
 
@@ -222,13 +225,12 @@ def settings_hash(config: dict[str, Any], set_name: str, tuned: bool) -> str:
     return digest({key: str(value) for key, value in values.items() if key not in varying})
 
 
-def _curve(record: Record, folder: Path, final: float | None) -> tuple[list[list[float]], float]:
+def _curve(folder: Path, error: str, final: float | None) -> tuple[list[list[float]], float]:
     """The checkpoints and the end of a run, and its cost. A line has the error before its step, and the costs after."""
-    error = suite().errors[record["config"]["experiment"].removeprefix(EXPERIMENT_PREFIX)]
     checkpoints, costs = list[list[float]](), [0.0, 0.0]
     for line in curve_lines(folder) or []:
         if line.get(error) is not None:
-            checkpoints.append([*costs, _finite(line[error])])
+            checkpoints.append([*costs, _error(line[error])])
         costs = [as_number(line.get(name)) or 0.0 for name in ("cost", "seconds")]
     end = [[*costs, final]] if final is not None else []
     return [[_rounded(number) for number in point] for point in checkpoints + end], _rounded(costs[0])
@@ -251,7 +253,9 @@ def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]
     """
     folder, (stored, problems) = attempts_folder(results_dir), read_attempts(results_dir)
     if problems:
-        raise ValueError(f"{folder} keeps what cannot be read; mend it or move it away: {'; '.join(problems)}")
+        raise ValueError(
+            f"{folder} has files that cannot be read: {'; '.join(problems)}. Repair them or move them away."
+        )
     ordered = sorted(newest_attempts([*stored, *attempts]), key=lambda attempt: attempt.key)
     files = grouped(ordered, lambda attempt: re.sub(r"[^a-z0-9]+", "_", attempt.row.lower()).strip("_") or "row")
     folder.mkdir(parents=True, exist_ok=True)

@@ -13,15 +13,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.records.record import MAX_WAIT_FRACTION
+from bench.records.record import MAX_WAIT_FRACTION, TOO_EXPENSIVE
 from bench.report.data import flips, statistics
 from bench.report.data.statistics import shapes_needed
 from bench.report.suite.attempts import Attempt, Gathered, problems_of, suite
 from bench.tables import choice
 
-DIST = "dist"  # the preset whose problems a row needs to be compared, and whose errors others are related to
+DIST = "dist"  # the preset that decides which problems are compared, and that ratios of errors refer to
 MIN_LOG_ERROR = 1e-12  # lower bound before taking the logarithm
-FEW_ITERATIONS = "the budget paid for"  # begins the reason of a run that its budget ended too early
 KEY = ["set", "problem", "budget"]
 ALPHA = 0.05  # total over all tests at a budget
 
@@ -36,8 +35,8 @@ class Standing:
         self.complete = self.reached[self.reached["complete"]]
         self.rankings = {budget: ranking(runs) for budget, runs in self.complete.groupby("budget")}
         self.budgets = [*self.rankings]
-        ranked = [row for ranked in self.rankings.values() for row in ranked.progress]
-        self.rows = [*dict.fromkeys([*ranked, *(row for _, row in self.cannot_run)])]
+        ranked_rows = [row for ranked in self.rankings.values() for row in ranked.progress]
+        self.rows = [*dict.fromkeys([*ranked_rows, *(row for _, row in self.cannot_run)])]
         self.sets = [name for name in suite().errors if name in {*self.complete["set"]}]
 
     @cached_property
@@ -84,9 +83,9 @@ def dist_row(runs: pd.DataFrame) -> str:
 def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
     """The newest attempt of each row on the problems that all complete rows have at the same budget.
 
-    A row is complete at a budget if it has the problems of that size of the suite, or all of DIST's if these are fewer,
-    and if the budget pays for enough iterations in most problems of each set. Other rows stay in the frame, but are not
-    compared.
+    A row is complete at a budget if it has the problems of that size of the suite. If DIST lacks one of them, or the
+    size has none at that budget, it needs all of DIST's. The budget must also pay for enough iterations in at least
+    half of the problems of each set. Other rows stay in the frame, but are not compared.
 
     Args:
         everything: the result of `frame_of`.
@@ -111,7 +110,7 @@ def _compared_at_budget(runs: pd.DataFrame, wanted: set[tuple[Any, ...]]) -> pd.
     wanted = {key for key in wanted if key[-1] == runs["budget"].iloc[0]}
     needed = wanted if wanted and wanted <= reachable else reachable
     missing = runs["row"].map({row: len(needed - problems) for row, problems in rows.items()})
-    few = runs["reason"].str.startswith(FEW_ITERATIONS).groupby([runs["row"], runs["set"]]).mean()
+    few = runs["reason"].str.startswith(TOO_EXPENSIVE).groupby([runs["row"], runs["set"]]).mean()
     sets = {row: ", ".join(of_set for _, of_set in group.index) for row, group in few[few > 0.5].groupby("row")}
     expensive = runs["row"].map(lambda row: sets.get(row, ""))
     complete = (missing == 0) & (expensive == "") & ~runs["tuned"]
@@ -128,17 +127,17 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
     finite = runs[np.isfinite(runs["start"])]
     sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any
     least = runs[~runs["tuned"]].groupby(KEY)["final"].min().clip(lower=MIN_LOG_ERROR)
-    stated = [_reference(*line) for line in zip(runs["set"], runs["problem"], runs["scene"], strict=True)]
+    stated = [_reference(*line) for line in zip(runs["set"], runs["scene"], strict=True)]
     return runs.assign(
         initial=at_problem(sound.groupby(KEY)["start"].median()),
         reference=pd.Series(stated, runs.index, dtype=float).fillna(at_problem(least)),
     )
 
 
-def _reference(of_set: str, problem: str, scene: str) -> float | None:
-    """The reference error that the suite states; None, for a scene of one's own, if the least final error is used."""
-    errors = suite().references.get(of_set, {})
-    return errors.get(problem, errors.get(scene, errors.get("all")))
+def _reference(set_name: str, scene: str) -> float | None:
+    """The best possible error that the suite states; None for a scene that it does not list."""
+    errors = suite().references.get(set_name, {})
+    return errors.get(scene, errors.get("all"))
 
 
 def progress_curve(run: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -154,6 +153,11 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
     """The attempts whose initial error is above the reference, and their final `progress`."""
     runs = runs[(runs["initial"] > runs["reference"]) & (runs["reference"] > 0)].reset_index(drop=True)
     return runs.assign(progress=[float(progress_curve(run)[1][-1]) for run in runs.itertuples()])
+
+
+def units(budget: float) -> str:
+    """A budget as text, such as 1 unit or 10 units."""
+    return f"{budget:g} {'unit' if budget == 1 else 'units'}"
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ class Result:
 
     @cached_property
     def shown_columns(self) -> list[Column]:
-        """The columns without runtimes, if most runs were on a loaded machine; the CSV has these too."""
+        """The columns for readers. If most runs were on a busy machine, runtimes are left out; the CSV has them."""
         hide = bool(self.runs.records) and not self.runs.timed
         return [column for column in self.columns if not (hide and column.show is seconds)]
 

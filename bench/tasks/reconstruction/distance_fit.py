@@ -15,11 +15,11 @@ from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Meter
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DistanceFit(Reconstruction):
     """Fits the field of a reconstruction to signed distances of the true mesh; no renderer takes part in the fit.
 
-    The fields of `Reconstruction` have the same meaning; `rays`, `losses` and `guide` are not used.
+    The settings of `Reconstruction` keep their meaning. But `rays`, `losses`, `guide` and `pixel_block` have no effect.
 
     Args:
         distances: number of signed distances of the shape.
@@ -27,14 +27,14 @@ class DistanceFit(Reconstruction):
         surface_width: see `bench.shape_prior.PriorSettings`.
     """
 
-    distances: int = 100_000
-    batch: int = 2000
-    surface_width: float = 0.05
+    distances: int
+    batch: int
+    surface_width: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least("task.distances", self.distances, 100, "100000 work")
-        check_at_least("task.batch", self.batch, 1, "4000 work")
+        check_at_least("task.distances", self.distances, 100, "100000 works")
+        check_at_least("task.batch", self.batch, 1, "2000 works")
         check_positive("task.surface_width", self.surface_width, "0.05 works")
 
     def problem(self, name: str, subject: Subject, run: RunContext) -> "DistanceProblem":

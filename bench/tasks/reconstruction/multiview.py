@@ -6,6 +6,8 @@ import torch
 
 from bench.pictures.run_figures import draw_curve
 from bench.setup.inputs import RunContext, RunInputs
+from bench.solve.latent_code import CodeProblem
+from bench.solve.optimise import with_affordable_rays
 from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, run_optimisation
 from bench.tasks.multiview import Multiview, PhotometricLoss
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, coloured, judge_mesh
@@ -49,8 +51,13 @@ class MultiviewOnPhotographs(Multiview, PhotographTask):
         record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
         subject = self.subject(inputs)
         record.notes = [*record.notes, subject.summary]
-        photometric_loss = PhotometricLoss(self, inputs.renderer, subject.input_shots, inputs.device, from_user=True)
-        problem = self.problem_of(inputs.prior, photometric_loss, torch.Generator().manual_seed(inputs.seed))
+
+        def make(task: MultiviewOnPhotographs) -> CodeProblem:
+            shots, device = subject.input_shots, inputs.device
+            loss = PhotometricLoss(task, inputs.renderer, shots, device, from_user=True, seed=inputs.seed)
+            return task.problem_of(inputs.prior, loss, torch.Generator().manual_seed(inputs.seed))
+
+        problem = with_affordable_rays(self, make)
         check_kind(inputs.renderer, problem.field())
 
         def mesh() -> Mesh | None:
