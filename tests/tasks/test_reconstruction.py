@@ -239,7 +239,8 @@ def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
 
 def test_the_fit_to_true_distances_is_better_than_a_short_reconstruction(scene, tmp_path):
     shared = {each.name: getattr(SETTINGS, each.name) for each in fields(Reconstruction)}
-    settings = DistanceFit(**shared | {"optimiser": OptimiserSettings(60, 0.01, "cosine")}, distances=3000, batch=500)
+    shared["optimiser"] = OptimiserSettings(60, 0.01, "cosine")
+    settings = DistanceFit(**shared, distances=3000, batch=500, surface_width=0.05)
     errors = {}
     for name, task in {"fit": settings, "photographs": SETTINGS}.items():
         (tmp_path / name).mkdir()
