@@ -69,16 +69,15 @@ def _either(lines: list[dict[str, str]]) -> str:
 
 def table() -> str:
     """README's table of renderers, from the committed CSV files of the suite."""
-    sets = {(line["set"], line["row"]): line for line in _lines("suite_sets")}
+    seconds = {line["row"]: line["seconds"] for line in _lines("suite_sets") if line["set"] == "complete"}
     costs = [f"progress at {units(float(budget))}" for budget in _budgets()]
-    head = ["`renderer=`", *costs, "failed runs", "iterations of a completion at 1 unit", "rays of an iteration"]
+    head = ["`renderer=`", *costs, "failed runs", "runtime of 1 unit of a completion (s)"]
     rows = []
     for line in _lines("suite"):
-        completion = sets["complete", line["row"]]
         failed = sum(map(int, re.findall(r"(\d+) of \d+", line["failed"]))) or "none"
-        progress = [f"{_percent(line[budget])} ({line[f'{budget}_rank']})" for budget in _budgets()]
-        counts = [f"{float(completion[f'{name}_1']):.0f}" for name in ("iterations", "rays")]
-        rows.append(f"| `{line['preset']}` | {' | '.join([*progress, str(failed), *counts])} |")
+        progress = [_percent(line[budget]) if line[budget] else line[f"{budget}_rank"] for budget in _budgets()]
+        runtime = f"{float(text):.2g}" if (text := seconds.get(line["row"])) else "–"
+        rows.append(f"| `{line['preset']}` | {' | '.join([*progress, str(failed), runtime])} |")
     return f"| {' | '.join(head)} |\n|---|{'---:|' * (len(head) - 1)}\n" + "\n".join(rows)
 
 

@@ -69,8 +69,8 @@ def make(*several: Runs | None) -> Result:
         remarks=[*PROGRESS, *_notes(made), *(f"Not read: {problem}" for problem in gathered.problems)],
         columns=[
             table.text("row", "Renderer"),
-            *(table.Column(f"{b:g}", f"At {units(b)}", words=partial(_progress, budget=b)) for b in suite().budgets),
-            *(table.text(f"{b:g}_rank") for b in suite().budgets),
+            *(table.Column(f"{b:g}", f"At {units(b)}", words=partial(_progress, budget=b)) for b in made.budgets),
+            *(table.text(f"{b:g}_rank") for b in made.budgets),
             *(table.text("failed", "Failed"), table.PRESET),
         ],
         lines=_lines(made),
@@ -93,7 +93,7 @@ def make_sets(*several: Runs | None) -> Result:
     order = [*made.sets, *made.rows, *reached["row"].unique()]
     lines = lines.sort_index(key=lambda names: names.map(order.index)).reset_index()
     lines = lines.astype(object).where(lines.notna(), None)
-    budgets = suite().budgets
+    budgets = made.budgets
     return Result(
         replace(runs, records=[], left_out=Counter()),
         "The suite, set by set.",
@@ -101,9 +101,9 @@ def make_sets(*several: Runs | None) -> Result:
         question="How much progress does each renderer make in each set, and how long does a unit of cost take?",
         verdict=_first_of_sets(made),
         n=_sample(made),
-        interval="none; the test is over all sets together",
         remarks=[
             *PROGRESS,
+            "The test is over all sets together, so this page has no intervals.",
             "Iterations and rays are medians over problems. In multiview, neighbouring views count as one ray "
             "per pixel. Runtimes are medians over runs on a machine without other "
             f"load: {format.plural(int(lines['timed'].sum()), 'run')}, others are not timed.",
@@ -329,8 +329,8 @@ def _notes(made: Standing) -> list[str]:
         rows = ", ".join(f"{row} at {units(b)} ({format.plural(n, 'problem')})" for (b, row), n in made.lacking.items())
         notes.append(f"Not compared, because runs are missing: {rows}.")
     machines, loaded = runs.loc[runs["cpu"] != "", "machine"].nunique(), (~runs["timed"]).sum()
-    versions, kinds = format.plural(runs["code"].nunique(), "version"), format.plural(machines, "machine")
-    notes.append(f"Runs: {versions} of the code, {kinds} (counted apart by threads and kernels).")
+    versions, kinds = format.plural(runs["commit"].nunique(), "commit"), format.plural(machines, "machine")
+    notes.append(f"Runs: {versions}, {kinds} (counted apart by threads and kernels).")
     notes.append(f"{loaded} of {len(runs)} runs have no runtime, because the machine had other load.")
     return [note.replace("*", "") for note in notes]  # without the marks of numbers in verdicts
 
