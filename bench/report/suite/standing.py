@@ -22,7 +22,7 @@ from bench.tables import choice
 DIST = "dist"  # the preset that decides which problems are compared, and that ratios of errors refer to
 MIN_LOG_ERROR = 1e-12  # lower bound before taking the logarithm
 KEY = ["set", "problem", "budget"]
-ALPHA = 0.05  # total over all tests at a budget
+ALPHA = 0.03  # total over all tests at a budget; as scenes are skewed, simulations of equal rows have 5 % false pairs
 
 
 class Standing:
