@@ -209,6 +209,7 @@ def test_bounds_hold_the_ratios_that_flipped_signs_do_not_reject():
     failed = [replace(one, row="Lost", status="nan", final=inf) for one in b]
     assert bounds(judged([*dist, *b, *failed])) == (low, high)
     assert bounds(judged(dist)) is None
+    assert bounds(judged(b)) is None  # without DIST
 
 
 def test_a_number_that_is_none_is_not_reached_and_a_changed_renderer_has_another_name(tmp_path):

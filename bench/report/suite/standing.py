@@ -215,13 +215,14 @@ def bounds(runs: pd.DataFrame) -> tuple[float, float] | None:
     """The bounds of the mean final errors of all rows relative to DIST's, in runs of one set at one budget.
 
     The means are geometric, over scenes, see `flips.bounds`, without rows that mostly failed. None if the set has too
-    few scenes.
+    few scenes, or no row of DIST.
     """
     runs = runs[runs.groupby("row")["ok"].transform("mean") >= 0.5]
     errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=MIN_LOG_ERROR))
     table = errors.groupby([runs["scene"], runs["row"]]).mean().unstack("row")
-    ratios = table.drop(columns=dist_row(runs), errors="ignore").sub(table.get(dist_row(runs)), axis=0)
-    ends = flips.bounds(ratios.to_numpy(), ALPHA)
+    if (reference := dist_row(runs)) not in table:
+        return None
+    ends = flips.bounds(table.drop(columns=reference).sub(table[reference], axis=0).to_numpy(), ALPHA)
     return ends and (float(np.exp(ends[0])), float(np.exp(ends[1])))
 
 
