@@ -14,11 +14,12 @@ Any other KEY=VALUE is passed to `python -m bench`.
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.records.format import MISSING, number, plural
+from bench.records.format import MISSING, number, plural, seconds
 from bench.records.read import read_records
 from bench.records.results import RESULTS
 from bench.report.suite.attempts import (
@@ -29,6 +30,7 @@ from bench.report.suite.attempts import (
     TUNED_SUFFIX,
     attempts_of,
     gather,
+    problems_of,
     read_attempts,
     suite,
     write_attempts,
@@ -44,6 +46,7 @@ FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have fai
 TUNED_LABEL = f"label='${{renderer._label_}}{TUNED_SUFFIX}'"
 STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
 AXES = tuple(key for key, _, _ in PROBLEM_SETTINGS.values())  # may be typed, to run some problems only
+SETUP_AND_EVALUATION_SECONDS = 2.0  # per run
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one
 SETTING_VALUES = ("stated", "tuned")  # the set's setting for all renderers, or that of conf/tuned.yaml
 
@@ -56,6 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         options, overrides = parse_arguments(arguments)
         results_dir = Path(dict(text.split("=", 1) for text in overrides).get("results_dir", RESULTS))
+        print(_expected_runtime(options))
         for title, keys in _sweeps(options, overrides):
             print(title, flush=True)
             if (code := _sweep(keys)) not in FINISHED_EXIT_STATUSES:
@@ -92,6 +96,30 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
             if word not in allowed:
                 raise ValueError(f"unknown {key} {word!r}{nearest(word, [*allowed])}")
     return options, overrides
+
+
+def _expected_runtime(options: dict[str, str]) -> str:
+    """The number of runs of one renderer, and the time that these took for the fastest and slowest shipped renderer."""
+    keys = {key for key in problems_of(options["suite"]) if key[0] in options["set"].split(",")}
+    spent, costs = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
+    for attempt in read_attempts(paper.SHIPPED)[0]:
+        if attempt.ok and attempt.seconds is not None and not attempt.tuned:
+            row_and_set = attempt.row, attempt.set
+            spent[row_and_set] += attempt.seconds * (1 - (attempt.waited or 0))  # without the wait for a processor
+            costs[row_and_set] += attempt.budget
+    sums = {
+        row: sum(
+            SETUP_AND_EVALUATION_SECONDS + spent[row, name] / costs[row, name] * budget for name, _, budget in keys
+        )
+        for row in dict.fromkeys(row for row, _ in costs)
+        if all(costs[row, name] for name, *_ in keys)
+    }
+    runs = f"{plural(len(keys), 'run')} of each renderer"
+    if not sums:
+        return runs
+    fastest, slowest = min(sums, key=sums.__getitem__), max(sums, key=sums.__getitem__)
+    texts = [f"{seconds(sums[row])} ({row})" for row in (fastest, slowest)]
+    return f"{runs}; the shipped ones need about {' to '.join(texts)} of one processor"
 
 
 def shipped_rows() -> set[str]:

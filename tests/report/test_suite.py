@@ -42,7 +42,7 @@ from bench.report.suite.standing import (
     with_progress,
 )
 from bench.studies import suite as study
-from bench.suite import _sweeps, main, parse_arguments, print_standing
+from bench.suite import _expected_runtime, _sweeps, main, parse_arguments, print_standing
 from bench.tables import choice
 from tests.looped import each
 from tests.report.test_report_paper import write_lines, write_run
@@ -587,3 +587,13 @@ def test_a_failed_run_has_the_cost_of_its_loop(tmp_path):
     write_completion(tmp_path, [0.8, 0.4, 0.2], status="diverged", reason="the loss rose")
     (found,) = attempts_of(read_records(tmp_path)[0], tmp_path)
     assert (found.final, found.cost, found.curve[-1][0]) == (inf, 2000, 1000)
+
+
+def test_the_expected_runtime_is_that_of_the_shipped_rows_at_the_budgets_of_the_size(tmp_path, monkeypatch):
+    write_attempts([replace(one, set=name) for name in suite().errors for one in made([("A", 0.1, 9.0)])], tmp_path)
+    monkeypatch.setattr("bench.report.write.paper.SHIPPED", tmp_path)
+    quick = _expected_runtime({"suite": "quick", "set": "pose,complete"})  # 36 runs of 1 unit, of a second each
+    assert quick == "36 runs of each renderer; the shipped ones need about 108 s (A) to 108 s (A) of one processor"
+    assert "24 runs" in _expected_runtime({"suite": "quick", "set": "pose"})
+    seconds = 168 * (2 + 1) + 168 * (2 + 10)
+    assert f"{seconds / 60:.1f} min (A)" in _expected_runtime({"suite": "core", "set": ",".join(suite().errors)})
