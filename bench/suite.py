@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         options, overrides = parse_arguments(arguments)
         results_dir = Path(dict(text.split("=", 1) for text in overrides).get("results_dir", RESULTS))
-        print(_expected_runtime(options))
+        print(_expected_runtime(options, _renderers(overrides)))
         for title, keys in _sweeps(options, overrides):
             print(title, flush=True)
             if (code := _sweep(keys)) not in FINISHED_EXIT_STATUSES:
@@ -84,9 +84,8 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
         elif re.match(STATED_KEYS_PATTERN, key) and key not in AXES:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
         elif key == "label" and (value in shipped_rows() or value.endswith(TUNED_SUFFIX)):
-            raise ValueError(
-                f"label={value} is the name of a shipped row, or ends in '{TUNED_SUFFIX}': type another one"
-            )
+            reason = "is the name of a shipped row" if value in shipped_rows() else f"ends in '{TUNED_SUFFIX}'"
+            raise ValueError(f"label={value} {reason}: type another one")
         elif "=" in argument:
             overrides.append(argument)
         else:
@@ -98,11 +97,21 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
     return options, overrides
 
 
-def _expected_runtime(options: dict[str, str]) -> str:
-    """The number of runs of one renderer, and the time that these took for the fastest and slowest shipped renderer."""
+def _renderers(overrides: list[str]) -> list[str]:
+    return [name for text in overrides if text.startswith("renderer=") for name in text[9:].split(",")]
+
+
+def _expected_runtime(options: dict[str, str], presets: list[str]) -> str:
+    """The number of runs of one renderer, and their time for the fastest and slowest of shipped rows.
+
+    Args:
+        presets: of the rows; if none is shipped, all rows.
+    """
+    shipped = read_attempts(paper.SHIPPED)[0]
+    shipped = [attempt for attempt in shipped if attempt.preset in presets] or shipped
     keys = {key for key in problems_of(options["suite"]) if key[0] in options["set"].split(",")}
     spent, costs = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
-    for attempt in read_attempts(paper.SHIPPED)[0]:
+    for attempt in shipped:
         if attempt.ok and attempt.seconds is not None and not attempt.tuned:
             row_and_set = attempt.row, attempt.set
             spent[row_and_set] += attempt.seconds * (1 - (attempt.waited or 0))  # without the wait for a processor
@@ -118,7 +127,7 @@ def _expected_runtime(options: dict[str, str]) -> str:
     if not sums:
         return runs
     fastest, slowest = min(sums, key=sums.__getitem__), max(sums, key=sums.__getitem__)
-    texts = [f"{seconds(sums[row])} ({row})" for row in (fastest, slowest)]
+    texts = [f"{seconds(sums[row])} ({row})" for row in dict.fromkeys((fastest, slowest))]
     return f"{runs}; the shipped ones need about {' to '.join(texts)} of one processor"
 
 
@@ -134,7 +143,7 @@ def _sweeps(options: dict[str, str], overrides: list[str]) -> list[tuple[str, li
         ValueError: if no set has a tuned setting.
     """
     sets, sweeps = options["set"].split(","), list[tuple[str, list[str]]]()
-    renderers = [name for text in overrides if text.startswith("renderer=") for name in text[9:].split(",")]
+    renderers = _renderers(overrides)
     others = [text for text in overrides if not text.startswith("renderer=")]
     for position, name in enumerate(sets, 1):
         title = f"set {position} of {len(sets)}: {name}"

@@ -41,7 +41,8 @@ def recommendation() -> str:
         raise ValueError("no row is among the best at all costs: README needs another sentence")
     first = max(always, key=lambda line: float(line[_budgets()[-1]]))
     sentences = [
-        f"At {units(float(budget))} of cost, no renderer makes significantly more progress than {_either(rows)}."
+        f"At {units(float(budget))} of cost, no renderer makes significantly more progress than {_either(rows)}. "
+        f"Of these, `{max(rows, key=lambda line: float(line[budget]))['preset']}` makes the most."
         for budget, rows in leaders.items()
     ]
     hard = "cannot be distinguished from the best" if first["row"] in _hardest() else "is significantly worse"
@@ -71,13 +72,13 @@ def table() -> str:
     """README's table of renderers, from the committed CSV files of the suite."""
     seconds = {line["row"]: line["seconds"] for line in _lines("suite_sets") if line["set"] == "complete"}
     costs = [f"progress at {units(float(budget))}" for budget in _budgets()]
-    head = ["`renderer=`", *costs, "failed runs", "runtime of 1 unit of a completion (s)"]
+    head = ["`renderer=`", *costs, "runtime of 1 unit of a completion (s)"]
     rows = []
     for line in _lines("suite"):
-        failed = sum(map(int, re.findall(r"(\d+) of \d+", line["failed"]))) or "none"
-        progress = [_percent(line[budget]) if line[budget] else line[f"{budget}_rank"] for budget in _budgets()]
+        ranks = {budget: line[f"{budget}_rank"] for budget in _budgets()}
+        progress = [f"{_percent(line[b])} ({rank})" if line[b] else rank for b, rank in ranks.items()]
         runtime = f"{float(text):.2g}" if (text := seconds.get(line["row"])) else "–"
-        rows.append(f"| `{line['preset']}` | {' | '.join([*progress, str(failed), runtime])} |")
+        rows.append(f"| `{line['preset']}` | {' | '.join([*progress, runtime])} |")
     return f"| {' | '.join(head)} |\n|---|{'---:|' * (len(head) - 1)}\n" + "\n".join(rows)
 
 

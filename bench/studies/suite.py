@@ -26,6 +26,8 @@ READS = tuple(
 )
 COST = "field evaluations, in units"
 CANNOT_RUN = "cannot run"
+MENTIONED_FRACTION_OF_LARGER_ERRORS = 0.05
+NEAR_DIST = (0.8, 1.25)  # ratios of errors to DIST's; bounds outside of them say little and are not shown
 UNITS = ", ".join(f"{unit:.2g} ({name})" for name, unit in suite().units.items())
 PROGRESS = (
     "Every run spends the same number of field evaluations, whatever the number of its iterations. A gradient counts "
@@ -43,8 +45,8 @@ PROGRESS = (
     "units is not the continuation of a run over 1 unit. In a set, all renderers have one learning rate and one "
     "silhouette loss, which were chosen in runs of fixed length: 100 iterations in complete, 200 in reconstruct. Pose "
     "and multiview have the defaults of their tasks, multiview without a silhouette loss.",
-    f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:g}. "
-    "It holds for scenes of these four families.",
+    f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:.0%}. "
+    "At that level, 5 % of simulated draws of equal renderers have a false pair. The sample is of these four families.",
 )
 
 
@@ -132,7 +134,7 @@ def _lines(made: Standing) -> list[dict[str, Any]]:
                 line |= {f"{budget:g}": ranked.progress[row], f"{budget:g}_rank": ranked.rank(row)}
             elif (budget, row) in made.cannot_run:
                 line[f"{budget:g}_rank"] = CANNOT_RUN
-        counts = []
+        counts = [CANNOT_RUN for _, name in made.cannot_run if name == row]
         for (budget, name), group in runs.groupby(["budget", "set"]):
             statuses = ", ".join(
                 f"{n} {status}" for status, n in group.loc[~group["ok"], "status"].value_counts().items()
@@ -304,10 +306,20 @@ def _notes(made: Standing) -> list[str]:
     notes, runs = [], made.complete
     for budget, ranked in made.rankings.items():
         at_budget = runs[runs["budget"] == budget]
-        least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}."
-        notes.append(f"At {units(budget)}, {len(ranked.better)} of {ranked.pairs} pairs differ significantly. {least}")
+        least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}"
+        possible = f"{2 / 2 ** min(ranked.scenes, 16):.2g} is possible with {format.plural(ranked.scenes, 'scene')}"
+        pairs = f"{len(ranked.better)} of {ranked.pairs} pairs differ significantly"
+        notes.append(f"At {units(budget)}, {pairs}. {least}; {possible}.")
+        further = at_budget[at_budget["ok"] & (at_budget["final"] > at_budget["initial"])]
+        counts = further.groupby("set").size() / at_budget[at_budget["ok"]].groupby("set").size()
+        for name, fraction in counts[counts > MENTIONED_FRACTION_OF_LARGER_ERRORS].items():
+            notes.append(
+                f"At {units(budget)}, {percent(fraction)} of the runs of {name} that ended ok have a larger error than "
+                "at their start: their loss fell. Their progress is 0 %."
+            )
         for name in made.sets:
-            if ends := standing.bounds(at_budget[at_budget["set"] == name]):
+            ends = standing.bounds(at_budget[at_budget["set"] == name])
+            if ends and NEAR_DIST[0] <= ends[0] <= ends[1] <= NEAR_DIST[1]:
                 notes.append(
                     f"At {units(budget)}, in {name}, mean final errors are {ends[0]:.2f} to {ends[1]:.2f} times DIST's "
                     "(geometric means over scenes, simultaneous 95 % intervals). Renderers that failed in more than "
@@ -315,8 +327,10 @@ def _notes(made: Standing) -> list[str]:
                 )
         for name in made.sets if len(made.sets) > 1 else ():
             others = standing.ranking(at_budget[at_budget["set"] != name])
-            lead = leaders(others, f"Without {name}, at {units(budget)}") if others.decidable else ""
-            notes.append(f"{lead} The order is: {'; '.join(others.progress)}. Different pairs: {len(others.better)}.")
+            if others.decidable:
+                lead = leaders(others, f"Without {name}, at {units(budget)}")
+                order = f"The order is: {'; '.join(others.progress)}. Different pairs: {len(others.better)}."
+                notes.append(f"{lead} {order}")
     for (budget, row), sets in made.cannot_run.items():
         notes.append(f"At {units(budget)}, {row} cannot run in {sets}.")
     if made.other_settings:

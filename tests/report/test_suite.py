@@ -363,8 +363,9 @@ def test_a_wrong_argument_is_told(argument, said, capsys):
 def test_a_label_of_a_shipped_row_is_refused(tmp_path, monkeypatch):
     write_attempts([attempt("Newton", "s", {0: 1.0, 5: 0.5})], tmp_path)
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", tmp_path)
-    for label in ("Newton", "Mine, tuned"):  # its runs would replace shipped ones, or would count as tuned
-        with pytest.raises(ValueError, match=f"label={label} is the name of a shipped row, or ends in ', tuned'"):
+    reasons = {"Newton": "is the name of a shipped row", "Mine, tuned": "ends in ', tuned'"}
+    for label, reason in reasons.items():  # its runs would replace shipped ones, or would count as tuned
+        with pytest.raises(ValueError, match=f"label={label} {reason}"):
             parse_arguments(["renderer=custom", f"label={label}"])
 
 
@@ -492,7 +493,7 @@ def test_the_runtime_of_a_unit_is_of_timed_runs_of_one_machine():
     runs = made([("Dist", 0.01, 100.0)])  # a cost of 200 in a second
     loaded = replace(runs[0], row="B", waited=0.3)
     elsewhere = replace(runs[0], row="C", cpu="another")
-    known = seconds_per_unit(frame_of([*runs, loaded, elsewhere])[0])
+    known = seconds_per_unit(frame_of([*runs, *runs, loaded, elsewhere])[0])
     assert known.loc[("complete", "Dist")].to_dict() == {"seconds": 4e5 / 200, "timed": len(runs)} and len(known) == 1
 
 
@@ -592,8 +593,11 @@ def test_a_failed_run_has_the_cost_of_its_loop(tmp_path):
 def test_the_expected_runtime_is_that_of_the_shipped_rows_at_the_budgets_of_the_size(tmp_path, monkeypatch):
     write_attempts([replace(one, set=name) for name in suite().errors for one in made([("A", 0.1, 9.0)])], tmp_path)
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", tmp_path)
-    quick = _expected_runtime({"suite": "quick", "set": "pose,complete"})  # 36 runs of 1 unit, of a second each
-    assert quick == "36 runs of each renderer; the shipped ones need about 108 s (A) to 108 s (A) of one processor"
-    assert "24 runs" in _expected_runtime({"suite": "quick", "set": "pose"})
+    write_attempts([replace(one, set="pose") for one in made([("B", 0.1, 9.0)])], tmp_path)
+    quick = _expected_runtime({"suite": "quick", "set": "pose,complete"}, [])  # 36 runs of 1 unit, of a second each
+    assert quick == "36 runs of each renderer; the shipped ones need about 108 s (A) of one processor"
+    assert "72.0 s (B) of" in _expected_runtime({"suite": "quick", "set": "pose"}, ["b"])
     seconds = 168 * (2 + 1) + 168 * (2 + 10)
-    assert f"{seconds / 60:.1f} min (A)" in _expected_runtime({"suite": "core", "set": ",".join(suite().errors)})
+    assert f"{seconds / 60:.1f} min (A)" in _expected_runtime(
+        {"suite": "core", "set": ",".join(suite().errors)}, ["new"]
+    )
