@@ -22,7 +22,7 @@ from tests.report.test_suite import attempt, write_completion
 pytestmark = pytest.mark.browser
 
 RUNS = 7
-SOLVED = [attempt("Dist", f"car test {n}", {0: 0.8, 500: 0.0115, 600: 0.001}, preset="dist") for n in (0, 1)]
+SOLVED = [attempt("Dist", f"car test {n}", {0: 0.8, 2e5: 0.1, 4e5: 0.001}, preset="dist") for n in (0, 1)]
 NUMBERS = (
     0.0123456,
     0.5,
@@ -101,7 +101,7 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     write_attempts([*SOLVED, *lost], tmp_path)
     assert main([f"results_dir={tmp_path}"]) == 0
     page = tab(tmp_path).open()
-    assert page.locator("h1").inner_text() == "Which renderer makes the most progress, and at what cost?"
+    assert page.locator("h1").inner_text() == "Which renderer makes the most progress, at the same cost?"
     assert "2 scenes cannot decide between 2 renderers" in page.locator(".answer").inner_text()
     page.locator(".scatterlayer .trace").first.wait_for()
     assert page.locator(".panel").count() == 1
@@ -119,7 +119,7 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     page.get_by_text("It fails in 2 of 2 runs.").wait_for()
     text = page.locator("main").inner_text()
     assert "complete: car test 0, 20 points, 1 unit: lost." in text and "python -m bench.suite" in text
-    assert page.locator("table.list tbody tr").count() == 2 and "2 of 2 complete (nan)" in text
+    assert page.locator("table.list tbody tr").count() == 2 and "2 of 2 complete at 1 unit (2 nan)" in text
     page.get_by_role("link", name="Suite").first.click()
     page.get_by_role("link", name="Dist", exact=True).click()
     page.get_by_text("No renderer makes more progress in any of 2 runs.").wait_for()
