@@ -100,6 +100,7 @@ class Optimisable(Protocol):
         ...
 
 
+@runtime_checkable
 class SampledTask(Protocol):
     """A task of which an iteration compares one pixel of each block of `pixel_block` x `pixel_block`."""
 

@@ -313,9 +313,9 @@ class PhotometricLoss:
         self,
         depth: Float[Tensor, "height width"],
         hit: Bool[Tensor, "height width"],
-        pixels: Float[Tensor, "height width 2"],
-        expected: Float[Tensor, "height width"],
-    ) -> Bool[Tensor, "height width"]:
+        pixels: Float[Tensor, "*points 2"],
+        expected: Float[Tensor, "*points"],
+    ) -> Bool[Tensor, "*points"]:
         """Whether a view's depth agrees with `expected`, of another view's points at `pixels` (DIST, B.3)."""
         depth_and_weight = torch.stack([depth * hit, hit.to(depth.dtype)], dim=-1)
         interpolated, inside = sample(depth_and_weight, pixels)
