@@ -287,17 +287,16 @@ class Compared:
             return ""
         n = len(complete[0]["error"].points)
         among = "The" if len(lines) == len(self.pooled) else "Among the rows with equal settings, the"
-        if not self.runs.timed:
-            best = min(complete, key=lambda line: line["error"].value)
-            text = f"*{format.number(best['error'].value)}* ({best['row']})"
-            return f"{among} smallest median of {least_of} is {text}; n = {format.plural(n, 'shape')}."
         best, quickest = (min(complete, key=key) for key in (lambda x: x["error"].value, lambda x: x["seconds"]))
         best_text, quickest_text = (
-            f"{format.number(line['error'].value)}{mark} ({line['row']}, {format.seconds(line['seconds'])}"
+            f"{format.number(line['error'].value)}{mark} ({line['row']}"
+            + (f", {format.seconds(line['seconds'])})" if self.runs.timed else ")")
             for line, mark in ((best, "*"), (quickest, ""))
         )
-        other = "It is also the fastest." if best is quickest else f"The fastest row has {quickest_text})."
-        return f"{among} smallest median of {least_of} is *{best_text}); n = {format.plural(n, 'shape')}. {other}"
+        text = f"{among} smallest median of {least_of} is *{best_text}; n = {format.plural(n, 'shape')}."
+        if not self.runs.timed:
+            return text
+        return f"{text} {'It is also the fastest.' if best is quickest else f'The fastest row has {quickest_text}.'}"
 
     def panels(self, ratio: str) -> list[chart.Panel]:
         """Panels of errors, of ratios (labelled `ratio`) and of costs: a line per row, the least error first."""

@@ -60,6 +60,11 @@ def central_differences(field: Field, points: Float[Tensor, "n 3"], width: float
     return (ahead - behind) / width
 
 
+def expected_in_draw(observed: Bool[Tensor, "*rays"], count: int) -> float:
+    """The mean number of observed rays in a draw of `count` rays, the `expected` of `observed_hits`."""
+    return float(observed.sum()) * count / observed.numel()
+
+
 def observed_hits(
     hit: Bool[Tensor, "*rays"], observed: Bool[Tensor, "*rays"], expected: float | None = None
 ) -> Float[Tensor, ""]:
@@ -137,8 +142,7 @@ class ObservedView:
 
     def drawn(self, rays: Int[Tensor, " n"]) -> "ObservedView":
         """The observations of drawn rays in one row; terms have the same weights on average as among all rays."""
-        expected = float(self.observed.sum()) * len(rays) / self.observed.numel()
-        return replace(self.select(rays), expected_observed=expected)
+        return replace(self.select(rays), expected_observed=expected_in_draw(self.observed, len(rays)))
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted loss terms of DIST, Eq. 5."""

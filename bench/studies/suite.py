@@ -307,7 +307,7 @@ def _notes(made: Standing) -> list[str]:
     for budget, ranked in made.rankings.items():
         at_budget = runs[runs["budget"] == budget]
         least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}"
-        possible = f"{2 / 2 ** min(ranked.scenes, 16):.2g} is possible with {format.plural(ranked.scenes, 'scene')}"
+        possible = f"{ranked.possible_p:.2g} is possible with {format.plural(ranked.scenes, 'scene')}"
         pairs = f"{len(ranked.better)} of {ranked.pairs} pairs differ significantly"
         notes.append(f"At {units(budget)}, {pairs}. {least}; {possible}.")
         further = at_budget[at_budget["ok"] & (at_budget["final"] > at_budget["initial"])]

@@ -25,7 +25,14 @@ from bench.records.record import digest
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import load_or_make
 from bench.solve.draw import solve_and_draw
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error, generator_of, normal_error, observed_hits
+from bench.solve.observed_view import (
+    DEPTH_LOSSES,
+    depth_error,
+    expected_in_draw,
+    generator_of,
+    normal_error,
+    observed_hits,
+)
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
 from datasets.scene import Scene, View, see
 from datasets.views import pixel_of_each_block
@@ -266,7 +273,7 @@ class PoseProblem:
         depth, depth_per_distance, observed, normals = observations
         rendering = render_checked(renderer, shape, rays)
         compared = observed & rendering.hit
-        expected = None if pixels is None else float(self.observed.sum()) * len(pixels) / self.observed.numel()
+        expected = None if pixels is None else expected_in_draw(self.observed, len(pixels))
         count = observed_hits(rendering.hit, observed, expected)
         rendered = rendering.distance * depth_per_distance
         error = depth_error(self.settings.depth_loss, rendered, depth, depth_per_distance)

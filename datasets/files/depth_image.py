@@ -188,7 +188,7 @@ def _read_depths(path: Path) -> Float[np.ndarray, "h w"]:
 def _crop_and_subsample(
     depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], intrinsics: Float[np.ndarray, "3 3"], largest: int
 ) -> tuple[Float[np.ndarray, "n n"], Bool[np.ndarray, "n n"], Float[np.ndarray, "3 3"]]:
-    """Cuts depth and mask to a square about the object of at most `largest` pixels a side, and moves the intrinsics.
+    """Cuts depth and mask to a square about the object of at most `largest` pixels per side, and moves the intrinsics.
 
     Depths are not averaged, since a mean across an outline lies on neither side.
     """

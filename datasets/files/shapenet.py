@@ -90,7 +90,7 @@ class ShapeNet:
         return FileColours(file, load_repaired(file), self.mesh(split, index))
 
     def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
-        """The images of a shape with cameras in its mesh's world, at most `longest` pixels a side; None without any."""
+        """A shape's images with cameras in its mesh's world, `longest` pixels per side at most; None without any."""
         if self.renders is None:
             return None
         folder = Path(self.renders) / self.folder.name / _id(self._file(split, index))

@@ -56,7 +56,6 @@ class Suite:
     sizes: dict[str, str]
     errors: dict[str, str]
     units: dict[str, float]
-    budgets: tuple[float, ...]
     references: dict[str, dict[str, float]]
 
     @property
@@ -304,7 +303,7 @@ def _checked(attempt: Attempt) -> Attempt:
         ValueError, TypeError: they do not.
     """
     numbers = [attempt.start, attempt.final, attempt.cost, *(number for point in attempt.curve for number in point)]
-    costs, end = [point[:2] for point in attempt.curve], [[attempt.cost, float(f"{attempt.final:.5g}")]]
+    costs, end = [point[:2] for point in attempt.curve], [[attempt.cost, _rounded(attempt.final)]]
     if any(as_number(number) is None or number < 0 for number in numbers) or any(len(p) != 3 for p in attempt.curve):
         raise ValueError(f"{attempt.problem}: errors and costs must be numbers of 0 or more")
     if costs != sorted(costs) or (attempt.ok and [[point[0], point[2]] for point in attempt.curve[-1:]] != end):

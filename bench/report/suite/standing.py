@@ -183,6 +183,11 @@ class Ranking:
         """Whether this number of scenes can show any difference."""
         return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs, ALPHA)
 
+    @property
+    def possible_p(self) -> float:
+        """The smallest p value that this number of scenes can give."""
+        return 1 / len(flips.signs(self.scenes))
+
     def rank(self, row: str) -> str:
         """The ranks that a row can have, such as 1–4, simultaneous at 95 % (Mogstad et al. 2024)."""
         above, below = (sum(pair[position] == row for pair in self.better) for position in (1, 0))

@@ -41,7 +41,7 @@ class Pictured(Protocol):
     """A dataset that includes rendered images of its shapes."""
 
     def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
-        """The images of a shape with cameras in its mesh's world, at most `longest` pixels a side; None without any."""
+        """A shape's images with cameras in its mesh's world, `longest` pixels per side at most; None without any."""
         ...
 
 
