@@ -25,6 +25,7 @@ from bench.records.results import RESULTS
 from bench.report.suite.attempts import (
     EXPERIMENT_PREFIX,
     FIXED_KEYS,
+    NOISE_KEY,
     PROBLEM_SETTINGS,
     TUNED_PREFIX,
     TUNED_SUFFIX,
@@ -45,7 +46,7 @@ PAGE = "suite"  # its file name in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
 TUNED_LABEL = f"label='${{renderer._label_}}{TUNED_SUFFIX}'"
 STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
-AXES = tuple(key for key, _, _ in PROBLEM_SETTINGS.values())  # may be typed, to run some problems only
+AXES = (*(key for key, _, _ in PROBLEM_SETTINGS.values()), NOISE_KEY)  # may be typed: some problems, a second start
 SETUP_AND_EVALUATION_SECONDS = 2.0  # per run
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one
 SETTING_VALUES = ("stated", "tuned")  # the set's setting for all renderers, or that of conf/tuned.yaml

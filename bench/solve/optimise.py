@@ -49,6 +49,7 @@ class OptimiserSettings:
         budget: largest cost, see `renderers.field.Counts.cost`; the step that reaches it is the last.
         ends: "iterations", the number of steps, with the budget as a limit; "budget": whatever the number of steps, and
             schedules over `iterations` follow the spent fraction of the budget.
+        start_noise: standard deviation of normal noise in all initial parameters, for the run-to-run spread.
     """
 
     iterations: int
@@ -56,6 +57,7 @@ class OptimiserSettings:
     schedule: str
     budget: float | None = None
     ends: str = ITERATIONS
+    start_noise: float = 0.0
 
     def __post_init__(self) -> None:
         check_at_least("task.optimiser.iterations", self.iterations, 1, "the paper uses 100")
@@ -64,6 +66,7 @@ class OptimiserSettings:
         if self.budget is not None:
             check_positive("task.optimiser.budget", self.budget, "the suite has 2.5e5 to 1e7, null is none")
         check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET))
+        check_at_least("task.optimiser.start_noise", self.start_noise, 0, "1e-6 shows the run-to-run spread")
         if self.ends == BUDGET and self.budget is None:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
 
@@ -167,6 +170,7 @@ def optimise(
     Raises:
         BrokenContract: the history has notes, and the distance of a hit of the warm-up is not finite or is negative.
     """
+    _add_noise(problem.parameters, settings.start_noise)
     optimiser, own_starts = _Adam(problem.parameters), getattr(problem, "starts", None)
     starts = own_starts or Starts(StartSettings(1, 1))
     loss_of = problem.loss if own_starts else lambda step, start: problem.loss(step)
@@ -243,6 +247,13 @@ def _budget_problem(curve: list[dict[str, Any]], is_spent: bool) -> str:
         return ""
     few = f"{TOO_EXPENSIVE} {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}"
     return f"{few}: set task.optimiser.budget={MIN_BUDGET_ITERATIONS * cost / iterations:.2g} or more"
+
+
+@torch.no_grad()
+def _add_noise(parameters: list[Tensor], deviation: float) -> None:
+    draw = torch.Generator().manual_seed(0)
+    for parameter in parameters if deviation else ():
+        parameter += deviation * torch.randn(parameter.shape, generator=draw, device="cpu").to(parameter)
 
 
 class _Adam:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from bench.report.study import Result, Runs, Selection, chart, figure_style, format, merge_runs, table
 from bench.report.suite import standing
 from bench.report.suite.attempts import EXPERIMENT_PREFIX, PROBLEM_SETTINGS, attempts_folder, gather, suite
-from bench.report.suite.standing import ALPHA, Ranking, Standing, units
+from bench.report.suite.standing import ALPHA, KEY, Ranking, Standing, units
 from bench.report.write import paper
 from bench.report.write.table import percent
 
@@ -27,6 +27,7 @@ READS = tuple(
 COST = "field evaluations, in units"
 CANNOT_RUN = "cannot run"
 MENTIONED_FRACTION_OF_LARGER_ERRORS = 0.05
+MENTIONED_CHANGE_OF_PROGRESS = 0.05
 NEAR_DIST = (0.8, 1.25)  # ratios of errors to DIST's; bounds outside of them say little and are not shown
 UNITS = ", ".join(f"{unit:.2g} ({name})" for name, unit in suite().units.items())
 PROGRESS = (
@@ -325,6 +326,8 @@ def _notes(made: Standing) -> list[str]:
                     "(geometric means over scenes, simultaneous 95 % intervals). Renderers that failed in more than "
                     "half of their runs are left out. Other failed runs count with their initial error."
                 )
+        if text := _second_starts(made, budget):
+            notes.append(text)
         for name in made.sets if len(made.sets) > 1 else ():
             others = standing.ranking(at_budget[at_budget["set"] != name])
             if others.decidable:
@@ -347,6 +350,23 @@ def _notes(made: Standing) -> list[str]:
     notes.append(f"Runs: {versions}, {kinds} (counted apart by threads and kernels).")
     notes.append(f"{loaded} of {len(runs)} runs have no runtime, because the machine had other load.")
     return [note.replace("*", "") for note in notes]  # without the marks of numbers in verdicts
+
+
+def _second_starts(made: Standing, budget: float) -> str:
+    """How much noise in the initial parameters changes the progress of runs; empty without second starts."""
+    runs = made.second_starts[made.second_starts["budget"] == budget]
+    if runs.empty:
+        return ""
+    changes = runs["progress"] - runs["first"]
+    large = percent((changes.abs() > MENTIONED_CHANGE_OF_PROGRESS).mean())
+    median, of_rows = 100 * changes.abs().median(), changes.groupby(runs["row"]).mean().abs()
+    return (
+        f"Run-to-run spread at {units(budget)}: {format.plural(len(runs), 'run')} of "
+        f"{format.plural(len(runs[KEY].drop_duplicates()), 'problem')} have a second start, with noise in the initial "
+        f"parameters (task.optimiser.start_noise, here 1e-6). {large} of them change their progress by "
+        f"more than {100 * MENTIONED_CHANGE_OF_PROGRESS:g} points, in the median by {median:.1f}. The mean over "
+        f"these problems changes by at most {100 * of_rows.max():.1f} points ({of_rows.idxmax()})."
+    )
 
 
 PAGES = {"suite": make, "suite_sets": make_sets}

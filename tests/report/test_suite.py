@@ -601,3 +601,23 @@ def test_the_expected_runtime_is_that_of_the_shipped_rows_at_the_budgets_of_the_
     assert f"{seconds / 60:.1f} min (A)" in _expected_runtime(
         {"suite": "core", "set": ",".join(suite().errors)}, ["new"]
     )
+
+
+def test_a_second_start_shows_the_spread_and_changes_no_comparison(tmp_path):
+    for name, noise, final in (("first", 0.0, 0.1), ("second", 1e-6, 0.2)):
+        own = {"task": {"points": "20", "optimiser": {"ends": "budget", "budget": 4e5, "start_noise": noise}}}
+        write_completion(tmp_path / name, [1.0, final], settings=own)
+    runs = [
+        one for name in ("first", "second") for one in attempts_of(read_records(tmp_path / name)[0], tmp_path / name)
+    ]
+    assert runs[0].settings == runs[1].settings and len(newest_attempts(runs)) == 2
+    write_attempts(runs, tmp_path)
+    gathered = gather(tmp_path / "nothing", tmp_path)
+    assert gathered.everything == gathered.local == runs[:1]
+    assert gathered.second_starts == [replace(runs[1], row=runs[0].row)]
+    first, second = (replace(one, scene=SCENES[0]) for one in (*gathered.everything, *gathered.second_starts))
+    best = attempt("Dist", SCENES[0], {0: 1.0, 9: 0.01}, problem=first.problem, settings=first.settings)
+    made = Standing(Gathered([first, best], [], [], [second]))
+    (run,) = made.second_starts.itertuples()
+    assert (run.first, run.progress) == (pytest.approx(0.5), pytest.approx(-np.log10(0.2) / 2))
+    assert "more than 5 points, in the median by 15.1" in study._second_starts(made, 1.0)

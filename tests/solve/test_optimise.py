@@ -450,3 +450,14 @@ def test_the_budget_chooses_the_smallest_block_with_which_it_pays_for_forty_iter
     assert [blocks for blocks, _ in made[:-1]] == [side for side in (1, 2, 4, 8) if side <= block]
     made.clear()
     assert with_affordable_rays(replace(task, pixel_block=2), make) is made[0][1] and len(made) == 1
+
+
+def test_noise_moves_the_initial_parameters_of_a_second_start_and_nothing_else():
+    radii = []
+    for noise in (0.0, 1e-6):
+        toy, history = Toy(), History()
+        settings = OptimiserSettings(2, 1e-9, "constant", start_noise=noise)
+        optimise(toy, settings, CPU, history=history, on_step=lambda line: None)
+        radii.append(toy.radius.detach().clone())
+    change = (radii[1] - radii[0]).abs().max()
+    assert 0 < change < 1e-5

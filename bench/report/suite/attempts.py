@@ -8,7 +8,7 @@ import csv
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from io import StringIO
 from itertools import product
@@ -42,6 +42,8 @@ BUDGET_KEY = "task.optimiser.budget"
 CUSTOM = "custom"  # the preset of renderers that a user names by their class
 TUNED_PREFIX = "tuned/"  # before the name of a method with tuned settings
 TUNED_SUFFIX = ", tuned"  # after the name of a row with tuned settings
+NOISE_KEY = "task.optimiser.start_noise"
+SECOND_SUFFIX = ", second start"  # after the name of a row, for runs with noise in their initial parameters
 TUNABLE_KEYS = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"
 # A set fixes these for all renderers; tuned settings may only change TUNABLE_KEYS.
 FIXED_KEYS = ("task", "view", "evaluation", "silhouette", "field", "prior", "split", "seed")
@@ -178,12 +180,13 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     overrides = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
     changes = [text.removeprefix("renderer.") for text in overrides if re.match(r"renderer\.[^_]", text)]
     row = ", ".join([renderer_name(config, record["renderer"]), *changes])  # without the loss, which is the set's
+    suffix = TUNED_SUFFIX if tuned else SECOND_SUFFIX if setting(config, *NOISE_KEY.split(".")) else ""
     return Attempt(
         set=set_name,
         problem=", ".join([scene, *amount_texts]),
         scene=scene,
         budget=_units(set_name, setting(config, *BUDGET_KEY.split("."))),
-        row=row.removesuffix(TUNED_SUFFIX) + TUNED_SUFFIX if tuned else row,
+        row=row.removesuffix(suffix) + suffix,
         preset=record["renderer"] if tuned else record.get("method") or record["renderer"],
         status=str(record["status"]),
         reason=record["reason"],
@@ -220,7 +223,9 @@ def settings_hash(config: dict[str, Any], set_name: str, tuned: bool) -> str:
     """A hash of the settings that a set fixes, without those in which problems or tuned settings differ."""
     values = flat({key: config.get(key) for key in FIXED_KEYS})
     amount_key, *_ = PROBLEM_SETTINGS.get(set_name, ("",))
-    varying = [key for key in values if key in (amount_key, BUDGET_KEY) or (tuned and re.match(TUNABLE_KEYS, key))]
+    varying = [
+        key for key in values if key in (amount_key, BUDGET_KEY, NOISE_KEY) or (tuned and re.match(TUNABLE_KEYS, key))
+    ]
     return digest({key: str(value) for key, value in values.items() if key not in varying})
 
 
@@ -264,7 +269,7 @@ def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]
 def _write_lines(path: Path, attempts: list[Attempt]) -> Path:
     """Writes a line per attempt: text unchanged, other values as JSON."""
     text = StringIO()
-    table = csv.DictWriter(text, [field.name for field in fields(Attempt)], lineterminator="\n")
+    table = csv.DictWriter(text, [f.name for f in fields(Attempt)], lineterminator="\n")
     table.writeheader()
     for attempt in attempts:
         cells = asdict(attempt).items()
@@ -315,11 +320,15 @@ def _checked(attempt: Attempt) -> Attempt:
 
 @dataclass(frozen=True)
 class Gathered:
-    """All attempts in any order, the `local` ones of a results folder, and a message for each unreadable file."""
+    """All attempts in any order, the `local` ones of a results folder, and a message for each unreadable file.
+
+    `second_starts` are apart from both, with the names of their rows.
+    """
 
     everything: list[Attempt]
     local: list[Attempt]
     problems: list[str]
+    second_starts: list[Attempt] = field(default_factory=list)
 
     @property
     def size(self) -> str:
@@ -339,4 +348,7 @@ def gather(shipped: Path, results_dir: Path, records: Iterable[Record] = ()) -> 
         replace(attempt, row=f"{attempt.row}, yours") if attempt.preset == CUSTOM and attempt.row in names else attempt
         for attempt in local
     ]
-    return Gathered([*shipped_attempts, *local], local, [*problems, *unread])
+    first = grouped([*shipped_attempts, *local], lambda attempt: not attempt.row.endswith(SECOND_SUFFIX))
+    second_starts = [replace(run, row=run.row.removesuffix(SECOND_SUFFIX)) for run in first.get(False, ())]
+    local = [attempt for attempt in local if not attempt.row.endswith(SECOND_SUFFIX)]
+    return Gathered(first.get(True, []), local, [*problems, *unread], second_starts)

@@ -37,6 +37,7 @@ class Standing:
         self.budgets = [*self.rankings]
         ranked_rows = [row for ranked in self.rankings.values() for row in ranked.progress]
         self.rows = [*dict.fromkeys([*ranked_rows, *(row for _, row in self.cannot_run)])]
+        self.second_starts = second_starts(gathered.second_starts, self.complete)
         self.sets = [name for name in suite().errors if name in {*self.complete["set"]}]
 
     @cached_property
@@ -153,6 +154,13 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
     """The attempts whose initial error is above the reference, and their final `progress`."""
     runs = runs[(runs["initial"] > runs["reference"]) & (runs["reference"] > 0)].reset_index(drop=True)
     return runs.assign(progress=[float(progress_curve(run)[1][-1]) for run in runs.itertuples()])
+
+
+def second_starts(attempts: Iterable[Attempt], first: pd.DataFrame) -> pd.DataFrame:
+    """The second starts of compared runs with their `progress`, and as `first` that of the run itself."""
+    runs = first[[*KEY, "row", "initial", "reference", "progress"]].rename(columns={"progress": "first"})
+    newest = frame_of(attempts)[0].drop_duplicates([*KEY, "row"], keep="last")
+    return with_progress(newest.merge(runs, on=[*KEY, "row"]))
 
 
 def units(budget: float) -> str:
