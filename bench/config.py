@@ -263,8 +263,8 @@ def find_class(path: Any, name: str, packages: Sequence[str], role: type | None)
 
 
 def custom_renderer_hint(path: str) -> str:
-    """The remedy for a class of the user that replaces that of another renderer."""
-    return f"a class with arguments of its own is renderer=custom renderer._target_={path}"
+    """How to run a renderer's class of the user."""
+    return f"a class of your own is renderer=custom renderer._target_={path}"
 
 
 def _role_fault(cls: type, role: type) -> str:

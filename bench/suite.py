@@ -5,6 +5,7 @@
     python -m bench.suite renderer=custom renderer._target_=mypkg.Mine label=Mine       your own
     python -m bench.suite suite=core hydra/launcher=slurm       the large size, on a cluster
     python -m bench.suite set=pose,complete                     some sets of problems
+    python -m bench.suite budget=10                             at 10 units of cost; 1,10 is both
     python -m bench.suite setting=tuned renderer=newton         with its settings of conf/tuned.yaml, as a second row
     python -m bench.suite plan=true                             what would run, and for how long
 
@@ -23,6 +24,8 @@ from bench.records.format import MISSING, number, plural, seconds
 from bench.records.read import read_records
 from bench.records.results import RESULTS
 from bench.report.suite.attempts import (
+    BUDGET_KEY,
+    CUSTOM,
     EXPERIMENT_PREFIX,
     FIXED_KEYS,
     NOISE_KEY,
@@ -78,9 +81,10 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
         ValueError: if a size, set or setting is unknown, or the suite states the key.
     """
     options, overrides = {"suite": "quick", "set": ",".join(suite().errors), "setting": "stated"}, list[str]()
+    budgets = sorted({f"{budget:g}" for *_, budget in problems_of("core")})
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key in ("suite", "set", "setting"):
+        if key in ("suite", "set", "setting", "budget"):
             options[key] = value
         elif re.match(STATED_KEYS_PATTERN, key) and key not in AXES:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
@@ -91,8 +95,10 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
             overrides.append(argument)
         else:
             raise ValueError(f"{argument!r} is no KEY=VALUE: python -m bench.suite --help has examples")
-    for key, allowed in (("suite", suite().sizes), ("set", suite().errors), ("setting", SETTING_VALUES)):
-        for word in options[key].split(",") if key == "set" else [options[key]]:
+    options.setdefault("budget", ",".join(budgets) if options["suite"] == "core" else budgets[0])
+    allowed_words = {"suite": suite().sizes, "set": suite().errors, "setting": SETTING_VALUES, "budget": budgets}
+    for key, allowed in allowed_words.items():
+        for word in options[key].split(",") if key in ("set", "budget") else [options[key]]:
             if word not in allowed:
                 raise ValueError(f"unknown {key} {word!r}{nearest(word, [*allowed])}")
     return options, overrides
@@ -110,7 +116,8 @@ def _expected_runtime(options: dict[str, str], presets: list[str]) -> str:
     """
     shipped = read_attempts(paper.SHIPPED)[0]
     shipped = [attempt for attempt in shipped if attempt.preset in presets] or shipped
-    keys = {key for key in problems_of(options["suite"]) if key[0] in options["set"].split(",")}
+    problems = {key[:2] for key in problems_of(options["suite"]) if key[0] in options["set"].split(",")}
+    keys = [(*key, float(budget)) for key in problems for budget in options["budget"].split(",")]
     spent, costs = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for attempt in shipped:
         if attempt.ok and attempt.seconds is not None and not attempt.tuned:
@@ -148,7 +155,9 @@ def _sweeps(options: dict[str, str], overrides: list[str]) -> list[tuple[str, li
     others = [text for text in overrides if not text.startswith("renderer=")]
     for position, name in enumerate(sets, 1):
         title = f"set {position} of {len(sets)}: {name}"
+        budgets = ",".join(f"{float(budget) * suite().units[name]:.1e}" for budget in options["budget"].split(","))
         keys = [f"+experiment={EXPERIMENT_PREFIX}{name}", f"sizes.chosen={suite().sizes[options['suite']]}"]
+        keys.append(f"{BUDGET_KEY}={budgets}")
         if options["setting"] == "stated":
             sweeps.append((title, [*keys, *overrides]))
             continue
@@ -234,7 +243,10 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
         print(f"{row}: {plural(count, 'run')} with other settings than the set's, not compared.")
     for (budget, row), missing in standing.lacking.items():
         lacks = f"{row} lacks {plural(missing, 'problem')} at {units(budget)}"
-        print(f"{lacks}, so it is not compared there: run all sets{' with suite=core' if budget > 1 else ''}.")
+        print(f"{lacks}, so it is not compared there: run all sets with budget={budget:g}.")
+    versions = standing.complete[standing.complete["preset"] == CUSTOM].groupby("row")["code"].nunique()
+    for row, count in versions[versions > 1].items():
+        print(f"{row} has runs of {count} versions of the code: run all sets again.")
 
 
 def _print_errors(standing: Standing, local_rows: set[str]) -> None:

@@ -28,7 +28,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from bench.config import CLASS_PACKAGE_KEY, Config, type_of, wrong_type_message
+from bench.config import CLASS_PACKAGE_KEY, Config, custom_renderer_hint, type_of, wrong_type_message
 from bench.records.folder import planned_run, resolve_config
 from bench.records.results import PlannedRun
 from bench.runner.library import OPTIONAL_GROUPS
@@ -184,8 +184,9 @@ def unknown_choice(group: str, name: str, options: Sequence[str]) -> ValueError:
     """The error for an unknown choice, with similar choices."""
     text = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
     mesh_hint = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
+    class_hint = f"; {custom_renderer_hint('mypkg.Mine')}" if group == "renderer" else ""
     hint = nearest(name, [option for option in options if not option.startswith("_")])  # choices with _ are only bases
-    return ValueError(text + hint + (mesh_hint if "/" in name or "." in name else ""))
+    return ValueError(text + hint + (mesh_hint if "/" in name or "." in name else class_hint))
 
 
 def unknown_key(key: str, config: DictConfig) -> ValueError:

@@ -246,7 +246,7 @@ def _budget_problem(curve: list[dict[str, Any]], is_spent: bool) -> str:
     if not is_spent or iterations >= MIN_BUDGET_ITERATIONS:
         return ""
     few = f"{TOO_EXPENSIVE} {iterations} iterations, fewer than {MIN_BUDGET_ITERATIONS}"
-    return f"{few}: set task.optimiser.budget={MIN_BUDGET_ITERATIONS * cost / iterations:.2g} or more"
+    return f"{few}: these need {MIN_BUDGET_ITERATIONS * cost / iterations:.2g} field evaluations"
 
 
 @torch.no_grad()

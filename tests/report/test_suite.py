@@ -307,7 +307,7 @@ def test_rows_are_compared_at_the_least_size_where_one_of_ones_own_lacks_more(mo
         return Gathered([], local, []).size
 
     assert size() == size(("A", 8)) == size(("A", 5)) == size(("A", 8), ("B, tuned", 1)) == "quick"
-    assert size(("A", 3)) == size(("A", 8), ("B", 1)) == "smoke"
+    assert size(("A", 8), ("B", 1)) == "quick" and size(("A", 3), ("B", 1)) == "smoke"
 
 
 def test_more_problems_of_ones_own_and_of_dist_leave_the_shipped_rows_compared(monkeypatch):
@@ -350,7 +350,7 @@ def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alon
     "argument, said",
     [("suite=large", "unknown suite 'large'"), ("setting=tunde", "did you mean tuned"),
      ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
-     ("seed=1", "is stated by the suite"),
+     ("budget=5", "unknown budget '5': it has 1, 10"), ("seed=1", "is stated by the suite"),
      ("task.optimiser.budget=5e5", "is stated by the suite"),
      ("scale=smoke", "is stated by the suite"), ("+dataset.radius=.5", "is stated by the suite"),
      ("models.size=free", "is stated by the suite")],
@@ -372,7 +372,13 @@ def test_a_label_of_a_shipped_row_is_refused(tmp_path, monkeypatch):
 def test_what_is_not_its_own_is_passed_on():
     given = ["renderer=custom", "renderer._target_=a.B", "label=Mine", "dataset=sofa", "task.points=20"]
     own, passed = parse_arguments(["suite=core", *given])
-    assert own["suite"] == "core" and passed == given
+    assert (own["suite"], own["budget"]) == ("core", "1,10") and passed == given
+
+
+@each("given, budgets", [([], "4.0e+05"), (["budget=10"], "4.0e+06"), (["suite=core"], "4.0e+05,4.0e+06")])
+def test_a_sweep_has_the_chosen_budgets_in_units_of_its_set(given, budgets):
+    ((_, keys),) = _sweeps(*parse_arguments(["set=complete", *given]))
+    assert f"task.optimiser.budget={budgets}" in keys
 
 
 def test_a_tuned_row_changes_no_comparison_and_has_lines_in_its_sets(tmp_path, monkeypatch):
@@ -594,12 +600,14 @@ def test_the_expected_runtime_is_that_of_the_shipped_rows_at_the_budgets_of_the_
     write_attempts([replace(one, set=name) for name in suite().errors for one in made([("A", 0.1, 9.0)])], tmp_path)
     monkeypatch.setattr("bench.report.write.paper.SHIPPED", tmp_path)
     write_attempts([replace(one, set="pose") for one in made([("B", 0.1, 9.0)])], tmp_path)
-    quick = _expected_runtime({"suite": "quick", "set": "pose,complete"}, [])  # 36 runs of 1 unit, of a second each
+    quick = _expected_runtime(
+        {"suite": "quick", "set": "pose,complete", "budget": "1"}, []
+    )  # 36 runs of 1 unit, of a second each
     assert quick == "36 runs of each renderer; the shipped ones need about 108 s (A) of one processor"
-    assert "72.0 s (B) of" in _expected_runtime({"suite": "quick", "set": "pose"}, ["b"])
+    assert "72.0 s (B) of" in _expected_runtime({"suite": "quick", "set": "pose", "budget": "1"}, ["b"])
     seconds = 168 * (2 + 1) + 168 * (2 + 10)
     assert f"{seconds / 60:.1f} min (A)" in _expected_runtime(
-        {"suite": "core", "set": ",".join(suite().errors)}, ["new"]
+        {"suite": "core", "set": ",".join(suite().errors), "budget": "1,10"}, ["new"]
     )
 
 

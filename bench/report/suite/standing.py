@@ -84,8 +84,8 @@ def dist_row(runs: pd.DataFrame) -> str:
 def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
     """The newest attempt of each row on the problems that all complete rows have at the same budget.
 
-    A row is complete at a budget if it has the problems of that size of the suite. If DIST lacks one of them, or the
-    size has none at that budget, it needs all of DIST's. The budget must also pay for enough iterations in at least
+    A row is complete at a budget if it has the problems of that size of the suite, at whichever budget the size has
+    them. If DIST lacks one of them, it needs all of DIST's. The budget must also pay for enough iterations in at least
     half of the problems of each set. Other rows stay in the frame, but are not compared.
 
     Args:
@@ -108,8 +108,8 @@ def _compared_at_budget(runs: pd.DataFrame, wanted: set[tuple[Any, ...]]) -> pd.
     keys = pd.Series([*zip(*(runs[name] for name in KEY), strict=True)], runs.index, dtype=object)
     rows = {row: {*group} for row, group in keys.groupby(runs["row"])}
     reachable = rows.get(dist_row(runs), {*keys})
-    wanted = {key for key in wanted if key[-1] == runs["budget"].iloc[0]}
-    needed = wanted if wanted and wanted <= reachable else reachable
+    wanted = {(*key[:2], runs["budget"].iloc[0]) for key in wanted}
+    needed = wanted if wanted <= reachable else reachable
     missing = runs["row"].map({row: len(needed - problems) for row, problems in rows.items()})
     few = runs["reason"].str.startswith(TOO_EXPENSIVE).groupby([runs["row"], runs["set"]]).mean()
     sets = {row: ", ".join(of_set for _, of_set in group.index) for row, group in few[few > 0.5].groupby("row")}
