@@ -2,7 +2,10 @@
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +13,16 @@ from bench.records import format
 from bench.records.metrics import HIGHER, LOWER, TABLE_METRICS, Metric, better_direction
 from bench.records.names import differences
 from bench.records.read import not_run_record, read_plans
+from bench.records.record import as_number
 from bench.records.results import Plan, read_run
 from bench.report.data import records
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
+from bench.report.write import chart
 from bench.report.write.caption import FEW, VARYING
-from bench.report.write.chart import Panel, panel_data, series
+from bench.report.write.chart import Panel, Series
 from bench.report.write.paper import RECORD_ERRORS, SWEEPS, TABLE, studies
 from bench.report.write.result import Result, write
 from bench.report.write.table import Column, count_with_interval, ends, text
@@ -26,9 +31,16 @@ ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # after a heading: the better 
 MAX_LISTED_VALUES = 6  # per swept key
 MAX_DATASET_COLUMNS = 8
 MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `TABLE_METRICS`
+COST, RUNTIME = "field evaluations (a gradient counts as two)", "runtime of the loop (s)"
+PANEL_HEIGHT_INCHES, LEGEND_HEIGHT_INCHES = 2.3, 0.6
+AVERAGED_KEYS = ("index", "seed", "dataset")  # a sweep over their numbers is no axis of a chart
 FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
+)
+CHART = (
+    "A small point is a run, a large one the median of a row. Grey steps: the front, of the rows for which no other is "
+    "both cheaper and better. A cross: half of the runs or more failed."
 )
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
@@ -37,13 +49,16 @@ UNDIRECTED = "Of metrics of which neither direction is better, medians are of th
 class Sweep:
     """The runs of a sweep, one per planned cell, each with the name of its row; and the swept keys with their values.
 
-    `missing` is the number of cells that were not run, or killed. They are in `runs` only if no cell ended.
+    `missing` is the number of cells that were not run, or killed. They are in `runs` only if no cell ended. `axis` is
+    the only swept setting that is a number, if there is one. Each run has its value as `position`, and the name of
+    its row without it as `curve`.
     """
 
     name: str
     swept: dict[str, list[str]]
     runs: Runs
     missing: int
+    axis: str
 
     @property
     def metrics(self) -> list[str]:
@@ -100,10 +115,14 @@ def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
     swept = {key: values for key, values in swept.items() if len(values) > 1}
     overrides = [{key: values[key] for key in values if key in swept} for values in overrides]
     names = differences(runs, distinguished_by=_average_key, swept=overrides)
-    runs = [run | {"row": name} for run, name in zip(runs, names, strict=True)]
+    numeric = [key for key, texts in swept.items() if key not in AVERAGED_KEYS and all(map(_number, texts))]
+    axis = numeric[0] if len(numeric) == 1 else ""
+    runs = [run | {"position": _number(values.get(axis, ""))} for run, values in zip(runs, overrides, strict=True)]
+    curves = differences(runs, distinguished_by=lambda run: (_average_key(run), run["position"]), swept=overrides)
+    runs = [run | {"row": name, "curve": curve} for run, name, curve in zip(runs, names, curves, strict=True)]
     selection = Selection(plan.cells[0].config.get("experiment") or "", setup=("scenes", "pixels", "machine"))
     ended = [run for run in runs if run["status"] not in UNFINISHED]
-    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or runs), len(runs) - len(ended))
+    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or runs), len(runs) - len(ended), axis)
 
 
 def lines(sweep: Sweep) -> list[dict[str, Any]]:
@@ -184,8 +203,9 @@ def table_of(sweep: Sweep) -> Result:
     kinds = ["95 % bootstrap intervals over shapes" if any(has_interval) else ""]
     kinds += [] if all(has_interval) else [f"{FEW}: no interval"]
     lead = names[0] if names and names[0] in headings and better_direction(names[0]) else ""
-    dataset_by_key = {_on(lead, dataset): dataset for dataset in sweep.datasets} or {lead: ""}
-    panels = [_panel(table_lines, key, title, headings[lead]) for key, title in dataset_by_key.items()] if lead else []
+    panels = [_panels(sweep, dataset, lead, headings[lead]) for dataset in sweep.datasets or [""]] if lead else []
+    rows = sum(map(bool, panels))
+    panels, height = [*chain(*panels)], PANEL_HEIGHT_INCHES * rows + LEGEND_HEIGHT_INCHES
     return Result(
         sweep.runs,
         f"Sweep {sweep.name}.",
@@ -193,7 +213,8 @@ def table_of(sweep: Sweep) -> Result:
         **_answer(sweep, table_lines, lead, headings),
         n=f"{len(sweep.runs.records)} runs" if stress else "",
         interval="; ".join(filter(None, kinds)) if headings else "",
-        chart={"panels": panels} if panels else None,
+        figure=chart.draw(panels, height, rows, legend=3) if panels else None,
+        chart={"panels": panels, "note": CHART} if panels else None,
         remarks=(
             FAILURE,
             f"Left out: {sweep.missing} that were not run; the same command runs them." if sweep.missing else "",
@@ -206,14 +227,48 @@ def table_of(sweep: Sweep) -> Result:
     )
 
 
-def _panel(lines: list[dict[str, Any]], key: str, title: str, shown: Metric) -> Panel:
-    """A panel with a row per line: its median and interval along x."""
-    panel_series = [
-        series(line["row"], line["preset"], [line[key].times(shown.factor)], [position])
-        for position, line in enumerate(lines)
-        if line[key] is not None
+def _panels(sweep: Sweep, dataset: str, lead: str, metric: Metric) -> list[Panel]:
+    """The first metric over the swept number, if there is one, and over each cost that the runs have."""
+    runs = [run for run in sweep.runs.records if not dataset or records.family(run) == dataset]
+    axes = {COST: records.cost} | ({RUNTIME: records.loop_seconds} if sweep.runs.timed else {})
+    if sweep.axis:
+        axes = {sweep.axis: lambda run: run["position"]} | axes
+    costs = (COST, RUNTIME) if not sweep.axis or sweep.axis.startswith("renderer.") else ()  # of the same problem
+    panels = [
+        _panel(runs, (dataset, title), number_of, (lead, metric), title in costs) for title, number_of in axes.items()
     ]
-    return panel_data(title, shown.label, "", panel_series, rows=[line["row"] for line in lines])
+    return [panel for panel in panels if panel["series"]]
+
+
+def _panel(
+    runs: list[Record],
+    titles: tuple[str, str],
+    number_of: Callable[[Record], float | None],
+    lead: tuple[str, Metric],
+    has_front: bool,
+) -> Panel:
+    """A point per row, joined along the swept number; the initial error; the front if less is better."""
+    (dataset, title), (key, metric) = titles, lead
+    curves, fronts = list[Series](), list[Series]()
+    for name, of_curve in grouped(runs, lambda run: run["curve"]).items():
+        rows = grouped(of_curve, lambda run: run["row"]).values()
+        pairs = [(records.median_or_none(map(number_of, of_row)), median_of(of_row, key)) for of_row in rows]
+        points = [(x, estimate.times(metric.factor)) for x, estimate in pairs if x is not None and estimate is not None]
+        pairs = [(number_of(run), measured(run, key)) for run in of_curve if run["status"] == "ok"]
+        dots = [[x, metric.factor * value] for x, value in pairs if x is not None and value is not None]
+        if points:
+            make = chart.curve if len(points) > 1 else chart.series
+            preset = records.row_of(of_curve[0]).preset
+            curves.append(make(name, preset, *zip(*sorted(points, key=itemgetter(0)), strict=True), shapes=dots))
+    positions = [x for each in curves for x in each["x"]]
+    starts = [as_number(run["metrics_start"].get(key)) for run in runs]
+    initial = records.median_or_none(starts)
+    if curves and has_front and metric.better == LOWER:
+        fronts.append(chart.front(positions, [y for each in curves for y in each["y"]]))
+    if curves and initial is not None and math.isfinite(initial):
+        span = [x for dots in curves for x, _ in dots["shapes"]] or positions
+        fronts.append(chart.level("initial value, median", span, metric.factor * initial, dash="--"))
+    return chart.panel_data(dataset, title, metric.label, [*fronts, *curves])
 
 
 def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict[str, Metric]) -> dict[str, str]:
@@ -281,6 +336,14 @@ def _listed(sweep: Sweep) -> str:
         for key, values in sweep.swept.items()
     ]
     return ", ".join(key_texts) or "nothing"
+
+
+def _number(value: str) -> float | None:
+    """The number that a text is; None for other texts."""
+    try:
+        return float(value)
+    except ValueError:
+        return None
 
 
 def _override_values(overrides: list[str]) -> dict[str, str]:

@@ -59,6 +59,8 @@ def print_sweep_summary(plan: Plan, index: Path, table: Path | None = None) -> l
         print(f"first failure: {index.parent / 'runs' / record['folder']} ({record['status']}: {record['reason']})")
     if table is not None:
         print(f"table of this sweep: {table}")
+        if (picture := table.with_suffix(".png")).is_file():
+            print(f"error over cost: {picture}")
     print(f"report: {index}")
     _print_contract_test(index.parent / "runs", [record for record in records if record and not record["reused"]])
     _print_report_command(index.parent)

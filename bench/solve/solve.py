@@ -33,6 +33,7 @@ COST_DEFINITIONS = {
     "evaluations.masked": "not in these: points of rays that had ended, whose values were computed and thrown away, "
     "since a march on a GPU looks every eight steps only which rays go on; absent without any",
     "evaluations.gradient": "points through whose field value a gradient other than zero was propagated back",
+    "evaluations.cost": "field evaluations: those of value, twice those of gradient, and an eighth of coarse ones",
     "evaluations.observed": "pixels whose depth was given",
     "evaluations.per_ray": "value evaluations divided by rays times iterations",
     "evaluations.work_over_bound": "the operations of all evaluations, divided by those of one value and one gradient "
@@ -279,7 +280,7 @@ def note_costs(
 
 def evaluation_counts(counts: Counts, field: Field) -> dict[str, float]:
     """The evaluation counts of a field for the record; "work_over_bound" only with hits."""
-    numbers: dict[str, float] = {"value": counts.value, "gradient": counts.gradient}
+    numbers: dict[str, float] = {"value": counts.value, "gradient": counts.gradient, "cost": counts.cost}
     numbers |= {name: number for name in ("coarse", "masked") if (number := getattr(counts, name))}
     if (over_bound := counts.over_bound(field)) is not None:
         numbers["work_over_bound"] = over_bound

@@ -191,8 +191,7 @@ def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
         look = {"text": [*map(_hover, settings)], "link": links, "size": 11}
         look |= {"hollow": True} if dominated else {}
         drawn.append(chart.series(names[renderer], renderer, *([p[key] for p in settings] for key in axes), **look))
-    line = {"colour": chart.REFERENCE_COLOUR, "symbol": "", "dash": "-", "step": True, "quiet": True}
-    drawn.append(chart.series("front", "", *([p[key] for p in _front(panel)] for key in axes), **line))
+    drawn.append(chart.front(*([p[key] for p in panel] for key in axes)))
     return chart.panel_data(trial.title, "time (seconds)", trial.heading, drawn, height=440)
 
 

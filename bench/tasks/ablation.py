@@ -60,6 +60,7 @@ DEFINITIONS = {
     "backward_seconds": "the backward pass of a step",
     "repeats": "how often a step was timed",
     "evaluations.value, evaluations.gradient": "as step_queries and step_gradients",
+    "evaluations.cost": "field evaluations of a step: a gradient counts as two, a coarse value as an eighth",
     "evaluations.per_ray": "queries divided by rays",
     "evaluations.work_over_bound": "the operations of a step, divided by those of one value and one gradient per hit; "
     "absent without hits",

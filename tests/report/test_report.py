@@ -37,7 +37,7 @@ def record(name: str, **changed) -> dict:
         "metrics": metrics,
         "metrics_start": {**metrics, "chamfer_l2": 0.0456},
         "definitions": {"chamfer_l2": "Sum of two means.", "fscore": "Harmonic mean."},
-        "evaluations": {"value": 1_430_000, "gradient": 999, "per_ray": 21.5},
+        "evaluations": {"value": 1_430_000, "gradient": 999, "cost": 1_431_998, "per_ray": 21.5},
         "seconds": {"warmup": 0.5, "forward": 10.0, "backward": 20.0, "evaluation": 1.0, "total": 31.5},
         "peak_memory_bytes": 2_500_000_000,
         "flops": 1e12,

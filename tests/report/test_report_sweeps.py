@@ -11,7 +11,7 @@ import pytest
 from bench.records.read import read_plans, read_records
 from bench.records.results import Plan, PlannedRun
 from bench.report.__main__ import main as report
-from bench.report.sweeps import lines, of_plan, write_sweep, write_sweeps
+from bench.report.sweeps import COST, RUNTIME, lines, of_plan, write_sweep, write_sweeps
 from bench.report.write.html import ASSETS
 from bench.report.write.paper import find_sweeps
 from tests.report.test_report import record, write_run
@@ -84,8 +84,12 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     )
     assert "n = 5 runs (3 shapes, 1 seed); fewer than six shapes: no interval." in shown.caption
     panels = shown.chart["panels"]
-    assert [panel["title"] for panel in panels] == ["sofa", "plane"] and panels[0]["rows"] == ["DIST", "DVR"]
-    assert [(one["x"], one["y"]) for one in panels[1]["series"]] == [([4.0], [0.0]), ([2.0], [1.0])]
+    assert [panel["title"] for panel in panels] == ["sofa", "sofa", "plane", "plane"]
+    assert [panel["x"]["title"] for panel in panels[:2]] == [COST, RUNTIME]
+    series = {each["name"]: each for each in panels[2]["series"]}
+    assert [*series] == ["front", "initial value, median", "DIST", "DVR"]
+    assert (series["DVR"]["y"], series["DVR"]["shapes"]) == ([2.0], [[1_431_998, 2.0]])
+    assert series["front"]["y"] == [2.0]
     text, tex = ((found.base.with_suffix(suffix)).read_text() for suffix in (".md", ".tex"))
     assert "| DIST | **1.00** | 4.00 |" in text and r"& \textbf{\boldmath 1.00} & 4.00 &" in tex and "(n = " not in text
 
@@ -186,7 +190,9 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     (found,) = find_sweeps(tmp_path)
     assert (found.name, found.shown.title) == ("completion-1", "Sweep completion-1.")
     assert found.shown.columns[:2] == ["Run", "Chamfer (x1000) ↓"] and found.shown.rows[0][:2] == ["DIST", "1.00"]
-    assert found.files == {suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "tex")}
+    assert found.files == {
+        suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "pdf", "tex")
+    }
     within = re.search(r"WITHIN = /(.*)/;", (ASSETS / "base" / "dom.js").read_text())
     assert within and all(re.fullmatch(within[1], link) for link in found.files.values())  # the page links to them
     assert r"\label{tab:completion-1}" in (folder / "table.tex").read_text()

@@ -123,7 +123,7 @@ def test_the_record_has_the_settings_and_the_machine(finished):
 def test_every_metric_has_an_initial_value_a_final_value_and_a_definition(finished):
     record = finished.record
     assert set(record["metrics"]) == set(record["metrics_start"]) == METRICS
-    costs = {f"evaluations.{name}" for name in ("value", "gradient", "per_ray", "work_over_bound")}
+    costs = {f"evaluations.{name}" for name in ("value", "gradient", "cost", "per_ray", "work_over_bound")}
     assert set(record["definitions"]) >= METRICS | costs | {f"seconds.{name}" for name in record["seconds"]}
     assert all(len(text) > 20 for text in record["definitions"].values())
     assert all(isinstance(value, float) and np.isfinite(value) for value in record["metrics"].values())
@@ -154,6 +154,7 @@ def test_evaluations_add_up(finished):
     assert evaluations["gradient"] == last["gradient_evaluations"] > 0
     assert evaluations["per_ray"] == pytest.approx(evaluations["value"] / PIXELS**2 / ITERATIONS)
     assert evaluations["per_ray"] < 10
+    assert evaluations["cost"] == evaluations["value"] + 2 * evaluations["gradient"] == last["cost"]
     hits = (evaluations["value"] + evaluations["gradient"]) / 2 / evaluations["work_over_bound"]
     assert hits == pytest.approx(round(hits))  # a value and a gradient of the network take equally many operations
     assert 0 < hits < evaluations["rays_per_iteration"] * ITERATIONS

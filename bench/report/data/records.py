@@ -92,6 +92,11 @@ def value_evaluations(record: Record) -> float | None:
     return None if value is None else value + record["evaluations"].get("coarse", 0)
 
 
+def cost(record: Record) -> float | None:
+    """The number of field evaluations in the loop, where a gradient counts as two; None if it is not recorded."""
+    return as_number(record["evaluations"].get("cost"))
+
+
 def median_or_none(values: Iterable[float | None]) -> float | None:
     """The median of the values that are not None; None without any."""
     numbers = [value for value in values if value is not None]

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pictures import figure_style, style
-from bench.report.data.statistics import Interval
+from bench.report.data.statistics import Interval, dominated
 
 REFERENCE_COLOUR = "#777777"
 Series = dict[str, Any]
@@ -57,6 +57,14 @@ def level(name: str, x: Iterable[float], value: float, **more: Any) -> Series:
     """A grey horizontal line at a value, from the smallest to the largest position."""
     ends = [min(places := list(x)), max(places)]
     return {"name": name, "x": ends, "y": [value, value], "colour": REFERENCE_COLOUR, "symbol": "", "dash": "-", **more}
+
+
+def front(x: Iterable[float], y: Iterable[float]) -> Series:
+    """The line of the front of points: those for which no other point is smaller in both."""
+    points = np.array([pair for pair in zip(x, y, strict=True) if all(map(math.isfinite, pair))]).reshape(-1, 2)
+    points = points[~dominated(*points.T)] if len(points) else points
+    line = {"symbol": "", "dash": "-", "step": True, "quiet": True}
+    return series("front", "", *points[points[:, 0].argsort()].T.tolist(), **line) | {"colour": REFERENCE_COLOUR}
 
 
 def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) -> Panel:
