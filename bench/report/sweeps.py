@@ -1,6 +1,7 @@
 """The table and chart of each sweep that no study shows: medians over shapes and seeds, failures and costs."""
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
 from bench.report.data.runs import Runs, Selection
 from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
+from bench.report.suite.attempts import portable_overrides
 from bench.report.write import chart
 from bench.report.write.caption import FEW, VARYING
 from bench.report.write.chart import Panel, Series
@@ -38,10 +40,9 @@ FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
-CHART = (
-    "A small point is a run, a large one the median of a row. Grey steps: the front, of the rows for which no other is "
-    "both cheaper and better. A cross: half of the runs or more failed."
-)
+POINTS = "A point is the median of a row. "
+SMALL_POINTS = "In the figure, small points are runs, and a cross is a row of which half of the runs or more failed."
+FRONT = "Grey steps: the front, of the rows for which no other is both cheaper and better."
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
 
@@ -59,6 +60,7 @@ class Sweep:
     runs: Runs
     missing: int
     axis: str
+    command: str
 
     @property
     def metrics(self) -> list[str]:
@@ -119,10 +121,12 @@ def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
     axis = numeric[0] if len(numeric) == 1 else ""
     runs = [run | {"position": _number(values.get(axis, ""))} for run, values in zip(runs, overrides, strict=True)]
     curves = differences(runs, distinguished_by=lambda run: (_average_key(run), run["position"]), swept=overrides)
+    command = shlex.join(["python", "-m", "bench", "-m", *_command_overrides(plan, swept)])
     runs = [run | {"row": name, "curve": curve} for run, name, curve in zip(runs, names, curves, strict=True)]
     selection = Selection(plan.cells[0].config.get("experiment") or "", setup=("scenes", "pixels", "machine"))
     ended = [run for run in runs if run["status"] not in UNFINISHED]
-    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or runs), len(runs) - len(ended), axis)
+    missing = len(runs) - len(ended)
+    return Sweep(plan.name, swept, Runs(selection, plan.results_dir, ended or runs), missing, axis, command)
 
 
 def lines(sweep: Sweep) -> list[dict[str, Any]]:
@@ -206,16 +210,20 @@ def table_of(sweep: Sweep) -> Result:
     panels = [_panels(sweep, dataset, lead, headings[lead]) for dataset in sweep.datasets or [""]] if lead else []
     rows = sum(map(bool, panels))
     panels, height = [*chain(*panels)], PANEL_HEIGHT_INCHES * rows + LEGEND_HEIGHT_INCHES
+    has_front = any(each["name"] == "front" for panel in panels for each in panel["series"])
     return Result(
         sweep.runs,
         f"Sweep {sweep.name}.",
         f"Medians over {VARYING}; swept over {_listed(sweep)}.",
         **_answer(sweep, table_lines, lead, headings),
+        command=sweep.command,
+        folders={row: [run["folder"] for run in runs] for row, runs in grouped(sweep.runs.records, _row).items()},
         n=f"{len(sweep.runs.records)} runs" if stress else "",
         interval="; ".join(filter(None, kinds)) if headings else "",
         figure=chart.draw(panels, height, rows, legend=3) if panels else None,
-        chart={"panels": panels, "note": CHART} if panels else None,
+        chart={"panels": panels, "note": POINTS + FRONT * has_front} if panels else None,
         remarks=(
+            SMALL_POINTS if panels else "",
             FAILURE,
             f"Left out: {sweep.missing} that were not run; the same command runs them." if sweep.missing else "",
             UNDIRECTED if any(not better_direction(name) for name in headings) else "",
@@ -336,6 +344,20 @@ def _listed(sweep: Sweep) -> str:
         for key, values in sweep.swept.items()
     ]
     return ", ".join(key_texts) or "nothing"
+
+
+def _command_overrides(plan: Plan, swept: dict[str, list[str]]) -> list[str]:
+    """The overrides of a sweep's command: a swept key has all its values. Without the results folder."""
+    overrides = dict[str, str]()
+    for override in portable_overrides(override for cell in plan.cells for override in cell.overrides):
+        key = override.partition("=")[0]
+        values = swept.get(key.lstrip("+"))
+        overrides[key] = f"{key}={','.join(values)}" if values else override
+    return [*overrides.values()]
+
+
+def _row(record: Record) -> str:
+    return record["row"]
 
 
 def _number(value: str) -> float | None:

@@ -203,7 +203,8 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
         content_by_key[key] = {
             **{"caption": f"{shown.head} {shown.caption}".strip(), "notes": shown.notes, "header": shown.columns},
             **{"rows": shown.rows + _shipped_rows(page, results_dir), "files": page.files, "picture": page.picture},
-            **{"chart": shown.chart, "atlas": shown.atlas, "best": shown.best},
+            **{"command": shown.command, "folders": shown.folders, "best": shown.best},
+            **{"chart": shown.chart, "atlas": shown.atlas},
         }
     return entries, content_by_key
 

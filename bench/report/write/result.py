@@ -70,6 +70,8 @@ class Result:
         plotted: what is plotted, as a sentence.
         question: as a reader would ask it; empty for a page of pictures.
         verdict: the answer, one sentence with its numbers between asterisks; empty if the runs do not give it.
+        command: the command that makes the runs; empty if it is that of the experiment.
+        folders: the folders of the runs by the text of a line's first cell, for the links of the page.
         n: the sample as text; by default the numbers of runs, shapes and seeds.
         interval: the kind of interval; empty for none.
         estimates: the shown estimates, which may lack an interval; empty if every interval exists.
@@ -87,6 +89,8 @@ class Result:
     plotted: str
     question: str = ""
     verdict: str = ""
+    command: str = ""
+    folders: dict[str, list[str]] = field(default_factory=dict)
     n: str = ""
     interval: str = ""
     estimates: Iterable[Interval] = ()
@@ -137,6 +141,8 @@ class Result:
             question=self.question,
             verdict=caption.SMOKE_WARNING if self.verdict and caption.has_smoke_runs(self.runs) else self.verdict,
             caption=self.caption,
+            command=self.command,
+            folders=self.folders,
             columns=list(self.table),
             rows=self.table.to_numpy().tolist(),
             best=best(self.shown_columns, self.lines),
@@ -157,6 +163,8 @@ class Shown:
     question: str = ""
     verdict: str = ""
     caption: str = ""
+    command: str = ""
+    folders: dict[str, list[str]] = field(default_factory=dict)
     columns: list[str] = field(default_factory=list)
     rows: list[list[str]] = field(default_factory=list)
     best: list[list[int]] = field(default_factory=list)  # the row and the column of each bold cell
@@ -184,7 +192,7 @@ class Shown:
 
     def to_json(self) -> str:
         """The content as JSON, a line per part; infinite numbers of a chart become null."""
-        parts = {key: value for key, value in asdict(self).items() if value not in ("", [], None, False)}
+        parts = {key: value for key, value in asdict(self).items() if value not in ("", [], {}, None, False)}
         encoded = {key: json.dumps(to_json_values(value), ensure_ascii=False) for key, value in parts.items()}
         lines = [f"{json.dumps(JSON_KEYS.get(key, key))}: {text}" for key, text in encoded.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
@@ -204,6 +212,8 @@ def read_shown(path: Path) -> Shown:
 def _is_valid(name: str, value: Any) -> bool:
     if name in ("chart", "atlas"):
         return isinstance(value, dict)
+    if name == "folders":
+        return isinstance(value, dict) and all(_is_valid("columns", folders) for folders in value.values())
     if name == "rows":
         return isinstance(value, list) and all(_is_valid("columns", row) for row in value)
     if name == "best":
@@ -254,6 +264,8 @@ def markdown(shown: Shown, name: str) -> str:
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows)))
     if shown.drawn:
         parts.append(f"![{as_markdown(shown.title)}]({name}.png)")
+    if shown.command:
+        parts.append(f"    {_flat(shown.command)}")
     if shown.notes:
         parts.append("\n".join(f"- {as_markdown(note)}" for note in shown.notes))
     return "\n\n".join(parts) + "\n"

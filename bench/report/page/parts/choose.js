@@ -11,10 +11,12 @@
     const columns = ["task", ...Object.keys(FILTERS), ...LINKED].filter((column) => query[column]);
     const wanted = columns.map((column) => [column, runs.codes(column), runs.values(column).indexOf(query[column])]);
     const counts = Object.fromEntries(Object.keys(FILTERS).map((column) => [column, new Map()]));
+    const folders = query.folders && new Set(query.folders.split(","));
     const words = (query.q || "").toLowerCase().split(/\s+/).filter(Boolean);
     const indices = [];
     for (let index = 0; index < runs.count; index++) {
       const missed = wanted.filter(([, codes, code]) => codes[index] !== code);
+      if (folders && !folders.has(runs.folder(index))) continue;
       if (missed.length > 1 || !words.every((word) => runs.words(index).includes(word))) continue;
       if (!missed.length) indices.push(index);
       for (const column of missed.length ? [missed[0][0]] : Object.keys(FILTERS)) {

@@ -72,11 +72,11 @@
 
   /* The active filters, each with a button that removes it. */
   function chipsOf(state, change) {
-    const set = [...LINKED, ...Object.keys(FILTERS), "q"].filter((column) => state[column]);
+    const set = [...LINKED, ...Object.keys(FILTERS), "q", "folders"].filter((column) => state[column]);
     const chip = (column) => {
-      const label = `Remove the filter ${state[column]}`;
+      const text = column === "folders" ? plural(state.folders.split(",").length, "run") : state[column];
       const click = () => change({[column]: ""});
-      return element("button.chip", {type: "button", "aria-label": label, click}, `${state[column]} ×`);
+      return element("button.chip", {type: "button", "aria-label": `Remove the filter ${text}`, click}, `${text} ×`);
     };
     const clear = () => change(Object.fromEntries(set.map((column) => [column, ""])));
     return [set.map(chip), set.length > 1 && element("button.chip.plain", {type: "button", click: clear}, "Clear all")];

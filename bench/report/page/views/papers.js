@@ -1,8 +1,8 @@
-/* The first screen: the suite's verdict, chart and table, sweeps and leaderboards; all tables; and the page of a table. */
+/* The first screen: the newest sweep, or the suite; sweeps and leaderboards; all tables; and the page of a table. */
 (function (bench) {
   "use strict";
 
-  const {element, fill, section, details, list, later, choice, emphasised} = bench.dom;
+  const {element, fill, section, details, list, later, choice, copied, emphasised} = bench.dom;
   const SUITE = "suite";
   const STANDING = {named: "Renderer", link: (row) => bench.address.to(["renderer", row])};
   const link = ({name}) => bench.address.to(["table", name]);
@@ -12,11 +12,13 @@
   function overview(home, query) {
     const [suite, sweeps] = [find(SUITE), all().filter(({sweep}) => sweep)];
     const boards = element("section", {"aria-labelledby": "board"});
+    const [newest] = sweeps;
+    const first = newest ? (data) => parts(newest, data) : answer;
+    const shown = newest || suite;
     fill(home,
-      suite
-        ? [heading(suite), later(bench.store.load("paper", suite.key), answer)]
-        : element("h1.unseen", null, "All results"),
-      sweeps.length > 0 && section("Sweeps", answers(sweeps)),
+      shown ? [heading(shown), later(bench.store.load("paper", shown.key), first)] : element("h1.unseen", null, "All results"),
+      sweeps.length > 0 && section("All sweeps", answers(sweeps)),
+      newest && suite && section("The suite", answers([suite])),
       boards);
     bench.board(boards, query);
   }
@@ -74,11 +76,14 @@
     const image = () => element("img.figure", {src: data.picture, alt: data.caption || entry.title, loading: "lazy"});
     const picture = data.picture && element("figure", null, element("a", {href: data.files.PDF || data.picture}, image()));
     const links = Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "]);
-    const table = data.rows.length > 0 && bench.written(data.header, data.rows, entry.name === SUITE ? STANDING : data);
+    const runs = (row) => bench.address.to(["runs"], {task: "all", view: "runs", folders: (data.folders[row] || []).join()});
+    const rows = entry.sweep ? {...data, named: data.header[0], link: runs} : data;
+    const table = data.rows.length > 0 && bench.written(data.header, data.rows, entry.name === SUITE ? STANDING : rows);
     return [
       data.atlas && bench.atlas(data.atlas),
       data.chart && bench.chart(data.chart, {label: entry.title}),
       picture && (data.atlas || data.chart) ? details("The figure as in the paper", picture) : picture,
+      data.command && copied(data.command, "Copy the command"),
       element("p.caption", null, data.caption),
       table && data.atlas ? details("The table, with intervals", table) : table,
       data.notes.length > 0 && details(`Notes and definitions (${data.notes.length})`, list(data.notes)),
