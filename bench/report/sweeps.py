@@ -162,6 +162,7 @@ def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
         "reasons": "; ".join(f"{reason} ({count} runs)" if count > 1 else reason for reason, count in reasons.items()),
         "loop_seconds": records.median_or_none(map(records.loop_seconds, ended)),
         "value_evaluations": records.median_or_none(map(records.value_evaluations, ended)),
+        "cost": records.median_or_none(map(records.cost, ended)),
         **{name: median_of(runs, name) for name in names},
     }
 
@@ -321,7 +322,7 @@ def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> lis
         *ends("failed", lambda line: line["rate"]),
         text("reasons"),
         Column("loop_seconds", "Runtime", show=format.seconds),
-        Column("value_evaluations", "Field values", show=format.count),
+        *(Column("cost", "Field evaluations", show=format.count), Column("value_evaluations")),
     ]
 
 
