@@ -30,6 +30,11 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'bench' has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    """What a user of the library needs."""
+    return [*__all__]
+
+
 def _foreign_package_message() -> str:
     """Returns an error message if one of our package names leads to a package of another project, else "".
 

@@ -11,7 +11,7 @@ import pandas as pd
 from bench.records.read import read_records
 from bench.records.record import flat, row_name, started
 from bench.records.results import RESULTS
-from bench.report.data.records import index
+from bench.report.data.records import index, setting
 
 TEXT, CATEGORY, INTEGER, NUMBER, BOOLEAN, TIME = (
     *("string", "category", "Int64", "Float64", "boolean"),
@@ -19,7 +19,7 @@ TEXT, CATEGORY, INTEGER, NUMBER, BOOLEAN, TIME = (
 )
 FIXED_COLUMNS = {  # every table has them
     **{name: TEXT for name in ("folder", "name")},
-    **{name: CATEGORY for name in ("task", "renderer", "method", "dataset", "scene")},
+    **{name: CATEGORY for name in ("task", "renderer", "method", "dataset", "scene", "experiment", "scale")},
     **{name: INTEGER for name in ("index", "seed")},
     "status": CATEGORY,
     "reason": TEXT,
@@ -85,6 +85,8 @@ def _row(record: dict[str, Any]) -> dict[str, Any]:
     row = {name: record.get(name) for name in FIXED_COLUMNS}
     row |= {name: None if (value := record["environment"].get(name)) == "" else value for name in ENVIRONMENT_COLUMNS}
     row |= {"name": row_name(record["config"], record["renderer"]), "index": index(record)}
+    config = record["config"]
+    row |= {"experiment": config.get("experiment") or None, "scale": setting(config, "scale", "name")}
     row |= {"started": started(record), "method": record.get("method") or None, "scene": record.get("scene") or None}
     for section, prefix in PREFIXES.items():
         named = {f"{prefix}{name}": value for name, value in record[section].items()}
