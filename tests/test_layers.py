@@ -29,17 +29,18 @@ PACKAGES = (
     "runner", "report", "studies",
 )  # fmt: skip
 COMMANDS = (
-    "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.suite", "bench.train", "bench.tune",
-    "bench.turntable", "bench.verify",
+    "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.ray", "bench.suite", "bench.train",
+    "bench.tune", "bench.turntable", "bench.verify",
 )  # fmt: skip
 # Three layers: a file imports only from its layer and the layers below. Files that are not listed are the core.
 DATA_LAYER = ("datasets.files", "renderers.fields.networks", "renderers.fields.parts", "bench.photos", "bench.exports")
 STUDIES_LAYER = (
     "bench.report", "bench.studies", "bench.pictures.figure_style", "bench.pictures.size_chart", "renderers.later",
+    "bench.evaluate.along_ray", "bench.pictures.ray",
     "bench.records.names", "bench.records.read",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",
     "bench.tasks.single_view", "bench.tasks.stability",
-    *(f"bench.{command}" for command in ("judge", "merge", "prior", "suite", "train", "tune", "turntable", "verify")),
+    *(f"bench.{name}" for name in ("judge", "merge", "prior", "ray", "suite", "train", "tune", "turntable", "verify")),
 )  # fmt: skip
 LISTS = ("bench", "bench.__main__", "renderers")  # import from all layers, to list what there is
 MAX_CORE_LINES = 15_200

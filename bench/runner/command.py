@@ -34,6 +34,7 @@ HELP = """
     python -m bench dataset=mesh dataset.path=chair.obj                    your own mesh
     python -m bench renderer=custom renderer._target_=mypkg.Mine           your own renderer
     python -m bench list                                                   the tasks, renderers, datasets, experiments
+    python -m bench.ray dataset=torus renderer=dist,newton                 what renderers do along one ray
     python -m bench.report                                                 tables, figures and results/local/index.html
 
 Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.

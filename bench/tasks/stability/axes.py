@@ -103,13 +103,22 @@ class Stress:
             return SCENES[self.scene]
         return network_scene(self.scene, prior.decoder.to(conditions.device), prior.codes.to(conditions.device))
 
+    @property
+    def needs_prior(self) -> bool:
+        """Whether the scenes are those of a prior's network."""
+        return self.scene in NETWORK_DISTORTIONS
+
+    def trial_seed(self, level: float, repeat: int) -> int:
+        """The seed of trial number `repeat` at a level."""
+        return crc32(f"{self.scene} {level:.6f} {repeat}".encode())
+
     def trial(self, renderer: Renderer, level: float, repeat: int, conditions: Conditions) -> Outcome:
         """Trial number `repeat` at a level, the same one for every renderer. An exception is recorded as a failure.
 
         Raises:
             Unsupported: if the renderer lacks the tested property, or has no such setting.
         """
-        seed = crc32(f"{self.scene} {level:.6f} {repeat}".encode())
+        seed = self.trial_seed(level, repeat)
         torch.manual_seed(seed)  # for renderers and losses with random draws
         try:
             return self._judge(renderer, self.sweep.severity(level), np.random.default_rng(seed), conditions)

@@ -1,0 +1,322 @@
+"""`python -m bench.ray dataset=torus renderer=dist,newton,neus`: what renderers do along one ray, as a picture.
+
+    python -m bench.ray dataset=torus renderer=dist,newton pixel=31,40    column and row, from 0 at the top left
+    python -m bench.ray dataset=sofa split=train renderer=newton,dvr      a network: the prior at a training shape
+    python -m bench.ray field=file field_path=RUN renderer=dist,neus      a network of yours, or a run's final field
+    python -m bench.ray dataset=mesh dataset.path=FILE                    a mesh, as a grid of distances
+    python -m bench.ray task=stability stress=thin_plate level=0.5        the stress at a level from 0, mild, to 1
+    python -m bench.ray RUN_FOLDER pixel=31,40                            the scene and renderer of a task=ablation run
+
+Without pixel=, it takes the pixel where the first renderer is most wrong. zoom=0.05 shows the ray within 0.05 scene
+units of the true hit, zoom=0 all of it. into=FILE names the picture, by default ray.png; a PDF is written too. The
+configuration in a run folder is trusted, as by `python -m bench`.
+"""
+
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+
+from bench.evaluate.along_ray import Lane, TrueRay, follow, sentences, true_ray
+from bench.evaluate.reference import MIN_STEP, RADIUS, in_float64
+from bench.pictures.ray import RayPicture
+from bench.records.format import number, plural
+from bench.records.record import bad_link, read_record
+from bench.records.results import PlannedRun
+from bench.runner.command import command_line
+from bench.runner.compose import Composer
+from bench.setup.inputs import RunInputs, Task, prepare_run
+from bench.tasks.ablation import Ablation
+from bench.tasks.stability.task import Stability
+from bench.tasks.stability.trial import Conditions
+from datasets.families import BUILDERS, CUBE_HALF_SIDE, Family
+from datasets.mesh import extract, fit_in_sphere
+from datasets.scene import Photographed, Split
+from renderers.boundary import render_checked
+from renderers.camera import Camera, Rays, sphere_span
+from renderers.field import Field, estimate_lipschitz
+from renderers.fields.grid import Grid
+from renderers.rendering import Renderer, Unsupported
+from renderers.tracing.reference import trace
+
+DECIMAL = r"\d+(\.\d*)?(e-?\d+)?"
+OPTIONS = {  # the pattern of a value, and an example
+    "pixel": (r"\d+,\d+", "pixel=31,40, its column and row"),
+    "zoom": (DECIMAL, "zoom=0.05, in scene units"),
+    "level": (DECIMAL, "level=0.5"),
+    "into": (r".*\w.*", "into=ray.png"),
+}
+NEUTRAL_TASK = "capacity"  # takes every shape, and needs no prior
+RUN_TASK = "ablation"
+GRID_REACH = 1.05  # scene units: half the cube of the distances to a mesh
+MAX_SEARCHED_PIXELS = 64  # per side; of a larger image, every second pixel or fewer are searched
+TOLERANCE_PIXELS = 0.1  # a hit is right within so many widths of a pixel at the distance of the origin
+MAX_ZOOM_FRACTION = 0.25  # what happens on more of the ray is shown on the whole ray
+Pixel = tuple[int, int]  # column and row
+
+
+@dataclass(frozen=True)
+class RayScene:
+    """A scene: the field that renderers get, the field of the true surface in float64, and a camera."""
+
+    name: str
+    field: Field
+    exact: Field
+    camera: Camera
+
+    @cached_property
+    def lipschitz(self) -> float:
+        """An estimate of the Lipschitz constant of `exact`."""
+        return estimate_lipschitz(self.exact, radius=RADIUS)
+
+    def ray(self, pixel: Pixel, camera: Camera) -> Rays:
+        """The ray of a pixel, [1, 3], of the scene's camera in float32 or float64.
+
+        Raises:
+            ValueError: if the pixel is outside the image, or its ray misses the unit sphere.
+        """
+        (column, row), height, width = pixel, camera.height, camera.width
+        name, remedy = f"pixel={column},{row}", f"the middle is pixel={width // 2},{height // 2}"
+        if column >= width or row >= height:
+            size = f"{width} columns and {height} rows, which count from 0"
+            raise ValueError(f"{name} is outside the image of {size}: {remedy}")
+        rays = camera.rays()
+        ray = Rays(rays.origins[row, column][None], rays.directions[row, column][None])
+        if not bool(sphere_span(ray, RADIUS)[2]):
+            raise ValueError(f"the ray of {name} misses the unit sphere that contains the scene: {remedy}")
+        return ray
+
+    def true_ray(self, pixel: Pixel) -> TrueRay:
+        """The truth on the ray of a pixel."""
+        tolerance = TOLERANCE_PIXELS * float(self.camera.center.norm() / self.camera.intrinsics[0, 0])
+        ray = self.ray(pixel, self.camera.double())
+        return true_ray(self.exact, ray, lipschitz=self.lipschitz, tolerance=tolerance)
+
+    def most_wrong_pixel(self, renderer: Renderer) -> tuple[Pixel, str]:
+        """The pixel where a renderer is most wrong, and the search in words.
+
+        A miss counts as an end where the ray leaves the sphere. No ray uses the coarse rays of an image.
+        """
+        stride = ceil(max(self.camera.height, self.camera.width) / MAX_SEARCHED_PIXELS)
+        cut = (slice(stride // 2, None, stride),) * 2
+        images = [camera.rays() for camera in (self.camera, self.camera.double())]
+        rays, exact_rays = (Rays(image.origins[cut], image.directions[cut]) for image in images)
+        with torch.no_grad():
+            rendering = render_checked(renderer, self.field, rays.flat())
+        reference = trace(self.exact, exact_rays.flat(), lipschitz=self.lipschitz, least_step=MIN_STEP, radius=RADIUS)
+        _, leave, in_sphere = sphere_span(exact_rays.flat(), RADIUS)
+        ends = [torch.where(each.hit, each.distance.double(), leave) for each in (rendering, reference)]
+        error = torch.where(in_sphere, (ends[0] - ends[1]).abs(), -1.0)
+        row, column = divmod(int(error.argmax()), rays.shape[1])
+        pixel = (stride // 2 + stride * column, stride // 2 + stride * row)
+        return pixel, f"by {float(error.max()):.2g} scene units, of {error.numel()} pixels searched"
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of this command; None stands for what it chooses itself."""
+
+    run: Path | None = None
+    pixel: Pixel | None = None
+    zoom: float | None = None
+    level: float = 0.5
+    into: Path = Path("ray.png")
+
+
+def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:
+    """The options of this command, and the other arguments, which are those of `python -m bench`.
+
+    Raises:
+        ValueError: if an option cannot be read, or does not go with a run folder.
+    """
+    values, others = dict[str, Any](), list[str]()
+    for argument in arguments:
+        key, _, text = argument.partition("=")
+        if key in OPTIONS:
+            pattern, example = OPTIONS[key]
+            if not re.fullmatch(pattern, text):
+                raise ValueError(f"cannot read {argument!r}: type {example}")
+            read = {"pixel": lambda text: tuple(map(int, text.split(","))), "into": Path}.get(key, float)
+            values[key] = read(text)
+        elif key == "field" and text in BUILDERS:
+            raise ValueError(f"{argument} names the field that a task optimises: a scene's shape is dataset={text}")
+        elif "=" not in argument and Path(argument).is_dir():
+            values["run"] = Path(argument)
+        else:
+            others.append(argument)
+    if "run" in values and others:
+        raise ValueError(f"{values['run']} states its scene and renderer: remove {others[0]}, or the folder")
+    task = [] if any(text.startswith(("task=", "+method=")) for text in others) else [f"task={NEUTRAL_TASK}"]
+    return Options(**values), [*task, *others]
+
+
+def run_of(folder: Path) -> PlannedRun:
+    """The run of a folder.
+
+    Raises:
+        OSError, ValueError: if it cannot be read, or is of another task.
+    """
+    if not (folder / "record.json").is_file():
+        raise ValueError(f"{folder} has no record.json: name the folder of a run, RESULTS/runs/NAME")
+    if link := bad_link(folder, folder.parent):
+        raise ValueError(f"{folder}: {link} is a link out of the folder: remove it")
+    record = read_record(folder)
+    if record["task"] != RUN_TASK:
+        remedy = f"field=file field_path={folder} takes its final field"
+        raise ValueError(f"{folder} is a run of task={record['task']}, not of task={RUN_TASK}: {remedy}")
+    names = {key: record[key] for key in ("task", "renderer", "dataset", "seed", "config")}
+    return PlannedRun(folder.name, [], **names)
+
+
+def scene_of(cell: PlannedRun, task: Task, inputs: RunInputs, level: float) -> RayScene:
+    """The scene of a configuration, on the CPU.
+
+    Raises:
+        ValueError: if it has no field to render.
+    """
+    if isinstance(task, Stability):
+        return _stress_scene(cell.dataset, task, inputs, level)
+    if isinstance(inputs.dataset, Photographed) or inputs.scene.is_partial:
+        remedy = "field=file field_path=RUN takes the final field of a run"
+        raise ValueError(f"dataset={cell.dataset} has pictures, and no field: {remedy}")
+    name, camera = inputs.scene_name, inputs.scene.view.camera
+    if isinstance(task, Ablation) and task.size:
+        camera = camera.resized(task.size, task.size)
+    if inputs.prior_choice.scene_code is not None:
+        prior, exact = inputs.fitted(), in_float64(inputs.fitted())
+        fields = [each.decoder.cpu().requires_grad_(False).at(each.codes[0].cpu()) for each in (prior, exact)]
+        return RayScene(f"{name}, a network", *fields, camera)
+    if isinstance(inputs.dataset, Family):
+        shape = _formula(inputs.dataset, Split(cell.config["split"]), cell.config["index"])
+        return RayScene(f"{name}, a formula", shape, shape, camera)
+    samples = inputs.evaluation.grid
+    values = torch.from_numpy(inputs.scene.raycaster.distance_grid(samples, GRID_REACH))
+    fields = Grid(values, GRID_REACH), Grid(values.double(), GRID_REACH)
+    return RayScene(f"{name}, a grid of {samples} x {samples} x {samples} distances to its mesh", *fields, camera)
+
+
+def _formula(family: Family, split: Split, index: int) -> Field:
+    """The shape of a family by its formula, moved and scaled as its mesh is."""
+    shape = BUILDERS[family.name](SimpleNamespace(**family.draw(split, index)))
+    mesh = extract(shape, grid=family.resolution, reach=CUBE_HALF_SIDE)
+    assert mesh is not None  # the scene has been made
+    centre, factor = fit_in_sphere(mesh.used_vertices, family.radius)
+    return shape.translate((-centre).tolist()).scale(float(factor))
+
+
+def _stress_scene(name: str, task: Stability, inputs: RunInputs, level: float) -> RayScene:
+    """The first trial of a stress at a level."""
+    stress, severity = task.stress, task.stress.sweep.severity(level)
+    if stress.measure == "fit" or stress.setting is not None:
+        raise ValueError(f"stress={name} varies a fit or a renderer's setting, and no scene: type stress=thin_plate")
+    prior, device = inputs.prior if stress.needs_prior else None, torch.device("cpu")
+    conditions = Conditions(task.resolution, task.fit, task.criteria, task.limits, device, prior)
+    draw = np.random.default_rng(stress.trial_seed(level, 0))
+    case = stress.exam_generator(conditions)(severity, draw, task.resolution)
+    title = f"{name.replace('_', ' ')} at {number(severity)} {stress.sweep.unit}"
+    return RayScene(title, case.field, case.truth.field, case.camera)
+
+
+def show(cells: list[PlannedRun], options: Options) -> None:
+    """Renders a ray by the renderer of each configuration; prints sentences, and the path of the picture last.
+
+    Raises:
+        ValueError: if the configurations differ in more than the renderer, or a renderer cannot render the scene.
+    """
+    for key in cells[0].config.keys() - {"renderer", "label"}:
+        if any(cell.config.get(key) != cells[0].config[key] for cell in cells):
+            raise ValueError(f"one ray has one scene, but {key} has several values: give several only to renderer")
+    runs = [prepare_run(cell.config) for cell in cells]
+    task, inputs = runs[0]
+    inputs.configure_process()
+    scene = scene_of(cells[0], task, inputs, options.level)
+    pixel, search = options.pixel, ""
+    if pixel is None:
+        try:
+            pixel, search = scene.most_wrong_pixel(inputs.renderer)
+        except Unsupported as error:
+            raise ValueError(f"renderer={cells[0].renderer}: {error}") from error
+        search = f", where {cells[0].renderer} is most wrong: {search}"
+    ray, truth, lanes = scene.ray(pixel, scene.camera), scene.true_ray(pixel), list[tuple[Lane, str]]()
+    for cell, (_, cell_inputs) in zip(cells, runs, strict=True):
+        cell_inputs.configure_process()  # renderers may draw: each from the same seed
+        lane = follow(cell.renderer, _title(cell, cells), cell_inputs.renderer, scene.field, ray)
+        lanes.append((lane, sentences(lane, truth)))
+    texts = f"{scene.name}; pixel={pixel[0]},{pixel[1]}{search}", result_of([lane for lane, _ in lanes], truth)
+    window = window_of([lane for lane, _ in lanes], truth, options.zoom)
+    print(*texts, *(f"{lane.title}: {text}" for lane, text in lanes), sep="\n")
+    _save(RayPicture(*texts, scene.field, ray, truth, window, lanes), options.into)
+
+
+def _title(cell: PlannedRun, cells: list[PlannedRun]) -> str:
+    """The title of a renderer's lane: its preset, its settings that differ, and its label."""
+    common = set.intersection(*(set(other.overrides) for other in cells))
+    settings = [text for text in cell.overrides if text.startswith("renderer.") and text not in common]
+    label = cell.config["label"] or cell.config["renderer"].get("_label_")
+    return " ".join([cell.renderer, *settings, *([f"({label})"] if label else [])])
+
+
+def result_of(lanes: list[Lane], truth: TrueRay) -> str:
+    """How many renderers agree with the reference, and which do not."""
+    wrong = [lane.title.partition(" (")[0] for lane in lanes if not lane.agrees(truth)]
+    end = "miss, like the float64 reference" if truth.hit is None else "hit the surface"
+    return f"{len(lanes) - len(wrong)} of {plural(len(lanes), 'renderer')} {end}" + (
+        f"; wrong: {', '.join(wrong)}" if wrong else ""
+    )
+
+
+def window_of(lanes: list[Lane], truth: TrueRay, zoom: float | None) -> tuple[float, float]:
+    """The part of the ray that is shown: without `zoom`, all of it if a renderer is wrong, else where they decide."""
+    if truth.hit is None:
+        return truth.entry, truth.leave
+    if zoom is None:
+        zoom = 2 * max(max(lane.extent(truth.hit)) for lane in lanes)
+        is_short = zoom < MAX_ZOOM_FRACTION * (truth.leave - truth.entry)
+        zoom = zoom if is_short and all(lane.agrees(truth) for lane in lanes) else 0
+    return (
+        (max(truth.hit - zoom, truth.entry), min(truth.hit + zoom, truth.leave)) if zoom else (truth.entry, truth.leave)
+    )
+
+
+def _save(picture: RayPicture, into: Path) -> None:
+    """Writes the picture as PNG and PDF, and prints the path of the PNG."""
+    figure, path = picture.draw(), into.with_suffix(".png")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=150)
+        figure.savefig(path.with_suffix(".pdf"))
+    except OSError as error:
+        raise ValueError(f"into={into} cannot be written ({error.strerror}): name a file in another folder") from error
+    print(path)
+
+
+def main() -> int:
+    """Runs the command line; returns the exit status, 2 for a wrong command line."""
+    try:
+        options, arguments = parse_arguments(sys.argv[1:])
+        if options.run is not None:
+            show([run_of(options.run)], options)
+            return 0
+    except (OSError, ValueError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+
+    def sweep(composer: Composer, config: DictConfig) -> list[str]:
+        show(composer.cells(composer.swept(config)), options)
+        return []
+
+    sys.argv[1:] = ["-m", *arguments]  # several renderers are lanes of one picture
+    return command_line(lambda run: None, sweep)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""The command bench.ray: what it records on a ray, its sentences on shapes with known hits, its picture and errors."""
+
+import re
+from dataclasses import replace
+from math import cos, radians, sin
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.config import load
+from bench.evaluate.along_ray import Lane, Recorder, TrueRay, follow, sentences, true_ray
+from bench.pictures.ray import RayPicture
+from bench.ray import main, window_of
+from renderers.camera import Rays
+from renderers.field import Field, Kind
+from renderers.fields.analytic import Shape, box, plane, sphere
+from renderers.rendering import Renderer, Status
+from tests.runner.driving import command, stored
+
+SMALL = ("scale=smoke", "view.resolution=12", "threads=1")
+PLATE = box((0.5, 0.5, 0.0125)) | sphere(0.2, (0, 0, 0.6))
+DIST_WITHOUT_CAP = replace(load("renderer", "dist"), alpha=1.5, extra_step_cap=None)
+
+
+def ray(*, tilt: float = 0.0, dtype: torch.dtype = torch.float32) -> Rays:
+    """A ray from z = -2.5 along the axis z, tilted downwards by an angle in degrees about the origin."""
+    direction = torch.tensor([[0.0, -sin(radians(tilt)), cos(radians(tilt))]], dtype=dtype)
+    return Rays(-2.5 * direction, direction)
+
+
+def looked_at(renderer: Renderer, field: Field, tilt: float = 0.0) -> tuple[Lane, TrueRay, str]:
+    """What a renderer does on the ray, the truth, and the sentences."""
+    truth = true_ray(field, ray(tilt=tilt, dtype=torch.float64), lipschitz=1.2, tolerance=3e-3)
+    lane = follow("dist", "DIST", renderer, field, ray(tilt=tilt))
+    return lane, truth, sentences(lane, truth)
+
+
+def test_the_truth_has_the_chord_of_a_sphere_and_the_angle_of_a_plane():
+    truth = true_ray(sphere(0.5), ray(dtype=torch.float64), lipschitz=1.2, tolerance=1e-3)
+    assert (truth.entry, truth.leave, truth.hit) == pytest.approx((1.5, 3.5, 2.0), abs=1e-9)
+    assert truth.spans == [pytest.approx((2.0, 3.0), abs=1e-9)] and truth.angle == pytest.approx(90, abs=1e-3)
+    tilted = true_ray(plane(), ray(tilt=20, dtype=torch.float64), lipschitz=1.2, tolerance=1e-3)
+    assert (tilted.hit, tilted.angle) == pytest.approx((2.5, 20.0), abs=1e-6)
+    assert tilted.first_span == pytest.approx((2.5, 3.5), abs=1e-9)  # inside until it leaves the sphere
+
+
+def test_evaluations_on_the_ray_are_noted_in_order_and_once():
+    recorder = Recorder(sphere(0.5), ray())
+    recorder(ray().at(torch.tensor([1.5])))
+    recorder(ray().at_each(torch.tensor([3.0, 2.0, 1.5, 2.0]))[0])
+    recorder(torch.tensor([[0.0, 0.0, 0.25], [0.0, 2e-5, 0.5]]))
+    assert recorder.calls == [[1.5], [3.0, 2.0], [2.75]]
+    lane = Lane("dist", "", [[1.0], [3.0, 2.0, 2.5], [2.25]], 2.2, Status.HIT, 0.0, None)
+    assert lane.samples == [2.0, 2.5, 3.0] and lane.evaluations == [1.0, 3.0, 2.0, 2.5, 2.25]
+
+
+def test_a_long_step_goes_through_a_thin_plate_and_newton_hits_it():
+    lane, truth, text = looked_at(DIST_WITHOUT_CAP, PLATE)
+    assert truth.hit == pytest.approx(2.4875) and lane.hit is not None and lane.hit > 2.8
+    step = 1.5 * 0.9875
+    assert f"Step 1 went through the surface: the surface is 0.025 thick along the ray, the step {step:.2g} " in text
+    assert f" It hit {2.9 - 2.4875:.2g} behind the surface." in text  # the sphere behind the plate begins at 2.9
+    newton, truth, text = looked_at(load("renderer", "newton"), PLATE)
+    assert newton.agrees(truth) and newton.hit == pytest.approx(2.4875, abs=1e-6) and "through" not in text
+
+
+def test_samples_farther_apart_than_a_plate_is_thick_miss_it():
+    lane, truth, text = looked_at(load("renderer", "dvr", n_ray_samples=16), box((0.5, 0.5, 0.004)))
+    assert len(lane.samples) == 16 and lane.hit is None and not lane.agrees(truth)
+    assert re.match(r"None of 16 samples, 0\.1\d* apart, fell into the surface, 0\.008 thick along the ray\.", text)
+    assert text.endswith("It missed.")
+
+
+def test_a_volume_spreads_its_weights_on_a_slanted_plane():
+    lane, truth, text = looked_at(load("renderer", "neus"), plane(), tilt=15)
+    assert lane.weights is not None and lane.agrees(truth) and "since the ray meets the surface at 15 degrees" in text
+    frontal, truth, text = looked_at(load("renderer", "neus"), plane((0, 0, -1.0)))
+    assert frontal.weights is not None and "degrees" not in text
+    assert sum(lane.extent(2.5)) > 2 * sum(frontal.extent(2.5))  # over 1 / sin 15 degrees without other errors
+
+
+def test_a_miss_and_a_residual_are_stated():
+    text = looked_at(load("renderer", "dist"), sphere(0.3, (0, 0.5, 0)))[2]
+    assert text.endswith("It missed. The reference has no hit.")
+    lane, truth, text = looked_at(load("renderer", "dist", epsilon=0.01), plane(), tilt=15)
+    remaining = lane.residual / sin(radians(15)) - lane.residual  # the last step is as long as the residual
+    assert text.endswith(f"It hit {remaining:.2g} before the surface. A residual of {lane.residual:.2g} is left.")
+    assert not lane.agrees(truth)
+
+
+def test_the_panels_below_the_slice_share_the_distance_and_show_the_whole_ray_if_a_renderer_is_wrong():
+    lane, truth, text = looked_at(DIST_WITHOUT_CAP, PLATE)
+    assert window_of([lane], truth, None) == (truth.entry, truth.leave)
+    right, truth, _ = looked_at(load("renderer", "dvr"), PLATE)
+    low, high = window_of([right], truth, None)
+    assert low < 2.4875 < high and high - low < 0.1 and window_of([right], truth, 0) == (truth.entry, truth.leave)
+    figure = RayPicture("", "", PLATE, ray(), truth, (low, high), [(lane, text), (right, "")]).draw()
+    assert [axes.get_xlim() for axes in figure.axes[1:]] == [pytest.approx((low, high))] * 3
+    assert figure.axes[0].get_xlim() == pytest.approx((1.5, 3.5))
+
+
+def test_the_command_writes_a_picture_of_the_pixel_where_the_first_renderer_is_most_wrong(tmp_path):
+    scene = ("task=stability", "stress=thin_plate", "task.resolution=16", "level=0.8", "threads=1")
+    renderers = "renderer=dist_aggressive_unclamped,newton"
+    code, out, err = command(*scene, renderers, f"into={tmp_path / 'new' / 'a.png'}", main=main)
+    assert (code, err) == (0, "") and "where dist_aggressive_unclamped is most wrong: by 1 " in out
+    assert "1 of 2 renderers hit the surface; wrong: dist_aggressive_unclamped\n" in out
+    path = Path(out.splitlines()[-1])
+    assert path == tmp_path / "new" / "a.png" and path.stat().st_size > 10_000 and path.with_suffix(".pdf").is_file()
+
+
+@pytest.mark.parametrize("scene", [("dataset=torus",), ("dataset=sofa", "split=train"), ("dataset=box", "index=1")])
+def test_the_command_draws_formulas_and_networks(tmp_path, scene):
+    code, out, err = command(*SMALL, *scene, "pixel=6,5", "renderer=newton", f"into={tmp_path / 'a'}", main=main)
+    assert (code, err) == (0, "") and "1 of 1 renderer hit the surface" in out
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("renderer=newtn",), "did you mean newton?"),
+    (("pixel=12,3",), "pixel=12,3 is outside the image of 12 columns and 12 rows"),
+    (("pixel=0,0",), "misses the unit sphere that contains the scene: the middle is pixel=6,6"),
+    (("pixel=3",), "type pixel=31,40"),
+    (("dataset=torus,box",), "dataset has several values"),
+    (("field=torus",), "a scene's shape is dataset=torus"),
+    (("task=stability", "stress=learning_rate"), "type stress=thin_plate"),
+])  # fmt: skip
+def test_wrong_arguments_are_one_line_with_a_remedy(arguments, message):
+    code, _, err = command(*SMALL, *arguments, main=main)
+    assert code == 2 and message in err and err.startswith("error: ") and err.count("\n") == 1
+
+
+def test_a_run_folder_must_be_of_an_ablation(tmp_path):
+    folder = stored(tmp_path, "run")
+    for arguments, message in (
+        ((str(folder),), "is a run of task=completion, not of task=ablation: field=file field_path="),
+        ((str(folder), "renderer=idr"), "states its scene and renderer: remove renderer=idr"),
+        ((str(tmp_path),), "has no record.json: name the folder of a run"),
+    ):
+        code, _, err = command(*arguments, main=main)
+        assert code == 2 and message in err
+
+
+@pytest.mark.slow
+def test_a_run_of_an_ablation_is_shown_as_it_was_rendered(tmp_path):
+    settings = ("task=ablation", "dataset=sofa", "split=train", "+task.size=16", "renderer=newton")
+    made = command(*SMALL, *settings, "isolation=off", f"results_dir={tmp_path}")
+    code, out, err = command(made.out.splitlines()[-1], f"into={tmp_path / 'a.png'}", "pixel=11,8", main=main)
+    assert (code, err) == (0, "") and "sofa train 0, a network; pixel=11,8" in out and "newton" in out
+
+
+def test_a_field_that_a_renderer_cannot_render_is_named():
+    level = Shape(sphere(0.5).function, kind=Kind.LEVEL)
+    with pytest.raises(ValueError, match=r"renderer=dist: .* needs a distance or bound field"):
+        follow("dist", "", load("renderer", "dist"), level, ray())
