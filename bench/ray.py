@@ -60,7 +60,7 @@ RUN_TASK = "ablation"
 GRID_REACH = 1.05  # scene units: half the cube of the distances to a mesh
 MAX_SEARCHED_PIXELS = 64  # per side; of a larger image, every second pixel or fewer are searched
 TOLERANCE_PIXELS = 0.1  # a hit is right within so many widths of a pixel at the distance of the origin
-MAX_ZOOM_FRACTION = 0.25  # what happens on more of the ray is shown on the whole ray
+ZOOM_FRACTIONS = (0.001, 0.25)  # what happens on less or more of the ray is shown on the whole ray
 Pixel = tuple[int, int]  # column and row
 
 
@@ -268,23 +268,20 @@ def _title(cell: PlannedRun, cells: list[PlannedRun]) -> str:
 def result_of(lanes: list[Lane], truth: TrueRay) -> str:
     """How many renderers agree with the reference, and which do not."""
     wrong = [lane.title.partition(" (")[0] for lane in lanes if not lane.agrees(truth)]
-    end = "miss, like the float64 reference" if truth.hit is None else "hit the surface"
-    return f"{len(lanes) - len(wrong)} of {plural(len(lanes), 'renderer')} {end}" + (
-        f"; wrong: {', '.join(wrong)}" if wrong else ""
-    )
+    hit = "have no hit, like the reference" if truth.hit is None else f"hit the surface within {truth.tolerance:.1g}"
+    names = f"; wrong: {', '.join(wrong)}" if wrong else ""
+    return f"{len(lanes) - len(wrong)} of {plural(len(lanes), 'renderer')} {hit}{names}"
 
 
 def window_of(lanes: list[Lane], truth: TrueRay, zoom: float | None) -> tuple[float, float]:
-    """The part of the ray that is shown: without `zoom`, all of it if a renderer is wrong, else where they decide."""
-    if truth.hit is None:
+    """The part of the ray that is shown: within `zoom` of the true hit; by default, where the renderers decide."""
+    length = truth.leave - truth.entry
+    if zoom is None and truth.hit is not None:
+        zoom = 2 * max(max(*lane.extent(truth.hit), abs(lane.end - truth.hit)) for lane in lanes)
+        zoom = zoom if ZOOM_FRACTIONS[0] < zoom / length < ZOOM_FRACTIONS[1] else 0
+    if truth.hit is None or not zoom:
         return truth.entry, truth.leave
-    if zoom is None:
-        zoom = 2 * max(max(lane.extent(truth.hit)) for lane in lanes)
-        is_short = zoom < MAX_ZOOM_FRACTION * (truth.leave - truth.entry)
-        zoom = zoom if is_short and all(lane.agrees(truth) for lane in lanes) else 0
-    return (
-        (max(truth.hit - zoom, truth.entry), min(truth.hit + zoom, truth.leave)) if zoom else (truth.entry, truth.leave)
-    )
+    return max(truth.hit - zoom, truth.entry), min(truth.hit + zoom, truth.leave)
 
 
 def _save(picture: RayPicture, into: Path) -> None:
