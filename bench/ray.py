@@ -8,8 +8,9 @@
     python -m bench.ray RUN_FOLDER pixel=31,40                            the scene and renderer of a task=ablation run
 
 Without pixel=, it takes the pixel where the first renderer is most wrong. zoom=0.05 shows the ray within 0.05 scene
-units of the true hit, zoom=0 all of it. into=FILE names the picture, by default ray.png; a PDF is written too. The
-configuration in a run folder is trusted, as by `python -m bench`.
+units of the true hit, zoom=0 all of it. A hit is wrong if it is off by more than a tenth of a pixel's width.
+into=FILE names the picture, by default ray.png; a PDF is written too. The configuration in a run
+folder is trusted, as by `python -m bench`.
 """
 
 import re
