@@ -29,8 +29,9 @@ NOTES = (
     "1. A fit is within {surface_error:g} scene units of the surface.",
 )
 COST_NOTES = (
-    "An axis is a kind of stress. The axes are those of renderings that every renderer supports. Rank 1 is the best, "
-    "and equal breakdowns share their mean rank. A failed or missing run has the worst rank.",
+    "An axis is a kind of stress. The axes are those of renderings, without settings that some renderer lacks. Rank 1 "
+    "is the best, and equal breakdowns share their mean rank. A failed or missing run has the worst rank, and so has a "
+    "renderer that refuses the field.",
     "Intervals are 95 % bootstrap intervals over axes. Two renderers cannot be distinguished if the interval of the "
     "difference of their ranks contains 0. Each renderer has one preset; the page “stability” has all presets.",
     "At once: axes on which it breaks at the mildest severity. None: axes on which it does not break at the severest.",
@@ -95,9 +96,9 @@ def make_cost(runs: Runs) -> Result:
     cells = cells_of(runs)
     cells = cells[cells["row"].isin(_ranked(runs))]
     rendered = cells[cells["measure"] == "rendering"]
-    unsupported = set(rendered.loc[rendered["status"] == "unsupported", "axis"])
+    unsupported = set(rendered.loc[(rendered["status"] == "unsupported") & rendered["is_setting"], "axis"])
     shared = rendered[~rendered["axis"].isin(unsupported)]
-    # A failed or missing run has no shade, so it ranks last.
+    # A failed, missing or unsupported run has no shade, so it ranks last.
     shades = shared.pivot(index="axis", columns="row", values="shade").reindex(columns=cells["row"].unique())
     ranks = statistics.rank({str(row): (1.0 - row_shades).to_dict() for row, row_shades in shades.items()})
     lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
@@ -170,6 +171,7 @@ def cells_of(runs: Runs) -> pd.DataFrame:
         **{key: [record[key] for record in runs.records] for key in ("status", "reason", "folder")},
         **{key: runs.setting(f"task.stress.{key}") for key in ("group", "measure")},
         unit=runs.setting("task.stress.sweep.unit"),
+        is_setting=runs.setting("task.stress.setting").ne(""),
         one_trial=runs.setting("task.stress.repeats") == "1",
         **{key: runs.number(key) for key in NUMBERS},
     )

@@ -21,6 +21,7 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", crit
     settings = {"renderer": {"_target_": more.pop("target")}} if "target" in more else {}
     known |= {"mild_successes": trials * (level > 0), "severe_successes": trials * (level > 1)} | more
     stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP, "repeats": repeats}
+    stress |= {"setting": "renderer.alpha"} if axis == "alpha" else {}
     search = {"levels": 11, "repeats": 4}
     folder = write_run(
         *(results, "stability", label),
@@ -97,7 +98,7 @@ def test_what_did_not_end_ok_keeps_its_cell(tmp_path):
     assert [cell["shade"] for line in result.atlas["cells"] for cell in line] == [0.5, None, 0.5, None]
 
 
-def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
+def test_ranks_leave_out_settings_that_a_renderer_lacks_and_a_refused_field_is_the_worst(tmp_path):
     for label, level in (("DIST", 0.25), ("DVR", 0.75)):
         broke(tmp_path, "wires", label, level, evaluations_per_ray=2.0 if label == "DIST" else 90.0)
         broke(tmp_path, "thin_plate", label, -0.1 if label == "DIST" else 1.1)
@@ -105,13 +106,15 @@ def test_costs_are_of_the_axes_that_all_renderers_have(tmp_path):
         broke(tmp_path, "depth_noise", label, 0.5, measure="fit")
     broke(tmp_path, "alpha", "DIST", 0.9)
     broke(tmp_path, "alpha", "DVR", 0.9, status="unsupported")
+    broke(tmp_path, "csg_difference", "DIST", -0.1)
+    broke(tmp_path, "csg_difference", "DVR", 0.9, status="unsupported")
     page = page_of(tmp_path, "stability_cost")
     assert page.chart["panels"][0]["y"]["reversed"] and page.figure.axes[0].yaxis_inverted()
     rows = page.data.set_index("row")
     columns = ["axes", "at_once", "never", "cost"]
-    assert rows.loc["DIST", columns].tolist() == [3, 1, 0, 3.0]
-    assert rows.loc["DVR", columns].tolist() == [3, 0, 1, 4.0]
-    assert rows["rank"].to_dict() == {"DIST": pytest.approx(5.5 / 3), "DVR": pytest.approx(3.5 / 3)}
+    assert rows.loc["DIST", columns].tolist() == [4, 2, 0, 3.0]
+    assert rows.loc["DVR", columns].tolist() == [4, 0, 1, 4.0]
+    assert rows["rank"].to_dict() == {"DIST": pytest.approx(6.5 / 4), "DVR": pytest.approx(5.5 / 4)}
 
 
 def test_the_ranking_has_one_row_a_renderer(tmp_path):
