@@ -46,7 +46,7 @@ from renderers.boundary import render_checked
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Field, estimate_lipschitz
 from renderers.fields.grid import Grid
-from renderers.rendering import Renderer, Unsupported
+from renderers.rendering import Renderer, Status, Unsupported
 from renderers.tracing.reference import trace
 
 DECIMAL = r"\d+(\.\d*)?(e-?\d+)?"
@@ -56,6 +56,7 @@ OPTIONS = {  # the pattern of a value, and an example
     "level": (DECIMAL, "level=0.5"),
     "into": (r".*\w.*", "into=ray.png"),
 }
+DEFAULT_LEVEL = 0.5
 NEUTRAL_TASK = "capacity"  # takes every shape, and needs no prior
 RUN_TASK = "ablation"
 GRID_REACH = 1.05  # scene units: half the cube of the distances to a mesh
@@ -115,7 +116,9 @@ class RayScene:
             rendering = render_checked(renderer, self.field, rays.flat())
         reference = trace(self.exact, exact_rays.flat(), lipschitz=self.lipschitz, least_step=MIN_STEP, radius=RADIUS)
         _, leave, in_sphere = sphere_span(exact_rays.flat(), RADIUS)
-        ends = [torch.where(each.hit, each.distance.double(), leave) for each in (rendering, reference)]
+        ends = [
+            torch.where(each.status == Status.MISS, leave, each.distance.double()) for each in (rendering, reference)
+        ]
         error = torch.where(in_sphere, (ends[0] - ends[1]).abs(), -1.0)
         row, column = divmod(int(error.argmax()), rays.shape[1])
         pixel = (stride // 2 + stride * column, stride // 2 + stride * row)
@@ -129,7 +132,7 @@ class Options:
     run: Path | None = None
     pixel: Pixel | None = None
     zoom: float | None = None
-    level: float = 0.5
+    level: float | None = None
     into: Path = Path("ray.png")
 
 
@@ -150,7 +153,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:
             values[key] = read(text)
         elif key == "field" and text in BUILDERS:
             raise ValueError(f"{argument} names the field that a task optimises: a scene's shape is dataset={text}")
-        elif "=" not in argument and Path(argument).is_dir():
+        elif "=" not in argument and Path(argument).is_dir() and "run" not in values:
             values["run"] = Path(argument)
         else:
             others.append(argument)
@@ -178,14 +181,16 @@ def run_of(folder: Path) -> PlannedRun:
     return PlannedRun(folder.name, [], **names)
 
 
-def scene_of(cell: PlannedRun, task: Task, inputs: RunInputs, level: float) -> RayScene:
+def scene_of(cell: PlannedRun, task: Task, inputs: RunInputs, level: float | None) -> RayScene:
     """The scene of a configuration, on the CPU.
 
     Raises:
         ValueError: if it has no field to render.
     """
     if isinstance(task, Stability):
-        return _stress_scene(cell.dataset, task, inputs, level)
+        return _stress_scene(cell.dataset, task, inputs, DEFAULT_LEVEL if level is None else level)
+    if level is not None:
+        raise ValueError(f"level={level:g} is of a stress: add task=stability stress=thin_plate, or leave it out")
     if isinstance(inputs.dataset, Photographed) or inputs.scene.is_partial:
         remedy = "field=file field_path=RUN takes the final field of a run"
         raise ValueError(f"dataset={cell.dataset} has pictures, and no field: {remedy}")
@@ -216,6 +221,8 @@ def _formula(family: Family, split: Split, index: int) -> Field:
 
 def _stress_scene(name: str, task: Stability, inputs: RunInputs, level: float) -> RayScene:
     """The first trial of a stress at a level."""
+    if not 0 <= level <= 1:
+        raise ValueError(f"level={level:g} must be from 0, mild, to 1, severe")
     stress, severity = task.stress, task.stress.sweep.severity(level)
     if stress.measure == "fit" or stress.setting is not None:
         raise ValueError(f"stress={name} varies a fit or a renderer's setting, and no scene: type stress=thin_plate")
@@ -246,7 +253,7 @@ def show(cells: list[PlannedRun], options: Options) -> None:
             pixel, search = scene.most_wrong_pixel(inputs.renderer)
         except Unsupported as error:
             raise ValueError(f"renderer={cells[0].renderer}: {error}") from error
-        search = f", where {cells[0].renderer} is most wrong: {search}"
+        search = f", where {cells[0].renderer} is off most: {search}"
     ray, truth, lanes = scene.ray(pixel, scene.camera), scene.true_ray(pixel), list[tuple[Lane, str]]()
     for cell, (_, cell_inputs) in zip(cells, runs, strict=True):
         cell_inputs.configure_process()  # renderers may draw: each from the same seed
@@ -269,7 +276,11 @@ def _title(cell: PlannedRun, cells: list[PlannedRun]) -> str:
 def result_of(lanes: list[Lane], truth: TrueRay) -> str:
     """How many renderers agree with the reference, and which do not."""
     wrong = [lane.title.partition(" (")[0] for lane in lanes if not lane.agrees(truth)]
-    hit = "have no hit, like the reference" if truth.hit is None else f"hit the surface within {truth.tolerance:.1g}"
+    hit = (
+        f"right within {truth.tolerance:.1g} scene units"
+        if truth.hit is not None
+        else "without a hit, as the reference"
+    )
     names = f"; wrong: {', '.join(wrong)}" if wrong else ""
     return f"{len(lanes) - len(wrong)} of {plural(len(lanes), 'renderer')} {hit}{names}"
 
@@ -287,11 +298,12 @@ def window_of(lanes: list[Lane], truth: TrueRay, zoom: float | None) -> tuple[fl
 
 def _save(picture: RayPicture, into: Path) -> None:
     """Writes the picture as PNG and PDF, and prints the path of the PNG."""
-    figure, path = picture.draw(), into.with_suffix(".png")
+    name = into.name.removesuffix(".png").removesuffix(".pdf")
+    figure, path = picture.draw(), into.with_name(f"{name}.png")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=150)
-        figure.savefig(path.with_suffix(".pdf"))
+        figure.savefig(into.with_name(f"{name}.pdf"))
     except OSError as error:
         raise ValueError(f"into={into} cannot be written ({error.strerror}): name a file in another folder") from error
     print(path)

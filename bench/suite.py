@@ -30,6 +30,7 @@ from bench.report.suite.attempts import (
     FIXED_KEYS,
     NOISE_KEY,
     PROBLEM_SETTINGS,
+    SECOND_SUFFIX,
     TUNED_PREFIX,
     TUNED_SUFFIX,
     attempts_of,
@@ -88,13 +89,17 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
             options[key] = value
         elif re.match(STATED_KEYS_PATTERN, key) and key not in AXES:
             raise ValueError(f"{key} is stated by the suite, so that all rows have the same: leave it out")
-        elif key == "label" and (value in shipped_rows() or value.endswith(TUNED_SUFFIX)):
-            reason = "is the name of a shipped row" if value in shipped_rows() else f"ends in '{TUNED_SUFFIX}'"
+        elif key == "label" and (value in shipped_rows() or value.endswith((TUNED_SUFFIX, SECOND_SUFFIX))):
+            ending = TUNED_SUFFIX if value.endswith(TUNED_SUFFIX) else SECOND_SUFFIX
+            reason = "is the name of a shipped row" if value in shipped_rows() else f"ends in '{ending}'"
             raise ValueError(f"label={value} {reason}: type another one")
         elif "=" in argument:
             overrides.append(argument)
         else:
             raise ValueError(f"{argument!r} is no KEY=VALUE: python -m bench.suite --help has examples")
+    noise = [text.partition("=")[2] for text in overrides if text.startswith(NOISE_KEY)]
+    if noise and (options["setting"] == "tuned" or noise != ["1e-6"]):
+        raise ValueError(f"a second start is {NOISE_KEY}=1e-6, without setting=tuned")
     options.setdefault("budget", ",".join(budgets) if options["suite"] == "core" else budgets[0])
     allowed_words = {"suite": suite().sizes, "set": suite().errors, "setting": SETTING_VALUES, "budget": budgets}
     for key, allowed in allowed_words.items():
@@ -114,7 +119,7 @@ def _expected_runtime(options: dict[str, str], presets: list[str]) -> str:
     Args:
         presets: of the rows; if none is shipped, all rows.
     """
-    shipped = read_attempts(paper.SHIPPED)[0]
+    shipped = [attempt for attempt in read_attempts(paper.SHIPPED)[0] if not attempt.second_start]
     shipped = [attempt for attempt in shipped if attempt.preset in presets] or shipped
     problems = {key[:2] for key in problems_of(options["suite"]) if key[0] in options["set"].split(",")}
     keys = [(*key, float(budget)) for key in problems for budget in options["budget"].split(",")]
@@ -141,7 +146,7 @@ def _expected_runtime(options: dict[str, str], presets: list[str]) -> str:
 
 def shipped_rows() -> set[str]:
     """The names of the shipped rows."""
-    return {attempt.row for attempt in read_attempts(paper.SHIPPED)[0]}
+    return {attempt.row for attempt in read_attempts(paper.SHIPPED)[0] if not attempt.second_start}
 
 
 def _sweeps(options: dict[str, str], overrides: list[str]) -> list[tuple[str, list[str]]]:
@@ -244,7 +249,8 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
     for (budget, row), missing in standing.lacking.items():
         lacks = f"{row} lacks {plural(missing, 'problem')} at {units(budget)}"
         print(f"{lacks}, so it is not compared there: run all sets with budget={budget:g}.")
-    versions = standing.complete[standing.complete["preset"] == CUSTOM].groupby("row")["code"].nunique()
+    versions = standing.complete[standing.complete["preset"] == CUSTOM].groupby(["row", "set"])["code"]
+    versions = versions.nunique().groupby("row").max()
     for row, count in versions[versions > 1].items():
         print(f"{row} has runs of {count} versions of the code: run all sets again.")
 

@@ -51,7 +51,7 @@ def test_evaluations_on_the_ray_are_noted_in_order_and_once():
     recorder(ray().at_each(torch.tensor([3.0, 2.0, 1.5, 2.0]))[0])
     recorder(torch.tensor([[0.0, 0.0, 0.25], [0.0, 2e-5, 0.5]]))
     assert recorder.calls == [[1.5], [3.0, 2.0], [2.75]]
-    lane = Lane("dist", "", [[1.0], [3.0, 2.0, 2.5], [2.25]], 2.2, Status.HIT, 0.0, None)
+    lane = Lane("dist", "", [[1.0], [3.0, 2.0, 2.5], [2.25]], 2.2, Status.HIT, 0.0, True, None)
     assert lane.samples == [2.0, 2.5, 3.0] and lane.evaluations == [1.0, 3.0, 2.0, 2.5, 2.25]
 
 
@@ -85,7 +85,7 @@ def test_a_miss_and_a_residual_are_stated():
     assert text.endswith("It missed. The reference has no hit.")
     lane, truth, text = looked_at(load("renderer", "dist", epsilon=0.01), plane(), tilt=15)
     remaining = lane.residual / sin(radians(15)) - lane.residual  # the last step is as long as the residual
-    assert text.endswith(f"It hit {remaining:.2g} before the surface. A residual of {lane.residual:.2g} is left.")
+    assert text.endswith(f"It hit {remaining:.2g} before the surface. Its residual is {lane.residual:.2g}.")
     assert not lane.agrees(truth)
 
 
@@ -104,8 +104,8 @@ def test_the_command_writes_a_picture_of_the_pixel_where_the_first_renderer_is_m
     scene = ("task=stability", "stress=thin_plate", "task.resolution=16", "level=0.8", "threads=1")
     renderers = "renderer=dist_aggressive_unclamped,newton"
     code, out, err = command(*scene, renderers, f"into={tmp_path / 'new' / 'a.png'}", main=main)
-    assert (code, err) == (0, "") and "where dist_aggressive_unclamped is most wrong: by 1 " in out
-    assert "1 of 2 renderers hit the surface within 0.006; wrong: dist_aggressive_unclamped\n" in out
+    assert (code, err) == (0, "") and "where dist_aggressive_unclamped is off most: by 1 " in out
+    assert "1 of 2 renderers right within 0.006 scene units; wrong: dist_aggressive_unclamped\n" in out
     path = Path(out.splitlines()[-1])
     assert path == tmp_path / "new" / "a.png" and path.stat().st_size > 10_000 and path.with_suffix(".pdf").is_file()
 
@@ -113,7 +113,7 @@ def test_the_command_writes_a_picture_of_the_pixel_where_the_first_renderer_is_m
 @pytest.mark.parametrize("scene", [("dataset=torus",), ("dataset=sofa", "split=train"), ("dataset=box", "index=1")])
 def test_the_command_draws_formulas_and_networks(tmp_path, scene):
     code, out, err = command(*SMALL, *scene, "pixel=6,5", "renderer=newton", f"into={tmp_path / 'a'}", main=main)
-    assert (code, err) == (0, "") and "1 of 1 renderer hit the surface" in out
+    assert (code, err) == (0, "") and "1 of 1 renderer right within" in out
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
@@ -153,3 +153,8 @@ def test_a_field_that_a_renderer_cannot_render_is_named():
     level = Shape(sphere(0.5).function, kind=Kind.LEVEL)
     with pytest.raises(ValueError, match=r"renderer=dist: .* needs a distance or bound field"):
         follow("dist", "", load("renderer", "dist"), level, ray())
+
+
+@pytest.mark.parametrize("name", ["range_analysis", "mesh_proxy_48"])
+def test_evaluations_of_a_renderer_without_steps_are_not_called_steps(name):
+    assert "Step" not in looked_at(load("renderer", name), PLATE)[2]

@@ -22,7 +22,7 @@ ROUNDING = 5e-7  # scene units: float32 resolves no shorter length at a distance
 DENSE_SAMPLES = 40_001  # on the ray, for the thickness of the shape along it
 MIN_SAMPLES = 3  # a call with so many points of the ray is sampling; a step evaluates one point, or both of its ends
 WEIGHT_TAILS = (0.05, 0.95)  # nine tenths of a volume's weight lie between
-FRONTAL_DEGREES = 45.0  # above this angle between ray and surface, the angle does not explain the spread of weights
+FRONTAL_DEGREES = 20.0  # above this angle between ray and surface, the angle does not explain the spread of weights
 
 
 @dataclass
@@ -95,6 +95,7 @@ class Lane:
         calls: distances of its field evaluations on the ray, call by call.
         end: where it ends the ray.
         residual: the last field value.
+        marches: whether it has a number of steps; the evaluations of other renderers are no steps.
         weights: sorted distances of a volume's samples, and their weights; None if it sums nothing.
     """
 
@@ -104,6 +105,7 @@ class Lane:
     end: float
     status: Status
     residual: float
+    marches: bool
     weights: tuple[np.ndarray, np.ndarray] | None
 
     @property
@@ -169,30 +171,30 @@ def follow(name: str, title: str, renderer: Renderer, field: Field, rays: Rays) 
     except Unsupported as error:
         raise ValueError(f"renderer={name}: {error}") from error
     weights = None
-    if (volume := rendering.volume) is not None and len(volume.weight) > 1:
+    if (volume := rendering.volume) is not None and len(volume.weight) >= MIN_SAMPLES:
         order = volume.distance.argsort()
         weights = volume.distance[order].double().numpy(), volume.weight[order].double().numpy()
     end, residual, status = (float(x[0]) for x in (rendering.distance, rendering.residual, rendering.status))
-    return Lane(name, title, recorder.calls, end, Status(int(status)), residual, weights)
+    marches = getattr(renderer, "steps", None) is not None
+    return Lane(name, title, recorder.calls, end, Status(int(status)), residual, marches, weights)
 
 
 def sentences(lane: Lane, truth: TrueRay) -> str:
     """What a renderer did on the ray, in one to three sentences."""
-    count, agrees = plural(len(lane.evaluations), "evaluation"), lane.agrees(truth)
+    count, agrees = f"It evaluated {plural(len(lane.evaluations), 'point')} of the ray", lane.agrees(truth)
     if truth.hit is None or not lane.evaluations:
-        count = count if lane.evaluations else "No evaluation on this ray"
         reference = " The reference has no hit." if truth.hit is None else ""
         return f"{count}. {_ending(lane, truth)}{reference}"
-    if lane.weights is not None:
+    if not agrees and (cause := _step_through(lane, truth) or _missed_between_samples(lane, truth)):
+        text = cause
+    elif lane.weights is not None:
         text = _on_weights(lane, truth, truth.hit)
-    elif not agrees and (step := _step_through(lane, truth)):
-        text = step
     elif lane.samples:
         text = _on_samples(lane, truth, truth.hit)
     else:
-        text = _on_steps(lane, truth.hit) if agrees else f"{count}."
+        text = _on_steps(lane, truth.hit) if agrees and lane.marches else f"{count}."
     if lane.hit and abs(lane.residual) > ROUNDING < abs(lane.hit - truth.hit) and lane.weights is None:
-        return f"{text} {_ending(lane, truth)} A residual of {_length(lane.residual)} is left."
+        return f"{text} {_ending(lane, truth)} Its residual is {_length(lane.residual)}."
     return f"{text} {_ending(lane, truth)}"
 
 
@@ -200,25 +202,35 @@ def _step_through(lane: Lane, truth: TrueRay) -> str:
     """The sentence on the first step that begins before the surface and ends beyond it; empty without one."""
     steps, span = [call for call in lane.calls if len(call) < MIN_SAMPLES], truth.first_span
     ends = [distance for call in steps for distance in call] + [lane.end] * (not lane.samples)
-    for number, (start, stop) in enumerate(pairwise(ends), 1):
+    for number, (start, stop) in enumerate(pairwise(ends if lane.marches else []), 1):
         if span is not None and start < span[0] and stop > span[1]:
             cause = f"the surface is {_length(span[1] - span[0])} thick along the ray"
             return f"Step {number} went through the surface: {cause}, the step {_length(stop - start)} long."
     return ""
 
 
-def _on_samples(lane: Lane, truth: TrueRay, hit: float) -> str:
+def _missed_between_samples(lane: Lane, truth: TrueRay) -> str:
+    """The sentence on samples none of which lies inside the surface; empty for others."""
     samples, span = np.array(lane.samples), truth.first_span
-    others, gaps = len(lane.evaluations) - len(samples), np.diff(samples)
-    which = f"{len(samples)} samples, {_length(gaps.mean())} apart{' on average' if np.ptp(gaps) > gaps.mean() else ''}"
-    more = f" It took {plural(others, 'further evaluation')}." if others else ""
+    if not len(samples) or span is None or ((samples >= span[0]) & (samples <= span[1])).any():
+        return ""
+    return f"None of {_samples(lane)} fell into the surface, {_length(span[1] - span[0])} thick along the ray."
+
+
+def _on_samples(lane: Lane, truth: TrueRay, hit: float) -> str:
+    samples, others = lane.samples, len(lane.evaluations) - len(lane.samples)
+    more = f" It evaluated {plural(others, 'other point')}." if others else ""
     if lane.agrees(truth) and samples[-1] >= hit:
-        pair = "two" if samples[0] < hit else "the first one and an earlier step"
-        return f"Of {which}, {pair} enclose the surface.{more}"
-    inside = int(((samples >= span[0]) & (samples <= span[1])).sum()) if span else 0
-    if span and not inside:
-        return f"None of {which}, fell into the surface, {_length(span[1] - span[0])} thick along the ray.{more}"
-    return f"Of {which}, {inside} fell into the surface.{more}"
+        pair = "two" if samples[0] < hit else "the first one and an earlier point"
+        return f"Of {_samples(lane)} {pair} enclose the surface.{more}"
+    return f"It has {_samples(lane).rstrip(',')}.{more}"
+
+
+def _samples(lane: Lane) -> str:
+    """The number of samples and their spacing."""
+    gaps = np.diff(lane.samples)
+    average = " on average" if np.ptp(gaps) > gaps.mean() else ""
+    return f"{len(lane.samples)} samples, {_length(gaps.mean())} apart{average},"
 
 
 def _on_steps(lane: Lane, hit: float) -> str:

@@ -111,7 +111,7 @@ class RayPicture:
         axes.axhline(0, color=RULE, lw=0.6)
         axes.set_xlim(*self.window)
         axes.set_xlabel("distance along the ray (scene units)", labelpad=1)
-        title = f"Field along the ray, negative inside; its values are a {self.field.kind.value}"
+        title = f"Field along the ray, negative inside; kind: {self.field.kind.value}"
         axes.set_title(title, loc="left", pad=3, path_effects=HALO)
         axes.locator_params(axis="y", nbins=4)
         self._mark_truth(axes)
@@ -153,7 +153,7 @@ def draw_lane(axes: Axes, lane: Lane) -> None:
     axes.vlines(samples, 0, 0.16, color=colour, lw=0.7)
     axes.plot(steps, [0] * len(steps), "o", color=colour, ms=3, zorder=4)
     for number, ((start, sampled), (stop, next_sampled)) in enumerate(pairwise([*points, (lane.end, False)]), 1):
-        if not (sampled or next_sampled):
+        if lane.marches and not (sampled or next_sampled):
             _draw_step(axes, colour, str(number), (start, stop))
     if lane.weights is not None:
         distance, weight = lane.weights

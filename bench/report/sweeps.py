@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +35,16 @@ MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `TABLE_METRI
 COST, RUNTIME = "field evaluations (a gradient counts as two)", "runtime of the loop (s)"
 PANEL_HEIGHT_INCHES, LEGEND_HEIGHT_INCHES = 2.3, 0.6
 AVERAGED_KEYS = ("index", "seed", "dataset")  # a sweep over their numbers is no axis of a chart
+METHOD_KEYS = ("renderer", "label", "method", "silhouette", "task.optimiser")  # the runs still solve the same problems
 FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
 POINTS = "A point is the median of a row. "
-SMALL_POINTS = "In the figure, small points are runs, and a cross is a row of which half of the runs or more failed."
+SMALL_POINTS = (
+    "In the figure, small points are runs. A row of which half of the runs failed has a cross, or no point on a curve. "
+    "Costs are medians over runs that ended ok."
+)
 FRONT = "Grey steps: the front, of the rows for which no other is both cheaper and better."
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
@@ -117,7 +120,7 @@ def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
     swept = {key: values for key, values in swept.items() if len(values) > 1}
     overrides = [{key: values[key] for key in values if key in swept} for values in overrides]
     names = differences(runs, distinguished_by=_average_key, swept=overrides)
-    numeric = [key for key, texts in swept.items() if key not in AVERAGED_KEYS and all(map(_number, texts))]
+    numeric = [key for key, texts in swept.items() if key not in AVERAGED_KEYS and None not in map(_number, texts)]
     axis = numeric[0] if len(numeric) == 1 else ""
     runs = [run | {"position": _number(values.get(axis, ""))} for run, values in zip(runs, overrides, strict=True)]
     curves = differences(runs, distinguished_by=lambda run: (_average_key(run), run["position"]), swept=overrides)
@@ -242,9 +245,10 @@ def _panels(sweep: Sweep, dataset: str, lead: str, metric: Metric) -> list[Panel
     axes = {COST: records.cost} | ({RUNTIME: records.loop_seconds} if sweep.runs.timed else {})
     if sweep.axis:
         axes = {sweep.axis: lambda run: run["position"]} | axes
-    costs = (COST, RUNTIME) if not sweep.axis or sweep.axis.startswith("renderer.") else ()  # of the same problem
+    same_problems = all(key.startswith(METHOD_KEYS) for key in sweep.swept if key not in AVERAGED_KEYS)
     panels = [
-        _panel(runs, (dataset, title), number_of, (lead, metric), title in costs) for title, number_of in axes.items()
+        _panel(runs, (dataset, title), number_of, (lead, metric), same_problems and title != sweep.axis)
+        for title, number_of in axes.items()
     ]
     return [panel for panel in panels if panel["series"]]
 
@@ -256,25 +260,29 @@ def _panel(
     lead: tuple[str, Metric],
     has_front: bool,
 ) -> Panel:
-    """A point per row, joined along the swept number; the initial error; the front if less is better."""
+    """A point per row, joined along the swept number; the initial value if all rows have it; the front if wanted."""
     (dataset, title), (key, metric) = titles, lead
     curves, fronts = list[Series](), list[Series]()
     for name, of_curve in grouped(runs, lambda run: run["curve"]).items():
         rows = grouped(of_curve, lambda run: run["row"]).values()
-        pairs = [(records.median_or_none(map(number_of, of_row)), median_of(of_row, key)) for of_row in rows]
+        ordered = sorted(rows, key=lambda of_row: of_row[0]["position"] or 0.0)
+        costs = [records.median_or_none(map(number_of, _ended_ok(of_row) or of_row)) for of_row in ordered]
+        pairs = zip(costs, [median_of(of_row, key) for of_row in ordered], strict=True)
         points = [(x, estimate.times(metric.factor)) for x, estimate in pairs if x is not None and estimate is not None]
-        pairs = [(number_of(run), measured(run, key)) for run in of_curve if run["status"] == "ok"]
+        pairs = [(number_of(run), measured(run, key)) for run in _ended_ok(of_curve)]
         dots = [[x, metric.factor * value] for x, value in pairs if x is not None and value is not None]
         if points:
             make = chart.curve if len(points) > 1 else chart.series
             preset = records.row_of(of_curve[0]).preset
-            curves.append(make(name, preset, *zip(*sorted(points, key=itemgetter(0)), strict=True), shapes=dots))
+            curves.append(make(name, preset, *zip(*points, strict=True), shapes=dots))
     positions = [x for each in curves for x in each["x"]]
-    starts = [as_number(run["metrics_start"].get(key)) for run in runs]
+    of_rows = grouped(runs, lambda run: run["row"]).values()
+    starts = [records.median_or_none(as_number(run["metrics_start"].get(key)) for run in row) for row in of_rows]
     initial = records.median_or_none(starts)
+    same_start = initial and all(start is None or math.isclose(start, initial, rel_tol=0.01) for start in starts)
     if curves and has_front and metric.better == LOWER:
         fronts.append(chart.front(positions, [y for each in curves for y in each["y"]]))
-    if curves and initial is not None and math.isfinite(initial):
+    if curves and initial and same_start and math.isfinite(initial):
         span = [x for dots in curves for x, _ in dots["shapes"]] or positions
         fronts.append(chart.level("initial value, median", span, metric.factor * initial, dash="--"))
     return chart.panel_data(dataset, title, metric.label, [*fronts, *curves])
@@ -345,6 +353,10 @@ def _listed(sweep: Sweep) -> str:
         for key, values in sweep.swept.items()
     ]
     return ", ".join(key_texts) or "nothing"
+
+
+def _ended_ok(runs: list[Record]) -> list[Record]:
+    return [run for run in runs if run["status"] == "ok"]
 
 
 def _command_overrides(plan: Plan, swept: dict[str, list[str]]) -> list[str]:

@@ -13,7 +13,14 @@ from matplotlib.figure import Figure
 
 from bench.report.study import Result, Runs, Selection, chart, figure_style, format, merge_runs, table
 from bench.report.suite import standing
-from bench.report.suite.attempts import EXPERIMENT_PREFIX, PROBLEM_SETTINGS, attempts_folder, gather, suite
+from bench.report.suite.attempts import (
+    EXPERIMENT_PREFIX,
+    PROBLEM_SETTINGS,
+    SECOND_START_NOISE,
+    attempts_folder,
+    gather,
+    suite,
+)
 from bench.report.suite.standing import ALPHA, KEY, Ranking, Standing, units
 from bench.report.write import paper
 from bench.report.write.table import percent
@@ -355,17 +362,19 @@ def _notes(made: Standing) -> list[str]:
 def _second_starts(made: Standing, budget: float) -> str:
     """How much noise in the initial parameters changes the progress of runs; empty without second starts."""
     runs = made.second_starts[made.second_starts["budget"] == budget]
-    if runs.empty:
+    changes = (runs["progress"] - runs["first"]).rename("change")
+    moved = changes[runs[["progress", "first"]].max(axis=1) > 0].abs()
+    if moved.empty:
         return ""
-    changes = runs["progress"] - runs["first"]
-    large = percent((changes.abs() > MENTIONED_CHANGE_OF_PROGRESS).mean())
-    median, of_rows = 100 * changes.abs().median(), changes.groupby(runs["row"]).mean().abs()
+    large = percent((moved > MENTIONED_CHANGE_OF_PROGRESS).mean())
+    of_sets = runs.assign(change=changes).groupby(["row", "set"])["change"].mean()
+    means = of_sets.groupby("row").mean().abs()
     return (
-        f"Run-to-run spread at {units(budget)}: {format.plural(len(runs), 'run')} of "
-        f"{format.plural(len(runs[KEY].drop_duplicates()), 'problem')} have a second start, with noise in the initial "
-        f"parameters (task.optimiser.start_noise, here 1e-6). {large} of them change their progress by "
-        f"more than {100 * MENTIONED_CHANGE_OF_PROGRESS:g} points, in the median by {median:.1f}. The mean over "
-        f"these problems changes by at most {100 * of_rows.max():.1f} points ({of_rows.idxmax()})."
+        f"Sensitivity at {units(budget)}: {format.plural(len(runs), 'run')} have a second start, with noise of "
+        f"{SECOND_START_NOISE:g} in the initial parameters. In {len(moved)} of these pairs, a run makes progress. The "
+        f"progress of {large} of them differs by more than {100 * MENTIONED_CHANGE_OF_PROGRESS:g} points, and the "
+        f"median difference is {100 * moved.median():.1f} points. The mean over sets of a renderer changes by at most "
+        f"{100 * means.max():.1f} points ({means.idxmax()}), over {len(runs[KEY].drop_duplicates())} problems."
     )
 
 

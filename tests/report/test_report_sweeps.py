@@ -242,3 +242,33 @@ def test_two_sweeps_have_their_own_runs_in_the_order_of_their_plans(tmp_path):
     named = [name for name in found if name in ("chamfer_l2", "fscore", "steps_taken")]
     assert named == ["chamfer_l2", "fscore", "steps_taken"]  # the first one has the ratio
     assert found.loc["DIST", "ratio"] == 4
+
+
+def test_a_swept_number_has_a_curve_and_no_front_and_failed_runs_cost_nothing(tmp_path):
+    cells = [cell(r, index=i, steps=steps) for r in ("dist", "dvr") for steps in ("0", "9") for i in (0, 1, 2)]
+    swept(tmp_path, cells)
+    for number, planned in enumerate(cells):
+        evaluations = {"value": 1, "gradient": 0, "per_ray": 1.0, "cost": 5.0 if number % 3 else 0.1}
+        ran(tmp_path, planned, 0.001 * (1 + number) if number % 3 else None, evaluations=evaluations)
+    table(tmp_path)
+    panels = {panel["x"]["title"]: panel for panel in find_sweeps(tmp_path)[0].shown.chart["panels"]}
+    curves = {each["name"]: each for each in panels["renderer.steps"]["series"]}
+    assert [*curves][1:] == ["DIST", "DVR"] and curves["DVR"]["x"] == [0, 9]  # no front over the axis itself
+    costs = {each["name"]: each for each in panels[COST]["series"]}
+    assert costs["DIST"]["x"] == [5, 5] and "front" in costs
+
+
+def test_settings_of_the_task_pose_other_problems_and_have_no_front(tmp_path):
+    cells = [
+        replace(planned, overrides=[*planned.overrides, f"task.points={points}"], id=f"{planned.id}-{points}")
+        for planned in (cell("dist"), cell("dvr"))
+        for points in (20, 50)
+    ]
+    cells = [replace(each, config=each.config | {"task": {"points": each.id[-2:]}}) for each in cells]
+    swept(tmp_path, cells)
+    for planned in cells:
+        ran(tmp_path, planned, 0.001)
+    table(tmp_path)
+    panels = find_sweeps(tmp_path)[0].shown.chart["panels"]
+    assert panels[0]["x"]["title"] == "task.points"
+    assert all(each["name"] != "front" for panel in panels for each in panel["series"])

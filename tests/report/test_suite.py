@@ -350,6 +350,7 @@ def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alon
     "argument, said",
     [("suite=large", "unknown suite 'large'"), ("setting=tunde", "did you mean tuned"),
      ("set=pose,poze", "did you mean pose"), ("--plan", "no KEY=VALUE"),
+     ("task.optimiser.start_noise=1e-3", "a second start is"),
      ("budget=5", "unknown budget '5': it has 1, 10"), ("seed=1", "is stated by the suite"),
      ("task.optimiser.budget=5e5", "is stated by the suite"),
      ("scale=smoke", "is stated by the suite"), ("+dataset.radius=.5", "is stated by the suite"),
@@ -628,4 +629,6 @@ def test_a_second_start_shows_the_spread_and_changes_no_comparison(tmp_path):
     made = Standing(Gathered([first, best], [], [], [second]))
     (run,) = made.second_starts.itertuples()
     assert (run.first, run.progress) == (pytest.approx(0.5), pytest.approx(-np.log10(0.2) / 2))
-    assert "more than 5 points, in the median by 15.1" in study._second_starts(made, 1.0)
+    assert "100 % of them differs by more than 5 points, and the median difference is 15.1" in study._second_starts(
+        made, 1.0
+    )

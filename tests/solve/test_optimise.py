@@ -452,7 +452,7 @@ def test_the_budget_chooses_the_smallest_block_with_which_it_pays_for_forty_iter
     assert with_affordable_rays(replace(task, pixel_block=2), make) is made[0][1] and len(made) == 1
 
 
-def test_noise_moves_the_initial_parameters_of_a_second_start_and_nothing_else():
+def test_noise_moves_the_initial_parameters_of_a_second_start():
     radii = []
     for noise in (0.0, 1e-6):
         toy, history = Toy(), History()

@@ -43,7 +43,8 @@ CUSTOM = "custom"  # the preset of renderers that a user names by their class
 TUNED_PREFIX = "tuned/"  # before the name of a method with tuned settings
 TUNED_SUFFIX = ", tuned"  # after the name of a row with tuned settings
 NOISE_KEY = "task.optimiser.start_noise"
-SECOND_SUFFIX = ", second start"  # after the name of a row, for runs with noise in their initial parameters
+SECOND_START_NOISE = 1e-6  # standard deviation of the noise in the initial parameters of a second start
+SECOND_SUFFIX = ", second start"  # after the name of its row
 TUNABLE_KEYS = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"
 # A set fixes these for all renderers; tuned settings may only change TUNABLE_KEYS.
 FIXED_KEYS = ("task", "view", "evaluation", "silhouette", "field", "prior", "split", "seed")
@@ -147,6 +148,11 @@ class Attempt:
         return self.status == "ok"
 
     @property
+    def second_start(self) -> bool:
+        """Whether its initial parameters had noise; it is compared only with the run without."""
+        return self.row.endswith(SECOND_SUFFIX)
+
+    @property
     def tuned(self) -> bool:
         """Whether it has the renderer's tuned settings, not those of the set."""
         return self.row.endswith(TUNED_SUFFIX)
@@ -170,6 +176,8 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         return None
     if setting(config, "task", "optimiser", "ends") != "budget":  # of an older version of the suite
         return None
+    if (noise := setting(config, *NOISE_KEY.split(".")) or 0.0) not in (0.0, SECOND_START_NOISE):
+        return None
     error, ok = suite().errors[set_name], record["status"] == "ok"
     scene = f"{family(record)} {config.get('split')} {config.get('index')}"
     amount_key, _, form = PROBLEM_SETTINGS.get(set_name, ("", "", ""))
@@ -180,7 +188,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     overrides = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
     changes = [text.removeprefix("renderer.") for text in overrides if re.match(r"renderer\.[^_]", text)]
     row = ", ".join([renderer_name(config, record["renderer"]), *changes])  # without the loss, which is the set's
-    suffix = TUNED_SUFFIX if tuned else SECOND_SUFFIX if setting(config, *NOISE_KEY.split(".")) else ""
+    suffix = SECOND_SUFFIX if noise else TUNED_SUFFIX if tuned else ""
     return Attempt(
         set=set_name,
         problem=", ".join([scene, *amount_texts]),
@@ -343,12 +351,17 @@ def gather(shipped: Path, results_dir: Path, records: Iterable[Record] = ()) -> 
     shipped_attempts, problems = read_attempts(shipped)
     local, unread = ([], []) if results_dir.resolve() == shipped.resolve() else read_attempts(results_dir)
     local += attempts_of(records, results_dir)
-    names = {attempt.row for attempt in shipped_attempts}
-    local = [
-        replace(attempt, row=f"{attempt.row}, yours") if attempt.preset == CUSTOM and attempt.row in names else attempt
-        for attempt in local
+    names = {attempt.row.removesuffix(SECOND_SUFFIX) for attempt in shipped_attempts}
+    local = [_renamed(attempt, names) for attempt in local]
+    attempts = [*shipped_attempts, *local]
+    second_starts = [
+        replace(attempt, row=attempt.row.removesuffix(SECOND_SUFFIX)) for attempt in attempts if attempt.second_start
     ]
-    first = grouped([*shipped_attempts, *local], lambda attempt: not attempt.row.endswith(SECOND_SUFFIX))
-    second_starts = [replace(run, row=run.row.removesuffix(SECOND_SUFFIX)) for run in first.get(False, ())]
-    local = [attempt for attempt in local if not attempt.row.endswith(SECOND_SUFFIX)]
-    return Gathered(first.get(True, []), local, [*problems, *unread], second_starts)
+    attempts, local = ([run for run in runs if not run.second_start] for runs in (attempts, local))
+    return Gathered(attempts, local, [*problems, *unread], second_starts)
+
+
+def _renamed(attempt: Attempt, shipped: set[str]) -> Attempt:
+    """The attempt of a user's class, with another row if its row is shipped."""
+    row, suffix = attempt.row.removesuffix(SECOND_SUFFIX), SECOND_SUFFIX * attempt.second_start
+    return replace(attempt, row=f"{row}, yours{suffix}") if attempt.preset == CUSTOM and row in shipped else attempt

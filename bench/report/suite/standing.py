@@ -158,9 +158,10 @@ def with_progress(runs: pd.DataFrame) -> pd.DataFrame:
 
 def second_starts(attempts: Iterable[Attempt], first: pd.DataFrame) -> pd.DataFrame:
     """The second starts of compared runs with their `progress`, and as `first` that of the run itself."""
-    runs = first[[*KEY, "row", "initial", "reference", "progress"]].rename(columns={"progress": "first"})
-    newest = frame_of(attempts)[0].drop_duplicates([*KEY, "row"], keep="last")
-    return with_progress(newest.merge(runs, on=[*KEY, "row"]))
+    key = [*KEY, "row", "settings"]
+    runs = first[[*key, "initial", "reference", "progress"]].rename(columns={"progress": "first"})
+    newest = frame_of(attempts)[0].drop_duplicates(key, keep="last")
+    return with_progress(newest.merge(runs, on=key))
 
 
 def units(budget: float) -> str:

@@ -165,7 +165,7 @@
   const costs = (get, unit) => [
     numeric("loop", "Optimisation", (item) => get(item, "loop"),
       (value, item) => [seconds(value), element("small", null, seconds(get(item, "total")))], {unit}),
-    numeric("values", "Field evaluations", (item) => get(item, "values"), count),
+    numeric("values", "Field values", (item) => get(item, "values"), count),
   ];
 
   function thumb(index) {

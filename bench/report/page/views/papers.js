@@ -77,7 +77,7 @@
     const picture = data.picture && element("figure", null, element("a", {href: data.files.PDF || data.picture}, image()));
     const links = Object.entries(data.files).map(([kind, href]) => [element("a", {href}, kind), " "]);
     const runs = (row) => bench.address.to(["runs"], {task: "all", view: "runs", folders: (data.folders[row] || []).join()});
-    const rows = entry.sweep ? {...data, named: data.header[0], link: runs} : data;
+    const rows = Object.keys(data.folders || {}).length ? {...data, named: data.header[0], link: runs} : data;
     const table = data.rows.length > 0 && bench.written(data.header, data.rows, entry.name === SUITE ? STANDING : rows);
     return [
       data.atlas && bench.atlas(data.atlas),
