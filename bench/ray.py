@@ -28,7 +28,7 @@ import torch
 from omegaconf import DictConfig
 
 from bench.evaluate.along_ray import Lane, TrueRay, follow, sentences, true_ray
-from bench.evaluate.reference import MIN_STEP, RADIUS, in_float64
+from bench.evaluate.reference import RADIUS, in_float64, trace_exactly
 from bench.pictures.ray import RayPicture
 from bench.records.format import number, plural
 from bench.records.record import bad_link, read_record
@@ -47,7 +47,6 @@ from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Field, estimate_lipschitz
 from renderers.fields.grid import Grid
 from renderers.rendering import Renderer, Status, Unsupported
-from renderers.tracing.reference import trace
 
 DECIMAL = r"\d+(\.\d*)?(e-?\d+)?"
 OPTIONS = {  # the pattern of a value, and an example
@@ -114,7 +113,7 @@ class RayScene:
         rays, exact_rays = (Rays(image.origins[cut], image.directions[cut]) for image in images)
         with torch.no_grad():
             rendering = render_checked(renderer, self.field, rays.flat())
-        reference = trace(self.exact, exact_rays.flat(), lipschitz=self.lipschitz, least_step=MIN_STEP, radius=RADIUS)
+        reference = trace_exactly(self.exact, exact_rays.flat(), self.lipschitz)
         _, leave, in_sphere = sphere_span(exact_rays.flat(), RADIUS)
         ends = [
             torch.where(each.status == Status.MISS, leave, each.distance.double()) for each in (rendering, reference)

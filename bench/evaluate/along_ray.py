@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.evaluate.reference import MIN_STEP, RADIUS
+from bench.evaluate.reference import RADIUS, trace_exactly
 from bench.records.format import plural
 from renderers.boundary import render_checked
 from renderers.camera import Rays, sphere_span
 from renderers.field import Bounds, Coarse, Field, Wrapper, autograd_normals, coarse_version, field_bounds
 from renderers.rendering import Renderer, Status, Unsupported
-from renderers.tracing.reference import trace
 
 ON_RAY_TOLERANCE = 1e-5  # scene units: a point within this distance of the ray is on it
 ROUNDING = 5e-7  # scene units: float32 resolves no shorter length at a distance of 2.5
@@ -144,7 +143,7 @@ class Lane:
 def true_ray(exact: Field, rays: Rays, *, lipschitz: float, tolerance: float) -> TrueRay:
     """The truth on one float64 ray [1, 3] that meets the unit sphere, of a float64 field."""
     entry, leave = (float(ends[0]) for ends in sphere_span(rays, RADIUS)[:2])
-    reference = trace(exact, rays, lipschitz=lipschitz, least_step=MIN_STEP, radius=RADIUS)
+    reference = trace_exactly(exact, rays, lipschitz)
     distances = torch.linspace(entry, leave, DENSE_SAMPLES, dtype=torch.float64)
     with torch.no_grad():
         values = torch.cat([exact(points) for points in rays.at_each(distances)[0].split(4096)]).numpy()

@@ -12,8 +12,9 @@ from torch import Tensor
 from bench.progress import notice
 from bench.records.record import digest
 from bench.shape_prior import Prior, load_or_make
-from renderers.camera import Camera
+from renderers.camera import Camera, Rays
 from renderers.field import Field, autograd_normals, estimate_lipschitz
+from renderers.rendering import Rendering
 from renderers.tracing.reference import trace
 
 VERSION = 1  # raise it when the reference changes
@@ -54,10 +55,15 @@ def make_reference(field: Field, camera: Camera) -> Reference:
     """Traces a float64 field along the rays through all pixel centres."""
     rays = camera.double().rays()
     lipschitz = estimate_lipschitz(field, radius=RADIUS)
-    rendering = trace(field, rays, lipschitz=lipschitz, least_step=MIN_STEP, radius=RADIUS)
+    rendering = trace_exactly(field, rays, lipschitz)
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     return Reference(rendering.distance * rendering.hit, normals, rendering.hit)
+
+
+def trace_exactly(field: Field, rays: Rays, lipschitz: float) -> Rendering:
+    """The float64 hits of a float64 field in the unit sphere, given its Lipschitz constant."""
+    return trace(field, rays, lipschitz=lipschitz, least_step=MIN_STEP, radius=RADIUS)
 
 
 def fingerprint(prior: Prior) -> str:

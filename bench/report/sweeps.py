@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ class Sweep:
     @property
     def datasets(self) -> list[str]:
         """The data sets of which every row has runs; empty if there is only one, or too many."""
-        rows = grouped(self.runs.records, lambda run: run["row"]).values()
+        rows = grouped(self.runs.records, itemgetter("row")).values()
         sets, names = [{*map(records.family, runs)} for runs in rows], map(records.family, self.runs.records)
         shared = [name for name in dict.fromkeys(names) if all(name in datasets for datasets in sets)]
         return shared if 1 < len(shared) <= MAX_DATASET_COLUMNS else []
@@ -138,7 +139,7 @@ def lines(sweep: Sweep) -> list[dict[str, Any]]:
     The ratio is to the first row, paired by shape, or None. The median of the first metric on each data set that all
     rows have is under the name of the metric with that of the data set.
     """
-    rows, names = grouped(sweep.runs.records, lambda record: record["row"]), sweep.metrics
+    rows, names = grouped(sweep.runs.records, itemgetter("row")), sweep.metrics
     first = next(iter(rows.values()))
     lead = names[0] if names and better_direction(names[0]) == LOWER else ""
     sweep_lines = [_line(row, runs, names) | {"ratio": _ratio(runs, first, lead)} for row, runs in rows.items()]
@@ -156,7 +157,7 @@ def _on(metric: str, dataset: str) -> str:
 def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
     shapes = grouped(runs, lambda record: run_key(record)[0]).values()
     failures = [[record["status"] != "ok" for record in of_shape] for of_shape in shapes]
-    ended = [record for record in runs if record["status"] == "ok"]
+    ended = _ended_ok(runs)
     reasons = Counter(f"{run['status']}: {run['reason']}".rstrip(": ") for run in runs if run["status"] != "ok")
     rate = share([sum(failed) for failed in failures], [len(failed) for failed in failures])
     return {
@@ -221,7 +222,9 @@ def table_of(sweep: Sweep) -> Result:
         f"Medians over {VARYING}; swept over {_listed(sweep)}.",
         **_answer(sweep, table_lines, lead, headings),
         command=sweep.command,
-        folders={row: [run["folder"] for run in runs] for row, runs in grouped(sweep.runs.records, _row).items()},
+        folders={
+            row: [run["folder"] for run in runs] for row, runs in grouped(sweep.runs.records, itemgetter("row")).items()
+        },
         n=f"{len(sweep.runs.records)} runs" if stress else "",
         interval="; ".join(filter(None, kinds)) if headings else "",
         figure=chart.draw(panels, height, rows, legend=3) if panels else None,
@@ -244,7 +247,7 @@ def _panels(sweep: Sweep, dataset: str, lead: str, metric: Metric) -> list[Panel
     runs = [run for run in sweep.runs.records if not dataset or records.family(run) == dataset]
     axes = {COST: records.cost} | ({RUNTIME: records.loop_seconds} if sweep.runs.timed else {})
     if sweep.axis:
-        axes = {sweep.axis: lambda run: run["position"]} | axes
+        axes = {sweep.axis: itemgetter("position")} | axes
     same_problems = all(key.startswith(METHOD_KEYS) for key in sweep.swept if key not in AVERAGED_KEYS)
     panels = [
         _panel(runs, (dataset, title), number_of, (lead, metric), same_problems and title != sweep.axis)
@@ -263,8 +266,8 @@ def _panel(
     """A point per row, joined along the swept number; the initial value if all rows have it; the front if wanted."""
     (dataset, title), (key, metric) = titles, lead
     curves, fronts = list[Series](), list[Series]()
-    for name, of_curve in grouped(runs, lambda run: run["curve"]).items():
-        rows = grouped(of_curve, lambda run: run["row"]).values()
+    for name, of_curve in grouped(runs, itemgetter("curve")).items():
+        rows = grouped(of_curve, itemgetter("row")).values()
         ordered = sorted(rows, key=lambda of_row: of_row[0]["position"] or 0.0)
         costs = [records.median_or_none(map(number_of, _ended_ok(of_row) or of_row)) for of_row in ordered]
         pairs = zip(costs, [median_of(of_row, key) for of_row in ordered], strict=True)
@@ -276,7 +279,7 @@ def _panel(
             preset = records.row_of(of_curve[0]).preset
             curves.append(make(name, preset, *zip(*points, strict=True), shapes=dots))
     positions = [x for each in curves for x in each["x"]]
-    of_rows = grouped(runs, lambda run: run["row"]).values()
+    of_rows = grouped(runs, itemgetter("row")).values()
     starts = [records.median_or_none(as_number(run["metrics_start"].get(key)) for run in row) for row in of_rows]
     initial = records.median_or_none(starts)
     same_start = initial and all(start is None or math.isclose(start, initial, rel_tol=0.01) for start in starts)
@@ -367,10 +370,6 @@ def _command_overrides(plan: Plan, swept: dict[str, list[str]]) -> list[str]:
         values = swept.get(key.lstrip("+"))
         overrides[key] = f"{key}={','.join(values)}" if values else override
     return [*overrides.values()]
-
-
-def _row(record: Record) -> str:
-    return record["row"]
 
 
 def _number(value: str) -> float | None:
