@@ -23,12 +23,13 @@ def main() -> int:
 
 def _summarise(plan: Plan) -> list[str]:
     """Writes and prints the summary of a sweep; returns the status of each of its cells."""
-    from bench.report.sweeps import write_sweep
+    from bench.report.sweeps import summary_lines, write_sweep
     from bench.report.write.html import write_index
     from bench.runner.summary import print_sweep_summary
 
-    table = write_sweep(plan)
-    return print_sweep_summary(plan, write_index(plan.results_dir), table)
+    problems: list[str] = []
+    lines = summary_lines(write_sweep(plan, problems))
+    return print_sweep_summary(plan, write_index(plan.results_dir), [*lines, *problems])
 
 
 def console() -> int:

@@ -3,7 +3,7 @@
 import math
 import shlex
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from operator import itemgetter
@@ -13,7 +13,7 @@ from typing import Any
 from bench.records import format
 from bench.records.metrics import HIGHER, LOWER, TABLE_METRICS, Metric, better_direction
 from bench.records.names import differences
-from bench.records.read import not_run_record, read_plans
+from bench.records.read import not_run_record, read_plans, read_records
 from bench.records.record import as_number
 from bench.records.results import Plan, read_run
 from bench.report.data import records
@@ -25,8 +25,9 @@ from bench.report.suite.attempts import portable_overrides
 from bench.report.write import chart
 from bench.report.write.caption import FEW, VARYING
 from bench.report.write.chart import Panel, Series
-from bench.report.write.paper import RECORD_ERRORS, SWEEPS, TABLE, studies
-from bench.report.write.result import Result, write
+from bench.report.write.html import page_lock
+from bench.report.write.paper import RECORD_ERRORS, SWEEPS, TABLE, studies, write_paper
+from bench.report.write.result import Result, read_shown, write
 from bench.report.write.table import Column, count_with_interval, ends, text
 
 ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # after a heading: the better direction
@@ -99,16 +100,34 @@ def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) 
     return written
 
 
-def write_sweep(plan: Plan) -> Path | None:
-    """Writes the table of a finished sweep, unless a study shows it; returns the path of the Markdown file."""
-    if plan.cells[0].config.get("experiment") in _studied():
-        return None
+def write_sweep(plan: Plan, problems: list[str]) -> list[Path]:
+    """Writes the tables of a finished sweep: those of the study named as its experiment, or its own.
+
+    Returns the paths of the Markdown files; none if only studies of other names show the experiment. `problems` gets a
+    line for a table that cannot be made.
+    """
+    if (experiment := plan.cells[0].config.get("experiment")) in _studied():
+        with page_lock(plan.results_dir):
+            records, _ = read_records(plan.results_dir)
+            written = write_paper(records, plan.results_dir, problems=problems, only=experiment)
+        return [path.with_suffix(".md") for path in written]
     record_by_id = {}
     for cell in plan.cells:
         record, _ = read_run(plan.results_dir / "runs" / cell.id, plan.results_dir)
         record_by_id[cell.id] = record or not_run_record(cell, plan)
     _write(of_plan(plan, record_by_id), plan.folder)
-    return plan.folder / f"{TABLE}.md"
+    return [plan.folder / f"{TABLE}.md"]
+
+
+def summary_lines(tables: Sequence[Path]) -> list[str]:
+    """What a sweep prints about its tables: the answer, the paths, and the pictures."""
+    lines = []
+    for path in tables:
+        shown = read_shown(path.with_suffix(".json"))
+        lines += [f"answer: {shown.verdict.replace('*', '')}"] if shown.verdict else []
+        lines += [f"table: {path}"]
+        lines += [f"picture: {picture}"] if (picture := path.with_suffix(".png")).is_file() else []
+    return lines
 
 
 def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
@@ -166,7 +185,7 @@ def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
         "reasons": "; ".join(f"{reason} ({count} runs)" if count > 1 else reason for reason, count in reasons.items()),
         "loop_seconds": records.median_or_none(map(records.loop_seconds, ended)),
         "value_evaluations": records.median_or_none(map(records.value_evaluations, ended)),
-        "cost": records.median_or_none(map(records.cost, ended)),
+        "evaluations_cost": records.median_or_none(map(records.cost, ended)),
         **{name: median_of(runs, name) for name in names},
     }
 
@@ -333,7 +352,7 @@ def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> lis
         *ends("failed", lambda line: line["rate"]),
         text("reasons"),
         Column("loop_seconds", "Runtime", show=format.seconds),
-        *(Column("cost", "Field evaluations", show=format.count), Column("value_evaluations")),
+        *(Column("evaluations_cost", "Field evaluations", show=format.count), Column("value_evaluations")),
     ]
 
 

@@ -43,11 +43,11 @@ def print_run_summary(folder: Path, record: Record) -> None:
     print(folder)
 
 
-def print_sweep_summary(plan: Plan, index: Path, table: Path | None = None) -> list[str]:
+def print_sweep_summary(plan: Plan, index: Path, tables: Sequence[str] = ()) -> list[str]:
     """Prints the results of a sweep, with the plan's folder last; returns the status of every planned cell.
 
     Args:
-        table: the file of the sweep's table, if it has one.
+        tables: lines on the sweep's tables.
     """
     records = [plan.record(cell) for cell in plan.cells]
     statuses = [record["status"] if record else NOT_RUN for record in records]
@@ -57,11 +57,7 @@ def print_sweep_summary(plan: Plan, index: Path, table: Path | None = None) -> l
         print("the same command runs what was not run or was killed; with rerun=failed, also the cells that failed")
     for record in [record for record in records if record and record["status"] != "ok"][:1]:
         print(f"first failure: {index.parent / 'runs' / record['folder']} ({record['status']}: {record['reason']})")
-    if table is not None:
-        print(f"table of this sweep: {table}")
-        if (picture := table.with_suffix(".png")).is_file():
-            print(f"error over cost: {picture}")
-    print(f"report: {index}")
+    print(*tables, f"report: {index}", sep="\n")
     _print_contract_test(index.parent / "runs", [record for record in records if record and not record["reused"]])
     _print_report_command(index.parent)
     print(plan.folder)

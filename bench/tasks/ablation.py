@@ -7,6 +7,7 @@ used, because the sizes of a march's tensors differ between renderings.
 
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from math import ceil
 from statistics import median
@@ -36,11 +37,12 @@ from renderers.field import (
     Field,
     Meter,
     Wrapper,
+    autograd_gradients,
     autograd_normals,
     coarse_version,
     field_bounds,
 )
-from renderers.rendering import RayObservation, Renderer, Rendering, check_kind
+from renderers.rendering import RayObservation, Renderer, Rendering, Status, check_kind
 from renderers.tracing.waits import active_mask
 
 BASE = "base"  # the run's renderer, if it is compared with others
@@ -77,6 +79,10 @@ DEFINITIONS = {
     "wrong": "pixels that both hit, at depths that differ by more than task.wrong",
     "error_p95": "95th percentile of the difference of depth over the pixels that either hits, where a pixel that only "
     "one of them hits counts as infinite; in scene units",
+    "out_of_steps": "pixels whose ray used all steps before it converged",
+    "gradient_cosine": "of two gradients of the summed movement of hits along normals by the network's weights: "
+    "the renderer's, and the float64 reference's by implicit differentiation (DVR, Eq. 8); over pixels that both hit; "
+    "1 is the right direction",
     "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
 }
 IN_TURN_DEFINITIONS = {
@@ -199,7 +205,10 @@ class Ablation:
         machine, peak_flops = record.environment, gemm_peak(bench.device)  # measured close to the times
         machine["gemm_peak_flops"] = max(machine["gemm_peak_flops"], peak_flops)
         numbers = {
-            name: costs(b.forward, b.step, machine) | b.errors(self.wrong) | {"behind": b.negative_fraction()}
+            name: costs(b.forward, b.step, machine)
+            | b.errors(self.wrong)
+            | b.gradient()
+            | {"behind": b.negative_fraction()}
             for name, b in benches.items()
         }
         record.metrics = {"size": bench.camera.height, **numbers[BASE], "cost": bench.forward.counts.cost}
@@ -351,6 +360,8 @@ class Workbench:
             "false": int((predicted.mask & ~reference.mask).sum()),
             "wrong": int((error > wrong).sum()),
         }
+        if self.rendering is not None:
+            numbers["out_of_steps"] = int((self.rendering.status == Status.OUT_OF_STEPS).sum())
         numbers["pixel_errors"] = numbers["lost"] + numbers["false"] + numbers["wrong"]
         all_errors = torch.cat([error, torch.full((numbers["lost"] + numbers["false"],), torch.inf, dtype=error.dtype)])
         if all_errors.numel():
@@ -366,6 +377,31 @@ class Workbench:
         with torch.no_grad():
             render_checked(self.renderer, signs, self.rays)
         return signs.negative / max(signs.evaluated, 1)
+
+    def gradient(self) -> dict[str, float]:
+        """The metric `gradient_cosine`; empty without a pixel that both hit, or with a gradient that is zero."""
+        decoder, cosines = deepcopy(self.decoder).requires_grad_(True), dict[str, float]()
+        rendering = render_checked(self.renderer, decoder.at(self.code.detach()), self.rays)
+        both, rays = rendering.hit.cpu() & self.reference.hit, self.camera.double().rays()
+        if both.any():
+            facing = (self.reference.normals * rays.directions).sum(-1)[both].abs().to(self.rays.directions)
+            moved = (rendering.distance[both.to(self.device)] * facing).sum()
+            exact = deepcopy(decoder).cpu().double()
+            points, field = rays.at(self.reference.distance)[both], exact.at(self.code.detach().cpu().double())
+            reference = (field(points) / autograd_gradients(field, points).detach().norm(dim=-1)).sum()
+            pair = [
+                torch.cat(
+                    [
+                        each.flatten().cpu().double()
+                        for each in torch.autograd.grad(loss, [*network.parameters()], materialize_grads=True)
+                    ]
+                )
+                for loss, network in ((moved, decoder), (reference, exact))
+            ]
+            lengths = pair[0].norm() * pair[1].norm()
+            if lengths > 0:
+                cosines["gradient_cosine"] = float(pair[0] @ pair[1] / lengths)
+        return cosines
 
     def views(self, normal_width: float | None = None) -> tuple[View, View]:
         """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes.

@@ -32,7 +32,15 @@ SINGLE_RUN_EXPERIMENTS = {"fitted"}  # without a table or figure
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
 # An experiment that sweeps over rows that several experiments share.
 SHARED_ROWS = {"speed_accuracy": "speed_completion", "core": "core_complete"}
-COMPARING = {"table1": 24, "fig4": 7, "fig5": 9, "stability": 21, "gradients": 14, "speed_accuracy": 30}  # renderers
+COMPARING = {
+    "table1": 24,
+    "fig4": 7,
+    "fig5": 9,
+    "stability": 21,
+    "gradients": 14,
+    "speed_accuracy": 30,
+    "fit_for": 18,
+}  # renderers
 COMPARING |= {"core": 11}
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
@@ -172,6 +180,8 @@ def test_the_first_and_last_cell_of_an_experiment_compose_and_build(paths, name,
             actual, expected = OmegaConf.select(config, key), yaml.safe_load(value.replace(":", ": "))
             if isinstance(expected, dict):  # other settings of a node stay
                 assert expected.items() <= dict(actual).items()
+            elif isinstance(expected, list):
+                assert list(actual) == expected
             else:
                 assert actual == (expected if actual is None else type(actual)(value))
 

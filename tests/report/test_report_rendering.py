@@ -68,6 +68,35 @@ def test_table1_says_to_a_reader_what_failed_and_how_it_was_measured(tmp_path):
         assert words in told(page)
 
 
+def shown_from(results, label: str, azimuth: int, wrong: int, cost: int, **changed) -> None:
+    """A run of fit_for from a camera at an azimuth; its hits are 400."""
+    pixels = {"lost": wrong, "false": 0, "wrong": 0, "pixel_errors": wrong, "out_of_steps": wrong, "cost": cost}
+    settings = {"view": {"resolution": 64, "azimuth": [azimuth] * 2}}
+    metrics = costs() | pixels | {"gradient_cosine": 0.5}
+    folder = write_run(results, "fit_for", label, settings=settings, **{"metrics": metrics, **changed})
+    write_images(folder)
+
+
+def test_the_renderer_for_a_field_is_chosen_without_the_camera_that_checks_it(tmp_path):
+    for azimuth, wrong in ((0, 4), (90, 4), (180, 100)):  # few wrong pixels from the first two cameras only
+        shown_from(tmp_path, "A", azimuth, wrong, cost=1000)
+    for azimuth in (0, 90, 180):
+        shown_from(tmp_path, "B", azimuth, 2, cost=2000)
+        shown_from(tmp_path, "C", azimuth, 40, cost=500)
+        shown_from(tmp_path, "D", azimuth, 0, 0, metrics={}, status="unsupported", reason="needs a distance")
+    page = page_of(tmp_path, "fit_for")
+    assert page.verdict == (
+        "With at most 1 % wrong pixels, *A* needs the fewest field evaluations, 1.00k: 8 of 800 pixels are wrong. From "
+        "another camera, 100 of 400. Cheaper, with more wrong pixels: C 10.0 %."
+    )
+    rows = page.data.set_index("renderer")
+    assert list(rows["lost"])[:3] == [108, 6, 120] and rows.loc["A", "fraction"] == pytest.approx(108 / 1200)
+    assert rows.loc["B", "gradient_angle"] == pytest.approx(60) and rows.loc["D", "reason"] == "needs a distance"
+    assert [each["name"] for each in page.chart["panels"][0]["series"]] == ["A", "B", "C"]
+    pictures = page_of(tmp_path, "fit_for_pixels")
+    assert len(pictures.runs.records) == 4  # of the first camera
+
+
 def numbers(factor: float, coarse: int = 0) -> dict:
     """The numbers of a renderer that takes `factor` times what the first one does."""
     ratios = {f"{cost}_ratio": factor for cost in benchmark.COSTS}

@@ -32,7 +32,7 @@ def ran(results: Path, planned: PlannedRun, chamfer: float | None, **changed) ->
     metrics = {} if chamfer is None else {"steps_taken": 9, "fscore": 1 - chamfer, "chamfer_l2": chamfer}
     ended = {"status": "ok"} if chamfer is not None else {"status": "crashed", "reason": "as planned"}
     given = {"config": planned.config, "renderer": planned.renderer, "dataset": planned.dataset, "seed": planned.seed}
-    content = record(planned.id, **given, metrics=metrics, **ended, **changed)
+    content = record(planned.id, **{**given, "metrics": metrics, **ended, **changed})
     write_run(results, content, planned.id)
 
 
@@ -111,12 +111,22 @@ def test_a_sweep_that_has_ended_has_its_table_at_once(tmp_path):
     plan.write()
     for one in cells[:3]:  # the last was not run
         ran(tmp_path, one, 0.001)
-    assert write_sweep(plan) == tmp_path / "sweeps" / "completion-1" / "table.md"
+    problems: list[str] = []
+    assert write_sweep(plan, problems) == [tmp_path / "sweeps" / "completion-1" / "table.md"]
     at_once = (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()
     assert list(table(tmp_path)["failed"]) == [0, 0] and list(table(tmp_path)["runs"]) == [2, 1]
     assert at_once == (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()  # as the report makes it
     experiment = [replace(one, config=one.config | {"experiment": "table2"}) for one in cells]
-    assert write_sweep(Plan("table2-1", tmp_path, experiment)) is None  # a page shows it
+    assert write_sweep(Plan("table2-1", tmp_path, experiment), problems) == problems == []  # a page without runs
+
+
+def test_a_metric_with_the_name_of_a_cost_has_its_median(tmp_path):
+    cells = [cell(renderer) for renderer in ("dist", "dvr")]
+    swept(tmp_path, cells)
+    for each in cells:
+        ran(tmp_path, each, 0.001, metrics={"cost": 7.0}, evaluations={"cost": 9})
+    rows = table(tmp_path)
+    assert list(rows["cost"]) == [7, 7] and list(rows["evaluations_cost"]) == [9, 9]
 
 
 def test_six_shapes_have_an_interval(tmp_path):

@@ -106,6 +106,15 @@ def test_counts_are_those_of_a_meter(dist):
     assert record.evaluations["work_over_bound"] == pytest.approx(work / least, rel=1e-12)
 
 
+def test_the_gradient_by_weights_is_exact_at_exact_hits_and_wrong_with_the_opposite_sign(tmp_path):
+    exact = measured(tmp_path / "a", load("renderer", "newton")).record.metrics
+    assert exact["gradient_cosine"] == pytest.approx(1, abs=1e-6) and exact["out_of_steps"] == 0
+    coarse = measured(tmp_path / "b", load("renderer", "dist", steps=3)).record.metrics
+    assert coarse["out_of_steps"] > 0
+    opposite = measured(tmp_path / "c", Opposite(load("renderer", "newton"))).record.metrics
+    assert opposite["gradient_cosine"] == pytest.approx(-1, abs=1e-6)
+
+
 def test_times_and_rates_agree_with_each_other(dist):
     metrics = dist.record.metrics
     assert metrics["repeats"] == 2
@@ -223,6 +232,24 @@ def test_lost_false_and_wrong_are_counted_against_the_reference(tmp_path, monkey
 
 
 @dataclass
+class Opposite:
+    """A renderer whose hits are right and whose gradients have the opposite sign."""
+
+    inner: Renderer
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return self.inner.capabilities
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        rendering = self.inner.render(field, rays)
+        return replace(rendering, distance=2 * rendering.distance.detach() - rendering.distance)
+
+    def silhouette_loss(self, *arguments: Any) -> torch.Tensor:
+        return self.inner.silhouette_loss(*arguments)
+
+
+@dataclass
 class Costly(Fake):
     """Evaluates more values in each rendering with more rays than some."""
 
@@ -266,7 +293,7 @@ def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, v
     costly = Costly(above=WARM_UP_PIXELS**2, values=values)
     run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
     assert run.record.status is RunStatus.OK and run.record.metrics["repeats"] == times
-    assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
+    assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 2)  # the last two: the gradient, the signs
 
 
 TURNS = replace(SETTINGS, repeats=1, beside=["newton", "dvr"], rounds=2, size=16, threads=1)

@@ -1,0 +1,136 @@
+"""Which renderer and which settings suit a field: wrong pixels, depth errors and costs from several cameras."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from bench.report.study import Result, Runs, Selection, chart, format, gallery, records, table
+
+PLACE = 25
+READS = (Selection("fit_for", ("view.azimuth",), alike=("dataset", "prior", "task")),)
+MAX_WRONG_FRACTION_OF_HITS = 0.01
+MAX_COLUMNS = 6
+Y_TITLE = "wrong pixels (% of the hits)"
+SUMMED = ("hits", "lost", "false", "wrong", "pixel_errors", "out_of_steps")
+MEDIANS = ("cost", "forward_seconds", "step_seconds", "depth_error_median", "error_p95", "gradient_cosine")
+NOTES = (
+    "Missed: only the float64 reference hits. Spurious: only the renderer hits. Wrong depth: both hit, at depths that "
+    "differ by more than half a pixel. Pixels are summed over cameras, other numbers are medians over cameras.",
+    "Out of steps: the ray ended before it converged. More steps can mend such pixels: see DIST, 200 steps.",
+    "A step is a rendering with gradients, the loss and the backward pass. Depths are in scene units.",
+    "In the chart, a renderer without wrong pixels has half a pixel.",
+    "Gradient angle: between the renderer's gradient by the network's weights and the exact one, in degrees.",
+)
+Line = dict[str, Any]
+
+
+def make(runs: Runs) -> Result:
+    """A line per renderer: the sums or medians over all cameras."""
+    rows = runs.executed.rows()
+    lines = [_line(row.name, row.preset, of_row) for row, of_row in rows.items()]
+    return Result(
+        runs,
+        "Renderers on one field.",
+        "Pixels that differ from the float64 reference, over the field evaluations of one rendering.",
+        question="Which renderer suits this field?",
+        verdict=_verdict(rows, lines),
+        remarks=NOTES,
+        columns=COLUMNS,
+        lines=lines,
+        folders={row.name: [record["folder"] for record in of_row] for row, of_row in rows.items()},
+        figure=chart.draw(panels := _panels(lines, timed=runs.timed), 3.6, legend=4, sharey=True),
+        chart={"panels": panels, "note": "Click on a point for the runs of its renderer."},
+    )
+
+
+def make_pictures(runs: Runs) -> Result:
+    """A column of pictures per renderer, from the first camera."""
+    first = str(records.setting(runs.records[0]["config"], "view", "azimuth"))
+    chosen = runs.only([r for r in runs.records if str(records.setting(r["config"], "view", "azimuth")) == first])
+    comparison = gallery.compare_with_reference(replace(chosen, selection=Selection("fit_for")), MAX_COLUMNS)
+    return Result(
+        chosen,
+        "Wrong pixels of each renderer.",
+        "Normals (right, up, towards the camera as red, green, blue), and below their angle to those of the reference.",
+        remarks=comparison.missing,
+        figure=gallery.draw(comparison.blocks, largest=comparison.largest),
+    )
+
+
+def _line(name: str, preset: str, of_row: list[records.Record]) -> Line:
+    sums = {key: [records.measured(record, key) for record in of_row] for key in SUMMED}
+    failed = [record for record in of_row if record["status"] != "ok"]
+    line = {"renderer": name, "preset": preset, "cameras": len(of_row), "failed": len(failed)}
+    line |= {key: None if None in values else sum(values) for key, values in sums.items()}
+    line |= {key: records.median_or_none(records.measured(record, key) for record in of_row) for key in MEDIANS}
+    line["fraction"] = (
+        line["pixel_errors"] / line["hits"] if line["hits"] and line["pixel_errors"] is not None else None
+    )
+    cosine = line["gradient_cosine"]
+    line["gradient_angle"] = None if cosine is None else math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+    return line | {"reason": failed[0]["reason"] if failed else ""}
+
+
+def _verdict(rows: dict[records.Row, list[records.Record]], lines: list[Line]) -> str:
+    """The cheapest step among the renderers with few wrong pixels, chosen without the last camera, which checks it."""
+    cameras = max(line["cameras"] for line in lines)
+    chosen = [_line(row.name, row.preset, of_row[: max(cameras - 1, 1)]) for row, of_row in rows.items()]
+    good = [line for line in chosen if line["fraction"] is not None and line["fraction"] <= MAX_WRONG_FRACTION_OF_HITS]
+    if not good:
+        measured = {line["renderer"]: line["fraction"] for line in lines}
+        return format.ends("Wrong pixels, of all hits", measured, f"{cameras} cameras", show=table.small_percent)
+    best = min(good, key=lambda line: line["cost"])
+    wrong, hits = best["pixel_errors"], best["hits"]
+    text = (
+        f"With at most {table.percent(MAX_WRONG_FRACTION_OF_HITS)} wrong pixels, *{best['renderer']}* needs the fewest field "
+        f"evaluations, {format.count(best['cost'])}: {wrong} of {hits} pixels are wrong."
+    )
+    if cameras > 1:
+        last = next(
+            _line(row.name, row.preset, of_row[-1:]) for row, of_row in rows.items() if row.name == best["renderer"]
+        )
+        text += f" From another camera, {last['pixel_errors']} of {last['hits']}."
+    others = [
+        f"{line['renderer']} {table.small_percent(line['fraction'])}" for line in lines if _is_cheaper(line, best)
+    ]
+    return text + (f" Cheaper, with more wrong pixels: {', '.join(others)}." if others else "")
+
+
+def _is_cheaper(line: Line, best: Line) -> bool:
+    return line["fraction"] is not None and line["cost"] < best["cost"] and line["renderer"] != best["renderer"]
+
+
+def _panels(lines: list[Line], *, timed: bool) -> list[chart.Panel]:
+    """A point per renderer, over field evaluations and, on a quiet machine, over the rendering's seconds."""
+    axes = {"cost": "field evaluations of a rendering"} | ({"forward_seconds": "runtime (seconds)"} if timed else {})
+    panels = []
+    for key, title in axes.items():
+        drawn = []
+        for line in lines:
+            if line["fraction"] is not None and line[key] is not None:
+                percent = 100 * max(line["fraction"], 0.5 / line["hits"])  # the axis is logarithmic
+                name, share = line["renderer"], table.small_percent(line["fraction"])
+                look = {"text": [[name, share]], "link": [chart.link_to_runs(name)]}
+                drawn.append(chart.series(name, line["preset"], [line[key]], [percent], **look))
+        panels.append(chart.panel_data("", title, Y_TITLE, drawn, height=440))
+    return panels
+
+
+COLUMNS = (
+    *table.columns(table.word, renderer="Renderer"),
+    table.Column("fraction", "Wrong pixels", show=table.small_percent, better="lower"),
+    table.shown(
+        "Missed / spurious / wrong depth", table.joined_cell(dict.get, table.integer, "lost", "false", "wrong")
+    ),
+    *table.raw(*SUMMED[:-1]),
+    table.Column("out_of_steps", "Out of steps", show=table.integer),
+    table.Column("depth_error_median", "Median depth error"),
+    table.Column("error_p95", "95 % depth error"),
+    table.Column("cost", "Field evaluations", show=format.count, better="lower"),
+    *table.columns(format.seconds, forward_seconds="Rendering", step_seconds="Step"),
+    table.Column("gradient_angle", "Gradient angle (°)"),
+    *table.raw("gradient_cosine", "cameras", "failed"),
+    table.Column("reason", "Not measured", show=table.word),
+)
+
+PAGES = {"fit_for": make, "fit_for_pixels": make_pictures}
