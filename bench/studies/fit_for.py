@@ -81,10 +81,9 @@ def _verdict(rows: dict[records.Row, list[records.Record]], lines: list[Line]) -
         return format.ends("Wrong pixels, of all hits", measured, f"{cameras} cameras", show=table.small_percent)
     best = min(good, key=lambda line: line["cost"])
     wrong, hits = best["pixel_errors"], best["hits"]
-    text = (
-        f"With at most {table.percent(MAX_WRONG_FRACTION_OF_HITS)} wrong pixels, *{best['renderer']}* needs the fewest field "
-        f"evaluations, {format.count(best['cost'])}: {wrong} of {hits} pixels are wrong."
-    )
+    limit, cost = table.percent(MAX_WRONG_FRACTION_OF_HITS), format.count(best["cost"])
+    text = f"With at most {limit} wrong pixels, *{best['renderer']}* needs the fewest field evaluations, {cost}: "
+    text += f"{wrong} of {hits} pixels are wrong."
     if cameras > 1:
         last = next(
             _line(row.name, row.preset, of_row[-1:]) for row, of_row in rows.items() if row.name == best["renderer"]
