@@ -1,7 +1,8 @@
 """The benchmark: tasks, the runner, records and reports.
 
-From Python, `bench.load()` returns all runs as a pandas table, `bench.run(task="completion")` makes a run, and
-`bench.load_field(RUN)` loads the final field of a run.
+From Python, `bench.load()` returns all runs as a pandas table, `bench.run(task="completion")` makes a run,
+`bench.load_field(RUN)` loads the final field of a run, `bench.compare(["dist", "newton"])` compares renderers on the
+suite, and `bench.plot(bench.load())` draws error over cost.
 """
 
 import os
@@ -16,7 +17,13 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
-MODULES = {"load": "bench.report.data.frame", "load_field": "datasets.files.field_files", "run": "bench.runner.library"}
+MODULES = {
+    "compare": "bench.report.library",
+    "load": "bench.report.data.frame",
+    "load_field": "datasets.files.field_files",
+    "plot": "bench.report.library",
+    "run": "bench.runner.library",
+}
 __all__ = [*MODULES]
 
 SIBLING_PACKAGES = ("conf", "datasets", "renderers")  # `datasets` is also the name of a Hugging Face package

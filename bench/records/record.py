@@ -4,12 +4,14 @@ import hashlib
 import json
 import math
 import os
+from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
 from functools import cache
+from html import escape
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -100,6 +102,14 @@ class Record:
     def __repr__(self) -> str:
         """The title, the status, its reason and the run's folder name."""
         return f"<run {self.outcome}{f' ({self.reason})' if self.reason else ''}; {self.id}>"
+
+    def _repr_html_(self) -> str:
+        """The text of `__repr__` and the run's picture, for notebooks."""
+        picture = self.folder / "summary.png"
+        data = b64encode(picture.read_bytes()).decode() if picture.is_file() else ""
+        return f"<p>{escape(repr(self))}</p>" + (
+            f'<img src="data:image/png;base64,{data}" width="800">' if data else ""
+        )
 
     @property
     def name(self) -> str:

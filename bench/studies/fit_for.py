@@ -72,31 +72,31 @@ def _line(name: str, preset: str, of_row: list[records.Record]) -> Line:
 
 
 def _verdict(rows: dict[records.Row, list[records.Record]], lines: list[Line]) -> str:
-    """The cheapest step among the renderers with few wrong pixels, chosen without the last camera, which checks it."""
-    cameras = max(line["cameras"] for line in lines)
-    chosen = [_line(row.name, row.preset, of_row[: max(cameras - 1, 1)]) for row, of_row in rows.items()]
-    good = [line for line in chosen if line["fraction"] is not None and line["fraction"] <= MAX_WRONG_FRACTION_OF_HITS]
-    if not good:
-        measured = {line["renderer"]: line["fraction"] for line in lines}
-        return format.ends("Wrong pixels, of all hits", measured, f"{cameras} cameras", show=table.small_percent)
-    best = min(good, key=lambda line: line["cost"])
-    wrong, hits = best["pixel_errors"], best["hits"]
-    limit, cost = table.percent(MAX_WRONG_FRACTION_OF_HITS), format.count(best["cost"])
-    text = f"With at most {limit} wrong pixels, *{best['renderer']}* needs the fewest field evaluations, {cost}: "
-    text += f"{wrong} of {hits} pixels are wrong."
+    """The cheapest renderer with few wrong pixels, chosen without the last camera, and confirmed by that camera."""
+    cameras, limit = max(line["cameras"] for line in lines), table.percent(MAX_WRONG_FRACTION_OF_HITS)
+    fitted, checked = (
+        [_line(row.name, row.preset, of_row[selected]) for row, of_row in rows.items()]
+        for selected in (slice(max(cameras - 1, 1)), slice(-1, None))
+    )
+    good = sorted((line for line in fitted if _is_good(line)), key=lambda line: line["cost"])
+    check = {line["renderer"]: line for line in checked}
+    confirmed = [line for line in good if _is_good(check[line["renderer"]])]
+    if not confirmed:
+        fractions = {line["renderer"]: line["fraction"] for line in lines}
+        return format.ends("Wrong pixels, of all hits", fractions, f"{cameras} cameras", show=table.small_percent)
+    best = confirmed[0]
+    text = f"With at most {limit} wrong pixels, *{best['renderer']}* needs the fewest field evaluations, "
+    text += f"{format.count(best['cost'])}: {best['pixel_errors']} of {best['hits']} pixels are wrong."
     if cameras > 1:
-        last = next(
-            _line(row.name, row.preset, of_row[-1:]) for row, of_row in rows.items() if row.name == best["renderer"]
-        )
+        last = check[best["renderer"]]
         text += f" From another camera, {last['pixel_errors']} of {last['hits']}."
-    others = [
-        f"{line['renderer']} {table.small_percent(line['fraction'])}" for line in lines if _is_cheaper(line, best)
-    ]
-    return text + (f" Cheaper, with more wrong pixels: {', '.join(others)}." if others else "")
+    cheaper = [line for line in lines if line["fraction"] is not None and line["cost"] < best["cost"]]
+    others = [f"{line['renderer']} {table.small_percent(line['fraction'])}" for line in cheaper]
+    return text + (f" Cheaper, with more wrong pixels from a camera: {', '.join(others)}." if others else "")
 
 
-def _is_cheaper(line: Line, best: Line) -> bool:
-    return line["fraction"] is not None and line["cost"] < best["cost"] and line["renderer"] != best["renderer"]
+def _is_good(line: Line) -> bool:
+    return line["fraction"] is not None and line["fraction"] <= MAX_WRONG_FRACTION_OF_HITS
 
 
 def _panels(lines: list[Line], *, timed: bool) -> list[chart.Panel]:

@@ -26,6 +26,15 @@ def make_record(**changed) -> Record:
     return Record("completion-dist-sofa", "completion", "dist", "sofa", seed=0, config={"seed": 0}, **changed)
 
 
+def test_a_notebook_shows_a_record_with_its_picture(tmp_path):
+    shown = Record("a", "completion", "dist", "sofa", 0, {"results_dir": str(tmp_path)}, reason="1 < 2")
+    assert "&lt;run " in shown._repr_html_() and "1 &lt; 2" in shown._repr_html_()
+    assert "<img" not in shown._repr_html_()
+    shown.folder.mkdir(parents=True)
+    (shown.folder / "summary.png").write_bytes(b"picture")
+    assert 'src="data:image/png;base64,cGljdHVyZQ=="' in shown._repr_html_()
+
+
 def test_a_new_record_says_killed_until_the_run_ends(tmp_path):
     folder = new_folder(tmp_path)
     record = make_record()

@@ -100,6 +100,6 @@ def test_a_record_that_cannot_be_read_is_told(results):
 
 
 def test_the_module_says_what_it_has():
-    assert sys.modules["bench"].__all__ == ["load", "load_field", "run"]
+    assert sys.modules["bench"].__all__ == ["compare", "load", "load_field", "plot", "run"]
     with pytest.raises(AttributeError, match="no attribute 'lode'"):
         _ = bench.lode
