@@ -93,9 +93,10 @@ def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, 
 
 
 def planned_run(values: dict[str, Any], choices: Mapping[str, Any], overrides: Sequence[str]) -> PlannedRun:
-    """The run of a resolved configuration, after all checks that need no torch. Its id has the names of its choices.
+    """The run of a resolved configuration, after all checks that need no torch.
 
-    A stress replaces the dataset among them.
+    Its id has the names of its choices, the number of the shape, a seed other than 0, and the observed points. A stress
+    replaces the dataset among them.
 
     Raises:
         ValueError: if a value is invalid.
@@ -105,7 +106,10 @@ def planned_run(values: dict[str, Any], choices: Mapping[str, Any], overrides: S
     names = {"task": choices["task"], "renderer": choices["renderer"], "dataset": choices[scene_group]}
     names = {key: str(name) for key, name in (names | {"method": choices.get("method") or ""}).items()}
     parts = [name.replace("/", "_") for name in names.values() if name]  # some are NAME/NAME
-    folder = "-".join([*parts, config_hash(values)])
+    points = (values["task"] or {}).get("points")
+    numbers = {"": values.get("index"), "seed": values["seed"] or None, "points": points}
+    details = [f"{word}{number}" for word, number in numbers.items() if isinstance(number, int | str)]
+    folder = "-".join([*parts, *details, config_hash(values)])
     return PlannedRun(folder, [*overrides], seed=values["seed"], config=values, **names)
 
 

@@ -3,12 +3,14 @@
 A check builds the configuration with the same code as the run, `bench.setup.inputs.prepare_run`.
 """
 
+import csv
+import gzip
 import io
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from itertools import islice
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 from bench.config import Isolation
@@ -23,6 +25,7 @@ from bench.runner.process import run_in_child
 STATUSES_WITHOUT_DURATION = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 MAX_SIMILAR_RUNS, MAX_RECORDS_READ = 100, 300  # per group of similar runs
 LOCAL_EXECUTORS = ("basic", "workers")  # they run on this machine
+SHIPPED = Path(__file__).resolve().parents[2] / "results" / "paper"  # rows of experiments; only in a checkout
 
 
 def plan_of(cells: list[PlannedRun]) -> Plan:
@@ -116,6 +119,18 @@ def durations_of_similar_runs(plan: Plan, reused: set[str]) -> dict[Any, list[fl
     return durations
 
 
+def durations_of_shipped_runs(experiment: str | None) -> dict[Any, list[float]]:
+    """The seconds of the shipped runs of an experiment that ended ok, by `duration_group`."""
+    durations: dict[Any, list[float]] = {}
+    if (path := SHIPPED / f"{experiment}.runs.csv.gz").is_file():
+        with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                if row["status"] == "ok" and row.get("seconds.total"):
+                    group = row["task"], row["renderer"], row["method"].strip('"'), row["config.scale.name"]
+                    durations.setdefault(group, []).append(float(row["seconds.total"]))
+    return durations
+
+
 def _name_may_match(folder: str, task: str, renderer: str, method: str) -> bool:
     """Whether the name of a folder may be that of a run of a task, renderer and method; see `planned_run`."""
     task, renderer, method = (name.replace("/", "_") for name in (task, renderer, method))
@@ -139,24 +154,27 @@ def duration_group(run: dict[str, Any]) -> Any:
 def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     """Prints a line for each cell, and one for all of them."""
     durations = durations_of_similar_runs(plan, reused)
-    to_run = {cell.id: durations[duration_group(vars(cell))] for cell in plan.cells if cell.id not in reused}
+    shipped = durations_of_shipped_runs(plan.cells[0].config["experiment"]) if [] in durations.values() else {}
+    groups = {cell.id: duration_group(vars(cell)) for cell in plan.cells if cell.id not in reused}
+    to_run = {name: durations[group] or shipped.get(group, []) for name, group in groups.items()}
     for number, cell in enumerate(plan.cells, 1):
         file = Path((cell.config["dataset"] or {}).get("path") or "").name
         title = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {f'{cell.dataset} {file}'.strip()}"
         estimate = "reused" if cell.id in reused else "time unknown"
         if similar := to_run.get(cell.id):
-            estimate = f"about {seconds(median(similar))} (median of {plural(len(similar), 'finished run')})"
+            kind = "finished run" if durations[groups[cell.id]] else "shipped run"
+            estimate = f"about {seconds(median(similar))} (median of {plural(len(similar), kind)})"
         parts = (f"{number:>4}", " ".join(plan.distinct_overrides(cell)), title, estimate)
         print("  ".join(filter(None, parts)))
     counts = [f"{len(plan.cells)} planned: {len(to_run)} to run"]
     if reused:
         counts.append(f"{len(reused)} reused")
     if unknown := sum(not group for group in to_run.values()):
-        counts.append(f"{unknown} of unknown time (no run like them has finished here)")
+        counts.append(f"{unknown} of unknown time (no run like them has finished here or is shipped)")
     text = ", ".join(counts) + ("" if to_run else "; nothing is left to do")
-    if medians := [median(group) for group in to_run.values() if group]:
+    if means := [fmean(group) for group in to_run.values() if group]:
         concurrency = min(workers, len(to_run))
-        text += f"; about {seconds(sum(medians) / concurrency)}, {concurrency} at a time"
+        text += f"; about {seconds(sum(means) / concurrency)}, {concurrency} at a time"
         text += f", without the {unknown} of unknown time" if unknown else ""
         text += "; the training of a missing prior is not counted"
     print(text)
