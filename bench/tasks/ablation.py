@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from bench.config import load
 from bench.evaluate.reference import Reference, reference_for
@@ -24,7 +25,6 @@ from bench.machine.limits import LimitReached, Limits
 from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.observed_view import central_differences
 from bench.solve.solve import check_field_gradient, evaluation_counts
 from datasets.scene import View
 from renderers.boundary import render_checked, silhouette_loss
@@ -111,8 +111,6 @@ class Ablation:
         rounds: number of rounds with `beside`; in each, every renderer takes one step and renders once.
         size: pixels per side of the image; None: the size in `view`.
         threads: number of CPU threads; None: the run's number.
-        normal_width: width of the finite differences for the normals of pictures (DIST, Eq. 3: 2 delta), in scene
-            units; None: normals are the field's gradients.
     """
 
     repeats: int
@@ -123,7 +121,6 @@ class Ablation:
     rounds: int = 1
     size: int | None = None
     threads: int | None = None
-    normal_width: float | None = None
 
     def __post_init__(self) -> None:
         check_at_least("task.repeats", self.repeats, 1, "3 show the spread")
@@ -134,8 +131,6 @@ class Ablation:
             check_at_least("task.size", self.size, 8, "128 is quick")
         if self.threads is not None:
             check_at_least("task.threads", self.threads, 1, "1 is steadiest")
-        if self.normal_width is not None:
-            check_positive("task.normal_width", self.normal_width, "0.01 shows the shape; null takes gradients")
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a network that was fitted to the scene's shape."""
@@ -144,9 +139,6 @@ class Ablation:
     def execute(self, run: RunContext) -> None:
         """Measures costs and errors, and writes them to the record, images.npz and a picture."""
         run.record.definitions = DEFINITIONS | (IN_TURN_DEFINITIONS if self.beside else {})
-        if self.normal_width is not None:
-            note = f"normals of pictures are differences over {self.normal_width:g} scene units (DIST, Eq. 3)"
-            run.record.notes = [*run.record.notes, note]
         with using_threads(self.threads or torch.get_num_threads()):
             self._measure(run)
 
@@ -225,7 +217,7 @@ class Ablation:
                 if (work_ratio := timed.step.counts.over_bound(timed.decoder.at(timed.code))) is not None:
                     metrics["work_over_bound"] = work_ratio
                 record.metrics |= {f"{name}.{key}": number for key, number in metrics.items()}
-        views = bench.views(self.normal_width)
+        views = bench.views()
         save_images(run.folder, *views)
         draw_against(run.folder / "summary.png", *views, title=f"{record.name}, {record.scene}: {record.status}")
 
@@ -379,44 +371,30 @@ class Workbench:
         return signs.negative / max(signs.evaluated, 1)
 
     def gradient(self) -> dict[str, float]:
-        """The metric `gradient_cosine`; empty without a pixel that both hit, or with a gradient that is zero."""
-        decoder, cosines = deepcopy(self.decoder).requires_grad_(True), dict[str, float]()
+        """The metric `gradient_cosine`; empty without a pixel that both hit."""
+        decoder = deepcopy(self.decoder).requires_grad_(True)
         rendering = render_checked(self.renderer, decoder.at(self.code.detach()), self.rays)
         both, rays = rendering.hit.cpu() & self.reference.hit, self.camera.double().rays()
-        if both.any():
-            facing = (self.reference.normals * rays.directions).sum(-1)[both].abs().to(self.rays.directions)
-            moved = (rendering.distance[both.to(self.device)] * facing).sum()
-            exact = deepcopy(decoder).cpu().double()
-            points, field = rays.at(self.reference.distance)[both], exact.at(self.code.detach().cpu().double())
-            reference = (field(points) / autograd_gradients(field, points).detach().norm(dim=-1)).sum()
-            pair = [
-                torch.cat(
-                    [
-                        each.flatten().cpu().double()
-                        for each in torch.autograd.grad(loss, [*network.parameters()], materialize_grads=True)
-                    ]
-                )
-                for loss, network in ((moved, decoder), (reference, exact))
-            ]
-            lengths = pair[0].norm() * pair[1].norm()
-            if lengths > 0:
-                cosines["gradient_cosine"] = float(pair[0] @ pair[1] / lengths)
-        return cosines
+        if not both.any():
+            return {}
+        facing = (self.reference.normals * rays.directions).sum(-1)[both].abs().to(self.rays.directions)
+        moved = (rendering.distance[both.to(self.device)] * facing).sum()
+        exact = deepcopy(decoder).cpu().double()
+        points, field = rays.at(self.reference.distance)[both], exact.at(self.code.detach().cpu().double())
+        reference = (field(points) / autograd_gradients(field, points).detach().norm(dim=-1)).sum()
+        gradients = [
+            parameters_to_vector(torch.autograd.grad(loss, [*network.parameters()], materialize_grads=True))
+            for loss, network in ((moved, decoder), (reference, exact))
+        ]
+        return {"gradient_cosine": torch.cosine_similarity(gradients[0].cpu().double(), gradients[1], dim=0).item()}
 
-    def views(self, normal_width: float | None = None) -> tuple[View, View]:
-        """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes.
-
-        Args:
-            normal_width: see `Ablation`; the reference's normals are always gradients.
-        """
+    def views(self) -> tuple[View, View]:
+        """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes."""
         assert self.rendering is not None
         hit, cosine = self.rendering.hit, self.camera.double().depth(torch.ones_like(self.reference.distance))
         normals = torch.zeros_like(self.rendering.points)
         field, points = self.decoder.at(self.code.detach()), self.rendering.points[hit]
-        if normal_width is None:
-            normals[hit] = autograd_normals(field, points)
-        else:
-            normals[hit] = torch.nn.functional.normalize(central_differences(field, points, normal_width), dim=-1)
+        normals[hit] = autograd_normals(field, points)
         hit, distance = hit.cpu(), self.rendering.distance.cpu().double()
         return (
             View(self.camera, distance * cosine * hit, normals.cpu(), hit),

@@ -184,14 +184,6 @@ def test_longer_steps_ask_more_behind_the_surface(tmp_path, monkeypatch):
     assert behind("dist_aggressive") == pytest.approx(longer)
 
 
-def test_normals_may_be_differences(tmp_path, dist):
-    wide = measured(tmp_path, load("renderer", "dist"), replace(SETTINGS, normal_width=0.3))
-    exact, drawn = (np.load(run.folder / "images.npz") for run in (dist, wide))
-    cosine = (drawn["normals"] * exact["normals"]).sum(-1)[exact["hit"]]
-    assert 0.9 < cosine.min() < np.median(cosine) < 0.9999  # smooth over the polyhedron's faces
-    assert np.allclose(np.linalg.norm(drawn["normals"][exact["hit"]], axis=-1), 1, atol=1e-2)
-
-
 @dataclass
 class Fake:
     """Hits where it is told, at known distances, with a gradient of one value of the field a ray."""
