@@ -46,7 +46,7 @@ from renderers.boundary import render_checked
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Field, estimate_lipschitz
 from renderers.fields.grid import Grid
-from renderers.rendering import Renderer, Status, Unsupported
+from renderers.rendering import Renderer, Unsupported
 
 DECIMAL = r"\d+(\.\d*)?(e-?\d+)?"
 OPTIONS = {  # the pattern of a value, and an example
@@ -105,7 +105,7 @@ class RayScene:
     def most_wrong_pixel(self, renderer: Renderer) -> tuple[Pixel, str]:
         """The pixel where a renderer is most wrong, and the search in words.
 
-        A miss counts as an end where the ray leaves the sphere. No ray uses the coarse rays of an image.
+        A ray without a hit counts as an end where it leaves the sphere. No ray uses the coarse rays of an image.
         """
         stride = ceil(max(self.camera.height, self.camera.width) / MAX_SEARCHED_PIXELS)
         cut = (slice(stride // 2, None, stride),) * 2
@@ -115,9 +115,7 @@ class RayScene:
             rendering = render_checked(renderer, self.field, rays.flat())
         reference = trace_exactly(self.exact, exact_rays.flat(), self.lipschitz)
         _, leave, in_sphere = sphere_span(exact_rays.flat(), RADIUS)
-        ends = [
-            torch.where(each.status == Status.MISS, leave, each.distance.double()) for each in (rendering, reference)
-        ]
+        ends = [torch.where(each.hit, each.distance.double(), leave) for each in (rendering, reference)]
         error = torch.where(in_sphere, (ends[0] - ends[1]).abs(), -1.0)
         row, column = divmod(int(error.argmax()), rays.shape[1])
         pixel = (stride // 2 + stride * column, stride // 2 + stride * row)
@@ -275,13 +273,10 @@ def _title(cell: PlannedRun, cells: list[PlannedRun]) -> str:
 def result_of(lanes: list[Lane], truth: TrueRay) -> str:
     """How many renderers agree with the reference, and which do not."""
     wrong = [lane.title.partition(" (")[0] for lane in lanes if not lane.agrees(truth)]
-    hit = (
-        f"right within {truth.tolerance:.1g} scene units"
-        if truth.hit is not None
-        else "without a hit, as the reference"
-    )
-    names = f"; wrong: {', '.join(wrong)}" if wrong else ""
-    return f"{len(lanes) - len(wrong)} of {plural(len(lanes), 'renderer')} {hit}{names}"
+    limit, reference = f" within {truth.tolerance:.1g} scene units", "The reference has no hit: "
+    right = f"{len(lanes) - len(wrong)} of {plural(len(lanes), 'renderer')} right"
+    text = right + limit if truth.hit is not None else reference + right
+    return f"{text}; wrong: {', '.join(wrong)}" if wrong else text
 
 
 def window_of(lanes: list[Lane], truth: TrueRay, zoom: float | None) -> tuple[float, float]:

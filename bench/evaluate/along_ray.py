@@ -183,7 +183,9 @@ def sentences(lane: Lane, truth: TrueRay) -> str:
     count, agrees = f"It evaluated {plural(len(lane.evaluations), 'point')} of the ray", lane.agrees(truth)
     if truth.hit is None or not lane.evaluations:
         reference = " The reference has no hit." if truth.hit is None else ""
-        return f"{count}. {_ending(lane, truth)}{reference}"
+        is_marched_hit = lane.hit is not None and lane.weights is None
+        residual = f" Its residual is {_length(lane.residual)}." if is_marched_hit else ""
+        return f"{count}. {_ending(lane, truth)}{residual}{reference}"
     if not agrees and (cause := _step_through(lane, truth) or _missed_between_samples(lane, truth)):
         text = cause
     elif lane.weights is not None:

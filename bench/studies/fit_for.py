@@ -21,6 +21,7 @@ NOTES = (
     "In the chart, a renderer without wrong pixels has half a pixel.",
     "Gradient angle: between the renderer's gradient by the network's weights and the exact one, in degrees.",
 )
+RAY_NOTE = "python -m bench.ray RUN_FOLDER shows what a renderer did on the ray of its most wrong pixel."
 Line = dict[str, Any]
 
 
@@ -52,7 +53,7 @@ def make_pictures(runs: Runs) -> Result:
         chosen,
         "Wrong pixels of each renderer.",
         "Normals (right, up, towards the camera as red, green, blue), and below their angle to those of the reference.",
-        remarks=comparison.missing,
+        remarks=(*comparison.missing, RAY_NOTE),
         figure=gallery.draw(comparison.blocks, largest=comparison.largest),
     )
 
