@@ -91,7 +91,9 @@ def _verdict(rows: dict[records.Row, list[records.Record]], lines: list[Line]) -
     if cameras > 1:
         last = check[best["renderer"]]
         text += f" From another camera, {last['pixel_errors']} of {last['hits']}."
+    names = {line["renderer"] for line in confirmed}
     cheaper = [line for line in lines if line["fraction"] is not None and line["cost"] < best["cost"]]
+    cheaper = [line for line in cheaper if line["renderer"] not in names]
     others = [f"{line['renderer']} {table.small_percent(line['fraction'])}" for line in cheaper]
     return text + (f" Cheaper, with more wrong pixels from a camera: {', '.join(others)}." if others else "")
 

@@ -1,6 +1,7 @@
 """What a page is, and how rows are told apart: by presets, and in older records by labels."""
 
 import math
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -139,6 +140,22 @@ def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path,
     entries, wholes = papers(own.parent)
     rows = {entry["name"]: wholes[entry["key"]]["rows"] for entry in entries}
     assert rows == {"alike": [["mine", "1"], ["shipped: ours", "1"]], "other": [["mine", "1"]]}
+
+
+def test_a_page_of_a_sweep_of_the_user_has_the_time_of_its_request(tmp_path, monkeypatch):
+    own, shipped = tmp_path / "own", tmp_path / "shipped"
+    monkeypatch.setattr(paper, "SHIPPED", shipped)
+    for folder, name in ((own, "asked"), (own, "old"), (shipped, "theirs")):
+        (folder / "paper").mkdir(parents=True, exist_ok=True)
+        shown = Shown(title="T.", experiments=["table1"] if name != "old" else ["fig4"])
+        (folder / "paper" / f"{name}.json").write_text(shown.to_json())
+    for plan, seconds in (("table1-0abc", 10), ("table1-1abc", 20), ("other-2abc", 30)):
+        (own / "sweeps" / plan).mkdir(parents=True)
+        (own / "sweeps" / plan / "plan.json").write_text("{}")
+        os.utime(own / "sweeps" / plan / "plan.json", (seconds, seconds))
+    (own / "sweeps" / "other-2abc" / "table.json").write_text(Shown(title="T.").to_json())
+    times = {entry["name"]: entry["asked"] for entry in papers(own)[0]}
+    assert times == {"asked": 20, "old": 0, "theirs": 0, "other-2abc": 30}
 
 
 def test_every_study_can_be_read_and_has_pages_of_its_own():

@@ -198,7 +198,8 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
         key = key_of(page.name)
         shown = page.shown
         texts = {"question": shown.question, "verdict": shown.verdict, "shipped": page.shipped}
-        texts["sweep"] = page.base.name == TABLE and page.base.parents[1].name == SWEEPS
+        sweeps = [] if page.shipped else _sweep_folders(page, results_dir)
+        texts["asked"] = max(map(_plan_time, sweeps), default=0.0)
         entries.append({"name": page.name, "key": key, "title": (shown.title or page.name).rstrip("."), **texts})
         content_by_key[key] = {
             **{"caption": f"{shown.head} {shown.caption}".strip(), "notes": shown.notes, "header": shown.columns},
@@ -207,6 +208,14 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
             **{"chart": shown.chart, "atlas": shown.atlas},
         }
     return entries, content_by_key
+
+
+def _sweep_folders(page: Page, results_dir: Path) -> list[Path]:
+    """The folders of the sweeps that a page of the user shows: its own, or those of its experiments."""
+    if page.base.name == TABLE and page.base.parents[1].name == SWEEPS:
+        return [page.base.parent]
+    names = (f"{name}-*" for name in page.shown.experiments)
+    return [folder for pattern in names for folder in (results_dir / SWEEPS).glob(pattern)]
 
 
 def _shipped_rows(page: Page, results_dir: Path) -> list[list[str]]:
@@ -267,7 +276,7 @@ def write_readme(results_dir: Path) -> Path | None:
 
 
 def _plan_time(folder: Path) -> float:
-    """The time of the last request for a sweep: that of its plan file; 0 without a plan."""
+    """The time of the last request for a sweep, in seconds: that of its plan file; 0 without a plan."""
     plan = folder / PLAN_FILE
     return plan.stat().st_mtime if plan.is_file() else 0.0
 

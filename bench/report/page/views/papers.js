@@ -10,7 +10,7 @@
   const find = (name) => all().find((each) => each.name === name);
 
   function overview(home, query) {
-    const [suite, sweeps] = [find(SUITE), all().filter(({sweep}) => sweep)];
+    const [suite, sweeps] = [find(SUITE), all().filter(({asked}) => asked > 0).sort((a, b) => b.asked - a.asked)];
     const boards = element("section", {"aria-labelledby": "board"});
     const [newest] = sweeps;
     const first = newest ? (data) => parts(newest, data) : answer;
