@@ -95,8 +95,8 @@ def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, 
 def planned_run(values: dict[str, Any], choices: Mapping[str, Any], overrides: Sequence[str]) -> PlannedRun:
     """The run of a resolved configuration, after all checks that need no torch.
 
-    Its id has the names of its choices, the number of the shape, a seed other than 0, and the observed points. A stress
-    replaces the dataset among them.
+    Its id has the names of its choices, the number of the shape, a seed other than 0, and `task.points`. With a stress,
+    it has the stress's name instead of the dataset's.
 
     Raises:
         ValueError: if a value is invalid.

@@ -1,7 +1,6 @@
 """Formats numbers for readers: three significant digits, `∞` for infinite, `–` for missing."""
 
 import math
-from collections.abc import Callable, Mapping
 
 MISSING = "–"
 INFINITE = "∞"
@@ -55,27 +54,3 @@ def seconds(x: int | float | None) -> str:
     if abs(x) < 120:
         return f"{number(x)} s"
     return f"{number(x, 1 / 60)} min" if abs(x) < 7200 else f"{number(x, 1 / 3600)} h"
-
-
-def ends(
-    what: str,
-    values: Mapping[str, float | None],
-    n: str,
-    *,
-    show: Callable[[float], str] = number,
-    largest_first: bool = False,
-) -> str:
-    """A sentence with the best and the worst value and their rows; empty if no value is finite.
-
-    Args:
-        n: the sample in words.
-        show: formats a value.
-        largest_first: whether the largest value is the best, which comes first.
-    """
-    numbers = {row: value for row, value in values.items() if value is not None and not math.isnan(value)}
-    ordered = sorted(numbers, key=lambda row: -numbers[row] if largest_first else numbers[row])
-    if not ordered or math.isinf(numbers[ordered[0]]):
-        return ""
-    best, worst = (f"{show(numbers[row])}" for row in (ordered[0], ordered[-1]))
-    rest = f" to {worst} ({ordered[-1]})" if len(ordered) > 1 else ""
-    return f"{what}: *{best}* ({ordered[0]}){rest}; n = {n}."

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from pandas.api.types import is_numeric_dtype
 
 from bench.records.metrics import TABLE_METRICS, Metric, better_direction
 from bench.records.read import read_records
@@ -26,7 +27,7 @@ AXIS_TITLES = {
     "evaluations_value": "field evaluations without gradients",
     "seconds_total": "runtime (s)",
 }
-COSTS = ("evaluations_cost", "evaluations_value")  # the second of runs of older versions
+COSTS = ("evaluations_cost", "evaluations_value")  # older records have only the second
 
 
 def compare(
@@ -44,9 +45,10 @@ def compare(
         budget: the cost that each run spends, in units of the suite.
 
     Returns:
-        A line per renderer but the first: `versus`, the first; `progress` and `progress_versus`, means over sets;
-        `difference`, in progress, with its 95 % interval from `low` to `high`; `scenes`; `p`, by flips of the signs of
-        scenes' differences; `significant`, as in the suite's table: after Holm's correction over all pairs of rows.
+        One line for each renderer after the first: `versus`, the first; `progress` and `progress_versus`, means over
+        sets; `difference`, in progress, with its 95 % interval from `low` to `high`; `scenes`; `p_uncorrected`, by
+        flips of the signs of scenes' differences; `significant`, as on the suite's page: after Holm's correction over
+        all pairs of rows, at a total level of 0.02.
 
     Raises:
         ValueError: fewer than two renderers, or one is not complete on the suite at this budget.
@@ -57,12 +59,16 @@ def compare(
     records = read_records(results)[0] if results.is_dir() else []
     standing = Standing(gather(paper.SHIPPED, results, records))
     runs = standing.complete[standing.complete["budget"] == budget]
-    rows = dict(zip(runs["preset"], runs["row"], strict=True)) | {row: row for row in runs["row"]}
+    pairs = runs[["preset", "row"]].drop_duplicates().drop_duplicates("preset", keep=False)
+    rows = dict(zip(pairs["preset"], pairs["row"], strict=True)) | {row: row for row in runs["row"]}
     for name in renderers:
         if name not in rows:
-            text = f"{name!r} has no complete results of the suite at {units(budget)}{nearest(name, [*rows])}"
-            raise ValueError(f"{text}: python -m bench.suite renderer={name} makes them")
-    first, *others = (rows[name] for name in renderers)
+            listed = f"complete are {', '.join(sorted({*runs['row']})) or 'none'}"
+            text = f"no complete results of {name!r} on the suite at {units(budget)}{nearest(name, [*rows])}; {listed}"
+            raise ValueError(f"{text}; python -m bench.suite renderer=PRESET budget={budget:g} makes the runs")
+    first, *others = dict.fromkeys(rows[name] for name in renderers)
+    if not others:
+        raise ValueError(f"{' and '.join(renderers)} are one row, {first}: name another")
     scores = by_scene(runs)
     differences = scores[others].to_numpy() - scores[[first]].to_numpy()
     p_values = flips.p_values(differences)
@@ -77,7 +83,7 @@ def compare(
             "low": low,
             "high": high,
             "scenes": len(scores),
-            "p": p_values,
+            "p_uncorrected": p_values,
             "significant": [bool({(first, row), (row, first)} & ranked.better) for row in others],
         },
         index=pd.Index(others, name="row"),
@@ -105,23 +111,24 @@ def plot(runs: pd.DataFrame, *, error: str = "", cost: str = "", width: float = 
     error = error or next((name for name in TABLE_METRICS if name in runs and runs[name].notna().any()), "")
     cost = cost or next((name for name in COSTS if name in runs and runs[name].notna().any()), "")
     for what, name in (("error", error), ("cost", cost)):
-        if name not in runs or not runs[name].notna().any():
+        if name not in runs or not is_numeric_dtype(runs[name]) or not runs[name].notna().any():
             raise ValueError(f"no run has the {what} {name!r}{'' if name in runs else nearest(name, [*runs.columns])}")
-    metric = TABLE_METRICS.get(error, Metric(error))
+    metric, is_higher_better = TABLE_METRICS.get(error, Metric(error)), better_direction(error) == "higher"
     series, names = [], {str(name) for name in runs["name"].dropna()}
     endings = {name.rpartition(", ")[2] for name in names}
     shared = f", {endings.pop()}" if len(names) > 1 and len(endings) == 1 else ""  # such as one mask loss
     for name, of_row in runs.groupby("name", observed=True, sort=False):
-        ended = of_row[(of_row["status"] == "ok") & of_row[cost].notna() & of_row[error].notna()]
-        x, y = ended[cost].to_numpy(float), metric.factor * ended[error].to_numpy(float)
-        worst = 0.0 if better_direction(error) == "higher" else np.inf
-        finals = np.append(y, np.full(len(of_row) - len(ended), worst))  # failed runs are worst
-        if len(x):
-            look = {"shapes": np.stack([x, y], axis=1).tolist()}
-            title, preset = str(name).removesuffix(shared), str(of_row["renderer"].iloc[0])
-            series.append(chart.series(title, preset, [float(median(x))], [float(median(finals))], **look))
+        ok = (of_row["status"] == "ok").to_numpy(bool) & of_row[error].notna().to_numpy(bool)
+        costs = of_row[cost][ok].to_numpy(float, na_value=np.nan)
+        errors = metric.factor * of_row[error].to_numpy(float, na_value=np.nan)
+        finals = np.where(ok, errors, 0.0 if is_higher_better else np.inf)  # failed runs are worst
+        failed = f" ({int((~ok).sum())} of {len(ok)} failed)" if not ok.all() else ""
+        dots = [[x, y] for x, y in zip(costs, errors[ok], strict=True) if np.isfinite(x)]
+        middle = [float(np.nanmedian(costs))] if np.isfinite(costs).any() else []
+        title, preset = f"{str(name).removesuffix(shared)}{failed}", str(of_row["renderer"].iloc[0])
+        series.append(chart.series(title, preset, middle, [float(median(finals))] * len(middle), shapes=dots))
     panel = chart.panel_data("", AXIS_TITLES.get(cost, cost.replace("_", " ")), metric.label, series)
-    panel["y"]["log"] = all(y > 0 for each in series for _, y in each["shapes"])
-    legend_columns = 1 if max((len(each["name"]) for each in series), default=0) > MAX_LETTERS_IN_TWO_COLUMNS else 2
+    panel["y"]["log"] = not is_higher_better and all(y > 0 for each in series for _, y in each["shapes"])
+    legend_columns = 1 if max(len(each["name"]) for each in series) > MAX_LETTERS_IN_TWO_COLUMNS else 2
     height = PANEL_HEIGHT_INCHES + LEGEND_LINE_INCHES * -(-len(series) // legend_columns)
     return chart.draw([panel], height, legend=legend_columns, width=width)

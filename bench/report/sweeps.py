@@ -28,7 +28,7 @@ from bench.report.write.chart import Panel, Series
 from bench.report.write.html import page_lock
 from bench.report.write.paper import RECORD_ERRORS, SWEEPS, TABLE, studies, write_paper
 from bench.report.write.result import Result, read_shown, write
-from bench.report.write.table import Column, count_with_interval, ends, text
+from bench.report.write.table import Column, count_with_interval, ends, extremes, text
 
 ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # after a heading: the better direction
 MAX_LISTED_VALUES = 6  # per swept key
@@ -103,7 +103,7 @@ def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) 
 def write_sweep(plan: Plan, problems: list[str]) -> list[Path]:
     """Writes the tables of a finished sweep: those of the study named as its experiment, or its own.
 
-    Returns the paths of the Markdown files; none if only studies of other names show the experiment. `problems` gets a
+    Returns the paths of the Markdown files; empty if no page has the experiment's name. `problems` gets a
     line for a table that cannot be made.
     """
     if (experiment := plan.cells[0].config.get("experiment")) in _studied():
@@ -115,7 +115,11 @@ def write_sweep(plan: Plan, problems: list[str]) -> list[Path]:
     for cell in plan.cells:
         record, _ = read_run(plan.results_dir / "runs" / cell.id, plan.results_dir)
         record_by_id[cell.id] = record or not_run_record(cell, plan)
-    _write(of_plan(plan, record_by_id), plan.folder)
+    try:
+        _write(of_plan(plan, record_by_id), plan.folder)
+    except RECORD_ERRORS as error:
+        problems.append(f"not made: {SWEEPS}/{plan.name} ({type(error).__name__}: {error})")
+        return []
     return [plan.folder / f"{TABLE}.md"]
 
 
@@ -318,7 +322,7 @@ def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict
     metric, is_higher_better = headings[lead], better_direction(lead) == HIGHER
     values = {row: metric.factor * interval.value for row, interval in interval_by_row.items()}
     shapes = format.plural(len({records.solid(run) for run in sweep.runs.records}), "shape")
-    verdict = [format.ends(f"Median {metric.label}", values, shapes, largest_first=is_higher_better)]
+    verdict = [extremes(f"Median {metric.label}", values, shapes, largest_first=is_higher_better)]
     best = dict[str, str]()
     for dataset in sweep.datasets:
         intervals = {line["row"]: line[_on(lead, dataset)] for line in lines}

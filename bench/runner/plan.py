@@ -120,12 +120,12 @@ def durations_of_similar_runs(plan: Plan, reused: set[str]) -> dict[Any, list[fl
 
 
 def durations_of_shipped_runs(experiment: str | None) -> dict[Any, list[float]]:
-    """The seconds of the shipped runs of an experiment that ended ok, by `duration_group`."""
+    """The seconds of the shipped runs of an experiment, by `duration_group`."""
     durations: dict[Any, list[float]] = {}
     if (path := SHIPPED / f"{experiment}.runs.csv.gz").is_file():
         with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
-                if row["status"] == "ok" and row.get("seconds.total"):
+                if row["status"] not in STATUSES_WITHOUT_DURATION and row.get("seconds.total"):
                     group = row["task"], row["renderer"], row["method"].strip('"'), row["config.scale.name"]
                     durations.setdefault(group, []).append(float(row["seconds.total"]))
     return durations
@@ -170,11 +170,11 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     if reused:
         counts.append(f"{len(reused)} reused")
     if unknown := sum(not group for group in to_run.values()):
-        counts.append(f"{unknown} of unknown time (no run like them has finished here or is shipped)")
+        counts.append(f"{unknown} of unknown time (no similar run has finished here, and none is shipped)")
     text = ", ".join(counts) + ("" if to_run else "; nothing is left to do")
     if means := [fmean(group) for group in to_run.values() if group]:
         concurrency = min(workers, len(to_run))
-        text += f"; about {seconds(sum(means) / concurrency)}, {concurrency} at a time"
+        text += f"; about {seconds(sum(means) / concurrency)} by mean times, {concurrency} at a time"
         text += f", without the {unknown} of unknown time" if unknown else ""
         text += "; the training of a missing prior is not counted"
     print(text)

@@ -59,7 +59,7 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
         if line["size"] == size and not line["first"]
     }
     first = next((line["renderer"] for line in measured_lines if line["first"]), "")
-    return format.ends(f"Step runtime at {size} × {size} pixels, relative to {first}", ratios, "one shape")
+    return table.extremes(f"Step runtime at {size} × {size} pixels, relative to {first}", ratios, "one shape")
 
 
 def _size_and_threads(record: Record) -> tuple[int, int]:

@@ -83,7 +83,7 @@ def make(runs: Runs) -> Result:
         f"Median errors over {scenes} on the surface that the photographs show; the figure has a point per scene and "
         f"the median.{_photograph_settings(runs)}",
         question="Which method best reconstructs shape and colour from photographs?",
-        verdict=format.ends(
+        verdict=table.extremes(
             "Median Chamfer-L1 × 1000 of the seen surface, without depth",
             medians.comparable_medians(
                 [line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR
@@ -170,7 +170,7 @@ def convergence(runs: Runs) -> Result:
         f"Median Chamfer-L1 of the seen surface over {_scenes(runs)}, at the checkpoint nearest to half of the "
         "iterations and at the end; the figure has all checkpoints.",
         question="Would more iterations reduce the error on photographs?",
-        verdict=format.ends(
+        verdict=table.extremes(
             "Decrease of the error in the second half",
             {line["method"]: line["fell"] for line in lines},
             _scenes(runs),

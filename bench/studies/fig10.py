@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, conditions, format, medians, records, statistics
+from bench.report.study import Result, Runs, Selection, chart, conditions, medians, records, statistics, table
 
 PLACE = 50
 CONDITIONS = (
@@ -69,7 +69,7 @@ def _verdict(runs: Runs) -> str:
     keys = [runs.frame.row, runs.frame.family, *map(runs.setting, KEYS)]
     errors = runs.error(records.ONE_WAY).groupby(keys, sort=False).median().groupby(level=[0, 1])
     factors = {", ".join(names): ratio for names, ratio in (errors.max() / errors.min()).items()}
-    return format.ends(
+    return table.extremes(
         "Largest median error of all conditions, relative to the smallest",
         factors,
         conditions.shapes_text(runs.records),

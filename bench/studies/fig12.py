@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from bench.report.data.records import CHAMFER_SCALE, ONE_WAY, Record, error, family, grouped, row_of, setting, solid
-from bench.report.study import Result, Runs, Selection, chart, conditions, format, gallery, statistics, table
+from bench.report.study import Result, Runs, Selection, chart, conditions, gallery, statistics, table
 
 PLACE = 55
 CONDITIONS = (
@@ -108,7 +108,7 @@ def _verdict(runs: Runs) -> str:
             misplaced.append(record)
         elif not is_place_known(record):
             undisplaced.append(record)
-    ends = format.ends(
+    ends = table.extremes(
         f"Misplaced runs that end with an error below {MAX_ERROR:g}",
         _shares(misplaced),
         conditions.shapes_text(misplaced),

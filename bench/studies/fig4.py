@@ -1,6 +1,6 @@
 """Fig. 4 of DIST: the images of each strategy of sphere tracing compared with the reference."""
 
-from bench.report.study import Result, Runs, Selection, format, gallery, table
+from bench.report.study import Result, Runs, Selection, gallery, table
 
 PLACE = 210
 READS = (Selection("fig4", alike=("dataset", "view", "prior", "task")),)
@@ -28,7 +28,7 @@ def make(runs: Runs) -> Result:
         "Above, normals (right, up, towards the camera as red, green, blue); below, their angle to the normals of the "
         "reference.",
         question="Which pixels does each strategy get wrong?",
-        verdict=format.ends("Missed and spurious pixels", wrong, "one shape", show=table.integer),
+        verdict=table.extremes("Missed and spurious pixels", wrong, "one shape", show=table.integer),
         remarks=(*comparison.missing, *NOTES),
         data=data,
         figure=gallery.draw(comparison.blocks, largest=comparison.largest),

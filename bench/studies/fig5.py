@@ -73,7 +73,7 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
 
 
 def _ends(lines: list[dict[str, Any]]) -> str:
-    return format.ends(
+    return table.extremes(
         "Median error at the end (Chamfer × 1000)",
         {line["row"]: line.get("end") for line in lines},
         f"{format.plural(min(line['runs'] for line in lines), 'run')} per row",

@@ -77,7 +77,7 @@ def _verdict(poses: pd.DataFrame) -> str:
     for starts, group in poses[poses.degrees == farthest].groupby("starts"):
         title = f"Cameras found from {farthest:g} degrees by {format.plural(int(starts), 'start')}"
         sentences.append(
-            format.ends(title, group.groupby("row").success.mean(), shapes, show=table.percent, largest_first=True)
+            table.extremes(title, group.groupby("row").success.mean(), shapes, show=table.percent, largest_first=True)
         )
     return " ".join(sentences)
 

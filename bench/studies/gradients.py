@@ -109,7 +109,7 @@ def _verdict(data: pd.DataFrame) -> str:
     least = cosines.min(min_count=len(ANGLES))  # NaN if a band is missing
     reached = f"{(least >= 0.99).sum()} of {len(least)}"
     title = f"{reached} reach a pooled cosine of 0.99 in all bands of hits, for the code. Lowest band"
-    return format.ends(title, least.to_dict(), "one shape", show=_cosine, largest_first=True)
+    return table.extremes(title, least.to_dict(), "one shape", show=_cosine, largest_first=True)
 
 
 def _visibility_verdict(data: pd.DataFrame) -> str:

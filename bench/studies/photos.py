@@ -30,7 +30,7 @@ def make(runs: Runs) -> Result:
         "Agreement of shape and colours with held-out photographs, medians over folders; the figure has a point per "
         "folder and the median.",
         question="Which method is best on real photographs?",
-        verdict=format.ends(
+        verdict=table.extremes(
             "PSNR of held-out photographs (dB)", medians.comparable_medians(lines, "psnr"), folders, largest_first=True
         ),
         remarks=records.definitions(runs.records, DEFINED),

@@ -44,7 +44,7 @@ def make(runs: Runs) -> Result:
         "Median errors over scans with exact and with measured depths, and their ratio (times 1000; depths in scene "
         "units, distances between surfaces in squared scene units).",
         question="Does shape completion work as well with depths from a scanner as with exact depths?",
-        verdict=format.ends(
+        verdict=table.extremes(
             "Chamfer distance with measured depths, relative to exact depths",
             {line["row"]: line.get(f"chamfer_l2_{RATIO}") for line in lines},
             f"{format.plural(scans, 'scan')} of {format.plural(len(runs.families()), 'object')}, without an interval",

@@ -78,7 +78,7 @@ def _verdict(lines: list[Line]) -> str:
     title = f"Median time to an error of {CHAMFER_SCALE * TARGET_ERROR:g} (Chamfer × 1000)"
     n = min(line["runs"] for line in lines)
     runs = f"{n} runs per setting; {len(reached)} of {len(lines)} settings reach it in most runs"
-    return format.ends(title, reached, runs, show=format.seconds)
+    return table.extremes(title, reached, runs, show=format.seconds)
 
 
 def _panel(lines: list[Line], axis: str) -> dict[str, Any]:

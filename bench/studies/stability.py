@@ -72,7 +72,7 @@ def make(runs: Runs) -> Result:
         "The severity at which each renderer breaks.",
         "The severity at which half of the trials succeed, on each axis (kind of stress).",
         question="At which severity of stress does each renderer break?",
-        verdict=format.ends(
+        verdict=table.extremes(
             "Axes on which a renderer does not break",
             cells.groupby("row", sort=False)["never"].sum().to_dict(),
             f"{trials:.0f} trials on {len(axes)} axes",
@@ -111,7 +111,7 @@ def make_cost(runs: Runs) -> Result:
     ]
     costs = [f"{line.row}, {format.number(line.cost)}" for line in lines.itertuples()]
     title = "Mean rank (1 is best) and field evaluations per ray"
-    ends = format.ends(title, dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
+    ends = table.extremes(title, dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
     panel = chart.panel_data("", *COST_AXES, points, height=420)
     panel["y"] = {"title": COST_AXES[1], "log": False, "reversed": True}
     return Result(

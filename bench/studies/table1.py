@@ -68,7 +68,7 @@ def _speedups(runs: Runs, size: int | None) -> str:
     chain = [steps.get(preset, ("", None)) for preset in list(published("dist_table1"))[:-1]]
     factors = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
     if not factors:
-        return format.ends(f"Step runtime at {size} pixels", dict(steps.values()), "one shape", show=format.seconds)
+        return table.extremes(f"Step runtime at {size} pixels", dict(steps.values()), "one shape", show=format.seconds)
     title = f"Speedup of a step at {size} pixels over the previous strategy"
     return f"{title}: {', '.join(factors)}; n = one shape."
 

@@ -47,6 +47,7 @@ from renderers.tracing.waits import active_mask
 
 BASE = "base"  # the run's renderer, if it is compared with others
 SHRINK_FACTOR = 8  # after a limit was reached, the image's side is divided by this
+GRADIENT_DRAWS = 16  # random signs of the hits' shifts
 WARM_UP_PIXELS = 8  # side of the image that is rendered before the timing, on a CPU
 DEFINITIONS = {
     "size": "pixels per side of the image for which the other numbers were measured",
@@ -80,9 +81,9 @@ DEFINITIONS = {
     "error_p95": "95th percentile of the difference of depth over the pixels that either hits, where a pixel that only "
     "one of them hits counts as infinite; in scene units",
     "out_of_steps": "pixels whose ray used all steps before it converged",
-    "gradient_cosine": "of two gradients of the summed movement of hits along normals by the network's weights: "
-    "the renderer's, and the float64 reference's by implicit differentiation (DVR, Eq. 8); over pixels that both hit; "
-    "1 is the right direction",
+    "gradient_error": "with task.gradient: relative error of the gradient by the network's weights, against implicit "
+    "differentiation in float64 (DVR, Eq. 8): root mean square, over random signs, of sums of all common hits' shifts "
+    "along their normals; so errors of pixels do not cancel; without coarse values",
     "depth_error": "median, 99th percentile and largest difference of depth over pixels that both hit, in scene units",
 }
 IN_TURN_DEFINITIONS = {
@@ -109,6 +110,7 @@ class Ablation:
         wrong: difference of depth, in scene units, above which a pixel is wrong.
         beside: names of other renderers that are timed in turn with the run's renderer.
         rounds: number of rounds with `beside`; in each, every renderer takes one step and renders once.
+        gradient: whether to measure `gradient_error`, which takes a further step with all weights.
         size: pixels per side of the image; None: the size in `view`.
         threads: number of CPU threads; None: the run's number.
     """
@@ -119,6 +121,7 @@ class Ablation:
     wrong: float
     beside: list[str] = field(default_factory=list)
     rounds: int = 1
+    gradient: bool = False
     size: int | None = None
     threads: int | None = None
 
@@ -197,12 +200,10 @@ class Ablation:
         machine, peak_flops = record.environment, gemm_peak(bench.device)  # measured close to the times
         machine["gemm_peak_flops"] = max(machine["gemm_peak_flops"], peak_flops)
         numbers = {
-            name: costs(b.forward, b.step, machine)
-            | b.errors(self.wrong)
-            | b.gradient()
-            | {"behind": b.negative_fraction()}
+            name: costs(b.forward, b.step, machine) | b.errors(self.wrong) | {"behind": b.negative_fraction()}
             for name, b in benches.items()
         }
+        numbers[BASE] |= bench.gradient() if self.gradient else {}
         record.metrics = {"size": bench.camera.height, **numbers[BASE], "cost": bench.forward.counts.cost}
         record.metrics_start = {"pixel_errors": record.metrics["hits"]}
         record.seconds |= {name: record.metrics[f"{name}_seconds"] for name in ("forward", "backward")}
@@ -352,8 +353,8 @@ class Workbench:
             "false": int((predicted.mask & ~reference.mask).sum()),
             "wrong": int((error > wrong).sum()),
         }
-        if self.rendering is not None:
-            numbers["out_of_steps"] = int((self.rendering.status == Status.OUT_OF_STEPS).sum())
+        assert self.rendering is not None
+        numbers["out_of_steps"] = int((self.rendering.status == Status.OUT_OF_STEPS).sum())
         numbers["pixel_errors"] = numbers["lost"] + numbers["false"] + numbers["wrong"]
         all_errors = torch.cat([error, torch.full((numbers["lost"] + numbers["false"],), torch.inf, dtype=error.dtype)])
         if all_errors.numel():
@@ -371,22 +372,33 @@ class Workbench:
         return signs.negative / max(signs.evaluated, 1)
 
     def gradient(self) -> dict[str, float]:
-        """The metric `gradient_cosine`; empty without a pixel that both hit."""
+        """The metric `gradient_error`; empty without weights or common hits, or if a limit is reached."""
         decoder = deepcopy(self.decoder).requires_grad_(True)
-        rendering = render_checked(self.renderer, decoder.at(self.code.detach()), self.rays)
-        both, rays = rendering.hit.cpu() & self.reference.hit, self.camera.double().rays()
-        if not both.any():
+        exact, rays = deepcopy(decoder).cpu().double(), self.camera.double().rays()
+        field = self.limits.watch(decoder.at(self.code.detach()), self.device, "a gradient")
+        try:
+            rendering = render_checked(self.renderer, field, self.rays)
+        except LimitReached:
+            return {}
+        both = rendering.hit.cpu() & self.reference.hit
+        if not both.any() or not [*decoder.parameters()]:
             return {}
         facing = (self.reference.normals * rays.directions).sum(-1)[both].abs().to(self.rays.directions)
-        moved = (rendering.distance[both.to(self.device)] * facing).sum()
-        exact = deepcopy(decoder).cpu().double()
-        points, field = rays.at(self.reference.distance)[both], exact.at(self.code.detach().cpu().double())
-        reference = (field(points) / autograd_gradients(field, points).detach().norm(dim=-1)).sum()
-        gradients = [
-            parameters_to_vector(torch.autograd.grad(loss, [*network.parameters()], materialize_grads=True))
-            for loss, network in ((moved, decoder), (reference, exact))
-        ]
-        return {"gradient_cosine": torch.cosine_similarity(gradients[0].cpu().double(), gradients[1], dim=0).item()}
+        points, exact_field = rays.at(self.reference.distance)[both], exact.at(self.code.detach().cpu().double())
+        moved = (rendering.distance[both.to(self.device)] * facing).cpu().double(), decoder
+        reference = exact_field(points) / autograd_gradients(exact_field, points).norm(dim=-1), exact
+        squares, generator = torch.zeros(2, dtype=torch.float64), torch.Generator().manual_seed(0)
+        for _ in range(GRADIENT_DRAWS):
+            signs = torch.randint(0, 2, (len(facing),), generator=generator) * 2.0 - 1
+            gradients = [
+                torch.autograd.grad(
+                    (signs * shifts).sum(), [*net.parameters()], retain_graph=True, materialize_grads=True
+                )
+                for shifts, net in (moved, reference)
+            ]
+            renderers, exacts = (parameters_to_vector(each).cpu().double() for each in gradients)
+            squares += torch.stack([(renderers - exacts).square().sum(), exacts.square().sum()])
+        return {"gradient_error": float((squares[0] / squares[1]).sqrt())}
 
     def views(self) -> tuple[View, View]:
         """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes."""

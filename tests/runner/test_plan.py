@@ -69,7 +69,7 @@ def test_a_sweep_is_listed_and_nothing_is_written(results):
     *cells, summary = result.out.splitlines()
     assert [line.split("  ")[-1] for line in cells] == ["time unknown"] * 4
     assert "renderer=dvr seed=1  completion, DVR, n = 128, sofa" in cells[3]
-    assert summary == "4 planned: 4 to run, 4 of unknown time (no run like them has finished here or is shipped)"
+    assert summary == "4 planned: 4 to run, 4 of unknown time (no similar run has finished here, and none is shipped)"
     assert not results.exists()
 
 
@@ -81,17 +81,20 @@ def test_finished_runs_are_reused_and_give_the_times_of_similar_runs(results):
     times = ["reused", "about 30.0 s (median of 1 finished run)", *["time unknown"] * 2]
     assert [line.split("  ")[-1] for line in lines] == times
     assert summary.startswith(
-        "4 planned: 3 to run, 1 reused, 2 of unknown time (no run like them has finished here or is shipped);"
+        "4 planned: 3 to run, 1 reused, 2 of unknown time (no similar run has finished here, and none is shipped);"
     )
-    assert "; about 30.0 s, 1 at a time, without the 2 of unknown time; the training of a missing prior is " in summary
+    assert (
+        "; about 30.0 s by mean times, 1 at a time, without the 2 of unknown time; the training of a missing prior is "
+        in summary
+    )
     assert sorted(results.rglob("*")) == before
     again = command(*SWEEP, "plan=true", "rerun=all", "hydra/launcher=workers", f"results_dir={results}").out
-    assert "; about 30.0 s, 2 at a time, without" in again.splitlines()[-1]
+    assert "; about 30.0 s by mean times, 2 at a time, without" in again.splitlines()[-1]
 
 
 def test_without_a_finished_run_the_shipped_runs_of_the_experiment_give_the_time(results, monkeypatch, tmp_path):
     lines = ["task,renderer,method,config.scale.name,status,seconds.total", 'ablation,dist,"""""",smoke,ok,70']
-    lines += ["ablation,dist,,smoke,ok,50", "ablation,dist,,desk,ok,9", "ablation,dvr,,smoke,timeout,3600"]
+    lines += ["ablation,dist,,smoke,ok,50", "ablation,dist,,desk,ok,9", "ablation,dvr,,smoke,crashed,3600"]
     with gzip.open(tmp_path / "table1.runs.csv.gz", "wt") as file:
         file.write("\n".join(lines) + "\n")
     monkeypatch.setattr(plan_module, "SHIPPED", tmp_path)

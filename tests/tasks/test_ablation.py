@@ -44,7 +44,7 @@ def measured(folder: Any, renderer: Any, settings: Ablation = SETTINGS, size: in
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory) -> RunContext:
-    return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"))
+    return measured(tmp_path_factory.mktemp("run"), load("renderer", "dist"), replace(SETTINGS, gradient=True))
 
 
 def test_it_ends_well_with_all_its_files(dist):
@@ -106,13 +106,17 @@ def test_counts_are_those_of_a_meter(dist):
     assert record.evaluations["work_over_bound"] == pytest.approx(work / least, rel=1e-12)
 
 
-def test_the_gradient_by_weights_is_exact_at_exact_hits_and_wrong_with_the_opposite_sign(tmp_path):
-    exact = measured(tmp_path / "a", load("renderer", "newton")).record.metrics
-    assert exact["gradient_cosine"] == pytest.approx(1, abs=1e-6) and exact["out_of_steps"] == 0
-    coarse = measured(tmp_path / "b", load("renderer", "dist", steps=3)).record.metrics
-    assert coarse["out_of_steps"] > 0
-    opposite = measured(tmp_path / "c", Opposite(load("renderer", "newton"))).record.metrics
-    assert opposite["gradient_cosine"] == pytest.approx(-1, abs=1e-6)
+def test_the_gradient_by_weights_is_right_at_exact_hits_and_wrong_signs_of_pixels_do_not_cancel(tmp_path):
+    settings = replace(SETTINGS, gradient=True)
+    exact = measured(tmp_path / "a", load("renderer", "newton"), settings).record.metrics
+    assert exact["gradient_error"] < 1e-3 and exact["out_of_steps"] == 0
+    opposite = measured(tmp_path / "b", Changed(load("renderer", "newton"), (-1, -1)), settings).record.metrics
+    assert opposite["gradient_error"] == pytest.approx(2, abs=1e-3)
+    half = measured(tmp_path / "c", Changed(load("renderer", "newton"), (-1, 3)), settings).record.metrics
+    assert half["gradient_error"] > 1.5
+    assert measured(tmp_path / "d", load("renderer", "dist", steps=3)).record.metrics["out_of_steps"] > 0
+    limited = measured(tmp_path / "e", load("renderer", "dvr"), replace(settings, limits=Limits(values=200, memory=8)))
+    assert "gradient_error" not in limited.record.metrics
 
 
 def test_times_and_rates_agree_with_each_other(dist):
@@ -224,10 +228,11 @@ def test_lost_false_and_wrong_are_counted_against_the_reference(tmp_path, monkey
 
 
 @dataclass
-class Opposite:
-    """A renderer whose hits are right and whose gradients have the opposite sign."""
+class Changed:
+    """A renderer whose hits are right and whose gradients are multiplied by two factors, pixel by pixel in turn."""
 
     inner: Renderer
+    factors: tuple[float, float]
 
     @property
     def capabilities(self) -> Capabilities:
@@ -235,7 +240,10 @@ class Opposite:
 
     def render(self, field: Field, rays: Rays) -> Rendering:
         rendering = self.inner.render(field, rays)
-        return replace(rendering, distance=2 * rendering.distance.detach() - rendering.distance)
+        flat = rendering.distance.flatten()
+        factors = torch.tensor(self.factors).repeat(len(flat) // 2 + 1)[: len(flat)]
+        changed = flat.detach() + factors * (flat - flat.detach())
+        return replace(rendering, distance=changed.reshape(rendering.distance.shape))
 
     def silhouette_loss(self, *arguments: Any) -> torch.Tensor:
         return self.inner.silhouette_loss(*arguments)
@@ -285,7 +293,7 @@ def test_repeats_are_fewer_where_they_come_to_a_quarter_of_the_limit(tmp_path, v
     costly = Costly(above=WARM_UP_PIXELS**2, values=values)
     run = measured(tmp_path, costly, replace(SETTINGS, repeats=5, limits=Limits(5000 if values else 20_000, 8)))
     assert run.record.status is RunStatus.OK and run.record.metrics["repeats"] == times
-    assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 2)  # the last two: the gradient, the signs
+    assert costly.rendered == [WARM_UP_PIXELS**2] + [SIZE**2] * (2 * times + 1)  # the last one counts signs
 
 
 TURNS = replace(SETTINGS, repeats=1, beside=["newton", "dvr"], rounds=2, size=16, threads=1)

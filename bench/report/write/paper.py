@@ -215,7 +215,8 @@ def _sweep_folders(page: Page, results_dir: Path) -> list[Path]:
     if page.base.name == TABLE and page.base.parents[1].name == SWEEPS:
         return [page.base.parent]
     names = (f"{name}-*" for name in page.shown.experiments)
-    return [folder for pattern in names for folder in (results_dir / SWEEPS).glob(pattern)]
+    folders = [folder for pattern in names for folder in (results_dir / SWEEPS).glob(pattern)]
+    return [folder for folder in folders if not (folder / f"{TABLE}.json").is_file()]  # of a task without experiment
 
 
 def _shipped_rows(page: Page, results_dir: Path) -> list[list[str]]:

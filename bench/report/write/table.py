@@ -1,7 +1,7 @@
 """Tables: a `Column` defines a value, its name in the CSV, and its heading and text in the readable table."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -178,6 +178,30 @@ def configured(key: str, *path: str, heading: str = "") -> Column:
 def through(select: Callable[[Any], Any], *columns: Column) -> tuple[Column, ...]:
     """The columns applied to a part of each line, such as its record."""
     return tuple(replace(c, value=lambda line, c=c: c.of(select(line))) for c in columns)
+
+
+def extremes(
+    what: str,
+    values: Mapping[str, float | None],
+    n: str,
+    *,
+    show: Callable[[float], str] = format.number,
+    largest_first: bool = False,
+) -> str:
+    """A sentence with the best and the worst value and their rows; empty if no value is finite.
+
+    Args:
+        n: the sample in words.
+        show: formats a value.
+        largest_first: whether the largest value is the best, which comes first.
+    """
+    numbers = {row: value for row, value in values.items() if value is not None and not math.isnan(value)}
+    ordered = sorted(numbers, key=lambda row: -numbers[row] if largest_first else numbers[row])
+    if not ordered or math.isinf(numbers[ordered[0]]):
+        return ""
+    best, worst = (f"{show(numbers[row])}" for row in (ordered[0], ordered[-1]))
+    rest = f" to {worst} ({ordered[-1]})" if len(ordered) > 1 else ""
+    return f"{what}: *{best}* ({ordered[0]}){rest}; n = {n}."
 
 
 # Identity and outcome of a run, for every table of runs.
