@@ -60,11 +60,12 @@ def make_pictures(runs: Runs) -> Result:
 
 
 def _line(name: str, preset: str, of_row: list[records.Record]) -> Line:
-    sums = {key: [records.measured(record, key) for record in of_row] for key in SUMMED}
+    ok = [record for record in of_row if record["status"] == "ok"]  # others may have a smaller image
+    sums = {key: [records.measured(record, key) for record in ok] or [None] for key in SUMMED}
     failed = [record for record in of_row if record["status"] != "ok"]
     line = {"renderer": name, "preset": preset, "cameras": len(of_row), "failed": len(failed)}
     line |= {key: None if None in values else sum(values) for key, values in sums.items()}
-    line |= {key: records.median_or_none(records.measured(record, key) for record in of_row) for key in MEDIANS}
+    line |= {key: records.median_or_none(records.measured(record, key) for record in ok) for key in MEDIANS}
     line["fraction"] = (
         line["pixel_errors"] / line["hits"] if line["hits"] and line["pixel_errors"] is not None else None
     )
@@ -74,7 +75,8 @@ def _line(name: str, preset: str, of_row: list[records.Record]) -> Line:
 def _verdict(rows: dict[records.Row, list[records.Record]], lines: list[Line]) -> str:
     """The cheapest renderer with few wrong pixels, chosen without the last camera, whose pixels are then stated."""
     cameras, limit = max(line["cameras"] for line in lines), table.percent(MAX_WRONG_FRACTION_OF_HITS)
-    complete = {row.name: sorted(of_row, key=_azimuth) for row, of_row in rows.items() if len(of_row) == cameras}
+    all_ok = {line["renderer"] for line in lines if line["cameras"] == cameras and not line["failed"]}
+    complete = {row.name: sorted(of_row, key=_azimuth) for row, of_row in rows.items() if row.name in all_ok}
     kept = {name: _line(name, "", of_row[: max(cameras - 1, 1)]) for name, of_row in complete.items()}
     cost = {line["renderer"]: line["cost"] for line in lines}
     good = sorted((name for name, line in kept.items() if _is_good(line)), key=lambda name: cost[name])
