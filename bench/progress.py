@@ -92,19 +92,19 @@ def run_progress(name: str) -> Iterator[Report]:
     """Shows one line for a run: its phase, its progress, and its loss."""
     with display() as live:
         line = live.add_task(name, total=None, status="")
-        current_phase, start, last_print = "", 0.0, 0.0
+        current_phase, start, last_print, first = "", 0.0, 0.0, 0
 
         def report(phase: str, finished: int, total: int, loss: float | None = None) -> None:
-            nonlocal current_phase, start, last_print
+            nonlocal current_phase, start, last_print, first
             status = "" if loss is None else f"loss {loss:.4g}"
             now = time.monotonic()
             if phase != current_phase:  # another phase has another speed
-                current_phase, start, last_print = phase, now, now
+                current_phase, start, last_print, first = phase, now, now, finished  # a resumed phase begins late
                 live.reset(line, total=total, description=f"{name}: {phase}", status=status)
             live.update(line, completed=finished, status=status)
-            if live.disable and now - last_print >= PRINT_INTERVAL_SECONDS and 0 < finished < total:
+            if live.disable and now - last_print >= PRINT_INTERVAL_SECONDS and first < finished < total:
                 last_print = now
-                left = (now - start) * (total / finished - 1)
+                left = (now - start) * (total - finished) / (finished - first)
                 _print(f"{name}: {phase}, {finished / total:.0%}, about {left:.0f} s left")
 
         try:

@@ -27,10 +27,18 @@ def test_a_long_phase_reports_its_progress_now_and_then(clock, capsys):
     printed = capsys.readouterr()
     assert printed.out == "" and all(letter.isprintable() or letter == "\n" for letter in printed.err)
     assert printed.err.splitlines() == [
-        "DIST: training the prior, 31%, about 33 s left",
-        "DIST: training the prior, 61%, about 19 s left",
+        "DIST: training the prior, 31%, about 34 s left",
+        "DIST: training the prior, 61%, about 20 s left",
         "DIST: training the prior, 91%, about 4 s left",
     ]
+
+
+def test_a_resumed_phase_is_estimated_from_its_own_steps(clock, capsys):
+    with progress.run_progress("DIST") as report:
+        for step in range(91, 101):
+            clock[0] += 10.0
+            report("training", step, 100)
+    assert capsys.readouterr().err.splitlines()[0] == "DIST: training, 93%, about 70 s left"
 
 
 def test_short_phases_report_nothing(clock, capsys):
