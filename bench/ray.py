@@ -119,7 +119,8 @@ class RayScene:
         error = torch.where(in_sphere, (ends[0] - ends[1]).abs(), -1.0)
         row, column = divmod(int(error.argmax()), rays.shape[1])
         pixel = (stride // 2 + stride * column, stride // 2 + stride * row)
-        return pixel, f"by {float(error.max()):.2g} scene units, of {error.numel()} pixels searched"
+        searched = "all pixels searched" if stride == 1 else f"one pixel in {stride} x {stride} searched"
+        return pixel, f"by {float(error.max()):.2g} scene units, {searched}"
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def test_a_long_step_goes_through_a_thin_plate_and_newton_hits_it():
     lane, truth, text = looked_at(DIST_WITHOUT_CAP, PLATE)
     assert truth.hit == pytest.approx(2.4875) and lane.hit is not None and lane.hit > 2.8
     step = 1.5 * 0.9875
-    assert f"Step 1 went through the surface: the surface is 0.025 thick along the ray, the step {step:.2g} " in text
+    assert f"Step 1 went through the surface: the shape is 0.025 thick along the ray, the step {step:.2g} " in text
     assert f" It hit {2.9 - 2.4875:.2g} behind the surface." in text  # the sphere behind the plate begins at 2.9
     newton, truth, text = looked_at(load("renderer", "newton"), PLATE)
     assert newton.agrees(truth) and newton.hit == pytest.approx(2.4875, abs=1e-6) and "through" not in text
@@ -68,13 +68,13 @@ def test_a_long_step_goes_through_a_thin_plate_and_newton_hits_it():
 def test_samples_farther_apart_than_a_plate_is_thick_miss_it():
     lane, truth, text = looked_at(load("renderer", "dvr", n_ray_samples=16), box((0.5, 0.5, 0.004)))
     assert len(lane.samples) == 16 and lane.hit is None and not lane.agrees(truth)
-    assert re.match(r"None of 16 samples, 0\.1\d* apart, fell into the surface, 0\.008 thick along the ray\.", text)
+    assert re.match(r"None of 16 samples, 0\.1\d* apart, fell into the shape, 0\.008 thick along the ray\.", text)
     assert text.endswith("It missed.")
 
 
 def test_a_volume_spreads_its_weights_on_a_slanted_plane():
     lane, truth, text = looked_at(load("renderer", "neus"), plane(), tilt=15)
-    assert lane.weights is not None and lane.agrees(truth) and "since the ray meets the surface at 15 degrees" in text
+    assert lane.weights is not None and lane.agrees(truth) and "since the ray meets the surface at 15.0 degrees" in text
     frontal, truth, text = looked_at(load("renderer", "neus"), plane((0, 0, -1.0)))
     assert frontal.weights is not None and "degrees" not in text
     assert sum(lane.extent(2.5)) > 2 * sum(frontal.extent(2.5))  # over 1 / sin 15 degrees without other errors

@@ -182,7 +182,8 @@ def sentences(lane: Lane, truth: TrueRay) -> str:
     """What a renderer did on the ray, in one to three sentences."""
     count, agrees = f"It evaluated {plural(len(lane.evaluations), 'point')} of the ray", lane.agrees(truth)
     if truth.hit is None or not lane.evaluations:
-        reference = " The reference has no hit." if truth.hit is None else ""
+        inside = ", since the ray starts inside the shape" if truth.spans and truth.spans[0][0] == truth.entry else ""
+        reference = f" The reference has no hit{inside}." if truth.hit is None else ""
         is_marched_hit = lane.hit is not None and lane.weights is None
         residual = f" Its residual is {_length(lane.residual)}." if is_marched_hit else ""
         return f"{count}. {_ending(lane, truth)}{residual}{reference}"
@@ -205,7 +206,7 @@ def _step_through(lane: Lane, truth: TrueRay) -> str:
     ends = [distance for call in steps for distance in call] + [lane.end] * (not lane.samples)
     for number, (start, stop) in enumerate(pairwise(ends if lane.marches else []), 1):
         if span is not None and start < span[0] and stop > span[1]:
-            cause = f"the surface is {_length(span[1] - span[0])} thick along the ray"
+            cause = f"the shape is {_length(span[1] - span[0])} thick along the ray"
             return f"Step {number} went through the surface: {cause}, the step {_length(stop - start)} long."
     return ""
 
@@ -215,7 +216,7 @@ def _missed_between_samples(lane: Lane, truth: TrueRay) -> str:
     samples, span = np.array(lane.samples), truth.first_span
     if not len(samples) or span is None or ((samples >= span[0]) & (samples <= span[1])).any():
         return ""
-    return f"None of {_samples(lane)} fell into the surface, {_length(span[1] - span[0])} thick along the ray."
+    return f"None of {_samples(lane)} fell into the shape, {_length(span[1] - span[0])} thick along the ray."
 
 
 def _on_samples(lane: Lane, truth: TrueRay, hit: float) -> str:
@@ -240,7 +241,7 @@ def _on_steps(lane: Lane, hit: float) -> str:
     index, overshoot = int(np.argmax(points)), max(points) - hit
     if index and overshoot > 10 * ROUNDING and index < len(points) - 1:
         more = plural(len(points) - 1 - index, "more evaluation")
-        return f"Step {index} went {_length(overshoot)} behind the surface, which the sign shows. It took {more}."
+        return f"Step {index} went {_length(overshoot)} behind the surface. Its negative value led to {more}."
     last = f", the last step {_length(lane.end - points[-1])} long" if lane.end != points[-1] else ""
     return f"{plural(len(points), 'evaluation')}{last}."
 
@@ -250,7 +251,7 @@ def _on_weights(lane: Lane, truth: TrueRay, hit: float) -> str:
     if not weight.sum() > 0:
         return f"{plural(len(lane.evaluations), 'evaluation')} and no weight: the samples passed the surface."
     mean, (before, behind) = float((distance * weight).sum() / weight.sum()), lane.extent(hit)
-    slant = f", since the ray meets the surface at {truth.angle:.0f} degrees" if truth.angle < FRONTAL_DEGREES else ""
+    slant = f", since the ray meets the surface at {truth.angle:.1f} degrees" if truth.angle < FRONTAL_DEGREES else ""
     spread = f"Nine tenths of its weight lie on {_length(before + behind)} of the ray{slant}"
     opacity = f" The weights sum to {weight.sum():.2g}." if weight.sum() < WEIGHT_TAILS[1] else ""
     return f"{spread}; their mean is {_offset(mean - hit)}.{opacity}"

@@ -161,8 +161,9 @@ def draw_lane(axes: Axes, lane: Lane) -> None:
         density = weight / np.maximum(np.diff(edges), 1e-9)
         heights = np.append(density, 0) / max(density.max(), 1e-30) * 0.85
         axes.fill_between(edges, 0, heights, step="post", color=colour, alpha=0.4, lw=0.8)
-    if lane.hit is not None and low <= lane.hit <= high:
-        axes.plot(lane.hit, -0.2, "^", color=colour, ms=6, zorder=5)
+    rounding = 1e-4 * (high - low)
+    if lane.hit is not None and low - rounding <= lane.hit <= high + rounding:
+        axes.plot(lane.hit, -0.2, "^", color=colour, ms=6, zorder=5, clip_on=False)
     axes.axhline(0, color=RULE, lw=0.6)
     axes.set(xlim=(low, high), ylim=(-0.34, 0.95), xticks=[], yticks=[])
     axes.set_title(lane.title, color=colour, fontweight="bold", loc="left", pad=1)

@@ -16,12 +16,16 @@ NOTES = (
     "Missed: only the float64 reference hits. Spurious: only the renderer hits. Wrong depth: both hit, at depths that "
     "differ by more than task.wrong, half a pixel at the 64 pixels of this experiment. Pixels are summed over cameras, "
     "other numbers are medians over cameras.",
-    "Out of steps: the ray ended before it converged. More steps can mend such pixels: see DIST, 200 steps.",
-    "A step is a rendering with gradients, the loss and the backward pass. Depths are in scene units.",
+    "Out of steps: rays that used all steps, also those that miss the shape. More steps can mend such pixels: see DIST, "
+    "200 steps.",
+    "A step of an optimisation is a rendering with gradients, the loss and the backward pass. The fewest evaluations "
+    "are not always the shortest time.",
+    "Depths are in scene units. A 95 % depth error is infinite if more than 5 % of the hits are missed or spurious.",
     "The axis of the chart is logarithmic, so 0 wrong pixels are drawn as half a pixel.",
     "Gradient error: the relative error of the gradient by the network's weights, over pixels that both hit. It does "
     "not see the outline.",
 )
+PICTURE_NOTE = "The pictures are of the first camera. A wrong depth has no colour of its own."
 RAY_NOTE = "python -m bench.ray RUN_FOLDER shows what a renderer did on the ray of its most wrong pixel."
 Line = dict[str, Any]
 
@@ -34,6 +38,7 @@ def make(runs: Runs) -> Result:
         runs,
         "Renderers on one field.",
         "Pixels that differ from the float64 reference, over the field evaluations of one rendering.",
+        n=f"{len(lines)} renderers × {max(line['cameras'] for line in lines)} cameras, one shape",
         question="Which renderer suits this field?",
         verdict=_verdict(rows, lines),
         remarks=NOTES,
@@ -54,7 +59,7 @@ def make_pictures(runs: Runs) -> Result:
         chosen,
         "Wrong pixels of each renderer.",
         "Normals (right, up, towards the camera as red, green, blue), and below their angle to those of the reference.",
-        remarks=(*comparison.missing, RAY_NOTE),
+        remarks=(*comparison.missing, PICTURE_NOTE, RAY_NOTE),
         figure=gallery.draw(comparison.blocks, largest=comparison.largest),
     )
 
@@ -85,14 +90,15 @@ def _verdict(rows: dict[records.Row, list[records.Record]], lines: list[Line]) -
         return table.extremes("Wrong pixels, of all hits", fractions, f"{cameras} cameras", show=table.small_percent)
     best, line = good[0], kept[good[0]]
     text = f"With at most {limit} wrong pixels, a rendering by *{best}* needs the fewest field evaluations, "
-    text += f"{format.count(cost[best])}: {line['pixel_errors']} of {line['hits']} pixels are wrong."
+    text += f"{format.count(cost[best])}: {line['pixel_errors']} of {line['hits']} hit pixels are wrong."
     if cameras > 1:
         last = _line(best, "", complete[best][-1:])
-        text += f" From a camera that had no part in the choice: {last['pixel_errors']} of {last['hits']}."
+        text += f" From a camera whose pixels had no part in the choice: {last['pixel_errors']} of "
+        text += f"{last['hits']}."
     cheaper = [line for line in lines if line["renderer"] in complete and line["fraction"] is not None]
     cheaper = [line for line in cheaper if line["cost"] < cost[best]]
-    others = [f"{line['renderer']} {table.small_percent(line['fraction'])}" for line in cheaper]
-    return text + (f" Cheaper, with more wrong pixels: {', '.join(others)}." if others else "")
+    others = [f"{line['renderer']} ({table.small_percent(line['fraction'])})" for line in cheaper]
+    return text + (f" Cheaper, but with more wrong pixels: {', '.join(others)}." if others else "")
 
 
 def _azimuth(record: records.Record) -> float:
@@ -129,7 +135,7 @@ COLUMNS = (
     table.Column("out_of_steps", "Out of steps", show=table.integer),
     table.Column("depth_error_median", "Median depth error"),
     table.Column("error_p95", "95 % depth error"),
-    table.Column("cost", "Field evaluations", show=format.count, better="lower"),
+    table.Column("cost", "Field evaluations", show=format.count),
     *table.columns(format.seconds, forward_seconds="Rendering", step_seconds="Step"),
     table.Column("gradient_error", "Gradient error", show=table.small_percent),
     *table.raw("cameras", "failed"),

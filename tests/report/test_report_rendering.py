@@ -87,9 +87,9 @@ def test_the_renderer_for_a_field_is_chosen_without_the_camera_that_checks_it(tm
         shown_from(tmp_path, "D", azimuth, 0, 0, metrics={}, status="unsupported", reason="needs a distance")
     page = page_of(tmp_path, "fit_for")
     assert page.verdict == (
-        "With at most 1 % wrong pixels, a rendering by *A* needs the fewest field evaluations, 1.00k: 8 of 800 pixels "
-        "are wrong. From a camera that had no part in the choice: 100 of 400. "
-        "Cheaper, with more wrong pixels: C 10.0 %."
+        "With at most 1 % wrong pixels, a rendering by *A* needs the fewest field evaluations, 1.00k: 8 of 800 hit "
+        "pixels are wrong. From a camera whose pixels had no part in the choice: 100 of 400. "
+        "Cheaper, but with more wrong pixels: C (10.0 %)."
     )
     rows = page.data.set_index("renderer")
     assert list(rows["lost"])[:4] == [0, 108, 6, 120] and rows.loc["A", "fraction"] == pytest.approx(108 / 1200)
