@@ -16,8 +16,8 @@ NOTES = (
     "Missed: only the float64 reference hits. Spurious: only the renderer hits. Wrong depth: both hit, at depths that "
     "differ by more than task.wrong, half a pixel at the 64 pixels of this experiment. Pixels are summed over cameras, "
     "other numbers are medians over cameras.",
-    "Out of steps: rays that used all steps, also those that miss the shape. More steps can mend such pixels: see DIST, "
-    "200 steps.",
+    "Out of steps: rays that used all steps, also those that miss the shape. More steps can mend them: see DIST, 200 "
+    "steps.",
     "A step of an optimisation is a rendering with gradients, the loss and the backward pass. The fewest evaluations "
     "are not always the shortest time.",
     "Depths are in scene units. A 95 % depth error is infinite if more than 5 % of the hits are missed or spurious.",
