@@ -302,6 +302,7 @@ class Compared:
         """Panels of errors, of ratios (labelled `ratio`) and of costs: a line per row, the least error first."""
         lines = sorted(self.pooled, key=lambda line: (math.isnan(line["error"].value), line["error"].value))
         costs = {label: cost for cost, label in COSTS.items() if cost != "seconds" or self.runs.timed}
+        costs = {label: cost for label, cost in costs.items() if any(line[cost] for line in lines)}
         measures = {
             self.label: [line["error"] for line in lines],
             ratio: [ratio_of(line["ratio"]) for line in lines],
