@@ -85,10 +85,13 @@ def test_the_name_of_a_run_has_its_method():
     rows = "paper paper_neither paper_clamp dist restarts idr dvr naive mesh mesh_long encoder mesh_encoder"
     names = rows.split()
     assert methods == [f"multiview_{name}" for name in names]
-    ids = [f"multiview-dist_paper-car-multiview_{name}" for name in names[:2]]
+    ids = [f"multiview-dist_paper-car-multiview_{name}-0" for name in names[:2]]
     assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells][:2] == ids
     plan = swept("seed=0,1")
-    assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells] == ["completion-dist-sofa"] * 2
+    assert [cell.id.rsplit("-", 1)[0] for cell in plan.cells] == [
+        "completion-dist-sofa-0-points100",
+        "completion-dist-sofa-0-seed1-points100",
+    ]
     assert [cell.method for cell in plan.cells] == ["", ""]
 
 
