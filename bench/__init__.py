@@ -2,7 +2,7 @@
 
 From Python, `bench.load()` returns all runs as a pandas table, `bench.run(task="completion")` makes a run,
 `bench.load_field(RUN)` loads the final field of a run, `bench.compare(["dist", "newton"])` compares renderers on the
-suite, and `bench.plot(bench.load())` draws error over cost.
+suite, and `bench.plot(RUNS)` draws error over cost of runs of one task.
 """
 
 import os

@@ -23,13 +23,17 @@ def main() -> int:
 
 def _summarise(plan: Plan) -> list[str]:
     """Writes and prints the summary of a sweep; returns the status of each of its cells."""
+    from bench.records.read import read_records
     from bench.report.sweeps import summary_lines, write_sweep
-    from bench.report.write.html import write_index
+    from bench.report.write.html import MAX_MESHES, page_lock, write_page
     from bench.runner.summary import print_sweep_summary
 
     problems: list[str] = []
-    lines = summary_lines(write_sweep(plan, problems))
-    return print_sweep_summary(plan, write_index(plan.results_dir), [*lines, *problems])
+    with page_lock(plan.results_dir):
+        records, unread = read_records(plan.results_dir)
+        lines = summary_lines(write_sweep(plan, records, problems))
+        index = write_page(records, unread, plan.results_dir, MAX_MESHES)
+    return print_sweep_summary(plan, index, [*lines, *problems])
 
 
 def console() -> int:

@@ -16,6 +16,7 @@ from bench.report.data import flips
 from bench.report.data.statistics import median
 from bench.report.suite.attempts import gather
 from bench.report.suite.standing import Standing, by_scene, units
+from bench.report.sweeps import COST
 from bench.report.write import chart, paper
 from bench.tables import nearest
 
@@ -23,7 +24,7 @@ COLUMN_INCHES = 3.4  # the width of a column of a paper
 PANEL_HEIGHT_INCHES, LEGEND_LINE_INCHES = 2.2, 0.15
 MAX_LETTERS_IN_TWO_COLUMNS = 24
 AXIS_TITLES = {
-    "evaluations_cost": "field evaluations (a gradient counts as two)",
+    "evaluations_cost": COST,
     "evaluations_value": "field evaluations without gradients",
     "seconds_total": "runtime (s)",
 }

@@ -13,9 +13,9 @@ from typing import Any
 from bench.records import format
 from bench.records.metrics import HIGHER, LOWER, TABLE_METRICS, Metric, better_direction
 from bench.records.names import differences
-from bench.records.read import not_run_record, read_plans, read_records
+from bench.records.read import read_plans
 from bench.records.record import as_number
-from bench.records.results import Plan, read_run
+from bench.records.results import Plan
 from bench.report.data import records
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
@@ -25,7 +25,6 @@ from bench.report.suite.attempts import portable_overrides
 from bench.report.write import chart
 from bench.report.write.caption import FEW, VARYING
 from bench.report.write.chart import Panel, Series
-from bench.report.write.html import page_lock
 from bench.report.write.paper import RECORD_ERRORS, SWEEPS, TABLE, studies, write_paper
 from bench.report.write.result import Result, read_shown, write
 from bench.report.write.table import Column, count_with_interval, ends, extremes, text
@@ -88,39 +87,33 @@ def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) 
 
     `problems` gets a line for each sweep whose table cannot be made.
     """
-    by_folder, studied, written = {record["folder"]: record for record in records}, _studied(), []
+    by_folder, studied, written = {record["folder"]: record for record in records}, _studied(), list[Path]()
     for plan in read_plans(results_dir)[0]:
-        try:
-            has_runs = any(cell.id in by_folder for cell in plan.cells)
-            if not has_runs or plan.cells[0].config.get("experiment") in studied:
-                continue
-            written.append(_write(of_plan(plan, by_folder), results_dir / SWEEPS / plan.name)[0])
-        except RECORD_ERRORS as error:
-            problems.append(f"not made: {SWEEPS}/{plan.name} ({type(error).__name__}: {error})")
+        if plan.cells[0].config.get("experiment") not in studied:
+            written += _write_plan(plan, by_folder, problems)
     return written
 
 
-def write_sweep(plan: Plan, problems: list[str]) -> list[Path]:
+def write_sweep(plan: Plan, records: list[Record], problems: list[str]) -> list[Path]:
     """Writes the tables of a finished sweep: those of the study named as its experiment, or its own.
 
-    Returns the paths of the Markdown files; empty if no page has the experiment's name. `problems` gets a
-    line for a table that cannot be made.
+    Returns the paths of the CSVs; empty if no page has the experiment's name. `problems` gets a line for a table that
+    cannot be made.
     """
     if (experiment := plan.cells[0].config.get("experiment")) in _studied():
-        with page_lock(plan.results_dir):
-            records, _ = read_records(plan.results_dir)
-            written = write_paper(records, plan.results_dir, problems=problems, only=experiment)
-        return [path.with_suffix(".md") for path in written]
-    record_by_id = {}
-    for cell in plan.cells:
-        record, _ = read_run(plan.results_dir / "runs" / cell.id, plan.results_dir)
-        record_by_id[cell.id] = record or not_run_record(cell, plan)
+        return write_paper(records, plan.results_dir, problems=problems, only=experiment)
+    return _write_plan(plan, {record["folder"]: record for record in records}, problems)
+
+
+def _write_plan(plan: Plan, by_folder: dict[str, Record], problems: list[str]) -> list[Path]:
+    """Writes the table of a plan; returns the path of its CSV, or none without runs or if it cannot be made."""
+    if not any(cell.id in by_folder for cell in plan.cells):
+        return []
     try:
-        _write(of_plan(plan, record_by_id), plan.folder)
+        return [_write(of_plan(plan, by_folder), plan.folder)[0]]
     except RECORD_ERRORS as error:
         problems.append(f"not made: {SWEEPS}/{plan.name} ({type(error).__name__}: {error})")
         return []
-    return [plan.folder / f"{TABLE}.md"]
 
 
 def summary_lines(tables: Sequence[Path]) -> list[str]:
@@ -129,7 +122,7 @@ def summary_lines(tables: Sequence[Path]) -> list[str]:
     for path in tables:
         shown = read_shown(path.with_suffix(".json"))
         lines += [f"answer: {shown.verdict.replace('*', '')}"] if shown.verdict else []
-        lines += [f"table: {path}"]
+        lines += [f"table: {path.with_suffix('.md')}"]
         lines += [f"picture: {picture}"] if (picture := path.with_suffix(".png")).is_file() else []
     return lines
 

@@ -11,7 +11,6 @@ from bench.report.data.records import (
     by_shape,
     error,
     grouped,
-    index,
     median_or_none,
     row_of,
     setting,
@@ -92,9 +91,8 @@ def make(runs: Runs) -> Result:
 
 def _of_usual_shapes(runs: Runs) -> Runs:
     """The runs of shapes that at least half of the rows of their family have, so that medians compare."""
-    frame = runs.frame.assign(shape=[str(index(record)) for record in runs.records])
-    rows = frame.groupby(["family", "shape"])["row"].transform("nunique")
-    return runs.where(2 * rows >= frame.groupby("family")["row"].transform("nunique"))
+    rows, all_rows = (runs.frame.groupby(keys)["row"].transform("nunique") for keys in (["family", "solid"], "family"))
+    return runs.where(2 * rows >= all_rows)
 
 
 def longer(runs: Runs) -> Result:

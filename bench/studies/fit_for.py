@@ -1,6 +1,5 @@
 """Which renderer and which settings suit a field: wrong pixels, depth errors and costs from several cameras."""
 
-from dataclasses import replace
 from typing import Any
 
 from bench.report.study import Result, Runs, Selection, chart, format, gallery, records, table
@@ -54,7 +53,7 @@ def make_pictures(runs: Runs) -> Result:
     """A column of pictures per renderer, from the first camera."""
     first = min(map(_azimuth, runs.records))
     chosen = runs.only([record for record in runs.records if _azimuth(record) == first])
-    comparison = gallery.compare_with_reference(replace(chosen, selection=Selection("fit_for")), MAX_COLUMNS)
+    comparison = gallery.compare_with_reference(chosen, MAX_COLUMNS)
     return Result(
         chosen,
         "Wrong pixels of each renderer.",

@@ -5,6 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
+from bench.records.read import read_records
+from bench.report.write.paper import write_paper
 from tests.report.test_report_galleries import cells, notes
 from tests.report.test_report_paper import page_of, write_run
 from tests.report.test_report_shapes import images
@@ -15,6 +17,7 @@ ROWS = {
     "Nearest image": "single_view_nearest",
     "Depth": "single_view_depth",
     "Occupancy": "single_view_occupancy",
+    "Longer": "single_view_dvr_long",
 }
 
 
@@ -108,3 +111,11 @@ def test_its_figure_has_a_point_for_each_shape(tmp_path):
     assert sorted(points.get_xdata()) == pytest.approx([0.8, 0.9, 1.0])
     assert list(middle.get_xdata()) == pytest.approx([0.9, 0.9])
     assert [label.get_text() for label in axis.get_yticklabels()] == ["RGB"]
+
+
+def test_a_page_that_shows_none_of_the_runs_is_not_written(tmp_path):
+    made(tmp_path, "RGB", 0.1)
+    names = [path.stem for path in write_paper(read_records(tmp_path)[0], tmp_path, only="dvr_length")]
+    assert "dvr_table1" in names and "dvr_length" not in names
+    made(tmp_path, "Longer", 0.1)
+    assert "dvr_length" in [path.stem for path in write_paper(read_records(tmp_path)[0], tmp_path, only="dvr_length")]

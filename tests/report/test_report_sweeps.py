@@ -112,12 +112,15 @@ def test_a_sweep_that_has_ended_has_its_table_at_once(tmp_path):
     for one in cells[:3]:  # the last was not run
         ran(tmp_path, one, 0.001)
     problems: list[str] = []
-    assert write_sweep(plan, problems) == [tmp_path / "sweeps" / "completion-1" / "table.md"]
+    assert write_sweep(plan, read_records(tmp_path)[0], problems) == [
+        tmp_path / "sweeps" / "completion-1" / "table.csv"
+    ]
     at_once = (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()
     assert list(table(tmp_path)["failed"]) == [0, 0] and list(table(tmp_path)["runs"]) == [2, 1]
     assert at_once == (tmp_path / "sweeps" / "completion-1" / "table.csv").read_text()  # as the report makes it
     experiment = [replace(one, config=one.config | {"experiment": "table2"}) for one in cells]
-    assert write_sweep(Plan("table2-1", tmp_path, experiment), problems) == problems == []  # a page without runs
+    table2 = Plan("table2-1", tmp_path, experiment)
+    assert write_sweep(table2, read_records(tmp_path)[0], problems) == problems == []  # a page without runs
 
 
 def test_a_metric_with_the_name_of_a_cost_has_its_median(tmp_path):

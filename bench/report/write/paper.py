@@ -68,7 +68,8 @@ class Study:
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
         """The result of each page; empty if there are neither runs nor kept rows.
 
-        A page that needs run folders uses the runs that have them; it is left out if these are the minority.
+        A page that needs run folders uses the runs that have them; it is left out if these are the minority. A page
+        that shows none of the runs is left out too.
 
         Raises:
             ValueError: the study reads an experiment that neither a run nor a file of `conf/experiment` names.
@@ -85,7 +86,8 @@ class Study:
         results = {}
         for name, make in self.pages.items():
             try:
-                results[name] = make(*chosen)
+                result = make(*chosen)
+                results |= {name: result} if result.runs.records or self.keeps is not None else {}
             except NoFolder:
                 with_folder = [record for record in records if FROM_RUNS_CSV not in record]
                 if 2 * self._count(with_folder, results_dir) >= self._count(records, results_dir):
