@@ -27,8 +27,12 @@ def identified(*arguments: str) -> PlannedRun:
         return composer.single_run(composer.shared_config())
 
 
-def cells_of(*overrides: str, folder: Path | None = None) -> list[PlannedRun]:
-    """The cells of a sweep, with a folder of a user's configurations as after `--config-dir`."""
+def cells_of(*overrides: str, folder: Path | None = None, at_most: int | None = None) -> list[PlannedRun]:
+    """The cells of a sweep, with a folder of a user's configurations as after `--config-dir`.
+
+    Composing takes a tenth of a second for each combination of choices; `at_most` leaves cells at even distances.
+    """
     with composing(*([folder] if folder else [])):
         composer = Composer(overrides)
-        return composer.cells(composer.swept(composer.shared_config()))
+        swept = composer.swept(composer.shared_config())
+        return composer.cells(swept[:: -(-len(swept) // (at_most or len(swept)))])
