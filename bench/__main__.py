@@ -2,10 +2,7 @@
 
 from __future__ import annotations  # a run's process imports this module again and must not load more
 
-import os
-import re
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -34,32 +31,6 @@ def _summarise(plan: Plan) -> list[str]:
         lines = summary_lines(write_sweep(plan, records, problems))
         index = write_page(records, unread, plan.results_dir, MAX_MESHES)
     return print_sweep_summary(plan, index, [*lines, *problems])
-
-
-def console() -> int:
-    """`implicit-bench WORD ...` is `python -m bench.WORD ...`, and with the word run it is `python -m bench ...`."""
-    command, *more = sys.argv[1:] or ["--help"]
-    commands = _commands()
-    if command in ("-h", "--help"):
-        print("usage: implicit-bench WORD ...", *commands.values(), sep="\n  ")
-        return 0
-    if command not in commands:
-        from bench.tables import nearest
-
-        print(f"error: unknown word {command!r}{nearest(command, [*commands])}", file=sys.stderr)
-        return 2
-    os.execv(sys.executable, [sys.executable, "-m", "bench" if command == "run" else f"bench.{command}", *more])
-
-
-def _commands() -> dict[str, str]:
-    """The usage line of each command of `implicit-bench`, from the first line of the module that `python -m` runs."""
-    here, usage_lines = Path(__file__).parent, {}
-    for file in sorted([*here.glob("*.py"), *here.glob("*/__main__.py")]):
-        first_line = file.read_text(encoding="utf-8").partition("\n")[0].strip('"').replace("`", "")
-        if first_line.startswith("python -m bench"):
-            command = file.stem if file.stem != "__main__" else "run" if file.parent == here else file.parent.name
-            usage_lines[command] = re.sub(r"python -m bench[.\w]*", f"implicit-bench {command}", first_line)
-    return usage_lines
 
 
 if __name__ == "__main__":

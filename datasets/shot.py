@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from renderers.camera import Camera
@@ -43,17 +42,6 @@ class Shot:
             image = getattr(self, name)
             if image is not None and tuple(image.shape[:2]) != size:
                 raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(image.shape[:2])}")
-
-    def allowed_by_mask(self, points: Float[Tensor, "n 3"], margin: float = 0.0) -> Bool[Tensor, " n"]:
-        """True for points in world coordinates that are out of view, or at most `margin` pixels outside of the mask."""
-        allowed = torch.ones(len(points), dtype=torch.bool)
-        if self.mask is not None:
-            points = points.to(self.camera.intrinsics.dtype)
-            shown, (height, width) = self.camera.shows(points), self.mask.shape
-            columns, rows = self.camera.project(points[shown])[0].long().unbind(-1)
-            mask = distance_transform_edt(~self.mask.numpy()) <= margin if margin else self.mask.numpy()
-            allowed[shown] = torch.from_numpy(mask)[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
-        return allowed
 
     def in_world(self, to_world: Float[np.ndarray, "4 4"]) -> "Shot":
         """The photograph in another world, in single precision; `to_world` maps from there to the present world."""

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import lru_cache, partial
-from math import log
 from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
@@ -387,30 +386,6 @@ def _draw_in_sphere(count: int, dtype: torch.dtype, device: torch.device) -> Flo
     options = {"generator": torch.Generator("cpu").manual_seed(0), "dtype": torch.float64, "device": "cpu"}
     direction = torch.nn.functional.normalize(torch.randn(count, 3, **options), dim=-1)
     return (torch.rand(count, 1, **options) ** (1 / 3) * direction).to(device, dtype)
-
-
-@dataclass(frozen=True)
-class OccupancyField:
-    """The level set p = threshold (DVR, Sec. 3.1) as a field: logit(threshold) - logit(p), negative where p is above.
-
-    Args:
-        logits: logit(p) at points.
-        threshold: DVR's tau, between 0 and 1; 0.5 in the paper.
-        flops: operations per point; None if unknown.
-    """
-
-    logits: PointFunction
-    threshold: float
-    flops: Flops | None = None
-    kind: Kind = Kind.LEVEL
-    lipschitz: float | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 < self.threshold < 1:
-            raise ValueError(f"threshold must lie between 0 and 1, not {self.threshold}: DVR uses 0.5")
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return log(self.threshold / (1 - self.threshold)) - self.logits(points)
 
 
 def occupancy_logits(field: Field, values: Float[Tensor, "*batch"], *, width: float) -> Float[Tensor, "*batch"]:

@@ -15,12 +15,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bench.__main__ import console
 from bench.records.results import RESULTS
 from bench.runner.executors import EXTRA_BY_EXECUTOR
 from datasets.extras import install_command, version
 from tests.runner.driving import by_program
-from tests.test_layers import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "conf", "datasets", "renderers")
@@ -107,24 +105,6 @@ def test_a_package_that_was_installed_over_ours_is_an_error(tmp_path):
 def test_a_users_conf_module_does_no_harm(tmp_path):
     (tmp_path / "conf.py").write_text("project = 'documentation'")
     assert started(tmp_path, "-c", "import bench") == (0, "")
-
-
-def test_the_command_has_a_word_for_every_module_that_runs(monkeypatch, capsys):
-    started = []
-    monkeypatch.setattr(os, "execv", lambda program, arguments: started.append(arguments[1:]))
-
-    def typed(*words: str) -> tuple[int | None, str]:
-        monkeypatch.setattr(sys, "argv", ["implicit-bench", *words])
-        code, (out, err) = console(), capsys.readouterr()
-        return code, out + err
-
-    code, help_text = typed("--help")
-    assert code == 0 and typed() == (0, help_text)
-    words = re.findall(r"^  implicit-bench (\w+) ?[^:]*: \w", help_text, re.MULTILINE)
-    assert {*words} == {"run", "report", *(name.removeprefix("bench.") for name in COMMANDS)}
-    assert typed("verfy", "RUN") == (2, "error: unknown word 'verfy': did you mean verify?\n") and not started
-    assert typed("run", "-m", "seed=0,1")[1] == typed("judge", "--help")[1] == ""
-    assert started == [["-m", "bench", "-m", "seed=0,1"], ["-m", "bench.judge", "--help"]]
 
 
 def test_results_are_not_in_the_checkout():

@@ -17,6 +17,7 @@ from torch import Tensor
 from bench.evaluate.state import State, empty_view
 from bench.pictures import style
 from bench.pictures.style import MISSED, SCREEN, SPURIOUS, bare, save, silhouette_image
+from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.results import NOT_LOSS_TERMS
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
@@ -98,20 +99,24 @@ def draw_run(
 
 @rc_context(SCREEN)
 def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
-    """Writes the terms of a loss over iterations and seconds."""
+    """Writes the terms of a loss over iterations and, if checkpoints have an error, the error over seconds."""
+    terms = dict.fromkeys(name for line in curve for name in line if name not in NOT_LOSS_TERMS)
+    errors = [name for name in TABLE_METRICS if any(name in line for line in curve)][:1]
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, (key, label) in zip(axes, (("iteration", "iteration"), ("seconds", "seconds in the loop")), strict=True):
-        for name in dict.fromkeys(name for line in curve for name in line if name not in NOT_LOSS_TERMS):
-            points = [(line[key], line[name]) for line in curve if line.get(name, 0) > 0]  # the axis has no zero
-            if points:
-                axis.plot(*zip(*points, strict=True), label=name, lw=1.4)
-        axis.set_xlabel(label)
-    style.log_axis(axes[0], "y", [value for line in axes[0].lines for value in line.get_ydata()])
+    axes = figure.subplots(1, 1 + len(errors), squeeze=False)[0]
+    for axis, key, names in zip(axes, ("iteration", "seconds"), (terms, errors), strict=False):
+        for name in names:
+            metric = TABLE_METRICS.get(name, Metric(name))
+            points = [(line[key], metric.factor * line[name]) for line in curve if line.get(name, 0) > 0]
+            if points:  # the axis has no zero
+                axis.plot(*zip(*points, strict=True), marker="." if name in errors else "", label=metric.label, lw=1.4)
+        style.log_axis(axis, "y", [value for line in axis.lines for value in line.get_ydata()])
+    axes[0].set(xlabel="iteration", ylabel="weighted loss")
     axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes[0].set_ylabel("weighted loss")
     if axes[0].lines:
         axes[0].legend(frameon=False)
+    for axis in axes[1:]:
+        axis.set(xlabel="seconds in the loop", ylabel=f"{TABLE_METRICS[errors[0]].label} at checkpoints")
     save(figure, path)
 
 

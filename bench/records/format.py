@@ -30,6 +30,11 @@ def number(x: int | float | str | None, scale: float = 1.0) -> str:
     return f"{mantissa}e{power}"
 
 
+def values_in_words(values: dict[str, str]) -> str:
+    """Numbers with their names, such as "12.5 before, 0.304 after"."""
+    return ", ".join(f"{value} {name}" for name, value in values.items())
+
+
 def plural(count: int, word: str) -> str:
     """A count with its word, such as 1 scene or 2 scenes."""
     return f"{count} {word}{'s' if count != 1 else ''}"

@@ -18,7 +18,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from filelock import FileLock
 
-from bench.records.metrics import metric_fault
+from bench.records.format import number
+from bench.records.metrics import TABLE_METRICS, metric_fault
 
 SCHEMA = 1
 # Keys of a configuration that change no result. Its hash leaves them out.
@@ -33,9 +34,11 @@ MAX_SETTINGS_DEPTH = 20
 MIN_BUDGET_ITERATIONS = 10  # with fewer, a run that its budget ends has no result
 TOO_EXPENSIVE = "the budget paid for"  # begins the reason of such a run
 MAX_WAIT_FRACTION = 0.05  # if threads waited for a larger fraction of their ready time, the machine was loaded
-NUMERIC_FIELDS = ("metrics", "metrics_start", "evaluations", "seconds", "peak_memory_bytes", "flops", "gemm_fraction")
+NUMERIC_FIELDS = ("metrics", "metrics_start", "metrics_best", "evaluations", "seconds")
+NUMERIC_FIELDS += ("peak_memory_bytes", "flops", "gemm_fraction")
 # Fields that old records may lack.
 OPTIONAL_FIELDS = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked", "overrides")
+OPTIONAL_FIELDS += ("metrics_best",)
 # JSON has no such numbers: these strings stand for them.
 _NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
@@ -83,6 +86,7 @@ class Record:
     reason: str = "the run is under way, or was killed before it could say why"
     metrics: dict[str, Any] = field(default_factory=dict)
     metrics_start: dict[str, Any] = field(default_factory=dict)
+    metrics_best: dict[str, Any] = field(default_factory=dict)  # best possible ones, see `shipped.best_possible`
     definitions: dict[str, Any] = field(default_factory=dict)
     evaluations: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, Any] = field(default_factory=dict)
@@ -125,6 +129,17 @@ class Record:
     def outcome(self) -> str:
         """The title with the status."""
         return f"{self.title}: {self.status}"
+
+    def compared(self) -> list[tuple[str, dict[str, str], str]]:
+        """The metrics of an optimisation: heading, values by their moment, and which direction is better."""
+        moments = {"before": self.metrics_start, "after": self.metrics}
+        moments |= {"best possible": self.metrics_best} if self.metrics_best else {}
+        measured = {*self.metrics_start, *self.metrics} if self.metrics_start else set[str]()
+        return [
+            (metric.label, {key: number(each.get(name), metric.factor) for key, each in moments.items()}, metric.better)
+            for name, metric in TABLE_METRICS.items()
+            if name in measured
+        ]
 
     @property
     def folder(self) -> Path:

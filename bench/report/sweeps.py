@@ -3,7 +3,7 @@
 import math
 import shlex
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from operator import itemgetter
@@ -296,15 +296,22 @@ def _panel(
             curves.append(make(name, preset, *zip(*points, strict=True), shapes=dots))
     positions = [x for each in curves for x in each["x"]]
     of_rows = grouped(runs, itemgetter("row")).values()
-    starts = [records.median_or_none(as_number(run["metrics_start"].get(key)) for run in row) for row in of_rows]
-    initial = records.median_or_none(starts)
-    same_start = initial and all(start is None or math.isclose(start, initial, rel_tol=0.01) for start in starts)
     if curves and has_front and metric.better == LOWER:
         fronts.append(chart.front(positions, [y for each in curves for y in each["y"]]))
-    if curves and initial and same_start and math.isfinite(initial):
-        span = [x for dots in curves for x, _ in dots["shapes"]] or positions
-        fronts.append(chart.level("initial value, median", span, metric.factor * initial, dash="--"))
+    span = [x for dots in curves for x, _ in dots["shapes"]] or positions
+    for name, field, dash in (("initial value", "metrics_start", "--"), ("best possible", "metrics_best", ":")):
+        value = _shared_median([run.get(field, {}).get(key) for run in row] for row in of_rows)
+        if curves and value and math.isfinite(value):
+            fronts.append(chart.level(f"{name}, median", span, metric.factor * value, dash=dash))
     return chart.panel_data(dataset, title, metric.label, [*fronts, *curves])
+
+
+def _shared_median(of_rows: Iterable[list[Any]]) -> float | None:
+    """The median of the values of each row, if it is the same for all rows that have one; else None."""
+    medians = [records.median_or_none(map(as_number, row)) for row in of_rows]
+    median = records.median_or_none(medians)
+    same = all(value is None or (median and math.isclose(value, median, rel_tol=0.01)) for value in medians)
+    return median if same else None
 
 
 def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict[str, Metric]) -> dict[str, str]:

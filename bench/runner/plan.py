@@ -3,8 +3,6 @@
 A check builds the configuration with the same code as the run, `bench.setup.inputs.prepare_run`.
 """
 
-import csv
-import gzip
 import io
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
@@ -18,6 +16,7 @@ from bench.records.folder import reusable_record
 from bench.records.format import plural, seconds
 from bench.records.record import digest, row_name
 from bench.records.results import Plan, PlannedRun, read_run, run_folders
+from bench.records.shipped import cell_value, shipped_rows
 from bench.runner.messages import reason_of
 from bench.runner.process import run_in_child
 
@@ -25,7 +24,6 @@ from bench.runner.process import run_in_child
 STATUSES_WITHOUT_DURATION = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 MAX_SIMILAR_RUNS, MAX_RECORDS_READ = 100, 300  # per group of similar runs
 LOCAL_EXECUTORS = ("basic", "workers")  # they run on this machine
-SHIPPED = Path(__file__).resolve().parents[2] / "results" / "paper"  # rows of experiments; only in a checkout
 
 
 def plan_of(cells: list[PlannedRun]) -> Plan:
@@ -122,12 +120,10 @@ def durations_of_similar_runs(plan: Plan, reused: set[str]) -> dict[Any, list[fl
 def durations_of_shipped_runs(experiment: str | None) -> dict[Any, list[float]]:
     """The seconds of the shipped runs of an experiment, by `duration_group`."""
     durations: dict[Any, list[float]] = {}
-    if (path := SHIPPED / f"{experiment}.runs.csv.gz").is_file():
-        with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                if row["status"] not in STATUSES_WITHOUT_DURATION and row.get("seconds.total"):
-                    group = row["task"], row["renderer"], row["method"].strip('"'), row["config.scale.name"]
-                    durations.setdefault(group, []).append(float(row["seconds.total"]))
+    for row in shipped_rows(experiment or ""):
+        if row["status"] not in STATUSES_WITHOUT_DURATION and row.get("seconds.total"):
+            group = row["task"], row["renderer"], cell_value(row["method"]), row["config.scale.name"]
+            durations.setdefault(group, []).append(float(row["seconds.total"]))
     return durations
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bench.records.format import count, number, plural, seconds
+from bench.records.format import count, number, plural, seconds, values_in_words
 from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus
 from bench.records.results import RESULTS, Plan
@@ -24,8 +24,9 @@ CONTRACT_TEST = "python -m pytest tests/renderers/test_renderer_contract.py -k c
 def print_run_summary(folder: Path, record: Record) -> None:
     """Prints the results of a run; the last line on standard output is its folder."""
     console = Console(highlight=False)
-    if rows := [*_compared_metrics(record)]:
-        console.print(_table(record.title, ("", "before", "after", "better"), rows))
+    if rows := record.compared():
+        lines = [(label, *values.values(), better) for label, values, better in rows]
+        console.print(_table(record.title, ("", *rows[0][1], "better"), lines))
     elif record.metrics:
         console.print(_table(record.title, ("", "measured"), [*_measured_metrics(record)]))
     if "iterations" in record.evaluations:
@@ -88,8 +89,8 @@ def log_lines(record: Record) -> Iterator[str]:
             f"machine: {machine['cpu']}; device {machine['device']}; {plural(machine['threads'], 'thread')}; "
             f"torch {machine['torch']}; kernels {machine['kernels']}"
         )
-    compared = list(_compared_metrics(record))
-    yield from (f"{label}: {before} before, {after} after" for label, before, after, _ in compared)
+    compared = record.compared()
+    yield from (f"{label}: {values_in_words(values)}" for label, values, _ in compared)
     if not compared:
         yield from (f"{label}: {value}" for label, value in _measured_metrics(record))
     if "iterations" in record.evaluations:
@@ -97,14 +98,6 @@ def log_lines(record: Record) -> Iterator[str]:
     yield f"started {record.started}, ended {record.ended}, {seconds(record.seconds['total'])} in all"
     yield from (f"note: {note}" for note in record.notes)
     yield f"status: {record.status}{f' ({record.reason})' if record.reason else ''}"
-
-
-def _compared_metrics(record: Record) -> Iterator[tuple[str, str, str, str]]:
-    """The metrics of a task that optimises: heading, before, after, and which direction is better."""
-    for name, metric in TABLE_METRICS.items():
-        if record.metrics_start and name in {*record.metrics_start, *record.metrics}:
-            before, after = record.metrics_start.get(name), record.metrics.get(name)
-            yield metric.label, number(before, metric.factor), number(after, metric.factor), metric.better
 
 
 def _measured_metrics(record: Record) -> Iterator[tuple[str, str]]:

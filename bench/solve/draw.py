@@ -8,6 +8,7 @@ import torch
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import Filmstrip, Shown
 from bench.pictures.run_figures import save_gallery
+from bench.records.format import values_in_words
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
 from bench.solve.optimise import OptimiserSettings
@@ -80,7 +81,8 @@ def draw(
         draw_pictures: writes the pictures with a title; not called if pictures are off.
         truth: see `Filmstrip.save`.
     """
-    title = run.record.outcome
+    title, compared = run.record.outcome, run.record.compared()
     if run.inputs.evaluation.picture is not None:
-        draw_pictures(title)
+        errors = [f"{label}: {values_in_words(values)}" for label, values, _ in compared[:1]]
+        draw_pictures("\n".join([title, *errors]))
     filmstrip.save(run.folder, title, truth=truth)

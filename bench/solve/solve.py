@@ -16,6 +16,7 @@ from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
 from bench.pictures.filmstrip import Shown
 from bench.records.record import Record, RunStatus, curve_file
+from bench.records.shipped import best_possible
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.optimise import BUDGET, CannotContinue, History, Optimisable, OptimiserSettings, optimise
 from datasets.mesh import Mesh
@@ -140,6 +141,7 @@ def solve(
     with run.off_clock():
         before = problem.evaluate(first)
     record.metrics_start = before.metrics
+    record.metrics_best = {name: best for name, best in best_possible(record.config).items() if name in before.metrics}
 
     def state() -> State:
         field = problem.field()

@@ -237,9 +237,14 @@ def test_a_legend_wider_than_the_figure_takes_fewer_columns():
         assert legend.get_window_extent().width <= figure.bbox.width or columns == 1
 
 
-def test_a_curve_has_terms_of_the_loss_and_no_error(drawn, tmp_path):
+def test_a_curve_has_the_terms_of_the_loss_and_the_first_error_of_checkpoints(drawn, tmp_path):
     known = SimpleNamespace(subject=SimpleNamespace(truth=object()))
     errors = dict.fromkeys((*TRACKED, *ReconstructionProblem.tracked.fget(known)), 1.0)  # type: ignore[misc]
     line = {"iteration": 0, "seconds": 0.1, "value_evaluations": 9, "total": 2.0, "depth": 1.5}
     draw_curve(tmp_path / "curve.png", [line | errors, line | {"iteration": 1}])
-    assert [shown.get_label() for shown in drawn[0].axes[0].lines] == ["total", "depth"]
+    losses, at_checkpoints = drawn[0].axes
+    assert [shown.get_label() for shown in losses.lines] == ["total", "depth"]
+    assert [shown.get_xydata().tolist() for shown in at_checkpoints.lines] == [[[0.1, 1000.0]]]
+    assert at_checkpoints.get_ylabel() == "Chamfer-L1 of what is seen (x1000) at checkpoints"
+    draw_curve(tmp_path / "curve.png", [line])
+    assert len(drawn[1].axes) == 1

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers.field import Flops, Kind, OccupancyField, occupancy_logits
+from renderers.field import Flops, Kind, occupancy_logits
 from renderers.fields.analytic import Shape, sphere
-from renderers.fields.networks.occupancy import OccupancyNetwork
+from renderers.fields.networks.occupancy import OccupancyField, OccupancyNetwork
 from tests.looped import each
 
 LEVEL = Shape(lambda p: p.square().sum(-1) - 0.25, Kind.LEVEL, None)

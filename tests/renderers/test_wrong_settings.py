@@ -11,12 +11,12 @@ from jaxtyping import TypeCheckError
 
 from bench.config import load
 from renderers.camera import Rays
-from renderers.field import OccupancyField, occupancy_logits
+from renderers.field import occupancy_logits
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
 from renderers.fields.networks.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
-from renderers.fields.networks.occupancy import OccupancyNetwork
+from renderers.fields.networks.occupancy import OccupancyField, OccupancyNetwork
 from renderers.rendering import RayObservation
 from renderers.tracing.reference import trace
 from tests.looped import each

@@ -117,8 +117,8 @@ def test_rows_are_newest_first_and_show_the_numbers(results):
     assert (numbers["loop"][2], numbers["total"][2], numbers["values"][2]) == (30.0, 31.5, 1_430_000)
     assert (metrics["chamfer_l2"]["after"][1], numbers["loop"][1]) == (None, None)
     details = page.run("plain")
-    assert ["chamfer_l2", 0.0456, 0.00123, "Sum of two means."] in details["metrics"]
-    assert ["rotation_error_deg", 3.25, 3.25, ""] in details["metrics"]
+    assert ["chamfer_l2", 0.0456, 0.00123, "Sum of two means.", None] in details["metrics"]
+    assert ["rotation_error_deg", 3.25, 3.25, "", None] in details["metrics"]
     assert details["notes"] == ["3 holes closed"] and ["commit", "abc1234"] in details["environment"]
     assert details["costs"]["peak_memory_bytes"] == 2_500_000_000
 

@@ -8,6 +8,7 @@ import pytest
 from hydra import compose
 
 from bench.prior import main as prior_main
+from bench.records import shipped
 from bench.records.folder import code_hash, config_hash, planned_run, resolve_config
 from bench.records.record import Record, RunStatus
 from bench.records.results import Plan, PlannedRun
@@ -97,7 +98,7 @@ def test_without_a_finished_run_the_shipped_runs_of_the_experiment_give_the_time
     lines += ["ablation,dist,,smoke,ok,50", "ablation,dist,,desk,ok,9", "ablation,dvr,,smoke,crashed,3600"]
     with gzip.open(tmp_path / "table1.runs.csv.gz", "wt") as file:
         file.write("\n".join(lines) + "\n")
-    monkeypatch.setattr(plan_module, "SHIPPED", tmp_path)
+    monkeypatch.setattr(shipped, "SHIPPED", tmp_path)
     *cells, summary = command(*SWEEP, "+experiment=table1", "plan=true", f"results_dir={results}").out.splitlines()
     times = [*["about 60.0 s (median of 2 shipped runs)"] * 2, *["time unknown"] * 2]
     assert [line.split("  ")[-1] for line in cells] == times and "; about 2.00 min" in summary

@@ -10,7 +10,7 @@ from bench.records.record import Record, RunStatus
 from bench.records.results import RESULTS, Plan
 from bench.runner import sweep
 from bench.runner.executors import Launcher
-from bench.runner.summary import print_run_summary, print_sweep_summary
+from bench.runner.summary import log_lines, print_run_summary, print_sweep_summary
 from tests.looped import each
 from tests.runner.driving import ROOT, planned
 
@@ -47,6 +47,20 @@ def test_a_metric_without_an_initial_value_is_shown_too(tmp_path, capsys):
     print_run_summary(tmp_path / "runs" / "a", record)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "DTU overall (mm)" in line]
     assert line.split()[-3:] == ["–", "0.700", "lower"]
+
+
+def test_the_best_possible_values_are_shown_where_they_are_known(tmp_path, capsys):
+    record = ended(tmp_path, "a")
+    print_run_summary(tmp_path / "runs" / "a", record)
+    assert "best possible" not in capsys.readouterr().out
+    record.metrics_best = {"chamfer_l2": 0.000133}
+    print_run_summary(tmp_path / "runs" / "a", record)
+    out = capsys.readouterr().out
+    assert "best possible" in out
+    rows = [line.split() for line in out.splitlines()]
+    assert ["Chamfer", "(x1000)", "12.5", "12.5", "0.133", "lower"] in rows
+    assert ["normal", "consistency", "0.700", "0.700", "–", "higher"] in rows
+    assert "Chamfer (x1000): 12.5 before, 12.5 after, 0.133 best possible" in log_lines(record)
 
 
 def contract_lines(out: str) -> list[str]:

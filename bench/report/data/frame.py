@@ -32,7 +32,8 @@ FIXED_COLUMNS = {  # every table has them
     "dirty": BOOLEAN,
 }
 ENVIRONMENT_COLUMNS = ("cpu", "device", "threads", "commit", "dirty")
-PREFIXES = {"metrics": "", "metrics_start": "start_", "seconds": "seconds_", "evaluations": "evaluations_"}
+PREFIXES = {"metrics": "", "metrics_start": "start_", "metrics_best": "best_"}
+PREFIXES |= {"seconds": "seconds_", "evaluations": "evaluations_"}
 CONFIG = "config."
 
 
@@ -51,8 +52,8 @@ def load(results: str | os.PathLike[str] = RESULTS) -> pd.DataFrame:
 
     Returns:
         The columns of `FIXED_COLUMNS`, then metrics by their names, `start_NAME` for metrics before the optimisation,
-        `seconds_NAME`, `evaluations_NAME`, and `config.KEY` for all settings. Missing values are `pandas.NA`. The files
-        of a run are in `runs/FOLDER` of the results folder.
+        `best_NAME` for the best possible ones, `seconds_NAME`, `evaluations_NAME`, and `config.KEY` for all settings.
+        Missing values are `pandas.NA`. The files of a run are in `runs/FOLDER` of the results folder.
 
     Raises:
         ValueError: the folder does not exist.

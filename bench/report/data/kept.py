@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import started, write_bytes
+from bench.records.shipped import CONFIG, SUFFIX, cell_value
 from bench.report.data.records import Record, grouped, setting
 
-SUFFIX = ".runs.csv.gz"
-CONFIG = "config."
 FROM_RUNS_CSV = "kept"  # the field that marks a record read from such a file
 UNFINISHED = ("not_run", "killed")
 UNMEASURED = (*UNFINISHED, "refused")  # statuses that say nothing about a renderer
@@ -84,7 +83,7 @@ def _cells(value: Any, name: str = "") -> dict[str, str]:
         return {column: cell for cells in inner for column, cell in cells.items()}
     if isinstance(value, str) and name.startswith(CONFIG) and value.startswith("/"):
         value = "/".join(["", *Path(value).parts[-2:]])  # the last two parts name the family
-    bare = isinstance(value, str) and value and _value(value) == value
+    bare = isinstance(value, str) and value and cell_value(value) == value
     return {} if name in LOCAL_FIELDS else {name: value if bare else json.dumps(value)}
 
 
@@ -97,7 +96,7 @@ def _has_columns(value: Any, name: str) -> bool:
 
 def _record(cells: dict[str, str]) -> Record:
     record: Record = {}
-    for name, value in ((name, _value(cell)) for name, cell in cells.items() if cell != ""):
+    for name, value in ((name, cell_value(cell)) for name, cell in cells.items() if cell != ""):
         *parents, key = name.split(".", -1 if name.startswith(CONFIG) else 1)
         node = record
         for parent in parents:
@@ -107,10 +106,3 @@ def _record(cells: dict[str, str]) -> Record:
         raise ValueError(f"a line has no {', '.join(sorted(lacking))}")
     started(record)
     return record | {FROM_RUNS_CSV: True, "log": []}
-
-
-def _value(cell: str) -> Any:
-    try:
-        return json.loads(cell)
-    except ValueError:
-        return cell

@@ -97,8 +97,11 @@ def _kept_indices(lines: list[dict[str, Any]]) -> list[int]:
 def _metrics(record: Record) -> list[list[Any]]:
     names = tuple(dict.fromkeys([*record["metrics"], *record["metrics_start"]]))
     definitions = _definitions(tuple((key, text(words)) for key, words in record["definitions"].items()), names)
-    before, after = record["metrics_start"], record["metrics"]
-    return [[name, _value(before.get(name)), _value(after.get(name)), definitions[name]] for name in names]
+    before, after, best = record["metrics_start"], record["metrics"], record.get("metrics_best", {})
+    return [
+        [name, _value(before.get(name)), _value(after.get(name)), definitions[name], _value(best.get(name))]
+        for name in names
+    ]
 
 
 @lru_cache(maxsize=1000)  # most runs of a task share their definitions

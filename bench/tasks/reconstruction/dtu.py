@@ -19,6 +19,7 @@ from scipy.io.matlab import MatReadError
 from scipy.spatial import cKDTree
 
 from bench.records.metrics import DVR_SCANS, DVR_TABLE2
+from bench.tasks.reconstruction.stereo import allowed_by_mask
 from datasets.files.meshes import read_points
 from datasets.mesh import Mesh
 from datasets.shot import Shot
@@ -149,7 +150,7 @@ def culled(mesh: Mesh, shots: Sequence[Shot]) -> Mesh | None:
     for shot in shots:
         if shot.mask is None:
             raise BadInput(f"culling needs a mask of each photograph, and {shot.name} has none")
-        kept &= shot.allowed_by_mask(points, MASK_DILATION_FRACTION * max(shot.mask.shape)).numpy()
+        kept &= allowed_by_mask(shot, points, MASK_DILATION_FRACTION * max(shot.mask.shape)).numpy()
     faces = mesh.faces[kept[mesh.faces].all(axis=1)]
     return replace(mesh, faces=faces).compact() if len(faces) else None
 

@@ -7,6 +7,7 @@ from math import acos, degrees
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import distance_transform_edt
 
 from datasets.extras import install_command
 from datasets.shot import Shot
@@ -139,5 +140,17 @@ def _inside_masks(shots: Sequence[Shot], points: Float[np.ndarray, "n 3"]) -> Bo
     """A mask of the points inside the unit sphere that no photograph's mask excludes."""
     positions, inside = torch.from_numpy(points).float(), torch.from_numpy(np.linalg.norm(points, axis=1) < 1)
     for shot in shots:
-        inside &= shot.allowed_by_mask(positions)
+        inside &= allowed_by_mask(shot, positions)
     return inside.numpy()
+
+
+def allowed_by_mask(shot: Shot, points: Float[torch.Tensor, "n 3"], margin: float = 0.0) -> Bool[torch.Tensor, " n"]:
+    """True for points in world coordinates that are out of view, or at most `margin` pixels outside of the mask."""
+    allowed = torch.ones(len(points), dtype=torch.bool)
+    if shot.mask is not None:
+        points = points.to(shot.camera.intrinsics.dtype)
+        shown, (height, width) = shot.camera.shows(points), shot.mask.shape
+        columns, rows = shot.camera.project(points[shown])[0].long().unbind(-1)
+        mask = distance_transform_edt(~shot.mask.numpy()) <= margin if margin else shot.mask.numpy()
+        allowed[shown] = torch.from_numpy(mask)[rows.clamp(max=height - 1), columns.clamp(max=width - 1)]
+    return allowed

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 
 from bench.evaluate.state import DEFAULT_VERTEX_COLOUR, render_vertex_colours
-from bench.tasks.reconstruction.stereo import Cloud
+from bench.tasks.reconstruction.stereo import Cloud, allowed_by_mask
 from bench.tasks.reconstruction.subject import Subject, points_in_sphere, visible
 from datasets.files.meshes import read_points
 from datasets.files.repair import require_meshlab
@@ -53,7 +53,7 @@ def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
     if all(shot.mask is not None for shot in subject.input_shots):
         positions = torch.from_numpy(points).float()
         points = points[
-            torch.stack([s.allowed_by_mask(positions, margin=1.0) for s in subject.input_shots]).all(0).numpy()
+            torch.stack([allowed_by_mask(s, positions, margin=1.0) for s in subject.input_shots]).all(0).numpy()
         ]
     cameras = [shot.camera for shot in subject.input_shots]
     viewers = _nearest_viewers(torch.from_numpy(points).float(), cameras).numpy()

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Flops, Kind, OccupancyField, Vectors
+from renderers.field import Flops, Kind, Vectors
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import split_into_passes
 from renderers.fields.networks.network import flops_of
-from renderers.fields.networks.occupancy import BoundOccupancy, OccupancyNetwork
+from renderers.fields.networks.occupancy import BoundOccupancy, OccupancyField, OccupancyNetwork
 
 SOFTPLUS_BETA = 100.0  # as in IDR: nearly a ReLU, with a second derivative
 INIT_SPHERE_POINTS = 256  # points of the initial sphere; the bias is set so that the mean value there is 0

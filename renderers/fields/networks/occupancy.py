@@ -1,13 +1,14 @@
 """DVR's network: occupancy and texture of points and a shape code, bound to one code before rendering."""
 
 from dataclasses import dataclass
+from math import log
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from renderers.checks import check_at_least
-from renderers.field import Flops
+from renderers.field import Flops, Kind, PointFunction
 from renderers.fields.mlp import split_into_passes
 from renderers.fields.networks.network import flops_of
 
@@ -49,7 +50,7 @@ class OccupancyNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class BoundOccupancy:
-    """An occupancy network at one code. It is not a Field: `field.OccupancyField` makes one from its logits."""
+    """An occupancy network at one code. It is not a Field: `OccupancyField` makes one from its logits."""
 
     network: OccupancyNetwork
     shifts: tuple[Tensor, ...]
@@ -82,6 +83,30 @@ class BoundOccupancy:
                 features = features + (shift if shift.dim() == 1 else shift[..., None, :])
             features = block(features)
         return features.relu_()
+
+
+@dataclass(frozen=True)
+class OccupancyField:
+    """The level set p = threshold (DVR, Sec. 3.1) as a field: logit(threshold) - logit(p), negative where p is above.
+
+    Args:
+        logits: logit(p) at points.
+        threshold: DVR's tau, between 0 and 1; 0.5 in the paper.
+        flops: operations per point; None if unknown.
+    """
+
+    logits: PointFunction
+    threshold: float
+    flops: Flops | None = None
+    kind: Kind = Kind.LEVEL
+    lipschitz: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.threshold < 1:
+            raise ValueError(f"threshold must lie between 0 and 1, not {self.threshold}: DVR uses 0.5")
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return log(self.threshold / (1 - self.threshold)) - self.logits(points)
 
 
 class Block(nn.Module):

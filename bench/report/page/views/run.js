@@ -64,11 +64,12 @@
     const found = new Map(metrics.map((row) => [row[0], row]));
     const rows = Object.values(runs.metrics).filter(({key}) => found.has(key));
     const value = ({key, factor}, column) => number(bench.store.decoded(found.get(key)[column]), factor);
-    const started = rows.some(({key}) => found.get(key)[1] !== null);
+    const [started, bounded] = [1, 4].map((column) => rows.some(({key}) => found.get(key)[column] !== null));
     const columns = [
       {label: "Metric", head: true, cell: (metric) => label(metric.label)},
       ...(started ? [{label: "Before", kind: "number", cell: (metric) => value(metric, 1)}] : []),
       {label: started ? "After" : "Value", kind: "number", cell: (metric) => value(metric, 2)},
+      ...(bounded ? [{label: "Best possible", kind: "number", cell: (metric) => value(metric, 4)}] : []),
       {label: "Better", cell: (metric) => soft(metric.better || "–")},
     ];
     return bench.table(columns, rows, {caption: "Result"});

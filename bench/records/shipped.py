@@ -1,0 +1,49 @@
+"""The shipped rows of experiments, `results/paper/EXPERIMENT.runs.csv.gz`; only a checkout has them."""
+
+import csv
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+from bench.records.record import flat
+
+SHIPPED = Path(__file__).resolve().parents[2] / "results" / "paper"
+SUFFIX = ".runs.csv.gz"
+CONFIG = "config."  # before the dotted key of a setting, in the name of a column
+FITS = "priors"  # the experiment that fits the default priors to the true distances of test shapes
+# What an error of such a fit depends on; not the view, since these errors are of the whole surface.
+FIT_KEYS = ("dataset", "index", "split", "stress", "field", "prior", "evaluation.points", "evaluation.fscore_threshold")
+SURFACE_METRICS = ("chamfer_l2", "chamfer_l1", "accuracy", "completeness", "fscore", "normal_consistency")
+
+
+def shipped_rows(experiment: str) -> list[dict[str, str]]:
+    """The shipped rows of an experiment, each as cells by column; `cell_value` reads a cell. Empty without a file."""
+    path = SHIPPED / f"{experiment}{SUFFIX}"
+    if not path.is_file():
+        return []
+    with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
+        return [*csv.DictReader(file)]
+
+
+def cell_value(cell: str) -> Any:
+    """The value of a cell: JSON, or text without quotes."""
+    try:
+        return json.loads(cell)
+    except ValueError:
+        return cell
+
+
+def best_possible(config: dict[str, Any]) -> dict[str, float]:
+    """The errors of the prior's fit to the true distances of a run's shape, by metric; empty if none is shipped."""
+    for row in shipped_rows(FITS):
+        cells = {name: cell_value(cell) for name, cell in row.items() if cell}
+        if _fit_settings(cells) == _fit_settings(flat(config, CONFIG)):
+            return {name: cells[f"metrics.{name}"] for name in SURFACE_METRICS}
+    return {}
+
+
+def _fit_settings(values: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a flat record that an error of a fit depends on; null is the same as a key that is missing."""
+    keys = tuple(f"{CONFIG}{key}." for key in FIT_KEYS)
+    return {name: value for name, value in values.items() if f"{name}.".startswith(keys) and value is not None}

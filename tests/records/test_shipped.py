@@ -1,0 +1,24 @@
+"""The best possible errors of a run are those of the prior's fit to its shape, if it is evaluated in the same way."""
+
+import pytest
+
+from bench.records.metrics import LOWER, better_direction
+from bench.records.shipped import FITS, SURFACE_METRICS, best_possible, shipped_rows
+from tests.composing import identified
+
+if not shipped_rows(FITS):
+    pytest.skip("only a checkout has shipped rows", allow_module_level=True)
+
+
+@pytest.mark.parametrize(("family", "index"), [("sofa", 0), ("car", 7)])
+def test_a_completion_has_the_errors_of_the_fit_to_its_shape(family, index):
+    run = identified("task=completion", f"dataset={family}", f"index={index}")
+    (row,) = [row for row in shipped_rows(FITS) if row["scene"] == f"{family} test {index}"]
+    best = best_possible(run.config)
+    assert best == {name: float(row[f"metrics.{name}"]) for name in SURFACE_METRICS}
+    assert all(best[name] < 0.02 if better_direction(name) == LOWER else best[name] > 0.9 for name in best)
+
+
+@pytest.mark.parametrize("other", ["index=8", "scale=smoke", "evaluation.points=999", "field=box", "prior.steps=9"])
+def test_another_shape_prior_or_evaluation_has_none(other):
+    assert best_possible(identified("task=completion", other).config) == {}
