@@ -79,7 +79,7 @@ def make(*several: Runs | None) -> Result:
         remarks=[*PROGRESS, *_notes(made), *(f"Not read: {problem}" for problem in gathered.problems)],
         columns=[
             table.text("row", "Renderer"),
-            *(table.Column(f"{b:g}", f"At {units(b)}", words=partial(_progress, budget=b)) for b in made.budgets),
+            *(table.Column(f"{b:g}", f"At {_when(made, b)}", words=partial(_progress, budget=b)) for b in made.budgets),
             *(table.text(f"{b:g}_rank") for b in made.budgets),
             *(table.text("failed", "Failed"), table.PRESET),
         ],
@@ -167,8 +167,20 @@ def _sample(made: Standing) -> str:
             format.plural(runs[name].nunique(), word) for name, word in (("scene", "scene"), ("row", "renderer"))
         )
         failed = f"{(~runs['ok']).sum() or 'none'} of {format.plural(len(runs), 'run')} failed"
-        parts.append(f"at {units(budget)}, {problems} ({scenes}), {renderers}, {failed}")
+        parts.append(f"at {_when(made, budget)}, {problems} ({scenes}), {renderers}, {failed}")
     return f"{suite().id}: {'; '.join(parts) or 'no runs'}"
+
+
+def _sets_at(made: Standing, budget: float) -> list[str]:
+    """The sets with runs at a budget."""
+    at_budget = {*made.complete.loc[made.complete["budget"] == budget, "set"]}
+    return [name for name in made.sets if name in at_budget]
+
+
+def _when(made: Standing, budget: float) -> str:
+    """A budget as text, with its sets if they are not all sets."""
+    sets = _sets_at(made, budget)
+    return units(budget) + ("" if sets == made.sets else f" ({', '.join(sets)})")
 
 
 def _panel(made: Standing, of_set: str | None) -> chart.Panel:
@@ -262,7 +274,8 @@ def verdict(made: Standing) -> str:
     for budget, ranked in made.rankings.items():
         if ranked.decidable:
             pairs = f"{len(ranked.better) or 'None'} of {ranked.pairs} pairs"
-            parts.append(f"{leaders(ranked, f'At {units(budget)}')} {pairs} differ significantly.")
+            when = f"At {_when(made, budget)}"
+            parts.append(f"{leaders(ranked, when)} {pairs} differ significantly.")
         else:
             scenes = format.plural(ranked.scenes, "scene")
             rows = f"{len(ranked.progress)} renderers, whatever their results"
@@ -335,7 +348,7 @@ def _notes(made: Standing) -> list[str]:
                 )
         if text := _second_starts(made, budget):
             notes.append(text)
-        for name in made.sets if len(made.sets) > 1 else ():
+        for name in sets if len(sets := _sets_at(made, budget)) > 1 else ():
             others = standing.ranking(at_budget[at_budget["set"] != name])
             if others.decidable:
                 lead = leaders(others, f"Without {name}, at {units(budget)}")

@@ -528,6 +528,18 @@ def test_the_answer_says_what_differs_at_each_budget_what_failed_and_what_scenes
     )
 
 
+def test_a_budget_with_only_some_of_the_sets_names_them(tmp_path, monkeypatch):
+    rows = [("Dist", 0.0101, 100.0), ("B", 0.01, 300.0)]
+    runs = made(rows, TEN)
+    others = [replace(run, set="pose") for run in runs]
+    more = [replace(run, budget=10.0) for run in runs]
+    shown = page([*runs, *others, *more], tmp_path / "both", monkeypatch)
+    answer = study.verdict(shown)
+    assert "At 1 unit, B" in answer and "At 10 units (complete), B" in answer
+    caption = study._sample(shown)
+    assert "at 1 unit, 20 problems (10 scenes)" in caption and "at 10 units (complete), 10 problems" in caption
+
+
 def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch):
     page([], tmp_path, monkeypatch)
     runs = [None] * (len(study.READS) - 1)
