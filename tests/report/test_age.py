@@ -27,7 +27,7 @@ def test_a_recorded_setting_that_no_renderer_has_any_more_makes_a_row_old():
 
 
 def test_the_rows_of_dvr_have_the_setting_that_they_were_made_with():
-    rows = [row for row in read_rows(SHIPPED / "paper") if row["config"]["experiment"] == "dvr_table2"]
+    rows = read_rows(SHIPPED / "paper", "dvr_table2")
     recorded = [row["config"]["renderer"].get("keep_slope_sign") for row in rows]
     assert (recorded.count(False), recorded.count(True)) == (0, 8)
     assert not [row for row in rows if removed_settings(row)]

@@ -51,7 +51,7 @@ def test_the_answers_of_the_readme_are_those_of_the_committed_results():
 
 
 def test_the_ranks_that_the_readme_names_are_those_of_the_kept_rows(tmp_path):
-    rows = [row for row in read_rows(PAPER) if row["config"].get("experiment") == "stability"]
+    rows = read_rows(PAPER, "stability")
     write_paper(rows, tmp_path, only="stability_cost")
     drawn, committed = (read_shown(folder / "stability_cost.json") for folder in (tmp_path / "paper", PAPER))
     assert drawn.verdict == committed.verdict and drawn.rows == committed.rows

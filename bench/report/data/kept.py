@@ -43,14 +43,14 @@ def write_rows(records: Iterable[Record], experiments: Iterable[str], folder: Pa
     return [_write(folder / f"{name}{SUFFIX}", groups[name]) for name in dict.fromkeys(experiments) if name in groups]
 
 
-def read_rows(folder: Path) -> list[Record]:
-    """Reads the records of all such files of a folder.
+def read_rows(folder: Path, experiment: str = "[!.]*") -> list[Record]:
+    """Reads the records of all such files of a folder, or of those whose experiment has the pattern.
 
     Raises:
         ValueError: a file cannot be read.
     """
     records = list[Record]()
-    for path in sorted(folder.glob(f"[!.]*{SUFFIX}")):
+    for path in sorted(folder.glob(f"{experiment}{SUFFIX}")):
         try:
             with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
                 records += map(_record, csv.DictReader(file))
