@@ -86,7 +86,7 @@ def settings(config: dict[str, Any]) -> dict[str, str]:
 
 def values(record: dict[str, Any]) -> dict[str, float]:
     """All finite numbers of a record, such as `metrics.chamfer_l2`."""
-    return _finite(flat({name: record[name] for name in NUMERIC_FIELDS}))
+    return _finite(flat({name: record[name] for name in NUMERIC_FIELDS if name in record}))
 
 
 def curve(folder: Path) -> list[tuple[int, dict[str, float]]]:

@@ -90,7 +90,7 @@ def _row(record: dict[str, Any]) -> dict[str, Any]:
     row |= {"experiment": config.get("experiment") or None, "scale": setting(config, "scale", "name")}
     row |= {"started": started(record), "method": record.get("method") or None, "scene": record.get("scene") or None}
     for section, prefix in PREFIXES.items():
-        named = {f"{prefix}{name}": value for name, value in record[section].items()}
+        named = {f"{prefix}{name}": value for name, value in record.get(section, {}).items()}
         row |= {f"metric_{name}" if name in FIXED_COLUMNS else name: _cell(value) for name, value in named.items()}
     return row | {name: _cell(value) for name, value in flat(record["config"], CONFIG).items()}
 

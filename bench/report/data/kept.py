@@ -3,9 +3,6 @@
 A line is a record without the other files of its run folder (curves, pictures), and outlives the folder. A column is a
 field by its dotted name, such as `metrics.NAME` or `config.KEY.KEY`. A cell is the value as JSON; text that is not also
 JSON stands without quotes. An empty cell means that the run has no such field.
-
-A row with the field `restored` was made from the CSV of a page whose run folders are gone. It has only the settings
-that the page shows, the time of the page's commit as its start, and one number for the seconds of its loop.
 """
 
 import csv

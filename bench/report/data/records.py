@@ -81,9 +81,9 @@ def error(record: Record, name: str) -> float:
 
 
 def loop_seconds(record: Record) -> float | None:
-    """The seconds of the optimisation loop, or None. A restored row has only their sum."""
+    """The seconds of the optimisation loop, or None."""
     spent = [record["seconds"].get(name) for name in ("forward", "backward")]
-    return record["seconds"].get("loop") if None in spent else sum(spent)
+    return None if None in spent else sum(spent)
 
 
 def value_evaluations(record: Record) -> float | None:

@@ -100,14 +100,14 @@ class Runs:
         rows = [row_of(record) for record in self.records]
         coarse = table.evaluations_coarse.fillna(0) if "evaluations_coarse" in table else 0
         missing = pd.Series(pd.NA, table.index, dtype="Float64")
-        forward, backward, loop = (table.get(f"seconds_{phase}", missing) for phase in ("forward", "backward", "loop"))
+        forward, backward = (table.get(f"seconds_{phase}", missing) for phase in ("forward", "backward"))
         return table.assign(
             row=[row.name for row in rows],
             preset=[row.preset for row in rows],
             family=[family(record) for record in self.records],
             solid=[str(solid(record)[1]) for record in self.records],
             view=[view(record) for record in self.records],
-            loop=(forward + backward).fillna(loop).astype(float),
+            loop=(forward + backward).astype(float),
             values=(table.get("evaluations_value", missing) + coarse).astype(float),
         )
 

@@ -8,7 +8,6 @@ from operator import itemgetter
 from typing import Any
 
 from bench.records.format import plural
-from bench.report.data import age
 from bench.report.data.records import Record, doubtful, setting, solid, view
 from bench.report.data.runs import Runs, shared_loss
 from bench.report.data.statistics import Interval
@@ -56,9 +55,9 @@ def undefined(values: Iterable[float]) -> str:
 
 
 def warnings(runs: Runs) -> list[str]:
-    """Notes on differing settings, incomparable or doubtful times, old runs and missing runs."""
+    """Notes on differing settings, incomparable or doubtful times, and missing runs."""
     timing = (_machines(runs), _loaded(runs)) if "machine" in runs.selection.setup else ()  # else it shows no times
-    notes = (_mixed(runs), *timing, *age.notes(runs.records), _omitted(runs), _renamed(runs))
+    notes = (_mixed(runs), *timing, _omitted(runs), _renamed(runs))
     return [note for note in notes if note]
 
 

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from bench.records.record import is_outside, write_text
 from bench.records.results import PLAN_FILE
-from bench.report.data import age
+from bench.report.data import page_version
 from bench.report.data.kept import FROM_RUNS_CSV, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
 from bench.report.write.caption import SMOKE_WARNING
@@ -247,7 +247,7 @@ def ship(records: list[dict[str, Any]], results_dir: Path, output_dir: Path) -> 
     for page in _pages_of(output_dir):
         table = page.base.with_suffix(".csv")
         if table not in drawn:
-            stamp = "" if page.name in own_rows else age.drawn_by(table)
+            stamp = "" if page.name in own_rows else page_version.drawn_by(table)
             write_shown(replace(page.shown, drawn_by=page.shown.drawn_by or stamp), page.base)
     return [*rows, *drawn]
 

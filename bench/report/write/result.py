@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from bench.pictures.figure_style import RC
 from bench.records.format import seconds
 from bench.records.record import to_json_values
-from bench.report.data import age
+from bench.report.data import page_version
 from bench.report.data.runs import Runs
 from bench.report.data.statistics import Interval
 from bench.report.write import caption
@@ -177,7 +177,7 @@ class Shown:
     @property
     def head(self) -> str:
         """A sentence on the version that drew the page, if this one cannot draw it."""
-        return age.head(self.drawn_by)
+        return page_version.head(self.drawn_by)
 
     @property
     def answer(self) -> str:
