@@ -1,6 +1,7 @@
 # Two commands do everything on a fresh machine: `make demo` and `make test`.
 PYTHON ?=
 BIN := .venv/bin
+unexport PYTHONDONTWRITEBYTECODE  # with it, each of some hundred processes compiles all files again
 
 .PHONY: demo results test test-slow test-types test-browser benchmark mutants lint setup clean
 
