@@ -398,6 +398,8 @@ def wrong_type_message(key: str, value: Any, wanted: Any) -> str:
     members = get_args(wanted)
     is_list = get_origin(wanted) is list or members[1:] == (...,)
     remedy = f": write {key}=[{value}]" if is_list and isinstance(value, str | int | float) else ""
+    if match := re.fullmatch(r"(\d+)-(\d+)", str(value)):
+        remedy = f": several are -m {key}='range({match[1]},{int(match[2]) + 1})'"
     return f"{key} must be {_type_label(wanted)}, not {value!r}{remedy}"
 
 
@@ -416,4 +418,4 @@ def _type_label(wanted: Any) -> str:
 def type_of(key: str) -> Any:
     """The type of a dotted key of the top level; None for keys of other nodes, whose classes define them."""
     outer, _, inner = key.partition(".")
-    return get_type_hints(EvaluationSettings if outer == "evaluation" else Config).get(inner or outer)
+    return get_type_hints(EvaluationSettings).get(inner) if outer == "evaluation" else get_type_hints(Config).get(key)

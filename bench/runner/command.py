@@ -11,20 +11,20 @@ from pathlib import Path
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from bench.config import type_of
 from bench.progress import notice
 from bench.records.results import PlannedRun
 from bench.runner.compose import Composer, composing, parse_override, without_hydra
-from bench.runner.library import OPTIONAL_GROUPS
+from bench.runner.library import OPTIONAL_GROUPS, quoted
 from bench.runner.messages import Interrupted, write_error_message
 from bench.runner.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.runner.sweep import LauncherStopped, work_per_cell
 from bench.tables import names, nearest
 
 DANGLING_COMMA = re.compile(r"[=,]\s*,|,\s*$")
-SETTING_PATTERN = re.compile(r"(\+*(\w+))=(.+)", re.DOTALL)  # groups: plus signs and key, key, value
+SETTING_PATTERN = re.compile(r"(\+*([\w.]+))=(.+)", re.DOTALL)  # groups: plus signs and key, key, value
 LISTED_GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale")
 HELP = """
     python -m bench task=completion renderer=dist                          one run
@@ -181,18 +181,23 @@ def expand_field_file(arguments: list[str]) -> list[str]:
 
 
 def quote_text(argument: str) -> str:
-    """Quotes values that Hydra would read as numbers or booleans, if the key's type is text.
+    """Quotes text that Hydra would read as a number, a boolean or null, if the key is a path or its type is text.
 
-    Without quotes, `label=1e3` would become 1000.0, `label=Nan` nan, and `label=true` True.
+    Without quotes, `label=1e3` would become 1000.0, `label=Nan` nan, and `label=true` True. In a path, `~` is the home
+    folder. A path that Hydra cannot read, or a file whose name has a comma, becomes one quoted text.
     """
     setting = SETTING_PATTERN.fullmatch(argument)
-    if setting is None or type_of(setting[2]) not in (str, str | None):
+    is_path = setting is not None and setting[2].endswith("path")
+    if setting is None or not (is_path or type_of(setting[2]) in (str, str | None)):
         return argument
+    text = str(Path(setting[3]).expanduser()) if is_path and setting[3].startswith("~") else setting[3]
     try:
-        values = [(text, parse_override(f"text={text}").value()) for text in setting[3].split(",")]
-    except HydraException:  # a comma within quotes or brackets, or no value
-        return argument
-    typed = [f"'{text.strip()}'" if isinstance(value, int | float) else text for text, value in values]
+        values = [(word, parse_override(f"text={word}").value()) for word in text.split(",")]
+    except HydraException:  # a comma within quotes or brackets, no value, or a text that Hydra cannot read
+        return f"{setting[1]}={quoted(text)}" if is_path and text[0] not in "'\"[" else argument
+    if "," in text and is_path and Path(text).exists():
+        return f"{setting[1]}={quoted(text)}"
+    typed = [quoted(word.strip()) if isinstance(value, int | float) else word for word, value in values]
     return f"{setting[1]}={','.join(typed)}"
 
 
@@ -207,7 +212,13 @@ def message_of(error: Exception) -> str:
     """The error message in one line."""
     if isinstance(error, OverrideParseException):
         return _override_message(error.override)
-    return " ".join(str(error).split())
+    text = " ".join(str(error).split())
+    is_shell = isinstance(error, InterpolationKeyError) and re.search(r"Interpolation key '[A-Z]\w*'", text)
+    return (
+        f"{text}: ${{...}} in quotes is a key of the configuration; for a shell variable remove the quotes"
+        if is_shell
+        else text
+    )
 
 
 def _add_file(message: str) -> str:

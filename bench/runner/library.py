@@ -6,20 +6,12 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from bench.records.record import Record, read_record
 
 OPTIONAL_GROUPS = ("method", "experiment")  # they take a plus: +method=NAME
-UNQUOTED_TEXT = re.compile(r"[\w./:@%+-]+")  # Hydra accepts such a text without quotes
-
-
-class CommandResult(NamedTuple):
-    """The exit status, standard output and standard error of a command."""
-
-    code: int
-    out: str
-    err: str
+UNQUOTED_TEXT = re.compile(r"[A-Za-z_/][\w./:@%+-]*", re.ASCII)  # Hydra reads it as the same text
 
 
 def run(overrides: Sequence[str] = (), **choices: Any) -> Record:
@@ -53,20 +45,20 @@ def run(overrides: Sequence[str] = (), **choices: Any) -> Record:
         )
     arguments = [*(_override(key, value) for key, value in choices.items()), *overrides]
     result = _command(arguments)
-    folder = Path(result.out.rstrip("\n").rpartition("\n")[2] or ".")
+    folder = Path(result.stdout.rstrip("\n").rpartition("\n")[2] or ".")
     if (folder / "record.json").is_file():
         record = Record.of(read_record(folder))
         record.config["results_dir"] = str(folder.absolute().parents[1])
         return record
-    errors = [line.removeprefix("error: ") for line in result.err.splitlines() if line.startswith("error: ")]
-    if result.code == 0:
+    errors = [line.removeprefix("error: ") for line in result.stderr.splitlines() if line.startswith("error: ")]
+    if result.returncode == 0:
         line = " ".join(arguments)
         raise ValueError(f"bench.run makes one run, and {line!r} does not: leave out plan=true and options such as -m")
-    reason = errors[-1] if errors else f"the command ended with exit status {result.code}: {result.err.strip()[-2000:]}"
-    raise (ValueError if result.code == 2 else OSError)(reason)
+    ending = f"the command ended with exit status {result.returncode}: {result.stderr.strip()[-2000:]}"
+    raise (ValueError if result.returncode == 2 else OSError)(errors[-1] if errors else ending)
 
 
-def _command(arguments: list[str]) -> CommandResult:
+def _command(arguments: list[str]) -> subprocess.CompletedProcess[str]:
     """Runs the command line in a new process, which can import the same packages as this one."""
     paths = os.pathsep.join(str(Path(path).absolute()) for path in sys.path)
     with subprocess.Popen(
@@ -84,7 +76,7 @@ def _command(arguments: list[str]) -> CommandResult:
             process.terminate()
             process.communicate()
             raise
-    return CommandResult(process.returncode, out, err)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
 def _override(key: str, value: Any) -> str:
@@ -93,13 +85,21 @@ def _override(key: str, value: Any) -> str:
 
 
 def _as_typed(value: Any) -> str:
-    """A value as the command line reads it."""
+    """A value as the command line reads it; an array is a list, and a text stays that text."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, list | tuple):
         return f"[{','.join(map(_as_typed, value))}]"
+    if isinstance(value, dict):
+        return f"{{{','.join(f'{key}:{_as_typed(item)}' for key, item in value.items())}}}"
+    if hasattr(value, "tolist"):  # a NumPy or PyTorch array
+        return _as_typed(value.tolist())
     text = str(value)
-    if isinstance(value, int | float) or UNQUOTED_TEXT.fullmatch(text):
-        return text
-    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    is_plain = UNQUOTED_TEXT.fullmatch(text) and text.lower() not in ("null", "true", "false", "nan", "inf")
+    return text if is_plain or isinstance(value, int | float) else quoted(text.replace("${", "\\${"))
+
+
+def quoted(text: str) -> str:
+    """A text in quotes as Hydra reads it."""
+    escaped = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + match[2].replace("'", "\\'"), text)
     return f"'{escaped}'"

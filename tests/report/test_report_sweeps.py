@@ -94,6 +94,15 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     assert "| DIST | **1.00** | 4.00 |" in text and r"& \textbf{\boldmath 1.00} & 4.00 &" in tex and "(n = " not in text
 
 
+def test_a_row_of_which_every_run_failed_is_in_the_table_and_the_chart(tmp_path):
+    cells = [cell("dist"), cell("dvr")]
+    swept(tmp_path, cells)
+    ran(tmp_path, cells[0], 0.001)
+    ran(tmp_path, cells[1], 0.002, status="nan", reason="as planned")
+    assert list(table(tmp_path)["failed"]) == [0, 1]
+    assert (tmp_path / "sweeps" / "completion-1" / "table.png").is_file()
+
+
 def test_a_data_set_on_which_a_row_only_failed_has_a_column_all_the_same(tmp_path):
     cells = [cell(renderer, dataset=dataset) for renderer in ("dist", "dvr") for dataset in ("sofa", "plane")]
     swept(tmp_path, cells)

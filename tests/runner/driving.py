@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import torch
@@ -21,7 +21,6 @@ from bench.machine.environment import using_threads
 from bench.records.record import Record, RunStatus
 from bench.records.results import PlannedRun
 from bench.runner import process
-from bench.runner.library import CommandResult
 
 ROOT = Path(__file__).parents[2]
 FAILING = (
@@ -34,6 +33,14 @@ SMALLEST = (
     "evaluation.picture=null",
 )  # fmt: skip
 PATIENCE = 120.0  # seconds until a test that hangs is ended
+
+
+class CommandResult(NamedTuple):
+    """The exit status, standard output and standard error of a command."""
+
+    code: int
+    out: str
+    err: str
 
 
 def errors(err: str) -> list[str]:

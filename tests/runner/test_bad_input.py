@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.records import folder as run_folder
 from bench.runner.command import message_of, options_of, quote_text
+from bench.runner.compose import parse_override
 from bench.runner.plan import refusal_reason
 from bench.setup import priors
 from tests.composing import identified
@@ -156,6 +157,22 @@ def test_a_label_is_the_text_that_was_typed(text, label):
 def test_the_command_keeps_labels_as_typed_in_a_sweep_too(bench, no_prior):
     code, out, _ = bench("-m", "label=Nan,1e3,Mine", "plan=true")
     assert code == 0 and all(f"completion, {label}, sofa" in out for label in ("Nan", "1e3", "Mine")), out
+
+
+def test_a_path_is_the_text_that_was_typed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+
+    def paths(text: str) -> list[str]:
+        parsed = parse_override(quote_text(f"dataset.path={text}"))
+        return [*parsed.sweep_iterator()] if parsed.is_sweep_override() else [parsed.value()]
+
+    for text in ("1e5", "true", "李明.obj", "a b/chair (1).obj", "it's.obj"):
+        assert paths(text) == [text]
+    assert paths("null") == [None] and paths("~/chair.obj") == ["/home/me/chair.obj"]
+    assert paths("a,b.obj") == ["a", "b.obj"]
+    Path("a,b.obj").touch()
+    assert paths("a,b.obj") == ["a,b.obj"]
 
 
 def test_a_number_stays_one_if_the_key_takes_one():

@@ -2,13 +2,19 @@
 
 import doctest
 from pathlib import Path
+from subprocess import CompletedProcess
 
+import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
 import bench
 from bench.report.data import frame
 from bench.runner import library
-from tests.runner.driving import ROOT, CommandResult, by_program, command
+from bench.runner.compose import parse_override
+from tests.runner.driving import ROOT, by_program, command
 
 SMALL = (
     "isolation=off", "threads=1", "task.points=20", "task.optimiser.iterations=8", "view.resolution=16",
@@ -27,11 +33,15 @@ assert callable(bench.run)
 """
 
 
+def completed(code: int, out: str, err: str) -> CompletedProcess[str]:
+    return CompletedProcess([], code, out, err)
+
+
 @pytest.fixture
 def within(tmp_path, monkeypatch):
     """Makes an empty folder the working directory; `bench.run` runs in this process."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(library, "_command", lambda arguments: command(*arguments, *SMALL))
+    monkeypatch.setattr(library, "_command", lambda arguments: completed(*command(*arguments, *SMALL)))
     return tmp_path
 
 
@@ -52,13 +62,34 @@ def test_a_keyword_is_typed_as_on_the_command_line(compose_config):
     ):  # fmt: skip
         assert library._override("label", value) == f"label={text}"
     assert library._override("method", "dist_mask") == "+method=dist_mask"
-    for value in ("it's, a=b", "two words", "[x]", "back\\slash", "a\\'b"):
-        assert compose_config(library._override("label", value)).label == value
+
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=12)
+SCALARS = st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.floats(allow_nan=False) | TEXTS
+VALUES = SCALARS | st.lists(SCALARS, max_size=4)
+
+
+@given(VALUES)
+@example("1e5")
+@example("null")
+@example("-inf")
+@example("it's, a=b")
+@example("a\\'b")
+@example("${HOME}/x")
+@example("李明.obj")
+@example("~/chair (1).obj")
+def test_a_value_from_python_arrives_unchanged(value):
+    config = OmegaConf.create({"key": parse_override(library._override("key", value)).value()})
+    assert OmegaConf.to_container(config, resolve=True) == {"key": value}
+
+
+def test_an_array_is_a_list():
+    assert library._override("key", np.array([[60.0, 24.5]])) == library._override("key", ((60.0, 24.5),))
 
 
 @pytest.mark.parametrize(("code", "error"), [(2, ValueError), (1, OSError)])
 def test_a_refused_run_is_an_error_with_the_line_of_the_command(monkeypatch, code, error):
-    result = CommandResult(code, "", "a note\nerror: unknown renderer 'dits'\n")
+    result = completed(code, "", "a note\nerror: unknown renderer 'dits'\n")
     monkeypatch.setattr(library, "_command", lambda _: result)
     with pytest.raises(error, match=r"^unknown renderer 'dits'$"):
         bench.run(renderer="dits")
@@ -67,7 +98,7 @@ def test_a_refused_run_is_an_error_with_the_line_of_the_command(monkeypatch, cod
 
 
 def test_a_plan_is_no_run(monkeypatch):
-    monkeypatch.setattr(library, "_command", lambda _: CommandResult(0, "1 planned: 1 to run\n", ""))
+    monkeypatch.setattr(library, "_command", lambda _: completed(0, "1 planned: 1 to run\n", ""))
     with pytest.raises(ValueError, match="'renderer=dist plan=true' does not: leave out plan=true"):
         bench.run(renderer="dist", plan=True)
 

@@ -170,7 +170,7 @@ def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> No
         else:
             axis.vlines(x, *ends, color=each["colour"], lw=0.7)
     if "shapes" in each:
-        shape_x, shape_y = np.minimum(each["shapes"], edges).T
+        shape_x, shape_y = np.minimum(np.reshape(each["shapes"], (-1, 2)), edges).T  # without runs: empty
         axis.plot(shape_x, shape_y, color=each["colour"], marker=each["symbol"], ls="none", ms=2, alpha=0.5, zorder=1.5)
 
 
