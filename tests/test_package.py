@@ -1,12 +1,13 @@
 """The wheel and the sdist have all files that runs need, and one version."""
 
+import ast
+import json
 import os
 import re
 import shutil
 import site
 import subprocess
 import sys
-import tarfile
 import tomllib
 import zipfile
 from fnmatch import fnmatch
@@ -16,6 +17,7 @@ import pytest
 import yaml
 
 from bench.records.results import RESULTS
+from bench.records.shipped import FITS, SURFACE_METRICS, shipped_rows
 from bench.runner.executors import EXTRA_BY_EXECUTOR
 from datasets.extras import install_command, version
 from tests.runner.driving import by_program
@@ -24,7 +26,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "conf", "datasets", "renderers")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 VERSION = PROJECT["project"]["version"]
-NOT_IN_SDIST = ("results/",)
+SHIPPED_FILES = (
+    r"results/suite/[^/]+/[^/]+\.csv",
+    r"results/paper/[^/]+\.(json|md|runs\.csv\.gz)",
+)  # which commands read
 DEMO = ("task=completion", "renderer=dist", "scale=smoke", "threads=1", "evaluation.picture=null")
 
 
@@ -39,6 +44,11 @@ def tracked() -> list[str]:
 
 def of_packages(names: list[str]) -> set[str]:
     return {name for name in names if name.split("/")[0] in PACKAGES}
+
+
+def shipped_files(names: list[str]) -> set[str]:
+    """The shipped results that the wheel and the sdist have."""
+    return {name for name in names if re.fullmatch("|".join(SHIPPED_FILES), name)}
 
 
 def test_patterns_of_the_package_cover_every_file():
@@ -128,63 +138,126 @@ def test_a_run_and_its_report_leave_the_checkout_as_it_is(tmp_path):
     assert subprocess.check_output([*git, "status", "--porcelain"], text=True) == ""
 
 
+def build(source: Path, kinds: str, into: Path) -> None:
+    """Builds the sdist or the wheel, or both, of a folder of sources."""
+    calls = "; ".join(f"build_meta.build_{kind}({str(into)!r})" for kind in kinds.split())
+    code = f"from setuptools import build_meta; {calls}"
+    subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, check=True)
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> Path:
-    """A folder with the wheel and the sdist of the project's files."""
+    """A folder with the sdist and the wheel of the project's files."""
     folder = tmp_path_factory.mktemp("package")
     for name in tracked():
-        if not name.startswith(NOT_IN_SDIST):
-            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, folder / "source" / name)
-    code = "from setuptools import build_meta as b; b.build_sdist('../dist'); b.build_wheel('../dist')"
+        (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / "source" / name)
     (folder / "dist").mkdir()
-    subprocess.run([sys.executable, "-c", code], cwd=folder / "source", capture_output=True, check=True)
+    build(folder / "source", "sdist wheel", folder / "dist")
     return folder / "dist"
 
 
-@pytest.mark.slow
-def test_the_wheel_has_every_file_of_the_packages(built):
-    (wheel,) = built.glob(f"implicit_bench-{VERSION}-py3-none-any.whl")
-    names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
-    assert set(names) == of_packages(tracked())
+def files_of_wheel(folder: Path) -> set[str]:
+    (wheel,) = folder.glob(f"implicit_bench-{VERSION}-py3-none-any.whl")
+    return {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
 
 
 @pytest.mark.slow
-def test_the_sdist_has_every_file_but_results(built):
+def test_the_wheel_has_every_file_of_the_packages_and_the_results_that_commands_read(built):
+    results = shipped_files(tracked())
+    assert len(results) > 100
+    copies = {name.replace("results", "bench/shipped_results", 1) for name in results}
+    assert files_of_wheel(built) == of_packages(tracked()) | copies
+
+
+@pytest.mark.slow
+def test_the_sdist_has_every_file_but_results_that_no_command_reads_and_makes_the_same_wheel(built, tmp_path):
     (sdist,) = built.glob(f"implicit_bench-{VERSION}.tar.gz")
-    with tarfile.open(sdist) as archive:
-        names = {name.partition("/")[2] for name in archive.getnames()}
-    wanted = {name for name in tracked() if not name.startswith(NOT_IN_SDIST) and name != ".gitignore"}
+    subprocess.run(["tar", "-xzf", sdist, "-C", tmp_path], check=True)
+    source = tmp_path / sdist.name.removesuffix(".tar.gz")
+    names = {path.relative_to(source).as_posix() for path in source.rglob("*") if path.is_file()}
+    wanted = {name for name in tracked() if not name.startswith("results/") and name != ".gitignore"}
     assert wanted - names == set()
+    assert {name for name in names if name.startswith("results/")} == shipped_files(tracked())
+    build(source, "wheel", tmp_path)
+    assert files_of_wheel(tmp_path) == files_of_wheel(built)
 
 
-@pytest.mark.slow
-def test_the_wheel_runs_from_an_empty_folder(built, tmp_path):
-    """The new environment has the libraries of this one, but not this project."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True)
-    python = tmp_path / "venv" / "bin" / "python"
-    install = [sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", "-q"]
-    subprocess.run([*install, *built.glob("*.whl")], check=True)
-    (libraries,) = (tmp_path / "venv").glob("lib/*/site-packages")
-    (libraries / "libraries.pth").write_text("\n".join(site.getsitepackages()))
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+class Installed:
+    """The wheel in an environment of its own, which has the libraries of this one but not this project."""
 
-    def run(*arguments: str) -> str:
-        process = subprocess.run(
-            [python, *arguments], cwd=empty, env=environment, capture_output=True, text=True, check=False
-        )
+    def __init__(self, wheel: Path, folder: Path) -> None:
+        self.python = folder / "venv" / "bin" / "python"
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "venv"], check=True)
+        install = [sys.executable, "-m", "pip", "--python", self.python, "install", "--no-deps", "--no-index", "-q"]
+        subprocess.run([*install, wheel], check=True)
+        (self.libraries,) = (folder / "venv").glob("lib/*/site-packages")
+        (self.libraries / "libraries.pth").write_text("\n".join(site.getsitepackages()))
+        (self.libraries / "results").mkdir()  # as a package of another project
+
+    def run(self, folder: Path, *arguments: str | Path, program: str = "python") -> str:
+        """The standard output of a program of the environment in a folder."""
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        command = [self.python.with_name(program), *arguments]
+        process = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
         assert process.returncode == 0, process.stderr
         return process.stdout
 
-    assert run("-c", "import bench; print(bench.__file__)").startswith(str(libraries))
-    folder = empty / run("-m", "bench", *DEMO).splitlines()[-1]
+
+@pytest.fixture(scope="module")
+def installed(built, tmp_path_factory) -> Installed:
+    """The installed wheel, whose packages all come from its own environment."""
+    environment = Installed(*built.glob("*.whl"), tmp_path_factory.mktemp("installed"))
+    code = f"from importlib import import_module; print([import_module(name).__file__ for name in {PACKAGES}])"
+    files = ast.literal_eval(environment.run(environment.libraries.parents[3], "-c", code))
+    assert files == [str(environment.libraries / name / "__init__.py") for name in PACKAGES]
+    return environment
+
+
+@pytest.mark.slow
+def test_the_wheel_runs_from_an_empty_folder(installed, tmp_path):
+    folder = tmp_path / installed.run(tmp_path, "-m", "bench", *DEMO).splitlines()[-1]
     assert {"record.json", "mesh.ply"} <= {path.name for path in folder.iterdir()}
-    assert [path.name for path in empty.iterdir()] == ["results"]
-    assert run("-m", "bench.report").splitlines()[-1] == "results/local/index.html"
-    assert run(python.with_name("implicit-bench"), "report").splitlines()[-1] == "results/local/index.html"
-    printed = run(
-        "-c", "import bench; r = bench.load(); print(r.status[0], r['commit'].isna()[0] or r['commit'][0] == '')"
+    assert [path.name for path in tmp_path.iterdir()] == ["results"]
+    assert installed.run(tmp_path, "-m", "bench.report").splitlines()[-1] == "results/local/index.html"
+    printed = installed.run(
+        tmp_path,
+        "-c",
+        "import bench; r = bench.load(); print(r.status[0], r['commit'].isna()[0] or r['commit'][0] == '')",
     )
     assert printed.split() == ["ok", "True"]
+
+
+@pytest.mark.slow
+def test_a_run_of_the_wheel_has_the_best_possible_errors(installed, tmp_path):
+    words = ("task=completion", "renderer=dist", "threads=1", "evaluation.picture=null", "task.optimiser.iterations=2")
+    folder = tmp_path / installed.run(tmp_path, *words, program="implicit-bench").splitlines()[-1]
+    best = json.loads((folder / "record.json").read_text(encoding="utf-8"))["metrics_best"]
+    (fit,) = [row for row in shipped_rows(FITS) if row["scene"] == "sofa test 0"]
+    assert best == {name: float(fit[f"metrics.{name}"]) for name in SURFACE_METRICS}
+
+
+@pytest.mark.slow
+def test_a_plan_of_the_wheel_has_the_times_of_shipped_runs(installed, tmp_path):
+    *cells, summary = installed.run(tmp_path, "-m", "bench", "-m", "+experiment=table1", "plan=true").splitlines()
+    assert len(cells) > 20 and all("shipped run" in cell for cell in cells)
+    assert f"{len(cells)} to run; about" in summary
+
+
+@pytest.mark.slow
+def test_comparisons_and_pages_of_the_wheel_are_those_of_the_checkout(installed, tmp_path):
+    comparison = "import bench; print(bench.compare(['newton', 'dist']).to_csv())"
+    pages = "from pathlib import Path; from bench.report.write.paper import papers; print(papers(Path('none')))"
+    code = f"{comparison}; {pages}"
+    output = installed.run(tmp_path, "-c", code)
+    assert "DIST, our default" in output and "What does one rendering with its gradient cost" in output
+    assert output == by_program("-c", code, cwd=tmp_path, PYTHONPATH=str(ROOT)).out
+
+
+@pytest.mark.slow
+def test_the_suite_of_the_wheel_compares_a_run_with_the_shipped_results(installed, tmp_path):
+    output = installed.run(tmp_path, "-m", "bench.suite", "suite=smoke", "set=complete", "renderer=newton")
+    assert "the shipped ones need about" in output and "1 planned: 1 ok" in output
+    assert "1 run of results/local, in rows with a star; the others are shipped." in output
+    rows = [line for line in output.splitlines() if re.match(r"(Newton \*|DIST, our default) .* % \(", line)]
+    assert len(rows) == 2

@@ -1,4 +1,4 @@
-"""The shipped rows of experiments, `results/paper/EXPERIMENT.runs.csv.gz`; only a checkout has them."""
+"""The folder of shipped results, in a checkout or as setup.py copies it into a wheel; its rows of an experiment."""
 
 import csv
 import gzip
@@ -8,7 +8,8 @@ from typing import Any
 
 from bench.records.record import flat
 
-SHIPPED = Path(__file__).resolve().parents[2] / "results" / "paper"
+ROOT = Path(__file__).resolve().parents[2]
+SHIPPED = ROOT / "results" if (ROOT / "results" / "suite").is_dir() else ROOT / "bench" / "shipped_results"
 SUFFIX = ".runs.csv.gz"
 CONFIG = "config."  # before the dotted key of a setting, in the name of a column
 FITS = "priors"  # the experiment that fits the default priors to the true distances of test shapes
@@ -19,8 +20,7 @@ SURFACE_METRICS = ("chamfer_l2", "chamfer_l1", "accuracy", "completeness", "fsco
 
 def shipped_rows(experiment: str) -> list[dict[str, str]]:
     """The shipped rows of an experiment, each as cells by column; `cell_value` reads a cell. Empty without a file."""
-    path = SHIPPED / f"{experiment}{SUFFIX}"
-    if not path.is_file():
+    if not (path := SHIPPED / "paper" / f"{experiment}{SUFFIX}").is_file():
         return []
     with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
         return [*csv.DictReader(file)]

@@ -6,9 +6,6 @@ from bench.records.metrics import LOWER, better_direction
 from bench.records.shipped import FITS, SURFACE_METRICS, best_possible, shipped_rows
 from tests.composing import identified
 
-if not shipped_rows(FITS):
-    pytest.skip("only a checkout has shipped rows", allow_module_level=True)
-
 
 @pytest.mark.parametrize(("family", "index"), [("sofa", 0), ("car", 7)])
 def test_a_completion_has_the_errors_of_the_fit_to_its_shape(family, index):

@@ -7,13 +7,11 @@ import bench
 from bench.report.write import paper
 from tests.report.test_report_sweeps import cell, ran
 
-SHIPPED = paper.ROOT / "results"
+SHIPPED = paper.SHIPPED  # before tests/report/conftest.py replaces it
 
 
 @pytest.fixture
 def shipped(monkeypatch) -> None:
-    if not (SHIPPED / "suite").is_dir():
-        pytest.skip("only a checkout has the shipped runs")
     monkeypatch.setattr(paper, "SHIPPED", SHIPPED)
 
 

@@ -96,7 +96,8 @@ def test_finished_runs_are_reused_and_give_the_times_of_similar_runs(results):
 def test_without_a_finished_run_the_shipped_runs_of_the_experiment_give_the_time(results, monkeypatch, tmp_path):
     lines = ["task,renderer,method,config.scale.name,status,seconds.total", 'ablation,dist,"""""",smoke,ok,70']
     lines += ["ablation,dist,,smoke,ok,50", "ablation,dist,,desk,ok,9", "ablation,dvr,,smoke,crashed,3600"]
-    with gzip.open(tmp_path / "table1.runs.csv.gz", "wt") as file:
+    (tmp_path / "paper").mkdir()
+    with gzip.open(tmp_path / "paper" / "table1.runs.csv.gz", "wt") as file:
         file.write("\n".join(lines) + "\n")
     monkeypatch.setattr(shipped, "SHIPPED", tmp_path)
     *cells, summary = command(*SWEEP, "+experiment=table1", "plan=true", f"results_dir={results}").out.splitlines()

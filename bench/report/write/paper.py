@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 from bench.records.record import is_outside, write_text
 from bench.records.results import PLAN_FILE
+from bench.records.shipped import SHIPPED
 from bench.report.data import page_version
 from bench.report.data.kept import FROM_RUNS_CSV, join, read_rows, write_rows
 from bench.report.data.runs import NoFolder, Runs, Selection, choose
@@ -26,7 +27,6 @@ FOLDER = "paper"
 SWEEPS, TABLE = "sweeps", "table"  # the table of a sweep is next to its plan
 SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
-SHIPPED = ROOT / "results"  # only in a checkout
 STUDIES = ROOT / "bench" / "studies"
 SUITE_PAGE = "suite"  # its rows include the shipped ones
 SHIPPED_ROW_PREFIX = "shipped: "
