@@ -37,7 +37,7 @@ DATA_LAYER = ("datasets.files", "renderers.fields.networks", "renderers.fields.p
 STUDIES_LAYER = (
     "bench.report", "bench.studies", "bench.pictures.figure_style", "bench.pictures.size_chart", "renderers.later",
     "bench.evaluate.along_ray", "bench.pictures.ray",
-    "bench.records.names", "bench.records.read",
+    "bench.records.names", "bench.records.published", "bench.records.read",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",
     "bench.tasks.single_view", "bench.tasks.stability",
     *(f"bench.{name}" for name in ("judge", "merge", "prior", "ray", "suite", "train", "tune", "turntable", "verify")),

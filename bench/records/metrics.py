@@ -39,6 +39,16 @@ TABLE_METRICS = {  # the order is that of tables
     "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
     "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),
 }
+RENDERING_METRICS = {  # of task=ablation, as far as tables show them; the others are in the record
+    "pixel_errors": Metric("wrong pixels", better=LOWER),
+    "lost": Metric("missed pixels", better=LOWER),
+    "false": Metric("spurious pixels", better=LOWER),
+    "depth_error_median": Metric("median depth error (x1000)", 1000.0, LOWER),
+    "depth_error_p99": Metric("depth error, 99th percentile (x1000)", 1000.0, LOWER),
+    "cost": Metric("field evaluations of a rendering", better=LOWER),
+    "forward_seconds": Metric("rendering (ms)", 1000.0, LOWER),
+    "step_seconds": Metric("step (ms)", 1000.0, LOWER),
+}
 OTHER_DIRECTIONS = {  # which direction is better, for metrics that tables do not show
     **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred"), LOWER),
     **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
@@ -51,22 +61,13 @@ NON_NEGATIVE = frozenset(  # distances and angles; roughness is a logarithm
         *("dtu_overall", "dtu_accuracy", "dtu_completeness", "rotation_error_deg", "translation_error"),
     )
 )
-# DVR (Niemeyer et al. 2020), Table 2: accuracy, completeness and Chamfer-L1, means over three scans of DTU, in mm.
-DVR_SCANS = (65, 106, 118)
-DVR_TABLE2 = {
-    "Colmap + sPSR, trim 0": (1.881, 0.726, 1.303),
-    "Colmap + sPSR, trim 5": (1.400, 0.782, 1.091),
-    "Colmap + sPSR, trim 7": (0.446, 1.020, 0.733),
-    "DVR (RGB)": (1.054, 0.760, 0.907),
-    "DVR (RGB and depth)": (0.789, 0.775, 0.782),
-}
 
 
 def better_direction(name: str) -> str:
     """Which direction of a metric is better: `LOWER`, `HIGHER`, or empty if unknown."""
     for base_name in _with_base_names(name):
-        if base_name in TABLE_METRICS:
-            return TABLE_METRICS[base_name].better
+        if metric := (TABLE_METRICS | RENDERING_METRICS).get(base_name):
+            return metric.better
         if base_name in OTHER_DIRECTIONS:
             return OTHER_DIRECTIONS[base_name]
     return ""

@@ -9,7 +9,7 @@ from bench.records.record import NEUTRAL_KEYS, flat, renderer_name, row_name
 
 CHOICE_FIELDS = ("task", "method", "renderer", "dataset")  # fields of a record whose values need no key
 KEY_LABELS = {"index": "shape", "dataset.path": "", "_target_": ""}  # text before the value, instead of the key
-EXCLUDED_KEYS = NEUTRAL_KEYS | {"label", "packages"}
+EXCLUDED_KEYS = NEUTRAL_KEYS | {"label", "packages", "threads"}  # a swept key is named all the same
 
 
 class SharedSettings(dict):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records import format
-from bench.records.metrics import HIGHER, LOWER, TABLE_METRICS, Metric, better_direction
+from bench.records.metrics import HIGHER, LOWER, RENDERING_METRICS, TABLE_METRICS, Metric, better_direction
 from bench.records.names import differences
 from bench.records.read import read_plans
 from bench.records.record import as_number
@@ -30,9 +30,10 @@ from bench.report.write.result import Result, read_shown, write
 from bench.report.write.table import Column, count_with_interval, ends, extremes, text
 
 ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # after a heading: the better direction
+LISTED_METRICS = TABLE_METRICS | RENDERING_METRICS
 MAX_LISTED_VALUES = 6  # per swept key
 MAX_DATASET_COLUMNS = 8
-MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `TABLE_METRICS`
+MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `LISTED_METRICS`
 COST, RUNTIME = "field evaluations (a gradient counts as two)", "runtime of the loop (s)"
 PANEL_HEIGHT_INCHES, LEGEND_HEIGHT_INCHES = 2.3, 0.6
 AVERAGED_KEYS = ("index", "seed", "dataset")  # a sweep over their numbers is no axis of a chart
@@ -70,8 +71,8 @@ class Sweep:
     def metrics(self) -> list[str]:
         """The names of all metrics that are a number in some run; those that tables show come first."""
         names = {name: None for run in self.runs.records for name in run["metrics"] if measured(run, name) is not None}
-        listed = [name for name in TABLE_METRICS if name in names]
-        return [*listed, *(name for name in names if name not in TABLE_METRICS)]
+        listed = [name for name in LISTED_METRICS if name in names]
+        return [*listed, *(name for name in names if name not in LISTED_METRICS)]
 
     @property
     def datasets(self) -> list[str]:
@@ -220,7 +221,7 @@ def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | N
 
 def table_of(sweep: Sweep) -> Result:
     table_lines, names = lines(sweep), sweep.metrics
-    headings = {name: TABLE_METRICS[name] for name in names if name in TABLE_METRICS}
+    headings = {name: LISTED_METRICS[name] for name in names if name in LISTED_METRICS}
     headings = headings or {name: Metric(name) for name in names[:MAX_FALLBACK_METRICS]}
     stress = any(record["config"].get("stress") for record in sweep.runs.records)
     csv_only = [name for name in names if name not in headings]

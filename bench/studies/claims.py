@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.records.metrics import DVR_TABLE2
+from bench.records.published import DVR_TABLE2
 from bench.report.data.runs import NoFolder
 from bench.report.study import (
     Result,

@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from bench.records.metrics import DVR_TABLE2
+from bench.records.published import DVR_TABLE2
 from bench.records.record import as_number
 from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.records.metrics import DVR_TABLE2
+from bench.records.published import DVR_TABLE2
 from bench.records.read import read_records
 from bench.report.data.runs import choose
 from bench.report.medians import scene_of

@@ -94,6 +94,18 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     assert "| DIST | **1.00** | 4.00 |" in text and r"& \textbf{\boldmath 1.00} & 4.00 &" in tex and "(n = " not in text
 
 
+def test_a_sweep_of_renderings_has_the_errors_and_costs_of_table_1(tmp_path):
+    cells = [cell("dist"), cell("dvr")]
+    swept(tmp_path, cells)
+    measured = {"queries": 9, "lost": 2, "false": 1, "pixel_errors": 3, "depth_error_median": 1e-4, "cost": 9.0}
+    for planned in cells:
+        ran(tmp_path, planned, 0.001, task="ablation", metrics=measured | {"forward_seconds": 0.02})
+    table(tmp_path)
+    header = (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
+    titles = ("wrong pixels", "missed pixels", "spurious pixels", "median depth error (x1000)", "rendering (ms)")
+    assert all(title in header for title in titles) and "queries |" not in header
+
+
 def test_a_row_of_which_every_run_failed_is_in_the_table_and_the_chart(tmp_path):
     cells = [cell("dist"), cell("dvr")]
     swept(tmp_path, cells)

@@ -26,7 +26,7 @@ def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[fl
             small points show its shapes.
         more: further data for the page, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
     """
-    look, x, y = figure_style.look(preset), list(x), list(y)
+    look, x, y = _look(name, preset), list(x), list(y)
     points = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
     estimates = [estimate for estimate in (*x, *y) if isinstance(estimate, Interval)]
     if any(estimate.has_ends for estimate in estimates):
@@ -34,6 +34,11 @@ def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[fl
         points |= dict(zip(("low", "high"), map(_values, zip(*ends, strict=True)), strict=True))
     shapes = [_values(pair) for point in zip(x, y, strict=True) for pair in _shape_points(*point)]
     return points | ({"shapes": shapes} if shapes else {}) | more
+
+
+def _look(name: str, preset: str) -> figure_style.Look:
+    """The look of a preset; rows of renderer=custom have different looks."""
+    return figure_style.look(name if preset == "custom" else preset)
 
 
 def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[float, float]]:
@@ -45,7 +50,7 @@ def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[fl
 
 def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
     """A `series` whose points a line joins."""
-    return series(name, preset, x, y, **{"dash": figure_style.look(preset).line} | more)
+    return series(name, preset, x, y, **{"dash": _look(name, preset).line} | more)
 
 
 def link_to_runs(text: str) -> str:
