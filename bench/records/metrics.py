@@ -1,4 +1,4 @@
-"""Metrics by name: their heading, the factor of printed numbers, and which direction is better."""
+"""Metrics by name: heading, factor of printed numbers, better direction. `RENDERING_METRICS` are of task=ablation."""
 
 from typing import Any, NamedTuple
 
@@ -39,7 +39,7 @@ TABLE_METRICS = {  # the order is that of tables
     "rotation_error_deg": Metric("rotation error (degrees)", better=LOWER),
     "translation_error": Metric("translation error (x1000)", 1000.0, LOWER),
 }
-RENDERING_METRICS = {  # of task=ablation, as far as tables show them; the others are in the record
+RENDERING_METRICS = {
     "pixel_errors": Metric("wrong pixels", better=LOWER),
     "lost": Metric("missed pixels", better=LOWER),
     "false": Metric("spurious pixels", better=LOWER),

@@ -22,7 +22,7 @@ NOTES = (
     "Colours are compared at hits in held-out photographs. For volume renderers and the relaxed boundary, they are "
     "compared at all pixels of the mask, on black.",
     "Volume renderers use the cross entropy between opacity and mask, and a limited number of samples per ray.",
-    "The page “Error over the iterations on photographs” shows whether a row has converged.",
+    "The page `dvr_curves`, drawn from the folders of your runs, shows whether a row has converged.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm. These numbers cannot be compared directly "
     "with the measured rows.",
 )
