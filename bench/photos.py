@@ -9,10 +9,10 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import SCREEN, bare, silhouette_image
+from datasets.files.captures.frames import AXES
 from datasets.files.captures.hull import MaskFit
 from datasets.files.captures.sphere import likely_cause
 from datasets.files.own_photographs import (
-    AXES,
     GOOD_OVERLAP,
     PHOTOS_HINT,
     WARN_BELOW,

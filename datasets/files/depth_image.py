@@ -5,16 +5,15 @@ from functools import cached_property
 from math import cos, radians, sin
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from datasets.files.captures.depth import read_depth_file
-from datasets.files.captures.image import open_image
-from datasets.files.captures.mask import load_mask
+from datasets.files.captures.depth import check_object_depths, missing_note, read_depths
+from datasets.files.captures.frames import AXES
+from datasets.files.captures.mask import is_inverted, load_mask
 from datasets.files.meshes import load_mesh
 from datasets.files.range_scans import join_neighbours
 from datasets.mesh import Mesh
@@ -22,7 +21,7 @@ from datasets.scene import Scene, Split, Truth, View, see
 from datasets.shot import camera_in_world
 from datasets.views import look_at
 from renderers.camera import Camera
-from renderers.checks import BadInput, check_positive
+from renderers.checks import BadInput, check_choice, check_positive
 
 OBJECT_RADIUS = 0.75  # scene units, of the visible surface, so that the hidden part also fits the unit sphere
 OUTLIER_FRACTION = 0.01  # on each side, such as stray points behind an outline
@@ -30,8 +29,13 @@ DEFAULT_PITCH_DEGREES = 25.0  # assumed angle at which a camera without camera_t
 MARGIN_FRACTION = 0.1  # image margin around the object, relative to the object's extent
 MIN_DEPTH_PIXELS = 20
 MAX_CENTRE_OFFSET = 0.3  # from the image centre to the principal point, relative to half the image
+MIN_FOCAL_FRACTION = 0.2  # of the image; a pinhole camera with a smaller one would see more than 136 degrees
+MAX_UP_COMPONENT = 0.09  # upwards, of the camera axis that points down in the image: the sine of 5 degrees
+LEVEL_TOLERANCE = 0.005  # vertical part of the axis to the right, for a camera that is level
 MAX_TRUTH_DISTANCE = 0.15  # scene units; median distance of the visible surface from the truth
 MATRIX_SYNTAX = "write [fx,fy,cx,cy] or [[fx,0,cx],[0,fy,cy],[0,0,1]], and [4, 4] numbers for a rigid motion"
+DEPTH_KINDS = ("z", "ray")
+Z_UP_TO_Y_UP = "[[1,0,0,0],[0,0,1,0],[0,-1,0,0],[0,0,0,1]]"
 
 
 @dataclass(frozen=True)
@@ -39,21 +43,24 @@ class DepthImage:
     """One depth image with the camera that took it.
 
     Args:
-        path: camera z, 0 or not finite at unknown pixels: an `.npy`; an `.npz` with one array or an array `depth`; a
-            PNG of 16 bits; or another file that OpenCV reads, such as an EXR.
+        path: a file of depths; see `datasets.files.captures.depth.read_depths`.
+        depth: "z" for camera z, or "ray" for the distance along the ray of each pixel.
         intrinsics: fx, fy, cx, cy, or a matrix [3, 3], in pixels; the first pixel's centre is (0.5, 0.5).
         scale: units of the file's world per stored number, such as 0.001 for a PNG in millimetres.
         mask_path: an image of the same size, white on the object; None: all pixels with a depth show the object.
         camera_to_world: matrix [4, 4] into the file's world, whose y points up; x of a camera points right, y down, z
             forward. None: the world's axes are the camera's axes.
+        axes: "stated", as above, or "flipped": the camera's y points up and its z backward, as in OpenGL.
         truth: a mesh in the file's world, the ground truth of results; None: the visible surface is the truth.
     """
 
     path: str
+    depth: str
     intrinsics: list[Any]
     scale: float
     mask_path: str | None
     camera_to_world: list[Any] | None
+    axes: str
     truth: str | None
 
     def __post_init__(self) -> None:
@@ -61,7 +68,9 @@ class DepthImage:
         for name, path in (("path", self.path), ("mask_path", self.mask_path), ("truth", self.truth)):
             if path is not None and not Path(path).is_file():
                 raise ValueError(f"dataset.{name}={path} is no file: check the path")
-        _ = self.camera
+        check_choice("dataset.depth", self.depth, DEPTH_KINDS)
+        check_choice("dataset.axes", self.axes, tuple(AXES))
+        self._check_upright()
 
     @property
     def name(self) -> str:
@@ -81,7 +90,8 @@ class DepthImage:
                 fx, fy, cx, cy = pinhole
                 pinhole = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
             motion = np.eye(4) if self.camera_to_world is None else np.array(self.camera_to_world, dtype=np.float64)
-            return Camera(torch.from_numpy(pinhole), torch.from_numpy(np.linalg.inv(motion)), 1, 1)
+            world_to_camera = AXES[self.axes] @ np.linalg.inv(motion)
+            return Camera(torch.from_numpy(pinhole), torch.from_numpy(world_to_camera), 1, 1)
         except (TypeError, ValueError, np.linalg.LinAlgError) as error:
             raise ValueError(f"dataset.intrinsics, dataset.camera_to_world: {error}; {MATRIX_SYNTAX}") from None
 
@@ -99,20 +109,24 @@ class DepthImage:
         Raises:
             BadInput: a file cannot be read, or shows too little of the object.
         """
-        depth = self.scale * _read_depths(Path(self.path))
-        mask = depth > 0 if self.mask_path is None else load_mask(Path(self.mask_path))
-        if mask.shape != depth.shape:
-            sizes = " and ".join(f"{width} x {height}" for height, width in (mask.shape, depth.shape))
-            raise BadInput(f"{self.mask_path} and {self.path} must have one size, not {sizes} pixels")
-        warning = self._principal_point_warning(*depth.shape)
-        depth, mask, intrinsics = _crop_and_subsample(depth, mask, self.camera.intrinsics.numpy(), resolution)
+        depths = read_depths(Path(self.path))
+        mask = self._mask(depths.values)
+        check_object_depths(depths.values[mask & (depths.values > 0)], Path(self.path))
+        self._check_units_of_intrinsics(*mask.shape)
+        notes = (self._principal_point_warning(*mask.shape), *missing_note(depths.missing))
+        depth, mask, intrinsics = _crop_and_subsample(
+            self.scale * depths.values, mask, self.camera.intrinsics.numpy(), resolution
+        )
         measured = (depth > 0) & mask
         if measured.sum() < MIN_DEPTH_PIXELS:
             raise BadInput(
                 f"{self.path} has {measured.sum()} depths on the object at view.resolution={resolution}, and "
                 f"{MIN_DEPTH_PIXELS} are the fewest: check dataset.mask_path, or raise view.resolution"
             )
-        to_world, camera = self._fit_to_sphere(torch.from_numpy(depth), measured, torch.from_numpy(intrinsics))
+        pixel_camera = Camera(torch.from_numpy(intrinsics), self.camera.world_to_camera, *measured.shape)
+        if self.depth == "ray":
+            depth = pixel_camera.depth(torch.from_numpy(depth)).numpy()
+        to_world, camera = self._fit_to_sphere(torch.from_numpy(depth), measured, pixel_camera)
         scene_depth = torch.from_numpy(depth * mask / np.linalg.norm(to_world[:3, 0])).float()
         points = camera.rays().at(camera.distance(scene_depth)).double().numpy()[measured]
         if self.truth is None:
@@ -124,12 +138,57 @@ class DepthImage:
             if gap > MAX_TRUTH_DISTANCE:
                 raise BadInput(
                     f"what {self.path} shows lies {gap / OBJECT_RADIUS:.2g} of its radius from dataset.truth (median): "
-                    "give both in one world, by dataset.camera_to_world and dataset.scale, and check dataset.intrinsics"
+                    "give both in one world, by dataset.camera_to_world, dataset.axes and dataset.scale, and check "
+                    "dataset.intrinsics"
                 )
         surface = see(Truth(mesh, closed=False), camera)
         view = View(camera, surface.depth, surface.normals, torch.from_numpy(mask))
-        mesh = replace(mesh, repairs=(*filter(None, (truth_note, warning)), *mesh.repairs))
+        mesh = replace(mesh, repairs=(*filter(None, (truth_note, *notes)), *mesh.repairs))
         return Scene(self.name, mesh, view, scene_depth, to_world, is_partial=self.truth is None)
+
+    def _mask(self, depths: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        """The pixels that show the object."""
+        if self.mask_path is None:
+            return depths > 0
+        mask = load_mask(Path(self.mask_path))
+        if mask.shape != depths.shape:
+            sizes = " and ".join(f"{width} x {height}" for height, width in (mask.shape, depths.shape))
+            raise BadInput(f"{self.mask_path} and {self.path} must have one size, not {sizes} pixels")
+        if is_inverted(mask):
+            raise BadInput(
+                f"dataset.mask_path={self.mask_path} is white along the border, as an inverted mask: make the object "
+                "white and the rest black, or leave it out if all depths are the object's"
+            )
+        return mask
+
+    def _check_upright(self) -> None:
+        """Raises ValueError if the world's z points up, or the camera is upside down, as with OpenGL's axes."""
+        if self.camera_to_world is None:
+            return
+        right, down, _ = self.camera.world_to_camera[:3, :3].tolist()
+        other_axes = f"dataset.axes={next(name for name in AXES if name != self.axes)}"
+        if abs(right[2]) < LEVEL_TOLERANCE and abs(right[1]) > MAX_UP_COMPONENT:
+            flipped = f", and set {other_axes}" if down[2] > 0 else ""
+            raise ValueError(
+                "dataset.camera_to_world must be into a world whose y points up, and its camera is level in a world "
+                f"whose z points up: give the product {Z_UP_TO_Y_UP} @ camera_to_world{flipped}; turn dataset.truth too"
+            )
+        if down[1] > MAX_UP_COMPONENT:
+            raise ValueError(
+                "dataset.camera_to_world holds a camera that is upside down in a world whose y points up: set "
+                f"{other_axes} (flipped: camera axes of OpenGL, Blender, nerfstudio and ARKit), or turn the image and "
+                "the camera by 180 degrees"
+            )
+
+    def _check_units_of_intrinsics(self, height: int, width: int) -> None:
+        """Raises BadInput if the intrinsics are no pixels of the image."""
+        (fx, _, cx), (_, fy, cy), _ = self.camera.intrinsics.tolist()
+        if min(fx / width, fy / height) < MIN_FOCAL_FRACTION or (0 < cx < 1 and 0 < cy < 1):
+            raise BadInput(
+                f"dataset.intrinsics must be pixels, not fx={fx:.4g}, fy={fy:.4g}, cx={cx:.4g}, cy={cy:.4g} for "
+                f"{width} x {height} pixels: multiply shares of the image by {width} (fx, cx) and {height} (fy, cy), "
+                f"or millimetres by {width} / the sensor's width"
+            )
 
     def _principal_point_warning(self, height: int, width: int) -> str:
         """A warning about a principal point far from the middle of the image; "" for others."""
@@ -142,47 +201,25 @@ class DepthImage:
         )
 
     def _fit_to_sphere(
-        self, depth: Float[Tensor, "n n"], measured: Bool[np.ndarray, "n n"], intrinsics: Float[Tensor, "3 3"]
+        self, depth: Float[Tensor, "n n"], measured: Bool[np.ndarray, "n n"], camera: Camera
     ) -> tuple[Float[np.ndarray, "4 4"], Camera]:
         """The map from the scene to the file's world, and the camera in the scene.
 
         Args:
             depth: in units of the file's world.
             measured: true at the object's pixels that have a depth.
-            intrinsics: of these pixels.
+            camera: of these pixels, in the file's world.
         """
         to_world = np.eye(4)
         if self.camera_to_world is None:
             eye = torch.tensor([0.0, sin(radians(DEFAULT_PITCH_DEGREES)), cos(radians(DEFAULT_PITCH_DEGREES))])
-            to_world[:3, :3] = look_at(eye, torch.zeros(3))[:3, :3].numpy()
-        camera = Camera(intrinsics, self.camera.world_to_camera, *measured.shape)
+            to_world[:3, :3] = AXES[self.axes][:3, :3] @ look_at(eye, torch.zeros(3))[:3, :3].numpy()
         points = camera.rays().at(camera.distance(depth)).numpy()[measured] @ to_world[:3, :3]
         low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
         centre = (low + high) / 2
         to_world[:3, 3] = to_world[:3, :3] @ centre
         to_world[:3, :3] *= np.quantile(np.linalg.norm(points - centre, axis=1), 1 - OUTLIER_FRACTION) / OBJECT_RADIUS
         return to_world, camera_in_world(camera, to_world)
-
-
-def _read_depths(path: Path) -> Float[np.ndarray, "h w"]:
-    """The numbers of a file of depths, 0 at pixels without depth."""
-    suffix = path.suffix.lower()
-    if suffix == ".png":
-        with open_image(path) as image:
-            depths = np.asarray(image, np.float64)
-    elif suffix in (".npy", ".npz"):
-        try:
-            with path.open("rb") as file:
-                loaded = np.load(file)
-                name = None if suffix == ".npy" else "depth" if "depth" in loaded else loaded.files[0]
-                depths = np.asarray(loaded if name is None else loaded[name], np.float64)
-        except (OSError, EOFError, TypeError, ValueError, IndexError, BadZipFile) as error:
-            raise BadInput(f"{path} cannot be read as depths ({error}): save one array [height, width]") from None
-    else:
-        depths = read_depth_file(path, "save them as .npy")
-    if depths.squeeze().ndim != 2:
-        raise BadInput(f"{path} must hold one number for a pixel, not an array of shape {list(depths.shape)}")
-    return np.where(np.isfinite(depths) & (depths > 0), depths, 0.0).squeeze()
 
 
 def _crop_and_subsample(

@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datasets.files.captures.frames import OPENGL, Frame, Layout, nearest_rigid_matrix, rigid_matrix
+from datasets.files.captures.frames import AXES, Frame, Layout, nearest_rigid_matrix, rigid_matrix
 from datasets.files.captures.hull import MaskFit, measure_mask_fit
 from datasets.files.captures.layouts import find_layout
 from datasets.files.captures.sphere import Sphere, hull_sphere, likely_cause, viewed_sphere
-from datasets.files.captures.take import exif_notes, read_shot
+from datasets.files.captures.take import exif_notes, read_shots
 from datasets.mesh import Mesh
 from datasets.scene import Split
 from datasets.shot import Shot
 from renderers.checks import BadInput, check_at_least, check_choice
 
-AXES = {"stated": np.eye(4), "flipped": OPENGL}
 MIN_PHOTOS = 3
 GOOD_OVERLAP, WARN_BELOW, REFUSE_BELOW = 0.9, 0.8, 0.5  # overlap of hull and masks, or visible fraction of the hull
 PHOTOS_HINT = "python -m bench.photos shows it"
@@ -181,7 +180,7 @@ def read_capture(folder: Path, settings: ReadSettings) -> Capture:
 def _capture(layout: Layout, settings: ReadSettings) -> Capture:
     """The photographs of a layout, with their fit."""
     frames, origin = _centre(layout.frames, AXES[settings.axes])
-    shots = [read_shot(frame, settings.longest) for frame in frames]
+    shots, depth_notes = read_shots(frames, settings.longest)
     masked = settings.masks and _all_masked(shots)
     shots = shots if masked else [replace(shot, mask=None) for shot in shots]
     used = [i for i in range(len(shots)) if settings.held_out is None or i % settings.held_out]
@@ -204,7 +203,7 @@ def _capture(layout: Layout, settings: ReadSettings) -> Capture:
         source if masked else "",
         sphere.source,
         layout.world @ to_world,
-        (*layout.notes, *exif, *size_note),
+        (*layout.notes, *exif, *depth_notes, *size_note),
         measure_mask_fit(unit_shots) if masked else None,
     )
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.tasks.single_view.images import as_input
+from datasets.files.captures.mask import is_inverted, white_border_fractions
 from datasets.files.captures.take import read_image
 from datasets.mesh import Mesh
 from datasets.scene import Truth, see
@@ -40,10 +41,9 @@ def read_picture(path: Path, mask: Path | None, pixels: int, filled: float) -> t
     if not bool(inside.any()) or _box(inside)[2] < MIN_OBJECT_PIXELS:
         size = f"{MIN_OBJECT_PIXELS} pixels"
         raise BadInput(f"the mask {mask or path} shows no object of {size}: make it white on the object")
-    sides = {"top": inside[0], "bottom": inside[-1], "left": inside[:, 0], "right": inside[:, -1]}
-    if all(bool(side.float().mean() > 0.5) for side in sides.values()):
+    if is_inverted(inside.numpy()):
         raise BadInput(f"the mask {mask or path} is white along the border, as an inverted one: make the object white")
-    cut_off = [name for name, side in sides.items() if bool(side.any())]
+    cut_off = [name for name, fraction in white_border_fractions(inside.numpy()).items() if fraction > 0]
     notes = [f"the object touches the border ({', '.join(cut_off)}): the network knows whole ones"] if cut_off else []
     channels = torch.from_numpy(np.concatenate([colours, opaque], axis=-1)).permute(2, 0, 1)
     cut = _framed(channels, inside, pixels, filled)

@@ -42,6 +42,17 @@ def _unlike_border(colours: Int[np.ndarray, "height width 3"]) -> Bool[np.ndarra
     return np.abs(colours - background).max(axis=-1) > COLOUR_DIFFERENCE
 
 
+def white_border_fractions(mask: Bool[np.ndarray, "height width"]) -> dict[str, float]:
+    """The fraction of pixels on the object along each side of an image."""
+    sides = {"top": mask[0], "bottom": mask[-1], "left": mask[:, 0], "right": mask[:, -1]}
+    return {name: float(side.mean()) for name, side in sides.items()}
+
+
+def is_inverted(mask: Bool[np.ndarray, "height width"]) -> bool:
+    """Whether a mask is white along most of each side, as an inverted one."""
+    return min(white_border_fractions(mask).values()) > 0.5
+
+
 def load_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     """Reads a mask, true on the object; raises BadInput if the file cannot be read."""
     return np.asarray(foreground(load_image(path), path)) > MASK_THRESHOLD

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 
 from datasets.files.captures.hull import carve
+from datasets.files.captures.mask import is_inverted
 from datasets.shot import Shot
 from renderers.camera import Camera
 from renderers.checks import BadInput
@@ -58,9 +59,7 @@ def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:
 
 def likely_cause(shots: Sequence[Shot]) -> str:
     """The likely cause why cameras and masks do not fit: inverted masks, or the size of the images; "" if unknown."""
-    masked = [(shot.name, shot.mask) for shot in shots if shot.mask is not None]
-    sides = [(name, (mask[0], mask[-1], mask[:, 0], mask[:, -1])) for name, mask in masked]
-    if white := [name for name, borders in sides if all(bool(side.float().mean() > 0.5) for side in borders)]:
+    if white := [shot.name for shot in shots if shot.mask is not None and is_inverted(shot.mask.numpy())]:
         which = f"{len(white)} of the masks, such as that of {white[0]}, are"
         return f"{which} white along the border, as inverted ones: make the object white, and the rest black"
     return _size_mismatch([shot.camera for shot in shots])

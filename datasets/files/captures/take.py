@@ -1,5 +1,6 @@
 """Reads the photograph of a frame, downscaled and without distortion."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from datasets.files.captures.depth import load_depths
+from datasets.files.captures.depth import check_object_depths, load_depths, missing_note
 from datasets.files.captures.frames import Frame
 from datasets.files.captures.image import (
     EXIF_SWAPPED,
@@ -27,7 +28,21 @@ ALPHA_BACKGROUND = 1.0  # white, as in NeRF
 
 
 def read_shot(frame: Frame, longest: int) -> Shot:
-    """Reads a frame's photograph, with at most `longest` pixels along its longer side, and a camera in float64.
+    """The photograph of a frame; see `read_shots`."""
+    return _read_shot(frame, longest)[0]
+
+
+def read_shots(frames: Sequence[Frame], longest: int) -> tuple[list[Shot], tuple[str, ...]]:
+    """Photographs with cameras in float64, at most `longest` pixels along the longer side, and notes on their depths.
+
+    Raises: as `read_shot`.
+    """
+    pairs = [_read_shot(frame, longest) for frame in frames]
+    return [shot for shot, _ in pairs], missing_note(sum((missing for _, missing in pairs), Counter()))
+
+
+def _read_shot(frame: Frame, longest: int) -> tuple[Shot, Counter[str]]:
+    """A frame's photograph, and the pixels of its depth file by the numbers that stand for no depth.
 
     Raises:
         BadInput: a file cannot be read, or image, mask and camera have different aspect ratios.
@@ -44,7 +59,7 @@ def read_shot(frame: Frame, longest: int) -> Shot:
     size = colours.shape[1], colours.shape[0]
     scale = np.array([[size[0] / width], [size[1] / height], [1.0]])
     intrinsics = scale * frame.intrinsics
-    depth = None if frame.depth is None else load_depths(*frame.depth, size)
+    depth, missing = (None, Counter()) if frame.depth is None else load_depths(*frame.depth, size)
     if frame.lens.has_distortion:
         colours = frame.lens.undistort(colours, intrinsics)
         opacity = None if opacity is None else frame.lens.undistort(opacity, intrinsics)
@@ -53,7 +68,9 @@ def read_shot(frame: Frame, longest: int) -> Shot:
     except ValueError as error:
         raise BadInput(f"the camera of {frame.image}: {error}") from None
     mask = None if opacity is None else torch.from_numpy(opacity[..., 0] > 0.5)
-    return Shot(frame.image.name, camera, torch.from_numpy(np.ascontiguousarray(colours)), mask, depth)
+    if frame.depth is not None and depth is not None and mask is not None:
+        check_object_depths(depth[mask & (depth > 0)].double().numpy(), frame.depth[0])
+    return Shot(frame.image.name, camera, torch.from_numpy(np.ascontiguousarray(colours)), mask, depth), missing
 
 
 def exif_notes(frames: Sequence[Frame]) -> tuple[str, ...]:
