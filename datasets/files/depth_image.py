@@ -29,7 +29,7 @@ DEFAULT_PITCH_DEGREES = 25.0  # assumed angle at which a camera without camera_t
 MARGIN_FRACTION = 0.1  # image margin around the object, relative to the object's extent
 MIN_DEPTH_PIXELS = 20
 MAX_CENTRE_OFFSET = 0.3  # from the image centre to the principal point, relative to half the image
-MIN_FOCAL_FRACTION = 0.2  # of the image; a pinhole camera with a smaller one would see more than 136 degrees
+MIN_FOCAL_TO_SIDE_RATIO = 0.2  # a pinhole camera of this ratio sees 136 degrees
 MAX_UP_COMPONENT = 0.09  # upwards, of the camera axis that points down in the image: the sine of 5 degrees
 LEVEL_TOLERANCE = 0.005  # vertical part of the axis to the right, for a camera that is level
 MAX_TRUTH_DISTANCE = 0.15  # scene units; median distance of the visible surface from the truth
@@ -183,7 +183,7 @@ class DepthImage:
     def _check_units_of_intrinsics(self, height: int, width: int) -> None:
         """Raises BadInput if the intrinsics are no pixels of the image."""
         (fx, _, cx), (_, fy, cy), _ = self.camera.intrinsics.tolist()
-        if min(fx / width, fy / height) < MIN_FOCAL_FRACTION or (0 < cx < 1 and 0 < cy < 1):
+        if min(fx / width, fy / height) < MIN_FOCAL_TO_SIDE_RATIO or (0 < cx < 1 and 0 < cy < 1):
             raise BadInput(
                 f"dataset.intrinsics must be pixels, not fx={fx:.4g}, fy={fy:.4g}, cx={cx:.4g}, cy={cy:.4g} for "
                 f"{width} x {height} pixels: multiply shares of the image by {width} (fx, cx) and {height} (fy, cy), "

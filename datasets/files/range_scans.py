@@ -12,6 +12,7 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from datasets.files.captures.depth import missing_numbers
 from datasets.files.meshes import load_mesh
 from datasets.files.readers.ply import read_ply
 from datasets.files.readers.text import wrong_kind_message
@@ -39,8 +40,9 @@ class Scan:
         """From the scan's axes to the world's."""
         return Rotation.from_quat(self.quaternion).inv()
 
-    def surface(self) -> Mesh:
-        """The scan as an open surface in world coordinates; neighbours in the scanner's view are joined.
+    @cached_property
+    def points(self) -> tuple[Float[np.ndarray, "n 3"], int]:
+        """The measured points in the scan's axes, and the number of others, such as (0, 0, 0) and not finite ones.
 
         Raises:
             BadInput: the file is truncated, or has no points.
@@ -51,8 +53,18 @@ class Scan:
             points = read_ply(self.file.read_bytes()).vertices
         except ValueError as error:
             raise BadInput(f"scan '{self.file}' {error}") from None
-        if len(points) < 3 or not np.isfinite(points).all():
-            raise BadInput(f"scan '{self.file}' has no points, or some that are not finite: copy the file again")
+        missing = missing_numbers(points)
+        measured = ~missing.all(axis=1) & (~missing | (points == 0)).all(axis=1)
+        if measured.sum() < 3:
+            raise BadInput(f"scan '{self.file}' has no points: none of {len(points)} is finite; copy the file again")
+        return points[measured], int((~measured).sum())
+
+    def surface(self) -> Mesh:
+        """The scan as an open surface in world coordinates; neighbours in the scanner's view are joined.
+
+        Raises: as `points`.
+        """
+        points, _ = self.points
         return replace(join_neighbours(points[:, :2], points), vertices=self.rotation.apply(points) + self.translation)
 
 
@@ -125,8 +137,10 @@ class RangeScans:
             raise BadInput(
                 "scans show one object, of which there is no prior: take task=completion field=auto split=test"
             )
-        self._scan(index)
-        return normalise(self._read, self.radius)
+        _, missing = self._scan(index).points
+        notes = (f"{missing} points of '{self._scan(index).file.name}' are no measurements, and are left out",)
+        mesh = normalise(self._read, self.radius)
+        return replace(mesh, repairs=(*mesh.repairs, *notes)) if missing else mesh
 
     def towards_scanner(self, index: int) -> Float[Tensor, "3"]:
         """See `Scanned`."""

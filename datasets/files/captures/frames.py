@@ -16,7 +16,7 @@ from datasets.files.captures.lenses import Lens
 from renderers.checks import BadInput
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, z backward
-AXES = {"stated": np.eye(4), "flipped": OPENGL}  # by the names of dataset.axes
+AXES = {"stated": np.eye(4), "flipped": OPENGL}  # names are values of dataset.axes
 PIXEL_CENTRE = 0.5  # pixels; some formats have the first pixel's centre at 0
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 ROTATION_TOLERANCE = 5e-3  # largest accepted deviation of the axes from unit length and right angles
