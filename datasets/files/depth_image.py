@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from datasets.files.captures.depth import check_object_depths, missing_note, read_depths
-from datasets.files.captures.frames import AXES
+from datasets.files.captures.frames import AXES, Frame, homogeneous_matrix
 from datasets.files.captures.mask import is_inverted, load_mask
 from datasets.files.meshes import load_mesh
 from datasets.files.range_scans import join_neighbours
@@ -32,6 +32,8 @@ MAX_CENTRE_OFFSET = 0.3  # from the image centre to the principal point, relativ
 MIN_FOCAL_TO_SIDE_RATIO = 0.2  # a pinhole camera of this ratio sees 136 degrees
 MAX_UP_COMPONENT = 0.09  # upwards, of the camera axis that points down in the image: the sine of 5 degrees
 LEVEL_TOLERANCE = 0.005  # vertical part of the axis to the right, for a camera that is level
+MIN_VERTICAL_COMPONENT = 0.3  # of the axis down; a camera that looks straight down or up has less
+MAX_PORTRAIT_COMPONENT = 0.99  # upwards, of the axis to the right; a camera turned to portrait format has more
 MAX_TRUTH_DISTANCE = 0.15  # scene units; median distance of the visible surface from the truth
 MATRIX_SYNTAX = "write [fx,fy,cx,cy] or [[fx,0,cx],[0,fy,cy],[0,0,1]], and [4, 4] numbers for a rigid motion"
 DEPTH_KINDS = ("z", "ray")
@@ -91,7 +93,10 @@ class DepthImage:
                 pinhole = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
             motion = np.eye(4) if self.camera_to_world is None else np.array(self.camera_to_world, dtype=np.float64)
             world_to_camera = AXES[self.axes] @ np.linalg.inv(motion)
-            return Camera(torch.from_numpy(pinhole), torch.from_numpy(world_to_camera), 1, 1)
+            camera = Camera(torch.from_numpy(pinhole), torch.from_numpy(world_to_camera), 1, 1)
+            homogeneous_matrix(motion, "camera_to_world")  # this and the next have the checks of photographs
+            Frame(Path(self.path), pinhole, world_to_camera)
+            return camera
         except (TypeError, ValueError, np.linalg.LinAlgError) as error:
             raise ValueError(f"dataset.intrinsics, dataset.camera_to_world: {error}; {MATRIX_SYNTAX}") from None
 
@@ -167,7 +172,8 @@ class DepthImage:
             return
         right, down, _ = self.camera.world_to_camera[:3, :3].tolist()
         other_axes = f"dataset.axes={next(name for name in AXES if name != self.axes)}"
-        if abs(right[2]) < LEVEL_TOLERANCE and abs(right[1]) > MAX_UP_COMPONENT:
+        is_tilted = MAX_UP_COMPONENT < abs(right[1]) < MAX_PORTRAIT_COMPONENT
+        if is_tilted and abs(right[2]) < LEVEL_TOLERANCE and abs(down[2]) > MIN_VERTICAL_COMPONENT:
             flipped = f", and set {other_axes}" if down[2] > 0 else ""
             raise ValueError(
                 "dataset.camera_to_world must be into a world whose y points up, and its camera is level in a world "
