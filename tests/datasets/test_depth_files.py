@@ -13,10 +13,12 @@ from scipy.spatial.transform import Rotation
 from bench.config import load
 from datasets.files.captures.depth import read_depths
 from datasets.files.captures.frames import OPENGL
+from datasets.files.own_photographs import read_capture
 from datasets.views import look_at
 from renderers.checks import BadInput
 from tests.looped import each
 from tests.made_depths import CENTRE, HEIGHT, INTRINSICS, RADIUS, WIDTH, sphere_depths, write_exr
+from tests.made_photographs import READ, SIZE, dvr
 
 SEVERAL = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10, deadline=None)
 DEPTHS = sphere_depths()
@@ -287,3 +289,27 @@ def test_an_inverted_mask_is_refused(tmp_path, shift, has_wall):
     mask = np.roll(~ON_SPHERE, shift, axis=1)
     with pytest.raises(BadInput, match=r"dataset.mask_path=.*inverted mask: make the object white"):
         scene_of(saved(tmp_path, "depth.npy", depths), mask_path=str(saved(tmp_path, "mask.png", np.uint8(255 * mask))))
+
+
+@each("number, missing", [(65504.0, True), (1e10, True), (-1.0, True), (0.0, False)])
+def test_depths_of_photographs_are_read_in_the_same_way(tmp_path_factory, number, missing):
+    folder, depths = tmp_path_factory.mktemp("dvr"), np.full(SIZE, 1.25)
+    dvr(folder)
+    depths[::2] = number
+    write_exr(folder / "depth" / "002.exr", {"V": depths})
+    capture = read_capture(folder, READ)
+    stored = capture.shots[2].depth
+    assert (stored[::2] == 0).all() and stored[1::2].unique().tolist() == pytest.approx([1.25 / capture.sphere.radius])
+    assert any(f"{number:.6g} ({SIZE[0] // 2 * SIZE[1]})" in note for note in capture.notes) is missing
+
+
+@each("channels, message", [
+    ({"Y": -np.full(SIZE, 1.25)}, "negative depths"), ({"R": np.ones(SIZE), "Z": np.ones(SIZE)}, "channels R, Z"),
+    ({"Y": np.geomspace(1, 1e6, SIZE[0] * SIZE[1]).reshape(SIZE)}, "002.exr has depths up to .*write 0"),
+])  # fmt: skip
+def test_depths_of_photographs_are_refused_in_the_same_way(tmp_path_factory, channels, message):
+    folder = tmp_path_factory.mktemp("dvr")
+    dvr(folder)
+    write_exr(folder / "depth" / "002.exr", channels)
+    with pytest.raises(BadInput, match=message):
+        read_capture(folder, READ)

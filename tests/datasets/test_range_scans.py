@@ -107,6 +107,17 @@ def test_a_scan_that_is_cut_short_or_has_no_points_is_refused(tmp_path):
             make_scene(scans(tmp_path), VIEWS, split=Split.TEST, index=0)
 
 
+@each("number", [0.0, np.nan, np.inf, 1e10])
+def test_points_that_are_no_measurements_are_left_out_and_noted(tmp_path_factory, number):
+    """Organised clouds have them at pixels without a depth."""
+    folder = write_scans(tmp_path_factory.mktemp("ball"))
+    complete, points = scans(folder).scans[0].surface(), trimesh.load(folder / "scan_0.ply").vertices
+    trimesh.PointCloud(np.insert(points, [50, 700, 700], number, axis=0)).export(folder / "scan_0.ply")
+    assert np.array_equal(scans(folder).scans[0].surface().vertices, complete.vertices)
+    assert "3 points of 'scan_0.ply' are no measurements" in scans(folder).mesh(Split.TEST, 0).repairs[-1]
+    assert "measurements" not in str(scans(folder).mesh(Split.TEST, 1).repairs)
+
+
 def test_the_ground_truth_may_be_set_and_is_noted(tmp_path):
     folder = write_scans(tmp_path)
     (folder / "ball_whole.ply").rename(folder / "small.ply")
