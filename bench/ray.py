@@ -9,16 +9,17 @@
 
 Without pixel=, it takes the pixel where the first renderer is most wrong. zoom=0.05 shows the ray within 0.05 scene
 units of the true hit, zoom=0 all of it. A hit is wrong if it is off by more than a tenth of a pixel's width.
+Each renderer's derivatives of the hit distance are compared with central differences of the float64 reference. Their
+parameters are the three most sensitive ones of the latent code or the family's formula, and the object's translation
+for meshes and stresses.
 into=FILE names the picture, by default ray.png; a PDF is written too. The configuration in a run
 folder is trusted, as by `python -m bench`.
 """
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from math import ceil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,9 +28,11 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from bench.evaluate.along_ray import Lane, TrueRay, follow, sentences, true_ray
-from bench.evaluate.reference import RADIUS, in_float64, trace_exactly
-from bench.pictures.ray import RayPicture
+from bench.evaluate.along_ray import Lane, TrueRay, follow, sentences
+from bench.evaluate.ray_derivatives import Parameters, true_derivatives, with_renderer
+from bench.evaluate.ray_scene import Pixel, RayScene
+from bench.evaluate.reference import in_float64
+from bench.pictures.ray import LanePanel, RayPicture
 from bench.records.format import number, plural
 from bench.records.record import bad_link, read_record
 from bench.records.results import PlannedRun
@@ -42,11 +45,10 @@ from bench.tasks.stability.trial import Conditions
 from datasets.families import BUILDERS, CUBE_HALF_SIDE, Family
 from datasets.mesh import extract, fit_in_sphere
 from datasets.scene import Photographed, Split
-from renderers.boundary import render_checked
-from renderers.camera import Camera, Rays, sphere_span
-from renderers.field import Field, estimate_lipschitz
+from renderers.field import Field
+from renderers.fields.analytic import Shape
 from renderers.fields.grid import Grid
-from renderers.rendering import Renderer, Unsupported
+from renderers.rendering import Unsupported
 
 DECIMAL = r"\d+(\.\d*)?(e-?\d+)?"
 OPTIONS = {  # the pattern of a value, and an example
@@ -59,68 +61,7 @@ DEFAULT_LEVEL = 0.5
 NEUTRAL_TASK = "capacity"  # takes every shape, and needs no prior
 RUN_TASK = "ablation"
 GRID_REACH = 1.05  # scene units: half the cube of the distances to a mesh
-MAX_SEARCHED_PIXELS = 64  # per side; of a larger image, every second pixel or fewer are searched
-TOLERANCE_PIXELS = 0.1  # a hit is right within so many widths of a pixel at the distance of the origin
 ZOOM_FRACTIONS = (0.001, 0.25)  # what happens on less or more of the ray is shown on the whole ray
-Pixel = tuple[int, int]  # column and row
-
-
-@dataclass(frozen=True)
-class RayScene:
-    """A scene: the field that renderers get, the field of the true surface in float64, and a camera."""
-
-    name: str
-    field: Field
-    exact: Field
-    camera: Camera
-
-    @cached_property
-    def lipschitz(self) -> float:
-        """An estimate of the Lipschitz constant of `exact`."""
-        return estimate_lipschitz(self.exact, radius=RADIUS)
-
-    def ray(self, pixel: Pixel, camera: Camera) -> Rays:
-        """The ray of a pixel, [1, 3], of the scene's camera in float32 or float64.
-
-        Raises:
-            ValueError: if the pixel is outside the image, or its ray misses the unit sphere.
-        """
-        (column, row), height, width = pixel, camera.height, camera.width
-        name, remedy = f"pixel={column},{row}", f"the middle is pixel={width // 2},{height // 2}"
-        if column >= width or row >= height:
-            size = f"{width} columns and {height} rows, which count from 0"
-            raise ValueError(f"{name} is outside the image of {size}: {remedy}")
-        rays = camera.rays()
-        ray = Rays(rays.origins[row, column][None], rays.directions[row, column][None])
-        if not bool(sphere_span(ray, RADIUS)[2]):
-            raise ValueError(f"the ray of {name} misses the unit sphere that contains the scene: {remedy}")
-        return ray
-
-    def true_ray(self, pixel: Pixel) -> TrueRay:
-        """The truth on the ray of a pixel."""
-        tolerance = TOLERANCE_PIXELS * float(self.camera.center.norm() / self.camera.intrinsics[0, 0])
-        ray = self.ray(pixel, self.camera.double())
-        return true_ray(self.exact, ray, lipschitz=self.lipschitz, tolerance=tolerance)
-
-    def most_wrong_pixel(self, renderer: Renderer) -> tuple[Pixel, str]:
-        """The pixel where a renderer is most wrong, and the search in words.
-
-        A ray without a hit counts as an end where it leaves the sphere. No ray uses the coarse rays of an image.
-        """
-        stride = ceil(max(self.camera.height, self.camera.width) / MAX_SEARCHED_PIXELS)
-        cut = (slice(stride // 2, None, stride),) * 2
-        images = [camera.rays() for camera in (self.camera, self.camera.double())]
-        rays, exact_rays = (Rays(image.origins[cut], image.directions[cut]) for image in images)
-        with torch.no_grad():
-            rendering = render_checked(renderer, self.field, rays.flat())
-        reference = trace_exactly(self.exact, exact_rays.flat(), self.lipschitz)
-        _, leave, in_sphere = sphere_span(exact_rays.flat(), RADIUS)
-        ends = [torch.where(each.hit, each.distance.double(), leave) for each in (rendering, reference)]
-        error = torch.where(in_sphere, (ends[0] - ends[1]).abs(), -1.0)
-        row, column = divmod(int(error.argmax()), rays.shape[1])
-        pixel = (stride // 2 + stride * column, stride // 2 + stride * row)
-        searched = "all pixels searched" if stride == 1 else f"one pixel in {stride} x {stride} searched"
-        return pixel, f"by {float(error.max()):.2g} scene units, {searched}"
 
 
 @dataclass(frozen=True)
@@ -197,24 +138,42 @@ def scene_of(cell: PlannedRun, task: Task, inputs: RunInputs, level: float | Non
         camera = camera.resized(task.size, task.size)
     if inputs.prior_choice.scene_code is not None:
         prior, exact = inputs.fitted(), in_float64(inputs.fitted())
-        fields = [each.decoder.cpu().requires_grad_(False).at(each.codes[0].cpu()) for each in (prior, exact)]
-        return RayScene(f"{name}, a network", *fields, camera)
+        decoders = [each.decoder.cpu().requires_grad_(False) for each in (prior, exact)]
+        codes = [each.codes[0].detach().cpu() for each in (prior, exact)]
+        fields = [decoder.at(code) for decoder, code in zip(decoders, codes, strict=True)]
+        parameters = Parameters.of_translation(*fields)
+        if len(codes[0]):
+            names = [f"code[{index}]" for index in range(len(codes[0]))]
+            parameters = Parameters.of_field(names, codes[1], lambda code: decoders[0].at(code.float()), decoders[1].at)
+        return RayScene(f"{name}, a network", *fields, camera, parameters)
     if isinstance(inputs.dataset, Family):
-        shape = _formula(inputs.dataset, Split(cell.config["split"]), cell.config["index"])
-        return RayScene(f"{name}, a formula", shape, shape, camera)
+        field_at, values = _formula(inputs.dataset, Split(cell.config["split"]), cell.config["index"])
+        shape, numbers = field_at([*values.values()]), torch.tensor([*values.values()], dtype=torch.float64)
+        parameters = Parameters.of_field([*values], numbers, field_at, field_at)
+        return RayScene(f"{name}, a formula", shape, shape, camera, parameters)
     samples = inputs.evaluation.grid
     values = torch.from_numpy(inputs.scene.raycaster.distance_grid(samples, GRID_REACH))
     fields = Grid(values, GRID_REACH), Grid(values.double(), GRID_REACH)
-    return RayScene(f"{name}, a grid of {samples} x {samples} x {samples} distances to its mesh", *fields, camera)
+    parameters = Parameters.of_translation(*fields)
+    return RayScene(
+        f"{name}, a grid of {samples} x {samples} x {samples} distances to its mesh", *fields, camera, parameters
+    )
 
 
-def _formula(family: Family, split: Split, index: int) -> Field:
-    """The shape of a family by its formula, moved and scaled as its mesh is."""
-    shape = BUILDERS[family.name](SimpleNamespace(**family.draw(split, index)))
-    mesh = extract(shape, grid=family.resolution, reach=CUBE_HALF_SIDE)
+def _formula(family: Family, split: Split, index: int) -> tuple[Callable[[Iterable[Any]], Field], dict[str, float]]:
+    """A family's formula as a function of its parameters, and the parameters of a shape.
+
+    All shapes are moved and scaled as the mesh of this shape is.
+    """
+    values = family.draw(split, index)
+
+    def build(numbers: Iterable[Any]) -> Shape:
+        return BUILDERS[family.name](SimpleNamespace(**dict(zip(values, numbers, strict=True))))
+
+    mesh = extract(build(values.values()), grid=family.resolution, reach=CUBE_HALF_SIDE)
     assert mesh is not None  # the scene has been made
     centre, factor = fit_in_sphere(mesh.used_vertices, family.radius)
-    return shape.translate((-centre).tolist()).scale(float(factor))
+    return lambda numbers: build(numbers).translate((-centre).tolist()).scale(float(factor)), values
 
 
 def _stress_scene(name: str, task: Stability, inputs: RunInputs, level: float) -> RayScene:
@@ -229,7 +188,8 @@ def _stress_scene(name: str, task: Stability, inputs: RunInputs, level: float) -
     draw = np.random.default_rng(stress.trial_seed(level, 0))
     case = stress.exam_generator(conditions)(severity, draw, task.resolution)
     title = f"{name.replace('_', ' ')} at {number(severity)} {stress.sweep.unit}"
-    return RayScene(title, case.field, case.truth.field, case.camera)
+    parameters = Parameters.of_translation(case.field, case.truth.field)
+    return RayScene(title, case.field, case.truth.field, case.camera, parameters)
 
 
 def show(cells: list[PlannedRun], options: Options) -> None:
@@ -248,19 +208,38 @@ def show(cells: list[PlannedRun], options: Options) -> None:
     pixel, search = options.pixel, ""
     if pixel is None:
         try:
-            pixel, search = scene.most_wrong_pixel(inputs.renderer)
+            result = scene.search(inputs.renderer)
         except Unsupported as error:
             raise ValueError(f"renderer={cells[0].renderer}: {error}") from error
-        search = f", where {cells[0].renderer} is off most: {search}"
-    ray, truth, lanes = scene.ray(pixel, scene.camera), scene.true_ray(pixel), list[tuple[Lane, str]]()
-    for cell, (_, cell_inputs) in zip(cells, runs, strict=True):
-        cell_inputs.configure_process()  # renderers may draw: each from the same seed
-        lane = follow(cell.renderer, _title(cell, cells), cell_inputs.renderer, scene.field, ray)
-        lanes.append((lane, sentences(lane, truth)))
-    texts = f"{scene.name}; pixel={pixel[0]},{pixel[1]}{search}", result_of([lane for lane, _ in lanes], truth)
-    window = window_of([lane for lane, _ in lanes], truth, options.zoom)
-    print(*texts, *(f"{lane.title}: {text}" for lane, text in lanes), sep="\n")
-    _save(RayPicture(*texts, scene.field, ray, truth, window, lanes), options.into)
+        (pixel, _), search = result.worst(1)[0], f", where {cells[0].renderer} is off most: {result.summary}"
+    renderers = [(cell, _title(cell, cells), inputs) for cell, (_, inputs) in zip(cells, runs, strict=True)]
+    picture = picture_of(scene, pixel, search, renderers, options.zoom)
+    print(*picture.texts, sep="\n")
+    _save(picture, options.into)
+
+
+def picture_of(
+    scene: RayScene, pixel: Pixel, search: str, renderers: list[tuple[PlannedRun, str, RunInputs]], zoom: float | None
+) -> RayPicture:
+    """The picture of the ray of a pixel.
+
+    Args:
+        search: how the pixel was chosen, in words.
+        renderers: each with its title.
+    """
+    ray, truth, panels = scene.ray(pixel, scene.camera), scene.true_ray(pixel), list[LanePanel]()
+    true = None
+    if truth.hit is not None:
+        true = true_derivatives(scene.parameters, scene.ray(pixel, scene.camera.double()), truth.hit, scene.lipschitz)
+    for cell, title, inputs in renderers:
+        inputs.configure_process()  # renderers may draw: each from the same seed
+        lane = follow(cell.renderer, title, inputs.renderer, scene.field, ray)
+        inputs.configure_process()
+        derivatives = true and with_renderer(true, inputs.renderer, scene.parameters, ray)
+        panels.append(LanePanel(lane, sentences(lane, truth), derivatives))
+    lanes = [panel.lane for panel in panels]
+    texts = f"{scene.name}; pixel={pixel[0]},{pixel[1]}{search}", result_of(lanes, truth)
+    return RayPicture(*texts, scene.field, ray, truth, window_of(lanes, truth, zoom), panels)
 
 
 def _title(cell: PlannedRun, cells: list[PlannedRun]) -> str:

@@ -19,6 +19,7 @@ from renderers.fields.analytic import Shape, box, capsule, cylinder, rounded_box
 
 VERSION = 1  # raise it when a builder changes, so that no prior of the old shapes is used for the new ones
 CUBE_HALF_SIDE = 1.5  # the sampled cube is larger than any shape before it is normalised
+Parameter = float | torch.Tensor  # a tensor gets gradients
 SHEAR_VALUE_FACTOR = 0.8  # multiplies the values of sheared parts; fillets and the shipped priors depend on it
 
 
@@ -76,12 +77,13 @@ def _mirror(shape: Shape, axis: int) -> Shape:
     return shape | Shape(lambda p: shape(p * signs), shape.kind, shape.lipschitz)
 
 
-def _shear(shape: Shape, *, along: int, by: int, slope: float) -> Shape:
+def _shear(shape: Shape, *, along: int, by: int, slope: Parameter) -> Shape:
     """The shape moved along one axis by `slope` times the coordinate on another.
 
     The shear lengthens gradients by its largest singular value at most.
     """
-    stretch = (abs(slope) + sqrt(slope**2 + 4)) / 2
+    steepness = abs(torch.as_tensor(slope).item())
+    stretch = (steepness + sqrt(steepness**2 + 4)) / 2
 
     def sheared(points: torch.Tensor) -> torch.Tensor:
         moved = points.clone()
@@ -94,7 +96,7 @@ def _shear(shape: Shape, *, along: int, by: int, slope: float) -> Shape:
 
 
 def _sofa(p: SimpleNamespace) -> Shape:
-    def block(width: float, height: float, depth: float, centre: tuple[float, float, float]) -> Shape:
+    def block(width: Parameter, height: Parameter, depth: Parameter, centre: tuple[Parameter, ...]) -> Shape:
         return rounded_box((width / 2, height / 2, depth / 2), p.rounding).translate(centre)
 
     floor = p.leg_height
@@ -110,7 +112,7 @@ def _sofa(p: SimpleNamespace) -> Shape:
 def _plane(p: SimpleNamespace) -> Shape:
     body = capsule((0, 0, -p.length / 2), (0, 0, p.length / 2), p.body_radius)
     half = (p.span / 2, p.thickness / 2, p.chord / 2)
-    wing = rounded_box((half[0], half[1], half[2]), p.thickness * 0.45).translate((half[0], 0, 0))
+    wing = rounded_box(half, p.thickness * 0.45).translate((half[0], 0, 0))
     wing = _shear(_shear(wing, along=2, by=0, slope=-p.sweep), along=1, by=0, slope=p.dihedral)
     wings = _mirror(wing.translate((0, -p.body_radius * 0.4, p.wing_position)), 0)
     end = -p.length / 2
@@ -140,7 +142,7 @@ def _table(p: SimpleNamespace) -> Shape:
 
 
 def _car(p: SimpleNamespace) -> Shape:
-    def slab(size: tuple[float, float, float], centre: tuple[float, float, float], radius: float) -> Shape:
+    def slab(size: tuple[Parameter, ...], centre: tuple[Parameter, ...], radius: Parameter) -> Shape:
         return rounded_box((size[0] / 2, size[1] / 2, size[2] / 2), radius).translate(centre)
 
     floor = p.clearance

@@ -36,7 +36,7 @@ COMMANDS = (
 DATA_LAYER = ("datasets.files", "renderers.fields.networks", "renderers.fields.parts", "bench.photos", "bench.exports")
 STUDIES_LAYER = (
     "bench.report", "bench.studies", "bench.pictures.figure_style", "bench.pictures.size_chart", "renderers.later",
-    "bench.evaluate.along_ray", "bench.pictures.ray",
+    "bench.evaluate.along_ray", "bench.evaluate.ray_derivatives", "bench.evaluate.ray_scene", "bench.pictures.ray",
     "bench.records.names", "bench.records.published", "bench.records.read",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",
     "bench.tasks.single_view", "bench.tasks.stability",

@@ -1,5 +1,6 @@
 """The command bench.ray: what it records on a ray, its sentences on shapes with known hits, its picture and errors."""
 
+import math
 import re
 from dataclasses import replace
 from math import cos, radians, sin
@@ -10,12 +11,13 @@ import torch
 
 from bench.config import load
 from bench.evaluate.along_ray import Lane, Recorder, TrueRay, follow, sentences, true_ray
-from bench.pictures.ray import RayPicture
+from bench.evaluate.ray_derivatives import Derivatives, Parameters, true_derivatives, with_renderer
+from bench.pictures.ray import LanePanel, RayPicture
 from bench.ray import main, window_of
 from renderers.camera import Rays
 from renderers.field import Field, Kind
 from renderers.fields.analytic import Shape, box, plane, sphere
-from renderers.rendering import Renderer, Status
+from renderers.rendering import DISTANCE_CAPABILITIES, Renderer, Rendering, Status
 from tests.runner.driving import command, stored
 
 SMALL = ("scale=smoke", "view.resolution=12", "threads=1")
@@ -34,6 +36,71 @@ def looked_at(renderer: Renderer, field: Field, tilt: float = 0.0) -> tuple[Lane
     truth = true_ray(field, ray(tilt=tilt, dtype=torch.float64), lipschitz=1.2, tolerance=3e-3)
     lane = follow("dist", "DIST", renderer, field, ray(tilt=tilt))
     return lane, truth, sentences(lane, truth)
+
+
+class Altered:
+    """Newton, whose gradient is multiplied by a factor; None detaches it."""
+
+    capabilities = DISTANCE_CAPABILITIES
+
+    def __init__(self, factor: float | None) -> None:
+        self.inner, self.factor = load("renderer", "newton"), factor
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        rendering = self.inner.render(field, rays)
+        fixed = rendering.distance.detach()
+        factor = self.factor
+        return replace(rendering, distance=fixed if factor is None else fixed + factor * (rendering.distance - fixed))
+
+    def silhouette_loss(self, field: Field, rays: Rays, rendering: Rendering, mask: torch.Tensor) -> torch.Tensor:
+        return self.inner.silhouette_loss(field, rays, rendering, mask)
+
+
+class WithoutGradient(Altered):
+    """Newton without a gradient, which says so."""
+
+    capabilities = replace(DISTANCE_CAPABILITIES, field_gradient=False)
+
+
+def derivatives_on_a_sphere(renderer: Renderer, *, of_radius: bool = True, x: float = 0.3) -> Derivatives:
+    """The derivatives on a ray along z that passes the centre of a sphere of radius 0.5 at a distance x."""
+
+    def field_at(radius: torch.Tensor) -> Field:
+        return sphere(radius[0])
+
+    radius = torch.tensor([0.5], dtype=torch.float64)
+    by_radius, shape = Parameters.of_field(["radius"], radius, field_at, field_at), sphere(0.5)
+    parameters = by_radius if of_radius else Parameters.of_translation(shape, shape)
+    rays = Rays(torch.tensor([[x, 0.0, -2.5]]), torch.tensor([[0.0, 0.0, 1.0]]))
+    exact = Rays(torch.tensor([[x, 0.0, -2.5]], dtype=torch.float64), rays.directions.double())
+    true = true_derivatives(parameters, exact, 2.5 - (0.25 - x**2) ** 0.5, 1.2)
+    return with_renderer(true, renderer, parameters, rays)
+
+
+def test_derivatives_on_a_sphere_are_the_exact_ones():
+    by_radius = derivatives_on_a_sphere(load("renderer", "newton"))
+    assert by_radius.true == [pytest.approx(-0.5 / 0.4, rel=1e-7)] and by_radius.verdict == "They agree within 1 %."
+    assert by_radius.computed == (pytest.approx(-1.25, rel=1e-4),)
+    moved = derivatives_on_a_sphere(load("renderer", "newton"), of_radius=False)
+    exact = {"shift x": -0.75, "shift y": 0.0, "shift z": 1.0}  # the normal over its component along the ray
+    assert dict(zip(moved.names, moved.true, strict=True)) == pytest.approx(exact, abs=1e-7)
+    assert dict(zip(moved.names, moved.computed, strict=True)) == pytest.approx(exact, abs=1e-4)
+
+
+def test_a_wrong_or_missing_gradient_is_stated():
+    scaled = derivatives_on_a_sphere(Altered(0.5))
+    assert scaled.error == pytest.approx(0.5, rel=1e-3) and scaled.pairs == ["radius -0.625 (-1.25)"]
+    assert scaled.sentences.endswith("They are 0.5 times those of the reference.")
+    detached = derivatives_on_a_sphere(Altered(None))
+    assert detached.error == 1 and detached.verdict.endswith("towards the field, but its distance has none.")
+    unable = derivatives_on_a_sphere(WithoutGradient(None))
+    assert unable.pairs == ["radius – (-1.25)"] and unable.sentences == "It states no gradient towards the field."
+    missed = derivatives_on_a_sphere(load("renderer", "dvr", n_ray_samples=8), x=0.4999)
+    assert missed.computed == () and missed.sentences == "Without a hit, its distance has no derivative."
+
+
+def test_a_hit_that_jumps_within_a_step_has_no_derivative():
+    assert math.isnan(derivatives_on_a_sphere(load("renderer", "newton"), x=0.5 - 1e-8).true[0])
 
 
 def test_the_truth_has_the_chord_of_a_sphere_and_the_angle_of_a_plane():
@@ -95,7 +162,7 @@ def test_the_panels_below_the_slice_share_the_distance_and_show_the_whole_ray_if
     right, truth, _ = looked_at(load("renderer", "dvr"), PLATE)
     low, high = window_of([right], truth, None)
     assert low < 2.4875 < high and high - low < 0.1 and window_of([right], truth, 0) == (truth.entry, truth.leave)
-    figure = RayPicture("", "", PLATE, ray(), truth, (low, high), [(lane, text), (right, "")]).draw()
+    figure = RayPicture("", "", PLATE, ray(), truth, (low, high), [LanePanel(lane, text), LanePanel(right, "")]).draw()
     assert [axes.get_xlim() for axes in figure.axes[1:]] == [pytest.approx((low, high))] * 3
     assert figure.axes[0].get_xlim() == pytest.approx((1.5, 3.5))
 
@@ -110,10 +177,13 @@ def test_the_command_writes_a_picture_of_the_pixel_where_the_first_renderer_is_m
     assert path == tmp_path / "new" / "a.png" and path.stat().st_size > 10_000 and path.with_suffix(".pdf").is_file()
 
 
-@pytest.mark.parametrize("scene", [("dataset=torus",), ("dataset=sofa", "split=train"), ("dataset=box", "index=1")])
-def test_the_command_draws_formulas_and_networks(tmp_path, scene):
+@pytest.mark.parametrize(("scene", "parameter"), [
+    (("dataset=torus",), "minor"), (("dataset=sofa", "split=train"), "code["), (("dataset=car",), "width"),
+])  # fmt: skip
+def test_the_command_draws_formulas_and_networks(tmp_path, scene, parameter):
     code, out, err = command(*SMALL, *scene, "pixel=6,5", "renderer=newton", f"into={tmp_path / 'a'}", main=main)
     assert (code, err) == (0, "") and "1 of 1 renderer right within" in out
+    assert parameter in out.partition("Derivatives of the distance")[2] and "They agree within 1 %." in out
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

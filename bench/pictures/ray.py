@@ -7,11 +7,13 @@ from itertools import pairwise
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from matplotlib.patheffects import withStroke
 
 from bench.evaluate.along_ray import MIN_SAMPLES, Lane, TrueRay
+from bench.evaluate.ray_derivatives import AGREEMENT, Derivatives
 from bench.pictures.figure_style import WIDTH, look, styled
 from renderers.camera import Rays
 from renderers.field import Field
@@ -23,7 +25,19 @@ TITLE_CHARACTERS, TEXT_CHARACTERS = 104, 110  # per line
 SLICE_SAMPLES, PROFILE_SAMPLES = (480, 200), 1500  # along and across the ray; along the ray
 MIN_NUMBERED_FRACTION = 0.03  # a step that takes less of a panel has no number
 HALO = [withStroke(linewidth=2.5, foreground="white")]
-KEY = "Dot, tick: field evaluations. Arc: a step. Area: weights. Triangle: the hit. Dashed: the true hit. Grey: inside."
+DERIVATIVE_COLUMNS = (0.22, 0.49, 0.76)  # fractions of the panel's width
+KEY = (
+    "Dot, tick: evaluation. Arc: step. Area: weights. Triangle: hit. Cross: miss. Dashed: true hit. Bold: over 1 % off."
+)
+
+
+@dataclass(frozen=True)
+class LanePanel:
+    """A lane with its sentences, and the derivatives of its hit distance, if the reference has any."""
+
+    lane: Lane
+    text: str
+    derivatives: Derivatives | None = None
 
 
 @dataclass(frozen=True)
@@ -36,7 +50,7 @@ class RayPicture:
         field: the input of the renderers.
         rays: the ray, [1, 3].
         window: the distances at the ends of the field's panel and of the lanes.
-        lanes: one per renderer, with its sentences.
+        lanes: one per renderer.
     """
 
     scene: str
@@ -45,16 +59,27 @@ class RayPicture:
     rays: Rays
     truth: TrueRay
     window: tuple[float, float]
-    lanes: list[tuple[Lane, str]]
+    lanes: list[LanePanel]
+
+    @property
+    def texts(self) -> list[str]:
+        """All sentences: on the scene, on all renderers, and on each renderer."""
+        lanes = [f"{panel.lane.title}: {panel.text}" for panel in self.lanes]
+        more = [f" {panel.derivatives.sentences}" if panel.derivatives else "" for panel in self.lanes]
+        return [self.scene, self.result, *map(str.__add__, lanes, more)]
 
     @styled
     def draw(self) -> Figure:
         """Draws all panels; those below the slice share one axis, the distance along the ray."""
         heading, result = (textwrap.wrap(text, TITLE_CHARACTERS) for text in (self.scene, self.result))
-        texts = [textwrap.wrap(text, TEXT_CHARACTERS) for _, text in self.lanes]
+        texts = [textwrap.wrap(panel.text, TEXT_CHARACTERS) for panel in self.lanes]
         top = TITLE_INCHES + 0.12 + LINE_INCHES * (len(heading) + len(result))
         height = top + SLICE_INCHES + PROFILE_INCHES + 1.0
-        height += sum(LANE_INCHES + 0.3 + LINE_INCHES * len(lines) for lines in texts)
+        under_lane = [
+            LINE_INCHES * (len(lines) + (panel.derivatives is not None))
+            for lines, panel in zip(texts, self.lanes, strict=True)
+        ]
+        height += sum(LANE_INCHES + 0.3 + inches for inches in under_lane)
         figure = Figure(figsize=(WIDTH, height))
 
         def panel(inches: float, gap: float) -> Axes:
@@ -71,17 +96,25 @@ class RayPicture:
         self._profile(profile)
         if self.window != (self.truth.entry, self.truth.leave):
             magnify(slice_axes, profile, self.window)
-        for (lane, _), lines in zip(self.lanes, texts, strict=True):
-            axes = panel(LANE_INCHES, 0.3 + LINE_INCHES * len(lines))
+        for shown, lines, inches, shade in zip(self.lanes, texts, under_lane, self._shades(), strict=True):
+            axes = panel(LANE_INCHES, 0.3 + inches)
             axes.set_xlim(*self.window)
-            draw_lane(axes, lane)
+            draw_lane(axes, shown.lane, shade)
             self._mark_truth(axes)
             axes.text(0, -0.05, "\n".join(lines), transform=axes.transAxes, va="top")
+            if shown.derivatives:
+                write_derivatives(axes, shown.derivatives, -0.05 - LINE_INCHES * len(lines) / LANE_INCHES)
         under_heading = 0.08 + LINE_INCHES * len(heading)
         figure.text(PANEL_LEFT_FRACTION, 1 - 0.08 / height, "\n".join(heading), color=FAINT, va="top")
         figure.text(PANEL_LEFT_FRACTION, 1 - under_heading / height, "\n".join(result), fontweight="bold", va="top")
         figure.text(PANEL_LEFT_FRACTION, 0.06 / height, KEY, fontsize=7, color=FAINT)
         return figure
+
+    def _shades(self) -> list[str]:
+        """The colour of each lane: that of its renderer, darker or lighter if an earlier lane has it."""
+        colours = [look(panel.lane.name).colour for panel in self.lanes]
+        repeats = [colours[:index].count(colour) for index, colour in enumerate(colours)]
+        return [mixed(colour, repeat) for colour, repeat in zip(colours, repeats, strict=True)]
 
     def _slice(self, axes: Axes) -> None:
         """The field on a plane through the ray, up in the world to the top; lengths are equal in both directions."""
@@ -90,9 +123,10 @@ class RayPicture:
         along, across = np.linspace(low, high, SLICE_SAMPLES[0]), np.linspace(-half, half, SLICE_SAMPLES[1])
         values = self._values(torch.from_numpy(along)[None, :, None], torch.from_numpy(across)[:, None, None])
         axes.contour(along, across, values, levels=14, colors="#a9bacb", linewidths=0.6, linestyles="-")
-        if np.nanmin(values) < 0 < np.nanmax(values):
-            axes.contourf(along, across, values, levels=[np.nanmin(values), 0], colors=["#cccccc"])
-            axes.contour(along, across, values, levels=[0], colors=INK, linewidths=1.6)
+        solid = thickened(values)
+        if np.nanmin(solid) < 0 < np.nanmax(solid):
+            axes.contourf(along, across, solid, levels=[np.nanmin(solid), 0], colors=["#cccccc"])
+            axes.contour(along, across, solid, levels=[0], colors=INK, linewidths=1.6)
         axes.annotate(
             "", (high, 0), (low, 0), arrowprops={"arrowstyle": "-|>", "color": INK, "shrinkA": 0, "shrinkB": 0}
         )
@@ -135,6 +169,13 @@ class RayPicture:
             axes.axvline(self.truth.hit, color=INK, lw=0.8, ls=(0, (4, 2)), zorder=1)
 
 
+def thickened(values: np.ndarray) -> np.ndarray:
+    """The values minus their change over half a sample: a part thinner than the samples' spacing stays negative."""
+    padded = np.pad(values, 1, mode="edge")
+    neighbours = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
+    return values - 0.5 * np.max([np.abs(values - neighbour) for neighbour in neighbours], axis=0)
+
+
 def magnify(above: Axes, below: Axes, window: tuple[float, float]) -> None:
     """Marks on the slice which part of the ray is magnified below it."""
     above.axvspan(*window, color=MAGNIFIED, alpha=0.3, lw=0, zorder=0.5)
@@ -144,9 +185,25 @@ def magnify(above: Axes, below: Axes, window: tuple[float, float]) -> None:
         above.figure.add_artist(line)
 
 
-def draw_lane(axes: Axes, lane: Lane) -> None:
-    """Draws steps as numbered arcs, samples as ticks, weights as an area and the hit; the x limits are set before."""
-    (low, high), colour = axes.get_xlim(), look(lane.name).colour
+def mixed(colour: str, repeat: int) -> str:
+    """A colour for its repeated use: itself, then darker and lighter in turn."""
+    target = np.zeros(3) if repeat % 2 else np.ones(3)
+    share = 1 - 0.6 ** ((repeat + 1) // 2)
+    return to_hex((1 - share) * np.array(to_rgb(colour)) + share * target)
+
+
+def write_derivatives(axes: Axes, derivatives: Derivatives, height: float) -> None:
+    """Writes a row under a lane: the derivatives in columns, bold if they differ from the reference."""
+    text = {"transform": axes.transAxes, "va": "top"}
+    axes.text(0, height, "Derivatives (reference)", color=FAINT, **text)
+    weight = "bold" if derivatives.error > AGREEMENT else "normal"
+    for column, pair in zip(DERIVATIVE_COLUMNS, derivatives.pairs, strict=False):
+        axes.text(column, height, pair, fontweight=weight, **text)
+
+
+def draw_lane(axes: Axes, lane: Lane, colour: str) -> None:
+    """Draws steps as numbered arcs, samples as ticks, weights as an area, and the end; the x limits are set before."""
+    low, high = axes.get_xlim()
     points = [(distance, len(call) >= MIN_SAMPLES) for call in lane.calls for distance in call]
     samples = [distance for distance, sampled in points if sampled and low <= distance <= high]
     steps = [distance for distance, sampled in points if not sampled]
@@ -162,7 +219,9 @@ def draw_lane(axes: Axes, lane: Lane) -> None:
         heights = np.append(density, 0) / max(density.max(), 1e-30) * 0.85
         axes.fill_between(edges, 0, heights, step="post", color=colour, alpha=0.4, lw=0.8)
     rounding = 1e-4 * (high - low)
-    if lane.hit is not None and low - rounding <= lane.hit <= high + rounding:
+    if lane.hit is None:  # a ray that ends outside the panel has its cross at the edge
+        axes.plot(min(max(lane.end, low), high), -0.2, "x", color=colour, ms=6, mew=1.8, zorder=5, clip_on=False)
+    elif low - rounding <= lane.hit <= high + rounding:
         axes.plot(lane.hit, -0.2, "^", color=colour, ms=6, zorder=5, clip_on=False)
     axes.axhline(0, color=RULE, lw=0.6)
     axes.set(xlim=(low, high), ylim=(-0.34, 0.95), xticks=[], yticks=[])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from renderers.field import Flops, Kind
 
-Numbers = float | Sequence[float] | Tensor
+Numbers = float | Sequence[float | Tensor] | Tensor
 
 
 @dataclass(frozen=True)
@@ -124,14 +124,8 @@ def cylinder(radius: Numbers, half_height: Numbers) -> Shape:
     """A cylinder about the y axis; exact distance."""
 
     def distance(points: Tensor) -> Tensor:
-        beyond = torch.stack(
-            [
-                _norm(points[..., [0, 2]]) - like(radius, points),
-                points[..., 1].abs() - like(half_height, points),
-            ],
-            -1,
-        )
-        return _box_distance(beyond)
+        side, end = _norm(points[..., [0, 2]]) - like(radius, points), points[..., 1].abs() - like(half_height, points)
+        return _box_distance(torch.stack([side, end], -1))
 
     return Shape(distance)
 
@@ -145,7 +139,9 @@ def _combine(function: Callable[[Tensor, Tensor], Tensor], first: Shape, second:
 
 
 def like(value: Numbers, points: Tensor) -> Tensor:
-    """The value as a tensor of the dtype and device of the points."""
+    """The value as a tensor of the dtype and device of the points; tensors in a tuple keep their gradients."""
+    if isinstance(value, tuple) and any(isinstance(number, Tensor) for number in value):
+        return torch.stack([like(number, points) for number in value])
     return torch.as_tensor(value, dtype=points.dtype, device=points.device)
 
 

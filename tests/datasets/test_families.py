@@ -125,3 +125,13 @@ def test_a_shape_that_fills_the_cube_is_refused(sofa):
     huge |= {"leg_height": [-4.0, -4.0]}
     with pytest.raises(ValueError, match=r"sofa test 0 has no surface: check dataset.ranges"):
         replace(sofa, ranges=huge, resolution=16).mesh(Split.TEST, 0)
+
+
+@by_family
+def test_values_have_a_gradient_towards_each_parameter(family):
+    numbers = {name: torch.tensor(x, requires_grad=True) for name, x in family.draw(Split.TRAIN, 1).items()}
+    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    shape = BUILDERS[family.name](SimpleNamespace(**numbers))
+    assert isinstance(shape.lipschitz, float) and shape.lipschitz > 0
+    gradients = torch.autograd.grad(shape(points).square().sum(), [*numbers.values()])
+    assert all(gradient != 0 for gradient in gradients)
