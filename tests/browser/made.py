@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from bench.report.site.rays import MAP_FILE, RAYS_FILE, RAYS_FOLDER, ray_file
 from tests.report.test_report import record
 
 PICTURES = ("summary.png", "curve.png")
@@ -44,6 +45,17 @@ def write(results: Path, number: int, **changed) -> Path:
         Image.new("RGB", (40, 30), (80 * index, 120, 40 * number % 256)).save(folder / picture)
     write_mesh(folder / "mesh.ply", number)
     return folder
+
+
+def write_rays(folder: Path, pixels: list[tuple[int, int]], **changed) -> Path:
+    """Writes the rays of an image of 8 x 4 pixels into a run folder, as bench.ray does."""
+    (folder / RAYS_FOLDER).mkdir()
+    drawn = [{"column": x, "row": y, "error": 0.1, "texts": ["", "", f"ray {x}"]} for x, y in pixels]
+    content = {"width": 8, "height": 4, "rays": drawn} | changed
+    (folder / RAYS_FOLDER / RAYS_FILE).write_text(json.dumps(content))
+    for name in (MAP_FILE, *map(ray_file, range(1, len(pixels) + 1))):
+        (folder / RAYS_FOLDER / name).write_bytes(b"")
+    return folder / RAYS_FOLDER
 
 
 def write_mesh(path: Path, number: int = 0) -> None:

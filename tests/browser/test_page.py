@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -278,6 +279,22 @@ def test_a_run_has_its_page_with_the_result_first_scaled_as_in_tables(results, t
     assert page.locator(".chart .panel").count() == 2
     page.get_by_role("button", name="Seconds").click()
     page.get_by_text("seconds of optimisation").first.wait_for()
+
+
+def test_the_most_wrong_pixels_are_marks_that_open_their_rays(tmp_path, tab):
+    folder = made.write(tmp_path, 0, folder="drawn", task="ablation")
+    for picture in made.write_rays(folder, [(3, 1), (7, 3)]).glob("*.png"):
+        shutil.copy(folder / "summary.png", picture)
+    made.write(tmp_path, 1, folder="plain", task="ablation")
+    write_index(tmp_path)
+    opened = tab(tmp_path)
+    page = opened.open("#/run/drawn")
+    marks = page.locator(".marked .mark")
+    assert marks.all_text_contents() == ["1", "2"] and page.locator(".rays li").count() == 2
+    assert marks.nth(1).get_attribute("href") == "runs/drawn/rays/02.png"
+    image, box = page.locator(".marked img").bounding_box(), marks.nth(0).bounding_box()
+    assert box["x"] + box["width"] / 2 == pytest.approx(image["x"] + 0.4375 * image["width"], abs=2)
+    assert "bench.ray" in opened.open("#/run/plain").locator("main").text_content()
 
 
 def test_the_mesh_turns_under_the_mouse_and_the_keys(results, tab):

@@ -69,6 +69,11 @@ def strange(tmp_path_factory):
         (path / f"{'<img src=x onerror=window.hacked=1>'[: 20 + number % 5]}.png").write_bytes(
             (path / "curve.png").read_bytes()
         )
+        (path / "rays").mkdir()
+        ray = {"column": 1, "row": 1, "texts": [MALICE]}
+        (path / "rays" / "rays.json").write_text(json.dumps({"width": 4, "height": 4, "map": attack, "rays": [ray]}))
+        for name in ("01.png", "pixels.png"):
+            (path / "rays" / name).write_bytes((path / "curve.png").read_bytes())
         content = (path / "mesh.ply").read_bytes()
         if number == 1:
             (path / "mesh.ply").write_bytes(

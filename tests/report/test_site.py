@@ -22,6 +22,7 @@ from bench.report.site.columns import columns, names
 from bench.report.site.detail import curve, detail
 from bench.report.site.files import Folder
 from bench.report.site.meshes import mesh_data, read_ply, simplify
+from bench.report.site.rays import rays
 from bench.report.site.words import STATUSES, TASKS, command, request_sentence
 from bench.report.suite.attempts import write_attempts
 from bench.report.write import html
@@ -344,3 +345,30 @@ def test_the_shell_names_every_script_and_each_is_shipped(tmp_path):
     lists = {f"data/list/{name}.js" for name in ("about", "papers", "runs")}
     assert {*links} == shipped - {"index.html"} | lists and links[-1] == "app.js"
     assert all(len((html.ASSETS / name).read_text(encoding="utf-8").splitlines()) <= 300 for name in shipped)
+
+
+def test_a_run_lists_its_rays_and_an_ablation_without_them_the_command_that_draws_them(tmp_path):
+    for name in ("plain", "drawn", "other"):
+        write_run(tmp_path, record(name), name)
+    made.write_rays(tmp_path / "runs" / "drawn", [(3, 1), (7, 3)])
+    plain, drawn = (rays(record(name, task="ablation"), Folder(tmp_path, name)) for name in ("plain", "drawn"))
+    assert rays(record("other"), Folder(tmp_path, "other")) is None and plain["rays"] == []
+    assert shlex.split(plain["command"]) == ["python", "-m", "bench.ray", f"{tmp_path}/runs/plain", "pixels=worst"]
+    assert drawn["map"] == "runs/drawn/rays/pixels.png"
+    first = {"pixel": "3,1", "picture": "runs/drawn/rays/01.png", "text": "ray 3", "left": 43.75, "top": 37.5}
+    assert drawn["rays"][0] == first and drawn["rays"][1]["picture"].endswith("02.png")
+
+
+def test_odd_rays_of_a_run_are_left_out(tmp_path):
+    for number, odd in enumerate(
+        ({"rays": 3}, {"width": "x"}, {"width": 1e400}, {"rays": [{"column": 1}]}, {"height": 0})
+    ):
+        folder = write_run(tmp_path, record("odd", task="ablation"), f"odd{number}")
+        made.write_rays(folder, [(3, 1)], **odd)
+        assert rays(record("odd", task="ablation"), Folder(tmp_path, f"odd{number}"))["rays"] == []
+    pictures = made.write_rays(write_run(tmp_path, record("out", task="ablation"), "out"), [(3, 1), (4, 1)])
+    (tmp_path.parent / "outside.png").write_bytes(b"")
+    (pictures / "01.png").unlink()
+    (pictures / "01.png").symlink_to(tmp_path.parent / "outside.png")
+    shown = rays(record("out", task="ablation"), Folder(tmp_path, "out"))["rays"]
+    assert [ray["pixel"] for ray in shown] == ["4,1"]

@@ -10,6 +10,7 @@ from bench.records.results import NOT_LOSS_TERMS, curve_lines
 from bench.report.data.records import Record, definition
 from bench.report.site.columns import rounded
 from bench.report.site.files import PICTURE_TEXTS, Folder
+from bench.report.site.rays import rays
 from bench.report.site.words import STATUSES, command, request_sentence
 
 MAX_CURVE_POINTS = 240  # longer curves are thinned, but keep their ends and checkpoints
@@ -38,6 +39,7 @@ def detail(record: Record, folder: Folder, results_dir: Path) -> dict[str, Any]:
         "files": folder.links(),
         "pictures": [[name, folder.link(name), PICTURE_TEXTS.get(name, "")] for name in folder.pictures()],
         "curve": curve(folder),
+        "rays": rays(record, folder),
         "command": command(record, results_dir),
     }
 

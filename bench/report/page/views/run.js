@@ -34,6 +34,7 @@
         detail.metrics.length
           ? Object.assign(details(`All ${detail.metrics.length} metrics, with definitions`, recorded(detail.metrics)), {open: unlisted})
           : element("p.soft", null, "This run measured nothing.")),
+      detail.rays && section("Most wrong pixels", rays(detail.rays)),
       detail.files["mesh.ply"] && section("Mesh", bench.mesh(index)),
       detail.curve && section("Curve", bench.curves([{name: "run", curve: detail.curve}])),
       others.length > 0 && section("Pictures", element("div.pictures", null, others.map(picture))),
@@ -86,6 +87,25 @@
     ];
     const said = "Unscaled, in scene units: a shape lies in a sphere of radius 1.";
     return [element("p.soft", null, said), bench.table(columns, metrics, {caption: "All metrics"})];
+  }
+
+  /* The most wrong pixels: marks on the image and a list, which open the pictures of their rays; or the command. */
+  function rays({command, map, rays: drawn}) {
+    const command_text = copied(command, "Copy the command");
+    if (!drawn.length)
+      return [element("p.soft", null, "This command draws the rays of its 12 most wrong pixels, for this page:"), command_text];
+    const open = ({picture: href, pixel}, kind, text) =>
+      element(kind, {href, title: `pixel ${pixel}`, "aria-label": `The ray of pixel ${pixel}`}, text);
+    const marks = drawn.map((ray, index) => {
+      const mark = open(ray, "a.mark", String(index + 1));
+      Object.assign(mark.style, {left: `${ray.left}%`, top: `${ray.top}%`});
+      return mark;
+    });
+    const alt = "Hits: right in grey, missed in red, spurious in blue, at a wrong distance in orange";
+    const image = map && element("figure.marked", null,
+      element("div", null, element("img", {src: map, alt}), marks), element("figcaption", null, `${alt}. A number opens its ray.`));
+    const items = drawn.map((ray) => element("li", null, open(ray, "a", `pixel ${ray.pixel}`), ` ${ray.text}`));
+    return [element("div.two", null, element("ol.rays", null, items), image), details("The command that drew them", command_text)];
   }
 
   function picture([name, src, alt]) {
