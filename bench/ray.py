@@ -6,6 +6,7 @@
     python -m bench.ray dataset=mesh dataset.path=FILE                    a mesh, as a grid of distances
     python -m bench.ray task=stability stress=thin_plate level=0.5        the stress at a level from 0, mild, to 1
     python -m bench.ray RUN_FOLDER pixel=31,40                            the scene and renderer of a task=ablation run
+    python -m bench.ray RUN_FOLDER pixels=worst                           its 12 most wrong pixels, for the run's page
 
 Without pixel=, it takes the pixel where the first renderer is most wrong. zoom=0.05 shows the ray within 0.05 scene
 units of the true hit, zoom=0 all of it. A hit is wrong if it is off by more than a tenth of a pixel's width.
@@ -13,7 +14,10 @@ Each renderer's derivatives of the hit distance are compared with central differ
 parameters are the three most sensitive ones of the latent code or the family's formula, and the object's translation
 for meshes and stresses.
 into=FILE names the picture, by default ray.png; a PDF is written too. The configuration in a run
-folder is trusted, as by `python -m bench`.
+folder is trusted, as by `python -m bench`. A run of task=stability takes level= too.
+
+pixels=worst writes RUN_FOLDER/rays: a PNG for each of the 12 most wrong pixels, which lie apart, with sentences in
+rays.json. `python -m bench.report results_dir=RESULTS` then shows them on the run's page.
 """
 
 import re
@@ -30,12 +34,13 @@ from omegaconf import DictConfig
 
 from bench.evaluate.along_ray import Lane, TrueRay, follow, sentences
 from bench.evaluate.ray_derivatives import Parameters, true_derivatives, with_renderer
-from bench.evaluate.ray_scene import Pixel, RayScene
+from bench.evaluate.ray_scene import Pixel, RayScene, Search
 from bench.evaluate.reference import in_float64
-from bench.pictures.ray import LanePanel, RayPicture
+from bench.pictures.ray import LanePanel, RayPicture, draw_map
 from bench.records.format import number, plural
-from bench.records.record import bad_link, read_record
+from bench.records.record import bad_link, read_record, to_json, write_text
 from bench.records.results import PlannedRun
+from bench.report.site.rays import MAP_FILE, MAX_RAYS, RAYS_FILE, RAYS_FOLDER, ray_file
 from bench.runner.command import command_line
 from bench.runner.compose import Composer
 from bench.setup.inputs import RunInputs, Task, prepare_run
@@ -53,15 +58,17 @@ from renderers.rendering import Unsupported
 DECIMAL = r"\d+(\.\d*)?(e-?\d+)?"
 OPTIONS = {  # the pattern of a value, and an example
     "pixel": (r"\d+,\d+", "pixel=31,40, its column and row"),
+    "pixels": ("worst", "pixels=worst, with a run folder"),
     "zoom": (DECIMAL, "zoom=0.05, in scene units"),
     "level": (DECIMAL, "level=0.5"),
     "into": (r".*\w.*", "into=ray.png"),
 }
 DEFAULT_LEVEL = 0.5
 NEUTRAL_TASK = "capacity"  # takes every shape, and needs no prior
-RUN_TASK = "ablation"
+RUN_TASKS = ("ablation", "stability")
 GRID_REACH = 1.05  # scene units: half the cube of the distances to a mesh
 ZOOM_FRACTIONS = (0.001, 0.25)  # what happens on less or more of the ray is shown on the whole ray
+RendererOfCell = tuple[PlannedRun, str, RunInputs]  # with the title of its lane
 
 
 @dataclass(frozen=True)
@@ -70,6 +77,7 @@ class Options:
 
     run: Path | None = None
     pixel: Pixel | None = None
+    pixels: str = ""
     zoom: float | None = None
     level: float | None = None
     into: Path = Path("ray.png")
@@ -88,7 +96,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:
             pattern, example = OPTIONS[key]
             if not re.fullmatch(pattern, text):
                 raise ValueError(f"cannot read {argument!r}: type {example}")
-            read = {"pixel": lambda text: tuple(map(int, text.split(","))), "into": Path}.get(key, float)
+            read = {"pixel": lambda text: tuple(map(int, text.split(","))), "into": Path, "pixels": str}.get(key, float)
             values[key] = read(text)
         elif key == "field" and text in BUILDERS:
             raise ValueError(f"{argument} names the field that a task optimises: a scene's shape is dataset={text}")
@@ -98,6 +106,8 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:
             others.append(argument)
     if "run" in values and others:
         raise ValueError(f"{values['run']} states its scene and renderer: remove {others[0]}, or the folder")
+    if "pixels" in values and ("run" not in values or "pixel" in values or "into" in values):
+        raise ValueError("pixels=worst needs a run folder, and neither pixel= nor into=: type RUN_FOLDER pixels=worst")
     task = [] if any(text.startswith(("task=", "+method=")) for text in others) else [f"task={NEUTRAL_TASK}"]
     return Options(**values), [*task, *others]
 
@@ -113,9 +123,9 @@ def run_of(folder: Path) -> PlannedRun:
     if link := bad_link(folder, folder.parent):
         raise ValueError(f"{folder}: {link} is a link out of the folder: remove it")
     record = read_record(folder)
-    if record["task"] != RUN_TASK:
+    if record["task"] not in RUN_TASKS:
         remedy = f"field=file field_path={folder} takes its final field"
-        raise ValueError(f"{folder} is a run of task={record['task']}, not of task={RUN_TASK}: {remedy}")
+        raise ValueError(f"{folder} is a run of task={record['task']}, not of task={RUN_TASKS[0]}: {remedy}")
     names = {key: record[key] for key in ("task", "renderer", "dataset", "seed", "config")}
     return PlannedRun(folder.name, [], **names)
 
@@ -205,27 +215,44 @@ def show(cells: list[PlannedRun], options: Options) -> None:
     task, inputs = runs[0]
     inputs.configure_process()
     scene = scene_of(cells[0], task, inputs, options.level)
+    renderers = [(cell, _title(cell, cells), inputs) for cell, (_, inputs) in zip(cells, runs, strict=True)]
     pixel, search = options.pixel, ""
     if pixel is None:
         try:
             result = scene.search(inputs.renderer)
         except Unsupported as error:
             raise ValueError(f"renderer={cells[0].renderer}: {error}") from error
+        if options.run and options.pixels:
+            return save_worst(scene, renderers[0], result, options.run / RAYS_FOLDER)
         (pixel, _), search = result.worst(1)[0], f", where {cells[0].renderer} is off most: {result.summary}"
-    renderers = [(cell, _title(cell, cells), inputs) for cell, (_, inputs) in zip(cells, runs, strict=True)]
     picture = picture_of(scene, pixel, search, renderers, options.zoom)
     print(*picture.texts, sep="\n")
     _save(picture, options.into)
 
 
+def save_worst(scene: RayScene, renderer: RendererOfCell, search: Search, folder: Path) -> None:
+    """Writes the pictures of the most wrong pixels, the map of the searched ones, and the texts of all as JSON."""
+    folder.mkdir(exist_ok=True)
+    rays = list[dict[str, Any]]()
+    for rank, (pixel, error) in enumerate(search.worst(MAX_RAYS), 1):
+        picture = picture_of(scene, pixel, f", off by {error:.2g} scene units", [renderer], None)
+        picture.draw().savefig(folder / ray_file(rank), dpi=150)
+        texts = [picture.scene, picture.result, picture.lanes[0].sentences]
+        rays.append({"column": pixel[0], "row": pixel[1], "error": error, "texts": texts})
+        print(f"{rank} of {MAX_RAYS}: {picture.texts[0]}", file=sys.stderr)
+    draw_map(folder / MAP_FILE, search, scene.tolerance)
+    size = {"width": scene.camera.width, "height": scene.camera.height}
+    write_text(folder / RAYS_FILE, to_json({**size, "rays": rays}))
+    print(folder / RAYS_FILE)
+
+
 def picture_of(
-    scene: RayScene, pixel: Pixel, search: str, renderers: list[tuple[PlannedRun, str, RunInputs]], zoom: float | None
+    scene: RayScene, pixel: Pixel, search: str, renderers: list[RendererOfCell], zoom: float | None
 ) -> RayPicture:
     """The picture of the ray of a pixel.
 
     Args:
         search: how the pixel was chosen, in words.
-        renderers: each with its title.
     """
     ray, truth, panels = scene.ray(pixel, scene.camera), scene.true_ray(pixel), list[LanePanel]()
     true = None

@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from math import cos, radians, sin
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,9 @@ from bench.evaluate.along_ray import Lane, Recorder, TrueRay, follow, sentences,
 from bench.evaluate.ray_derivatives import Derivatives, Parameters, true_derivatives, with_renderer
 from bench.pictures.ray import LanePanel, RayPicture
 from bench.ray import main, window_of
+from bench.records.record import read_record
+from bench.report.site.files import Folder
+from bench.report.site.rays import MAX_RAYS, rays
 from renderers.camera import Rays
 from renderers.field import Field, Kind
 from renderers.fields.analytic import Shape, box, plane, sphere
@@ -191,6 +195,7 @@ def test_the_command_draws_formulas_and_networks(tmp_path, scene, parameter):
     (("pixel=12,3",), "pixel=12,3 is outside the image of 12 columns and 12 rows"),
     (("pixel=0,0",), "misses the unit sphere that contains the scene: the middle is pixel=6,6"),
     (("pixel=3",), "type pixel=31,40"),
+    (("dataset=torus", "pixels=worst"), "type RUN_FOLDER pixels=worst"),
     (("dataset=torus,box",), "dataset has several values"),
     (("field=torus",), "a scene's shape is dataset=torus"),
     (("task=stability", "stress=learning_rate"), "type stress=thin_plate"),
@@ -217,6 +222,26 @@ def test_a_run_of_an_ablation_is_shown_as_it_was_rendered(tmp_path):
     made = command(*SMALL, *settings, "isolation=off", f"results_dir={tmp_path}")
     code, out, err = command(made.out.splitlines()[-1], f"into={tmp_path / 'a.png'}", "pixel=11,8", main=main)
     assert (code, err) == (0, "") and "sofa train 0, a network; pixel=11,8" in out and "newton" in out
+    code, out, err = command(made.out.splitlines()[-1], "pixels=worst", main=main)
+    drawn = rays_of(made.out.splitlines()[-1], tmp_path)
+    assert code == 0 and len(drawn) == MAX_RAYS and drawn[0]["text"]
+
+
+@pytest.mark.slow
+def test_a_run_of_a_stress_is_shown_at_a_level(tmp_path):
+    settings = ("task=stability", "stress=thin_plate", "renderer=dist")
+    made = command("scale=smoke", "threads=1", *settings, "isolation=off", f"results_dir={tmp_path}")
+    folder = made.out.splitlines()[-1]
+    code, out, err = command(folder, "level=1", f"into={tmp_path / 'a.png'}", main=main)
+    assert (code, err) == (0, "") and "thin plate at 0.000500 scene units thick" in out and "wrong: dist" in out
+    assert command(folder, "level=1", "pixels=worst", main=main).code == 0 and rays_of(folder, tmp_path)
+
+
+def rays_of(folder: str, results: Path) -> list[dict[str, Any]]:
+    """The rays of a run as its page lists them."""
+    shown = rays(read_record(Path(folder)), Folder(results, Path(folder).name))
+    assert shown is not None and shown["map"]
+    return shown["rays"]
 
 
 def test_a_field_that_a_renderer_cannot_render_is_named():

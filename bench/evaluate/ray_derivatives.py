@@ -105,7 +105,7 @@ class Derivatives:
         rest = float((computed - factor * true).norm() / true.norm())
         if factor and rest <= PARALLEL * abs(factor):
             return f"They are {factor:.3g} times those of the reference."
-        return f"Their relative error is {100 * self.error:.2g} %."
+        return f"Their relative error is {100 * self.error:.0f} %."
 
     @property
     def sentences(self) -> str:

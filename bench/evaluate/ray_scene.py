@@ -94,11 +94,15 @@ class RayScene:
             raise ValueError(f"the ray of {name} misses the unit sphere that contains the scene: {remedy}")
         return ray
 
+    @property
+    def tolerance(self) -> float:
+        """The error in scene units up to which a hit is right."""
+        return TOLERANCE_PIXELS * float(self.camera.center.norm() / self.camera.intrinsics[0, 0])
+
     def true_ray(self, pixel: Pixel) -> TrueRay:
         """The truth on the ray of a pixel."""
-        tolerance = TOLERANCE_PIXELS * float(self.camera.center.norm() / self.camera.intrinsics[0, 0])
         ray = self.ray(pixel, self.camera.double())
-        return true_ray(self.exact, ray, lipschitz=self.lipschitz, tolerance=tolerance)
+        return true_ray(self.exact, ray, lipschitz=self.lipschitz, tolerance=self.tolerance)
 
     def search(self, renderer: Renderer) -> Search:
         """The errors of a renderer. No ray uses the coarse rays of an image."""

@@ -3,29 +3,33 @@
 import textwrap
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.image import imsave
 from matplotlib.patches import ConnectionPatch
 from matplotlib.patheffects import withStroke
 
 from bench.evaluate.along_ray import MIN_SAMPLES, Lane, TrueRay
 from bench.evaluate.ray_derivatives import AGREEMENT, Derivatives
+from bench.evaluate.ray_scene import Search
 from bench.pictures.figure_style import WIDTH, look, styled
+from bench.pictures.style import silhouette_image
 from renderers.camera import Rays
 from renderers.field import Field
 
 INK, FAINT, RULE, INSIDE, MAGNIFIED = "#1a1a1a", "#6b6b6b", "#9a9a9a", "#e6e6e6", "#c9a227"
+WRONG = "#f2a600"  # as in the pictures of stress tests
 PANEL_LEFT_FRACTION, PANEL_WIDTH_FRACTION = 0.08, 0.89
 TITLE_INCHES, SLICE_INCHES, PROFILE_INCHES, LANE_INCHES, LINE_INCHES = 0.2, 1.5, 0.8, 0.55, 0.14
 TITLE_CHARACTERS, TEXT_CHARACTERS = 104, 110  # per line
 SLICE_SAMPLES, PROFILE_SAMPLES = (480, 200), 1500  # along and across the ray; along the ray
 MIN_NUMBERED_FRACTION = 0.03  # a step that takes less of a panel has no number
 HALO = [withStroke(linewidth=2.5, foreground="white")]
-DERIVATIVE_COLUMNS = (0.22, 0.49, 0.76)  # fractions of the panel's width
 KEY = (
     "Dot, tick: evaluation. Arc: step. Area: weights. Triangle: hit. Cross: miss. Dashed: true hit. Bold: over 1 % off."
 )
@@ -38,6 +42,11 @@ class LanePanel:
     lane: Lane
     text: str
     derivatives: Derivatives | None = None
+
+    @property
+    def sentences(self) -> str:
+        """The sentences on the lane and on its derivatives."""
+        return f"{self.text} {self.derivatives.sentences}" if self.derivatives else self.text
 
 
 @dataclass(frozen=True)
@@ -64,9 +73,7 @@ class RayPicture:
     @property
     def texts(self) -> list[str]:
         """All sentences: on the scene, on all renderers, and on each renderer."""
-        lanes = [f"{panel.lane.title}: {panel.text}" for panel in self.lanes]
-        more = [f" {panel.derivatives.sentences}" if panel.derivatives else "" for panel in self.lanes]
-        return [self.scene, self.result, *map(str.__add__, lanes, more)]
+        return [self.scene, self.result, *(f"{panel.lane.title}: {panel.sentences}" for panel in self.lanes)]
 
     @styled
     def draw(self) -> Figure:
@@ -185,6 +192,14 @@ def magnify(above: Axes, below: Axes, window: tuple[float, float]) -> None:
         above.figure.add_artist(line)
 
 
+def draw_map(path: Path, search: Search, tolerance: float) -> None:
+    """Writes the searched pixels in the colours of silhouettes; hits off by more than `tolerance` are orange."""
+    hit, reference_hit = search.hit.numpy(), search.reference_hit.numpy()
+    image = silhouette_image(hit, reference_hit)
+    image[hit & reference_hit & (search.error.numpy() > tolerance)] = to_rgb(WRONG)
+    imsave(path, image)
+
+
 def mixed(colour: str, repeat: int) -> str:
     """A colour for its repeated use: itself, then darker and lighter in turn."""
     target = np.zeros(3) if repeat % 2 else np.ones(3)
@@ -193,12 +208,11 @@ def mixed(colour: str, repeat: int) -> str:
 
 
 def write_derivatives(axes: Axes, derivatives: Derivatives, height: float) -> None:
-    """Writes a row under a lane: the derivatives in columns, bold if they differ from the reference."""
-    text = {"transform": axes.transAxes, "va": "top"}
-    axes.text(0, height, "Derivatives (reference)", color=FAINT, **text)
+    """Writes the derivatives in a line under a lane, bold if they differ from the reference."""
+    axes.text(0, height, "Derivatives (reference)", color=FAINT, transform=axes.transAxes, va="top", fontsize=7)
     weight = "bold" if derivatives.error > AGREEMENT else "normal"
-    for column, pair in zip(DERIVATIVE_COLUMNS, derivatives.pairs, strict=False):
-        axes.text(column, height, pair, fontweight=weight, **text)
+    text = "     ".join(derivatives.pairs)
+    axes.text(0.19, height, text, transform=axes.transAxes, va="top", fontsize=7, fontweight=weight)
 
 
 def draw_lane(axes: Axes, lane: Lane, colour: str) -> None:
