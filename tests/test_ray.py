@@ -16,8 +16,10 @@ from bench.evaluate.ray_derivatives import Derivatives, Parameters, true_derivat
 from bench.pictures.ray import LanePanel, RayPicture
 from bench.ray import main, window_of
 from bench.records.record import read_record
+from bench.report.data.runs import Runs
 from bench.report.site.files import Folder
 from bench.report.site.rays import MAX_RAYS, rays
+from bench.studies.stability import READS, first_trials
 from renderers.camera import Rays
 from renderers.field import Field, Kind
 from renderers.fields.analytic import Shape, box, plane, sphere
@@ -235,6 +237,12 @@ def test_a_run_of_a_stress_is_shown_at_a_level(tmp_path):
     code, out, err = command(folder, "level=1", f"into={tmp_path / 'a.png'}", main=main)
     assert (code, err) == (0, "") and "thin plate at 0.000500 scene units thick" in out and "wrong: dist" in out
     assert command(folder, "level=1", "pixels=worst", main=main).code == 0 and rays_of(folder, tmp_path)
+    record = read_record(Path(folder)) | {"folder": Path(folder).name}
+    tried = first_trials(Runs(READS[0], tmp_path, []), record)
+    assert {*tried.values()} == {True, False}
+    for level in (max(level for level in tried if tried[level]), min(level for level in tried if not tried[level])):
+        out = command(folder, f"level={level}", f"into={tmp_path / 'b.png'}", main=main).out
+        assert ("wrong: dist" in out) is not tried[level]
 
 
 def rays_of(folder: str, results: Path) -> list[dict[str, Any]]:

@@ -1,6 +1,7 @@
 """The breakdown of each renderer on each axis of the stress test: as an atlas, over cost, and as curves."""
 
 import math
+import shlex
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,22 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.records.results import curve_lines
-from bench.report.study import Result, Runs, Selection, chart, figure_style, format, records, statistics, table
+from bench.report.study import (
+    NoFolder,
+    Result,
+    Runs,
+    Selection,
+    chart,
+    figure_style,
+    format,
+    records,
+    statistics,
+    table,
+)
 
 PLACE = 120
 READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
+DEFAULT_SCALE = "desk"
 FAILED = "failed_"  # prefix of the metrics that count failed trials by kind
 ENDS = ("mild", "severe")
 COST_AXES = ("field evaluations per ray at the mildest severity, median", "mean rank over axes (1 is best)")
@@ -86,7 +99,7 @@ def make(runs: Runs) -> Result:
         columns=[table.text(name, name) for name in words],
         lines=words.to_dict("records"),
         figure=draw(cells, axes),
-        atlas=_atlas(cells, axes),
+        atlas=_atlas(cells.assign(ray=_rays(runs, cells)), axes),
     )
 
 
@@ -247,7 +260,7 @@ def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
 def _atlas(cells: pd.DataFrame, axes: pd.DataFrame) -> dict[str, Any]:
     """The grid for the page: axes, rows, and each cell's breakdown as text, shade and run."""
     rows = list(cells["row"].unique())
-    shown = cells[["short", "full", "status", "reason", "shade", "folder"]].astype({"shade": object})
+    shown = cells[["short", "full", "status", "reason", "shade", "folder", "ray"]].astype({"shade": object})
     shown["shade"] = shown["shade"].where(shown["shade"].notna(), None)
     cell_data = dict(zip(zip(cells["axis"], cells["row"], strict=True), shown.to_dict("records"), strict=True))
     return {
@@ -257,6 +270,49 @@ def _atlas(cells: pd.DataFrame, axes: pd.DataFrame) -> dict[str, Any]:
         "rows": rows,
         "cells": [[cell_data.get((axis, row)) for row in rows] for axis in axes.index],
     }
+
+
+def _rays(runs: Runs, cells: pd.DataFrame) -> list[dict[str, Any] | None]:
+    """For each cell, the command that draws a ray, with the levels nearest to the breakdown that fail and succeed.
+
+    None for fits and settings of a renderer, which have no scene, and without such a level.
+    """
+    rays = []
+    for record, cell in zip(runs.records, cells.itertuples(), strict=True):
+        tried, level = first_trials(runs, record), cell.level
+        breaks = min((x for x, success in tried.items() if not success and x >= level), default=None)
+        works = max((x for x, success in tried.items() if success and x <= level), default=None)
+        has_scene = cell.measure != "fit" and not cell.is_setting and not cell.rises
+        command = {"command": _ray_command(record), "breaks": breaks, "works": works}
+        rays.append(command if has_scene and (breaks, works) != (None, None) else None)
+    return rays
+
+
+def first_trials(runs: Runs, record: records.Record) -> dict[float, bool]:
+    """Levels of which the outcome of the first trial is certain, which is the trial that bench.ray shows."""
+    metrics, tried = record["metrics"], dict[float, bool]()
+    for level, end in zip((0.0, 1.0), ENDS, strict=True):
+        successes, trials = (metrics.get(f"{end}_{name}") for name in ("successes", "trials"))
+        if trials and successes in (0, trials):
+            tried[level] = successes == trials
+    try:
+        lines = curve_lines(runs.folder(record)) or []
+    except NoFolder:
+        lines = []
+    for line in reversed(lines):  # the first trial of a level is the last one that is noted
+        if isinstance(level := line.get("level"), float) and math.isfinite(level):
+            tried[level] = line.get("success") is True
+    return tried
+
+
+def _ray_command(record: records.Record) -> str:
+    """The command of a ray of a run's scene, without its level."""
+    scale = records.setting(record["config"], "scale", "name")
+    settings = [str(text) for text in record.get("overrides") or []]
+    settings = [text for text in settings if text.lstrip("+").startswith(("renderer.", "task."))]
+    stress, renderer = f"stress={record['dataset']}", f"renderer={record['renderer']}"
+    scales = [f"scale={scale}"] if scale not in (None, DEFAULT_SCALE) else []
+    return shlex.join(["python", "-m", "bench.ray", "task=stability", stress, renderer, *settings, *scales])
 
 
 @figure_style.styled

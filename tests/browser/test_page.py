@@ -75,7 +75,8 @@ def write_tables(results):
     (folder / "speed_front.csv").write_text("setting,time\nslow,12\n")
     axes = [{"axis": name, "title": name, "group": "geometry", "unit": "units"} for name in ("wires", "gap")]
     cell = {"short": "0.1", "full": "0.1 (0.05 to 0.2)", "shade": 0.4, "status": "ok", "reason": ""}
-    cell |= {"folder": "completion-0002"}
+    ray = {"command": "python -m bench.ray task=stability stress=wires renderer=dist", "breaks": 0.5, "works": None}
+    cell |= {"folder": "completion-0002", "ray": ray}
     lost = cell | {"short": "unsupported", "shade": None, "status": "unsupported", "folder": "gone"}
     lost |= {"reason": "no alpha"}
     atlas = {"axes": axes, "rows": ["dist", "dvr"], "cells": [[cell, lost], [cell, None]]}
@@ -381,6 +382,8 @@ def test_a_cell_of_the_atlas_opens_its_curve_and_its_run(results, tab):
     page.locator(".opened .scatterlayer .trace").first.wait_for()
     assert "Breaks: 0.1 (0.05 to 0.2). The run" in page.locator(".opened").inner_text()
     assert page.locator(".opened a").get_attribute("href") == "#/run/completion-0002"
+    command = "python -m bench.ray task=stability stress=wires renderer=dist level=0.5"
+    assert page.locator(".opened .code pre").all_text_contents() == [command]
     page.keyboard.press("ArrowRight")
     page.keyboard.press("Enter")
     assert "no alpha Its run is not among these results." in page.locator(".opened").inner_text()

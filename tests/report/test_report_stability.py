@@ -1,9 +1,13 @@
 """The stability atlas as tables and figures, made from run folders whose numbers are known."""
 
+from pathlib import Path
+
 import pytest
 
+from bench.report.data.kept import FROM_RUNS_CSV
 from bench.report.data.records import row_of
-from bench.report.data.runs import named_rows, shared_loss
+from bench.report.data.runs import Runs, named_rows, shared_loss
+from bench.studies.stability import READS, first_trials
 from tests.report.test_report_paper import page_of, told, write_lines, write_run
 
 SWEEP = {"mild": 1.0, "severe": 0.01, "log": True, "unit": "scene units"}
@@ -17,7 +21,7 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", crit
     known |= {f"breakdown{end}": 0.01**at if at is not None and 0 <= at <= 1 else None for end, at in ends.items()}
     known |= {"trials": 10, "grid_trials": 40, "evaluations_per_ray": 4.0, "failed_lost": 3, "failed_false": 1}
     known |= {f"{end}_trials": trials for end in ("mild", "severe")}
-    renderer = {name: more.pop(name) for name in ("renderer",) if name in more}
+    renderer = {name: more.pop(name) for name in ("renderer", "overrides") if name in more}
     settings = {"renderer": {"_target_": more.pop("target")}} if "target" in more else {}
     known |= {"mild_successes": trials * (level > 0), "severe_successes": trials * (level > 1)} | more
     stress = {"scene": axis, "measure": measure, "group": "viewing", "sweep": SWEEP, "repeats": repeats}
@@ -54,6 +58,26 @@ def test_a_breakdown_stands_with_its_interval(tmp_path):
     assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of the trials" in told(page)
     dist, dvr = page.atlas["cells"][0]
     assert dist["shade"] == 0.5 and (dvr["shade"], dvr["short"]) == (1.0, "none")
+
+
+def test_a_cell_has_the_command_of_a_ray_and_the_levels_around_the_breakdown(tmp_path):
+    broke(tmp_path, "wires", "DIST", 0.45, overrides=["renderer.steps=20", "seed=3"])
+    broke(tmp_path, "wires", "DVR", 1.1)
+    broke(tmp_path, "alpha", "DIST", 0.45)
+    broke(tmp_path, "depth_noise", "DIST", 0.45, measure="fit")
+    (dist, dvr), *others = page_of(tmp_path, "stability").atlas["cells"]
+    command = "python -m bench.ray task=stability stress=wires renderer=dist renderer.steps=20"
+    assert dist["ray"] == {"command": command, "breaks": 0.5, "works": 0.4}
+    assert (dvr["ray"]["breaks"], dvr["ray"]["works"]) == (None, 1.0)  # it does not break
+    assert [cell["ray"] for line in others for cell in line if cell] == [None, None]
+
+
+def test_a_shipped_row_has_the_ends_of_the_sweep_at_which_all_trials_agree():
+    numbers = {"mild_successes": 5, "mild_trials": 5, "severe_successes": 1, "severe_trials": 5}
+    record = {"metrics": numbers, "folder": "gone", FROM_RUNS_CSV: True}
+    runs = Runs(READS[0], Path("results"), [record])
+    assert first_trials(runs, record) == {0.0: True}
+    assert first_trials(runs, record | {"metrics": numbers | {"severe_successes": 0}}) == {0.0: True, 1.0: False}
 
 
 def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):

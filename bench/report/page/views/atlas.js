@@ -2,7 +2,7 @@
 (function (bench) {
   "use strict";
 
-  const {element, fill, soft, later} = bench.dom;
+  const {element, fill, soft, later, copied} = bench.dom;
   const SHADES = ["#8c2d04", "#cc6a1a", "#f0b46a", "#f3ead8", "#a9cfe3", "#4a90c2", "#0b4f8a"]; // from at once to never
 
   function atlas(data) {
@@ -71,6 +71,7 @@
       element("h2", null, `${axis.title}, ${row}`),
       element("p", null, `Breaks: ${words(result)}. ${result.reason || ""} `,
         isListed ? element("a", {href: bench.runs.link(run)}, "The run") : soft("Its run is not among these results.")),
+      rays(result.ray || {}),
       later(curves(), (panels) => {
         const panel = panels.find((each) => each.axis === axis.axis);
         return panel && bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row});
@@ -78,6 +79,12 @@
       isListed && later(bench.runs.detail(run), failure));
     if (getComputedStyle(opened).position !== "sticky") opened.scrollIntoView({block: "nearest"});
   }
+
+  /* The commands that draw the ray of the most wrong pixel, where the renderer breaks and where it does not. */
+  const rays = ({command, breaks, works}) =>
+    [["The most wrong pixel at a severity that breaks it:", breaks], ["And at one that does not, where few pixels are wrong:", works]]
+      .filter(([, level]) => typeof level === "number")
+      .map(([text, level]) => [soft(text), copied(`${command} level=${Number(level.toFixed(6))}`, text)]);
 
   /* The curves of all axes, which stand in a page of their own. */
   async function curves() {
