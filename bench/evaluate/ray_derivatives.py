@@ -14,6 +14,7 @@ from renderers.field import Field
 from renderers.rendering import Renderer, Unsupported, with_empty_memory
 
 STEP = 1e-6  # units of the parameter: roots are exact to 1e-15, so rounding and curvature stay below 1e-8
+ROUNDING = 1e-8  # derivatives of a smaller magnitude are shown as 0
 MAX_CHANGE = 1e-3  # scene units: a hit that moves farther within a step is on another surface
 SHOWN_PARAMETERS = 3
 AGREEMENT = 0.01  # relative error up to which derivatives agree
@@ -163,4 +164,6 @@ def with_renderer(true: Derivatives, renderer: Renderer, parameters: Parameters,
 
 def _number(derivative: float) -> str:
     """A derivative as people write it; a dash if there is none."""
-    return f"{float(f'{derivative:.3g}'):g}" if isfinite(derivative) else "–"
+    if not isfinite(derivative):
+        return "–"
+    return f"{float(f'{derivative:.3g}'):g}" if abs(derivative) > ROUNDING else "0"
