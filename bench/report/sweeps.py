@@ -36,13 +36,14 @@ MAX_DATASET_COLUMNS = 8
 MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `LISTED_METRICS`
 COST, RUNTIME = "field evaluations (a gradient counts as two)", "runtime of the loop (s)"
 PANEL_HEIGHT_INCHES, LEGEND_HEIGHT_INCHES = 2.3, 0.6
+LINE_ENDS = (0.9, 1.1)  # of horizontal lines, relative to the smallest and largest cost
 AVERAGED_KEYS = ("index", "seed", "dataset")  # a sweep over their numbers is no axis of a chart
 METHOD_KEYS = ("renderer", "label", "method", "silhouette", "task.optimiser")  # the runs still solve the same problems
 FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
-POINTS = "A point is the median of a row. "
+POINTS = "A point is the median of a row, small points are its runs. A cross at the upper edge: half of the runs failed. "
 SMALL_POINTS = (
     "In the figure, small points are runs. A row of which half of the runs failed has a cross, or no point on a curve. "
     "Costs are medians over runs that ended ok."
@@ -235,7 +236,7 @@ def table_of(sweep: Sweep) -> Result:
     has_front = any(each["name"] == "front" for panel in panels for each in panel["series"])
     return Result(
         sweep.runs,
-        f"Sweep {sweep.name}.",
+        f"Sweep over {', '.join(sweep.swept)}, {sweep.name}." if sweep.swept else f"Sweep {sweep.name}.",
         f"Medians over {VARYING}; swept over {_listed(sweep)}.",
         **_answer(sweep, table_lines, lead, headings),
         command=sweep.command,
@@ -299,7 +300,8 @@ def _panel(
     of_rows = grouped(runs, itemgetter("row")).values()
     if curves and has_front and metric.better == LOWER:
         fronts.append(chart.front(positions, [y for each in curves for y in each["y"]]))
-    span = [x for dots in curves for x, _ in dots["shapes"]] or positions
+    costs = [*positions, *(x for dots in curves for x, _ in dots["shapes"])]
+    span = [LINE_ENDS[0] * min(costs, default=1.0), LINE_ENDS[1] * max(costs, default=1.0)]
     for name, field, dash in (("initial value", "metrics_start", "--"), ("best possible", "metrics_best", ":")):
         value = _shared_median([run.get(field, {}).get(key) for run in row] for row in of_rows)
         if curves and value and math.isfinite(value):

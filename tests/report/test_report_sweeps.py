@@ -222,7 +222,7 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     assert str(folder / "table.csv") in capsys.readouterr().out
     assert not (tmp_path / "paper").exists()
     (found,) = find_sweeps(tmp_path)
-    assert (found.name, found.shown.title) == ("completion-1", "Sweep completion-1.")
+    assert (found.name, found.shown.title) == ("completion-1", "Sweep over renderer, completion-1.")
     assert found.shown.columns[:2] == ["Run", "Chamfer (x1000) ↓"] and found.shown.rows[0][:2] == ["DIST", "1.00"]
     assert found.files == {
         suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "pdf", "tex")

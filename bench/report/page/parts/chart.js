@@ -18,7 +18,7 @@
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 
   /* A chart of {panels: [{title, x: {title, log, reversed}, y: likewise, rows, series}]}. A series is {name, colour, symbol,
-     dash, x, y, text, link, low, high, size, hollow, off}: with a dash it has lines, with a symbol points. Series of one name
+     dash, x, y, text, link, low, high, size, hollow, off, shapes}: with a dash it has lines, with a symbol points. Series of one name
      are shown and hidden together. A point with a link opens it. `focus` is the name of the series to bring out. With
      `rows`, their names stand down the y axis instead of a legend, and `low` and `high` are of x. */
   function chart(spec, {label, focus} = {}) {
@@ -60,31 +60,42 @@
     if (!target.isConnected) return;
     const front = ({name}) => Number(name === focus); // drawn last, over the others
     const shown = panel.series.filter(({name}) => !off.has(name)).sort((a, b) => front(a) - front(b));
-    const traces = shown.map((series) => trace(series, focus, panel.rows ? "x" : "y"));
+    const edge = panel.rows ? null : upperEdge(shown, panel.y);
+    const traces = shown.map((series) => trace(series, focus, panel.rows ? "x" : "y", edge));
+    traces.push(...shown.filter(({shapes}) => shapes).map(dots)); // last, so that a number is that of a series
     plotly.react(target, traces, layout(panel, target), {displayModeBar: false, responsive: true});
     target.removeAllListeners("plotly_click");
     target.on("plotly_click", ({points: [point]}) => {
-      const {link} = shown[point.curveNumber];
+      const {link} = shown[point.curveNumber] || {};
       const address = link && bench.dom.safeAddress(link[point.pointNumber]);
       if (address) location.hash = address;
     });
   }
 
-  function trace(series, focus, letter) {
+  /* Where infinite values stand, those of rows that failed: a little above all others. */
+  function upperEdge(shown, {log}) {
+    const values = shown.flatMap(({y, shapes = []}) => [...y, ...shapes.map((pair) => pair[1])].map(decoded)).filter(Number.isFinite);
+    const [low, high] = [Math.min(...values), Math.max(...values)];
+    return !values.length ? 1 : log ? high * 1.3 : high + 0.15 * (high - low || 1);
+  }
+
+  function trace(series, focus, letter, edge) {
     const color = bench.colour(series.colour);
     const lines = series.dash !== undefined;
     const dash = DASHES.get(series.dash) || "solid";
     const [symbol] = SYMBOLS.get(series.symbol) || ["circle"];
     const width = focus === series.name ? 3 : 1.6;
+    const y = series.y.map(decoded);
+    const failed = edge === null ? [] : y.map((value) => value === Infinity);
     const made = {
       type: "scatter",
       name: plain(series.name),
       x: series.x.map(decoded),
-      y: series.y.map(decoded),
+      y: y.map((value, n) => (failed[n] ? edge : value)),
       mode: lines ? (series.symbol && !series.step ? "lines+markers" : "lines") : "markers",
       opacity: focus && series.name !== focus ? 0.35 : 1,
       line: {color, width, dash, shape: series.step ? "hv" : "linear"},
-      marker: {color, symbol: symbol + (series.hollow ? "-open" : ""), size: series.size || 7, line: {color, width: 1.5}},
+      marker: {color, symbol: y.map((_, n) => (failed[n] ? "x" : symbol + (series.hollow ? "-open" : ""))), size: series.size || 7, line: {color, width: 1.5}},
       hoverinfo: series.quiet ? "skip" : "text",
       text: hover(series),
     };
@@ -93,6 +104,13 @@
       made[`error_${letter}`] = {type: "data", symmetric: false, array, arrayminus, color, thickness: 1, width: 2};
     }
     return made;
+  }
+
+  /* The small points of a series: its runs, or its shapes. */
+  function dots({shapes, colour}) {
+    const [x, y] = [0, 1].map((index) => shapes.map((pair) => decoded(pair[index])));
+    const marker = {color: bench.colour(colour), size: 4, opacity: 0.5};
+    return {type: "scatter", mode: "markers", x, y, marker, hoverinfo: "skip"};
   }
 
   const hover = ({name, x, y, text}) =>
