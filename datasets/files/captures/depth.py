@@ -21,6 +21,7 @@ from datasets.files.readers.text import wrong_kind_message
 from renderers.checks import BadInput
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp")
+RADIANCE_SUFFIX = ".hdr"
 DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I;16N", "I", "F")  # Pillow's, with one number of 16 bits or more per pixel
 STRETCHED_BYTE_FACTORS = (256, 257)  # from 8 to 16 bits
 MIN_STRETCHED_VALUES = 20  # fewer different values may have such a factor by chance
@@ -75,6 +76,8 @@ def read_depths(path: Path, remedy: str = FORMATS) -> Depths:
         stored = _picture_numbers(path, remedy)
     else:
         stored = _array(path, remedy) if path.suffix.lower() in (".npy", ".npz") else _opencv_numbers(path, remedy)
+    if path.suffix.lower() == RADIANCE_SUFFIX:
+        raise BadInput(f"{path} has 8 bits per number, with a common exponent, which is too coarse: {remedy}")
     if stored.dtype.kind not in "uif" or stored.dtype.itemsize < 2:
         raise BadInput(f"{path} has numbers of type {stored.dtype}, as a picture or a mask, not depths: {remedy}")
     if stored.squeeze().ndim != 2:
@@ -157,8 +160,8 @@ def _array(path: Path, remedy: str) -> Shaped[np.ndarray, "..."]:
     except BadInput:
         raise
     except (OSError, EOFError, TypeError, ValueError, IndexError, BadZipFile, zlib.error) as error:
-        cause = wrong_kind_message(path) or f"cannot be read as depths ({error})"
-        raise BadInput(f"{path} {cause}: save one array [height, width], or {remedy}") from None
+        cause = f"cannot be read as depths ({error}): save one array [height, width], or {remedy}"
+        raise BadInput(f"{path} {wrong_kind_message(path) or cause}") from None
 
 
 def _array_name(path: Path, names: list[str]) -> str:
@@ -185,8 +188,8 @@ def _opencv_numbers(path: Path, remedy: str) -> Shaped[np.ndarray, "height width
     except cv2.error:
         pixels = None
     if pixels is None:
-        cause = wrong_kind_message(path) or "cannot be read as depths: it is cut short or of another format"
-        raise BadInput(f"{path} {cause}; copy it again, or {remedy}")
+        cause = f"cannot be read as depths: it is cut short or of another format; copy it again, or {remedy}"
+        raise BadInput(f"{path} {wrong_kind_message(path) or cause}")
     if pixels.ndim == 2:
         return pixels
     first, *others = np.moveaxis(pixels[..., : len(names)], -1, 0)
