@@ -43,7 +43,7 @@ FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
-POINTS = "A point is the median of a row, small points are its runs. A cross at the upper edge: half of the runs failed. "
+POINTS = "Large points are medians of rows, small points are runs. A cross at the upper edge: half of the runs failed. "
 SMALL_POINTS = (
     "In the figure, small points are runs. A row of which half of the runs failed has a cross, or no point on a curve. "
     "Costs are medians over runs that ended ok."
