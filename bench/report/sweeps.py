@@ -36,7 +36,7 @@ MAX_DATASET_COLUMNS = 8
 MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `LISTED_METRICS`
 COST, RUNTIME = "field evaluations (a gradient counts as two)", "runtime of the loop (s)"
 PANEL_HEIGHT_INCHES, LEGEND_HEIGHT_INCHES = 2.3, 0.6
-LINE_ENDS = (0.9, 1.1)  # of horizontal lines, relative to the smallest and largest cost
+LINE_ENDS_OVER_COSTS = (0.9, 1.1)
 AVERAGED_KEYS = ("index", "seed", "dataset")  # a sweep over their numbers is no axis of a chart
 METHOD_KEYS = ("renderer", "label", "method", "silhouette", "task.optimiser")  # the runs still solve the same problems
 FAILURE = (
@@ -301,7 +301,7 @@ def _panel(
     if curves and has_front and metric.better == LOWER:
         fronts.append(chart.front(positions, [y for each in curves for y in each["y"]]))
     costs = [*positions, *(x for dots in curves for x, _ in dots["shapes"])]
-    span = [LINE_ENDS[0] * min(costs, default=1.0), LINE_ENDS[1] * max(costs, default=1.0)]
+    span = [LINE_ENDS_OVER_COSTS[0] * min(costs, default=1.0), LINE_ENDS_OVER_COSTS[1] * max(costs, default=1.0)]
     for name, field, dash in (("initial value", "metrics_start", "--"), ("best possible", "metrics_best", ":")):
         value = _shared_median([run.get(field, {}).get(key) for run in row] for row in of_rows)
         if curves and value and math.isfinite(value):
