@@ -41,7 +41,7 @@ def recommendation() -> str:
         raise ValueError("no row is among the best at all costs: README needs another sentence")
     first = max(always, key=lambda line: float(line[_budgets()[-1]]))
     sentences = [
-        f"At {units(float(budget))} of cost, no renderer makes significantly more progress than {_either(rows)}. "
+        f"At {units(float(budget))} of cost{_sets(budget)}, no renderer makes significantly more progress than {_either(rows)}. "
         f"Of these, `{max(rows, key=lambda line: float(line[budget]))['preset']}` makes the most."
         for budget, rows in leaders.items()
     ]
@@ -58,6 +58,13 @@ def _budgets() -> list[str]:
     """The budgets with results, as they are named in the CSV file of the suite."""
     lines = _lines("suite")
     return [name for name in lines[0] if name.isdigit() and any(line[name] for line in lines)]
+
+
+def _sets(budget: str) -> str:
+    """The sets of a budget in brackets, if they are not all sets; from the heading of its column."""
+    headings = json.loads((PAPER / "suite.json").read_text(encoding="utf-8"))["columns"]
+    when = f"At {units(float(budget))}"
+    return next(heading for heading in headings if re.fullmatch(rf"{when}( \(.*)?", heading)).removeprefix(when)
 
 
 def _first_rank(line: dict[str, str], budget: str) -> bool:
