@@ -41,7 +41,8 @@ def recommendation() -> str:
         raise ValueError("no row is among the best at all costs: README needs another sentence")
     first = max(always, key=lambda line: float(line[_budgets()[-1]]))
     sentences = [
-        f"At {units(float(budget))} of cost{_sets(budget)}, no renderer makes significantly more progress than {_either(rows)}. "
+        f"At {units(float(budget))} of cost{_sets(budget)}, no renderer makes significantly more progress than "
+        f"{_either(rows)}. "
         f"Of these, `{max(rows, key=lambda line: float(line[budget]))['preset']}` makes the most."
         for budget, rows in leaders.items()
     ]
