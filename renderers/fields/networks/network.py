@@ -24,6 +24,7 @@ from renderers.field import (
 )
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import Decoder, split_into_passes
+from renderers.fields.networks.forward import check_forward
 
 SAMPLES = 2**14  # points in the unit sphere, for values and slopes
 SPHERE_POINTS, OTHER_CODE_POINTS = 4096, 512  # points on the unit sphere, for the field and for each other code
@@ -121,7 +122,7 @@ def measure_field(
         others: fields of the same network at other codes, with the same sign and the same divisor.
 
     Raises:
-        BadInput: if values are not finite.
+        BadInput: if values or gradients are not finite.
     """
     points = points_in_sphere(SAMPLES, like)
     surface = nn.functional.normalize(points[:SPHERE_POINTS], dim=-1)
@@ -129,9 +130,11 @@ def measure_field(
         values = torch.cat([field(chunk) for chunk in points.split(SPHERE_POINTS)]).double() - level
         sphere_values = [field(surface).double() - level]
         sphere_values += [other(surface[:OTHER_CODE_POINTS]) - level for other in others]
-    if count := int((~values.isfinite()).sum()):
-        raise BadInput(f"its value is not finite at {count} of {SAMPLES} points of the unit sphere: check its weights")
     slopes = scale * torch.cat([_slopes(field, chunk) for chunk in points.split(SPHERE_POINTS)])
+    for name, numbers in (("value", values), ("gradient", slopes)):
+        if count := int((~numbers.isfinite()).sum()):
+            message = f"its {name} is not finite at {count} of {SAMPLES} points of the unit sphere"
+            raise BadInput(f"{message}: check its weights")
     if sign is None:
         votes = sum(float((field_values > 0).double().mean()) >= 0.5 for field_values in sphere_values)
         sign = 1.0 if 2 * votes >= len(sphere_values) else -1.0
@@ -179,14 +182,15 @@ def from_module(network: Callable[[Tensor], Tensor], *, kind: Kind | None = None
         like: a tensor with the network's dtype and device; None takes its first parameter, or float32 on the CPU.
 
     Raises:
-        BadInput: if values are not finite, or not negative inside and positive outside.
+        BadInput: if the network fails or has no gradient, see `check_forward`; if values are not finite, or not
+            negative inside and positive outside.
     """
     parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
     like = (parameters or [torch.zeros(())])[0] if like is None else like
-    dtype = parameters[0].dtype if parameters else None
+    checked = check_forward(network, like)
 
     def values(points: Tensor) -> Tensor:
-        return network(points.reshape(-1, 3).to(dtype or points.dtype)).reshape(points.shape[:-1]).to(points.dtype)
+        return checked(points.reshape(-1, 3)).reshape(points.shape[:-1])
 
     interpretation = measure_field(values, like, kind=kind, sign=1.0)
     low, high = interpretation.statistics.min_value, interpretation.statistics.max_value
@@ -289,15 +293,22 @@ class Adjusted:
 
 
 class Published(nn.Module):
-    """A published network; its field at a code is `Adjusted`."""
+    """A published network; its field at a code is `Adjusted`.
+
+    Args:
+        inner: the network.
+        squash: number of tanh after it.
+        assumption: of the values, which the file does not state; for notes and messages.
+    """
 
     factor: Tensor
     level: Tensor
     kind: Kind
     lipschitz: float | None
 
-    def __init__(self, inner: Decoder | Coded, squash: int = 0) -> None:
+    def __init__(self, inner: Decoder | Coded, squash: int = 0, assumption: str = "") -> None:
         super().__init__()
+        self.assumption = assumption
         self.inner, self.squash, self.kind, self.lipschitz = inner, squash, Kind.LEVEL, None
         self.code_length, self.width, self.code_is_position = inner.code_length, inner.width, inner.code_is_position
         self.register_buffer("factor", torch.ones(()))
