@@ -5,12 +5,9 @@ Only weights are read: nothing in a file is executed.
 
 import hashlib
 import json
-import pickle
 import re
-import struct
-import warnings
-import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -18,11 +15,10 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
-import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
+from datasets.files.checkpoints import OWN_CLASS, fit_weights, read_arrays, read_codes, read_tensors
 from datasets.files.field_files import ASSUMED_WIDTH, load_network
 from datasets.mesh import Mesh, extract
 from datasets.saved_field import FIELD_FILE
@@ -30,7 +26,15 @@ from datasets.scene import SceneNetwork, Split
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, sphere
-from renderers.fields.networks.network import Coded, Published, interpret, measure_field, scale_shapes
+from renderers.fields.networks.forward import CheckedForward, check_forward
+from renderers.fields.networks.network import (
+    Coded,
+    FieldInterpretation,
+    Published,
+    interpret,
+    measure_field,
+    scale_shapes,
+)
 from renderers.fields.networks.published import (
     LAYERS,
     SIGNED,
@@ -46,18 +50,14 @@ CUBE_HALF_SIDE = 1.05  # scene units: the surface within the unit sphere is extr
 AUTO = "auto"
 MEASURED_CODES = 16  # the sign and the Lipschitz constant are measured at about so many codes
 INSIDE_SIGNS = {AUTO: None, "negative": 1.0, "positive": -1.0}  # see `FieldInterpretation`
-OWN_CLASS = "field._target_=PACKAGE.CLASS"
+# Values of one sign are unsigned distances if they come so close to 0, as a share of the largest, and if their slope
+# there is at least such a share of the largest slope. Probabilities and densities are flat there.
+TOUCHING_SHARE, UNSIGNED_SLOPE_SHARE = 0.05, 0.2
 DEEPSDF_FILES = ("ModelParameters/latest.pth", "LatentCodes/latest.pth")
 SUPPORTED_CHECKPOINTS = (
     "DeepSDF (name the folder with its specs.json); IDR, NeuS, VolSDF (implicit_network.lin0, sdf_network.lin0); "
     "occupancy networks, DVR (fc_p, conv_p)"
 )
-# The loader raises these if a file is no pickle of weights.
-CHECKPOINT_ERRORS = (pickle.UnpicklingError, LookupError, UnicodeDecodeError, struct.error)
-NUMPY_SCALAR_CLASSES = [  # some checkpoints store their best loss as a NumPy scalar
-    *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
-    *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
-]
 
 
 @dataclass(frozen=True)
@@ -142,6 +142,8 @@ class Module(Protocol):
 
     def __call__(self, points: Tensor) -> Tensor: ...
 
+    def modules(self) -> Any: ...
+
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
 
 
@@ -162,29 +164,23 @@ class ModuleFile(NetworkFile):
 
     def read(self) -> Published:
         """The network in evaluation mode, with the weights of the file; their names may have any prefix."""
-        tensors, module = _tensors(Path(self.path)), deepcopy(cast(nn.Module, self.module)).eval()
-        names = [*module.state_dict()]
-        prefixes = [name.removesuffix(names[0]) for name in tensors if f".{name}".endswith(f".{names[0]}")]
-        if len(prefixes) > 1 and "" not in prefixes:
-            raise BadInput(f"it has several networks, {', '.join(prefixes)}: save the state_dict() of one of them")
-        prefix = "" if "" in prefixes else next(iter(prefixes), "")
-        try:
-            module.load_state_dict({name: tensors[prefix + name] for name in names if prefix + name in tensors})
-        except RuntimeError as error:
-            message = " ".join(str(error).split())
-            raise BadInput(f"its weights are not those of {type(module).__name__}: {message}") from error
-        return Published(Coded(_Body(module), code_length=0, width=ASSUMED_WIDTH))
+        # Normalised weights of older classes are computed attributes, which cannot be copied as they are.
+        values = [value for layer in self.module.modules() for value in vars(layer).values()]
+        computed = [value for value in values if isinstance(value, Tensor) and not value.is_leaf]
+        module = cast(nn.Module, deepcopy(self.module, {id(value): value.detach() for value in computed}))
+        module.eval().requires_grad_(False)
+        fit_weights(module, read_tensors(Path(self.path)))
+        body = _checked(module)
+        return Published(Coded(body, code_length=0, width=ASSUMED_WIDTH), assumption=body.note)
 
 
-class _Body(nn.Module):
-    """A module as the body of a `Coded`."""
-
-    def __init__(self, inner: nn.Module) -> None:
-        super().__init__()
-        self.inner = inner
-
-    def forward(self, points: Float[Tensor, "n 3"], code: Tensor) -> Float[Tensor, " n"]:
-        return self.inner(points).reshape(len(points))
+def _checked(module: nn.Module) -> CheckedForward:
+    """The module in float32, or in its types if its forward pass needs them."""
+    like = torch.zeros(())
+    if any(tensor.is_floating_point() and tensor.dtype != like.dtype for tensor in module.state_dict().values()):
+        with suppress(BadInput):
+            return check_forward(deepcopy(module).float(), like)
+    return check_forward(module, like)
 
 
 @lru_cache(maxsize=4)
@@ -215,123 +211,89 @@ def _measured(file: NetworkFile, network: Published, codes: Tensor, index: int, 
     )
     facts, kind = meaning.statistics, meaning.kind
     if not facts.min_value < 0 < facts.max_value:
-        ends = sorted(
-            file.level + value / (meaning.factor * meaning.divisor) for value in (facts.min_value, facts.max_value)
-        )
-        raise BadInput(
-            f"its values in the unit sphere lie between {ends[0]:.3g} and {ends[1]:.3g}, and the surface at the level "
-            f"{file.level:g} is not among them: set dataset.level (0.5 where they are probabilities), or dataset.scale"
-        )
+        raise BadInput(_no_surface(file, network, meaning))
     network.register_buffer("content", torch.frombuffer(bytearray.fromhex(content), dtype=torch.uint8))
     decoder = interpret(network, meaning, level=file.level).requires_grad_(False)
     side = f"values are {'negative' if meaning.factor > 0 else 'positive'} inside, at the level {file.level:g}"
     if isinstance(network.inner, Coded) and isinstance(network.inner.body, Residual):
         side += f" of the logits, a probability of {torch.tensor(file.level).sigmoid():.2g} (occupancy networks' own "
         side += "meshes are at 0.2, dataset.level=-1.386)"
+    side += f"; {network.assumption}" if network.assumption else ""
     divided = f", by values divided by {meaning.divisor:.3g}" if kind is Kind.BOUND else ""
     note = f"{file.name}: {side}; {facts.summary}; taken as a {kind.value}{divided}"
     return SceneNetwork(decoder, codes, (note,))
+
+
+def _no_surface(file: NetworkFile, network: Published, meaning: FieldInterpretation) -> str:
+    """Why values of one side of the level have no surface, and what to set."""
+    facts = meaning.statistics
+    ends = (file.level + value / (meaning.factor * meaning.divisor) for value in (facts.min_value, facts.max_value))
+    low, high = sorted(ends)
+    hints = ["a number between them"]
+    if 0 <= low <= TOUCHING_SHARE * high and facts.near_slopes[1] >= UNSIGNED_SLOPE_SHARE * facts.max_slope:
+        hints = ["0.05 for a shell, as unsigned distances have no inside"]
+    elif 0 <= low < 0.5 < high <= 1:
+        hints = ["0.5 where they are probabilities"]
+    elif low >= 0:
+        hints = [f"such as {(low + high) / 2:.2g} where they are densities"]
+    hints = [network.assumption, "a number between them"] if network.assumption else hints
+    return (
+        f"its values in the unit sphere lie between {low:.3g} and {high:.3g}, and the surface at the level "
+        f"{file.level:g} is not among them: set dataset.level ({'; '.join(hints)}), or dataset.scale"
+    )
 
 
 def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     """The network of a file or a folder, and its codes."""
     path = Path(file.path)
     if isinstance(file, ModuleFile):
-        network, codes = file.read(), None
+        network = file.read()
     elif (path / FIELD_FILE).is_file() or (path / "record.json").is_file():
-        network, codes = load_network(path), None
+        network = load_network(path)
     elif path.is_dir():
-        network, codes = _read_folder(path, file.tanh)
+        network = _read_folder(path, file.tanh)
     elif path.suffix == ".npz":
-        network, codes = load_mlp(_arrays(path)), None
+        network = load_mlp(read_arrays(path))
     else:
-        network, codes = _by_tensor_names(_tensors(path)), None
+        network = _by_tensor_names(read_tensors(path))
+    length, stored = network.code_length, path / DEEPSDF_FILES[1]
     if file.codes is not None:
-        codes = _codes(Path(file.codes))
-    length = network.code_length
-    if codes is None:
-        if not network.code_is_position:
-            raise BadInput(
-                f"its values depend on a code of {length} numbers, which it does not hold: set dataset.codes=FILE, an "
-                f".npy or .pth of [shapes, {length}], such as an encoder's output"
-            )
-        codes = torch.zeros(1, length)
-    if codes.dim() != 2 or codes.shape[1] != length:
-        raise BadInput(f"its codes must be [shapes, {length}], not {list(codes.shape)}")
-    return network, codes
+        return network, read_codes(Path(file.codes), length)
+    if network.code_is_position:
+        return network, torch.zeros(1, length)
+    if not stored.is_file():
+        raise BadInput(
+            f"its values depend on a code of {length} numbers, which it does not hold: set dataset.codes=FILE, an "
+            f".npy or .pth of [shapes, {length}], such as an encoder's output"
+        )
+    return network, read_codes(stored, length)
 
 
-def _read_folder(path: Path, squash: int | None) -> tuple[Published, Tensor | None]:
-    """The network of a DeepSDF folder, and its codes; None without codes."""
+def _read_folder(path: Path, squash: int | None) -> Published:
+    """The network of a DeepSDF folder."""
     try:
         specs = json.loads((path / "specs.json").read_text("utf-8"))
     except OSError:
         raise BadInput("the folder has no specs.json: name a DeepSDF folder, or a file") from None
     except ValueError as error:
         raise BadInput(f"specs.json must be JSON: {error}") from error
-    weights, latent = (path / name for name in DEEPSDF_FILES)
+    weights = path / DEEPSDF_FILES[0]
     if not weights.is_file():
         raise BadInput(f"the folder has no {DEEPSDF_FILES[0]}")
-    network = load_deepsdf(_tensors(weights), specs, squash=squash)
-    return network, _codes(latent) if latent.is_file() and not network.code_is_position else None
+    return load_deepsdf(read_tensors(weights), specs, squash=squash)
 
 
 def _by_tensor_names(tensors: dict[str, Tensor]) -> Published:
     """The network of a checkpoint; its tensors' names determine its format."""
     if any(re.search(rf"(?:^|\.){SIGNED}\.{LAYERS}", name) for name in tensors):
-        return load_sdf_network(tensors)
+        network = load_sdf_network(tensors)
+        network.assumption += f"; another activation needs its class, {OWN_CLASS}"
+        return network
     if any(f".{first}_p." in f".{name}" for name in tensors for first in ("fc", "conv")):
         return load_occupancy_network(tensors)
     names = ", ".join([*tensors][:6]) or "no tensors"
     formats = f"{SUPPORTED_CHECKPOINTS}; .npz; a class of yours, by {OWN_CLASS}"
     raise BadInput(f"it is of no format that is read, which are {formats}: it has {names}")
-
-
-def _codes(path: Path) -> Tensor:
-    """The codes of a file: a tensor, alone or under `latent_codes`, or the weights of an embedding."""
-    if path.suffix == ".npy":
-        try:
-            return torch.from_numpy(np.load(path, allow_pickle=False)).float()
-        except (OSError, ValueError, EOFError) as error:
-            raise BadInput(f"{path.name} cannot be read: {error}") from error
-    tables = [tensor for tensor in _tensors(path).values() if tensor.dim() > 1]
-    if len(tables) != 1:
-        raise BadInput(f"{path.name} must hold one table of codes, not {len(tables)}")
-    return (tables[0].squeeze(1) if tables[0].dim() == 3 else tables[0]).float()
-
-
-def _arrays(path: Path) -> dict[str, Tensor]:
-    """The arrays of an `.npz` by name."""
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-            return {name: torch.from_numpy(np.asarray(arrays[name], dtype=np.float32)) for name in arrays.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise BadInput(f"it cannot be read: {' '.join(str(error).split())}") from error
-
-
-def _tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a checkpoint by their dotted names, on the CPU; all other contents are left out."""
-    try:
-        with torch.serialization.safe_globals(NUMPY_SCALAR_CLASSES), warnings.catch_warnings(action="ignore"):
-            return dict(_flatten(torch.load(path, weights_only=True, map_location="cpu")))
-    except CHECKPOINT_ERRORS as error:
-        message = "is no network file, or is broken: name a checkpoint of weights, an .npz or a folder"
-        if blocked := re.search(r"GLOBAL (\S+)", str(error)):
-            message = f"holds more than weights, which is not run ({blocked[1]}): save its state_dict() alone"
-        raise BadInput(f"{path.name} {message}") from error
-    except (OSError, RuntimeError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        if "TorchScript" in str(error):
-            message = f"a program, which is not run: save its state_dict(), and name its class by {OWN_CLASS}"
-            raise BadInput(f"{path.name} is TorchScript, {message}") from error
-        raise BadInput(f"{path.name} cannot be read: it may be cut short, copy it again") from error
-
-
-def _flatten(node: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
-    if isinstance(node, Tensor):
-        yield prefix.removesuffix(".") or "tensor", node
-    elif isinstance(node, Mapping):
-        for key, value in node.items():
-            yield from _flatten(value, f"{prefix}{key}.")
 
 
 def _content_hash(files: list[Path]) -> str:

@@ -4,7 +4,8 @@ A format does not define sign, level and slope of its values. They are measured,
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import sqrt
 from typing import Any
 
@@ -19,8 +20,9 @@ from renderers.fields.networks.network import Coded, Published
 
 SIGNED = r"(?:implicit_network|sdf_network\w*)"  # the name of IDR's, NeuS's and VolSDF's network
 LAYERS = r"lin(\d+)\."  # followed by weight or bias
-WRAPPER_PREFIX = r"(?:(?:module|model|model_state_dict|state_dict|decoder)\.)*"  # optional, in front of names of layers
+# Length and direction of a weight that torch normalises, in its older and its newer names.
 NORMALISED = (("weight_g", "weight_v"), ("parametrizations.weight.original0", "parametrizations.weight.original1"))
+SOFTPLUS_NOTE = "softplus with beta 100 between layers is assumed, as in IDR, NeuS and VolSDF"
 MAX_FREQUENCIES = 12  # IDR, NeuS and VolSDF have 6
 SOFTPLUS_BETA = 100  # as IDR, NeuS and VolSDF
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -35,18 +37,18 @@ class Weights:
 
     Args:
         tensors: by name.
-        pattern: of the prefix of the network's names, such as `module.`; tensors without the prefix are ignored.
+        pattern: of the prefix of the network's names, such as `model.`; tensors without the prefix are ignored.
         whose: the name of the checkpoint in error messages.
 
     Raises:
-        BadInput: if no name matches.
+        BadInput: if no name matches, or if several prefixes match the same number of names.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor], pattern: str = "", whose: str = "the network") -> None:
-        match = next(filter(None, (re.match(pattern, name) for name in tensors)), None)
-        if match is None:
+        prefixes = [match[0] for name in tensors if (match := re.match(pattern, name))]
+        if not prefixes:
             raise BadInput(f"it has no layers of this format: it has {', '.join([*tensors][:6]) or 'no tensors'}")
-        self.whose, self.prefix = whose, match[0]
+        self.whose, self.prefix = whose, choose_prefix(prefixes)
         names = [name for name in tensors if name.startswith(self.prefix)]
         self.remaining = {name.removeprefix(self.prefix): tensors[name].float() for name in names}
 
@@ -70,8 +72,7 @@ class Weights:
         for length, direction in NORMALISED:
             if f"{name}.{direction}" in self.remaining:
                 weight = self.take(f"{name}.{direction}", outputs, inputs)
-                scale = self.take(f"{name}.{length}", len(weight), 1)
-                weight = weight * (scale / torch.linalg.vector_norm(weight, dim=1, keepdim=True))
+                weight = scale_to_length(weight, self.take(f"{name}.{length}", len(weight), 1))
                 break
         else:
             full = f"{name}.weight"
@@ -95,6 +96,31 @@ class Weights:
     def _summary(self) -> str:
         shown, more = [f"{self.prefix}{name}" for name in [*self.remaining][:6]], len(self.remaining) - 6
         return ", ".join(shown) + (f" and {more} more" if more > 0 else "") or "nothing"
+
+
+def choose_prefix(prefixes: Iterable[str]) -> str:
+    """The prefix that occurs most often; of equals, the one that all of them begin with.
+
+    Raises:
+        BadInput: if there is none such.
+    """
+    counts = Counter(prefixes)
+    equals = [prefix for prefix, count in counts.items() if count == max(counts.values())]
+    shortest = min(equals, key=len)
+    if not all(prefix.startswith(shortest) for prefix in equals):
+        raise BadInput(f"it has several networks, {', '.join(equals)}: save the state_dict() of one of them")
+    return shortest
+
+
+def length_of(direction: Tensor, shape: Sequence[int]) -> Tensor:
+    """The lengths of a weight's vectors, in a shape that has size 1 along each vector, as torch normalises weights."""
+    axes = [axis for axis in range(direction.dim()) if len(shape) != direction.dim() or shape[axis] == 1]
+    return torch.linalg.vector_norm(direction, dim=axes, keepdim=True) if axes else direction.abs()
+
+
+def scale_to_length(direction: Tensor, length: Tensor) -> Tensor:
+    """A weight from its direction, of any length, and its length."""
+    return direction * (length / length_of(direction, length.shape))
 
 
 class Layered(nn.Module):
@@ -197,13 +223,13 @@ def load_deepsdf(tensors: Mapping[str, Tensor], specs: Mapping[str, Any], *, squ
     """The decoder of DeepSDF (Park et al. 2019), as the official code builds it from specs.json, without dropout.
 
     Args:
-        tensors: `model_state_dict`, with or without `module.`; weight normalisation in torch's format of 2019 or today.
+        tensors: `model_state_dict`, with any prefix; weight normalisation in torch's format of 2019 or today.
         specs: specs.json, with `NetworkSpecs` and `CodeLength`.
         squash: number of tanh after the last layer. None counts one for `use_tanh`, and one that the code of 2019
             always applies; newer code, which writes `geom_dimension`, does not.
     """
     network, code_length, dims = _check_specs(specs)
-    weights = Weights(tensors, f"{WRAPPER_PREFIX}(?={LAYERS})", "ModelParameters")
+    weights = Weights(tensors, rf"(?:.*\.)?(?={LAYERS})", "ModelParameters")
     again, input_size = {}, code_length + 3
     latent_in, every_layer = network.get("latent_in") or (), bool(network.get("xyz_in_all"))
     norm_layers = set(network.get("norm_layers") or ()) if not network.get("weight_norm") else set()
@@ -277,7 +303,8 @@ def load_sdf_network(tensors: Mapping[str, Tensor]) -> Published:
         )
     layers[-1] = (layers[-1][0][:1], layers[-1][1][:1])
     body = Layered(layers, activation="softplus", again=again, frequencies=frequencies, shrink=sqrt(0.5))
-    return Published(Coded(body, code_length=0, width=max(len(bias) for _, bias in layers)))
+    coded = Coded(body, code_length=0, width=max(len(bias) for _, bias in layers))
+    return Published(coded, assumption=SOFTPLUS_NOTE)
 
 
 def load_occupancy_network(tensors: Mapping[str, Tensor]) -> Published:
@@ -288,7 +315,7 @@ def load_occupancy_network(tensors: Mapping[str, Tensor]) -> Published:
     """
     if any("encoder.unet" in name or "encoder.fc_pos" in name for name in tensors):
         raise BadInput("it is a convolutional occupancy network, whose code differs from point to point: not read")
-    weights = Weights(tensors, rf"(?:{WRAPPER_PREFIX}|.*\.decoder\.)(?=(?:fc|conv)_p\.)", "the decoder")
+    weights = Weights(tensors, r"(?:.*\.)?(?=(?:fc|conv)_p\.)", "the decoder")
     kind = "fc" if weights.has("fc_p") else "conv"
     first = weights.layer(f"{kind}_p", 3)
     width = len(first[1])
