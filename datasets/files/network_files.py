@@ -168,9 +168,8 @@ class ModuleFile(NetworkFile):
         values = [value for layer in self.module.modules() for value in vars(layer).values()]
         computed = [value for value in values if isinstance(value, Tensor) and not value.is_leaf]
         module = cast(nn.Module, deepcopy(self.module, {id(value): value.detach() for value in computed}))
-        module.eval().requires_grad_(False)
-        fit_weights(module, read_tensors(Path(self.path)))
-        body = _checked(module)
+        fit_weights(module.eval(), read_tensors(Path(self.path)))
+        body = _checked(module.requires_grad_(False))  # lazy layers have no parameters before
         return Published(Coded(body, code_length=0, width=ASSUMED_WIDTH), assumption=body.note)
 
 

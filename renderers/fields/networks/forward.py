@@ -35,11 +35,12 @@ class CheckedForward(nn.Module):
         network: an nn.Module, or any function of points.
         batched: whether it takes points [1, n, 3].
         key: of the values in what it gives, such as "0" of a tuple; "" if it gives a tensor.
+        note: on the key and on coarse types; empty if there is nothing to note.
     """
 
-    def __init__(self, network: Callable[..., Any], *, batched: bool = False, key: str = "") -> None:
+    def __init__(self, network: Callable[..., Any], *, batched: bool, key: str = "", note: str = "") -> None:
         super().__init__()
-        self.network, self.batched, self.key = network, batched, key
+        self.network, self.batched, self.key, self.note = network, batched, key, note
 
     def forward(self, points: Float[Tensor, "n 3"], code: Tensor | None = None) -> Float[Tensor, " n"]:
         if not len(points):
@@ -54,13 +55,6 @@ class CheckedForward(nn.Module):
         """What the network gives at a copy of the points, in the type of its weights."""
         copied = points.to(self._dtype(points), copy=True)
         return self.network(copied[None] if self.batched else copied)
-
-    @property
-    def note(self) -> str:
-        """Which part of the network's output is used, and coarse types; empty if there is nothing to note."""
-        coarse = self._dtype(torch.zeros(())).itemsize < 4
-        uses = [f"values are {self.key!r} of the output of {name_of(self.network)}"] if self.key else []
-        return "; ".join([*uses, *(["computed in half precision, which the class needs"] if coarse else [])])
 
     def _dtype(self, points: Tensor) -> torch.dtype:
         tensors = chain(self.parameters(), self.buffers())
@@ -78,8 +72,11 @@ def check_forward(network: Callable[..., Any], like: Tensor) -> CheckedForward:
     """
     points = points_in_sphere(CHECKED_POINTS, like)
     _check_arguments(network)
-    checked, output = _call(network, points)
-    checked.key = _key_of_values(network, output)
+    batched, output = _call(network, points)
+    key, dtype = _key_and_dtype(network, output)
+    notes = [f"values are {key!r} of the output of {name_of(network)}"] if key else []
+    notes += [f"values come in {_name(dtype)}, which is coarse"] if dtype.itemsize < torch.float32.itemsize else []
+    checked = CheckedForward(network, batched=batched, key=key, note="; ".join(notes))
     with torch.no_grad():
         values, again, few = checked(points), checked(points), checked(points[: CHECKED_POINTS // 2])
     limit = MAX_CHANGE * (values.max() - values.min())
@@ -129,28 +126,25 @@ def _check_arguments(network: Callable[..., Any]) -> None:
         )
 
 
-def _call(network: Callable[..., Any], points: Tensor) -> tuple[CheckedForward, Any]:
-    """The network with the first form of points that it takes, [n, 3] or [1, n, 3], and what it gives."""
+def _call(network: Callable[..., Any], points: Tensor) -> tuple[bool, Any]:
+    """Whether the network takes points [1, n, 3], which are tried after [n, 3], and what it gives."""
     errors = []
     for batched in (False, True):
-        checked = CheckedForward(network, batched=batched)
         try:
             with torch.no_grad():
-                return checked, checked.output(points)
+                return batched, CheckedForward(network, batched=batched).output(points)
         except ERRORS as error:
             errors.append(error)
-    cause = f"{type(errors[0]).__name__}: {' '.join(str(errors[0]).split())[:200]}"
-    raise BadInput(
-        f"{name_of(network)} fails at points [n, 3], n = {len(points)}, where gradients are off: {cause}. {WANTED}"
-    ) from errors[0]
+    where = f"points [n, 3], n = {len(points)}, where gradients are off"
+    raise BadInput(f"{name_of(network)} fails at {where}: {_cause(errors[0])}: {WANTED}") from errors[0]
 
 
-def _key_of_values(network: Callable[..., Any], output: Any) -> str:
-    """The name of the only tensor with one value per point; raises BadInput if there is none, or several."""
+def _key_and_dtype(network: Callable[..., Any], output: Any) -> tuple[str, torch.dtype]:
+    """Name and type of the only tensor with one value per point; raises BadInput if there is none, or several."""
     tensors = dict(tensors_in(output))
     keys = [key for key, tensor in tensors.items() if _has_value_per_point(tensor, CHECKED_POINTS)]
     if len(keys) == 1:
-        return keys[0]
+        return keys[0], tensors[keys[0]].dtype
     what = "None" if output is None else f"a {type(output).__name__}"
     if tensors:
         shown = (f"{key}: " * bool(key) + _describe(tensor, CHECKED_POINTS) for key, tensor in [*tensors.items()][:6])
@@ -165,7 +159,15 @@ def _has_value_per_point(tensor: Tensor, count: int) -> bool:
 
 def _describe(tensor: Tensor, count: int) -> str:
     sizes = ", ".join("n" if size == count else str(size) for size in tensor.shape)
-    return f"{str(tensor.dtype).removeprefix('torch.')} [{sizes}]"
+    return f"{_name(tensor.dtype)} [{sizes}]"
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _cause(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:240]}"
 
 
 def _check_gradient(checked: CheckedForward, points: Tensor) -> None:
@@ -179,18 +181,17 @@ def _check_gradient(checked: CheckedForward, points: Tensor) -> None:
             total = values.sum()
             gradient = torch.autograd.grad(total, leaf, allow_unused=True)[0] if total.requires_grad else None
         except ERRORS as error:
-            cause = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            raise BadInput(f"{name} has no gradient towards the points: {cause}") from error
+            remedy = "use no in-place operation in it"
+            raise BadInput(f"{name} has no gradient towards the points: {_cause(error)}: {remedy}") from error
     if gradient is None:
         raise BadInput(f"the values of {name} have no gradient towards the points: {cut}")
+    share = _share_of_differences(checked, points, gradient)
+    if share is not None and (share < GRADIENT_SHARE[0] or share > GRADIENT_SHARE[1]):
+        message = f"the gradient of {name} towards the points is {share:.2g} times the change of its values"
+        raise BadInput(f"{message}: {cut}")
     if not bool(gradient.any()):
         remedy = "return values before sign, round or a threshold, and trained weights"
         raise BadInput(f"the gradient of {name} is 0 at all of {len(points)} points: {remedy}")
-    share = _share_of_differences(checked, points, gradient)
-    if share is not None and (share < GRADIENT_SHARE[0] or share > GRADIENT_SHARE[1]):
-        raise BadInput(
-            f"the gradient of {name} towards the points is {share:.2g} times the change of its values: {cut}"
-        )
 
 
 @torch.no_grad()
