@@ -9,6 +9,8 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +29,16 @@ NUMPY_SCALAR_CLASSES = [  # some checkpoints store their best loss as a NumPy sc
     *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
     *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
 ]
-WRAPPERS = {"module", "_orig_mod"}  # in names, by DataParallel and torch.compile
+WRAPPERS = re.compile(r"(?<![^.])(?:(?:module|_orig_mod)\.)+")  # in names, by DataParallel and torch.compile
 AVERAGED_COUNT = "n_averaged"  # which torch's AveragedModel adds to the weights
 NORMALISED_ENDING = re.compile(rf"\b({'|'.join(re.escape(name) for names in NORMALISED for name in names)})$")
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a checkpoint by dotted names without `WRAPPERS`, on the CPU; all other contents are left out."""
+    """The tensors of a checkpoint by their dotted names, on the CPU; all other contents are left out."""
     try:
         with torch.serialization.safe_globals(NUMPY_SCALAR_CLASSES), warnings.catch_warnings(action="ignore"):
-            tensors = dict(_flatten(torch.load(path, weights_only=True, map_location="cpu")))
+            return dict(_flatten(torch.load(path, weights_only=True, map_location="cpu")))
     except CHECKPOINT_ERRORS as error:
         message = "is no network file, or is broken: name a checkpoint of weights, an .npz or a folder"
         if blocked := re.search(r"GLOBAL (\S+)", str(error)):
@@ -47,8 +49,12 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
             message = f"a program, which is not run: save its state_dict(), and name its class by {OWN_CLASS}"
             raise BadInput(f"{path.name} is TorchScript, {message}") from error
         raise BadInput(f"{path.name} cannot be read: it may be cut short, copy it again") from error
+
+
+def without_wrappers(tensors: Mapping[str, Tensor], *, keep_first: bool = False) -> dict[str, Tensor]:
+    """The tensors by names without `WRAPPERS`, or without all but the first of each name."""
     names = [name for name in tensors if name.rpartition(".")[2] != AVERAGED_COUNT]
-    return {short: tensors[name] for name, short in _without_wrappers(names).items()}
+    return {short: tensors[name] for name, short in _short_names(names, keep_first).items()}
 
 
 def read_arrays(path: Path) -> dict[str, Tensor]:
@@ -73,9 +79,10 @@ def read_codes(path: Path, length: int) -> Float[Tensor, "shapes length"]:
             raise BadInput(f"{path.name} cannot be read: {error}") from error
     else:
         tensors = {name: tensor for name, tensor in read_tensors(path).items() if tensor.dim()}
-    usable = [table for tensor in tensors.values() if (table := _table(tensor, length)) is not None]
+    candidates = [tensor for tensor in tensors.values() if tensor.dim() > 1] or [*tensors.values()]
+    usable = [table for tensor in candidates if (table := _table(tensor, length)) is not None]
     tables = [table for table in usable if len(table) > 1] or usable
-    are_single = len(usable) == len(tensors) == sum(map(len, usable))
+    are_single = len(usable) == len(candidates) == sum(map(len, usable))
     if len(tables) == 1 or (tables and are_single):
         return torch.cat(tables).float()
     shown = _listed(f"{name} {list(tensor.shape)}" for name, tensor in tensors.items()) or "no tensors"
@@ -91,35 +98,60 @@ def fit_weights(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     Raises:
         BadInput: a name is missing, a tensor has another shape, or the module has no use for a tensor under the prefix.
     """
+    fit = _fit(module, without_wrappers(tensors))
+    if fit.faults:  # the first wrapper may be the prefix
+        with suppress(BadInput):
+            other = _fit(module, without_wrappers(tensors, keep_first=True))
+            fit = fit if other.faults else other
+    class_name = type(module).__name__
+    if fit.faults:
+        remedy = f"give {class_name} the arguments of its training by field.NAME=VALUE, or save its state_dict() alone"
+        if not (fit.unused or fit.wrong or {*fit.missing} & {*dict(module.named_parameters())}):
+            remedy = "register these buffers with persistent=False, if the class computes them"
+        raise BadInput(f"its weights are not those of {class_name}: {'; '.join(fit.faults)}: {remedy}")
+    saved = module.state_dict().keys()
+    try:
+        module.load_state_dict({name: tensor for name, tensor in fit.state.items() if name in saved})
+    except RuntimeError as error:
+        raise BadInput(f"{class_name} cannot take its weights: {' '.join(str(error).split())}") from error
+    for name in fit.state.keys() - saved:
+        module.get_buffer(name).copy_(fit.state[name])
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The tensors of a file by a module's names, and the names that do not fit."""
+
+    state: dict[str, Tensor]
+    missing: list[str]
+    unused: list[str]
+    wrong: list[str]
+
+    @property
+    def faults(self) -> list[str]:
+        """Sentences on the names that do not fit."""
+        sentences = (("it lacks", self.missing), ("the class has no", self.unused), ("it has", self.wrong))
+        return [f"{text} {_listed(names)}" for text, names in sentences if names]
+
+
+def _fit(module: nn.Module, tensors: Mapping[str, Tensor]) -> _Fit:
     saved = {name: tensor for name, tensor in module.state_dict().items() if isinstance(tensor, Tensor)}
     wanted = {**dict(module.named_buffers()), **saved}
-    short_names = _without_wrappers(wanted)
+    short_names = _short_names(wanted)
     shapes = {_plain(short): _shape(wanted[name]) for name, short in short_names.items()}
     prefix = choose_prefix([*_prefixes(tensors, shapes)] or [""])
     under = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
     matches = {name: _find(under, short_names[name], like) for name, like in wanted.items()}
     used = {name for _, names in matches.values() for name in names}
     state = {name: tensor for name, (tensor, _) in matches.items() if tensor is not None}
-    class_name, faults = type(module).__name__, []
-    # Files of older versions of torch lack the counts of batches, which torch adds.
-    if missing := [name for name in saved if name not in state and not name.endswith("num_batches_tracked")]:
-        faults.append(f"it lacks {_listed(missing)}, which {class_name} has")
-    if unused := [prefix + name for name in under if name not in used]:
-        faults.append(f"{class_name} has no {_listed(unused)}")
-    if wrong := [name for name in state if _shape(wanted[name]) not in (None, state[name].shape)]:
-        sizes = (f"{name} {list(state[name].shape)} instead of {list(wanted[name].shape)}" for name in wrong)
-        faults.append(f"it has {_listed(sizes)}")
-    if faults:
-        remedy = f"give {class_name} the arguments of its training by field.NAME=VALUE, or save its state_dict() alone"
-        if missing and not unused and not wrong and not {*missing} & {*dict(module.named_parameters())}:
-            remedy = "register these buffers with persistent=False, if the class computes them"
-        raise BadInput(f"its weights are not those of {class_name}: {'; '.join(faults)}: {remedy}")
-    try:
-        module.load_state_dict({name: tensor for name, tensor in state.items() if name in saved})
-    except RuntimeError as error:
-        raise BadInput(f"{class_name} cannot take its weights: {' '.join(str(error).split())}") from error
-    for name in state.keys() - saved.keys():
-        module.get_buffer(name).copy_(state[name])
+    wrong = [name for name in state if _shape(wanted[name]) not in (None, state[name].shape)]
+    return _Fit(
+        state,
+        # Files of older versions of torch lack the counts of batches, which torch adds.
+        missing=[name for name in saved if name not in state and not name.endswith("num_batches_tracked")],
+        unused=[prefix + name for name in under if name not in used],
+        wrong=[f"{name} {list(state[name].shape)} instead of {list(wanted[name].shape)}" for name in wrong],
+    )
 
 
 def _flatten(node: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
@@ -130,9 +162,10 @@ def _flatten(node: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
             yield from _flatten(value, f"{prefix}{key}.")
 
 
-def _without_wrappers(names: Iterable[str]) -> dict[str, str]:
+def _short_names(names: Iterable[str], keep_first: bool = False) -> dict[str, str]:
     """Each name without `WRAPPERS`, or as it is if two names would be equal."""
-    short = {name: ".".join(part for part in name.split(".") if part not in WRAPPERS) or name for name in names}
+    ends = {name: match.end() if keep_first and (match := WRAPPERS.search(name)) else 0 for name in names}
+    short = {name: name[:end] + WRAPPERS.sub("", name[end:]) for name, end in ends.items()}
     return short if len({*short.values()}) == len(short) else {name: name for name in short}
 
 

@@ -18,7 +18,7 @@ from typing import Any, Protocol, cast, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from datasets.files.checkpoints import OWN_CLASS, fit_weights, read_arrays, read_codes, read_tensors
+from datasets.files.checkpoints import OWN_CLASS, fit_weights, read_arrays, read_codes, read_tensors, without_wrappers
 from datasets.files.field_files import ASSUMED_WIDTH, load_network
 from datasets.mesh import Mesh, extract
 from datasets.saved_field import FIELD_FILE
@@ -254,7 +254,7 @@ def _read(file: NetworkFile) -> tuple[Published, Tensor]:
     elif path.suffix == ".npz":
         network = load_mlp(read_arrays(path))
     else:
-        network = _by_tensor_names(read_tensors(path))
+        network = _by_tensor_names(without_wrappers(read_tensors(path)))
     length, stored = network.code_length, path / DEEPSDF_FILES[1]
     if file.codes is not None:
         return network, read_codes(Path(file.codes), length)
@@ -279,7 +279,7 @@ def _read_folder(path: Path, squash: int | None) -> Published:
     weights = path / DEEPSDF_FILES[0]
     if not weights.is_file():
         raise BadInput(f"the folder has no {DEEPSDF_FILES[0]}")
-    return load_deepsdf(read_tensors(weights), specs, squash=squash)
+    return load_deepsdf(without_wrappers(read_tensors(weights)), specs, squash=squash)
 
 
 def _by_tensor_names(tensors: dict[str, Tensor]) -> Published:

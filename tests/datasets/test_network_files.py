@@ -309,7 +309,7 @@ def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkey
     several = {f"{name}.inner.{key}": value for name in "ab" for key, value in state.items()}
     for wrong, words in (
         (several, r"it has several networks, a\., b\.: save the state_dict"),
-        ({"net.inner.bias": state["bias"]}, r"not those of Net: it lacks inner\.weight, .* by field\."),
+        ({"net.inner.bias": state["bias"]}, r"not those of Net: it lacks inner\.weight: .* by field\."),
     ):
         torch.save(wrong, tmp_path / "a.pth")
         with pytest.raises(BadInput, match=words):
