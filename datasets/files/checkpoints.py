@@ -29,7 +29,8 @@ NUMPY_SCALAR_CLASSES = [  # some checkpoints store their best loss as a NumPy sc
     *((np._core.multiarray.scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
     *(np.dtype, *(type(np.dtype(name)) for name in ("f4", "f8", "i8"))),
 ]
-WRAPPERS = re.compile(r"(?<![^.])(?:(?:module|_orig_mod)\.)+")  # in names, by DataParallel and torch.compile
+# DataParallel and torch.compile write these words into names.
+WRAPPERS = re.compile(r"(?<![^.])(?:(?:module|_orig_mod)\.)+")
 AVERAGED_COUNT = "n_averaged"  # which torch's AveragedModel adds to the weights
 NORMALISED_ENDING = re.compile(rf"\b({'|'.join(re.escape(name) for names in NORMALISED for name in names)})$")
 
@@ -182,10 +183,10 @@ def _shape(tensor: Tensor) -> torch.Size | None:
 def _prefixes(tensors: Mapping[str, Tensor], shapes: Mapping[str, torch.Size | None]) -> Iterator[str]:
     """The prefix of each tensor whose name ends as a name of `shapes`; twice if it has the shape, too."""
     for name, tensor in tensors.items():
-        parts = _plain(name).split(".")
-        for count in range(len(parts)):
-            if (ending := ".".join(parts[count:])) in shapes:
-                prefix = "".join(f"{part}." for part in parts[:count])
+        words = _plain(name).split(".")
+        for count in range(len(words)):
+            if (ending := ".".join(words[count:])) in shapes:
+                prefix = "".join(f"{word}." for word in words[:count])
                 yield from [prefix, prefix] if tensor.shape == shapes[ending] else [prefix]
 
 
@@ -205,7 +206,7 @@ def _normalised(tensors: Mapping[str, Tensor], name: str, like: Tensor) -> tuple
     ending = name.removeprefix(layer)
     index = next((pair.index(ending) for pair in NORMALISED if ending in pair), None)
     for pair in NORMALISED:
-        names = [layer + part for part in pair]
+        names = [layer + suffix for suffix in pair]
         if all(each in tensors for each in names):
             length, direction = (tensors[each].float() for each in names)
             return scale_to_length(direction, length) if index is None else (length, direction)[index], {*names}

@@ -38,6 +38,7 @@ from renderers.fields.networks.network import (
 from renderers.fields.networks.published import (
     LAYERS,
     SIGNED,
+    SOFTPLUS_NOTE,
     Residual,
     load_deepsdf,
     load_mlp,
@@ -228,17 +229,17 @@ def _no_surface(file: NetworkFile, network: Published, meaning: FieldInterpretat
     facts = meaning.statistics
     ends = (file.level + value / (meaning.factor * meaning.divisor) for value in (facts.min_value, facts.max_value))
     low, high = sorted(ends)
-    hints = ["a number between them"]
+    hint = "a number between them"
     if 0 <= low <= TOUCHING_SHARE * high and facts.near_slopes[1] >= UNSIGNED_SLOPE_SHARE * facts.max_slope:
-        hints = ["0.05 for a shell, as unsigned distances have no inside"]
+        hint = "0.05 for a shell, as unsigned distances have no inside"
     elif 0 <= low < 0.5 < high <= 1:
-        hints = ["0.5 where they are probabilities"]
-    elif low >= 0:
-        hints = [f"such as {(low + high) / 2:.2g} where they are densities"]
-    hints = [network.assumption, "a number between them"] if network.assumption else hints
+        hint = "0.5 where they are probabilities"
+    elif low >= 0 and SOFTPLUS_NOTE not in network.assumption:
+        hint = f"such as {(low + high) / 2:.2g} where they are densities"
+    assumption = f" ({network.assumption})" if network.assumption else ""
     return (
         f"its values in the unit sphere lie between {low:.3g} and {high:.3g}, and the surface at the level "
-        f"{file.level:g} is not among them: set dataset.level ({'; '.join(hints)}), or dataset.scale"
+        f"{file.level:g} is not among them{assumption}: set dataset.level ({hint}), or dataset.scale"
     )
 
 

@@ -3,6 +3,7 @@
 import os
 import pickle
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from tests.composing import composed
 from tests.documentation import code_of
 from tests.looped import each
 from tests.made_networks import RADIUS, arrays, deepsdf_folder, npz, octahedron
-from tests.renderers.test_published import CODE, occupancy
+from tests.renderers.test_published import CODE, directly, implicit, occupancy
 from tests.tiny import inputs_from
 
 NET = """
@@ -316,6 +317,88 @@ def test_a_network_of_a_class_of_the_users_is_read_by_its_state(tmp_path, monkey
             composed_inputs(*overrides, "task=ablation", "packages=[mynet]")
     with pytest.raises(ValueError, match=r"type packages=\[mynet\] if you trust it"):
         composed_inputs(*overrides, "task=ablation")
+
+
+OUTPUTS = """
+import torch
+from torch import nn
+
+class Box(nn.Module):
+    def __init__(self, output, dtype="float32", norm=False):
+        super().__init__()
+        self.inner, self.output = nn.Linear(3, 6, dtype=getattr(torch, dtype)), output
+        self.inner = nn.utils.weight_norm(self.inner) if norm else self.inner
+
+    def forward(self, points):
+        values = self.inner(points.double() if self.output == "double" else points).relu().sum(-1) / 3**0.5 - 0.5
+        if self.output == "in place":
+            points *= 0
+        return {
+            "tuple": (values, points), "table": {"sdf": values}, "columns": points * 0 + values[:, None],
+            "unsigned": values.abs(), "probability": (-9 * values).sigmoid(), "density": (points, 9 * (-values).relu()),
+        }.get(self.output, values)
+"""
+
+
+def box(folder: Path, monkeypatch: pytest.MonkeyPatch, *keys: str) -> RunInputs:
+    """A run's inputs whose field is the octahedron, in a class of the user with these keys."""
+    (folder / "boxes.py").write_text(OUTPUTS)
+    monkeypatch.syspath_prepend(folder)
+    layers = arrays()
+    state = {"weight": torch.tensor(layers["0000.dense.A"].T), "bias": torch.tensor(layers["0000.dense.b"])}
+    torch.save({f"_orig_mod.inner.{key}": value for key, value in state.items()}, folder / "a.pth")
+    field = ["field=file", f"field_path={folder}/a.pth", "field._target_=boxes.Box", *keys]
+    return composed_inputs(*expand_field_file(field), "task=ablation", "packages=[boxes]")
+
+
+@each("keys, note", [
+    (["field.output=tuple"], "values are '0' of the output of Box.forward"),
+    (["field.output=table"], "values are 'sdf' of the output of Box.forward"),
+    (["field.output=in place"], "level 0; slopes"),
+    (["field.output=plain", "field.norm=true"], "level 0; slopes"),
+    (["field.output=plain", "field.dtype=float16"], "level 0; slopes"),
+    (["field.output=plain", "field.dtype=float64"], "level 0; slopes"),
+    (["field.output=double", "field.dtype=float64"], "level 0; slopes"),
+])  # fmt: skip
+@pytest.mark.filterwarnings("ignore::FutureWarning")  # of the older normalisation of weights
+def test_a_users_class_is_converted_where_it_can_be(tmp_path, monkeypatch, keys, note):
+    inputs = box(tmp_path, monkeypatch, *keys)
+    field = inputs.prior.decoder.at(inputs.prior.codes[0])
+    near(field(POINTS), octahedron(POINTS), 1e-6)
+    assert note in inputs.notes[-1] and field(POINTS).dtype == torch.float32
+
+
+@each("output, remedy", [
+    ("unsigned", r"dataset\.level \(0\.05 for a shell, as unsigned distances have no inside\)"),
+    ("probability", r"dataset\.level \(0\.5 where they are probabilities\)"),
+    ("density", r"dataset\.level \(such as 2\.\d where they are densities\)"),
+    ("columns", r"Box\.forward gives a Tensor of float32 \[n, 3\]: .*return the values alone"),
+])  # fmt: skip
+def test_a_users_class_is_refused_with_file_cause_and_remedy(tmp_path, monkeypatch, output, remedy):
+    with pytest.raises(BadInput, match=rf"the network {tmp_path}/a\.pth: .*{remedy}"):
+        box(tmp_path, monkeypatch, f"field.output={output}")
+
+
+@each("output, level, inside", [
+    ("unsigned", 0.05, lambda values: values.abs() < 0.05),
+    ("probability", 0.5, lambda values: values < 0),
+    ("density", 2.25, lambda values: values < -0.25),
+])  # fmt: skip
+def test_the_remedies_for_values_of_one_sign_hold(tmp_path, monkeypatch, output, level, inside):
+    inputs = box(tmp_path, monkeypatch, f"field.output={output}", f"dataset.level={level}")
+    assert torch.equal(inputs.prior.decoder.at(inputs.prior.codes[0])(POINTS) < 0, inside(octahedron(POINTS)))
+
+
+def test_the_activation_of_neus_is_named_as_an_assumption(tmp_path):
+    torch.manual_seed(0)
+    state, values = implicit("implicit_network._orig_mod.", 0, directly)
+    for shift in (-values.median(), 99.0):
+        last = "implicit_network._orig_mod.lin3.bias"
+        file = checkpoint(tmp_path, state | {last: state[last] + shift})
+        with nullcontext() if shift < 99 else pytest.raises(BadInput) as error:
+            shown = file.network(0).notes[0]
+        shown = shown if shift < 99 else str(error.value)
+        assert "softplus" in shown and "field._target_=PACKAGE.CLASS" in shown
 
 
 def test_a_stress_that_a_network_has_no_part_in_is_refused(tmp_path):

@@ -265,6 +265,12 @@ def plain_with(state: Any) -> Any:
         lambda: published.load_sdf_network(implicit("module.", 0, directly)[0]),
         ("no layers of this format", "module.lin0"),
     ),
+    (
+        lambda: published.load_sdf_network({
+            **implicit("model.sdf_network.", 0, directly)[0], **implicit("ema.sdf_network.", 0, directly)[0]
+        }),
+        ("several networks, model.sdf_network., ema.sdf_network.", "save the state_dict() of one"),
+    ),
     (lambda: cbn_with(lambda s: s | {"decoder.fc_p.weight": drawn(8, 2, 1)}), ("fc_p.weight must be any x 3",)),
     (lambda: cbn_with(lambda s: without(s, "decoder.bn.bn.running_var")), ("lacks decoder.bn.bn.running_var",)),
     (lambda: plain_with(lambda s: s | {"0000.dense.A": drawn(2, 8)}), ("0000.dense.A must be 3 x any", "2 x 8")),

@@ -21,7 +21,8 @@ CHECKED_POINTS = 127  # no usual width or batch size of a network
 WANTED = "forward must take points [n, 3] and give one value per point, [n] or [n, 1]"
 # What code of a user raises. Out of memory is a RuntimeError, but not at so few points.
 ERRORS = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, AssertionError, ArithmeticError)
-MAX_CHANGE = 0.01  # of a value between evaluations of the same point, as a fraction of the range of the values
+# Most that a value may differ between two evaluations of a point, as a fraction of the range of the values.
+MAX_REPEAT_DIFFERENCE = 0.01
 # Gradients are compared with differences of values where the differences of two steps agree.
 DIFFERENCE_STEPS = (1e-2, 5e-3)
 MAX_DIFFERENCE_CHANGE, MIN_COMPARED_POINTS = 0.05, 10
@@ -79,7 +80,7 @@ def check_forward(network: Callable[..., Any], like: Tensor) -> CheckedForward:
     checked = CheckedForward(network, batched=batched, key=key, note="; ".join(notes))
     with torch.no_grad():
         values, again, few = checked(points), checked(points), checked(points[: CHECKED_POINTS // 2])
-    limit = MAX_CHANGE * (values.max() - values.min())
+    limit = MAX_REPEAT_DIFFERENCE * (values.max() - values.min())
     for changed, cause in (
         (again, "differ between two calls at the same points: call eval(), and draw nothing at random in it"),
         (few, "at a point depend on the other points of the call: call eval(), and normalise by constants"),
