@@ -7,8 +7,6 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from contextlib import suppress
-from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from math import isfinite
@@ -26,7 +24,7 @@ from datasets.scene import SceneNetwork, Split
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Kind
 from renderers.fields.analytic import Shape, sphere
-from renderers.fields.networks.forward import CheckedForward, check_forward
+from renderers.fields.networks.forward import check_module, copy_module
 from renderers.fields.networks.network import (
     Coded,
     FieldInterpretation,
@@ -165,22 +163,10 @@ class ModuleFile(NetworkFile):
 
     def read(self) -> Published:
         """The network in evaluation mode, with the weights of the file; their names may have any prefix."""
-        # Normalised weights of older classes are computed attributes, which cannot be copied as they are.
-        values = [value for layer in self.module.modules() for value in vars(layer).values()]
-        computed = [value for value in values if isinstance(value, Tensor) and not value.is_leaf]
-        module = cast(nn.Module, deepcopy(self.module, {id(value): value.detach() for value in computed}))
+        module = copy_module(cast(nn.Module, self.module))
         fit_weights(module.eval(), read_tensors(Path(self.path)))
-        body = _checked(module.requires_grad_(False))  # lazy layers have no parameters before
+        body = check_module(module.requires_grad_(False))  # lazy layers have no parameters before
         return Published(Coded(body, code_length=0, width=ASSUMED_WIDTH), assumption=body.note)
-
-
-def _checked(module: nn.Module) -> CheckedForward:
-    """The module in float32, or in its types if its forward pass needs them."""
-    like = torch.zeros(())
-    if any(tensor.is_floating_point() and tensor.dtype != like.dtype for tensor in module.state_dict().values()):
-        with suppress(BadInput):
-            return check_forward(deepcopy(module).float(), like)
-    return check_forward(module, like)
 
 
 @lru_cache(maxsize=4)

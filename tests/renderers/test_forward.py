@@ -1,6 +1,7 @@
 """A user's forward pass: what is converted, and what is refused, over forms, types and containers that are drawn."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import make_dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 
 from renderers.checks import BadInput
 from renderers.field import autograd_gradients, points_in_sphere
-from renderers.fields.networks.forward import check_forward
+from renderers.fields.networks.forward import check_forward, check_module
 from renderers.fields.networks.network import from_module
 from tests.looped import each
 
@@ -83,6 +84,29 @@ def test_types_shapes_and_containers_are_converted(container, form, weights, res
     slopes = autograd_gradients(checked, POINTS)
     torch.testing.assert_close(slopes, autograd_gradients(sphere, POINTS), rtol=0, atol=16 * coarse)
     assert bool(checked.note) == (container(POINTS, POINTS) is not POINTS or result.itemsize < 4)
+
+
+class Casting(nn.Module):
+    """A sphere through a matrix that is no parameter, in a type that the class needs; it keeps a computed tensor."""
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.radius, self.matrix = nn.Parameter(torch.tensor([0.5], dtype=dtype)), torch.eye(3, dtype=dtype)
+
+    def forward(self, points: Tensor) -> Tensor:
+        self.kept = points.to(self.matrix.dtype) @ self.matrix
+        return torch.dot(self.radius, torch.ones(1, dtype=self.matrix.dtype)).neg() + self.kept.norm(dim=-1)
+
+
+@given(dtype=st.sampled_from(DTYPES), later=st.sampled_from((torch.float32, torch.float64)))
+def test_a_class_that_needs_its_types_keeps_them(dtype, later):
+    checked = check_module(Casting(dtype))
+    limit = 8 * max(torch.finfo(dtype).eps, torch.finfo(torch.float32).eps)
+    for version in (checked, deepcopy(checked).to(later)):
+        for points in (POINTS.clone(), POINTS.double()):
+            values = version(points.requires_grad_())
+            assert values.dtype == points.dtype
+            torch.testing.assert_close(values.detach().float(), sphere(POINTS), rtol=0, atol=limit)
 
 
 @torch.no_grad()

@@ -6,6 +6,7 @@ evaluations at few points before the network is used.
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import fields, is_dataclass
 from itertools import chain
 from typing import Any
@@ -37,11 +38,15 @@ class CheckedForward(nn.Module):
         batched: whether it takes points [1, n, 3].
         key: of the values in what it gives, such as "0" of a tuple; "" if it gives a tensor.
         note: on the key and on coarse types; empty if there is nothing to note.
+
+    Attributes:
+        keeps_types: whether `double`, `half` and such leave the network's types, as its forward pass needs them.
     """
 
     def __init__(self, network: Callable[..., Any], *, batched: bool, key: str = "", note: str = "") -> None:
         super().__init__()
         self.network, self.batched, self.key, self.note = network, batched, key, note
+        self.keeps_types = False
 
     def forward(self, points: Float[Tensor, "n 3"], code: Tensor | None = None) -> Float[Tensor, " n"]:
         if not len(points):
@@ -56,6 +61,16 @@ class CheckedForward(nn.Module):
         """What the network gives at a copy of the points, in the type of its weights."""
         copied = points.to(self._dtype(points), copy=True)
         return self.network(copied[None] if self.batched else copied)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "CheckedForward":
+        return super()._apply((lambda tensor: fn(tensor).to(tensor.dtype)) if self.keeps_types else fn, recurse)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "CheckedForward":
+        network = self.network
+        network = copy_module(network, memo) if isinstance(network, nn.Module) else network
+        copied = CheckedForward(network, batched=self.batched, key=self.key, note=self.note)
+        copied.keeps_types = self.keeps_types
+        return copied.train(self.training)
 
     def _dtype(self, points: Tensor) -> torch.dtype:
         tensors = chain(self.parameters(), self.buffers())
@@ -89,6 +104,32 @@ def check_forward(network: Callable[..., Any], like: Tensor) -> CheckedForward:
             raise BadInput(f"the values of {name_of(network)} {cause}")
     _check_gradient(checked, points)
     return checked
+
+
+def check_module(module: nn.Module) -> CheckedForward:
+    """As `check_forward`, in float32 on the CPU, or in the module's types if its forward pass needs them."""
+    like = torch.zeros(())
+    try:
+        checked = check_forward(copy_module(module).float(), like)
+    except BadInput:
+        checked = check_forward(module, like)
+        checked.keeps_types = True
+        return checked
+    try:
+        with torch.no_grad():
+            deepcopy(checked).double()(points_in_sphere(CHECKED_POINTS))  # as for references
+    except ERRORS:
+        checked.keeps_types = True
+    return checked
+
+
+def copy_module(module: nn.Module, memo: dict[int, Any] | None = None) -> nn.Module:
+    """A deep copy, in which computed attributes, such as weights of torch's older normalisation, have no graph."""
+    values = (value for layer in module.modules() for value in vars(layer).values())
+    computed = [value for value in values if isinstance(value, Tensor) and not value.is_leaf]
+    memo = {} if memo is None else memo
+    memo |= {id(value): value.detach() for value in computed}
+    return deepcopy(module, memo)
 
 
 def name_of(network: Callable[..., Any]) -> str:
