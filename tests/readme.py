@@ -84,11 +84,17 @@ def table() -> str:
     head = ["`renderer=`", *costs, "runtime of 1 unit of a completion (s)"]
     rows = []
     for line in _lines("suite"):
-        ranks = {budget: line[f"{budget}_rank"] for budget in _budgets()}
-        progress = [f"{_percent(line[b])} ({rank})" if line[b] else rank for b, rank in ranks.items()]
+        progress = [_progress(line, budget) for budget in _budgets()]
         runtime = f"{float(text):.2g}" if (text := seconds.get(line["row"])) else "–"
         rows.append(f"| `{line['preset']}` | {' | '.join([*progress, runtime])} |")
     return f"| {' | '.join(head)} |\n|---|{'---:|' * (len(head) - 1)}\n" + "\n".join(rows)
+
+
+def _progress(line: dict[str, str], budget: str) -> str:
+    """Bold if no row makes significantly more progress."""
+    if not line[budget]:
+        return line[f"{budget}_rank"] or "not run"
+    return f"**{_percent(line[budget])}**" if _first_rank(line, budget) else _percent(line[budget])
 
 
 def hard_scenes() -> str:

@@ -192,7 +192,10 @@ def _panel(made: Standing, of_set: str | None) -> chart.Panel:
         for key in ((b, row) for b in made.budgets for row in made.rows)
         if key in groups.groups
     ]
-    title = f"{of_set or 'Progress over cost, all sets'}, {format.plural(runs['scene'].nunique(), 'scene')}"
+    counts = runs.groupby("budget")["scene"].nunique()
+    fewer = [f", {count} at {units(float(b))}" for b, count in counts.items() if count < counts.max()]
+    scenes = format.plural(int(counts.max() if len(counts) else 0), "scene")
+    title = f"{of_set or 'Progress over cost, all sets'}, {scenes}{''.join(fewer)}"
     panel = chart.panel_data(title, COST, "progress", lines)
     panel["x"]["log"], panel["y"]["log"] = True, False
     return panel
