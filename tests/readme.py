@@ -35,11 +35,11 @@ def wrongs(text: str) -> list[str]:
 def recommendation() -> str:
     """README's first answer: the row with the most progress among those that none beats significantly at any cost."""
     lines = _lines("suite")
-    leaders = {budget: [line for line in lines if _first_rank(line, budget)] for budget in _budgets()}
+    leaders = {budget: [line for line in lines if _first_rank(line, budget)] for budget in _decided_budgets()}
     always = [line for line in lines if all(line in rows for rows in leaders.values())]
     if not always:
         raise ValueError("no row is among the best at all costs: README needs another sentence")
-    first = max(always, key=lambda line: float(line[_budgets()[-1]]))
+    first = max(always, key=lambda line: float(line[_decided_budgets()[-1]]))
     sentences = [
         f"At {units(float(budget))} of cost{_sets(budget)}, no renderer makes significantly more progress than "
         f"{_either(rows)}. "
@@ -59,6 +59,12 @@ def _budgets() -> list[str]:
     """The budgets with results, as they are named in the CSV file of the suite."""
     lines = _lines("suite")
     return [name for name in lines[0] if name.isdigit() and any(line[name] for line in lines)]
+
+
+def _decided_budgets() -> list[str]:
+    """The budgets at which some renderers are significantly worse than others."""
+    lines = _lines("suite")
+    return [budget for budget in _budgets() if not all(_first_rank(line, budget) for line in lines if line[budget])]
 
 
 def _sets(budget: str) -> str:
@@ -94,7 +100,8 @@ def _progress(line: dict[str, str], budget: str) -> str:
     """Bold if no row makes significantly more progress."""
     if not line[budget]:
         return line[f"{budget}_rank"] or "not run"
-    return f"**{_percent(line[budget])}**" if _first_rank(line, budget) else _percent(line[budget])
+    is_leader = budget in _decided_budgets() and _first_rank(line, budget)
+    return f"**{_percent(line[budget])}**" if is_leader else _percent(line[budget])
 
 
 def hard_scenes() -> str:

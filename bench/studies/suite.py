@@ -21,7 +21,7 @@ from bench.report.suite.attempts import (
     gather,
     suite,
 )
-from bench.report.suite.standing import ALPHA, KEY, Ranking, Standing, units
+from bench.report.suite.standing import ALPHA, KEY, MAX_LEVEL, Ranking, Standing, units
 from bench.report.write import paper
 from bench.report.write.table import percent
 
@@ -54,7 +54,8 @@ PROGRESS = (
     "silhouette loss, which were chosen in runs of fixed length: 100 iterations in complete, 200 in reconstruct. Pose "
     "and multiview have the defaults of their tasks, multiview without a silhouette loss.",
     f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:.0%}. "
-    "At that level, 5 % of simulated draws of equal renderers have a false pair. The sample is of these four families.",
+    "At that level, 5 % of simulated draws of equal renderers may have a false pair. If more have one, no pair counts "
+    "as significant. The sample is of these four families.",
 )
 
 
@@ -195,7 +196,7 @@ def _panel(made: Standing, of_set: str | None) -> chart.Panel:
     counts = runs.groupby("budget")["scene"].nunique()
     fewer = [f", {count} at {units(float(b))}" for b, count in counts.items() if count < counts.max()]
     scenes = format.plural(int(counts.max() if len(counts) else 0), "scene")
-    title = f"{of_set or 'Progress over cost, all sets'}, {scenes}{''.join(fewer)}"
+    title = f"{of_set}, {scenes}" if of_set else f"Progress over cost, all sets, {scenes}{''.join(fewer)}"
     panel = chart.panel_data(title, COST, "progress", lines)
     panel["x"]["log"], panel["y"]["log"] = True, False
     return panel
@@ -281,8 +282,8 @@ def verdict(made: Standing) -> str:
             parts.append(f"{leaders(ranked, when)} {pairs} differ significantly.")
         else:
             scenes = format.plural(ranked.scenes, "scene")
-            rows = f"{len(ranked.progress)} renderers, whatever their results"
-            parts.append(f"At {units(budget)}, {scenes} cannot decide between {rows}.")
+            rows = f"{len(ranked.progress)} renderers" + ("" if ranked.level else ", whatever their results")
+            parts.append(f"At {_when(made, budget)}, {scenes} cannot decide between {rows}.")
     return " ".join([*parts, failures(made)])
 
 
@@ -333,6 +334,8 @@ def _notes(made: Standing) -> list[str]:
         least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}"
         possible = f"{ranked.possible_p:.2g} is possible with {format.plural(ranked.scenes, 'scene')}"
         pairs = f"{len(ranked.better)} of {ranked.pairs} pairs differ significantly"
+        if ranked.level > MAX_LEVEL:
+            pairs = f"no pair counts as significant, since {percent(ranked.level)} of simulated draws have a false pair"
         notes.append(f"At {units(budget)}, {pairs}. {least}; {possible}.")
         further = at_budget[at_budget["ok"] & (at_budget["final"] > at_budget["initial"])]
         counts = further.groupby("set").size() / at_budget[at_budget["ok"]].groupby("set").size()
@@ -353,7 +356,7 @@ def _notes(made: Standing) -> list[str]:
             notes.append(text)
         for name in sets if len(sets := _sets_at(made, budget)) > 1 else ():
             others = standing.ranking(at_budget[at_budget["set"] != name])
-            if others.decidable:
+            if ranked.decidable and others.decidable:
                 lead = leaders(others, f"Without {name}, at {units(budget)}")
                 order = f"The order is: {'; '.join(others.progress)}. Different pairs: {len(others.better)}."
                 notes.append(f"{lead} {order}")

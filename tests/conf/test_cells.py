@@ -1,6 +1,6 @@
 """The cells of every experiment have the names and overrides of cells.json, whatever changes in the driver.
 
-At smoke, three cells of each experiment are compared; at desk, in the slow tests, all cells.
+At smoke, two cells of each experiment are compared; at desk, in the slow tests, all cells.
 After a change of settings, `python -m tests.conf.test_cells` writes the file again; it takes minutes.
 """
 
@@ -16,7 +16,7 @@ from tests.composing import cells_of
 
 FILE = Path(__file__).with_name("cells.json")
 EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
-CELLS = {"smoke": 3, "desk": None}  # at most, of an experiment
+CELLS = {"smoke": 2, "desk": None}  # at most, of an experiment
 EXPECTED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.is_file() else {}
 
 

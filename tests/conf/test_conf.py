@@ -71,6 +71,8 @@ def names_of_groups() -> tuple[str, ...]:
 
 TOGETHER = together()
 METHODS = [*visible("method"), *(f"tuned/{name}" for name in visible("method/tuned"))]  # spaces: test_spaces
+SLOW = pytest.mark.slow  # a composition takes a tenth of a second
+SOME_METHODS = [name if index % 4 == 0 else pytest.param(name, marks=SLOW) for index, name in enumerate(METHODS)]
 
 
 @pytest.fixture(scope="session")
@@ -151,13 +153,13 @@ def test_every_choice_composes_and_builds(paths, row):
     assert load("silhouette", row["silhouette"]) == build_part(config, "silhouette")
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", SOME_METHODS)
 def test_every_method_composes_and_builds(name):
     cloud = ["task.cloud=points.ply"] if name.startswith("cloud") else []  # the row contains the file's name
     builds(composed(f"+method={name}", *cloud))
 
 
-@pytest.mark.parametrize("position", [0, -1], ids=["first", "last"])
+@pytest.mark.parametrize("position", [0, pytest.param(-1, marks=SLOW)], ids=["first", "last"])
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_the_first_and_last_cell_of_an_experiment_compose_and_build(paths, name, position):
     """The first cell at desk scale; the last at the papers' scale, of a mesh if it names no dataset."""

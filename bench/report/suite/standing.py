@@ -6,7 +6,7 @@ has the same weight.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +22,7 @@ from bench.tables import choice
 DIST = "dist"  # the preset that decides which problems are compared, and that ratios of errors refer to
 MIN_LOG_ERROR = 1e-12  # lower bound before taking the logarithm
 KEY = ["set", "problem", "budget"]
+MAX_LEVEL = 0.055  # see `Ranking.level`; 5 %, and the uncertainty of its simulation
 ALPHA = 0.02  # total over all tests at a budget; as scenes are skewed, simulations of equal rows have 5 % false pairs
 
 
@@ -33,7 +34,7 @@ class Standing:
         self.compared = compared(self.everything, gathered.size)
         self.reached = with_progress(self.compared)
         self.complete = self.reached[self.reached["complete"]]
-        self.rankings = {budget: ranking(runs) for budget, runs in self.complete.groupby("budget")}
+        self.rankings = {budget: verified_ranking(runs) for budget, runs in self.complete.groupby("budget")}
         self.budgets = [*self.rankings]
         ranked_rows = [row for ranked in self.rankings.values() for row in ranked.progress]
         self.rows = [*dict.fromkeys([*ranked_rows, *(row for _, row in self.cannot_run)])]
@@ -179,6 +180,7 @@ class Ranking:
         pairs: the number of all pairs.
         least_p: the least p value of all pairs; 1 without pairs.
         scenes: the number of scenes, the units of the test.
+        level: the fraction of simulated draws of equal rows with a significant pair; 0 if it was not simulated.
     """
 
     progress: dict[str, float]
@@ -186,11 +188,12 @@ class Ranking:
     pairs: int
     least_p: float
     scenes: int
+    level: float = 0.0
 
     @property
     def decidable(self) -> bool:
-        """Whether this number of scenes can show any difference."""
-        return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs, ALPHA)
+        """Whether this number of scenes can show any difference, and equal rows rarely have one."""
+        return self.pairs > 0 and self.scenes >= shapes_needed(self.pairs, ALPHA) and self.level <= MAX_LEVEL
 
     @property
     def possible_p(self) -> float:
@@ -216,6 +219,26 @@ def ranking(runs: pd.DataFrame) -> Ranking:
     better = {pair if difference > 0 else pair[::-1] for pair, difference, sure in significant if sure}
     progress = scores.sum().sort_values(ascending=False, kind="stable")
     return Ranking(progress.to_dict(), better, len(first), p_values.min(initial=1.0), len(scores))
+
+
+def verified_ranking(runs: pd.DataFrame) -> Ranking:
+    """The ranking, without significant pairs if too many simulated draws of equal rows have one."""
+    ranked = ranking(runs)
+    if not ranked.better:
+        return ranked
+    ranked = replace(ranked, level=simulated_level(runs))
+    return ranked if ranked.decidable else replace(ranked, better=set())
+
+
+def simulated_level(runs: pd.DataFrame, draws: int = 200) -> float:
+    """The fraction of draws of scenes with a significant pair, after centring the rows in each set: they are equal."""
+    means = runs.groupby(["set", "row"])["progress"].transform("mean")
+    scores = by_scene(runs.assign(progress=runs["progress"] - means)).to_numpy()
+    rng, significant, (first, second) = np.random.default_rng(1), 0, np.triu_indices(scores.shape[1], 1)
+    for _ in range(draws):
+        drawn = scores[rng.integers(len(scores), size=len(scores))]
+        significant += statistics.holm(flips.p_values(drawn[:, first] - drawn[:, second]), ALPHA).any()
+    return significant / draws
 
 
 def by_scene(runs: pd.DataFrame) -> pd.DataFrame:
