@@ -283,7 +283,7 @@ def verdict(made: Standing) -> str:
         else:
             scenes = format.plural(ranked.scenes, "scene")
             rows = f"{len(ranked.progress)} renderers" + ("" if ranked.level else ", whatever their results")
-            parts.append(f"At {_when(made, budget)}, {scenes} cannot decide between {rows}.")
+            parts.append(f"At {units(budget)}, {scenes} cannot decide between {rows}.")
     return " ".join([*parts, failures(made)])
 
 

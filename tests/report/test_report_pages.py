@@ -185,8 +185,7 @@ def test_a_run_that_failed_stays_a_row_and_the_newest_of_a_cell_counts(tmp_path)
 
 PAPER = Path(__file__).parents[2] / "results" / "paper"
 PICTURES = {
-    *("single_view_figures", "dvr_figures", "completion_gallery", "misplaced_gallery", "multiview_gallery"),
-    "stability_curves",
+    *("single_view_figures", "completion_gallery", "misplaced_gallery", "stability_curves"),
 }
 
 
