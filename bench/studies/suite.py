@@ -319,11 +319,11 @@ def failures(made: Standing) -> str:
 
 def _first_of_sets(made: Standing) -> str:
     """The row with the most progress in each set, at each budget."""
-    means, parts = made.complete.groupby(["budget", "set", "row"])["progress"].mean(), []
+    means, firsts = made.complete.groupby(["budget", "set", "row"])["progress"].mean(), dict[float, list[str]]()
     for (budget, name), rows in means.groupby(["budget", "set"], sort=False):
         best = rows.droplevel(["budget", "set"])
-        parts.append(f"At {units(budget)}, the most progress in {name}: {best.idxmax()} (*{percent(best.max())}*).")
-    return " ".join(parts)
+        firsts.setdefault(budget, []).append(f"{name}, {best.idxmax()} (*{percent(best.max())}*)")
+    return " ".join(f"At {units(budget)}, the most progress: {'; '.join(sets)}." for budget, sets in firsts.items())
 
 
 def _notes(made: Standing) -> list[str]:
