@@ -107,8 +107,9 @@ def draw_curve(path: Path, curve: list[dict[str, Any]]) -> None:
     for axis, key, names in zip(axes, ("iteration", "seconds"), (terms, errors), strict=False):
         for name in names:
             metric = TABLE_METRICS.get(name, Metric(name))
+            # The axis has no zero.
             points = [(line[key], metric.factor * line[name]) for line in curve if line.get(name, 0) > 0]
-            if points:  # the axis has no zero
+            if points:
                 axis.plot(*zip(*points, strict=True), marker="." if name in errors else "", label=metric.label, lw=1.4)
         style.log_axis(axis, "y", [value for line in axis.lines for value in line.get_ydata()])
     axes[0].set(xlabel="iteration", ylabel="weighted loss")

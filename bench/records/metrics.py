@@ -49,6 +49,7 @@ RENDERING_METRICS = {
     "forward_seconds": Metric("rendering (ms)", 1000.0, LOWER),
     "step_seconds": Metric("step (ms)", 1000.0, LOWER),
 }
+LISTED_METRICS = TABLE_METRICS | RENDERING_METRICS
 OTHER_DIRECTIONS = {  # which direction is better, for metrics that tables do not show
     **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred"), LOWER),
     **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
@@ -66,7 +67,7 @@ NON_NEGATIVE = frozenset(  # distances and angles; roughness is a logarithm
 def better_direction(name: str) -> str:
     """Which direction of a metric is better: `LOWER`, `HIGHER`, or empty if unknown."""
     for base_name in _with_base_names(name):
-        if metric := (TABLE_METRICS | RENDERING_METRICS).get(base_name):
+        if metric := LISTED_METRICS.get(base_name):
             return metric.better
         if base_name in OTHER_DIRECTIONS:
             return OTHER_DIRECTIONS[base_name]

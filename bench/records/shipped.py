@@ -36,14 +36,10 @@ def cell_value(cell: str) -> Any:
 
 def best_possible(config: dict[str, Any]) -> dict[str, float]:
     """The errors of the prior's fit to the true distances of a run's shape, by metric; empty if none is shipped."""
-    for row in shipped_rows(FITS):
-        cells = {name: cell_value(cell) for name, cell in row.items() if cell}
-        if _fit_settings(cells) == _fit_settings(flat(config, CONFIG)):
-            return {name: cells[f"metrics.{name}"] for name in SURFACE_METRICS}
-    return {}
-
-
-def _fit_settings(values: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a flat record that an error of a fit depends on; null is the same as a key that is missing."""
     keys = tuple(f"{CONFIG}{key}." for key in FIT_KEYS)
-    return {name: value for name, value in values.items() if f"{name}.".startswith(keys) and value is not None}
+    settings = {name: value for name, value in flat(config, CONFIG).items() if f"{name}.".startswith(keys)}
+    for row in shipped_rows(FITS):
+        fitted = {name: cell_value(cell) for name, cell in row.items() if cell and f"{name}.".startswith(keys)}
+        if all(fitted.get(name) == settings.get(name) for name in {*fitted, *settings}):  # null is as a missing key
+            return {name: cell_value(row[f"metrics.{name}"]) for name in SURFACE_METRICS}
+    return {}

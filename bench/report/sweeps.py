@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records import format
-from bench.records.metrics import HIGHER, LOWER, RENDERING_METRICS, TABLE_METRICS, Metric, better_direction
+from bench.records.metrics import HIGHER, LISTED_METRICS, LOWER, Metric, better_direction
 from bench.records.names import differences
 from bench.records.read import read_plans
 from bench.records.record import as_number
@@ -30,7 +30,6 @@ from bench.report.write.result import Result, read_shown, write
 from bench.report.write.table import Column, count_with_interval, ends, extremes, text
 
 ARROWS = {LOWER: " ↓", HIGHER: " ↑", "": ""}  # after a heading: the better direction
-LISTED_METRICS = TABLE_METRICS | RENDERING_METRICS
 MAX_LISTED_VALUES = 6  # per swept key
 MAX_DATASET_COLUMNS = 8
 MAX_FALLBACK_METRICS = 8  # columns of a task that measures none of `LISTED_METRICS`

@@ -214,11 +214,8 @@ def message_of(error: Exception) -> str:
         return _override_message(error.override)
     text = " ".join(str(error).split())
     is_shell = isinstance(error, InterpolationKeyError) and re.search(r"Interpolation key '[A-Z]\w*'", text)
-    return (
-        f"{text}: ${{...}} in quotes is a key of the configuration; for a shell variable remove the quotes"
-        if is_shell
-        else text
-    )
+    hint = ": ${...} in quotes is a key of the configuration; for a shell variable remove the quotes"
+    return f"{text}{hint if is_shell else ''}"
 
 
 def _add_file(message: str) -> str:

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.records.format import count, number, plural, seconds, values_in_words
-from bench.records.metrics import RENDERING_METRICS, TABLE_METRICS, Metric
+from bench.records.metrics import LISTED_METRICS, RENDERING_METRICS, Metric
 from bench.records.record import NOT_RUN, PICTURE_FILES, Record, RunStatus
 from bench.records.results import RESULTS, Plan
 
@@ -101,10 +101,10 @@ def log_lines(record: Record) -> Iterator[str]:
 
 
 def _measured_metrics(record: Record) -> Iterator[tuple[str, str]]:
-    """The metrics of a task that measures without optimising; if it recommends a field, only the recommendation."""
+    """The metrics of a task that measures without optimising: those of renderings or of a recommendation, else all."""
     listed = [name for name in record.metrics if name.startswith("recommended") or name in RENDERING_METRICS]
     for name in listed or record.metrics:
-        metric = (TABLE_METRICS | RENDERING_METRICS).get(name, Metric(name))
+        metric = LISTED_METRICS.get(name, Metric(name))
         yield metric.label, number(record.metrics[name], metric.factor)
 
 

@@ -12,6 +12,7 @@ from bench.records.record import NEUTRAL_KEYS, as_number, digest, row_name, star
 from bench.report.data.records import OURS, Record, family, grouped, loop_seconds, run_key, setting, value_evaluations
 from bench.report.data.runs import MEASUREMENT_METRICS
 from bench.report.site.files import Folder
+from bench.report.suite.attempts import CUSTOM
 
 SIGNIFICANT_DIGITS = 5  # a run's own page has all digits
 MAX_REASON_LETTERS = 300
@@ -27,7 +28,6 @@ SORT_METRICS = {
     "single_view": "iou",
     "ablation": "step_seconds",
 }
-CUSTOM_RENDERER = "custom"  # the preset of a user's class
 MAX_NAMED_SETTINGS = 3
 # Keys of the configuration that have columns of their own, or follow from other keys.
 IN_COLUMNS = NEUTRAL_KEYS | {
@@ -90,9 +90,9 @@ def _base_name(record: Record) -> str:
     """The name of a record's row; for a user's renderer without a label, its class."""
     name = row_name(record["config"], record["renderer"])
     target = str(setting(record["config"], "renderer", "_target_") or "")
-    if record["renderer"] == CUSTOM_RENDERER and target and not target.startswith(OURS):
+    if record["renderer"] == CUSTOM and target and not target.startswith(OURS):
         class_name = target.rpartition(".")[2]
-        return name.replace(CUSTOM_RENDERER, class_name, 1) if name.startswith(CUSTOM_RENDERER) else name
+        return name.replace(CUSTOM, class_name, 1) if name.startswith(CUSTOM) else name
     return name
 
 

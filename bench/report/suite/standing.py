@@ -34,12 +34,17 @@ class Standing:
         self.compared = compared(self.everything, gathered.size)
         self.reached = with_progress(self.compared)
         self.complete = self.reached[self.reached["complete"]]
-        self.rankings = {budget: verified_ranking(runs) for budget, runs in self.complete.groupby("budget")}
-        self.budgets = [*self.rankings]
-        ranked_rows = [row for ranked in self.rankings.values() for row in ranked.progress]
+        progress = {budget: progress_of(by_scene(runs)) for budget, runs in self.complete.groupby("budget")}
+        self.budgets = [*progress]
+        ranked_rows = [row for of_rows in progress.values() for row in of_rows]
         self.rows = [*dict.fromkeys([*ranked_rows, *(row for _, row in self.cannot_run)])]
         self.second_starts = second_starts(gathered.second_starts, self.complete)
         self.sets = [name for name in suite().errors if name in {*self.complete["set"]}]
+
+    @cached_property
+    def rankings(self) -> "dict[float, Ranking]":
+        """The ranking at each budget; it takes seconds."""
+        return {budget: verified_ranking(runs) for budget, runs in self.complete.groupby("budget")}
 
     @cached_property
     def lacking(self) -> dict[tuple[float, str], int]:
@@ -217,8 +222,12 @@ def ranking(runs: pd.DataFrame) -> Ranking:
     pairs, p_values = zip(scores.columns[first], scores.columns[second], strict=True), flips.p_values(differences)
     significant = zip(pairs, differences.sum(axis=0), statistics.holm(p_values, ALPHA), strict=True)
     better = {pair if difference > 0 else pair[::-1] for pair, difference, sure in significant if sure}
-    progress = scores.sum().sort_values(ascending=False, kind="stable")
-    return Ranking(progress.to_dict(), better, len(first), p_values.min(initial=1.0), len(scores))
+    return Ranking(progress_of(scores), better, len(first), p_values.min(initial=1.0), len(scores))
+
+
+def progress_of(scores: pd.DataFrame) -> dict[str, float]:
+    """The progress of each row, the largest first, from the result of `by_scene`."""
+    return scores.sum().sort_values(ascending=False, kind="stable").to_dict()
 
 
 def verified_ranking(runs: pd.DataFrame) -> Ranking:

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from bench.pictures import figure_style, style
 from bench.report.data.statistics import Interval, dominated
+from bench.report.suite.attempts import CUSTOM
 
 REFERENCE_COLOUR = "#777777"
 Series = dict[str, Any]
@@ -38,7 +39,7 @@ def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[fl
 
 def _look(name: str, preset: str) -> figure_style.Look:
     """The look of a preset; rows of renderer=custom have different looks."""
-    return figure_style.look(name if preset == "custom" else preset)
+    return figure_style.look(name if preset == CUSTOM else preset)
 
 
 def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[float, float]]:
