@@ -32,7 +32,7 @@ COSTS = ("evaluations_cost", "evaluations_value")  # older records have only the
 
 
 def compare(
-    renderers: Sequence[str], results: str | os.PathLike[str] = RESULTS, *, budget: float = 1.0
+    renderers: Sequence[str], results_dir: str | os.PathLike[str] = RESULTS, *, budget: float = 1.0
 ) -> pd.DataFrame:
     """Compares renderers on the suite, from shipped runs and those of a results folder, paired by scene.
 
@@ -42,7 +42,7 @@ def compare(
 
     Args:
         renderers: presets or names of rows; all others are compared with the first.
-        results: the folder of runs by `python -m bench.suite`.
+        results_dir: the folder of runs by `python -m bench.suite`.
         budget: the cost that each run spends, in units of the suite.
 
     Returns:
@@ -56,7 +56,7 @@ def compare(
     """
     if isinstance(renderers, str) or len(renderers) < 2:
         raise ValueError(f"bench.compare takes two renderers or more, such as ['dist', 'newton'], not {renderers!r}")
-    results = Path(results)
+    results = Path(results_dir)
     records = read_records(results)[0] if results.is_dir() else []
     standing = Standing(gather(paper.SHIPPED, results, records))
     runs = standing.complete[standing.complete["budget"] == budget]

@@ -58,6 +58,11 @@ PROGRESS = (
     "as significant. The sample is of these four families.",
 )
 
+TUNED = (
+    "Tuned: the settings of conf/tuned.yaml, chosen on validation shapes. They may have another silhouette loss. The "
+    "effects of settings and loss are not separated."
+)
+
 
 def make(*several: Runs | None) -> Result:
     """Charts of all sets together and of each set, and a line per row."""
@@ -118,8 +123,7 @@ def make_sets(*several: Runs | None) -> Result:
             "Iterations and rays are medians over problems. In multiview, neighbouring views count as one ray "
             "per pixel. Runtimes are medians over runs on a machine without other "
             f"load: {format.plural(int(lines['timed'].sum()), 'run')}, others are not timed.",
-            "Tuned: the settings of conf/tuned.yaml, chosen on validation shapes. They may have another silhouette "
-            "loss. The effects of settings and loss are not separated.",
+            *([TUNED] if reached["tuned"].any() else []),
         ],
         columns=[
             *(table.text("set", "Set"), table.text("row", "Renderer")),

@@ -27,7 +27,7 @@ def results(tmp_path):
 
 
 def test_there_is_a_row_for_each_run_and_each_planned_cell(results):
-    runs = bench.load(results)
+    runs = bench.load(results, config=True)
     assert list(runs.folder) == ["three", "one", "two"]
     assert list(runs.status) == ["not_run", "ok", "crashed"]
     assert list(runs.name) == ["dvr", "dist", "Mine"]
@@ -35,11 +35,14 @@ def test_there_is_a_row_for_each_run_and_each_planned_cell(results):
     assert runs.start_chamfer_l2[1] == 0.0456 and runs.seconds_forward[1] == 10 and runs.evaluations_value[1] == 1.43e6
     assert runs["metric_status"].tolist()[1] == 4 and runs.best[1] == "grid_8"
     assert runs.depth_mae[1] == float("inf") and pd.isna(runs.psnr[1])
+    assert runs.sweep.isna().tolist() == [False, True, True] and runs.sweep[0] == "planned"
     assert runs.reason[2] == "why" and runs["config.renderer.steps"].tolist()[1:] == [5, 7]
 
 
 def test_columns_have_types_that_do_not_depend_on_the_runs(results, tmp_path_factory):
-    runs, none = bench.load(results), bench.load(tmp_path_factory.mktemp("none"))
+    runs, none = bench.load(results, config=True), bench.load(tmp_path_factory.mktemp("none"))
+    plain = bench.load(results_dir=results)
+    assert list(plain) == [name for name in runs if not name.startswith("config.")]
     assert {name: str(kind) for name, kind in none.dtypes.items()} == FIXED_COLUMNS
     assert {name: str(kind) for name, kind in runs.dtypes.items()} | FIXED_COLUMNS == dict(runs.dtypes.map(str))
     typed = {"chamfer_l2": "Float64", "start_fscore": "Float64", "seconds_total": "Float64", "best": "string"}
@@ -49,7 +52,7 @@ def test_columns_have_types_that_do_not_depend_on_the_runs(results, tmp_path_fac
 
 
 def test_the_table_can_be_written_for_a_spreadsheet(results):
-    runs = bench.load(results)
+    runs = bench.load(results, config=True)
     runs.to_csv(results / "all_runs.csv", index=False)
     table = pd.read_csv(results / "all_runs.csv")
     assert list(table) == list(runs) and list(table.folder) == list(runs.folder)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from bench.records.read import read_records
+from bench.records.read import read_plans, read_records
 from bench.records.record import flat, row_name, started
 from bench.records.results import RESULTS
 from bench.report.data.records import index, setting
@@ -19,7 +19,7 @@ TEXT, CATEGORY, INTEGER, NUMBER, BOOLEAN, TIME = (
 )
 FIXED_COLUMNS = {  # every table has them
     **{name: TEXT for name in ("folder", "name")},
-    **{name: CATEGORY for name in ("task", "renderer", "method", "dataset", "scene", "experiment", "scale")},
+    **{name: CATEGORY for name in ("task", "renderer", "method", "dataset", "scene", "experiment", "sweep", "scale")},
     **{name: INTEGER for name in ("index", "seed")},
     "status": CATEGORY,
     "reason": TEXT,
@@ -37,7 +37,7 @@ PREFIXES |= {"seconds": "seconds_", "evaluations": "evaluations_"}
 CONFIG = "config."
 
 
-def load(results: str | os.PathLike[str] = RESULTS) -> pd.DataFrame:
+def load(results_dir: str | os.PathLike[str] = RESULTS, *, config: bool = False) -> pd.DataFrame:
     """Reads all runs of a results folder into a table, newest first, with a row per run, also failed or planned.
 
     >>> runs = load("results/local")
@@ -48,24 +48,30 @@ def load(results: str | os.PathLike[str] = RESULTS) -> pd.DataFrame:
     True
 
     Args:
-        results: the folder that the runs' `results_dir` named.
+        results_dir: the results folder of the runs.
+        config: whether to add all settings as columns `config.KEY`, some hundred.
 
     Returns:
         The columns of `FIXED_COLUMNS`, then metrics by their names, `start_NAME` for metrics before the optimisation,
-        `best_NAME` for the best possible ones, `seconds_NAME`, `evaluations_NAME`, and `config.KEY` for all settings.
-        Missing values are `pandas.NA`. The files of a run are in `runs/FOLDER` of the results folder.
+        `best_NAME` for the best possible ones, `seconds_NAME` and `evaluations_NAME`. `sweep` is the folder in
+        `RESULTS_DIR/sweeps` of the newest sweep with this run. Missing values are `pandas.NA`. The files of a
+        run are in `RESULTS_DIR/runs/FOLDER`.
 
     Raises:
         ValueError: the folder does not exist.
     """
-    records, problems = read_records(Path(results))
+    records, problems = read_records(Path(results_dir))
     if problems:
         warnings.warn(f"{len(problems)} not read: {'; '.join(problems)}", stacklevel=2)
-    return to_frame(records)
+    plans = sorted(read_plans(Path(results_dir))[0], key=lambda plan: plan.asked)
+    sweeps = {cell.id: plan.name for plan in plans for cell in plan.cells}
+    table = to_frame(records)
+    table["sweep"] = _series([sweeps.get(folder) for folder in table["folder"]], CATEGORY)
+    return table if config else table.loc[:, ~table.columns.str.startswith(CONFIG)]
 
 
 def to_frame(records: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """A row per run, with the columns that `load` states."""
+    """A row per run, with the columns that `load` states and all settings; without sweeps."""
     columns = _columns(list(records))
     return pd.DataFrame({name: _series(values, _type(name, values)) for name, values in columns.items()})
 
