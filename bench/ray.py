@@ -9,7 +9,8 @@
     python -m bench.ray RUN_FOLDER pixels=worst                           its 12 most wrong pixels, for the run's page
 
 Without pixel=, it takes the pixel where the first renderer is most wrong. zoom=0.05 shows the ray within 0.05 scene
-units of the true hit, zoom=0 all of it. A hit is wrong if it is off by more than a tenth of a pixel's width.
+units of the true hit, zoom=0 all of it. A hit is wrong if it is off by more than a tenth of the pixel's width there.
+A ray is rendered alone, so the errors of coarse-to-fine marching do not show.
 Each renderer's derivatives of the hit distance are compared with central differences of the float64 reference. Their
 parameters are the three most sensitive ones of the latent code or the family's formula, and the object's translation
 for meshes and stresses.
@@ -240,7 +241,7 @@ def save_worst(scene: RayScene, renderer: RendererOfCell, search: Search, folder
         texts = [picture.scene, picture.result, picture.lanes[0].sentences]
         rays.append({"column": pixel[0], "row": pixel[1], "error": error, "texts": texts})
         print(f"{rank} of {MAX_RAYS}: {picture.texts[0]}", file=sys.stderr)
-    draw_map(folder / MAP_FILE, search, scene.tolerance)
+    draw_map(folder / MAP_FILE, search)
     size = {"width": scene.camera.width, "height": scene.camera.height}
     write_text(folder / RAYS_FILE, to_json({**size, "rays": rays}))
     print(folder / RAYS_FILE)

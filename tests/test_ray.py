@@ -183,6 +183,12 @@ def test_the_command_writes_a_picture_of_the_pixel_where_the_first_renderer_is_m
     assert path == tmp_path / "new" / "a.png" and path.stat().st_size > 10_000 and path.with_suffix(".pdf").is_file()
 
 
+def test_a_hit_before_a_near_surface_is_wrong_though_its_error_is_small(tmp_path):
+    scene = ("task=stability", "stress=near_camera", "task.resolution=16", "level=1", "threads=1")
+    code, out, _ = command(*scene, "renderer=dist", f"into={tmp_path / 'a'}", main=main)
+    assert code == 0 and "0 of 1 renderer right" in out and "its residual is 1e-5" in out.lower()
+
+
 @pytest.mark.parametrize(("scene", "parameter"), [
     (("dataset=torus",), "minor"), (("dataset=sofa", "split=train"), "code["), (("dataset=car",), "width"),
 ])  # fmt: skip

@@ -141,7 +141,11 @@ class Lane:
 
 
 def true_ray(exact: Field, rays: Rays, *, lipschitz: float, tolerance: float) -> TrueRay:
-    """The truth on one float64 ray [1, 3] that meets the unit sphere, of a float64 field."""
+    """The truth on one float64 ray [1, 3] that meets the unit sphere, of a float64 field.
+
+    Args:
+        tolerance: a hit within this fraction of the true distance is right.
+    """
     entry, leave = (float(ends[0]) for ends in sphere_span(rays, RADIUS)[:2])
     reference = trace_exactly(exact, rays, lipschitz)
     distances = torch.linspace(entry, leave, DENSE_SAMPLES, dtype=torch.float64)
@@ -154,7 +158,8 @@ def true_ray(exact: Field, rays: Rays, *, lipschitz: float, tolerance: float) ->
     hit = float(reference.distance[0]) if bool(reference.hit[0]) else None
     cosine = float((autograd_normals(exact, reference.points) * rays.directions).sum().abs())
     spans = [*zip(ends[::2], ends[1::2], strict=True)]
-    return TrueRay(entry, leave, hit, spans, degrees(asin(min(cosine, 1.0))), tolerance)
+    angle = degrees(asin(min(cosine, 1.0)))
+    return TrueRay(entry, leave, hit, spans, angle, tolerance * (leave if hit is None else hit))
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from renderers.field import Field, estimate_lipschitz
 from renderers.rendering import Renderer
 
 MAX_SEARCHED_PIXELS = 64  # per side; of a larger image, every second pixel or fewer are searched
-TOLERANCE_PIXELS = 0.1  # a hit is right within so many widths of a pixel at the distance of the origin
+TOLERANCE_PIXELS = 0.1  # a hit is right within so many widths of a pixel at the true hit
 MIN_SPACING_PER_SIDE = 1 / 16  # from one of the most wrong pixels to the next
 Pixel = tuple[int, int]  # column and row
 
@@ -29,23 +29,25 @@ class Search:
     Args:
         stride: one pixel in stride x stride is searched.
         error: in scene units; -1 where a ray misses the unit sphere. A ray without a hit ends where it leaves it.
+        tolerance: the error up to which a hit is right, in scene units.
         hit, reference_hit: of the renderer and of the reference.
     """
 
     stride: int
     error: Float[Tensor, "rows columns"]
+    tolerance: Float[Tensor, "rows columns"]
     hit: Bool[Tensor, "rows columns"]
     reference_hit: Bool[Tensor, "rows columns"]
 
     def worst(self, count: int) -> list[tuple[Pixel, float]]:
-        """The most wrong pixels with their errors, in falling order, at a distance from each other."""
-        error, spacing = self.error.clone(), max(1, ceil(max(self.error.shape) * MIN_SPACING_PER_SIDE))
+        """The pixels with the largest ratios of error to tolerance, in that order and apart; with their errors."""
+        ratio, spacing = self.error / self.tolerance, max(1, ceil(max(self.error.shape) * MIN_SPACING_PER_SIDE))
         pixels = list[tuple[Pixel, float]]()
-        while len(pixels) < count and float(error.max()) >= 0:
-            row, column = divmod(int(error.argmax()), error.shape[1])
-            pixels.append(((self._full(column), self._full(row)), float(error[row, column])))
+        while len(pixels) < count and float(ratio.max()) >= 0:
+            row, column = divmod(int(ratio.argmax()), ratio.shape[1])
+            pixels.append(((self._full(column), self._full(row)), float(self.error[row, column])))
             rows, columns = (slice(max(0, middle - spacing + 1), middle + spacing) for middle in (row, column))
-            error[rows, columns] = -1.0
+            ratio[rows, columns] = -1.0
         return pixels
 
     def _full(self, index: int) -> int:
@@ -53,9 +55,9 @@ class Search:
 
     @property
     def summary(self) -> str:
-        """The largest error and the number of searched pixels, in words."""
+        """The error of the most wrong pixel and the number of searched pixels, in words."""
         searched = "all pixels" if self.stride == 1 else f"one pixel in {self.stride} x {self.stride}"
-        return f"by {float(self.error.max()):.2g} scene units, {searched} searched"
+        return f"by {self.worst(1)[0][1]:.2g} scene units, {searched} searched"
 
 
 @dataclass(frozen=True)
@@ -96,8 +98,8 @@ class RayScene:
 
     @property
     def tolerance(self) -> float:
-        """The error in scene units up to which a hit is right."""
-        return TOLERANCE_PIXELS * float(self.camera.center.norm() / self.camera.intrinsics[0, 0])
+        """The error up to which a hit is right, as a fraction of the true distance."""
+        return TOLERANCE_PIXELS / float(self.camera.intrinsics[0, 0])
 
     def true_ray(self, pixel: Pixel) -> TrueRay:
         """The truth on the ray of a pixel."""
@@ -116,4 +118,6 @@ class RayScene:
         _, leave, in_sphere = sphere_span(exact_rays.flat(), RADIUS)
         ends = [torch.where(each.hit, each.distance.double(), leave) for each in (rendering, reference)]
         error = torch.where(in_sphere, (ends[0] - ends[1]).abs(), -1.0)
-        return Search(stride, *(image.view(rays.shape) for image in (error, rendering.hit, reference.hit)))
+        tolerance = self.tolerance * ends[1].clamp_min(torch.finfo(torch.float32).eps)
+        images = error, tolerance, rendering.hit, reference.hit
+        return Search(stride, *(image.view(rays.shape) for image in images))

@@ -192,11 +192,11 @@ def magnify(above: Axes, below: Axes, window: tuple[float, float]) -> None:
         above.figure.add_artist(line)
 
 
-def draw_map(path: Path, search: Search, tolerance: float) -> None:
-    """Writes the searched pixels in the colours of silhouettes; hits off by more than `tolerance` are orange."""
+def draw_map(path: Path, search: Search) -> None:
+    """Writes the searched pixels in the colours of silhouettes; hits off by more than the tolerance are orange."""
     hit, reference_hit = search.hit.numpy(), search.reference_hit.numpy()
     image = silhouette_image(hit, reference_hit)
-    image[hit & reference_hit & (search.error.numpy() > tolerance)] = to_rgb(WRONG)
+    image[hit & reference_hit & (search.error > search.tolerance).numpy()] = to_rgb(WRONG)
     imsave(path, image)
 
 
