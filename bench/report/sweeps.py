@@ -42,7 +42,8 @@ FAILURE = (
     "A run that did not end ok is counted as failed, and has the worst value of each metric: an infinite error, or 0 "
     "of what is better higher. So medians are ∞ where half of the runs failed, – where all did."
 )
-POINTS = "Large points are medians of rows, small points are runs. A cross at the upper edge: half of the runs failed. "
+POINTS = "Large points are medians of rows, small points are runs. "
+CROSS = "A cross at the upper edge: half of the runs failed. "
 SMALL_POINTS = (
     "In the figure, small points are runs. A row of which half of the runs failed has a cross, or no point on a curve. "
     "Costs are medians over runs that ended ok."
@@ -232,7 +233,11 @@ def table_of(sweep: Sweep) -> Result:
     panels = [_panels(sweep, dataset, lead, headings[lead]) for dataset in sweep.datasets or [""]] if lead else []
     rows = sum(map(bool, panels))
     panels, height = [*chain(*panels)], PANEL_HEIGHT_INCHES * rows + LEGEND_HEIGHT_INCHES
-    has_front = any(each["name"] == "front" for panel in panels for each in panel["series"])
+    series = [each for panel in panels for each in panel["series"]]
+    notes = {
+        CROSS: any(math.inf in each["y"] for each in series),
+        FRONT: any(each["name"] == "front" for each in series),
+    }
     return Result(
         sweep.runs,
         f"Sweep over {', '.join(sweep.swept)}, {sweep.name}." if sweep.swept else f"Sweep {sweep.name}.",
@@ -245,7 +250,9 @@ def table_of(sweep: Sweep) -> Result:
         n=f"{len(sweep.runs.records)} runs" if stress else "",
         interval="; ".join(filter(None, kinds)) if headings else "",
         figure=chart.draw(panels, height, rows, legend=3) if panels else None,
-        chart={"panels": panels, "note": POINTS + FRONT * has_front} if panels else None,
+        chart={"panels": panels, "note": POINTS + "".join(text for text, holds in notes.items() if holds)}
+        if panels
+        else None,
         remarks=(
             SMALL_POINTS if panels else "",
             FAILURE,
@@ -280,7 +287,7 @@ def _panel(
     lead: tuple[str, Metric],
     has_front: bool,
 ) -> Panel:
-    """A point per row, joined along the swept number; the initial value if all rows have it; the front if wanted."""
+    """A point per row, joined along the swept number; the initial error if all rows have it; the front if wanted."""
     (dataset, title), (key, metric) = titles, lead
     curves, fronts = list[Series](), list[Series]()
     for name, of_curve in grouped(runs, itemgetter("curve")).items():
@@ -301,10 +308,17 @@ def _panel(
         fronts.append(chart.front(positions, [y for each in curves for y in each["y"]]))
     costs = [*positions, *(x for dots in curves for x, _ in dots["shapes"])]
     span = [LINE_ENDS_OVER_COSTS[0] * min(costs, default=1.0), LINE_ENDS_OVER_COSTS[1] * max(costs, default=1.0)]
-    for name, field, dash in (("initial value", "metrics_start", "--"), ("best possible", "metrics_best", ":")):
+    for name, field, dash in (("initial", "metrics_start", "--"), ("best possible", "metrics_best", ":")):
         value = _shared_median([run.get(field, {}).get(key) for run in row] for row in of_rows)
         if curves and value and math.isfinite(value):
-            fronts.append(chart.level(f"{name}, median", span, metric.factor * value, dash=dash))
+            fronts.append(
+                chart.level(
+                    f"{name} {'error' if metric.better == LOWER else 'value'}, median",
+                    span,
+                    metric.factor * value,
+                    dash=dash,
+                )
+            )
     return chart.panel_data(dataset, title, metric.label, [*fronts, *curves])
 
 
@@ -332,6 +346,13 @@ def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict
         best |= {dataset: (max if is_higher_better else min)(medians, key=medians.__getitem__)} if medians else {}
     if len({*best.values()}) > 1:
         verdict.append(f"Best by data set: {', '.join(f'{dataset} {row}' for dataset, row in best.items())}.")
+    if not any(interval.has_ends for interval in interval_by_row.values()):
+        verdict.append(f"With {FEW}, the order is not certain.")
+    costs = {line["row"]: line["evaluations_cost"] for line in lines if line["evaluations_cost"]}
+    if len({*costs.values()}) > 1:
+        ordered = sorted(costs, key=lambda row: costs[row])
+        low, high = (f"{format.count(costs[row])} ({row})" for row in (ordered[0], ordered[-1]))
+        verdict.append(f"Field evaluations: {low} to {high}.")
     return {
         "question": f"Which has the {'highest' if is_higher_better else 'lowest'} {metric.label.split(' (')[0]}?",
         "verdict": " ".join(filter(None, verdict)),
@@ -346,10 +367,10 @@ def _failed(line: dict[str, Any]) -> str:
 
 def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> list[Column]:
     names, first = sweep.metrics, next(iter(headings.values()), Metric(""))
-    ratio = Metric(f"{first.label.split(' (')[0]} over the first row's" if several else "")
+    ratio = Metric(f"{first.label.split(' (')[0]}, ratio to the first row" if several else "")
     labels = {_on(names[0], dataset): f"{dataset}: {first.label}" for dataset in sweep.datasets if names}
     return [
-        text("row", "Run"),
+        text("row", "Row"),
         *(column for name, label in labels.items() for column in _estimate(name, first._replace(label=label))),
         *(column for name in names for column in _estimate(name, headings.get(name, Metric("")))),
         *_estimate("ratio", ratio),

@@ -114,7 +114,7 @@ def test_rows_are_newest_first_and_show_the_numbers(results):
     assert (metrics["chamfer_l2"]["before"][2], metrics["chamfer_l2"]["after"][2]) == (0.0456, 0.00123)
     assert metrics["chamfer_l2"]["factor"] == 1000.0
     assert (metrics["fscore"]["after"][2], metrics["depth_mae"]["after"][2]) == (0.875, "inf")
-    assert (numbers["loop"][2], numbers["total"][2], numbers["values"][2]) == (30.0, 31.5, 1_430_000)
+    assert (numbers["loop"][2], numbers["total"][2], numbers["cost"][2]) == (30.0, 31.5, 1_431_998)
     assert (metrics["chamfer_l2"]["after"][1], numbers["loop"][1]) == (None, None)
     details = page.run("plain")
     assert ["chamfer_l2", 0.0456, 0.00123, "Sum of two means.", None] in details["metrics"]

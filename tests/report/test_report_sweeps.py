@@ -80,14 +80,15 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     assert [at for at in shown.best if at[1] < 4] == [[0, 1], [1, 2], [0, 3]]
     assert shown.question == "Which has the lowest Chamfer?"
     assert shown.verdict == (
-        "Median Chamfer (x1000): *2.50* (DIST) to 3.00 (DVR); n = 3 shapes. Best by data set: sofa DIST, plane DVR."
+        "Median Chamfer (x1000): *2.50* (DIST) to 3.00 (DVR); n = 3 shapes. Best by data set: sofa DIST, plane DVR. "
+        "With fewer than six shapes, the order is not certain."
     )
     assert "n = 5 runs (3 shapes, 1 seed); fewer than six shapes: no interval." in shown.caption
     panels = shown.chart["panels"]
     assert [panel["title"] for panel in panels] == ["sofa", "sofa", "plane", "plane"]
     assert [panel["x"]["title"] for panel in panels[:2]] == [COST, RUNTIME]
     series = {each["name"]: each for each in panels[2]["series"]}
-    assert [*series] == ["front", "initial value, median", "DIST", "DVR"]
+    assert [*series] == ["front", "initial error, median", "DIST", "DVR"]
     assert (series["DVR"]["y"], series["DVR"]["shapes"]) == ([2.0], [[1_431_998, 2.0]])
     assert series["front"]["y"] == [2.0]
     text, tex = ((found.base.with_suffix(suffix)).read_text() for suffix in (".md", ".tex"))
@@ -223,7 +224,7 @@ def test_the_report_writes_the_table_and_it_is_read_back(tmp_path, capsys):
     assert not (tmp_path / "paper").exists()
     (found,) = find_sweeps(tmp_path)
     assert (found.name, found.shown.title) == ("completion-1", "Sweep over renderer, completion-1.")
-    assert found.shown.columns[:2] == ["Run", "Chamfer (x1000) ↓"] and found.shown.rows[0][:2] == ["DIST", "1.00"]
+    assert found.shown.columns[:2] == ["Row", "Chamfer (x1000) ↓"] and found.shown.rows[0][:2] == ["DIST", "1.00"]
     assert found.files == {
         suffix.upper(): f"sweeps/completion-1/table.{suffix}" for suffix in ("csv", "md", "pdf", "tex")
     }

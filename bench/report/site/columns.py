@@ -9,7 +9,17 @@ from bench.records.format import plural
 from bench.records.metrics import TABLE_METRICS
 from bench.records.names import SharedSettings, make_unique, ordered_settings, settings_of
 from bench.records.record import NEUTRAL_KEYS, as_number, digest, row_name, started, to_json_values
-from bench.report.data.records import OURS, Record, family, grouped, loop_seconds, run_key, setting, value_evaluations
+from bench.report.data.records import (
+    OURS,
+    Record,
+    cost,
+    family,
+    grouped,
+    loop_seconds,
+    run_key,
+    setting,
+    value_evaluations,
+)
 from bench.report.data.runs import MEASUREMENT_METRICS
 from bench.report.site.files import Folder
 from bench.report.suite.attempts import CUSTOM
@@ -113,7 +123,7 @@ NUMBERS = {
     "started": lambda record: int(started(record).timestamp()),
     "loop": lambda record: _safely(loop_seconds, record, None),
     "total": lambda record: record["seconds"].get("total"),
-    "values": lambda record: _safely(value_evaluations, record, None),
+    "cost": lambda record: cost(record) or _safely(value_evaluations, record, None),  # old records lack the first
     "gradients": lambda record: record["evaluations"].get("gradient"),
 }
 

@@ -42,12 +42,13 @@
     return [many && legend, panels, !many && legend, spec.note && element("p.soft", null, spec.note)];
   }
 
-  /* A button of the legend, which shows and hides a series: its marker, or its line where it has steps and no markers. */
+  /* A button of the legend, which shows and hides a series: its marker, or its line if it has steps or no markers. */
   function entry({name, symbol, colour, dash, step}, off, redraw) {
     const [, glyph] = (!step && SYMBOLS.get(symbol)) || [];
-    const swatch = element(glyph ? "span.glyph" : step ? "span.stroke" : "span.swatch", {"aria-hidden": "true"}, glyph);
-    swatch.style[glyph ? "color" : step ? "borderColor" : "background"] = bench.colour(colour);
-    if (step) swatch.style.borderTopStyle = {solid: "solid", dot: "dotted"}[DASHES.get(dash)] || "dashed";
+    const line = step || (dash !== undefined && !glyph);
+    const swatch = element(glyph ? "span.glyph" : line ? "span.stroke" : "span.swatch", {"aria-hidden": "true"}, glyph);
+    swatch.style[glyph ? "color" : line ? "borderColor" : "background"] = bench.colour(colour);
+    if (line) swatch.style.borderTopStyle = {solid: "solid", dot: "dotted"}[DASHES.get(dash)] || "dashed";
     const click = ({currentTarget}) => {
       off.has(name) ? off.delete(name) : off.add(name);
       currentTarget.setAttribute("aria-pressed", String(!off.has(name)));

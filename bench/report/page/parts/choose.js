@@ -75,7 +75,7 @@
       const covered = new Set(own.map((index) => runs.codes("cell")[index])).size;
       const row = {name, runs: own.length, failed: own.length - ok.length, covered};
       for (const key of metrics) row[key] = middle(runs, own, key);
-      for (const key of ["loop", "total", "values"])
+      for (const key of ["loop", "total", "cost"])
         row[key] = median(ok.map((index) => runs.number(index, key)).filter((value) => value !== null));
       return row;
     });

@@ -109,7 +109,7 @@
       const items = bench.choose.methods(bench.runs, own, metrics);
       const ordered = (all) => all.forEach((row, n) => (row.rank = ranks && cells ? n + 1 : null));
       const on = cells
-        ? ` on the ${plural(cells, "scene")} (shape, view, seed, what is given) that all have`
+        ? ` on the ${plural(cells, "scene")} (shape, view, seed, what is given) that all share`
         : items.length > 1 ? " without a scene in common: no ranks" : " alone";
       const title = `${scale ? `scale=${scale}: ` : ""}${plural(items.length, "method")}${on}`;
       return {columns: methodColumns(state, metrics), items, first, ordered, title};
@@ -135,7 +135,7 @@
       ...metrics.map(measured),
       numeric("failed", "Failed", (row) => row.failed / row.runs, (value, row) => share(row)),
       numeric("covered", "Scenes", (row) => row.covered, String, {down: true}),
-      ...costs((row, key) => row[key], "median, in all below"),
+      ...costs((row, key) => row[key], "median; whole run below"),
     ];
   }
 
@@ -156,7 +156,7 @@
       {...text("name", "Run", (index) => named(index, state)), head: true},
       text("status", "Status", (index) => [bench.badge(runs.text(index, "status")), reused(index)]),
       ...metrics.map(measured),
-      ...costs((index, key) => runs.number(index, key), "in all below"),
+      ...costs((index, key) => runs.number(index, key), "whole run below"),
       numeric("started", "Started", (index) => runs.number(index, "started"), (value) => soft(date(value)), {unit: "UTC", down: true}),
     ];
     return {columns, items: indices, first: metrics[0] || "started"};
@@ -165,7 +165,7 @@
   const costs = (get, unit) => [
     numeric("loop", "Optimisation", (item) => get(item, "loop"),
       (value, item) => [seconds(value), element("small", null, seconds(get(item, "total")))], {unit}),
-    numeric("values", "Field values", (item) => get(item, "values"), count),
+    numeric("cost", "Field evaluations", (item) => get(item, "cost"), count),
   ];
 
   function thumb(index) {

@@ -109,7 +109,7 @@
     const rows = [
       ["Optimisation", (n) => runs.number(indices[n], "loop"), seconds],
       ["In all", (n) => runs.number(indices[n], "total"), seconds],
-      ["Field values", (n) => runs.number(indices[n], "values"), count],
+      ["Field evaluations (a gradient counts as two)", (n) => runs.number(indices[n], "cost"), count],
       ["Gradients of the field", (n) => runs.number(indices[n], "gradients"), count],
       ["Operations", (n) => details[n].costs.flops, count],
       ["Peak memory", (n) => details[n].costs.peak_memory_bytes, size],
