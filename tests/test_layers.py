@@ -35,7 +35,8 @@ COMMANDS = (
 # Three layers: a file imports only from its layer and the layers below. Files that are not listed are the core.
 DATA_LAYER = ("datasets.files", "renderers.fields.networks", "renderers.fields.parts", "bench.photos", "bench.exports")
 STUDIES_LAYER = (
-    "bench.report", "bench.studies", "bench.pictures.figure_style", "bench.pictures.size_chart", "renderers.later",
+    "bench.report", "bench.studies", "bench.pictures.distances", "bench.pictures.figure_style",
+    "bench.pictures.size_chart", "renderers.later",
     "bench.evaluate.along_ray", "bench.evaluate.ray_derivatives", "bench.evaluate.ray_scene", "bench.pictures.ray",
     "bench.records.names", "bench.records.published", "bench.records.read",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",

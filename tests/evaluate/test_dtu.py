@@ -92,7 +92,7 @@ def test_the_box_reaches_60_mm_before_the_grid_and_120_mm_beyond_it():
 def test_without_a_mesh_or_far_from_the_scan_it_is_infinitely_wrong(folder):
     scan = read_scan(folder, NUMBER)
     assert dtu_metrics(None, scan, seed=0) == WORST == dtu_metrics(ball(centre=-CENTRE), scan, seed=0)
-    with pytest.raises(BadInput, match=r"too much for points 0\.2 mm apart: is it in mm"):
+    with pytest.raises(BadInput, match=r"too much for points 0\.2 apart: is it in the scan's"):
         dtu_metrics(ball(2e4, np.array([0, 0, 2e4]) + CENTRE, subdivisions=1), scan, seed=0)
 
 

@@ -18,6 +18,7 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 from scipy.spatial import cKDTree
 
+from bench.pictures.distances import Distances
 from bench.records.published import DVR_SCANS, DVR_TABLE2
 from bench.tasks.reconstruction.stereo import allowed_by_mask
 from datasets.files.meshes import read_points
@@ -27,6 +28,7 @@ from renderers.checks import BadInput
 
 SPACING_MM = 0.2  # the mesh is sampled with a point in each square of this side, then thinned to this distance
 MAX_DISTANCE_MM = 20.0  # larger distances do not count
+LAST_COLOUR_MM = 5.0
 VOLUME_MARGIN_MM = 60.0  # points of the mesh count within this margin of the observed volume, twice at its far corner
 MASK_DILATION_FRACTION = 1 / 32  # before culling, as NeuS: 50 pixels for the longer side of DTU's images, 1600
 MAX_MESH_SAMPLES = 300_000_000  # before thinning
@@ -43,6 +45,10 @@ DEFINITIONS = {
     "dtu_overall": "Mean of dtu_accuracy and dtu_completeness, the Chamfer distance of tables on DTU, in mm.",
 }
 WORST = dict.fromkeys(METRIC_NAMES, inf)
+PROTOCOL = (
+    f"points of the mesh, {SPACING_MM} mm apart, in ObsMask, and the scan's points above its plane; means of distances "
+    f"(not squared) to the nearest point; {MAX_DISTANCE_MM:g} mm and more are left out"
+)
 
 
 @dataclass(frozen=True)
@@ -126,14 +132,24 @@ def dtu_metrics(mesh: Mesh | None, scan: DtuScan, *, seed: int) -> dict[str, flo
     Raises:
         BadInput: if the mesh is too large, within the scan's box, to be sampled.
     """
-    if mesh is None:
-        return dict(WORST)
-    points = np.concatenate([*_sample_mesh(mesh, scan.box)])
+    return dict(WORST) if mesh is None else metrics_of(dtu_distances(mesh, scan, seed=seed))
+
+
+def dtu_distances(mesh: Mesh, scan: DtuScan, *, seed: int) -> Distances:
+    """The distances of `dtu_metrics`; those of `MAX_DISTANCE_MM` and more are infinite."""
+    points = np.concatenate([*sample_mesh(mesh, scan.box, SPACING_MM)])
     np.random.default_rng(seed).shuffle(points, axis=0)
     points = thinned(points, SPACING_MM)
     points = points[((points >= scan.box[0]) & (points < scan.box[1])).all(axis=1)]
-    accuracy = _mean_distance(points[scan.in_observed_cell(points)], scan.tree)
-    completeness = _mean_distance(scan.points_above_plane(), cKDTree(points)) if len(points) else inf
+    observed, above = points[scan.in_observed_cell(points)], scan.points_above_plane()
+    clouds = (observed, _nearest(observed, scan.tree), above, _nearest(above, cKDTree(points)))
+    return Distances(*clouds, "mm", None, scan.plane[:3], LAST_COLOUR_MM)
+
+
+def metrics_of(distances: Distances) -> dict[str, float]:
+    """The metrics of `DEFINITIONS`: means of the distances that are finite, infinite without any."""
+    counted = (array[np.isfinite(array)] for array in (distances.mesh_to_truth, distances.truth_to_mesh))
+    accuracy, completeness = (float(array.mean()) if len(array) else inf for array in counted)
     return dict(zip(METRIC_NAMES, (accuracy, completeness, (accuracy + completeness) / 2), strict=True))
 
 
@@ -181,12 +197,12 @@ def _greedy_mask(points: Float[np.ndarray, "n 3"], radius: float) -> Bool[np.nda
     return kept | undecided
 
 
-def _sample_mesh(mesh: Mesh, box: Float[np.ndarray, "2 3"]) -> Iterator[Float[np.ndarray, "_ 3"]]:
-    """Yields the vertices, then points in each face: centres of cells with an area of about `SPACING_MM` squared.
+def sample_mesh(mesh: Mesh, box: Float[np.ndarray, "2 3"], spacing: float) -> Iterator[Float[np.ndarray, "_ 3"]]:
+    """Yields the vertices, then points in each face: centres of cells with an area of about `spacing` squared.
 
     Points outside the box are left out; faces outside it are not sampled.
     """
-    low, high = box[0] - SPACING_MM, box[1] + SPACING_MM
+    low, high = box[0] - spacing, box[1] + spacing
 
     def in_box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
         return points[((points >= low) & (points <= high)).all(axis=1)]
@@ -197,12 +213,12 @@ def _sample_mesh(mesh: Mesh, box: Float[np.ndarray, "2 3"]) -> Iterator[Float[np
     start, sides = corners[:, 0], corners[:, 1:] - corners[:, :1]
     lengths, areas = np.linalg.norm(sides, axis=2), np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     start, sides, lengths, areas = (array[areas > 0] for array in (start, sides, lengths, areas))
-    counts = np.floor(lengths / (SPACING_MM * np.sqrt(lengths.prod(axis=1) / areas))[:, None])
+    counts = np.floor(lengths / (spacing * np.sqrt(lengths.prod(axis=1) / areas))[:, None])
     cell_counts = counts.prod(axis=1)
     if cell_counts.sum() > MAX_MESH_SAMPLES:
         raise BadInput(
-            f"the mesh has an area of {areas.sum() / 2e6:.3g} square metres near the scan, too much for points "
-            f"{SPACING_MM} mm apart: is it in mm? Cut off what is no part of the object, or cull it by masks"
+            f"the mesh has an area of {areas.sum() / 2:.3g} near the scan, too much for points {spacing:g} apart: is "
+            "it in the scan's units? Cut off what is no part of the object, or cull it by masks"
         )
     batch_ends = np.flatnonzero(np.diff(np.cumsum(cell_counts) // SAMPLES_PER_BATCH)) + 1
     for batch in np.split(np.arange(len(cell_counts)), batch_ends):
@@ -215,11 +231,12 @@ def _sample_mesh(mesh: Mesh, box: Float[np.ndarray, "2 3"]) -> Iterator[Float[np
         yield in_box(sides[face, 0] * along[:, :1] + sides[face, 1] * along[:, 1:] + start[face])
 
 
-def _mean_distance(points: Float[np.ndarray, "n 3"], tree: cKDTree) -> float:
-    """The mean of the distances to the nearest point below `MAX_DISTANCE_MM`; infinite if there is none."""
-    distances = tree.query(points, distance_upper_bound=MAX_DISTANCE_MM)[0] if len(points) else np.empty(0)
-    distances = distances[distances < MAX_DISTANCE_MM]
-    return float(distances.mean()) if len(distances) else inf
+def _nearest(points: Float[np.ndarray, "n 3"], tree: cKDTree) -> Float[np.ndarray, " n"]:
+    """The distance of each point to the nearest of a tree, infinite from `MAX_DISTANCE_MM` on."""
+    if not len(points) or not tree.n:
+        return np.full(len(points), inf)
+    distances = tree.query(points, distance_upper_bound=MAX_DISTANCE_MM)[0]
+    return np.where(distances < MAX_DISTANCE_MM, distances, inf)
 
 
 def _file(folder: Path, name: str, archive: str) -> Path:
