@@ -1,16 +1,17 @@
-"""`python -m bench.judge MESH --truth TRUTH`, or `--dtu FOLDER --scan 65`: judges a mesh from any source.
+"""`python -m bench.judge MESH --truth TRUTH`, `--dtu FOLDER --scan 65` or `--tnt FOLDER --scene Barn`: judges a mesh.
 
-Meshes are neither aligned nor scaled, except with --unit-sphere or --to-world. Results are in the units of the truth's
-file, with --unit-sphere in scene units, with --dtu in mm. The metrics are those of runs; bench/README.md defines them
-under "Which Chamfer is it?".
+Meshes are neither aligned nor scaled, except with --unit-sphere, --to-world or --tnt. Results are in the units of the
+truth's file, with --unit-sphere in scene units, with --dtu in mm. The metrics are those of runs; bench/README.md
+defines them under "Which Chamfer is it?".
 """
 
 import argparse
 import re
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,13 @@ import numpy as np
 from jaxtyping import Float
 
 from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, subsample, surface_metrics
+from bench.pictures.distances import compare_surfaces, draw_distances
 from bench.records.read import is_plain_name
 from bench.records.record import Record, RunStatus, digest, now, read_record
 from bench.records.results import check_links
 from bench.report.write.html import write_index
 from bench.tables import choice
-from bench.tasks.reconstruction import dtu
+from bench.tasks.reconstruction import dtu, tanks
 from datasets.files.meshes import find_meshes, read_mesh, read_points
 from datasets.files.own_photographs import Capture, ReadSettings, read_capture, scan_number
 from datasets.mesh import Mesh, fit_in_sphere
@@ -41,27 +43,42 @@ BOX_MARGIN_FRACTION = 0.02  # boxes are enlarged by it on each side, so that the
 MAX_CULLING_PIXELS = 800  # longer side of a photograph whose mask culls a mesh
 UNIT_SUFFIXES = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None, "normal_consistency": None}
 WORLD_MESH_FILE = "mesh_world.ply"  # the mesh of a run on photographs, in the world of their cameras
+ROW_PICTURE_FILE = "distances.png"
+PICTURE_POINTS = 300_000  # per surface, so that the samples are not seen in the picture
+SURFACE_SAMPLING = "random points on each surface, uniform by area; distances to the nearest point of the other surface"
+SURFACE_MEANS = (
+    "accuracy, completeness: mean distance from mesh to truth, from truth to mesh; chamfer_l1: their mean; "
+    "chamfer_l2: sum of the two means of squared distances; chamfer_gt_to_pred: the mean from truth to mesh alone"
+)
+SURFACE_SHARES = "how: fscore: harmonic mean of the shares of points, per surface, whose distance is below"
 JUDGE_TASK = "judge"  # the task of rows without --like
 
 
 @dataclass(frozen=True)
 class Item:
-    """A mesh, and the truth: a file or the number of a scan. The mesh is None if no mesh has the name of the truth."""
+    """A mesh, and the truth: a file, the number of a scan or the name of a scene.
+
+    The mesh is None if no mesh has the name of the truth.
+    """
 
     name: str
     mesh: Path | None
-    truth: Path | int
+    truth: Path | int | str
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The metrics of a mesh, and notes. If judging failed, `failure` is the reason, with the worst metrics."""
+    """The metrics of a mesh, and notes. If judging failed, `failure` is the reason, with the worst metrics.
+
+    `draw` writes a picture of the distances, with a title, to a path.
+    """
 
     name: str
     metrics: dict[str, float]
     notes: Sequence[str] = ()
     failure: str = ""
     mesh: Mesh | None = None
+    draw: Callable[[str, Path], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +94,8 @@ class Judge:
             into a sphere of `SPHERE_RADIUS`.
         to_world: folder of photographs; meshes are moved from their unit sphere into the world of their cameras.
         cull: folder of photographs whose masks cull meshes.
+        tanks_folder: the folder of Tanks and Temples; None for other truths.
+        tanks_settings: how its scans are compared.
     """
 
     folder: Path | None
@@ -86,10 +105,16 @@ class Judge:
     unit_sphere: bool
     to_world: Path | None
     cull: Path | None
+    tanks_folder: Path | None = None
+    tanks_settings: tanks.TanksSettings = tanks.PUBLISHED
 
     def __post_init__(self) -> None:
         if self.folder is not None and self.unit_sphere:
             raise ValueError("--unit-sphere is for --truth, and DTU's distances are in mm: leave it out")
+        if self.tanks_folder is not None and (self.unit_sphere or self.threshold != DEFAULT_THRESHOLD):
+            raise ValueError("--unit-sphere and --threshold are for --truth: --tnt has metres and a scene's threshold")
+        if self.tanks_folder is None and self.tanks_settings != tanks.PUBLISHED:
+            raise ValueError("--align, --no-icp and --surface are for --tnt: add --tnt FOLDER --scene Barn")
         if self.points < 1:
             raise ValueError(f"--points must be at least 1, found {self.points}")
         if not re.fullmatch(r"[\d.eE+-]+%?", self.threshold) or not float(self.threshold.rstrip("%")) > 0:
@@ -103,19 +128,36 @@ class Judge:
         """
         if item.mesh is None:
             raise ValueError(f"no mesh is named '{item.name}', as {item.truth} is")
+        if isinstance(item.truth, str):
+            return self._by_scene(item.name, item.mesh, item.truth)
         mesh = self.prepare(read_mesh(item.mesh))
         if isinstance(item.truth, Path):
             return self._by_surface(item.name, mesh, item.truth)
         scan = dtu.read_scan(self.folder or Path(), item.truth)
         notes = [*_mismatch_warnings(mesh, scan.points_above_plane(), *SCAN_LIMITS), *dtu.published_results(item.truth)]
-        metrics = dtu.dtu_metrics(mesh, scan, seed=self.seed)
+        distances = dtu.dtu_distances(mesh, scan, seed=self.seed)
+        metrics = dtu.metrics_of(distances)
         if metrics["dtu_accuracy"] == inf:
             raise BadInput(
                 f"'{item.mesh}': nothing of the mesh lies within {dtu.MAX_DISTANCE_MM:g} mm of scan {item.truth} "
                 "where it was observed: it must be in DTU's world, in mm; --to-world PHOTOS moves it there from their "
                 "unit sphere"
             )
-        return Verdict(item.name, metrics, notes, mesh=mesh)
+        notes.append(f"how: {dtu.PROTOCOL}")
+        return Verdict(item.name, metrics, notes, mesh=mesh, draw=partial(draw_distances, distances))
+
+    def _by_scene(self, name: str, file: Path, scene_name: str) -> Verdict:
+        """The metrics of Tanks and Temples. The file may have points only, as results there do."""
+        points = read_points(file)
+        if points is not None and (self.to_world or self.cull):
+            raise BadInput(f"'{file}' has no faces, and --to-world and --cull move and cut meshes: leave them out")
+        mesh = None if points is not None else self.prepare(read_mesh(file))
+        scene = tanks.read_scene(self.tanks_folder or Path(), scene_name)
+        settings = self.tanks_settings
+        distances, notes = tanks.tanks_distances(mesh or points, scene, settings, seed=self.seed)
+        notes = [*notes, f"how: {tanks.protocol(scene, settings)}"]
+        metrics = tanks.tanks_metrics(distances, scene.threshold)
+        return Verdict(name, metrics, notes, mesh=mesh, draw=partial(draw_distances, distances))
 
     def prepare(self, mesh: Mesh) -> Mesh:
         """The mesh after the movement and the culling of the settings."""
@@ -142,17 +184,31 @@ class Judge:
         extent = float(np.linalg.norm(np.ptp(truth_points, axis=0)))
         threshold = float(self.threshold.rstrip("%")) * (extent / 100 if self.threshold.endswith("%") else 1)
         threshold_text = f"{threshold:.4g}, {threshold / extent:.2%} of the truth's extent"
-        notes.append(f"{self.points} points of each; F at {threshold_text}")
+        notes += [
+            f"how: {self.points} {SURFACE_SAMPLING}",
+            f"how: {SURFACE_MEANS}",
+            f"{SURFACE_SHARES} {threshold_text}",
+        ]
         predicted_samples = sample_surface(mesh, self.points, self.seed + 1)
+        unit = "scene units" if self.unit_sphere else "units"
+
+        def draw(title: str, path: Path) -> None:
+            pair = mesh, truth_points if surface is None else surface
+            settings = {"seed": self.seed, "threshold": threshold, "unit": unit}
+            counts = self.points, max(self.points, PICTURE_POINTS)
+            measured, dense = (compare_surfaces(*pair, count=count, **settings) for count in counts)
+            draw_distances(measured, title, path, dense)
+
         if surface is None:
             metrics = cloud_metrics(
                 predicted_samples, subsample(truth_points, self.points, self.seed), threshold=threshold
             )
-            return Verdict(name, metrics, notes, mesh=mesh)
+            return Verdict(name, metrics, notes, mesh=mesh, draw=draw)
         true_samples, repeated_samples = (sample_surface(surface, self.points, self.seed + offset) for offset in (0, 2))
         sampling_error = surface_metrics(repeated_samples, true_samples, threshold=threshold)
         notes.append(f"two samplings of the truth have chamfer_l1 {sampling_error['chamfer_l1']:.4g}")
-        return Verdict(name, surface_metrics(predicted_samples, true_samples, threshold=threshold), notes, mesh=mesh)
+        metrics = surface_metrics(predicted_samples, true_samples, threshold=threshold)
+        return Verdict(name, metrics, notes, mesh=mesh, draw=draw)
 
 
 @cache
@@ -181,8 +237,11 @@ def _mismatch_warnings(mesh: Mesh, truth: Float[np.ndarray, "n 3"], max_ratio: f
     ]
 
 
-def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
-    """The meshes to judge: a mesh, a run's mesh, or the meshes of a folder, paired with truths by name or scan number.
+def items_of(mesh: Path, truth: Path | None, truth_of: Callable[[str], int | str]) -> list[Item]:
+    """The meshes to judge: a mesh, a run's mesh, or the meshes of a folder, paired with truths by their names.
+
+    Args:
+        truth_of: the scan or the scene of a mesh's name, if `truth` is None.
 
     Raises:
         ValueError: if meshes and truths do not fit.
@@ -192,7 +251,7 @@ def items_of(mesh: Path, truth: Path | None, scan: int | None) -> list[Item]:
         name, mesh = mesh.name, mesh / (WORLD_MESH_FILE if (mesh / WORLD_MESH_FILE).is_file() else "mesh.ply")
     meshes = {file.stem: file for file in find_meshes(mesh)} if mesh.is_dir() else {name: mesh}
     if truth is None:
-        return [Item(name, file, scan_number(file.stem) if scan is None else scan) for name, file in meshes.items()]
+        return [Item(name, file, truth_of(file.stem)) for name, file in meshes.items()]
     if mesh.is_dir() and not truth.is_dir():
         raise ValueError(f"{mesh} is a folder and --truth {truth} is none: give a folder with files of equal names")
     if truth.is_dir() and not mesh.is_dir():
@@ -207,6 +266,8 @@ def metric_units(judge: Judge) -> dict[str, str]:
     """The unit of each metric."""
     if judge.folder is not None:
         return dict.fromkeys(dtu.METRIC_NAMES, "mm")
+    if judge.tanks_folder is not None:
+        return dict.fromkeys(tanks.METRIC_NAMES, "")
     unit = "scene unit" if judge.unit_sphere else "unit"
     powers = {name: UNIT_SUFFIXES.get(name, "") for name in WORST_SURFACE}
     return {name: "" if power is None else unit + power for name, power in powers.items()}
@@ -238,14 +299,14 @@ def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: a
 
     Args:
         index: index of the mesh in its folder.
-        options: the command line: `into`, `method`, and `like`, a run with the same problem.
+        options: the command line: `into`, `method`, `picture`, and `like`, a run with the same problem.
     """
     method = re.sub(r"[^a-z0-9]+", "_", options.method.lower()).strip("_")
     if options.like is not None:
         like = read_record(options.like)
         fields: dict[str, Any] = {name: like[name] for name in ("task", "dataset", "seed", "scene", "config")}
     else:
-        truth = str(options.truth or options.dtu)
+        truth = str(options.truth or options.dtu or options.tnt)
         config = {"task": {"points": judge.points}, "dataset": {"path": truth}, "index": index, "split": "test"}
         fields = {"task": JUDGE_TASK, "dataset": JUDGE_TASK, "seed": judge.seed, "scene": item.name, "config": config}
     fields["config"] |= {"label": options.method, "renderer": {}, "silhouette": None, "results_dir": str(options.into)}
@@ -254,13 +315,17 @@ def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: a
     record.status, record.reason = (RunStatus.EMPTY, verdict.failure) if verdict.failure else (RunStatus.OK, "")
     record.metrics, record.notes = dict(verdict.metrics), [f"judged from {item.mesh}", *verdict.notes]
     unit = "scene units" if judge.unit_sphere else "units of the truth's file"
-    definitions = {name: text.replace("scene units", unit) for name, text in DEFINITIONS.items()} | dtu.DEFINITIONS
+    definitions = {name: text.replace("scene units", unit) for name, text in DEFINITIONS.items()}
+    definitions |= dtu.DEFINITIONS | tanks.DEFINITIONS
     record.definitions = {name: definitions[name] for name in verdict.metrics}
     record.ended = now()
     folder = options.into / "runs" / record.id
     folder.mkdir(parents=True, exist_ok=True)
     if verdict.mesh is not None:
         verdict.mesh.save(folder / "mesh.ply")
+    picture = picture_path(options.picture, item)
+    if picture is not None and verdict.draw is not None:
+        shutil.copy(picture, folder / ROW_PICTURE_FILE)
     record.write(folder)
 
 
@@ -271,7 +336,12 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     truth = parser.add_mutually_exclusive_group(required=True)
     truth.add_argument("--truth", type=Path, help="the true mesh, or points on it; a folder where MESH is one")
     truth.add_argument("--dtu", type=Path, metavar="FOLDER", help="DTU's, with Points/stl and ObsMask")
+    truth.add_argument("--tnt", type=Path, metavar="FOLDER", help="Tanks and Temples', with Barn/Barn.ply, Barn.json")
     parser.add_argument("--scan", type=int, help="of DTU (default: the number in the mesh's name)")
+    parser.add_argument("--scene", help="of Tanks and Temples (default: the scene in the mesh's name)")
+    parser.add_argument("--align", type=Path, metavar="FILE", help="of --tnt: 4 x 4 numbers, or .log of the cameras")
+    parser.add_argument("--no-icp", dest="icp", action="store_false", help="of --tnt: do not refine the alignment")
+    parser.add_argument("--surface", action="store_true", help="of --tnt: points of faces too, not only vertices")
     threshold = "of F, in units or %% of the truth's extent (default: %(default)s)"
     parser.add_argument("--threshold", default=DEFAULT_THRESHOLD, help=threshold)
     points = "sampled on each surface (default: %(default)s)"
@@ -280,10 +350,47 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--unit-sphere", action="store_true", help="move both as runs move a mesh: scene units")
     parser.add_argument("--to-world", type=Path, metavar="PHOTOS", help="move the mesh out of their unit sphere")
     parser.add_argument("--cull", type=Path, metavar="PHOTOS", help="cut off what their masks exclude, as NeuS does")
+    picture = "mesh and truth coloured by distance, with curves as .csv; a folder where MESH is one"
+    parser.add_argument("--picture", type=Path, metavar="PNG", help=picture)
     parser.add_argument("--into", type=Path, metavar="RESULTS", help="write rows into a results folder")
     parser.add_argument("--method", help="the name of these rows")
     parser.add_argument("--like", type=Path, metavar="RUN", help="a run whose problem the meshes answer")
     return parser.parse_args(arguments)
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Refuses options that do not fit each other.
+
+    Raises:
+        ValueError: the message says what to type instead.
+    """
+    is_folder = options.mesh.is_dir() and not (options.mesh / "record.json").is_file()
+    if options.into is not None and not (options.method and is_plain_name(options.method)):
+        raise ValueError("--into writes rows of a method: add --method NAME")
+    if options.like is not None and is_folder:
+        raise ValueError(f"--like names the problem of one run, and {options.mesh} is a folder: name one mesh")
+    if options.like is not None and not options.unit_sphere and read_record(options.like)["dataset"] != "photos":
+        raise ValueError("--like names a run, whose metrics are in scene units: add --unit-sphere, and its truth")
+    if options.picture is not None and (options.picture.suffix.lower() == ".png") is is_folder:
+        wanted = "a folder" if is_folder else "a file that ends in .png"
+        raise ValueError(f"--picture must name {wanted} for {options.mesh}, found {options.picture}")
+    if options.scene is not None and options.tnt is None:
+        raise ValueError("--scene is of Tanks and Temples: add --tnt FOLDER")
+    if options.into is not None:
+        check_links(options.into)
+
+
+def picture_path(picture: Path | None, item: Item) -> Path | None:
+    """The file of a mesh's picture: the named file, or a file in the named folder."""
+    is_file = picture is None or picture.suffix.lower() == ".png"
+    return picture if is_file else picture / f"{item.name}.png"
+
+
+def truth_of(options: argparse.Namespace, name: str) -> int | str:
+    """The scan or the scene of a mesh, from the command line or from its name."""
+    if options.tnt is not None:
+        return tanks.scene_name(options.scene or name)
+    return scan_number(name) if options.scan is None else options.scan
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -293,27 +400,27 @@ def main(arguments: list[str] | None = None) -> int:
         judge = Judge(
             *(options.dtu, options.threshold, options.points, options.seed),
             *(options.unit_sphere, options.to_world, options.cull),
+            *(options.tnt, tanks.TanksSettings(options.align, options.icp, options.surface)),
         )
-        if options.into is not None and not (options.method and is_plain_name(options.method)):
-            raise ValueError("--into writes rows of a method: add --method NAME")
-        if options.like is not None and options.mesh.is_dir() and not (options.mesh / "record.json").is_file():
-            raise ValueError(f"--like names the problem of one run, and {options.mesh} is a folder: name one mesh")
-        if options.like is not None and not options.unit_sphere and read_record(options.like)["dataset"] != "photos":
-            raise ValueError("--like names a run, whose metrics are in scene units: add --unit-sphere, and its truth")
-        items, verdicts = items_of(options.mesh, options.truth, options.scan), list[Verdict]()
-        for item in items:
+        check_options(options)
+        items, verdicts = items_of(options.mesh, options.truth, partial(truth_of, options)), list[Verdict]()
+        for index, item in enumerate(items):
             try:
-                verdicts.append(judge.verdict(item))
+                verdict = judge.verdict(item)
             except (OSError, ValueError) as error:
                 if len(items) == 1:
                     raise
-                worst = WORST_SURFACE if options.dtu is None else dtu.WORST
-                verdicts.append(Verdict(item.name, dict(worst), failure=" ".join(str(error).split())))
+                worst = WORST_SURFACE if options.truth else dtu.WORST if options.dtu else tanks.WORST
+                verdict = Verdict(item.name, dict(worst), failure=" ".join(str(error).split()))
+            picture = picture_path(options.picture, item) if verdict.draw is not None else None
+            if picture is not None:
+                picture.parent.mkdir(parents=True, exist_ok=True)
+                verdict.draw(f"{item.name}: distance of each point to the other surface", picture)
+            if options.into is not None:
+                write_row(verdict, item, index, judge, options)
+            verdicts.append(replace(verdict, mesh=None, draw=None))  # a folder may have many
         print_verdicts(verdicts, metric_units(judge))
         if options.into is not None:
-            check_links(options.into)
-            for index, (item, verdict) in enumerate(zip(items, verdicts, strict=True)):
-                write_row(verdict, item, index, judge, options)
             print(write_index(options.into))
     except (OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

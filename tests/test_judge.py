@@ -255,3 +255,15 @@ def test_a_record_may_name_the_problem_of_a_run(files, capsys):
     assert "--like names the problem of one run" in refused(capsys, files / "found", "--truth", files / "truth", *more)
     Record("run", "completion", "newton", "mesh", 3, config, scene="spot").write(files / "run")
     assert "in scene units: add --unit-sphere" in refused(capsys, *pair(files, "small"), *more)
+
+
+def test_pictures_of_a_folder_have_the_names_of_the_meshes(files, capsys):
+    (files / "found/large.ply").unlink()
+    (files / "found/plate.ply").unlink()
+    common = (files / "found", "--truth", files / "truth", *FEW, "--picture")
+    notes = judged(capsys, *common, files / "pictures", code=1)["notes"]
+    assert [file.name for file in sorted((files / "pictures").iterdir())] == ["small.csv", "small.png"]
+    with (files / "pictures/small.csv").open() as file:
+        assert file.readline().strip() == "distance_units,precision,recall,fscore"
+    assert sum("how: " in note for note in notes) == 3
+    assert "--picture must name a folder for" in refused(capsys, *common, files / "one.png")

@@ -32,6 +32,7 @@ TABLE_METRICS = {  # the order is that of tables
     "depth_mae": Metric("depth error (x1000)", 1000.0, LOWER),
     "mask_iou": Metric("mask IoU", better=HIGHER),
     "dtu_overall": Metric("DTU overall (mm)", better=LOWER),
+    "tnt_fscore": Metric("F-score, Tanks and Temples", better=HIGHER),
     "psnr": Metric("PSNR (dB)", better=HIGHER),
     "psnr_image": Metric("PSNR of whole images (dB)", better=HIGHER),
     "ssim": Metric("SSIM", better=HIGHER),
@@ -54,7 +55,7 @@ OTHER_DIRECTIONS = {  # which direction is better, for metrics that tables do no
     **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred"), LOWER),
     **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
     **dict.fromkeys(("dtu_accuracy", "dtu_completeness"), LOWER),
-    "mask_iou_least": HIGHER,
+    **dict.fromkeys(("mask_iou_least", "tnt_precision", "tnt_recall"), HIGHER),
 }
 NON_NEGATIVE = frozenset(  # distances and angles; roughness is a logarithm
     (

@@ -16,6 +16,7 @@ PICTURE_TEXTS = {
     "film.webp": "The way from the start to the end, moving",
     "curve.png": "Loss and error over the iterations",
     "input.png": "What was given",
+    "distances.png": "Mesh and truth, coloured by the distance to the other",
     "failure.png": "The first failure: kinds of pixels, beside the true distance",
 }
 
