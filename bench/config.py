@@ -14,7 +14,7 @@ from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hi
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.tables import LABEL_KEY, LOOK_KEY, ROWS_KEY, choice, names, nearest, register_resolvers
+from bench.tables import CONF, LABEL_KEY, LOOK_KEY, ROWS_KEY, choice, names, nearest, read_yaml, register_resolvers
 
 MIN_VALUES = {
     **{"seed": 0, "index": 0, "draw": 0, "threads": 1, "evaluation.grid": 8, "evaluation.points": 1},
@@ -44,15 +44,13 @@ ROLE_OF_NODE = {  # the protocol or base class that the class of a node must hav
     "prior": "datasets.scene.HasNetwork",
     "supervision": "bench.tasks.single_view.training.Supervision",
 }
-CLASS_OF_NODE = {  # for nodes without a _target_
+CLASS_OF_NODE = {  # for nodes without a _target_; see also conf/extensions.yaml
     "view": "datasets.views.ViewSampler",
     "auto": "bench.setup.auto.AutoSettings",
     "prior": "bench.shape_prior.PriorSettings",
-    "models": "bench.tasks.capacity.settings.ModelSettings",
     "evaluation": "bench.config.EvaluationSettings",
 }
 PRIOR_FIELD = "prior"  # value of `field`: a latent code of the prior
-FIT_MODULE = "bench.tasks.capacity.field"  # its `fit_view` fits any other field; only such a run loads it
 TYPE_LABELS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "null"}
 
 
@@ -279,6 +277,22 @@ def _role_fault(cls: type, role: type) -> str:
     return f"it lacks {', '.join(missing)}: see {role.__module__}" if missing else ""
 
 
+def class_of_node(name: str) -> str:
+    """The class of a node without a `_target_`; empty if it needs one."""
+    return CLASS_OF_NODE.get(name) or extensions().get(name, "")
+
+
+def extensions() -> dict[str, str]:
+    """The classes and functions of the layers above the core by their purpose: conf/extensions.yaml."""
+    return read_yaml(CONF / "extensions.yaml")
+
+
+def extension(purpose: str) -> Any:
+    """A class or function of `extensions`, imported at its use."""
+    module, _, name = extensions()[purpose].rpartition(".")
+    return getattr(import_module(module), name)
+
+
 def build_once(nodes: Mapping[str, Any], packages: Sequence[str], built: dict[str, Any]) -> list[Any]:
     """The objects of nodes by name, as `build` makes them; equal nodes are built once.
 
@@ -290,7 +304,7 @@ def build_once(nodes: Mapping[str, Any], packages: Sequence[str], built: dict[st
     for name, text in texts.items():
         if text not in built:
             try:
-                built[text] = build(nodes[name], name, packages, CLASS_OF_NODE.get(name, ""))
+                built[text] = build(nodes[name], name, packages, class_of_node(name))
             except ValueError as error:
                 built[text] = error
         if isinstance(built[text], ValueError):

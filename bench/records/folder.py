@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import FIT_MODULE, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references
+from bench.config import OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references, extensions
 from bench.records.imports import ROOT, imported_files
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.records.results import PlannedRun
@@ -62,9 +62,18 @@ def code_hash(config: Mapping[str, Any]) -> str:
     hashed = {key: value for key, value in config.items() if key not in NEUTRAL_KEYS}
     targets = {*_values_of_key(hashed, "_target_")}
     targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}
-    targets |= {FIT_MODULE} if hashed.get("field", PRIOR_FIELD) != PRIOR_FIELD else set()
+    targets |= {extensions()[purpose] for purpose in _used_extensions(hashed)}
     code = _our_code_hash(frozenset(targets), bool(packages))
     return digest([code, *(_package_hash(name) for name in packages), *files])
+
+
+def _used_extensions(config: Mapping[str, Any]) -> Iterator[str]:
+    """The purposes of the classes and functions of conf/extensions.yaml that a run uses."""
+    yield "pictures"
+    if (config.get("task") or {}).get("colour_weight"):
+        yield "colours"
+    if config.get("field", PRIOR_FIELD) != PRIOR_FIELD:
+        yield "fit"
 
 
 def _user_packages(config: Mapping[str, Any]) -> set[str]:

@@ -1,12 +1,10 @@
 """The field of an unknown shape: the names to choose from, and the choice of a run."""
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
-from bench.config import FIT_MODULE, PRIOR_FIELD
+from bench.config import PRIOR_FIELD
 from bench.setup.auto import AUTO
 from bench.tables import nearest
 from renderers.checks import check_at_least
@@ -67,10 +65,6 @@ class FieldChoice:
     def of_prior(self) -> bool:
         """Whether the field is a code of the dataset's prior."""
         return self.name == PRIOR_FIELD
-
-    def load_fit(self) -> Callable[..., None]:
-        """Returns `fit_view`, which fits a field without a prior to a view."""
-        return import_module(FIT_MODULE).fit_view
 
     @property
     def candidates(self) -> tuple[str, ...]:

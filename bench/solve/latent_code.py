@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import log, nan, pi
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -13,7 +12,6 @@ from torch import Tensor
 
 from bench.evaluate.evaluate import CHECKPOINT_METRICS, Evaluation, chamfer_only, evaluate
 from bench.evaluate.state import State
-from bench.pictures.run_figures import InputView, draw_run
 from bench.shape_prior import Prior
 from bench.solve.optimise import CannotContinue, Starts, StartSettings
 from renderers.checks import check_at_least, check_choice
@@ -88,7 +86,6 @@ class CodeProblem:
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = CHECKPOINT_METRICS
-    shown: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         self.decoder = self.prior.decoder.to(self.device).requires_grad_(False)
@@ -124,12 +121,6 @@ class CodeProblem:
     def checkpoint(self, state: State) -> dict[str, float]:
         """The Chamfer distances of the current shape."""
         return chamfer_only(state)
-
-    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
-        """Writes the pictures of the run; see `bench.solve.solve.Problem`."""
-        view, observed = states[0].inputs.scene.observed_view()[0], self.observed.cpu().numpy()
-        observations = InputView(view, observed, self.photographs, self.mask, self.coloured)
-        draw_run(folder, states, observations, curve, title)
 
     def loss(self, step: int, start: int = 0) -> Terms:
         """The terms and their sum."""

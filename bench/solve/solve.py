@@ -7,20 +7,22 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.config import DOUBLING
+from bench.config import DOUBLING, extension
 from bench.evaluate.evaluate import COLOUR_DEFINITIONS, DEFINITIONS, Evaluation, depth_gap_note
 from bench.evaluate.state import State
 from bench.machine.environment import seconds_at_peak
-from bench.pictures.filmstrip import Shown
 from bench.records.record import Record, RunStatus, curve_file
 from bench.records.shipped import best_possible
 from bench.setup.inputs import RunContext, RunInputs
+from bench.shape_prior import Prior
 from bench.solve.optimise import BUDGET, CannotContinue, History, Optimisable, OptimiserSettings, optimise
 from datasets.mesh import Mesh
 from datasets.saved_field import FIELD_FILE, save_field
+from datasets.scene import Scene, View
 from renderers.camera import Camera
 from renderers.field import Counts, Field
 from renderers.rendering import Renderer, Unsupported, check_kind
@@ -54,16 +56,11 @@ COST_DEFINITIONS = {
 
 @runtime_checkable
 class Problem(Optimisable, Protocol):
-    """An inverse problem: its unknown, and the evaluation and drawing of its state."""
+    """An inverse problem: its unknown, and the evaluation of its state."""
 
     tracked: tuple[str, ...]  # metrics that each checkpoint writes into the curve
     rays_per_iteration: int
     observed: Bool[Tensor, "height width"]  # pixels of the scene's view whose depth is observed
-
-    @property
-    def shown(self) -> Shown | None:
-        """The reference of the filmstrip's frames; None for the scene's shape in its view."""
-        ...
 
     def objective(self) -> float | None:
         """A measure that must decrease, not counted as cost; None if losses of different iterations are comparable."""
@@ -74,7 +71,7 @@ class Problem(Optimisable, Protocol):
         ...
 
     def camera(self) -> Camera | None:
-        """The camera of the filmstrip's frame of the current state; None for the scene's camera."""
+        """The camera of the picture of the current state; None for the scene's camera."""
         ...
 
     def evaluate(self, state: State) -> Evaluation:
@@ -83,14 +80,6 @@ class Problem(Optimisable, Protocol):
 
     def checkpoint(self, state: State) -> dict[str, float]:
         """Only the `tracked` metrics of the current state."""
-        ...
-
-    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
-        """Writes the pictures of the run into its folder.
-
-        Args:
-            states: before and after the optimisation.
-        """
         ...
 
 
@@ -114,6 +103,73 @@ def check_field_gradient(renderer: Renderer) -> None:
     """Raises Unsupported if a renderer has no gradient towards the field's parameters."""
     if not renderer.capabilities.field_gradient:
         raise Unsupported(f"{type(renderer).__name__} has no gradient towards the field")
+
+
+@runtime_checkable
+class Pictures(Protocol):
+    """The pictures of one run, made from its inputs; the extension `pictures`. Never drawn within a timed phase."""
+
+    def add(self, name: int | str, state: State, camera: Camera | None = None) -> None:
+        """Adds a picture of a state, such as that of a checkpoint.
+
+        Args:
+            name: its label, such as an iteration.
+            camera: of the picture; None for the scene's.
+        """
+        ...
+
+    def draw(self, run: RunContext, solution: Solution, *, gallery: bool) -> None:
+        """Writes the pictures of a solved problem into the run's folder, after its result is in the record.
+
+        Args:
+            gallery: whether pictures for galleries are written, if the configuration has a size for them.
+        """
+        ...
+
+    def compare(self, folder: Path, view: View, reference: View, *, title: str) -> None:
+        """Writes the pictures of a rendering and of its reference into a run's folder."""
+        ...
+
+
+@runtime_checkable
+class InverseTask(Protocol):
+    """A task that is an inverse problem of a prior's code; `solve_task` executes it."""
+
+    optimiser: OptimiserSettings
+
+    def problem(self, scene: Scene, prior: Prior, renderer: Renderer, *, seed: int, device: torch.device) -> Problem:
+        """The inverse problem of a scene.
+
+        Raises:
+            Unsupported: the renderer lacks a gradient that the task needs.
+        """
+        ...
+
+
+def solve_task(task: InverseTask, run: RunContext) -> State:
+    """Solves a task's inverse problem of a code, and returns the final state."""
+    inputs = run.inputs
+
+    def problem() -> Problem:
+        return task.problem(inputs.scene, inputs.prior, inputs.renderer, seed=inputs.seed, device=inputs.device)
+
+    return solve_and_draw(problem, task.optimiser, run, metric_definitions(inputs), gallery=True)
+
+
+def solve_and_draw(
+    make_problem: Callable[[], Problem],
+    settings: OptimiserSettings,
+    run: RunContext,
+    definitions: dict[str, str],
+    *,
+    gallery: bool = False,
+) -> State:
+    """Solves a problem (see `solve`), draws it (see `Pictures.draw`), and returns the final state."""
+    pictures: Pictures = extension("pictures")(run.inputs)
+    solution = solve(make_problem, settings, run, definitions, pictures.add)
+    with run.off_clock():
+        pictures.draw(run, solution, gallery=gallery)
+    return solution.states[1]
 
 
 def solve(

@@ -17,11 +17,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.config import load
+from bench.config import extension, load
 from bench.evaluate.reference import Reference, reference_for
 from bench.machine.environment import Stopwatch, gemm_peak, seconds_at_peak, using_threads
 from bench.machine.limits import LimitReached, Limits
-from bench.pictures.run_figures import draw_against, save_images
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import check_field_gradient, evaluation_counts
@@ -217,9 +216,8 @@ class Ablation:
                 if (work_ratio := timed.step.counts.over_bound(timed.decoder.at(timed.code))) is not None:
                     metrics["work_over_bound"] = work_ratio
                 record.metrics |= {f"{name}.{key}": number for key, number in metrics.items()}
-        views = bench.views()
-        save_images(run.folder, *views)
-        draw_against(run.folder / "summary.png", *views, title=f"{record.name}, {record.scene}: {record.status}")
+        title = f"{record.name}, {record.scene}: {record.status}"
+        extension("pictures")(run.inputs).compare(run.folder, *bench.views(), title=title)
 
 
 @dataclass

@@ -7,15 +7,13 @@ from typing import ClassVar
 
 import torch
 
-from bench.pictures.colours import note_colours
-from bench.pictures.run_figures import InputView
+from bench.config import extension
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.draw import solve_task
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
 from bench.solve.observed_view import DEPTH_LOSSES, ObservedView, generator_of
 from bench.solve.optimise import OptimiserSettings, StartSettings, with_affordable_rays
-from bench.solve.solve import check_field_gradient, save_in_world
+from bench.solve.solve import check_field_gradient, save_in_world, solve_task
 from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount, pixel_of_each_block
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
@@ -102,12 +100,12 @@ class Completion:
         if inputs.field.of_prior:
             state = solve_task(self, run)
             if self.colour_weight:
-                note_colours(run, state)
+                extension("colours")(run, state)
         else:
             check_field_gradient(inputs.renderer)
             view = self._observed_view(inputs.scene, inputs.renderer, seed=inputs.seed, device=inputs.device)
-            fit_view = inputs.field.load_fit()
-            fit_view(view, self._pictured(inputs.scene, view), run, iterations=self.optimiser.iterations)
+            true_view, _ = inputs.scene.observed_view(exact=self.depths == EXACT)
+            extension("fit")(view, true_view, run, iterations=self.optimiser.iterations)
         if inputs.scene.to_world is not None:
             save_in_world(run.folder, inputs.scene.to_world)
 
@@ -142,11 +140,6 @@ class Completion:
             return flat.drawn(pixels.to(view.observed.device)).compare(field, iteration)
 
         return compare
-
-    def _pictured(self, scene: Scene, view: ObservedView) -> InputView:
-        """The observations for pictures."""
-        true_view, _ = scene.observed_view(exact=self.depths == EXACT)
-        return InputView(true_view, view.observed.cpu().numpy(), mask=view.mask is not None)
 
     def _observed_view(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:
         """The observed part of a scene's view."""

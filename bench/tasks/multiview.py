@@ -12,11 +12,10 @@ from torch import Tensor
 
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.draw import solve_and_draw
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
 from bench.solve.observed_view import generator_of
 from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
-from bench.solve.solve import check_field_gradient, metric_definitions
+from bench.solve.solve import check_field_gradient, metric_definitions, solve_and_draw
 from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.shot import Shot

@@ -4,8 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from hashlib import sha256
 from math import atan2, degrees, radians, sqrt
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -20,11 +19,9 @@ from bench.evaluate.evaluate import (
     view_metrics,
 )
 from bench.evaluate.state import REACH, State
-from bench.pictures.run_figures import draw_curve
 from bench.records.record import digest
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import load_or_make
-from bench.solve.draw import solve_and_draw
 from bench.solve.observed_view import (
     DEPTH_LOSSES,
     depth_error,
@@ -34,6 +31,7 @@ from bench.solve.observed_view import (
     observed_hits,
 )
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
+from bench.solve.solve import solve_and_draw
 from datasets.scene import Scene, View, see
 from datasets.views import pixel_of_each_block
 from renderers.boundary import render_checked
@@ -213,7 +211,6 @@ class PoseProblem:
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = TRACKED
-    shown: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         self.cameras = [camera.to(self.device) for camera in self.cameras]
@@ -244,10 +241,6 @@ class PoseProblem:
     def checkpoint(self, state: State) -> dict[str, float]:
         """The errors of the current camera."""
         return self.settings.metrics(self.camera(), self.view.camera)
-
-    def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
-        """Writes the curve of the loss."""
-        draw_curve(folder / "curve.png", curve)
 
     def camera(self) -> Camera:
         """The current camera, on the CPU; the initial one if the parameters are not finite."""

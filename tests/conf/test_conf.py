@@ -8,7 +8,7 @@ import trimesh
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import CLASS_OF_NODE, build, check_references, load
+from bench.config import build, check_references, class_of_node, extension, extensions, load
 from bench.pictures import figure_style
 from bench.pictures.figure_style import look
 from bench.runner.compose import Composer, composing
@@ -96,14 +96,24 @@ def cells(name: str) -> list[list[str]]:
 
 
 def build_part(config: DictConfig, node: str):
-    return build(config[node], node, list(config.packages), CLASS_OF_NODE.get(node, ""))
+    return build(config[node], node, list(config.packages), class_of_node(node))
 
 
 def test_every_yaml_is_in_a_folder_that_is_searched():
-    assert {path.stem for path in CONF.glob("*.yaml")} == {"config", "suite", "published", *GROUP_OF_TABLE}
+    assert {path.stem for path in CONF.glob("*.yaml")} == {
+        "config",
+        "extensions",
+        "suite",
+        "published",
+        *GROUP_OF_TABLE,
+    }
     folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")} - {"."}
     files = {"task", "renderer", "dataset", "prior", "scale", "tracker", "experiment", "hydra/launcher"}
     assert folders <= files | {*GROUP_OF_TABLE.values(), "method/space"}
+
+
+def test_extensions_exist():
+    assert all(callable(extension(purpose)) for purpose in extensions())
 
 
 def test_no_yaml_sets_the_mode_of_hydra():

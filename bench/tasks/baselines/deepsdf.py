@@ -6,9 +6,9 @@ import torch
 
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior
-from bench.solve.draw import solve_task
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.optimise import OptimiserSettings
+from bench.solve.solve import solve_task
 from datasets.scene import Scene
 from datasets.views import observed_pixels, parse_amount
 from renderers.camera import sphere_span

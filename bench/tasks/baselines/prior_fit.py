@@ -8,9 +8,9 @@ from bench.evaluate.evaluate import surface_metrics
 from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior, near_surface_first, sample_distances
-from bench.solve.draw import solve_task
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms
 from bench.solve.optimise import OptimiserSettings
+from bench.solve.solve import solve_task
 from datasets.scene import Scene, sample_surface, see
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, autograd_gradients

@@ -8,11 +8,11 @@ import torch
 from bench.evaluate.evaluate import DEFINITIONS, Evaluation, evaluate
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import Filmstrip
+from bench.pictures.run import draw
 from bench.pictures.run_figures import InputView, draw_run
 from bench.records.record import Record, RunStatus, curve_file
 from bench.setup.auto import footprint
 from bench.setup.inputs import RunContext
-from bench.solve.draw import draw
 from bench.solve.observed_view import ObservedView
 from bench.solve.solve import COST_DEFINITIONS, note_costs, note_result
 from bench.tasks.capacity.candidates import by_size
@@ -20,6 +20,7 @@ from bench.tasks.capacity.fit import FitProblem, Fitter
 from bench.tasks.capacity.growth import Growth, grow
 from bench.tasks.capacity.model import Evidence
 from bench.tasks.capacity.observations import RayObservations, concatenate_views, hold_out, tiles
+from datasets.scene import View
 
 # Of the rays of each tile of a view.
 HELD_OUT_FRACTION = 0.2
@@ -41,9 +42,14 @@ FIELD_DEFINITIONS = {
 }
 
 
-def fit_view(view: ObservedView, pictured: InputView, run: RunContext, *, iterations: int) -> None:
-    """Fits the shape of a run to its view, of which a fraction of each tile is held out; see `solve_by_growth`."""
+def fit_view(view: ObservedView, true_view: View, run: RunContext, *, iterations: int) -> None:
+    """Fits the shape of a run to its view, of which a fraction of each tile is held out; see `solve_by_growth`.
+
+    Args:
+        true_view: the images of the view, for pictures.
+    """
     inputs = run.inputs
+    pictured = InputView(true_view, view.observed.cpu().numpy(), mask=view.mask is not None)
     camera = inputs.scene.view.camera
     half_pixel = footprint(float(camera.intrinsics[0, 0]), float(torch.linalg.vector_norm(camera.center)))
     rays, groups = concatenate_views([view]), tiles(*view.observed.shape)

@@ -8,9 +8,8 @@ import torch
 from bench.evaluate.state import State
 from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
-from bench.solve.draw import solve_and_draw
 from bench.solve.optimise import OptimiserSettings, with_affordable_rays
-from bench.solve.solve import check_field_gradient
+from bench.solve.solve import check_field_gradient, solve_and_draw
 from bench.tasks.reconstruction.choice import DEFINITIONS, Appearance, AutoField
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, judge
 from bench.tasks.reconstruction.losses import Losses
