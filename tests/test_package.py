@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from bench.clusters import Ray, Slurm
 from bench.records.results import RESULTS
 from bench.records.shipped import FITS, SURFACE_METRICS, shipped_rows
-from bench.runner.executors import EXTRA_BY_EXECUTOR
 from datasets.extras import install_command, version
 from tests.runner.driving import by_program
 
@@ -82,7 +82,7 @@ def test_every_extra_that_a_message_names_exists():
     sources = [(ROOT / path).read_text(encoding="utf-8") for path in of_packages(tracked()) if path.endswith(".py")]
     named = [extra for source in sources for extra in re.findall(r"""\binstall_command\(["'](\w+)["']\)""", source)]
     assert len(named) >= 4
-    assert {*named, *EXTRA_BY_EXECUTOR.values()} <= set(PROJECT["project"]["optional-dependencies"])
+    assert {*named, Slurm.extra, Ray.extra} <= set(PROJECT["project"]["optional-dependencies"])
 
 
 def started(folder: Path, *arguments: str) -> tuple[int, str]:

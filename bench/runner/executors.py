@@ -1,7 +1,8 @@
-"""Runs the cells of a sweep by `hydra/launcher`: in this process, in local workers, in Slurm jobs or by Ray."""
+"""Runs the cells of a sweep by `hydra/launcher`: in this process or in local workers; see also `clusters`."""
 
 import os
 import signal
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -10,38 +11,28 @@ from itertools import chain
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from pathlib import Path
-from shutil import which
-from typing import Any
+from typing import Any, ClassVar
 
 from omegaconf import DictConfig, OmegaConf
 
+from bench.config import find_class
 from bench.progress import notice
-from bench.records.record import CONCURRENT_RUNS_VARIABLE
-from bench.records.results import PlannedRun
-from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed, stop_signal
+from bench.records.results import Plan, PlannedRun
+from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed
 from datasets.extras import install_command
 
 Make = Callable[[PlannedRun], list[str]]  # runs a cell; returns messages if it leaves no record
 Jobs = Sequence[Sequence[PlannedRun]]  # the cells, in groups that one job of a cluster runs one after another
 Messages = Generator[list[str], None, None]  # of each cell or task that has ended
-EXTRA_BY_EXECUTOR = {"slurm": "submitit", "ray": "ray"}  # each extra has the name of its package
-# Keys of conf/hydra/launcher/slurm.yaml: those that submitit does not know, and those that all its clusters share.
-OUR_SETTINGS = (
-    *("executor", "cluster", "minutes_per_job", "minutes_per_run", "array_size", "submitit_folder", "max_num_timeout"),
-)
-COMMON_SETTINGS = (
-    *("timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes", "name", "stderr_to_stdout"),
-)
 
 
 @dataclass(frozen=True)
-class Launcher:
-    """The choice of `hydra/launcher`.
+class Launcher(ABC):
+    """The choice of `hydra/launcher`, which runs the cells of a sweep.
 
     Args:
         name: the name of the choice.
-        settings: `hydra.launcher`.
+        settings: `hydra.launcher`; its `executor` is a key of `LAUNCHERS`, or the dotted name of another launcher.
         variables: environment variables for runs.
     """
 
@@ -49,35 +40,9 @@ class Launcher:
     settings: dict[str, Any]
     variables: dict[str, str]
 
-    @classmethod
-    def of(cls, config: DictConfig) -> "Launcher":
-        """The launcher of a composed configuration.
-
-        Raises:
-            ValueError: if its executor is unknown, or needs a package that is not installed.
-        """
-        settings: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
-        variables = {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
-        launcher = cls(str(config.hydra.runtime.choices["hydra/launcher"]), settings, variables)
-        if launcher.executor not in EXECUTORS:
-            options = ", ".join(EXECUTORS)
-            raise ValueError(f"hydra.launcher.executor must be one of {options}, not {launcher.executor!r}")
-        if (extra := EXTRA_BY_EXECUTOR.get(launcher.executor)) is not None:
-            try:
-                import_module(extra)
-            except ImportError as error:
-                raise ValueError(f"this launcher needs a package: {install_command(extra)}") from error
-        return launcher
-
-    @property
-    def executor(self) -> str:
-        """The key of `EXECUTORS`; by default, this process runs one cell after another."""
-        return str(self.settings.get("executor", "basic"))
-
-    @property
-    def packs_runs(self) -> bool:
-        """Whether a job has several runs."""
-        return "minutes_per_job" in self.settings
+    extra: ClassVar[str] = ""  # that it needs, which has the name of its package
+    is_local: ClassVar[bool] = True  # whether all runs are on this machine
+    runs_per_job: ClassVar[int] = 1  # at a time
 
     @property
     def concurrency(self) -> int:
@@ -86,6 +51,48 @@ class Launcher:
             if (count := self.settings.get(key)) is not None:
                 return max(int(count), 1) if count > 0 else os.cpu_count() or 1
         return 1
+
+    @property
+    def rate(self) -> str:
+        """The number of cells at a time, in words."""
+        return f"{self.concurrency} at a time"
+
+    def check(self, cells: Sequence[PlannedRun]) -> None:  # noqa: B027 - without settings there is nothing to check
+        """Raises ValueError if a setting does not fit the cells to run."""
+
+    def jobs(self, plan: Plan, reused: set[str]) -> list[list[PlannedRun]]:
+        """The cells of each job, without reused cells."""
+        return [[cell] for cell in plan.cells if cell.id not in reused]
+
+    def describe(self, jobs: Jobs) -> str:
+        """The number of runs and jobs, as text; empty if each run is its own job."""
+        return ""
+
+    @abstractmethod
+    def run(self, make: Make, jobs: Jobs) -> Messages:
+        """Runs all cells; yields the messages of each cell or job when it ends.
+
+        Raises:
+            Exception: if a cluster is missing, or a process is lost.
+        """
+
+
+def launcher_of(config: DictConfig) -> Launcher:
+    """The launcher of a composed configuration.
+
+    Raises:
+        ValueError: if its executor is unknown, or needs a package that is not installed.
+    """
+    settings: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
+    executor = str(settings.get("executor", InTurn.executor))
+    cls = LAUNCHERS.get(executor) or find_class(executor, "hydra.launcher", (), Launcher)
+    if cls.extra:
+        try:
+            import_module(cls.extra)
+        except ImportError as error:
+            raise ValueError(f"this launcher needs a package: {install_command(cls.extra)}") from error
+    variables = {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
+    return cls(str(config.hydra.runtime.choices["hydra/launcher"]), settings, variables)
 
 
 def execute(make: Make, jobs: Jobs, launcher: Launcher) -> bool:
@@ -98,7 +105,7 @@ def execute(make: Make, jobs: Jobs, launcher: Launcher) -> bool:
     if not jobs:
         return True
     os.environ |= launcher.variables
-    with closing(EXECUTORS[launcher.executor](make, jobs, launcher)) as results:
+    with closing(launcher.run(make, jobs)) as results:
         return print_errors(results)
 
 
@@ -118,30 +125,44 @@ def run_in_turn(make: Make, cells: Iterable[PlannedRun]) -> Messages:
         raise_if_stopped()  # a library may have swallowed the exception
 
 
-def _run_by_workers(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
+class InTurn(Launcher):
+    """Runs cells in this process, one after another; also those that are reused, in their order."""
+
+    executor: ClassVar[str] = "basic"  # Hydra's name; its launcher has no key `executor`
+
+    def jobs(self, plan: Plan, reused: set[str]) -> list[list[PlannedRun]]:
+        return [[cell] for cell in plan.cells]
+
+    def run(self, make: Make, jobs: Jobs) -> Messages:
+        return run_in_turn(make, chain.from_iterable(jobs))
+
+
+class Workers(Launcher):
     """Runs cells in processes of this machine, each one cell at a time."""
-    cells = [*chain.from_iterable(jobs)]
-    remaining = iter(cells)
-    workers = dict(_start_worker(make) for _ in range(min(launcher.concurrency, len(cells))))
-    try:
-        for channel in workers:
-            channel.send(next(remaining))
-        while workers:
-            for channel in wait([*workers]):
-                assert isinstance(channel, Connection)
-                try:
-                    yield channel.recv()
-                    channel.send(next(remaining, None))
-                except (EOFError, ConnectionError):  # the worker has received None, or is lost
-                    process = workers.pop(channel)
-                    process.join()
-                    if process.exitcode:
-                        raise RuntimeError(f"a worker ended with exit status {process.exitcode}") from None
-    finally:
-        for process in workers.values():
-            process.terminate()
-        for process in workers.values():
-            process.join()
+
+    def run(self, make: Make, jobs: Jobs) -> Messages:
+        cells = [*chain.from_iterable(jobs)]
+        remaining = iter(cells)
+        workers = dict(_start_worker(make) for _ in range(min(self.concurrency, len(cells))))
+        try:
+            for channel in workers:
+                channel.send(next(remaining))
+            while workers:
+                for channel in wait([*workers]):
+                    assert isinstance(channel, Connection)
+                    try:
+                        yield channel.recv()
+                        channel.send(next(remaining, None))
+                    except (EOFError, ConnectionError):  # the worker has received None, or is lost
+                        process = workers.pop(channel)
+                        process.join()
+                        if process.exitcode:
+                            raise RuntimeError(f"a worker ended with exit status {process.exitcode}") from None
+        finally:
+            for process in workers.values():
+                process.terminate()
+            for process in workers.values():
+                process.join()
 
 
 def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
@@ -166,94 +187,4 @@ def _worker_main(make: Make, channel: Connection) -> None:
         return
 
 
-@dataclass(frozen=True)
-class PackedJob:
-    """A job of submitit, whose tasks share its cells and run them one after another.
-
-    Args:
-        folder: the folder of the command, to which paths in configurations are relative.
-        variables: environment variables for runs.
-    """
-
-    make: Make
-    cells: Sequence[PlannedRun]
-    folder: str
-    variables: dict[str, str]
-
-    def __call__(self) -> list[str]:
-        """Runs the cells of this task until a signal ends the job; returns error messages."""
-        from submitit import JobEnvironment
-
-        job, messages = JobEnvironment(), list[str]()
-        os.chdir(self.folder)
-        os.environ |= self.variables | {CONCURRENT_RUNS_VARIABLE: str(job.num_tasks)}
-        catch_signals()
-        for number in (signal.SIGUSR1, signal.SIGUSR2):  # a scheduler sends them before it ends a job
-            signal.signal(number, signal.getsignal(signal.SIGTERM))
-        try:
-            for cell in self.cells[job.global_rank :: job.num_tasks]:
-                messages += self.make(cell)
-        except KeyboardInterrupt:
-            messages.append(f"job {job.job_id}: {stop_signal()}; the same command goes on")
-        return messages
-
-
-def _run_by_slurm(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
-    """Runs the cells in one array of jobs after another."""
-    executor, size = _submitit_executor(launcher.settings), launcher.settings["array_size"]
-    packed_jobs = [PackedJob(make, job, str(Path.cwd()), launcher.variables) for job in jobs]
-    for start in range(0, len(packed_jobs), size):
-        for job in executor.submit_array(packed_jobs[start : start + size]):
-            yield from (_task_messages(job.task(task)) for task in range(job.num_tasks))
-
-
-def _submitit_executor(settings: dict[str, Any]) -> Any:
-    """The executor of submitit with the settings of the launcher."""
-    from submitit import AutoExecutor
-
-    if settings["cluster"] == "slurm" and which("srun") is None:
-        raise ValueError("no Slurm is here: type this on a machine of the cluster, or hydra.launcher.cluster=local")
-    retries = settings["max_num_timeout"]
-    executor = AutoExecutor(settings["submitit_folder"], settings["cluster"], slurm_max_num_timeout=retries)
-    names = {key: key if key in COMMON_SETTINGS else f"slurm_{key}" for key in settings if key not in OUR_SETTINGS}
-    executor.update_parameters(**{name: settings[key] for key, name in names.items()})
-    return executor
-
-
-def _task_messages(task: Any) -> list[str]:
-    """Waits for a task of a job; returns its error messages, also if it was lost."""
-    from submitit.core.utils import UncompletedJobError
-
-    try:
-        return task.result()
-    except UncompletedJobError:
-        return [f"job {task.job_id} was lost; {task.paths.stderr} may say why; the same command goes on"]
-
-
-def _run_by_ray(make: Make, jobs: Jobs, launcher: Launcher) -> Messages:
-    """Runs each cell in a Ray task."""
-    import ray
-
-    settings = launcher.settings["ray"]
-    if not ray.is_initialized():
-        ray.init(**settings["init"])
-    remote, folder = ray.remote(**settings["remote"])(_make_in_folder), str(Path.cwd())
-    pending = [remote.remote(make, cell, folder, launcher.variables) for cell in chain.from_iterable(jobs)]
-    while pending:
-        ended, pending = ray.wait(pending)
-        yield from map(ray.get, ended)
-
-
-def _make_in_folder(make: Make, cell: PlannedRun, folder: str, variables: dict[str, str]) -> list[str]:
-    """Runs a cell in the folder of the command."""
-    os.chdir(folder)
-    os.environ |= variables
-    return make(cell)
-
-
-EXECUTORS: dict[str, Callable[[Make, Jobs, Launcher], Messages]] = {
-    "basic": lambda make, jobs, launcher: run_in_turn(make, chain.from_iterable(jobs)),
-    "workers": _run_by_workers,
-    "slurm": _run_by_slurm,
-    "ray": _run_by_ray,
-}
+LAUNCHERS: dict[str, type[Launcher]] = {InTurn.executor: InTurn, "workers": Workers}

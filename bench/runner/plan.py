@@ -23,7 +23,6 @@ from bench.runner.process import run_in_child
 # Statuses of runs whose duration says nothing about similar runs.
 STATUSES_WITHOUT_DURATION = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 MAX_SIMILAR_RUNS, MAX_RECORDS_READ = 100, 300  # per group of similar runs
-LOCAL_EXECUTORS = ("basic", "workers")  # they run on this machine
 
 
 def plan_of(cells: list[PlannedRun]) -> Plan:
@@ -68,17 +67,17 @@ def _refusal_reasons(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     return [refusal_reason(config, built) for config in configs]
 
 
-def check_plan(plan: Plan, executor: str, reused: set[str]) -> None:
+def check_plan(plan: Plan, reused: set[str], *, is_local: bool) -> None:
     """Checks all cells of a sweep before its plan is written.
 
     Args:
-        executor: the executor of the runs; runs on another machine may use a GPU that this one lacks.
         reused: ids of cells whose finished run will be reused, which are not checked.
+        is_local: whether the runs are on this machine; those on another one may use a GPU that this one lacks.
 
     Raises:
         ValueError: if a cell is invalid; the message has the cell and the reason.
     """
-    device_override = {} if executor in LOCAL_EXECUTORS else {"device": "cpu"}
+    device_override = {} if is_local else {"device": "cpu"}
     cells = [cell for cell in plan.cells if cell.id not in reused]
     reasons = refusal_reasons([cell.config | device_override for cell in cells])
     refused = [(cell, reason) for cell, reason in zip(cells, reasons, strict=True) if reason]

@@ -17,8 +17,7 @@ from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.record import row_name
 from bench.records.results import Plan, PlannedRun
 from bench.runner.compose import Composer
-from bench.runner.executors import Launcher, execute, print_errors, run_in_turn
-from bench.runner.jobs import check_jobs, describe_jobs, split_into_jobs
+from bench.runner.executors import Launcher, execute, launcher_of, print_errors, run_in_turn
 from bench.runner.messages import Interrupted, reason_of
 from bench.runner.plan import check_plan, plan_of, reused_ids, show_plan
 from bench.runner.process import stopped_by, warm_up
@@ -48,18 +47,17 @@ def run_sweep(composer: Composer, config: DictConfig, summarise: Callable[[Plan]
         OSError: if the results folder cannot be written.
         LauncherStopped: if the executor cannot go on.
     """
-    swept, launcher = composer.swept(config), Launcher.of(config)
+    swept, launcher = composer.swept(config), launcher_of(config)
     if not config.plan:
-        rate = "many to a job" if launcher.packs_runs else f"{launcher.concurrency} at a time"
-        runs = f"{plural(len(swept), 'run')}, {rate} (hydra/launcher={launcher.name})"
+        runs = f"{plural(len(swept), 'run')}, {launcher.rate} (hydra/launcher={launcher.name})"
         notice(f"sweep: {runs}; a line follows as each ends")
     if config.isolation == Isolation.process:
         warm_up()
     plan = plan_of(composer.cells(swept))
     _print_partial_overrides(swept[0], plan)
     reused = reused_ids(plan.cells)
-    check_jobs([cell for cell in plan.cells if cell.id not in reused], launcher.settings)
-    check_plan(plan, launcher.executor, reused)
+    launcher.check([cell for cell in plan.cells if cell.id not in reused])
+    check_plan(plan, reused, is_local=launcher.is_local)
     if config.plan:
         _print_plan(plan, reused, launcher)
         return []
@@ -82,22 +80,20 @@ def _print_partial_overrides(overrides: list[str], plan: Plan) -> None:
 
 def _print_plan(plan: Plan, reused: set[str], launcher: Launcher) -> None:
     """Prints the cells, and the number of jobs if the launcher has jobs."""
-    if not launcher.packs_runs or not (jobs := split_into_jobs(plan, launcher.settings, reused)):
-        return show_plan(plan, reused, launcher.concurrency)
-    show_plan(plan, reused, min(launcher.concurrency, len(jobs) * launcher.settings["tasks_per_node"]))
-    print(describe_jobs(jobs, launcher.settings))
+    jobs = launcher.jobs(plan, reused)
+    show_plan(plan, reused, min(launcher.concurrency, len(jobs) * launcher.runs_per_job))
+    if jobs and (text := launcher.describe(jobs)):
+        print(text)
 
 
 def _run_all(plan: Plan, reused: set[str], launcher: Launcher) -> None:
     """Makes all runs of a plan by the executor; this process marks the reused runs as requested."""
-    make, cells = partial(run_cell, planned_at=plan.asked), plan.cells
+    make, jobs = partial(run_cell, planned_at=plan.asked), launcher.jobs(plan, reused)
     try:
-        if launcher.executor != "basic":
-            print_errors(run_in_turn(make, [cell for cell in cells if cell.id in reused]))
-            cells = [cell for cell in cells if cell.id not in reused]
-        jobs = [[cell] for cell in cells]
-        if launcher.packs_runs and (jobs := split_into_jobs(plan, launcher.settings, reused)):
-            notice(describe_jobs(jobs, launcher.settings))
+        in_jobs = {cell.id for job in jobs for cell in job}
+        print_errors(run_in_turn(make, [cell for cell in plan.cells if cell.id not in in_jobs]))
+        if jobs and (text := launcher.describe(jobs)):
+            notice(text)
         execute(make, jobs, launcher)
     except (ValueError, OSError):
         raise
@@ -115,7 +111,7 @@ def work_per_cell(composer: Composer, config: DictConfig, work: Callable[[Planne
         ValueError: if the sweep is invalid.
     """
     cells = composer.cells(composer.swept(config))
-    return execute(partial(_work, work), [[cell] for cell in cells], Launcher.of(config))
+    return execute(partial(_work, work), [[cell] for cell in cells], launcher_of(config))
 
 
 def _work(work: Callable[[PlannedRun], object], cell: PlannedRun) -> list[str]:

@@ -12,9 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from bench.clusters import group_by_duration
 from bench.records.read import read_records
 from bench.report.write.html import write_index
-from bench.runner.jobs import group_by_duration
 from tests.composing import identified
 from tests.looped import each
 from tests.report.page_data import Page
@@ -203,7 +203,7 @@ def test_what_a_job_cannot_do_is_refused_before_anything_is_written(tmp_path, se
 
 def test_without_slurm_nothing_runs_and_the_plan_stays(tmp_path, monkeypatch):
     need("slurm")
-    monkeypatch.setattr("bench.runner.executors.which", lambda _: None)
+    monkeypatch.setattr("bench.clusters.which", lambda _: None)
     code, out, err = command("-m", *FAILING, "+renderer.how=not", "hydra/launcher=slurm", f"results_dir={tmp_path}")
     assert code == 2 and "error: no Slurm is here: type this on a machine of the cluster, or hydra.launcher.c" in err
     assert "1 planned: 1 not_run" in out and len(plan_of(tmp_path)["cells"]) == 1

@@ -42,7 +42,7 @@ class Mine:
 @pytest.fixture
 def results(tmp_path, monkeypatch) -> Path:
     """A results folder whose runs are written by hand: no cell is checked or run."""
-    monkeypatch.setattr(sweep, "check_plan", lambda *_: None)
+    monkeypatch.setattr(sweep, "check_plan", lambda *_, **__: None)
     monkeypatch.setattr(run_module, "refusal_reasons", lambda configs: [""])
     return tmp_path / "r"
 
@@ -169,7 +169,7 @@ def test_a_value_that_cannot_be_set_is_an_error_as_for_a_single_run(results):
 
 
 def test_a_sweep_that_is_stopped_during_planning_says_that_nothing_was_run(results, monkeypatch):
-    def stopped(*_):
+    def stopped(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sweep, "check_plan", stopped)
@@ -319,15 +319,15 @@ def test_the_message_on_a_sweep_names_the_invalid_cell(plan_of):
     plan = plan_of(("seed=0", "renderer.steps=9"), ("seed=0", "renderer.steps=0"), ("seed=0", "renderer.steps=-1"))
     with pytest.raises(ValueError, match=r"^cell 2 of 3 \(renderer.steps=0\): steps must be at least 1, not 0: .*"
                        r"; 2 of 3 cells are invalid; nothing was run$"):  # fmt: skip
-        check_plan(plan, "basic", set())
-    check_plan(plan, "basic", {"c-1", "c-2"})  # finished runs are not checked
+        check_plan(plan, set(), is_local=True)
+    check_plan(plan, {"c-1", "c-2"}, is_local=True)  # finished runs are not checked
     with pytest.raises(ValueError, match=r"^steps must be"):  # all cells are invalid, so none is named
-        check_plan(plan_of(("renderer.steps=0", "seed=0"), ("renderer.steps=0", "seed=1")), "basic", set())
+        check_plan(plan_of(("renderer.steps=0", "seed=0"), ("renderer.steps=0", "seed=1")), set(), is_local=True)
 
 
 def test_a_gpu_is_looked_for_on_the_machine_of_the_runs(plan_of, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     plan = plan_of(("device=cuda",))
     with pytest.raises(ValueError, match="PyTorch sees no GPU"):
-        check_plan(plan, "workers", set())
-    check_plan(plan, "slurm", set())
+        check_plan(plan, set(), is_local=True)
+    check_plan(plan, set(), is_local=False)

@@ -9,7 +9,7 @@ import pytest
 from bench.records.record import Record, RunStatus
 from bench.records.results import RESULTS, Plan
 from bench.runner import sweep
-from bench.runner.executors import Launcher
+from bench.runner.executors import Workers
 from bench.runner.summary import log_lines, print_run_summary, print_sweep_summary
 from tests.looped import each
 from tests.runner.driving import ROOT, planned
@@ -141,4 +141,4 @@ def test_a_line_of_a_sweep_estimates_the_time_left_from_cells_that_are_not_reuse
 def test_a_sweep_says_how_many_runs_a_launcher_makes_at_a_time(launcher, workers, monkeypatch):
     """-1 stands for all processors; submitit has its own limit."""
     monkeypatch.setattr("os.cpu_count", lambda: 7)
-    assert Launcher("workers", launcher, {}).concurrency == workers
+    assert Workers("workers", launcher, {}).concurrency == workers
