@@ -46,11 +46,11 @@ ROLE_OF_NODE = {  # the protocol or base class that the class of a node must hav
 }
 CLASS_OF_NODE = {  # for nodes without a _target_; see also conf/extensions.yaml
     "view": "datasets.views.ViewSampler",
-    "auto": "bench.setup.auto.AutoSettings",
     "prior": "bench.shape_prior.PriorSettings",
     "evaluation": "bench.config.EvaluationSettings",
 }
 PRIOR_FIELD = "prior"  # value of `field`: a latent code of the prior
+AUTO = "auto"  # value of `field`, and of settings of a renderer that the node `auto` computes
 TYPE_LABELS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "null"}
 
 

@@ -132,7 +132,7 @@ def run_of(folder: Path, renderer: Any, prior: Prior, camera: Camera, **changed:
     sizes = {"grid": 16, "points": 50, "fscore_threshold": 0.02, "picture": 8}
     inputs = RunInputs(
         renderer=renderer, scene_name=scene.name, make_scene=lambda: scene, make_prior=lambda: prior,
-        make_pixel_precise=lambda: (renderer, []), views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
+        make_renderer=lambda _: (renderer, []), views=ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), camera.height),
         evaluation=EvaluationSettings(**sizes, gallery=None, every=None, film=None), seed=0, device=CPU,
         cache=folder / "cache", field=FieldChoice("prior", None),
         prior_choice=PriorChoice(SceneNetwork(prior.decoder, prior.codes, ()), scene_code=0),

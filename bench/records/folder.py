@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references, extensions
+from bench.config import AUTO, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references, extensions
 from bench.records.imports import ROOT, imported_files
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.records.results import PlannedRun
@@ -70,6 +70,8 @@ def code_hash(config: Mapping[str, Any]) -> str:
 def _used_extensions(config: Mapping[str, Any]) -> Iterator[str]:
     """The purposes of the classes and functions of conf/extensions.yaml that a run uses."""
     yield "pictures"
+    if AUTO in (config.get("renderer") or {}).values():
+        yield "auto"
     if (config.get("task") or {}).get("colour_weight"):
         yield "colours"
     if config.get("field", PRIOR_FIELD) != PRIOR_FIELD:

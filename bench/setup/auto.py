@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from math import ceil, log, radians, sin
 from typing import Any
 
+from bench.config import AUTO
 from datasets.views import ViewSampler
 from renderers.checks import check_fraction, check_positive
 
-AUTO = "auto"
 Node = Mapping[str, Any]  # configuration of a renderer
 UNIT_SPHERE_RADIUS = 1.0  # every shape lies in this sphere
 
@@ -37,6 +37,24 @@ class AutoSettings:
         check_positive("auto.area_over_perimeter", self.area_over_perimeter, examples)
         if self.grazing > 90:
             raise ValueError(f"auto.grazing must be at most 90 degrees, not {self.grazing}: 10")
+
+    def resolve(self, renderer: Node, view: ViewSampler) -> tuple[Node, list[str]]:
+        """The renderer's node with a number for each `auto`, in the order of `FORMULAS`, and a note on each.
+
+        Raises:
+            ValueError: a setting without an equation is `auto`.
+        """
+        requested = [name for name, value in renderer.items() if value == AUTO]
+        for name in requested:
+            if name not in FORMULAS:
+                names = ", ".join(FORMULAS)
+                raise ValueError(f"renderer.{name}=auto has no equation: only {names} have one; give a number")
+        node, notes = dict(renderer), []
+        for name in [name for name in FORMULAS if name in requested]:
+            node[name] = FORMULAS[name](view, node, self)
+            pixels = f"for {view.resolution} pixels from {view.distance:g} away (view)"
+            notes.append(f"renderer.{name}=auto is {node[name]:.4g}, {pixels}{VALIDITY_NOTES[name].format(self)}")
+        return node, notes
 
 
 def epsilon(view: ViewSampler, renderer: Node, settings: AutoSettings) -> float:
@@ -84,25 +102,6 @@ VALIDITY_NOTES = {
     "area over perimeter is {0.area_over_perimeter:g} or more (auto.area_over_perimeter)",
     "steps": ", for surfaces met at {0.grazing:g} degrees or more (auto.grazing)",
 }
-
-
-def resolve_auto_settings(renderer: Node, view: ViewSampler, settings: AutoSettings) -> tuple[Node, list[str]]:
-    """The renderer's node with a number for each `auto`, in the order of `FORMULAS`, and a note on each.
-
-    Raises:
-        ValueError: a setting without an equation is `auto`.
-    """
-    requested = [name for name, value in renderer.items() if value == AUTO]
-    for name in requested:
-        if name not in FORMULAS:
-            names = ", ".join(FORMULAS)
-            raise ValueError(f"renderer.{name}=auto has no equation: only {names} have one; give a number")
-    node, notes = dict(renderer), []
-    for name in [name for name in FORMULAS if name in requested]:
-        node[name] = FORMULAS[name](view, node, settings)
-        pixels = f"for {view.resolution} pixels from {view.distance:g} away (view)"
-        notes.append(f"renderer.{name}=auto is {node[name]:.4g}, {pixels}{VALIDITY_NOTES[name].format(settings)}")
-    return node, notes
 
 
 def at_pixel_precision(renderer: Node) -> Node:

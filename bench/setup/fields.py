@@ -4,8 +4,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from bench.config import PRIOR_FIELD
-from bench.setup.auto import AUTO
+from bench.config import AUTO, PRIOR_FIELD
 from bench.tables import nearest
 from renderers.checks import check_at_least
 

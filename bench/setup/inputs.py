@@ -4,7 +4,7 @@ Only `prepare_run` turns a configuration into objects: for the check of a sweep,
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -13,11 +13,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from bench.config import PRIOR_DATASET_KEY, EvaluationSettings, build_once
+from bench.config import AUTO, PRIOR_DATASET_KEY, EvaluationSettings, build_once
 from bench.machine.environment import pick_device
 from bench.progress import Report
 from bench.records.record import Record
-from bench.setup.auto import Node, at_pixel_precision, resolve_auto_settings
 from bench.setup.fields import FieldChoice
 from bench.setup.priors import PriorChoice, prior_keys_in_errors, training_dataset
 from bench.shape_prior import Prior, PriorSettings
@@ -40,6 +39,7 @@ from renderers.rendering import Renderer, final_notes
 
 MIN_MULTITHREADED_WIDTH = 256  # neurons per layer: a narrower network is evaluated by one thread
 DEFAULT_THREADS = torch.get_num_threads()  # PyTorch's choice
+Node = Mapping[str, Any]  # of a configuration
 RendererWithNotes = tuple[Renderer, list[str]]  # notes on the settings with the value `auto`
 
 
@@ -52,7 +52,7 @@ class RunInputs:
     scene_name: str
     make_scene: Callable[[], Scene]
     make_prior: Callable[[], Prior]
-    make_pixel_precise: Callable[[], RendererWithNotes]  # the renderer at pixel precision, with the steps it needs
+    make_renderer: Callable[[Callable[[Node], Node]], RendererWithNotes]  # the renderer with changed settings
     evaluation: EvaluationSettings
     seed: int
     device: torch.device
@@ -206,7 +206,7 @@ def prepare_run(
         scene_name=dataset.name if isinstance(dataset, Photographed | OneView) else scene_name(dataset, split, index),
         make_scene=partial(_make_scene, dataset, view, split, index, prior),
         make_prior=partial(prior.load, cache, device, threads or DEFAULT_THREADS, progress),
-        make_pixel_precise=partial(builder.renderer, at_pixel_precision(config["renderer"])),
+        make_renderer=lambda change: builder.renderer(change(config["renderer"])),
         evaluation=evaluation,
         seed=config["seed"],
         device=device,
@@ -235,7 +235,8 @@ class _Builder:
 
     def renderer(self, requested: Node) -> RendererWithNotes:
         """A renderer from its node with a number for each `auto`, and notes on these numbers."""
-        node, notes = resolve_auto_settings(requested, *self.parts("view", "auto"))
+        view, auto = self.parts("view", "auto")
+        node, notes = auto.resolve(requested, view) if AUTO in requested.values() else (requested, [])
         (renderer,) = self.parts(renderer=node)
         if not isinstance(renderer, Renderer):
             lacking = f"renderer {type(renderer).__name__} lacks capabilities, render or silhouette_loss"

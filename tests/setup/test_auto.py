@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.setup.auto import AutoSettings, epsilon, footprint, resolve_auto_settings, steps
+from bench.setup.auto import AutoSettings, epsilon, footprint, steps
 from datasets.families import BUILDERS, CUBE_HALF_SIDE, Family
 from datasets.mesh import extract, fit_in_sphere
 from datasets.scene import Split
@@ -65,7 +65,7 @@ def test_steps_that_cannot_be_computed_are_errors():
 
 
 def test_epsilon_and_steps_are_resolved_in_order_with_notes():
-    node, notes = resolve_auto_settings({"epsilon": "auto", "steps": "auto", "alpha": 1.5}, VIEW, TEN)
+    node, notes = TEN.resolve({"epsilon": "auto", "steps": "auto", "alpha": 1.5}, VIEW)
     assert node["epsilon"] == pytest.approx(7e-4) and node["steps"] == steps(VIEW, node, TEN) < 33
     views = "for 128 pixels from 2.5 away (view)"
     numbers = {"epsilon": f"{node['epsilon']:.4g}", "steps": str(node["steps"])}
@@ -79,7 +79,7 @@ def test_epsilon_and_steps_are_resolved_in_order_with_notes():
 
 def test_auto_without_an_equation_is_an_error():
     with pytest.raises(ValueError, match=r"renderer\.alpha=auto has no equation: only epsilon, steps have one"):
-        resolve_auto_settings({"alpha": "auto"}, VIEW, TEN)
+        TEN.resolve({"alpha": "auto"}, VIEW)
     with pytest.raises(ValueError, match=r"view\.distance - 1 must be positive.*outside of the unit sphere"):
         epsilon(ViewSampler(0.9, 50.0, (0.0, 0.0), (0.0, 0.0), 64), {}, TEN)
     with pytest.raises(ValueError, match=r"auto\.grazing must be positive"):

@@ -8,6 +8,7 @@ from bench.evaluate.state import State
 from bench.pictures.filmstrip import Filmstrip
 from bench.pictures.size_chart import draw_candidates
 from bench.records.record import curve_file
+from bench.setup.auto import at_pixel_precision
 from bench.setup.inputs import RunContext
 from bench.solve.observed_view import DEPTH_LOSSES
 from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result
@@ -100,7 +101,7 @@ class Capacity:
 
             candidates = by_size(models.candidates, models.size)
             fitter = Fitter(views.observations(inputs.seed), models.fit, inputs.seed, inputs.device, on_line)
-            renderer, settings_notes = inputs.make_pixel_precise()  # before the fits: it may be refused
+            renderer, settings_notes = inputs.make_renderer(at_pixel_precision)  # before the fits: it may be refused
             growth = grow(fitter, candidates, models.growth)
             fits: list[Fitted] = []
             for fitted in fit_all(fitter, candidates, self.rounds):

@@ -9,11 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.config import PRIOR_FIELD
+from bench.config import AUTO, PRIOR_FIELD
 from bench.evaluate.state import REACH
 from bench.records.format import plural
 from bench.records.record import RunStatus
-from bench.setup.auto import AUTO
 from bench.setup.fields import parse_field_name
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, OptimiserSettings, optimise

@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import torch
 
+from bench.config import AUTO
 from bench.evaluate.state import State
-from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, solve_and_draw

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bench.config import AUTO
 from bench.evaluate.evaluate import OWN_PREFIX, Evaluation
 from bench.evaluate.state import State, vertex_colours
 from bench.records.record import RunStatus
-from bench.setup.auto import AUTO
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result, run_optimisation
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, coloured, judge, judge_mesh
