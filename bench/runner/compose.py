@@ -31,7 +31,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from bench.config import CLASS_PACKAGE_KEY, Config, custom_renderer_hint, type_of, wrong_type_message
 from bench.records.folder import planned_run, resolve_config
 from bench.records.results import PlannedRun
-from bench.runner.library import OPTIONAL_GROUPS
+from bench.runner.messages import OPTIONAL_GROUPS
 from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
 NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")

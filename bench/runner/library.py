@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.record import Record, read_record
+from bench.runner.messages import OPTIONAL_GROUPS, quoted
 
-OPTIONAL_GROUPS = ("method", "experiment")  # they take a plus: +method=NAME
 UNQUOTED_TEXT = re.compile(r"[A-Za-z_/][\w./:@%+-]*", re.ASCII)  # Hydra reads it as the same text
 
 
@@ -97,9 +97,3 @@ def _as_typed(value: Any) -> str:
     text = str(value)
     is_plain = UNQUOTED_TEXT.fullmatch(text) and text.lower() not in ("null", "true", "false", "nan", "inf")
     return text if is_plain or isinstance(value, int | float) else quoted(text.replace("${", "\\${"))
-
-
-def quoted(text: str) -> str:
-    """A text in quotes as Hydra reads it."""
-    escaped = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + match[2].replace("'", "\\'"), text)
-    return f"'{escaped}'"

@@ -1,10 +1,13 @@
-"""The messages between the process of a run and its parent, and the texts of errors."""
+"""The messages between the process of a run and its parent, the texts of errors, and texts in overrides."""
 
 import errno
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from bench.records.record import Record
+
+OPTIONAL_GROUPS = ("method", "experiment")  # they take a plus: +method=NAME
 
 
 @dataclass(frozen=True)
@@ -55,3 +58,9 @@ def write_error_message(error: OSError, results_dir: str | None = None) -> str:
     file = next((parent for parent in path.parents if parent.is_file()), path) if path else None
     suffix = f" ({file})" if file else ""
     return f"{error.strerror or error}{suffix}: set results_dir to a folder you can write, or free space"
+
+
+def quoted(text: str) -> str:
+    """A text in quotes as Hydra reads it."""
+    escaped = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + match[2].replace("'", "\\'"), text)
+    return f"'{escaped}'"
