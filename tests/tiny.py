@@ -12,8 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.config import EvaluationSettings
 from bench.records.record import Record
-from bench.setup.fields import FieldChoice
-from bench.setup.inputs import RunContext, RunInputs, prepare_run
+from bench.setup.inputs import FieldChoice, RunContext, RunInputs, prepare_run
 from bench.setup.priors import PriorChoice
 from bench.shape_prior import Prior
 from datasets.mesh import Mesh

@@ -13,11 +13,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from bench.config import AUTO, PRIOR_DATASET_KEY, EvaluationSettings, build_once
+from bench.config import AUTO, PRIOR_DATASET_KEY, PRIOR_FIELD, EvaluationSettings, build_once, extension
 from bench.machine.environment import pick_device
 from bench.progress import Report
 from bench.records.record import Record
-from bench.setup.fields import FieldChoice
 from bench.setup.priors import PriorChoice, prior_keys_in_errors, training_dataset
 from bench.shape_prior import Prior, PriorSettings
 from datasets.scene import (
@@ -41,6 +40,36 @@ MIN_MULTITHREADED_WIDTH = 256  # neurons per layer: a narrower network is evalua
 DEFAULT_THREADS = torch.get_num_threads()  # PyTorch's choice
 Node = Mapping[str, Any]  # of a configuration
 RendererWithNotes = tuple[Renderer, list[str]]  # notes on the settings with the value `auto`
+
+
+@dataclass(frozen=True)
+class FieldChoice:
+    """The field of an unknown shape that a run's configuration selects.
+
+    Args:
+        name: "prior"; "auto", the smallest sufficient candidate, found by early growth; or a candidate's name.
+        models: the fields to choose from, and the settings of their fits; not read for "prior".
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+
+    name: str
+    models: Any
+
+    def __post_init__(self) -> None:
+        if self.name not in (PRIOR_FIELD, AUTO):
+            extension("field_name")(self.name)
+
+    @property
+    def of_prior(self) -> bool:
+        """Whether the field is a code of the dataset's prior."""
+        return self.name == PRIOR_FIELD
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The names of the candidates that are tried."""
+        return self.models.candidates if self.name == AUTO else (self.name,)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bench.config import build, load
-from bench.setup.fields import FieldChoice
+from bench.setup.inputs import FieldChoice
 from bench.solve.optimise import History, Optimisable, OptimiserSettings, optimise
 from bench.tasks.pose import Pose, PoseProblem
 from bench.tasks.reconstruction.subject import Depths

@@ -9,8 +9,7 @@ import torch
 import trimesh
 
 from bench.config import load
-from bench.setup.fields import FieldChoice
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import FieldChoice, RunContext
 from bench.solve.optimise import OptimiserSettings
 from bench.tasks.reconstruction.choice import Appearance, AutoField
 from bench.tasks.reconstruction.distance_fit import DistanceFit

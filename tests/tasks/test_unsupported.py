@@ -3,7 +3,7 @@
 import pytest
 
 from bench.config import build
-from bench.setup.fields import FieldChoice
+from bench.setup.inputs import FieldChoice
 from renderers.field import Kind
 from renderers.rendering import Capabilities, Unsupported
 from tests.composing import composed

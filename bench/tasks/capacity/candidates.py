@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bench.evaluate.state import REACH
-from bench.setup.fields import parse_field_name
 from bench.shape_prior import initialise_to_sphere
 from bench.tasks.capacity.model import FLOAT_BYTES, Candidate, Model, StartInputs
+from bench.tasks.capacity.names import parse_field_name
 from bench.tasks.capacity.settings import FREE
 from renderers.checks import BadInput
 from renderers.field import Flops

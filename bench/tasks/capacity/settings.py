@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from math import isnan
 
-from bench.setup.fields import parse_field_name
+from bench.tasks.capacity.names import parse_field_name
 from renderers.checks import check_at_least, check_choice, check_fraction
 
 STORED, FREE, BYTES = "stored", "free", "bytes"  # measures of size; see `bench.tasks.capacity.model.Size`

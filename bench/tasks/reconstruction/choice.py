@@ -13,12 +13,12 @@ from bench.config import AUTO, PRIOR_FIELD
 from bench.evaluate.state import REACH
 from bench.records.format import plural
 from bench.records.record import RunStatus
-from bench.setup.fields import parse_field_name
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.tasks.capacity.growth import Trials, climb
 from bench.tasks.capacity.held_out import HeldOutError
 from bench.tasks.capacity.model import Evidence, Size
+from bench.tasks.capacity.names import parse_field_name
 from bench.tasks.capacity.observations import TILES_PER_SIDE, tiles
 from bench.tasks.reconstruction.pixels import Stack
 from bench.tasks.reconstruction.problem import Learnt, ReconstructionProblem

@@ -1,8 +1,6 @@
-"""The field of an unknown shape: the names to choose from, and the choice of a run."""
+"""The names of the fields that an unknown shape may have, other than a prior's code."""
 
 import re
-from dataclasses import dataclass
-from typing import Any
 
 from bench.config import AUTO, PRIOR_FIELD
 from bench.tables import nearest
@@ -38,34 +36,3 @@ def parse_field_name(name: str) -> tuple[str, tuple[int, ...]]:
     if kind == "grid" and not 8 <= sizes[0] <= MAX_GRID_SAMPLES:
         raise ValueError(f"N of grid_N must lie between 8 and {MAX_GRID_SAMPLES}, not {sizes[0]}: grid_32")
     return kind, sizes
-
-
-@dataclass(frozen=True)
-class FieldChoice:
-    """The field that a run's configuration selects.
-
-    Args:
-        name: "prior"; "auto", the smallest sufficient candidate, found by early growth; or a candidate's name.
-        models: the fields to choose from, and the settings of their fits, see
-            `bench.tasks.capacity.settings.ModelSettings`; not read for "prior".
-
-    Raises:
-        ValueError: the name is unknown.
-    """
-
-    name: str
-    models: Any
-
-    def __post_init__(self) -> None:
-        if self.name not in (PRIOR_FIELD, AUTO):
-            parse_field_name(self.name)
-
-    @property
-    def of_prior(self) -> bool:
-        """Whether the field is a code of the dataset's prior."""
-        return self.name == PRIOR_FIELD
-
-    @property
-    def candidates(self) -> tuple[str, ...]:
-        """The names of the candidates that are tried."""
-        return self.models.candidates if self.name == AUTO else (self.name,)
