@@ -14,7 +14,6 @@ from torch import Tensor
 from renderers.camera import rigid
 from renderers.tracing.waits import active_mask
 
-EVALUATIONS_PER_BOUND = 3  # bounds on a segment multiply by a network's weights three times; see `fields.affine`
 GRADIENT_COST, COARSE_COST = 2.0, 0.125  # as multiples of a field evaluation; see `Counts.cost`
 COARSE_STEP_FACTOR = 2  # marches on coarse values may take more steps, since these are shorter near the surface
 LIPSCHITZ_SAFETY_FACTOR = 1.2  # the field may be steeper between the sampled points
@@ -143,28 +142,6 @@ def marching_values(field: Field, steps: int, *, epsilon: float, coarse: bool) -
     return values, COARSE_STEP_FACTOR * steps
 
 
-# From the middles of segments and the vectors to their ends, both [n, 3], to bounds of the values there: low and high.
-Bounds = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-
-
-def field_bounds(field: Field) -> Bounds | None:
-    """The bounds of the values on segments that a field has as `bounds`, without a graph; None if it has none."""
-    return getattr(field, "bounds", None)
-
-
-def counted_bounds(field: Field, on_evaluate: Callable[[int], None]) -> Bounds | None:
-    """The field's bounds; `on_evaluate` is called before with the number of field evaluations that cost as much."""
-    uncounted = field_bounds(field)
-    if uncounted is None:
-        return None
-
-    def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        on_evaluate(EVALUATIONS_PER_BOUND * len(middle))
-        return uncounted(middle, half)
-
-    return bounds
-
-
 class LateInt:
     """A field of a dataclass whose number a GPU may still be computing: reading it waits, `Counts.add` does not.
 
@@ -257,6 +234,9 @@ class Wrapper(ABC):
     @abstractmethod
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]: ...
 
+    def count_work(self, evaluations: int) -> None:  # noqa: B027 - a wrapper that counts nothing
+        """Counts work that is not an evaluation at points, as the number of field evaluations that cost as much."""
+
 
 @dataclass(frozen=True)
 class Meter(Wrapper):
@@ -282,10 +262,8 @@ class Meter(Wrapper):
         uncounted = coarse_version(self.inner)
         return uncounted and uncounted.with_counter(partial(self.counts.add_points, "coarse"))
 
-    @property
-    def bounds(self) -> Bounds | None:
-        """The field's bounds; each counts as `EVALUATIONS_PER_BOUND` field evaluations."""
-        return counted_bounds(self.inner, partial(self.counts.add_points, "value"))
+    def count_work(self, evaluations: int) -> None:
+        self.counts.add("value", evaluations)
 
     def _count_backward(self, gradient: Tensor) -> None:
         self.counts.add("gradient", gradient.count_nonzero())
@@ -305,26 +283,12 @@ class Moved(Wrapper):
     similarity: Float[Tensor, "7"]
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        scale, motion = self._scale_and_motion
+        scale, motion = self.scale_and_motion
         return scale * self.inner((points - motion[:3, 3]) @ motion[:3, :3] / scale)
 
     @property
-    def bounds(self) -> Bounds | None:
-        """The bounds of the inner field, scaled and moved."""
-        local_bounds = field_bounds(self.inner)
-        if local_bounds is None:
-            return None
-        scale, motion = (tensor.detach() for tensor in self._scale_and_motion)
-
-        def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-            to_local = motion[:3, :3] / scale
-            low, high = local_bounds((middle - motion[:3, 3]) @ to_local, half @ to_local)
-            return scale * low, scale * high
-
-        return bounds
-
-    @property
-    def _scale_and_motion(self) -> tuple[Tensor, Tensor]:
+    def scale_and_motion(self) -> tuple[Tensor, Tensor]:
+        """The scale, and the rigid motion M as a matrix [4, 4]."""
         return self.similarity[6].exp(), rigid(self.similarity[:6])
 
 

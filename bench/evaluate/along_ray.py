@@ -13,7 +13,7 @@ from bench.evaluate.reference import RADIUS, trace_exactly
 from bench.records.format import plural
 from renderers.boundary import render_checked
 from renderers.camera import Rays, sphere_span
-from renderers.field import Bounds, Coarse, Field, Wrapper, autograd_normals, coarse_version, field_bounds
+from renderers.field import Coarse, Field, Wrapper, autograd_normals, coarse_version
 from renderers.rendering import Renderer, Status, Unsupported
 
 ON_RAY_TOLERANCE = 1e-5  # scene units: a point within this distance of the ray is on it
@@ -42,11 +42,6 @@ class Recorder(Wrapper):
         """The coarse values of the field, noted like the others."""
         coarse = coarse_version(self.inner)
         return coarse and replace(coarse, values=lambda points: (self._note(points), coarse.values(points))[1])
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """The field's bounds on segments; they evaluate no points, so they are not noted."""
-        return field_bounds(self.inner)
 
     def _note(self, points: Tensor) -> None:
         offsets = (points.detach() - self.rays.origins[0]).double().reshape(-1, 3)

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.machine.environment import MemoryPeak
 from bench.records.record import RunStatus
 from renderers.checks import check_positive
-from renderers.field import Bounds, Coarse, Field, Wrapper, coarse_version, counted_bounds
+from renderers.field import Coarse, Field, Wrapper, coarse_version
 
 MEMORY_CHECK_SECONDS = 0.05  # interval
 MIN_VALUES_PER_CALL = 32  # a call with fewer points counts as this many, as it takes about as long
@@ -82,10 +82,8 @@ class Watched(Wrapper):
         coarse = coarse_version(self.inner)
         return coarse and coarse.with_counter(self._spend)
 
-    @property
-    def bounds(self) -> Bounds | None:
-        """The bounds of the field, until a limit is reached."""
-        return counted_bounds(self.inner, self._spend)
+    def count_work(self, evaluations: int) -> None:
+        self._spend(evaluations)
 
     def _spend(self, values: int) -> None:
         """Counts field evaluations before they are made.

@@ -29,7 +29,6 @@ from renderers.boundary import render_checked, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import (
-    Bounds,
     Coarse,
     Counts,
     Field,
@@ -38,7 +37,6 @@ from renderers.field import (
     autograd_gradients,
     autograd_normals,
     coarse_version,
-    field_bounds,
 )
 from renderers.rendering import RayObservation, Renderer, Rendering, Status, check_kind
 from renderers.tracing.waits import active_mask
@@ -296,10 +294,6 @@ class SignCounter(Wrapper):
     def coarse(self) -> Coarse | None:
         coarse = coarse_version(self.inner)
         return coarse and replace(coarse, values=lambda points: self._counted(coarse.values(points)))
-
-    @property
-    def bounds(self) -> Bounds | None:
-        return field_bounds(self.inner)
 
 
 class Workbench:

@@ -18,7 +18,6 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from renderers.checks import check_at_least
 from renderers.field import Coarse, Flops, Kind, PointFunction, points_in_sphere
-from renderers.fields.affine import segment_bounds
 from renderers.kernels.decoder import CompiledDecoder, compile_decoder
 
 CACHE_BYTES_PER_THREAD = 2**20  # for the features of one layer on a CPU: caches hold those of two layers
@@ -122,12 +121,6 @@ class BoundDecoder:
             return None
         with torch.no_grad():
             return coarse_values(self.hidden, self.last, self.skip, self)
-
-    def bounds(
-        self, middle: Float[Tensor, "n 3"], half: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Bounds of the values on segments; see `affine.segment_bounds`."""
-        return segment_bounds(self.hidden, self.last, self.skip, middle, half)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """The values; a batch of codes [*shapes, code_length] takes points [*shapes, n, 3]."""

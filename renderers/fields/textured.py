@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from renderers.field import Bounds, Field, Vectors, Wrapper, field_bounds
+from renderers.field import Field, Vectors, Wrapper
 from renderers.fields.mlp import BoundDecoder, Decoder
 
 
@@ -44,11 +44,6 @@ class TexturedShape(Wrapper):
 
     inner: Field
     texture: BoundDecoder
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """See `BoundDecoder`."""
-        return field_bounds(self.inner)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return self.inner(points)

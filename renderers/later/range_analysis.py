@@ -8,8 +8,9 @@ from torch import Tensor
 
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Bounds, Field, field_bounds
+from renderers.field import Field
 from renderers.gradients import attach_implicit_gradient, reevaluate_with_graph
+from renderers.later.affine import Bounds, field_bounds
 from renderers.rendering import Rendering, Status, assemble, check_kind
 from renderers.silhouette import SurfaceRenderer
 from renderers.tracing.bracket import Bracket, refine

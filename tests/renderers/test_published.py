@@ -9,11 +9,12 @@ from torch import Tensor
 from torch.nn.functional import batch_norm, layer_norm, linear, softplus
 
 from renderers.checks import BadInput
-from renderers.field import Coarse, Kind, coarse_version, field_bounds, points_in_sphere
+from renderers.field import Coarse, Kind, coarse_version, points_in_sphere
 from renderers.fields.analytic import Shape
 from renderers.fields.mlp import BoundDecoder
 from renderers.fields.networks import published
 from renderers.fields.networks.network import Adjusted
+from renderers.later.affine import field_bounds
 from tests.looped import each
 
 POINTS = points_in_sphere(64, torch.zeros(()))

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from renderers.checks import BadInput
 from renderers.field import (
     LIPSCHITZ_SAFETY_FACTOR,
-    Bounds,
     Coarse,
     Field,
     Flops,
@@ -19,7 +18,6 @@ from renderers.field import (
     PointFunction,
     autograd_gradients,
     coarse_version,
-    field_bounds,
     points_in_sphere,
 )
 from renderers.fields.analytic import Shape
@@ -263,7 +261,7 @@ class Adjusted:
         return self.inner.flops
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return self._adjust(self.inner(points))
+        return self.adjust(self.inner(points))
 
     @property
     def coarse(self) -> Coarse | None:
@@ -271,22 +269,10 @@ class Adjusted:
         inner = coarse_version(self.inner)
         if inner is None:
             return None
-        return Coarse(lambda points: self._adjust(inner.values(points)), float(self.factor.abs()) * inner.error)
+        return Coarse(lambda points: self.adjust(inner.values(points)), float(self.factor.abs()) * inner.error)
 
-    @property
-    def bounds(self) -> Bounds | None:
-        """The inner field's bounds, adjusted: the adjustment is monotonic."""
-        inner_bounds = field_bounds(self.inner)
-        if inner_bounds is None:
-            return None
-
-        def bounds(middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-            low, high = map(self._adjust, inner_bounds(middle, half))
-            return torch.minimum(low, high), torch.maximum(low, high)
-
-        return bounds
-
-    def _adjust(self, values: Tensor) -> Tensor:
+    def adjust(self, values: Tensor) -> Tensor:
+        """The values of this field from those of the inner one; monotonic."""
         for _ in range(self.squash):
             values = values.tanh()
         return self.factor * (values - self.level)

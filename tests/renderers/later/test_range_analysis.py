@@ -9,10 +9,10 @@ from torch.nn.functional import normalize
 from bench.config import load
 from bench.machine.limits import Limits
 from renderers.camera import Rays
-from renderers.field import Counts, Kind, Meter, Moved, estimate_lipschitz, field_bounds
-from renderers.fields.affine import segment_bounds
+from renderers.field import Counts, Kind, Meter, Moved, estimate_lipschitz
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.later.affine import field_bounds, segment_bounds
 from renderers.rendering import Status
 from renderers.tracing.reference import trace
 from tests.looped import each
@@ -44,7 +44,7 @@ def segments(count: int, length: float) -> tuple[torch.Tensor, torch.Tensor]:
 def test_all_values_of_a_segment_lie_within_its_bounds(seed, length):
     field = network(seed)
     middle, half = segments(200, length)
-    low, high = field.bounds(middle, half)
+    low, high = field_bounds(field)(middle, half)
     along = torch.linspace(-1, 1, 101, dtype=torch.float64)
     values = field(middle[:, None] + along[:, None] * half[:, None])
     assert (values >= low[:, None]).all() and (values <= high[:, None]).all()
@@ -121,7 +121,7 @@ def test_a_wrapped_network_is_cast_by_the_same_bounds():
         torch.testing.assert_close(RENDERER.render(wrapped, rays).distance, plain.distance, rtol=0, atol=1e-9)
     moved = Moved(field, vector((0.1, -0.2, 0.3, 0.05, 0.1, -0.1, -0.7)))
     middle, half_segment = segments(200, 0.1)
-    low, high = moved.bounds(middle, half_segment)
+    low, high = field_bounds(moved)(middle, half_segment)
     values = moved(middle[:, None] + torch.linspace(-1, 1, 51).double()[:, None] * half_segment[:, None])
     assert (values >= low[:, None]).all() and (values <= high[:, None]).all()
 
@@ -130,7 +130,7 @@ def test_rounding_does_not_blur_the_bounds_of_a_deep_network_in_float32():
     torch.manual_seed(0)
     field = Decoder(layers=8, width=256, code_length=0, skip=4, narrow=False).requires_grad_(False).at(torch.zeros(0))
     middle, half = (vectors.float() for vectors in segments(50, 1e-3))
-    low, high = field.bounds(middle, half)
+    low, high = field_bounds(field)(middle, half)
     exact = segment_bounds(field.hidden, field.last, field.skip, middle.double(), half.double())
     assert ((high - low) - (exact[1] - exact[0])).abs().max() < 1e-4
 
@@ -143,7 +143,7 @@ def test_values_of_a_network_of_large_weights_lie_within_its_bounds_in_float32()
         layer.weight.mul_(6.0)
     field = decoder.at(torch.zeros(0))
     middle, half = (vectors.float() for vectors in segments(1000, 2e-7))
-    low, high = field.bounds(middle, half)
+    low, high = field_bounds(field)(middle, half)
     values = field(middle)
     assert values.abs().max() > 10 and ((low <= values) & (values <= high)).all()
 

@@ -1,15 +1,53 @@
-"""Affine arithmetic through a ReLU network: bounds that hold for its values at every point of straight segments."""
+"""Bounds that hold for a field's values at every point of segments: affine arithmetic through a ReLU network."""
+
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from renderers.field import Field, Moved, Wrapper
+from renderers.fields.mlp import BoundDecoder
+from renderers.fields.networks.network import Adjusted
+
 # Assumed rounding errors, in units of the precision: of each number of a layer in these bounds, which are computed in
 # float64, and of the network's own values, in the precision of the points.
 ROUNDING_FACTOR, EVALUATION_ROUNDING_FACTOR = 8.0, 64.0
 SEGMENTS_PER_BATCH = 512  # keeps the activations in cache
+EVALUATIONS_PER_BOUND = 3  # a bound multiplies by the weights three times
 
 Layer = tuple[Tensor, Tensor]
+# From the middles of segments and the vectors to their ends, both [n, 3], to bounds of the values there: low and high.
+Bounds = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def field_bounds(field: Field) -> Bounds | None:
+    """The bounds of a field's values on segments, without a graph; None if it has none.
+
+    A decoder has bounds, also within wrappers, which count each bound as `EVALUATIONS_PER_BOUND` field evaluations. Any
+    other field may have a method `bounds`.
+    """
+    if isinstance(field, BoundDecoder):
+        return partial(segment_bounds, field.hidden, field.last, field.skip)
+    if not isinstance(field, Wrapper | Adjusted):
+        return getattr(field, "bounds", None)
+    inner = field_bounds(field.inner)
+    return None if inner is None else partial(_wrapped_bounds, field, inner)
+
+
+def _wrapped_bounds(field: Wrapper | Adjusted, inner: Bounds, middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    """The bounds of a field that has an inner field with bounds."""
+    if isinstance(field, Adjusted):  # which is monotonic
+        low, high = map(field.adjust, inner(middle, half))
+        return torch.minimum(low, high), torch.maximum(low, high)
+    if isinstance(field, Moved):
+        scale, motion = (tensor.detach() for tensor in field.scale_and_motion)
+        to_local = motion[:3, :3] / scale
+        low, high = inner((middle - motion[:3, 3]) @ to_local, half @ to_local)
+        return scale * low, scale * high
+    field.count_work(EVALUATIONS_PER_BOUND * len(middle))
+    return inner(middle, half)
 
 
 @torch.no_grad()
