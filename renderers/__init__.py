@@ -12,7 +12,7 @@ from renderers.later.relaxed_boundary import RelaxedBoundary
 from renderers.later.unisurf import UNISURF
 from renderers.later.volsdf import VolSDF
 from renderers.naive import Naive
-from renderers.newton import Newton
+from renderers.newton.newton import Newton
 from renderers.rendering import Capabilities, Renderer, Rendering, Status
 
 __all__ = [

@@ -18,7 +18,7 @@ from renderers.fields.mlp import Decoder
 from renderers.rendering import Status, at_iteration, with_empty_memory
 from tests.looped import each
 from tests.renderers.analytic_cases import sheet
-from tests.renderers.test_newton import camera, exact
+from tests.renderers.newton.test_newton import camera, exact
 
 NEWTON = load("renderer", "newton")
 MARCHES = {"newton": NEWTON, **{name: load("renderer", f"{name}_coarse") for name in ("dist", "idr")}}

@@ -11,10 +11,10 @@ from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Field, Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, sphere
+from renderers.newton import warm as warm_module
+from renderers.newton.warm import AUDIT_STRIDE, MIN_AUDITED_RAYS, Memory
 from renderers.rendering import Rendering, at_iteration, final_notes, with_empty_memory
 from renderers.silhouette import Hinge
-from renderers.tracing import warm as warm_module
-from renderers.tracing.warm import AUDIT_STRIDE, MIN_AUDITED_RAYS, Memory
 from tests.tiny import camera_of
 
 SIZE = 48  # pixels per side

@@ -20,9 +20,9 @@ from renderers.field import (
     points_in_sphere,
 )
 from renderers.gradients import evaluate_crossing
+from renderers.newton.packed_march import RayTable, Stop, Stride, march_rays, march_table
 from renderers.rendering import Deferred, Rendering, Status, assemble
 from renderers.tracing.bracket import SAMPLES_PER_BATCH, Bracket, equally_spaced, first_crossing, refine
-from renderers.tracing.packed_march import RayTable, Stop, Stride, march_rays, march_table
 
 # Scene units, times the slope along the ray: after a longer Newton step the field is evaluated again, since a step is
 # off by its square over the slope, times half the field's curvature.

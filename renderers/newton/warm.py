@@ -20,9 +20,9 @@ from torch import Tensor
 
 from renderers.camera import Rays
 from renderers.field import Field
+from renderers.newton.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable
+from renderers.newton.tracer import Crossings, Tracer, normalise_slope
 from renderers.rendering import Rendering
-from renderers.tracing.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable
-from renderers.tracing.tracer import Crossings, Tracer, normalise_slope
 
 MOVEMENT_SAFETY_FACTOR = 2.0  # elsewhere the field may have moved further than at the samples
 MAX_REUSABLE_SLOPE = -0.1  # hits with a flatter slope along the ray are marched again, since they may vanish suddenly

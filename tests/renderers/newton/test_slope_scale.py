@@ -6,7 +6,7 @@ from torch import Tensor
 
 from renderers.field import Coarse, Kind, Meter
 from renderers.fields.analytic import Shape, box, sphere, torus
-from renderers.tracing.tracer import (
+from renderers.newton.tracer import (
     MAX_DISTANCE_SLOPE,
     SLOPE_PAIR_COUNT,
     SlopeNormalised,

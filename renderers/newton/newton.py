@@ -9,10 +9,10 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.checks import check_choice, check_positive
 from renderers.field import Field
+from renderers.newton.tracer import Tracer
+from renderers.newton.warm import Memory, render_warm
 from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Rendering, check_kind
 from renderers.silhouette import AVERAGES, Hinge
-from renderers.tracing.tracer import Tracer
-from renderers.tracing.warm import Memory, render_warm
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from bench.config import load
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, capsule, plane, sphere, torus
+from renderers.newton.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable, Stop, Stride, march_table
+from renderers.newton.tracer import SLOPE_PAIR_COUNT
 from renderers.rendering import Rendering, Status
-from renderers.tracing.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable, Stop, Stride, march_table
-from renderers.tracing.tracer import SLOPE_PAIR_COUNT
 from tests.looped import each
 from tests.renderers.analytic_cases import beam, sheet
 from tests.tiny import camera_of
