@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from PIL import Image
 from torch import Tensor
 
-from bench.evaluate.state import render_vertex_colours
+from bench.evaluate.colours import render_vertex_colours
 from bench.pictures.run_figures import normals_image, shaded
 from bench.records.record import is_outside, read_record
 from datasets.files.meshes import SUFFIXES, read_mesh

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from bench.evaluate.state import State, coloured_image, colours_at, vertex_colours
+from bench.config import extension
+from bench.evaluate.state import State
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
@@ -137,12 +137,10 @@ def evaluate(state: State) -> Evaluation:
     metrics = _surface_scores(state) | view_metrics(state.view_from(truth.camera), truth)
     metrics |= view_metrics(renderer_view, truth, OWN_PREFIX)
     failure = (RunStatus.EMPTY, "the field has no surface in the unit sphere") if state.mesh is None else None
-    mesh, texture, device = state.mesh, state.inputs.scene.texture, state.inputs.device
-    if texture is not None and isinstance(state.field, Coloured):
-        surface = state.inputs.true_surface
-        colours = colours_at(state.field, torch.from_numpy(surface.points).float(), None, device).numpy()
-        metrics["colour_error"] = float(np.abs(colours - texture(surface.points, surface.normals)).mean())
-        mesh = mesh and replace(mesh, colours=vertex_colours(state.field, mesh, device))
+    mesh = state.mesh
+    if state.inputs.scene.texture is not None and isinstance(state.field, Coloured):
+        colour_metrics, mesh = extension("evaluate_colours")(state)
+        metrics |= colour_metrics
     return Evaluation(metrics, mesh, failure, missed_parts_note(state, [renderer_view]), state.field)
 
 
@@ -221,10 +219,10 @@ def _surface_scores(state: State) -> dict[str, float]:
 
 def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     """Renders a field with the run's renderer from a camera, as a View on the CPU."""
-    return _rendered(field, camera, inputs)[1]
+    return render_with_view(field, camera, inputs)[1]
 
 
-def _rendered(field: Field, camera: Camera, inputs: RunInputs) -> tuple[Rendering, View]:
+def render_with_view(field: Field, camera: Camera, inputs: RunInputs) -> tuple[Rendering, View]:
     """The run's rendering of a field, without gradients, and its hits as a View on the CPU."""
     with torch.no_grad():
         rendering = render_checked(inputs.renderer, field, camera.rays().to(inputs.device))
@@ -232,18 +230,6 @@ def _rendered(field: Field, camera: Camera, inputs: RunInputs) -> tuple[Renderin
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()
     return rendering, View(camera, depth, normals.cpu(), rendering.hit.cpu())
-
-
-def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[View, Float[Tensor, "height width 3"]]:
-    """The hits of the run's renderer from a camera, and their colours or a volume's weighted sums."""
-    rendering, view = _rendered(field, camera, inputs)
-    volume = rendering.volume
-    if volume is None:
-        return view, coloured_image(field, view, inputs.device)
-    rays = camera.rays().flat().to(inputs.device)
-    ray = rays[volume.ray]
-    colours = colours_at(field, ray.at(volume.distance), ray.directions, inputs.device).to(inputs.device)
-    return view, volume.weighted_sum(colours, len(rays.origins)).view(*view.mask.shape, 3).cpu()
 
 
 def _nearest(source: Surface, target: Surface) -> tuple[Float[np.ndarray, " source"], Float[np.ndarray, " source"]]:

@@ -10,7 +10,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from bench.evaluate.evaluate import render_image
+from bench.evaluate.colours import render_image
 from bench.evaluate.state import State
 from bench.pictures.run_figures import at_size, picture_normals, save_arrays
 from bench.pictures.style import SCREEN, bare, save

@@ -72,6 +72,8 @@ def _used_extensions(config: Mapping[str, Any]) -> Iterator[str]:
     yield "pictures"
     if AUTO in (config.get("renderer") or {}).values():
         yield "auto"
+    if (config.get("prior") or {}).get("colour"):
+        yield "evaluate_colours"
     if (config.get("task") or {}).get("colour_weight"):
         yield "colours"
     if config.get("field", PRIOR_FIELD) != PRIOR_FIELD:

@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.evaluate import state as state_module
+from bench.evaluate import colours as colours_module
+from bench.evaluate.colours import (
+    DEFAULT_VERTEX_COLOUR,
+    coloured_image,
+    colours_at,
+    render_image,
+    render_vertex_colours,
+)
 from bench.evaluate.evaluate import (
     DEFINITIONS,
     WORST_SURFACE,
@@ -15,18 +22,9 @@ from bench.evaluate.evaluate import (
     depth_gap_note,
     evaluate,
     missed_parts_note,
-    render_image,
     render_view,
 )
-from bench.evaluate.state import (
-    DEFAULT_VERTEX_COLOUR,
-    REACH,
-    State,
-    coloured_image,
-    colours_at,
-    newton_step,
-    render_vertex_colours,
-)
+from bench.evaluate.state import REACH, State, newton_step
 from bench.setup.inputs import RunInputs
 from bench.solve.solve import note_result
 from datasets.scene import Truth, sample_surface
@@ -89,7 +87,7 @@ class Painted(Shape):
 
 
 def test_colours_are_those_seen_along_each_ray_or_from_straight_above(monkeypatch):
-    monkeypatch.setattr(state_module, "POINTS_PER_BATCH", 4)
+    monkeypatch.setattr(colours_module, "POINTS_PER_BATCH", 4)
     points = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     field, device = Painted(sphere(1.0).function), torch.device("cpu")
     for directions in (points.roll(1, dims=0), None):

@@ -10,16 +10,16 @@ from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
+from bench.evaluate.colours import coloured_image, render_image, vertex_colours
 from bench.evaluate.evaluate import (
     DEFINITIONS,
     OWN_PREFIX,
     WORST_SURFACE,
     Evaluation,
     missed_parts_note,
-    render_image,
     surface_metrics,
 )
-from bench.evaluate.state import State, coloured_image, empty_view, vertex_colours
+from bench.evaluate.state import State, empty_view
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from bench.tasks.reconstruction.subject import Subject

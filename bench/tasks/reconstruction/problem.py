@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bench.evaluate.colours import colours_at
 from bench.evaluate.evaluate import Evaluation
-from bench.evaluate.state import State, colours_at
+from bench.evaluate.state import State
 from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
 from bench.solve.observed_view import generator_of

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 
-from bench.evaluate.state import DEFAULT_VERTEX_COLOUR, render_vertex_colours
+from bench.evaluate.colours import DEFAULT_VERTEX_COLOUR, render_vertex_colours
 from bench.tasks.reconstruction.stereo import Cloud, allowed_by_mask
 from bench.tasks.reconstruction.subject import Subject, points_in_sphere, visible
 from datasets.files.meshes import read_points

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench.config import AUTO
+from bench.evaluate.colours import vertex_colours
 from bench.evaluate.evaluate import OWN_PREFIX, Evaluation
-from bench.evaluate.state import State, vertex_colours
+from bench.evaluate.state import State
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import COST_DEFINITIONS, check_field_gradient, note_result, run_optimisation

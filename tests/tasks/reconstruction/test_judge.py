@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.config import load
-from bench.evaluate.evaluate import render_image
+from bench.evaluate.colours import render_image
 from bench.evaluate.state import State, empty_view
 from bench.records.record import RunStatus
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, OWN_PREFIX, image_scores, judge, surface_scores

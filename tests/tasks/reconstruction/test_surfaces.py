@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bench.evaluate.state import DEFAULT_VERTEX_COLOUR
+from bench.evaluate.colours import DEFAULT_VERTEX_COLOUR
 from bench.tasks.reconstruction import surfaces
 from bench.tasks.reconstruction.stereo import Cloud
 from bench.tasks.reconstruction.surfaces import fuse_clouds, given_clouds, poisson, with_colours
