@@ -174,20 +174,9 @@ def optimise(
     optimiser, own_starts = _Adam(problem.parameters), getattr(problem, "starts", None)
     starts = own_starts or Starts(StartSettings(1, 1))
     loss_of = problem.loss if own_starts else lambda step, start: problem.loss(step)
-
-    def warm_up() -> None:
-        start, step = starts.assignment(0)
-        with collect_hits() as all_hits:
-            loss = loss_of(step, start)["total"]
-        if history.notes is not None and not bool(loss.isnan()):  # a NaN is reported by the first iteration
-            for hits in all_hits:
-                hits.check()
-            notes = [f"at the first iteration, {note}" for hits in all_hits if (note := hits.off_surface())]
-            history.notes.extend(notes[:1])
-        loss.backward()
-
     stopwatch = Stopwatch(device)
-    warm_up()
+    start, step = starts.assignment(0)
+    _warm_up(lambda: loss_of(step, start)["total"], history)
     history.seconds["warmup"] = stopwatch.seconds()
     before = replace(problem.counts)
     memory = MemoryPeak(device)
@@ -236,6 +225,18 @@ def optimise(
             history.status = RunStatus.NOT_REACHED if history.reason else RunStatus.OK
         if is_spent or history.status is not RunStatus.OK:
             break
+
+
+def _warm_up(loss_of_first: Callable[[], Tensor], history: History) -> None:
+    """Computes the first loss and its gradient, and checks the hits of its renderings if the history has notes."""
+    with collect_hits() as all_hits:
+        loss = loss_of_first()
+    if history.notes is not None and not bool(loss.isnan()):  # a NaN is reported by the first iteration
+        for hits in all_hits:
+            hits.check()
+        notes = [f"at the first iteration, {note}" for hits in all_hits if (note := hits.off_surface())]
+        history.notes.extend(notes[:1])
+    loss.backward()
 
 
 def _budget_problem(curve: list[dict[str, Any]], is_spent: bool) -> str:
