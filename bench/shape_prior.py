@@ -19,23 +19,21 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from bench.config import build, extensions
 from bench.machine.environment import describe
 from bench.progress import Report, notice
 from bench.records.record import digest, file_lock, to_json, write_text
 from datasets.mesh import Mesh
-from datasets.scene import Dataset, Split, Textured, Truth, sample_surface, seed_of
-from datasets.textures import TEXTURES, Texture, make_texture
-from renderers.checks import check_at_least, check_choice, check_positive
+from datasets.scene import Dataset, Split, Truth, sample_surface
+from renderers.checks import check_at_least, check_positive
 from renderers.field import LatentDecoder
 from renderers.fields.mlp import Decoder
-from renderers.fields.textured import TexturedDecoder, TexturedShape
 
 SHIPPED = Path(__file__).resolve().parents[1] / "datasets" / "priors"
 VERSION = 1  # raise it when training changes, so that no prior of the old training is used for a new one
 VALIDATION_SHAPES = 8  # a new prior is evaluated on so many
 NEAR_SAMPLE_STD, FAR_SAMPLE_STD = 0.01, 0.08  # scene units, from the surface: of half and of a third of the samples
 SAMPLE_SPHERE_RADIUS = 1.1  # scene units: the other samples fill this sphere; rays start on the unit sphere
-Trained = Decoder | TexturedDecoder
 EVALUATED_DISTANCE = 0.02  # scene units: a prior is evaluated at samples this close to the surface
 
 
@@ -48,31 +46,6 @@ class NetworkSettings:
     code_length: int
     skip: int
     narrow: bool
-
-
-@dataclass(frozen=True)
-class ColourSettings:
-    """The settings of the colours that a prior learns.
-
-    Args:
-        texture, size: of shapes whose dataset has no colours; see `datasets.textures.make_texture`.
-        samples: points on the surface of each shape.
-        points_per_step: number of these points per shape in a step.
-        weight: of the mean absolute error of colours.
-    """
-
-    texture: str
-    size: float
-    samples: int
-    points_per_step: int
-    weight: float
-
-    def __post_init__(self) -> None:
-        check_choice("prior.colour.texture", self.texture, TEXTURES)
-        check_positive("prior.colour.size", self.size, "0.3 suits shapes in the unit sphere")
-        check_at_least("prior.colour.samples", self.samples, 1, "8000 work")
-        check_at_least("prior.colour.points_per_step", self.points_per_step, 1, "64 work")
-        check_positive("prior.colour.weight", self.weight, "0.1 works")
 
 
 @dataclass(frozen=True)
@@ -93,7 +66,7 @@ class PriorSettings:
         truncation: magnitude, in scene units, to which the field and the true distance are clamped before they are
             compared (delta of DeepSDF, Eq. 4, which takes 0.1); None compares them everywhere. Beyond it, the field is
             not constrained: a march clamps its values too (`renderer.step_clamp`).
-        colour: settings of the colours; None learns only the distance.
+        colour: settings of the colours, see the extension `colour_codes`; None learns only the distance.
     """
 
     network: NetworkSettings
@@ -109,7 +82,7 @@ class PriorSettings:
     surface_width: float
     seed: int
     truncation: float | None = None
-    colour: ColourSettings | None = None
+    colour: Any = None
 
     def __post_init__(self) -> None:
         for name in ("shapes", "samples", "steps", "shapes_per_step", "points_per_step"):
@@ -118,6 +91,9 @@ class PriorSettings:
         check_positive("prior.surface_width", self.surface_width, "0.05 works")
         if self.truncation is not None:
             check_positive("prior.truncation", self.truncation, "DeepSDF has 0.1; null compares distances everywhere")
+        if isinstance(self.colour, dict):
+            colour = build(self.colour, "prior.colour", target=extensions()["colour_codes"])
+            object.__setattr__(self, "colour", colour)
 
     @property
     def of_one_shape(self) -> bool:
@@ -129,17 +105,11 @@ class PriorSettings:
         """Plain data that determines the training."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
-    def new_decoder(self) -> Trained:
-        """A decoder initialised near the distance of a sphere."""
-        decoder = (Decoder if self.colour is None else TexturedDecoder)(**asdict(self.network))
+    def new_decoder(self) -> Any:
+        """A decoder initialised near the distance of a sphere, see `LatentDecoder`."""
+        decoder = (Decoder if self.colour is None else self.colour.new_decoder)(**asdict(self.network))
         initialise_to_sphere(decoder if isinstance(decoder, Decoder) else decoder.shape, radius=0.5)
         return decoder
-
-    def texture(self, dataset: Dataset, split: Split, index: int) -> Texture:
-        """The colours of a training shape: of its dataset if that has colours, else of the texture."""
-        if isinstance(dataset, Textured):
-            return dataset.texture(split, index)
-        return make_texture(self.colour.texture, self.colour.size, seed_of(split, index))
 
 
 @dataclass(frozen=True)
@@ -172,9 +142,7 @@ def distance_samples(
         mesh, seed = dataset.mesh(split, index), settings.seed + index
         samples = sample_distances(mesh, settings.samples, seed)
         if settings.colour:
-            surface = sample_surface(mesh, settings.colour.samples, seed)
-            colours = settings.texture(dataset, split, index)(surface.points, surface.normals)
-            samples += tuple(torch.from_numpy(array.astype(np.float32)) for array in (surface.points, colours))
+            samples += settings.colour.sampled(mesh, settings.colour.texture_of(dataset, split, index), seed)
         arrays.append(samples)
         progress(f"sampling {split} shapes", index + 1, shapes)
     return DistanceSamples(*map(torch.stack, zip(*arrays, strict=True)))
@@ -233,8 +201,8 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
         error = truncated(shape(points), settings.truncation) - truncated(distances, settings.truncation)
         weighted = near_surface_first(error.abs(), distances, settings.surface_width)
         loss = weighted.mean() + settings.code_penalty * codes[chosen].square().sum(-1).mean()
-        if (colour := settings.colour) is not None:
-            loss = loss + colour.weight * _colour_error(shape, samples, chosen, colour.points_per_step)
+        if settings.colour is not None:
+            loss = loss + settings.colour.loss(shape, samples.surface, samples.colours, chosen)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
@@ -244,14 +212,7 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
     return Prior(decoder.cpu().requires_grad_(False), codes.detach().cpu())
 
 
-def _colour_error(shape: TexturedShape, samples: DistanceSamples, chosen: Tensor, count: int) -> Tensor:
-    """The mean absolute error of colours at random points on the surfaces of the chosen shapes."""
-    indices = torch.randint(samples.surface.shape[1], (len(chosen), count), device=chosen.device)
-    predicted = shape.paint(samples.surface[chosen[:, None], indices])
-    return (predicted - samples.colours[chosen[:, None], indices]).abs().mean()
-
-
-def fit_error(decoder: Trained, samples: DistanceSamples, truncation: float | None, *, steps: int = 200) -> float:
+def fit_error(decoder: LatentDecoder, samples: DistanceSamples, truncation: float | None, *, steps: int = 200) -> float:
     """The `surface_error` with codes fitted to the samples from zero.
 
     Args:
@@ -277,7 +238,9 @@ def fit_error(decoder: Trained, samples: DistanceSamples, truncation: float | No
 
 
 @torch.no_grad()
-def surface_error(decoder: Trained, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples) -> float:
+def surface_error(
+    decoder: LatentDecoder, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples
+) -> float:
     """Mean error of the distance within `EVALUATED_DISTANCE` of the surface, in scene units, at given codes."""
     errors = []
     for code, points, distances in zip(codes, samples.points, samples.distances, strict=True):

@@ -8,9 +8,9 @@ import torch
 import trimesh
 
 from bench import shape_prior as prior_store
+from bench.setup.colour_codes import ColourSettings
 from bench.shape_prior import (
     SHIPPED,
-    ColourSettings,
     DistanceSamples,
     NetworkSettings,
     PriorSettings,

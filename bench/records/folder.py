@@ -73,7 +73,7 @@ def _used_extensions(config: Mapping[str, Any]) -> Iterator[str]:
     if AUTO in (config.get("renderer") or {}).values():
         yield "auto"
     if (config.get("prior") or {}).get("colour"):
-        yield "evaluate_colours"
+        yield from ("colour_codes", "evaluate_colours")
     if (config.get("task") or {}).get("colour_weight"):
         yield "colours"
     if config.get("field", PRIOR_FIELD) != PRIOR_FIELD:

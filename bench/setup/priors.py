@@ -52,7 +52,7 @@ class PriorChoice:
     def texture(self, dataset: Dataset, split: Split, index: int) -> Texture | None:
         """The colours of a shape; None if the prior has no colours, or the dataset only one view."""
         has_colours = self.coloured and not isinstance(dataset, OneView)
-        return self.source.texture(dataset, split, index) if has_colours else None
+        return self.source.colour.texture_of(dataset, split, index) if has_colours else None
 
     def load(self, folder: Path, device: torch.device, threads: int, progress: Report) -> Prior:
         """Loads the prior; trains it with these threads if it is neither shipped nor in the folder."""

@@ -13,7 +13,6 @@ from datasets.scene import View
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.field import Field, Meter
-from renderers.fields.textured import TexturedShape
 from renderers.rendering import RayObservation, Renderer, Rendering, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
@@ -104,7 +103,7 @@ class ObservedView:
     normal_weight: float = 0.0  # of `normal_error` at observed hits
     normal_width: float = 0.0  # scene units, see `central_differences`
     colours: Float[Tensor, "*rays 3"] | None = None  # of an image; NaN outside of the shape
-    colour_weight: float = 0.0  # of the mean absolute error of a `TexturedShape`'s colours
+    colour_weight: float = 0.0  # of the mean absolute error of colours; the field then has `paint`
     expected_observed: float | None = None  # of drawn rays, see `observed_hits`
 
     @staticmethod
@@ -169,7 +168,7 @@ class ObservedView:
 
     def _colour_error(self, field: Field, rendering: Rendering) -> Float[Tensor, ""]:
         """The mean absolute error of colours over hits on pixels that show the shape (DIST, B.3)."""
-        shape: TexturedShape = field.inner if isinstance(field, Meter) else field
+        shape: Any = field.inner if isinstance(field, Meter) else field
         shown = rendering.hit & ~self.colours.isnan().any(-1)
         error = (shape.paint(rendering.points[shown]) - self.colours[shown]).abs()
         return error.sum() / (3 * shown.sum().clamp_min(1))
