@@ -37,7 +37,7 @@ def describe_fit(fit: MaskFit, capture: Capture) -> list[str]:
         worst_names = ", ".join(f"{capture.shots[index].name} {overlaps[index]:.0%}" for index in worst)
         lines.append(f"note: least in {worst_names}: look at their masks and cameras")
     if median < WARN_BELOW and not likely_cause(capture.shots):
-        lines.append("note: cameras and masks hardly fit: one wrong one is enough; or try --axes flipped")
+        lines.append("note: cameras and masks hardly fit: one wrong one is enough")
     return lines
 
 

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from datasets.files.captures.frames import AXES, Frame, Layout, nearest_rigid_matrix, rigid_matrix
 from datasets.files.captures.hull import MaskFit, measure_mask_fit
 from datasets.files.captures.layouts import find_layout
-from datasets.files.captures.sphere import Sphere, hull_sphere, likely_cause, viewed_sphere
+from datasets.files.captures.mistakes import intrinsics_fault, likely_mistake
+from datasets.files.captures.sphere import Sphere, UnfitCameras, hull_sphere, likely_cause, viewed_sphere
 from datasets.files.captures.take import exif_notes, read_shots
 from datasets.mesh import Mesh
 from datasets.scene import Split
@@ -22,6 +23,8 @@ from renderers.checks import BadInput, check_at_least, check_choice
 MIN_PHOTOS = 3
 GOOD_OVERLAP, WARN_BELOW, REFUSE_BELOW = 0.9, 0.8, 0.5  # overlap of hull and masks, or visible fraction of the hull
 PHOTOS_HINT = "python -m bench.photos shows it"
+MISTAKE_PIXELS = 96  # maximum along the longer side of photographs in which mistakes are searched
+GENERIC_HINT = "Check the order of the images, and that masks are white on the object"
 SAME_POSITION_TOLERANCE = 1e-9  # relative to the coordinates of the cameras
 
 
@@ -171,7 +174,11 @@ def read_capture(folder: Path, settings: ReadSettings) -> Capture:
     layout = find_layout(folder, settings.images, masks=settings.masks)
     if len(layout.frames) < MIN_PHOTOS:
         raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {MIN_PHOTOS} or more are needed")
-    capture, doubts = _check_fit(_capture(layout, settings), layout.frames)
+    try:
+        capture, doubts = _check_fit(_capture(layout, settings), layout, settings)
+    except UnfitCameras as error:
+        cause = _cause(layout, settings) or layout.doubt
+        raise BadInput(f"{folder}: {cause}. As it is, {error}" if cause else f"{error}. {GENERIC_HINT}") from None
     if doubts and not settings.unchecked:
         raise BadInput(f"{folder}: {'; '.join(doubts)}; or set dataset.unchecked=true")
     return replace(capture, notes=(*capture.notes, *doubts))
@@ -187,8 +194,8 @@ def _capture(layout: Layout, settings: ReadSettings) -> Capture:
     exif = exif_notes(frames)
     try:
         sphere = _sphere(layout, origin, [shots[i] for i in used], [frames[i].depth_range for i in used])
-    except BadInput as error:
-        raise BadInput("; ".join([str(error), *exif])) from None
+    except UnfitCameras as error:
+        raise UnfitCameras("; ".join([str(error), *exif])) from None
     largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
     longest = settings.longest
     size_note = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
@@ -212,16 +219,16 @@ def _centre(frames: Sequence[Frame], axes: Float[np.ndarray, "4 4"]) -> tuple[li
     """Frames with the origin moved to the mean camera position, and that position; far coordinates would lose digits.
 
     Raises:
-        BadInput: all cameras are at one position.
+        UnfitCameras: all cameras are at one position.
     """
     poses = [axes @ nearest_rigid_matrix(frame.world_to_camera) for frame in frames]
     positions = -np.stack([np.linalg.solve(pose[:3, :3], pose[:3, 3]) for pose in poses])
     origin = positions.mean(axis=0)
     if np.abs(positions - origin).max() <= SAME_POSITION_TOLERANCE * np.abs(origin).max():
-        raise BadInput(
+        raise UnfitCameras(
             f"all {len(frames)} cameras, of {frames[0].image.name} to {frames[-1].image.name}, are at one place, "
             f"({', '.join(f'{value:.6g}' for value in origin)}): photographs from several places are needed; check the "
-            "translations in the file of cameras"
+            "translations in the file of cameras, or store the inverse poses"
         )
     shift = rigid_matrix(np.eye(3), origin)
     shifted = [replace(frame, world_to_camera=pose @ shift) for frame, pose in zip(frames, poses, strict=True)]
@@ -255,19 +262,40 @@ def _sphere(
     return viewed_sphere(shots, ranges)
 
 
-def _check_fit(capture: Capture, frames: Sequence[Frame]) -> tuple[Capture, list[str]]:
+def _check_fit(capture: Capture, layout: Layout, settings: ReadSettings) -> tuple[Capture, list[str]]:
     """A capture with notes on doubtful fits, and the messages on fits that are refused."""
     fit = capture.fit
-    overlap, shown = map(float, (np.median(fit.overlaps), np.median(fit.shown)) if fit else (1, 1))
-    is_doubtful = overlap < WARN_BELOW if fit else None in [frame.size for frame in frames]
-    if is_doubtful and (cause := likely_cause(capture.shots)):
-        return capture, [cause]
+    if fit is None:
+        has_no_size = None in [frame.size for frame in layout.frames]
+        doubt = intrinsics_fault(layout.frames[0]) or (has_no_size and likely_cause(capture.shots))
+        return replace(capture, notes=(*capture.notes, *filter(None, [layout.doubt]))), [doubt] if doubt else []
+    overlap, shown = float(np.median(fit.overlaps)), float(np.median(fit.shown))
+    text = f"the visual hull of the masks overlaps with them by {overlap:.0%} (median)"
+    if overlap < WARN_BELOW and (cause := _cause(layout, settings)):
+        return capture, [f"{cause}. As it is, {text}"]
     fractions_by_text = {
-        f"the visual hull of the masks overlaps with them by {overlap:.0%} (median): cameras may be those of other "
-        f"images; {PHOTOS_HINT}": overlap,
+        f"{text}: cameras may be those of other images; {PHOTOS_HINT}": overlap,
         f"the photographs show {shown:.0%} of the object (median): cameras may look elsewhere, or the focal length "
         "is another": shown,
     }
     notes = [text for text, fraction in fractions_by_text.items() if REFUSE_BELOW <= fraction < WARN_BELOW]
     refused = [text for text, fraction in fractions_by_text.items() if fraction < REFUSE_BELOW]
+    if layout.doubt and overlap < GOOD_OVERLAP:
+        (refused or notes).insert(0, layout.doubt)
     return replace(capture, notes=(*capture.notes, *notes)), refused
+
+
+def _cause(layout: Layout, settings: ReadSettings) -> str:
+    """The likely cause why cameras do not fit, with the remedy; "" if it is unknown."""
+    fault = intrinsics_fault(layout.frames[0])
+    scale = float(np.linalg.norm(layout.world[:3, 0]))
+    from_file = np.diag([scale, scale, scale, 1.0]), np.linalg.inv(layout.world)
+    frames = [
+        replace(frame, world_to_camera=from_file[0] @ AXES[settings.axes] @ frame.world_to_camera @ from_file[1])
+        for frame in layout.frames
+    ]
+    shots, _ = read_shots(frames, MISTAKE_PIXELS)
+    if not settings.masks or any(shot.mask is None or not bool(shot.mask.any()) for shot in shots):
+        return fault
+    cause = "" if fault else likely_cause(shots)
+    return cause or likely_mistake(shots, frames, settings.axes) or fault

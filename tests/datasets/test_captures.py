@@ -303,7 +303,7 @@ def test_flipped_axes_are_reported_and_can_be_set(tmp_path, capsys):
     assert main([str(tmp_path), *picture]) == 2
     out, err = capsys.readouterr()
     assert out == "" and len(err.splitlines()) == 1
-    assert "the visual hull of the masks is empty" in err and "flipped axes" in err
+    assert "the visual hull of the masks is empty" in err and "dataset.axes=flipped" in err
     assert main([str(tmp_path), "--axes", "flipped", *picture]) == 0
 
 

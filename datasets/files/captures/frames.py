@@ -82,6 +82,7 @@ class Layout:
         points_sphere: a sphere about most of the reconstructed points, if the format has points.
         world: the map from the cameras' world to the file's world.
         example_image: the first image that the format names, for the message about missing images.
+        doubt: a cause in the file of cameras why photographs may not fit each other; empty without one.
     """
 
     format: str
@@ -91,6 +92,7 @@ class Layout:
     points_sphere: tuple[Float[np.ndarray, "3"], float] | None = None
     world: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     example_image: str = ""
+    doubt: str = ""
 
 
 @dataclass(frozen=True)

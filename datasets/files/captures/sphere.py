@@ -18,11 +18,11 @@ SHRINK_ROUNDS = 4  # the sampled cube shrinks to the hull in each round
 HULL_RADIUS_FRACTION = 0.9  # the hull's radius in the unit sphere
 PARALLEL_SPREAD, NARROW_SPREAD = 1e-4, 3e-3  # squared radians between optical axes that do not, or hardly, converge
 MIN_SIZE_RATIO, ASPECT_TOLERANCE = 1.3, 0.15  # smaller or unequal ratios of width and height do not matter
-GENERIC_HINT = (
-    "Try flipped axes (stated ones, where they are flipped), check the order of the images and that masks are white on "
-    "the object"
-)
 MAX_OUT_OF_RANGE_FRACTION = 0.5  # if the viewed point is out of range in more photographs, it is not the centre
+
+
+class UnfitCameras(BadInput):
+    """Cameras that cannot be those of the photographs."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:
     """The sphere about the visual hull of the masks, searched in a cube about `start`.
 
     Raises:
-        BadInput: the hull is empty.
+        UnfitCameras: the hull is empty.
     """
     centre, half_side = start.centre, start.radius
     for _ in range(SHRINK_ROUNDS):
@@ -46,10 +46,7 @@ def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:
         points = torch.from_numpy(centre) + torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
         inside = points[carve(shots, points) < 0].numpy()
         if len(inside) == 0:
-            raise BadInput(
-                "the visual hull of the masks is empty: no point is inside of all masks, so that cameras do not fit "
-                f"the masks. {likely_cause(shots).capitalize() or GENERIC_HINT}"
-            )
+            raise UnfitCameras("the visual hull of the masks is empty: no point is inside of all masks")
         spacing = 2 * half_side / (SEARCH_SAMPLES_PER_AXIS - 1)
         low, high = inside.min(axis=0) - spacing, inside.max(axis=0) + spacing
         centre, half_side = (low + high) / 2, float((high - low).max()) / 2
@@ -87,7 +84,7 @@ def viewed_sphere(shots: Sequence[Shot], depth_ranges: Sequence[tuple[float, flo
         BadInput: the cameras look in parallel, and neither depth ranges nor masks are complete.
     """
     poses = np.stack([shot.camera.camera_to_world.double().numpy() for shot in shots])
-    centre, spread = _nearest_to_lines(poses[:, :3, 3], poses[:, :3, 2])
+    centre, spread = nearest_to_lines(poses[:, :3, 3], poses[:, :3, 2])
     depths = ((centre - poses[:, :3, 3]) * poses[:, :3, 2]).sum(axis=1)
     ranges = np.array([limits for limits in depth_ranges if limits is not None and 0 < limits[0] < limits[1]])
     if len(ranges) == len(shots):
@@ -98,7 +95,7 @@ def viewed_sphere(shots: Sequence[Shot], depth_ranges: Sequence[tuple[float, flo
             radius = max(_visible_radius(shots, centre), float(np.median(far - near)) / 2)
             return Sphere(centre, radius, "about the middle of the depths that the format states")
     elif spread < PARALLEL_SPREAD and all(shot.mask is not None for shot in shots):
-        centre, _ = _nearest_to_lines(poses[:, :3, 3], np.stack([_mask_direction(shot) for shot in shots]))
+        centre, _ = nearest_to_lines(poses[:, :3, 3], np.stack([_mask_direction(shot) for shot in shots]))
     elif spread < PARALLEL_SPREAD:
         raise BadInput(
             f"the cameras look in parallel ({np.degrees(spread**0.5):.2g} degrees apart), so that nothing says how far "
@@ -113,7 +110,7 @@ def viewed_sphere(shots: Sequence[Shot], depth_ranges: Sequence[tuple[float, flo
     return Sphere(centre, _visible_radius(shots, centre), source)
 
 
-def _nearest_to_lines(
+def nearest_to_lines(
     positions: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """The point nearest to all lines, and the mean squared angle between the lines, in squared radians."""

@@ -52,7 +52,10 @@ def read_layout(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     if any(not size_keys & {*cameras[path]} for path in images):
         notes += (f"{files[0].name} states no w and h: focal lengths are taken for the size of the images",)
     frames = sorted(frames, key=lambda frame: natural_key(frame.image.name))
-    return Layout("NeRF", tuple(frames), None, notes, example_image=next(iter(cameras), ""))
+    times = {str(cameras[path].get("time")) for path in images}
+    doubt = f"{files[0].name} has {len(times)} values of time: if the object moves, keep the frames of one time"
+    example = next(iter(cameras), "")
+    return Layout("NeRF", tuple(frames), None, notes, example_image=example, doubt=doubt if len(times) > 1 else "")
 
 
 def _masks(
