@@ -174,6 +174,24 @@ def test_images_of_16_bits_and_of_floats_are_read(tmp_path):
     assert np.abs(read_image(tmp_path / "a.tiff", None, 48)[0] - 0.5).max() < 0.01
 
 
+@each("bits", [10, 12, 14, 16])
+def test_images_of_10_to_16_bits_are_as_bright_as_those_of_8(tmp_path, bits):
+    idr(tmp_path)
+    for file in (tmp_path / "image").iterdir():
+        grey = np.asarray(Image.open(file).convert("L")) * ((2**bits - 1) / 255)
+        Image.fromarray(grey.astype(np.uint16)).save(file)
+    capture = read_capture(tmp_path, READ)
+    assert float(capture.shots[0].colours.max()) == pytest.approx(128 / 255, abs=0.01)
+    assert any(f"read as of {bits} bits" in note for note in capture.notes) is (bits < 16)
+
+
+@each("factor, noted", [(1, False), (1 / 16, True)])
+def test_dark_photographs_have_a_note(tmp_path, factor, noted):
+    idr(tmp_path)
+    repainted([*(tmp_path / "image").iterdir()], lambda pixels: pixels * factor)
+    assert any("12 bits to 16" in note for note in read_capture(tmp_path, READ).notes) is noted
+
+
 def test_an_opaque_alpha_channel_is_no_mask(tmp_path):
     nerf(tmp_path)
     repainted([*(tmp_path / "train").iterdir()], lambda pixels: np.dstack([pixels[..., :3], np.full(SIZE, 255)]))

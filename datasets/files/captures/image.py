@@ -1,6 +1,6 @@
 """Image files: their size, their orientation (EXIF), and their pixels as 8 bits a channel."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from datasets.files.readers.text import wrong_kind_message
 from renderers.checks import BadInput
 
 READ_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)  # Pillow's
+WHITE_LEVELS = (255, 1023, 4095, 16383, 65535)  # the largest numbers in 8, 10, 12, 14 and 16 bits
 EXIF_UPRIGHT, EXIF_SWAPPED = 1, 5  # orientations without a turn, and from which on width and height are swapped
 
 
@@ -38,15 +39,30 @@ def exif_orientation(image: Image.Image) -> int:
     return image.getexif().get(ExifTags.Base.Orientation, EXIF_UPRIGHT)
 
 
-def load_image(path: Path, *, upright: bool = False) -> Image.Image:
-    """Reads an image with 8 bits a channel; `upright` applies its orientation tag."""
+def white_level(paths: Sequence[Path]) -> int | None:
+    """The white of images with numbers of more than 8 bits, by their largest number; None for other images."""
+    largest = -1.0
+    for path in paths:
+        with open_image(path) as image:
+            if image.mode.startswith("I"):
+                largest = max(largest, float(np.asarray(image).max()))
+    return next((level for level in WHITE_LEVELS if 0 <= largest <= level), None)
+
+
+def load_image(path: Path, *, upright: bool = False, white: int | None = None) -> Image.Image:
+    """Reads an image with 8 bits a channel.
+
+    Args:
+        upright: applies its orientation tag.
+        white: the number of white in an image of more bits; None: that of 8 or 16 bits.
+    """
     with open_image(path) as stored:
         stored.load()
         image = ImageOps.exif_transpose(stored) if upright else stored.copy()
     if image.mode.startswith("I") or image.mode == "F":  # 16 bits a channel
         values = np.asarray(image, np.float64)
         largest = 65535 if values.max() > 255 else 1 if image.mode == "F" and values.max() <= 1 else 255
-        image = Image.fromarray((values * (255 / largest)).astype(np.uint8))
+        image = Image.fromarray((values * (255 / (white or largest))).astype(np.uint8))
     return image
 
 

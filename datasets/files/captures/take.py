@@ -18,6 +18,7 @@ from datasets.files.captures.image import (
     has_alpha,
     load_image,
     open_image,
+    white_level,
 )
 from datasets.files.captures.mask import foreground
 from datasets.shot import Shot
@@ -25,6 +26,7 @@ from renderers.camera import Camera
 from renderers.checks import BadInput
 
 ALPHA_BACKGROUND = 1.0  # white, as in NeRF
+DARK_LEVEL = 0.1  # numbers of 12 bits reach 1/16 of white, if they are read as 16 bits
 
 
 def read_shot(frame: Frame, longest: int) -> Shot:
@@ -33,22 +35,35 @@ def read_shot(frame: Frame, longest: int) -> Shot:
 
 
 def read_shots(frames: Sequence[Frame], longest: int) -> tuple[list[Shot], tuple[str, ...]]:
-    """Photographs with cameras in float64, at most `longest` pixels along the longer side, and notes on their depths.
+    """Photographs with cameras in float64, at most `longest` pixels along the longer side, and notes.
+
+    Notes are on depths that are none, on the bits of images that do not use all of 16, and on dark images.
 
     Raises: as `read_shot`.
     """
-    pairs = [_read_shot(frame, longest) for frame in frames]
-    return [shot for shot, _ in pairs], missing_note(sum((missing for _, missing in pairs), Counter()))
+    white = white_level([frame.image for frame in frames])
+    pairs = [_read_shot(frame, longest, white) for frame in frames]
+    shots = [shot for shot, _ in pairs]
+    notes = missing_note(sum((missing for _, missing in pairs), Counter()))
+    if white not in (None, 255, 65535):
+        notes += (f"no photograph has a number above {white}: they are read as of {white.bit_length()} bits, not 16",)
+    colours = [shot.colours if shot.mask is None else shot.colours[shot.mask] for shot in shots]
+    brightest = max(float(colour.max()) for colour in colours if colour.numel()) if any(map(len, colours)) else 1.0
+    if 0 < brightest < DARK_LEVEL:
+        notes += (
+            f"the brightest colour of all photographs is {brightest:.2g} of white: scale numbers of 12 bits to 16",
+        )
+    return shots, notes
 
 
-def _read_shot(frame: Frame, longest: int) -> tuple[Shot, Counter[str]]:
+def _read_shot(frame: Frame, longest: int, white: int | None = None) -> tuple[Shot, Counter[str]]:
     """A frame's photograph, and the pixels of its depth file by the numbers that stand for no depth.
 
     Raises:
         BadInput: a file cannot be read, or image, mask and camera have different aspect ratios.
     """
     upright = bool(_applies_exif(frame))
-    image = load_image(frame.image, upright=upright)
+    image = load_image(frame.image, upright=upright, white=white)
     height, width = frame.size or (image.height, image.width)
     if not _same_aspect(image.size, (height, width)):
         raise BadInput(
