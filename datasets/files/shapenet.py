@@ -2,9 +2,10 @@
 
 import hashlib
 import json
-import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +17,14 @@ from datasets.files.colours import FileColours
 from datasets.files.local import VERSION, load_repaired, split_files
 from datasets.files.meshes import read_mesh
 from datasets.files.repair import WRAPPED
+from datasets.files.shape_lists import NAMES, SYNSETS, read_lists
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.scene import Split
 from datasets.shot import Shot
 from datasets.textures import Texture
 from renderers.checks import BadInput, check_choice
 
-SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
-    **{"plane": "02691156", "bench": "02828884", "cabinet": "02933112", "car": "02958343", "chair": "03001627"},
-    **{"display": "03211117", "lamp": "03636649", "speaker": "03691459", "rifle": "04090263", "sofa": "04256520"},
-    **{"table": "04379243", "phone": "04401088", "vessel": "04530566"},
-}
-NAMES = {number: name for name, number in SYNSETS.items()}
 MESH_PATHS = ("models/model_normalized.obj", "model.obj")  # ShapeNetCore v2 and v1
-SPLIT_WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"}  # parts of the names of lists
 DEEPSDF_BUFFER = 1.03  # radius of the unit sphere divided by the shape's radius
 UNKNOWN_INSIDE_WARNING = (
     "warning: the file does not say what is inside: here it is what the wrap encloses; DeepSDF drops such shapes"
@@ -46,7 +41,7 @@ class ShapeNet:
     Args:
         path: the folder with the synsets' folders, with `ID/models/model_normalized.obj` (v2) or `ID/model.obj`.
         synset: a name of `SYNSETS`, or a number.
-        split: a list of ids; see `_lists`. None: all shapes are divided among the splits.
+        split: a list of ids; see `read_lists`. None: all shapes are divided among the splits.
         normalised: "deepsdf", into the unit sphere, or "onet", into a cube of side 1.
         renders: a folder with `SYNSET/ID`, of DVR's data or of NMR's in DVR's form, for `task=single_view`.
     """
@@ -68,12 +63,12 @@ class ShapeNet:
     @property
     def name(self) -> str:
         """The class, by its name if `SYNSETS` has one."""
-        return f"shapenet_{NAMES.get(self.synset, self.synset)}"
+        return f"shapenet_{NAMES.get(self.folder.name, self.folder.name)}"
 
     @property
     def folder(self) -> Path:
         """The folder of the class."""
-        return Path(self.path) / SYNSETS.get(self.synset, self.synset)
+        return Path(self.path) / SYNSETS.get(self.synset, self.synset.zfill(8))
 
     def mesh(self, split: Split, index: int) -> Mesh:
         """A shape as a closed mesh; its `repairs` state its id, shapes that are missing on disk, and its repairs."""
@@ -82,7 +77,18 @@ class ShapeNet:
         if missing := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
             text = f"{len(missing)} shapes of the list are not on disk, and left out, such as {min(missing)}"
             notes.append(f"warning: {text}")
-        return replace(mesh, repairs=(*notes, *mesh.repairs))
+        return replace(mesh, repairs=(*notes, *self._counts, *mesh.repairs))
+
+    @property
+    def _counts(self) -> Iterator[str]:
+        """Notes on the numbers of shapes: on disk, in each split, in several lists, and of each release."""
+        on_disk, counts = [*_shapes(self.folder).values()], {split: len({*self.files[split]}) for split in Split}
+        listed = ", ".join(f"{count} {split}" for split, count in counts.items())
+        yield f"{len(on_disk)} shapes on disk, {len({*chain(*self.files.values())})} used: {listed}"
+        if repeated := sum(map(len, self.lists.values())) - len({*chain(*self.lists.values())}):
+            yield f"warning: {repeated} shapes are in several lists, and only used in the last: train, validation, test"
+        if 0 < (first := sum(file.parent.name != "models" for file in on_disk)) < len(on_disk):
+            yield f"{len(on_disk) - first} shapes are of ShapeNetCore v2, and {first} of v1"
 
     def texture(self, split: Split, index: int) -> Texture:
         """The colours of a shape from its file; see `Textured`."""
@@ -123,16 +129,17 @@ class ShapeNet:
             )
         rest = {*by_id.values()}.difference(*listed.values())
         files = split_files(listed.get(Split.TRAIN, sorted(rest))) | listed
-        if Split.TRAIN in listed:
-            held_out = {*files[Split.VALIDATION], *files[Split.TEST]}
-            files[Split.TRAIN] = [file for file in files[Split.TRAIN] if file not in held_out]
+        held_out = set[Path]()
+        for split in (Split.TEST, Split.VALIDATION, Split.TRAIN):  # a shape of several lists is only in the first
+            if {split, Split.TRAIN} & {*listed}:
+                files[split] = [file for file in files[split] if file not in held_out]
+            held_out |= {*files[split]}
         return files
 
     @cached_property
     def lists(self) -> dict[Split, list[str]]:
         """The ids that each list names."""
-        files = {} if self.split is None else _lists(Path(self.split))
-        return {split: _read_ids(file, self.folder.name) for split, file in files.items()}
+        return {} if self.split is None else read_lists(Path(self.split), self.folder.name, _shapes(self.folder))
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: their paths, since the files of a ShapeNet release do not change."""
@@ -149,48 +156,12 @@ def _id(file: Path) -> str:
 
 def _shapes(folder: Path) -> dict[str, Path]:
     """The file of each shape in a class's folder, by its id."""
-    for inner in MESH_PATHS:
-        if files := sorted(folder.glob(f"*/{inner}")):
-            return {_id(file): file for file in files}
+    if files := [file for inner in MESH_PATHS for file in sorted(folder.glob(f"*/{inner}"))]:
+        return {_id(file): file for file in reversed(files)}  # of two releases, the later one
     what = f"'{folder}' has no ID/{MESH_PATHS[0]} (v2) and no ID/{MESH_PATHS[1]} (v1)"
     for parent in (folder, folder.parent):
         what = what if parent.is_dir() else f"there is no folder '{parent}'"
     raise ValueError(f"dataset.path: {what}: give the folder of ShapeNetCore in which that of the synset is unpacked")
-
-
-def _lists(file: Path) -> dict[Split, Path]:
-    """The list of each split: `file` and files of its folder with other `SPLIT_WORDS`; without any word, only test."""
-    if not file.is_file():
-        raise ValueError(f"dataset.split: there is no file '{file}': give a split of DeepSDF (.json) or a list (.lst)")
-    match = re.search(rf"(?<![a-z])({'|'.join(SPLIT_WORDS.values())})(?![a-z])", file.name)
-    if match is None:
-        return {Split.TEST: file}
-    names = {split: file.name[: match.start()] + word + file.name[match.end() :] for split, word in SPLIT_WORDS.items()}
-    return {split: file.with_name(name) for split, name in names.items() if file.with_name(name).is_file()}
-
-
-def _read_ids(file: Path, synset: str) -> list[str]:
-    """The ids of a synset in a list: DeepSDF's JSON, or lines with an id, alone or after its synset.
-
-    Raises:
-        ValueError: the list cannot be read, or has no ids of the synset.
-    """
-    ids = dict[str, list[str]]()
-    try:
-        if file.suffix == ".json":
-            for dataset in json.loads(file.read_text()).values():
-                ids |= dataset
-        else:
-            rows = (line.replace("/", " ").split() for line in file.read_text().splitlines() if line.strip())
-            for *parents, name in rows:
-                ids.setdefault(parents[-1] if parents else synset, []).append(name)
-    except (ValueError, AttributeError) as error:
-        raise ValueError(f"dataset.split: '{file}' cannot be read as a split of DeepSDF or a list: {error}") from None
-    if not ids.get(synset):
-        has = ", ".join(NAMES.get(number, number) for number in ids) or "nothing"
-        raise ValueError(f"dataset.split: '{file}' has nothing of {NAMES.get(synset, synset)}, but {has}: set "
-                         "dataset.synset to it, or give another list")  # fmt: skip
-    return ids[synset]
 
 
 @lru_cache(maxsize=64)

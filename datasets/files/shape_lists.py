@@ -1,0 +1,135 @@
+"""Lists of shapes: the ids of a class in each split, from JSON, CSV or lines of text."""
+
+import json
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from datasets.files.readers.text import decode
+from datasets.scene import Split
+
+SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
+    **{"plane": "02691156", "bench": "02828884", "cabinet": "02933112", "car": "02958343", "chair": "03001627"},
+    **{"display": "03211117", "lamp": "03636649", "speaker": "03691459", "rifle": "04090263", "sofa": "04256520"},
+    **{"table": "04379243", "phone": "04401088", "vessel": "04530566"},
+}
+NAMES = {number: name for name, number in SYNSETS.items()}
+SPLIT_WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"}  # parts of the names of lists
+SPLITS = {word: split for split, word in SPLIT_WORDS.items()}
+SPLITS |= {"training": Split.TRAIN, "valid": Split.VALIDATION, "validation": Split.VALIDATION, "testing": Split.TEST}
+SYNSET_PATTERN = re.compile(r"\d{7,8}")  # a spreadsheet removes the leading 0
+SEPARATORS = re.compile(r"[\s,;/\\\"]+")
+ID_HEADINGS, SPLIT_HEADINGS = {"id", "modelid", "model_id", "synsetid", "synset", "fullid"}, {"split", "set", "subset"}
+PARTS_OF_PATHS = {"models", "model", "model_normalized"}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A shape in a list; the synset is "" and the split None if the list does not state them."""
+
+    name: str
+    synset: str
+    split: Split | None
+
+
+def read_lists(file: Path, synset: str, ids: Collection[str]) -> dict[Split, list[str]]:
+    """The ids of a synset in each split, from a list and the lists of the other splits in its folder.
+
+    Args:
+        ids: the shapes on disk.
+
+    Raises:
+        ValueError: a list cannot be read, or has no ids of the synset.
+    """
+    lists = dict[Split, dict[str, None]]()
+    for file_split, path in _split_files(file).items():
+        entries = _entries(path, ids)
+        chosen = [entry for entry in entries if entry.synset in ("", synset)]
+        if not chosen:
+            has = ", ".join(dict.fromkeys(NAMES.get(entry.synset, entry.synset) for entry in entries)) or "nothing"
+            raise ValueError(f"dataset.split: '{path}' has nothing of {NAMES.get(synset, synset)}, but {has}: set "
+                             "dataset.synset to it, or give another list")  # fmt: skip
+        for entry in chosen:
+            lists.setdefault(entry.split or file_split, {})[entry.name] = None
+    return {split: [*names] for split, names in lists.items()}
+
+
+def _split_files(file: Path) -> dict[Split, Path]:
+    """The list of each split: `file` and files of its folder with other `SPLIT_WORDS`; without any word, only test."""
+    if not file.is_file():
+        raise ValueError(f"dataset.split: there is no file '{file}': give a split of DeepSDF (.json) or a list (.lst)")
+    match = re.search(rf"(?<![a-z])({'|'.join(SPLIT_WORDS.values())})(?![a-z])", file.name)
+    if match is None:
+        return {Split.TEST: file}
+    names = {split: file.name[: match.start()] + word + file.name[match.end() :] for split, word in SPLIT_WORDS.items()}
+    return {split: file.with_name(name) for split, name in names.items() if file.with_name(name).is_file()}
+
+
+def _entries(file: Path, ids: Collection[str]) -> list[Entry]:
+    content = file.read_bytes()
+    try:
+        rows = _json_rows(json.loads(decode(content)), [], ids) if file.suffix == ".json" else _text_rows(content)
+        return [entry for words in rows if (entry := _entry(words, ids))]
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"dataset.split: '{file}' cannot be read as a split of DeepSDF or a list: {error}") from None
+
+
+def _entry(words: list[str], ids: Collection[str]) -> Entry | None:
+    """The shape of a row, which has its id and may have a synset, a split and other words in any order."""
+    synsets = [word.zfill(8) for word in words if SYNSET_PATTERN.fullmatch(word)]
+    synsets += [SYNSETS[word] for word in words if word in SYNSETS]
+    splits = [SPLITS[word.lower()] for word in words if word.lower() in SPLITS]
+    stems = [word.partition(".")[0] for word in words]
+    others = [stem for stem in stems if not SYNSET_PATTERN.fullmatch(stem) and stem.lower() not in SPLITS]
+    others = [stem for stem in others if stem and stem not in PARTS_OF_PATHS]
+    names = [stem for stem in stems if stem in ids] or others
+    return Entry(names[-1], synsets[0] if synsets else "", splits[-1] if splits else None) if names else None
+
+
+def _text_rows(content: bytes) -> Iterator[list[str]]:
+    """The words of each line; if a heading names the column of the split, only its word is a split."""
+    lines = [line for line in decode(content).split("\n") if line.strip()]
+    column = None
+    for i, line in enumerate(lines):
+        words = SEPARATORS.split(line.strip(' "\t'))
+        headings = [word.lower() for word in words]
+        if i == 0 and ID_HEADINGS & {*headings}:
+            column = next((k for k, heading in enumerate(headings) if heading in SPLIT_HEADINGS), None)
+        elif column is not None and column < len(words):
+            others = [word for k, word in enumerate(words) if k != column and word.lower() not in SPLITS]
+            yield [*others, words[column]]
+        else:
+            yield words
+
+
+def _json_rows(node: Any, path: list[str], ids: Collection[str]) -> Iterator[list[str]]:
+    """The words of each shape: the keys that lead to it, texts beside them, and its own text, if it is one.
+
+    An id may be a text of a list, or a key, with its split or numbers such as views as the value.
+    """
+    if isinstance(node, dict):
+        texts = [value for key, value in node.items() if isinstance(value, str) and key not in ids]
+        is_record = all(isinstance(value, str) and key not in ids for key, value in node.items())
+        yield from [[*path, *chain.from_iterable(map(SEPARATORS.split, texts))]] if is_record and node else ()
+        for key, value in node.items():
+            words = [*path, *texts, *SEPARATORS.split(key)]
+            if key in ids and isinstance(value, str):
+                yield [*words, value]
+            elif _has_shapes(value):
+                yield from _json_rows(value, words, ids)
+            elif not isinstance(value, str):
+                yield words
+    elif isinstance(node, list):
+        for item in node:
+            yield from [[*path, *SEPARATORS.split(item)]] if isinstance(item, str) else _json_rows(item, path, ids)
+    else:
+        raise ValueError(f"it has {node!r} in the place of shapes")
+
+
+def _has_shapes(value: Any) -> bool:
+    """Whether a value of a table has shapes itself; an id may have numbers as its value."""
+    is_list = isinstance(value, list)
+    return isinstance(value, dict) or (is_list and not (value and all(isinstance(item, int | float) for item in value)))
