@@ -6,7 +6,7 @@ import tempfile
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -16,6 +16,7 @@ import numpy as np
 from datasets.extras import referenced_files, version
 from datasets.files.colours import FileColours
 from datasets.files.deform import Deformation
+from datasets.files.duplicates import first_of_each_shape
 from datasets.files.meshes import find_meshes, load_mesh
 from datasets.mesh import Mesh, normalise
 from datasets.scene import Split, seed_of
@@ -61,7 +62,8 @@ class LocalMeshes:
         """A shape as a closed mesh; its `repairs` list the repairs of the file."""
         files, file = self.files(split), self._file(split, index)
         mesh = _load(file, file.stat().st_mtime_ns, self.radius)
-        alone = len(find_meshes(self.path)) == 1
+        mesh = replace(mesh, repairs=(*self._duplicates_note, *mesh.repairs))
+        alone = len(self._meshes) == 1
         if index < len(files) and (split is Split.TRAIN or not alone):
             return mesh
         deformation = Deformation.draw(seed_of(split, index), self.strength)
@@ -78,12 +80,30 @@ class LocalMeshes:
 
     def files(self, split: Split) -> list[Path]:
         """The files of a split; splits share none, unless there are fewer than three."""
-        files = find_meshes(self.path)
-        return files if len(files) == 1 else split_files(files)[split]
+        return self._meshes if len(self._meshes) == 1 else split_files(self._meshes)[split]
+
+    @cached_property
+    def _meshes(self) -> list[Path]:
+        """The files, without those that hold the shape of a file before them."""
+        return [file for file in find_meshes(self.path) if self._first_files[file] == file]
+
+    @cached_property
+    def _first_files(self) -> dict[Path, Path]:
+        """The first file that holds a file's shape, by the length of names: `a.obj` is before `a (1).obj`."""
+        files = sorted(find_meshes(self.path), key=lambda file: (len(file.name), file.name))
+        return first_of_each_shape(files, cache_folder("shapes")) if len(files) > 1 else {files[0]: files[0]}
+
+    @property
+    def _duplicates_note(self) -> tuple[str, ...]:
+        """A note on files that hold the shape of another file; empty without any."""
+        repeated = [f"{file.name} that of {first.name}" for file, first in self._first_files.items() if file != first]
+        counts = ", ".join(f"{len(self.files(split))} {split}" for split in Split)
+        text = f"{len(repeated)} of {len(self._first_files)} files hold the shape of another file, and are left out"
+        return (f"{text} ({', '.join(repeated[:3])}): {counts}",) if repeated else ()
 
     def identity(self) -> dict[str, Any]:
         """Plain data that determines the shapes: the files' contents, not their paths."""
-        meshes = find_meshes(self.path)
+        meshes = self._meshes
         referenced = [other for file in meshes for other in referenced_files(file) if other.is_file()]
         contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in (*meshes, *referenced)]
         settings = {"radius": self.radius, "strength": self.strength}
@@ -105,6 +125,11 @@ def _load(path: Path, changed: int, radius: float) -> Mesh:
     return normalise(load_repaired(path), radius)
 
 
+def cache_folder(name: str) -> Path:
+    """A folder of this project in the user's cache; it may not exist."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "implicit-bench", name)
+
+
 def load_repaired(path: Path) -> Mesh:
     """Loads a mesh like `load_mesh`; caches a mesh whose repair took long, since each run loads its mesh again.
 
@@ -112,7 +137,7 @@ def load_repaired(path: Path) -> Mesh:
     """
     code = sorted(Path(__file__).parent.rglob("*.py"))
     fingerprint = b"\0".join([str(version("pymeshlab")).encode(), *(file.read_bytes() for file in (*code, path))])
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "implicit-bench", "meshes")
+    folder = cache_folder("meshes")
     entry = folder / f"{hashlib.sha256(fingerprint).hexdigest()[:16]}.npz"
     with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), entry.open("rb") as file, np.load(file) as data:
         return Mesh(data["vertices"], data["faces"], tuple(map(str, data["repairs"])))

@@ -89,7 +89,7 @@ def test_contents_decide_identity_and_shapes_and_not_the_path(tmp_path, folder):
     identities = [
         str(dataset.identity()) for dataset in (local(path), other, local(path, strength=0.5), smaller, local(folder))
     ]
-    write_box(folder / "one more.stl")
+    write_box(folder / "one more.stl", (1.0, 0.65, 0.4))
     assert len({*identities, str(local(folder).identity())}) == 6
 
 
