@@ -118,8 +118,11 @@ def read_points(path: str | Path) -> Float[np.ndarray, "n 3"] | None:
             points = polygons.vertices
             if len(polygons.counts):
                 return None
-        if not len(points) or not np.isfinite(points).all():
-            raise ValueError(f"must hold points that are finite, found {len(points)}; export or copy it again")
+        bad_count = int((~np.isfinite(points)).any(axis=1).sum())
+        if not len(points) or bad_count:
+            fault = f"{bad_count} of {len(points)} are not" if bad_count else "found 0"
+            remedy = "remove those without a return" if bad_count < len(points) else "export or copy it again"
+            raise ValueError(f"must hold points that are finite, {fault}; {remedy}")
     except ValueError as error:
         raise BadInput(f"file of points '{path}': {error}") from None
     return points

@@ -241,7 +241,7 @@ def test_points_that_are_not_finite_are_refused(tmp_path, odd):
     np.savez(tmp_path / "points.npz", points=points)
     trimesh.PointCloud(points).export(tmp_path / "points.ply")
     for name in ("points.npz", "points.ply"):
-        with pytest.raises(BadInput, match="must hold points that are finite"):
+        with pytest.raises(BadInput, match="must hold points that are finite, 1 of 3 are not; remove"):
             read_points(tmp_path / name)
 
 

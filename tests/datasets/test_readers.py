@@ -203,6 +203,7 @@ TETRAHEDRA = {
         .upper()
         .replace("\n", " "),
     ),
+    "end loop in .stl": (read_stl, SOLID.replace("endloop", "end loop").replace("endsolid", "END  SOLID")),
     "a wide text of .stl": (read_stl, SOLID.encode("utf-16")),
     "a text with more in a line than its header says": (
         read_ply,

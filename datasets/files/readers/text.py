@@ -138,7 +138,7 @@ def read_stl(content: bytes) -> Polygons:
             )
         vertices, counts = np.frombuffer(content, STL_FACE_DTYPE, count, 84)["corners"].reshape(-1, 3), [3] * count
     else:
-        text = decode(content).lower()
+        text = re.sub(r"\bend\s+(loop|facet|solid)\b", r"end\1", decode(content).lower())
         if not re.match(r"\s*solid\b", text) or not re.search(r"\bendsolid\b[^\n]*\s*$", text):
             first, last = (" ".join(end.split()) for end in (text[:20], text[-20:]))
             raise ValueError(
