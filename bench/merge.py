@@ -19,7 +19,6 @@ from bench.records.results import check_links, read_run, run_folders
 from bench.report.suite.attempts import attempts_folder, read_attempts, write_attempts
 from bench.report.write.html import write_index
 
-UNREADABLE = "copied, but it cannot be read and no table shows it: "
 UNFINISHED = ("killed", "crashed", "refused")  # they rank below all other statuses, and ok above
 
 
@@ -57,7 +56,7 @@ def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
             else:
                 lines += _copy_run(folder, into)
                 if fault := read_run(folder, source)[1]:
-                    faults.append(f"{source}: {UNREADABLE}{fault}")
+                    faults.append(f"{source}: not read: {fault} (the run is copied)")
         faults += [f"{source}: this plan cannot be read: {fault}" for fault in read_plans(source)[1]]
         for plan in sorted((source / "sweeps").glob("*/plan.json")):  # plans of the same name have the same cells
             if not is_outside(plan, source):

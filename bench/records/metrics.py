@@ -57,12 +57,10 @@ OTHER_DIRECTIONS = {  # which direction is better, for metrics that tables do no
     **dict.fromkeys(("dtu_accuracy", "dtu_completeness"), LOWER),
     **dict.fromkeys(("mask_iou_least", "tnt_precision", "tnt_recall"), HIGHER),
 }
-NON_NEGATIVE = frozenset(  # distances and angles; roughness is a logarithm
-    (
-        *("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness", "depth_mae", "colour_error"),
-        *("dtu_overall", "dtu_accuracy", "dtu_completeness", "rotation_error_deg", "translation_error"),
-    )
-)
+NON_NEGATIVE = {  # distances and angles; roughness is a logarithm
+    *("chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness", "depth_mae", "colour_error"),
+    *("dtu_overall", "dtu_accuracy", "dtu_completeness", "rotation_error_deg", "translation_error"),
+}
 
 
 def better_direction(name: str) -> str:
@@ -78,15 +76,16 @@ def better_direction(name: str) -> str:
 def metric_fault(metrics: dict[str, Any]) -> str:
     """What is wrong with the first metric that has an impossible value; empty if there is none.
 
-    A metric with a better direction must be a number, and a distance or an angle must not be negative.
+    A metric with a better direction must be a number in its range: distances are from 0 on, overlaps at most 1.
     """
     for name, value in metrics.items():
         if value is None or not better_direction(name):
             continue
-        if not isinstance(value, int | float):
+        if not isinstance(value, int | float) or isinstance(value, bool):
             return f"{name} must be a number, found {value!r}"
-        if value < 0 and not NON_NEGATIVE.isdisjoint(_with_base_names(name)):
-            return f"{name} must be at least 0, found {value}"
+        is_negative = value < 0 and not NON_NEGATIVE.isdisjoint(_with_base_names(name))
+        if is_negative or (value > 1 + 1e-6 and better_direction(name) == HIGHER and "psnr" not in name):
+            return f"{name} must be {'at least 0' if is_negative else 'at most 1'}, found {value}"
     return ""
 
 

@@ -218,8 +218,8 @@ def _check_fields(record: dict[str, Any]) -> None:
             raise ValueError(f"record.json must have the field {name!r}, found none")
         if not isinstance(record[name], types):
             raise ValueError(f"{name} in record.json has the wrong type, found {type(record[name]).__name__}")
-    for name in ("metrics", "metrics_start"):
-        if fault := metric_fault(record[name]):
+    for name in ("metrics", "metrics_start", "metrics_best"):
+        if fault := metric_fault(record.get(name, {})):
             raise ValueError(f"{name} in record.json: {fault}")
     if record["status"] not in _STATUSES:
         raise ValueError(f"status in record.json must be one of {', '.join(RunStatus)}, found {record['status']!r}")

@@ -22,7 +22,7 @@ KEYS = {text.partition("=")[0]: text for text in KEY_FORMS}
 def main(arguments: list[str]) -> int:
     """Writes all pages, the tables of sweeps and `index.html`.
 
-    Returns the exit status: 2 if an argument is wrong, 1 if a page could not be made, else 0.
+    Returns the exit status: 2 if an argument is wrong, 1 if a page could not be made or a run not read, else 0.
     """
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
@@ -62,7 +62,7 @@ def _write_all(results_dir: Path, meshes: int | None) -> int:
     for problem in [*(f"not read: {problem}" for problem in unread), *failed_pages]:
         print(problem, file=sys.stderr)
     print(write_page(records, unread, results_dir, meshes))
-    return 1 if failed_pages else 0
+    return 1 if failed_pages or unread else 0
 
 
 def parse_options(arguments: list[str]) -> dict[str, str]:

@@ -115,6 +115,14 @@ def test_a_logarithm_and_a_word_may_be_metrics():
     assert metric_fault(metrics) == ""
 
 
+@each("metrics, words", [
+    ({"mask_iou": 1.2}, "mask_iou must be at most 1"), ({"own_mask_iou": 9.0}, "must be at most 1"),
+    ({"seen_chamfer_l1": -1e-9}, "seen_chamfer_l1 must be at least 0"), ({"iou": True}, "iou must be a number"),
+])  # fmt: skip
+def test_a_metric_out_of_its_range_is_named(metrics, words):
+    assert words in metric_fault({"psnr": 40.0, "fscore": 1.0, **metrics})
+
+
 @each("key", ["path", "image_path", "mask_path"])
 def test_a_run_is_another_one_if_a_file_that_it_reads_has_changed(tmp_path, key):
     file, other = tmp_path / "file", tmp_path / "other"

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from bench.merge import main, merge
 from bench.records.read import read_records
 from bench.records.results import Plan
+from bench.report.__main__ import main as report
 from bench.report.suite.attempts import attempts_folder
 from tests.looped import each
 from tests.runner.driving import planned, stored
@@ -149,10 +150,13 @@ def test_a_run_that_cannot_be_read_is_named_and_is_in_no_table(tmp_path_factory,
     (results / "a" / "sweeps" / "table-1" / "plan.json").write_text("{")
     assert main([str(results / "a"), "--into", str(results / "b")]) == 1
     run, plan = capsys.readouterr().err.splitlines()
-    assert run.startswith(f"warning: {results / 'a'}: copied, but it cannot be read")
+    assert run.startswith(f"warning: {results / 'a'}: not read: ")
     assert CELLS[1] in run and words in run
     assert "sweeps/table-1/plan.json" in plan
     assert [record["folder"] for record in read_records(results / "b")[0]] == [CELLS[0]]
+    if not damage:  # the report has the same words and exit status
+        assert report([f"results_dir={results / 'b'}"]) == 1
+        assert capsys.readouterr().err.splitlines()[0] in run
 
 
 def test_a_run_or_a_plan_that_is_a_link_out_of_its_folder_is_not_read(tmp_path):
