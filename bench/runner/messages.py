@@ -57,7 +57,8 @@ def write_error_message(error: OSError, results_dir: str | None = None) -> str:
     path = Path(named) if (named := error.filename or results_dir) else None
     file = next((parent for parent in path.parents if parent.is_file()), path) if path else None
     suffix = f" ({file})" if file else ""
-    return f"{error.strerror or error}{suffix}: set results_dir to a folder you can write, or free space"
+    remedy = "on a local disk, which has locks" if error.errno == errno.ENOLCK else "you can write, or free space"
+    return f"{error.strerror or error}{suffix}: set results_dir to a folder {remedy}"
 
 
 def quoted(text: str) -> str:

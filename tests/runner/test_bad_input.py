@@ -1,5 +1,6 @@
 """Every mistake of a user ends in one clear line with a remedy, before anything slow."""
 
+import errno
 import json
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.records import folder as run_folder
 from bench.runner.command import message_of, options_of, quote_text
 from bench.runner.compose import parse_override
+from bench.runner.messages import write_error_message
 from bench.runner.plan import refusal_reason
 from bench.setup import priors
 from tests.composing import identified
@@ -254,6 +256,11 @@ def test_repairs_are_reported_also_if_the_run_fails_later(bench, no_prior, tmp_p
 @each("name", ["Stühle.ply", "chair (1).ply", "a=b.ply", "a,b.ply"])
 def test_a_path_that_hydra_cannot_read_bare_must_be_quoted(monkeypatch, name):
     assert_one_line(explained(monkeypatch, "dataset=mesh", f"dataset.path={name}"), "quote")
+
+
+def test_a_disk_without_locks_has_its_remedy():
+    assert "on a local disk" in write_error_message(OSError(errno.ENOLCK, "No locks available"), "results")
+    assert "on a local disk" not in write_error_message(OSError(errno.EACCES, "Permission denied"), "results")
 
 
 def test_a_results_folder_that_cannot_be_written_is_an_error(bench, tmp_path):
