@@ -5,10 +5,11 @@ import bench  # noqa: F401, before all else: it sets the OpenMP variables, which
 # isort: split
 import gc
 import os
+import pickle
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import cache
@@ -123,6 +124,42 @@ def cached_probes() -> Iterator[None]:
         # One server of processes serves all tests. It loads all that runs import, and pytest, which is their program.
         loaded = [*process.preloaded_modules(), "pytest", "tests.runner.spared"]
         patch.setattr(process, "preloaded_modules", lambda: loaded)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cached_compositions() -> Iterator[None]:
+    """Composes each combination of choices of conf once for all tests of this process; each command gets a copy."""
+    from bench.runner import compose
+    from bench.tables import folders
+
+    do = compose.compose_choices
+    once = cache(lambda choices: pickle.dumps(do(choices)))
+
+    def copied(choices: Sequence[str]) -> Any:
+        return do(choices) if folders() else pickle.loads(once(tuple(choices)))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compose, "compose_choices", copied)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_pages() -> Iterator[None]:
+    """Reads each shipped file of attempts once, and draws figures of few pixels; their PDF files subset no font."""
+    from bench.pictures import figure_style
+    from bench.records.shipped import SHIPPED
+    from bench.report.suite import attempts
+
+    read, read_once = attempts._read_lines, cache(attempts._read_lines)
+
+    def read_lines(path: Path) -> list[Any]:
+        return [*read_once(path)] if path.is_relative_to(SHIPPED) else read(path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(attempts, "_read_lines", read_lines)
+        patch.setitem(figure_style.RC, "savefig.dpi", 60)
+        patch.setitem(figure_style.RC, "pdf.fonttype", 3)
         yield
 
 

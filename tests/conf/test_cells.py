@@ -1,4 +1,4 @@
-"""The cells of every experiment have the names and overrides of cells.json, whatever changes in the driver.
+"""The cells of every experiment: their names and overrides are those of cells.json, and the first and last ones build.
 
 At smoke, two cells of each experiment are compared; at desk, in the slow tests, all cells.
 After a change of settings, `python -m tests.conf.test_cells` writes the file again; it takes minutes.
@@ -6,24 +6,39 @@ After a change of settings, `python -m tests.conf.test_cells` writes the file ag
 
 import json
 import sys
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
+from omegaconf import DictConfig, OmegaConf
 
 from bench.records.record import digest
-from bench.tables import names
-from tests.composing import cells_of
+from bench.records.results import PlannedRun
+from bench.tables import choice, names
+from tests.composing import cells_of, composed
+from tests.conf.test_conf import build_part, builds, paths  # noqa: F401, a fixture
 
 FILE = Path(__file__).with_name("cells.json")
 EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
+SINGLE_RUN_EXPERIMENTS = {"fitted"}  # without a table or figure
+# The experiments that share the table or figure of another name.
+JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
 CELLS = {"smoke": 2, "desk": None}  # at most, of an experiment
 EXPECTED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.is_file() else {}
 
 
+@cache
+def cells(experiment: str, scale: str) -> list[PlannedRun]:
+    """Cells of an experiment, of which the first one is its first."""
+    return cells_of(f"+experiment={experiment}", f"scale={scale}", at_most=CELLS[scale])
+
+
 def summary(experiment: str, scale: str) -> dict[str, int | str]:
     """The number of compared cells of an experiment, and a digest of their names and overrides."""
-    cells = cells_of(f"+experiment={experiment}", f"scale={scale}", at_most=CELLS[scale])
-    return {"cells": len(cells), "digest": digest([[cell.id, cell.overrides] for cell in cells])}
+    compared = cells(experiment, scale)
+    return {"cells": len(compared), "digest": digest([[cell.id, cell.overrides] for cell in compared])}
 
 
 @pytest.mark.parametrize("scale", ["smoke", pytest.param("desk", marks=pytest.mark.slow)])
@@ -32,8 +47,71 @@ def test_an_experiment_has_its_written_cells(experiment: str, scale: str):
     assert summary(experiment, scale) == EXPECTED[scale][experiment]
 
 
-def test_the_cells_of_every_experiment_are_written():
+def test_the_cells_of_every_experiment_are_written_and_more_than_one():
     assert {scale: {*EXPECTED[scale]} for scale in CELLS} == {scale: {*EXPERIMENTS} for scale in CELLS}
+    single = {scale: {name for name in EXPERIMENTS if EXPECTED[scale][name]["cells"] == 1} for scale in CELLS}
+    assert single == {scale: SINGLE_RUN_EXPERIMENTS for scale in CELLS}
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_first_cell_of_an_experiment_builds(paths, name):  # noqa: F811
+    """At smoke; a renderer or a method brings its own settings."""
+    (cell, *_) = cells(name, "smoke")
+    config = OmegaConf.create(cell.config)
+    if name in paths:
+        config.dataset.path = paths[name]
+    has_keys(config, cell.overrides, name)
+    for key, _, value in (text.removeprefix("+").partition("=") for text in cell.overrides):
+        if key in ("renderer", "method"):
+            brings_its_own(cell.overrides, config, key, value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_last_cell_of_an_experiment_builds(paths, name):  # noqa: F811
+    """At the papers' scale, of a mesh if it names no dataset."""
+    cell = cells(name, "desk")[-1].overrides
+    mesh = ["dataset=mesh", f"dataset.path={paths['mesh']}"]
+    own_path = [f"dataset.path={paths[name]}"] if name in paths else []
+    more = own_path if any(text.startswith("dataset=") for text in cell) else mesh
+    has_keys(composed(*(text for text in cell if text != "scale=desk"), "scale=paper", *more), cell, name)
+
+
+def has_keys(config: DictConfig, cell: list[str], name: str) -> None:
+    """Asserts that a configuration builds, and has the keys of a cell of an experiment."""
+    builds(config)
+    assert config.experiment == (None if name in SINGLE_RUN_EXPERIMENTS else JOINED.get(name, name))
+    for key, _, value in (text.removeprefix("+").partition("=") for text in cell):
+        if key == "dataset":
+            assert config.dataset.name == value
+        elif key == "silhouette":
+            assert config.task.silhouette == choice("silhouette", value)
+        elif key not in ("renderer", "method", "stress", "experiment", "scale"):
+            actual, expected = OmegaConf.select(config, key), yaml.safe_load(value.replace(":", ": "))
+            if isinstance(expected, dict):  # other settings of a node stay
+                assert expected.items() <= dict(actual).items()
+            elif isinstance(expected, list):
+                assert list(actual) == expected
+            else:
+                assert actual == (expected if actual is None else type(actual)(value))
+
+
+def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) -> None:
+    """Asserts that an experiment changes nothing that a renderer or a method sets."""
+    default: Any = composed("scale=smoke")
+    size = "scale.reconstruction.iterations"  # schedules depend on it
+    iterations = OmegaConf.select(config, size)
+    overrides = [f"{size}={iterations}"] if iterations != OmegaConf.select(default, size) else []
+    if "fit" in config.task:  # a stress
+        overrides += [f"task.optimiser.iterations={config.task.fit.iterations}"]
+    draw = [text for text in cell if text.startswith("draw=")]
+    alone = composed(f"{'+' if key == 'method' else ''}{key}={value}", "scale=smoke", *draw, *overrides)
+    assert config.label == alone.label
+    assert build_part(config, "renderer") == build_part(alone, "renderer")
+    if key == "method":
+        assert config.task._target_ == alone.task._target_
+        view_settings = choice("method", value).get("view")
+        assert view_settings is None or config.view.resolution == alone.view.resolution
 
 
 def write(scale: str) -> None:

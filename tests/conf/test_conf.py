@@ -1,17 +1,21 @@
-"""Every YAML in conf composes and builds; the message on a mistake has its key and the nearest valid key."""
+"""Every YAML in conf composes and builds; the message on a mistake has its key and the nearest valid key.
+
+Cells of experiments: tests/conf/test_cells.py.
+"""
 
 from dataclasses import replace
 from functools import cache
+from inspect import signature
+from typing import Any
 
 import pytest
 import trimesh
-import yaml
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
 from bench.config import build, check_references, class_of_node, extension, extensions, load
 from bench.pictures import figure_style
 from bench.pictures.figure_style import look
-from bench.runner.compose import Composer, composing
 from bench.setup.inputs import Task
 from bench.tables import CONF, GROUP_OF_TABLE, choice, names, read_yaml
 from datasets.scene import Dataset
@@ -27,9 +31,6 @@ from tests.made_scans import write_scans
 IDR_ARGUMENTS = {"steps": 7, "epsilon": 1e-4, "least_slope": 1e-3, "mask_sharpness": 50.0, "mask_weight": 100.0}
 IDR_ARGUMENTS["sphere_radius"] = 1.0
 EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
-SINGLE_RUN_EXPERIMENTS = {"fitted"}  # without a table or figure
-# The experiments that share the table or figure of another name.
-JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
 # An experiment that sweeps over rows that several experiments share.
 SHARED_ROWS = {"speed_accuracy": "speed_completion", "core": "core_complete"}
 COMPARING = {
@@ -72,7 +73,7 @@ def names_of_groups() -> tuple[str, ...]:
 TOGETHER = together()
 METHODS = [*visible("method"), *(f"tuned/{name}" for name in visible("method/tuned"))]  # spaces: test_spaces
 SLOW = pytest.mark.slow  # a composition takes a tenth of a second
-SOME_METHODS = [name if index % 4 == 0 else pytest.param(name, marks=SLOW) for index, name in enumerate(METHODS)]
+SOME_METHODS = [name if index % 16 == 0 else pytest.param(name, marks=SLOW) for index, name in enumerate(METHODS)]
 
 
 @pytest.fixture(scope="session")
@@ -84,15 +85,6 @@ def paths(tmp_path_factory) -> dict[str, str]:
     unread["depth_image"] = str(mesh)
     paths_by_dataset = unread | {"mesh": str(mesh), "scans": str(write_scans(scans))}
     return paths_by_dataset | {"shapenet": str(write_shapenet(tmp_path_factory.mktemp("shapenet")))}
-
-
-@cache
-def cells(name: str) -> list[list[str]]:
-    """The first and the last cell of an experiment at desk scale, as overrides."""
-    with composing():
-        composer = Composer([f"+experiment={name}"])
-        swept = composer.swept(composer.shared_config())
-    return [[text for text in cell if not text.startswith("+experiment=")] for cell in (swept[0], swept[-1])]
 
 
 def build_part(config: DictConfig, node: str):
@@ -163,61 +155,53 @@ def test_every_choice_composes_and_builds(paths, row):
     assert load("silhouette", row["silhouette"]) == build_part(config, "silhouette")
 
 
+@cache
+def merged(group: str, name: str) -> dict[str, Any]:
+    """The content of a file or a row, over that of its bases."""
+    content, node = choice(group, name), dict[str, Any]()
+    for base in content.get("defaults", ()):
+        if isinstance(base, str) and base != "_self_":
+            node = over(node, merged(group, base.removeprefix(f"/{group}/")))
+    return over(node, content)
+
+
+def over(node: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """Content over that of a node, key by key."""
+    both = {key for key in {*node} & {*content} if isinstance(node[key], dict) and isinstance(content[key], dict)}
+    return node | content | {key: over(node[key], content[key]) for key in both}
+
+
+def inherited(name: str, group: str) -> dict[str, Any]:
+    """The content of the file or row of a group that a method chooses, or else that it has from its base or default."""
+    defaults, key = choice("method", name).get("defaults", ()), f"override /{group}"
+    for default in (default for default in defaults if isinstance(default, dict) and key in default):
+        return merged(group, default[key])
+    if isinstance(base := next(iter(defaults), None), str) and base != "_self_":
+        base = base.removeprefix("/method/")
+        return over(inherited(base, group), choice("method", base).get(group, {}))
+    return merged(group, composed(hydra=True).hydra.runtime.choices[group])
+
+
+def lacking(node: dict[str, Any], known: dict[str, Any]) -> list[str]:
+    """The keys of a node that another node lacks, also of nodes within them."""
+    nested = [(child, known[key]) for key, child in node.items() if key in known]
+    pairs = [pair for pair in nested if isinstance(pair[0], dict) and isinstance(pair[1], dict)]
+    return [*({*node} - {*known}), *(key for pair in pairs for key in lacking(*pair))]
+
+
+@each("name", METHODS)
+@each("group", ["task", "renderer"])
+def test_a_key_of_a_method_is_one_of_the_task_and_the_renderer_that_it_chooses(name, group):
+    known = inherited(name, group)
+    target = known["_target_"].rpartition(",")[2].rstrip("}")  # perhaps the default of a reference
+    known = dict.fromkeys(signature(get_class(target)).parameters) | known
+    assert lacking(choice("method", name).get(group, {}), known) == []
+
+
 @pytest.mark.parametrize("name", SOME_METHODS)
 def test_every_method_composes_and_builds(name):
     cloud = ["task.cloud=points.ply"] if name.startswith("cloud") else []  # the row contains the file's name
     builds(composed(f"+method={name}", *cloud))
-
-
-@pytest.mark.parametrize("position", [0, pytest.param(-1, marks=SLOW)], ids=["first", "last"])
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_the_first_and_last_cell_of_an_experiment_compose_and_build(paths, name, position):
-    """The first cell at desk scale; the last at the papers' scale, of a mesh if it names no dataset."""
-    cell, more = cells(name)[position], [f"dataset.path={paths[name]}"] if name in paths else []
-    if position:
-        mesh = ["dataset=mesh", f"dataset.path={paths['mesh']}"]
-        more = ["scale=paper", *(more if any(text.startswith("dataset=") for text in cell) else mesh)]
-    config = composed(*cell, f"+experiment={name}", *more)
-    builds(config)
-    assert config.experiment == (None if name in SINGLE_RUN_EXPERIMENTS else JOINED.get(name, name))
-    for key, _, value in (text.removeprefix("+").partition("=") for text in cell):
-        if key in ("renderer", "method"):
-            if not position:
-                brings_its_own(cell, config, key, value)
-        elif key == "dataset":
-            assert config.dataset.name == value
-        elif key == "silhouette":
-            assert config.task.silhouette == choice("silhouette", value)
-        elif key != "stress":
-            actual, expected = OmegaConf.select(config, key), yaml.safe_load(value.replace(":", ": "))
-            if isinstance(expected, dict):  # other settings of a node stay
-                assert expected.items() <= dict(actual).items()
-            elif isinstance(expected, list):
-                assert list(actual) == expected
-            else:
-                assert actual == (expected if actual is None else type(actual)(value))
-
-
-def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) -> None:
-    """Asserts that an experiment changes nothing that a renderer or a method sets."""
-    default = composed()
-    size = "scale.reconstruction.iterations"  # schedules depend on it
-    iterations = OmegaConf.select(config, size)
-    overrides = [f"{size}={iterations}"] if iterations != OmegaConf.select(default, size) else []
-    if "fit" in config.task:  # a stress
-        overrides += [f"task.optimiser.iterations={config.task.fit.iterations}"]
-    draw = [text for text in cell if text.startswith("draw=")]
-    alone = composed(f"{'+' if key == 'method' else ''}{key}={value}", *draw, *overrides)
-    assert config.label == alone.label
-    assert build_part(config, "renderer") == build_part(alone, "renderer")
-    if key == "method":
-        assert config.task._target_ == alone.task._target_
-        view_settings = choice("method", value).get("view")
-        assert view_settings is None or config.view.resolution == alone.view.resolution
-
-
-def test_every_sweep_is_of_more_than_one_cell():
-    assert {name for name in EXPERIMENTS if cells(name)[0] != cells(name)[1]} == {*EXPERIMENTS} - SINGLE_RUN_EXPERIMENTS
 
 
 PAPER = DIST(  # DIST, Table 1, "+ coarse-to-fine": alpha 1.5 (Sec. 3.2), the official code's clamp, no changes of ours
