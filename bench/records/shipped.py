@@ -3,6 +3,7 @@
 import csv
 import gzip
 import json
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,12 @@ def shipped_rows(experiment: str) -> list[dict[str, str]]:
 
 def cell_value(cell: str) -> Any:
     """The value of a cell: JSON, or text without quotes."""
+    value = _parsed(cell)
+    return json.loads(cell) if isinstance(value, dict | list) else value  # each cell has its own
+
+
+@lru_cache(2**16)
+def _parsed(cell: str) -> Any:
     try:
         return json.loads(cell)
     except ValueError:

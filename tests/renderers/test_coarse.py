@@ -158,6 +158,8 @@ def test_coarse_values_are_counted_apart_and_limited():
 def wide(monkeypatch) -> Decoder:
     """A network that offers coarse values on any machine, slowly where they do not pay."""
     monkeypatch.setattr(mlp, "bfloat16_is_faster", lambda device: True)
+    monkeypatch.setattr(mlp, "ERROR_SAMPLE_POINTS", 2**11)  # an eighth of both, for speed
+    monkeypatch.setattr(mlp, "MIN_NEAR_SURFACE_POINTS", 12)
     torch.manual_seed(0)
     return Decoder(layers=4, width=256, code_length=8, skip=2, narrow=True).requires_grad_(False)
 
@@ -238,7 +240,7 @@ def test_the_gradient_of_a_network_is_that_of_its_field(wide, name):
     initialise_to_sphere(wide, radius=0.5)
     codes = [torch.zeros(8, requires_grad=True) for _ in range(2)]
     coarse, plain = (
-        replace(MARCHES[name], coarse=use).render(wide.at(code), camera().rays())
+        replace(MARCHES[name], coarse=use).render(wide.at(code), camera(24).rays())
         for use, code in zip((True, False), codes, strict=True)
     )
     both = coarse.hit & plain.hit

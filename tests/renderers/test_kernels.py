@@ -197,8 +197,8 @@ def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_
     program = "from renderers.kernels.library import kernels; print(kernels().description)"
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), library.KERNELS_VARIABLE: ""}
     command = [sys.executable, "-c", program]
-    several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    assert [process.communicate()[0].strip() for process in several] == ["compiled"] * 3
+    several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert [process.communicate()[0].strip() for process in several] == ["compiled"] * 2
     (built,) = (tmp_path / "implicit-bench" / "kernels").iterdir()
     whole = built.read_bytes()
     built.unlink()

@@ -148,7 +148,7 @@ def wait_for(ready: Callable[[], object], running: Driver | None = None) -> None
             assert ready(), (running.output / "err").read_text()
             return
         assert time.monotonic() < latest, "waited too long"
-        time.sleep(0.02)
+        time.sleep(0.1)
 
 
 def lines_of_curves(results: Path) -> int:

@@ -15,7 +15,7 @@ import pytest
 from bench.records.record import Record
 from bench.runner import process
 from bench.runner.messages import Step
-from tests.runner.driving import FAILING, at_work, driver, lines_of_curves, record_of, wait_for
+from tests.runner.driving import FAILING, PATIENCE, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
 # The way to fail: limits, the expected status, words of the reason.
@@ -114,4 +114,6 @@ def test_ctrl_c_while_the_server_loads_modules_is_reported_in_one_line(tmp_path)
         parent = psutil.Process(running.pid)
         wait_for(lambda: any("forkserver" in " ".join(child.cmdline()) for child in parent.children()))
         os.killpg(running.pid, signal.SIGINT)  # to all processes, as a terminal does
+        running.wait(PATIENCE)
+        os.killpg(running.pid, signal.SIGKILL)  # else the server ends after it has loaded all modules
         assert running.communicate()[1].splitlines() == ["error: stopped by Ctrl-C; nothing was run"]

@@ -188,7 +188,7 @@ def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
         write_dtu(truth.with_suffix(""), points, plane=(0, 0, 1, 0), centre=CENTRE)
     truth = truth if kind != "dtu" else truth.with_suffix("")
     run = without_pictures(run_in(folder(tmp_path, "run"), None, truth=str(truth), scan=65))
-    record = executed(altered(run, {"inputs.evaluation.points": 20_000}))
+    record = executed(altered(run, {"inputs.evaluation.points": 20_000}), **{"optimiser.iterations": 5})
     assert record.status == "ok", record.reason
     mesh = read_mesh(tmp_path / "run" / "mesh_world.ply")
     away = np.abs(np.linalg.norm(sample_surface(mesh, 4000, 0).points - CENTRE, axis=1) - RADIUS).mean()
