@@ -14,17 +14,31 @@ import pytest
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from bench.pictures.figure_style import look
 from bench.records.record import digest
 from bench.records.results import PlannedRun
 from bench.tables import choice, names
 from tests.composing import cells_of, composed
 from tests.conf.test_conf import build_part, builds, paths  # noqa: F401, a fixture
+from tests.looped import each
 
 FILE = Path(__file__).with_name("cells.json")
 EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
 SINGLE_RUN_EXPERIMENTS = {"fitted"}  # without a table or figure
 # The experiments that share the table or figure of another name.
 JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
+# An experiment that sweeps over rows that several experiments share.
+SHARED_ROWS = {"speed_accuracy": "speed_completion", "core": "core_complete"}
+COMPARING = {
+    "table1": 24,
+    "fig4": 7,
+    "fig5": 9,
+    "stability": 21,
+    "gradients": 14,
+    "speed_accuracy": 30,
+    "fit_for": 18,
+}  # renderers
+COMPARING |= {"core": 11}
 CELLS = {"smoke": 2, "desk": None}  # at most, of an experiment
 EXPECTED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.is_file() else {}
 
@@ -112,6 +126,24 @@ def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) ->
         assert config.task._target_ == alone.task._target_
         view_settings = choice("method", value).get("view")
         assert view_settings is None or config.view.resolution == alone.view.resolution
+
+
+@each("name", [*COMPARING])
+def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_ranks(name):
+    rows = {renderer: choice("renderer", renderer).get("_rows_", {}) for renderer in names("renderer")}
+    named = {renderer: ranks[name] for renderer, ranks in rows.items() if name in ranks}
+    experiment = SHARED_ROWS.get(name, name)
+    params = composed(f"+experiment={experiment}", "scale=smoke", hydra=True).hydra.sweeper.params
+    assert params.renderer.split(",") == sorted(named, key=lambda renderer: named[renderer])
+    assert len(named) == COMPARING[name]
+
+
+@each("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour per class
+def test_rows_of_an_experiment_have_different_looks(name):
+    params = composed(f"+experiment={name}", "scale=smoke", hydra=True).hydra.get("sweeper", {}).get("params") or {}
+    rows = str(params.get("+method") or params.get("renderer") or "dist").split(",")
+    solid = [row for row in rows if not row.startswith("tuned/")]  # tuned rows are hollow
+    assert len({(look(row).colour, look(row).marker) for row in solid}) == len(solid)
 
 
 def write(scale: str) -> None:

@@ -30,19 +30,6 @@ from tests.made_scans import write_scans
 
 IDR_ARGUMENTS = {"steps": 7, "epsilon": 1e-4, "least_slope": 1e-3, "mask_sharpness": 50.0, "mask_weight": 100.0}
 IDR_ARGUMENTS["sphere_radius"] = 1.0
-EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
-# An experiment that sweeps over rows that several experiments share.
-SHARED_ROWS = {"speed_accuracy": "speed_completion", "core": "core_complete"}
-COMPARING = {
-    "table1": 24,
-    "fig4": 7,
-    "fig5": 9,
-    "stability": 21,
-    "gradients": 14,
-    "speed_accuracy": 30,
-    "fit_for": 18,
-}  # renderers
-COMPARING |= {"core": 11}
 KINDS = {"renderer": Renderer, "task": Task, "dataset": Dataset, "silhouette": SilhouetteLoss}
 PARTS = ("task", "renderer", "dataset", "prior", "silhouette")
 LINEAR = ["packages=[torch]", "dataset.module._target_=torch.nn.Linear"]
@@ -256,25 +243,7 @@ def test_every_renderer_has_its_own_label_and_names_its_rows():
     labels = [node["_label_"] for node in nodes]
     assert len(set(labels)) == len(labels) >= 30
     ranks = [(experiment, rank) for node in nodes for experiment, rank in node["_rows_"].items()]
-    assert len(set(ranks)) == len(ranks) and {experiment for experiment, _ in ranks} == set(COMPARING)
-
-
-@each("name", [*COMPARING])
-def test_an_experiment_lists_the_renderers_that_name_it_in_the_order_of_their_ranks(name):
-    rows = {renderer: choice("renderer", renderer).get("_rows_", {}) for renderer in names("renderer")}
-    named = {renderer: ranks[name] for renderer, ranks in rows.items() if name in ranks}
-    experiment = SHARED_ROWS.get(name, name)
-    params = composed(f"+experiment={experiment}", hydra=True).hydra.sweeper.params
-    assert params.renderer.split(",") == sorted(named, key=lambda renderer: named[renderer])
-    assert len(named) == COMPARING[name]
-
-
-@each("name", [name for name in EXPERIMENTS if not name.startswith("speed_")])  # a colour per class
-def test_rows_of_an_experiment_have_different_looks(name):
-    params = composed(f"+experiment={name}", hydra=True).hydra.get("sweeper", {}).get("params") or {}
-    rows = str(params.get("+method") or params.get("renderer") or "dist").split(",")
-    solid = [row for row in rows if not row.startswith("tuned/")]  # tuned rows are hollow
-    assert len({(look(row).colour, look(row).marker) for row in solid}) == len(solid)
+    assert len(set(ranks)) == len(ranks) and len({experiment for experiment, _ in ranks}) == 8
 
 
 def label_of(group: str, name: str) -> str:
@@ -304,25 +273,6 @@ def test_an_unknown_row_has_a_colour_of_no_renderer():
 def test_a_chosen_method_brings_its_own_renderer_into_an_experiment_of_renderers():
     params = composed("+experiment=speed_completion", "+method=dist_half", hydra=True).hydra.sweeper.params
     assert params.renderer == "dist"
-
-
-def test_measuring_experiments_use_the_shape_that_their_network_was_fitted_to(compose_config):
-    deepsdf, small = (8, 512, 256, 4), (4, 128, 64, 2)  # DIST, B.1; and the network for central differences
-    for name, scale, size, layers in (
-        ("table1", "smoke", 64, deepsdf), ("table1_large", "desk", 512, deepsdf), ("fig4", "paper", 512, deepsdf),
-        ("fig7", "desk", 256, deepsdf), ("gradients", "desk", 256, small),
-    ):  # fmt: skip
-        config = compose_config(f"+experiment={name}", f"scale={scale}")
-        prior = build_part(config, "prior")
-        assert (prior.shapes, config.split, config.index, config.view.resolution) == (1, "train", 0, size)
-        network = prior.network
-        assert (network.layers, network.width, network.code_length, network.skip) == layers
-
-
-def test_figure_7_has_the_papers_settings_over_epsilon(compose_config):
-    config = compose_config("+experiment=fig7", "renderer.epsilon=5e-3")
-    assert build_part(config, "renderer") == replace(PAPER, epsilon=5e-3)
-    assert config.label == "epsilon 0.005"
 
 
 @each("overrides, iterations", [

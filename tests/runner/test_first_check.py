@@ -1,6 +1,4 @@
-"""Runs of a renderer with wrong hits have notes or fail; runs of shipped renderers do not."""
-
-import pytest
+"""Runs of a renderer with wrong hits have notes or fail; hits of shipped renderers: tests/renderers/test_hits.py."""
 
 from tests.runner.driving import SMALLEST, record_of
 
@@ -41,10 +39,3 @@ def test_a_nan_loss_leaves_the_shape_unchanged(isolated):
     assert record["evaluations"]["iterations"] == 1 and record["evaluations"]["gradient"] == 0
     (note,) = on_hits(record)
     assert note.startswith("the depth error of the renderer's own image is inf, and that of the mesh is ")
-
-
-@pytest.mark.parametrize("renderer", ["mesh_proxy_48", "neus_budget", "relaxed_boundary"])
-def test_the_hits_of_shipped_renderers_are_not_noted(isolated, renderer):
-    code, record = run(isolated, *SHORT, f"renderer={renderer}")
-    assert code == 0 or record["status"] == "not_reached", record["reason"]
-    assert on_hits(record) == []

@@ -137,13 +137,6 @@ def test_the_plan_is_written_before_the_first_cell_and_shows_what_was_not_run(tm
     assert Page(tmp_path).text("status").count("not_run") == 2
 
 
-def test_a_stopped_sweep_prints_its_summary(tmp_path):
-    code, out, _ = stopped(tmp_path, signal.SIGINT)
-    assert code == 130 and "3 planned: 2 not_run, 1 killed" in out
-    assert Path(out.splitlines()[-1]) == next(tmp_path.glob("sweeps/*/plan.json")).parent
-    assert (tmp_path / "index.html").is_file()
-
-
 def test_stopped_workers_write_the_records_of_their_runs(tmp_path):
     cells = ("-m", *FAILING, "+renderer.how=not", "+renderer.pause=900", "seed=0,1,2", f"results_dir={tmp_path}")
     program = [sys.executable, "-m", "bench", *cells, "hydra/launcher=workers"]
@@ -171,6 +164,8 @@ def test_a_sweep_stops_also_if_a_library_replaces_or_swallows_the_interrupt(tmp_
     code, out, err = command("-m", *FAILING, "+renderer.how=not", "seed=0,1,2", f"results_dir={tmp_path}")
     assert code == 130 and "3 planned: 2 not_run, 1 killed" in out
     assert errors(err)[0] == "error: killed: stopped by Ctrl-C; the same command starts it anew"
+    assert Path(out.splitlines()[-1]) == next(tmp_path.glob("sweeps/*/plan.json")).parent
+    assert (tmp_path / "index.html").is_file()
 
 
 def test_a_sweep_of_nothing_is_an_error(isolated):

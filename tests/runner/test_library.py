@@ -56,14 +56,6 @@ def test_the_examples_run(within, name):
     assert runner.run(examples, out=output.append).failed == 0, "".join(output)
 
 
-def test_a_keyword_is_typed_as_on_the_command_line(compose_config):
-    for value, text in (
-        (None, "null"), (True, "true"), (1e-4, "0.0001"), (Path("a/b.obj"), "a/b.obj"), ([1, "a b"], "[1,'a b']"),
-    ):  # fmt: skip
-        assert library._override("label", value) == f"label={text}"
-    assert library._override("method", "dist_mask") == "+method=dist_mask"
-
-
 TEXTS = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=12)
 SCALARS = st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.floats(allow_nan=False) | TEXTS
 VALUES = SCALARS | st.lists(SCALARS, max_size=4)
@@ -83,7 +75,9 @@ def test_a_value_from_python_arrives_unchanged(value):
     assert OmegaConf.to_container(config, resolve=True) == {"key": value}
 
 
-def test_an_array_is_a_list():
+def test_an_array_is_a_list_a_path_is_text_and_a_method_is_added():
+    assert library._override("label", Path("a/b.obj")) == "label=a/b.obj"
+    assert library._override("method", "dist_mask") == "+method=dist_mask"
     assert library._override("key", np.array([[60.0, 24.5]])) == library._override("key", ((60.0, 24.5),))
 
 

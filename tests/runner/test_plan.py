@@ -121,7 +121,7 @@ def test_a_plan_has_the_number_of_jobs(results):
     ("-m", "scale=smoke", "renderer.alpha=1.5,null", "label=a,'b c','${renderer._label_}'"),
     ("-m", "+method=space/dist_mask,space/idr_mask", "draw=0,3"),
     ("-m", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
-    ("-m", "seed=1,2", "index=0,3", "label='${index}',b"),
+    ("-m", "seed=1,2", "index=0,3", "label='${index} ${seed}',b"),
 ])  # fmt: skip
 def test_a_cell_is_as_hydra_composes_it(arguments):
     with composing():
@@ -152,11 +152,6 @@ def test_a_value_goes_to_the_cells_that_have_its_key():
 def test_a_sweep_says_which_keys_go_to_some_cells(results):
     result = command("-m", "renderer=dist,dvr", "renderer.alpha=2", "plan=true", f"results_dir={results}")
     assert result.err == "sweep: renderer.alpha goes to 1 of 2 runs, which have this key\n"
-
-
-def test_a_value_may_refer_to_the_seed_of_its_cell(results):
-    cells = planned(results, "-m", "scale=smoke", "seed=1,2", "label=of ${seed}")
-    assert [cell.config["label"] for cell in cells] == ["of 1", "of 2"]
 
 
 def test_a_value_that_cannot_be_set_is_an_error_as_for_a_single_run(results):

@@ -14,7 +14,6 @@ import pytest
 
 from bench.records.record import Record
 from bench.runner import process
-from bench.runner.messages import Step
 from tests.runner.driving import FAILING, PATIENCE, at_work, driver, lines_of_curves, record_of, wait_for
 
 LIMIT = 600  # seconds
@@ -58,13 +57,7 @@ def test_a_failed_run_has_its_reason(request, isolated, tmp_path, how):
     assert how != "raise" or "RuntimeError: it failed on request" in "\n".join(record["log"])
 
 
-def test_a_step_names_its_phase():
-    assert Step("training the prior", 100, 6500, None).phase_text == "while training the prior (100 of 6500)"
-    assert Step("optimising", 20, 20, None).phase_text == "after optimising (20 of 20)"
-
-
 @pytest.mark.parametrize(("how", "words"), [
-    ("raise", "it failed on request"),
     ("short", "Failing.render: distance must have the shape [12, 12], not [11, 12]"),
     ("detached_loss", "Failing.capabilities.field_gradient is True, but its silhouette loss carries no gradient"),
 ])  # fmt: skip

@@ -185,19 +185,6 @@ def bench(isolated):
     return run
 
 
-def test_a_repeated_command_gives_the_same_numbers_and_keeps_the_first_run(bench, tmp_path):
-    command = ("renderer=dist", *TINY, "evaluation.picture=null", "threads=1", "dataset=table", "rerun=all")
-    folders = [bench(*command)[3] for _ in range(2)]
-    assert folders[0] == folders[1]
-    folders[0] = next((tmp_path / "r" / "earlier").iterdir())
-    first, second = (json.loads((folder / "record.json").read_text()) for folder in folders)
-    assert (first["scene"], first["environment"]["threads"]) == ("table test 0", 1)
-    for key in ("metrics", "metrics_start", "evaluations", "flops", "config", "status"):
-        assert first[key] == second[key], key
-    curves = [[line["total"] for line in curve_of(folder)] for folder in folders]
-    assert curves[0] == curves[1]
-
-
 @pytest.mark.parametrize(("error", "status", "code"), [
     (RuntimeError("a bug\nover two lines"), "crashed", 1), (MemoryError(), "oom", 1),
     (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), "oom", 1),

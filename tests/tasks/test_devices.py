@@ -34,12 +34,10 @@ def scene() -> Scene:
     return scene_of(icosphere(0.5, subdivisions=3), camera_of(24, angles=(30.0, 20.0)))
 
 
-@pytest.mark.parametrize(
-    ("name", "renderer"), [*((name, "newton") for name in CASES), ("completion", "dist"), ("completion", "dvr")]
-)
-def test_the_loop_stays_on_the_device_of_its_run(scene, name, renderer):
+@pytest.mark.parametrize("name", CASES)  # with other renderers: tests/renderers/test_devices.py
+def test_the_loop_stays_on_the_device_of_its_run(scene, name):
     config = composed(f"task={name}", "scale=smoke", "task.optimiser.iterations=50", *CASES[name])
-    task, tested = build(config.task, "task"), load("renderer", renderer)
+    task, tested = build(config.task, "task"), load("renderer", "newton")
     if isinstance(task, Pose):
         problem = PoseProblem(task, tested, sphere(0.5), scene.view, task.cameras(scene.view.camera, 0), CPU)
     else:

@@ -175,11 +175,11 @@ def test_candidates_that_cannot_be_are_refused_before_photographs_are_taken(scen
         executed(run_in(tmp_path, scene, renderer="newton", field="auto"), **{"auto.candidates": candidates})
 
 
-@pytest.mark.parametrize("kind", ["mesh", "pieces", "cloud", "dtu"])
+@pytest.mark.parametrize("kind", ["pieces", "cloud", "dtu"])
 def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
     points = (on_ball(20_000, RADIUS) - DTU_CENTRE) + CENTRE
     truth = tmp_path / f"{kind}.ply"
-    ball(RADIUS, CENTRE).save(truth) if kind == "mesh" else trimesh.PointCloud(points).export(truth)
+    trimesh.PointCloud(points).export(truth)
     if kind == "pieces":
         truth = folder(tmp_path, kind)
         for index, faces in enumerate(np.array_split(ball(RADIUS, CENTRE).faces, 3)):
@@ -200,7 +200,7 @@ def test_a_truth_in_the_world_of_photographs_judges_them(tmp_path, kind):
         return
     unit = np.linalg.norm(np.loadtxt(tmp_path / "run" / "to_world.txt")[:3, 0])
     assert metrics["accuracy"] * unit == pytest.approx(away, abs=0.01 * RADIUS)
-    assert ("seen_chamfer_l1" in metrics) == ("normal_consistency" in metrics) == (kind in ("mesh", "pieces"))
+    assert ("seen_chamfer_l1" in metrics) == ("normal_consistency" in metrics) == (kind == "pieces")
 
 
 def test_a_truth_elsewhere_and_a_scan_without_a_number_are_refused(tmp_path):
