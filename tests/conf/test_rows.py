@@ -13,7 +13,7 @@ from bench.records.results import Plan
 from bench.runner import compose
 from bench.runner.plan import plan_of
 from bench.tables import group_choices, names, register_rows
-from tests.composing import cells_of
+from tests.composing import cells_of, composed
 
 CLASS = (
     "class Mine:\n    def __init__(self, size):\n        self.size = size\n    def render(self, field, rays): ...\n"
@@ -80,7 +80,11 @@ def test_the_command_line_narrows_and_replaces_the_rows():
 
 
 def test_the_name_of_a_run_has_its_method():
-    methods = ["multiview_paper", "multiview_paper_neither"]
+    rows = "paper paper_neither paper_clamp dist restarts idr dvr naive mesh mesh_long encoder mesh_encoder"
+    methods = [f"multiview_{name}" for name in rows.split()]
+    params = composed("+experiment=table3", hydra=True).hydra.sweeper.params
+    assert params["+method"].split(",") == methods
+    methods = methods[:2]
     plan = swept("+experiment=table3", f"+method={','.join(methods)}", "index=0", "dataset=car")
     assert [cell.method for cell in plan.cells] == methods
     ids = [f"multiview-dist_paper-car-{method}-0" for method in methods]

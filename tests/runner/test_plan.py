@@ -121,7 +121,7 @@ def test_a_plan_has_the_number_of_jobs(results):
     ("-m", "scale=smoke", "renderer.alpha=1.5,null", "label=a,'b c','${renderer._label_}'"),
     ("-m", "+method=space/dist_mask,space/idr_mask", "draw=0,3"),
     ("-m", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
-    ("-m", "seed=1,2", "index=0,3", "label='${index} ${seed}',b"),
+    ("-m", "seed=1,2", "index=0,3", "label='${index}','${seed}',b"),
 ])  # fmt: skip
 def test_a_cell_is_as_hydra_composes_it(arguments):
     with composing():
