@@ -3,7 +3,7 @@
 import pytest
 
 from bench.records.metrics import LOWER, better_direction
-from bench.records.shipped import FITS, SURFACE_METRICS, best_possible, shipped_rows
+from bench.records.shipped import FITS, SURFACE_METRICS, best_possible, cell_value, shipped_rows
 from tests.composing import identified
 
 
@@ -19,3 +19,11 @@ def test_a_completion_has_the_errors_of_the_fit_to_its_shape(family, index):
 @pytest.mark.parametrize("other", ["index=8", "scale=smoke", "evaluation.points=999", "field=box", "prior.steps=9"])
 def test_another_shape_prior_or_evaluation_has_none(other):
     assert best_possible(identified("task=completion", other).config) == {}
+
+
+@pytest.mark.parametrize(
+    ("cell", "value"), [("[1]", [1]), ("{}", {}), ("1e3", 1000.0), ("null", None), ("dist", "dist")]
+)
+def test_a_cell_is_json_or_text_and_shares_no_list(cell, value):
+    first, second = cell_value(cell), cell_value(cell)
+    assert first == second == value and (first is not second or not isinstance(value, list | dict))

@@ -14,6 +14,8 @@ from bench.report.data.kept import FROM_RUNS_CSV, LOCAL_FIELDS, join, read_rows,
 from bench.report.data.records import family
 from tests.report.test_report_paper import DYNAMIC, NAIVE, PARALLEL, bands, costs, write_curve, write_run
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def ship(results: Path, into: Path) -> dict[str, str]:
     """The shipped tables, after the runs of a results folder were added and the folder was deleted."""

@@ -4,6 +4,8 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from bench.report.data.kept import read_rows
 from bench.report.write.paper import write_paper, write_readme
 from bench.report.write.result import Shown, read_shown, write_shown
@@ -50,6 +52,7 @@ def test_the_answers_of_the_readme_are_those_of_the_committed_results():
     assert all(part in text for part in (readme.recommendation(), readme.table(), readme.hard_scenes()))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_ranks_that_the_readme_names_are_those_of_the_kept_rows(tmp_path):
     rows = read_rows(PAPER, "stability")
     write_paper(rows, tmp_path, only="stability_cost")

@@ -113,6 +113,7 @@ def test_its_figure_has_a_point_for_each_shape(tmp_path):
     assert [label.get_text() for label in axis.get_yticklabels()] == ["RGB"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_page_that_shows_none_of_the_runs_is_not_written(tmp_path):
     made(tmp_path, "RGB", 0.1)
     names = [path.stem for path in write_paper(read_records(tmp_path)[0], tmp_path, only="dvr_length")]

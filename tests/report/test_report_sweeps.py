@@ -16,6 +16,17 @@ from bench.report.write.html import ASSETS
 from bench.report.write.paper import find_sweeps
 from tests.report.test_report import record, write_run
 
+DRAWN = (
+    "test_a_row_of_which_every_run_failed_is_in_the_table_and_the_chart",
+    "test_a_swept_number_has_a_curve_and_no_front_and_failed_runs_cost_nothing",
+)
+
+
+@pytest.fixture(autouse=True)
+def few_figures(request) -> None:
+    if request.function.__name__ not in DRAWN:
+        request.getfixturevalue("undrawn")
+
 
 def cell(renderer: str, *, seed: int = 0, index: int = 0, dataset: str = "sofa", **asked: str) -> PlannedRun:
     """A planned cell; `asked` are keys of its renderer that the sweep asked for."""

@@ -1,9 +1,14 @@
-"""What the tests of signals share."""
+"""What the tests of the runner share."""
 
 import signal
 from collections.abc import Iterator
 
 import pytest
+
+
+@pytest.fixture(autouse=True)
+def undrawn_sweeps(undrawn) -> None:
+    """The sweep of test_launchers that runs in a program of its own draws its figure."""
 
 
 @pytest.fixture

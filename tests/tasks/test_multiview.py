@@ -230,8 +230,7 @@ def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is
     )
     encoded = command(*overrides, "+method=multiview_encoder", "prior.of=car", f"results_dir={tmp_path}")
     assert "take +method=multiview_dist" in encoded.err
-    small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=16", "evaluation.grid=24")
-    small += ("evaluation.points=1000", "evaluation.picture=24", "evaluation.every=null")
+    small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=40", "evaluation.grid=24")
     result = command(*overrides, *small, "prior.of=car", "isolation=off", f"results_dir={tmp_path}")
     record, folder = record_of(result.out), Path(result.out.splitlines()[-1])
     assert record["status"] == "ok", record["reason"]
