@@ -121,7 +121,8 @@ def test_a_plan_has_the_number_of_jobs(results):
     ("-m", "scale=smoke", "renderer.alpha=1.5,null", "label=a,'b c','${renderer._label_}'"),
     ("-m", "+method=space/dist_mask,space/idr_mask", "draw=0,3"),
     ("-m", "++task.points=20,30", "evaluation={grid:9}", "evaluation.points=4,5"),
-    ("-m", "seed=1,2", "index=0,3", "label='${index}','${seed}',b"),
+    ("-m", "index=0,3", "label='${index}',b"),
+    ("-m", "seed=1,2", "label='${seed}'"),
 ])  # fmt: skip
 def test_a_cell_is_as_hydra_composes_it(arguments):
     with composing():
@@ -264,7 +265,7 @@ def test_a_task_on_a_fitted_network_is_refused_without_one(plain):
 
 
 def test_an_experiment_without_m_says_that_it_is_one_run(tmp_path):
-    for options, experiment in (([], "fig10_start"), ([], "[fitted,gradients]"), (["-m"], "fig10_start")):
+    for options, experiment in (([], "fig7"), ([], "[fitted,gradients]"), (["-m"], "fig7")):
         result = command(*options, f"+experiment={experiment}", "plan=true", *SMALL, f"results_dir={tmp_path}")
         assert result.code == 0 and ("this is one run; with -m" in result.err) is (not options)
 
