@@ -15,7 +15,7 @@ from bench.records.format import plural
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
 from bench.records.results import Plan, PlannedRun
 from bench.runner.executors import Jobs, Launcher, Make, Messages
-from bench.runner.plan import duration_group, durations_of_similar_runs
+from bench.runner.plan import duration_group, durations_of_similar_runs, iterations
 from bench.runner.process import catch_signals, stop_signal
 
 CLUSTERS = ("slurm", "local")
@@ -71,11 +71,13 @@ class Slurm(Launcher):
     def jobs(self, plan: Plan, reused: set[str]) -> list[list[PlannedRun]]:
         """The cells of each job, as many as are expected to fit into `minutes_per_job`; without reused cells."""
         settings = self.settings
-        measured, default = durations_of_similar_runs(plan, reused), [60 * settings["minutes_per_run"]]
+        measured, default = durations_of_similar_runs(plan, reused), 60 * settings["minutes_per_run"]
         cells = [cell for cell in plan.cells if cell.id not in reused]
-        limits = [cell.config["time_limit"] or inf for cell in cells]
-        expected = [median(measured[duration_group(vars(cell))] or default) for cell in cells]
-        expected = [min(duration, limit) for duration, limit in zip(expected, limits, strict=True)]
+        expected = []
+        for cell in cells:
+            times = measured[duration_group(vars(cell))]
+            duration = iterations(cell.config) * median(times) if times else default
+            expected.append(min(duration, cell.config["time_limit"] or inf))
         groups = group_by_duration(expected, 60 * settings["minutes_per_job"] * settings["tasks_per_node"])
         return [[cells[index] for index in group] for group in groups]
 

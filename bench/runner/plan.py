@@ -14,15 +14,16 @@ from typing import Any
 from bench.config import Isolation
 from bench.records.folder import reusable_record
 from bench.records.format import plural, seconds
-from bench.records.record import digest, row_name
+from bench.records.record import digest, flat, row_name
 from bench.records.results import Plan, PlannedRun, read_run, run_folders
-from bench.records.shipped import cell_value, shipped_rows
+from bench.records.shipped import CONFIG, cell_value, shipped_rows
 from bench.runner.messages import reason_of
 from bench.runner.process import run_in_child
 
 # Statuses of runs whose duration says nothing about similar runs.
 STATUSES_WITHOUT_DURATION = ("killed", "crashed", "refused", "oom", "unsupported", "not_run")
 MAX_SIMILAR_RUNS, MAX_RECORDS_READ = 100, 300  # per group of similar runs
+ITERATIONS = "task.optimiser.iterations"
 
 
 def plan_of(cells: list[PlannedRun]) -> Plan:
@@ -95,7 +96,7 @@ def _refusal_message(plan: Plan, cell: PlannedRun, reason: str, count: int) -> s
 
 
 def durations_of_similar_runs(plan: Plan, reused: set[str]) -> dict[Any, list[float]]:
-    """The seconds of finished runs that are similar to those of a plan, by `duration_group`.
+    """The seconds per iteration of finished runs that are similar to those of a plan, by `duration_group`.
 
     There are at most `MAX_SIMILAR_RUNS` per group. They are taken in the order of their hashes, which is as if random.
 
@@ -112,17 +113,18 @@ def durations_of_similar_runs(plan: Plan, reused: set[str]) -> dict[Any, list[fl
                 break
             record, _ = read_run(folder, plan.results_dir)
             if record is not None and duration_group(record) in groups and (total := _full_duration(record)):
-                durations[duration_group(record)].append(total)
+                durations[duration_group(record)].append(total / iterations(record["config"]))
     return durations
 
 
 def durations_of_shipped_runs(experiment: str | None) -> dict[Any, list[float]]:
-    """The seconds of the shipped runs of an experiment, by `duration_group`."""
+    """The seconds per iteration of the shipped runs of an experiment, by `duration_group`."""
     durations: dict[Any, list[float]] = {}
     for row in shipped_rows(experiment or ""):
         if row["status"] not in STATUSES_WITHOUT_DURATION and row.get("seconds.total"):
             group = row["task"], row["renderer"], cell_value(row["method"]), row["config.scale.name"]
-            durations.setdefault(group, []).append(float(row["seconds.total"]))
+            count = float(row.get(f"{CONFIG}{ITERATIONS}") or 1)
+            durations.setdefault(group, []).append(float(row["seconds.total"]) / count)
     return durations
 
 
@@ -140,10 +142,16 @@ def _full_duration(record: dict[str, Any]) -> float | None:
 
 
 def duration_group(run: dict[str, Any]) -> Any:
-    """Task, renderer, method and scale: runs that share them take about the same time."""
+    """Task, renderer, method and scale: runs that share them take about the same time per iteration."""
     scale = run["config"].get("scale")
     name = str(scale.get("name")) if isinstance(scale, dict) else None
     return run["task"], run["renderer"], run.get("method", ""), name
+
+
+def iterations(config: Mapping[str, Any]) -> float:
+    """The iterations of a run; 1 for tasks without such a setting."""
+    value = flat(config).get(ITERATIONS)
+    return value if isinstance(value, int | float) and value > 0 else 1
 
 
 def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
@@ -151,7 +159,11 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     durations = durations_of_similar_runs(plan, reused)
     shipped = durations_of_shipped_runs(plan.cells[0].config["experiment"]) if [] in durations.values() else {}
     groups = {cell.id: duration_group(vars(cell)) for cell in plan.cells if cell.id not in reused}
-    to_run = {name: durations[group] or shipped.get(group, []) for name, group in groups.items()}
+    to_run = {
+        cell.id: [iterations(cell.config) * each for each in durations[group] or shipped.get(group, [])]
+        for cell in plan.cells
+        if (group := groups.get(cell.id))
+    }
     for number, cell in enumerate(plan.cells, 1):
         file = Path((cell.config["dataset"] or {}).get("path") or "").name
         title = f"{cell.task}, {row_name(cell.config, cell.renderer)}, {f'{cell.dataset} {file}'.strip()}"
@@ -161,12 +173,12 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
             estimate = f"about {seconds(median(similar))} (median of {plural(len(similar), kind)})"
         parts = (f"{number:>4}", " ".join(plan.distinct_overrides(cell)), title, estimate)
         print("  ".join(filter(None, parts)))
-    counts = [f"{len(plan.cells)} planned: {len(to_run)} to run"]
+    parts = [f"{len(plan.cells)} planned: {len(to_run)} to run"]
     if reused:
-        counts.append(f"{len(reused)} reused")
+        parts.append(f"{len(reused)} reused")
     if unknown := sum(not group for group in to_run.values()):
-        counts.append(f"{unknown} of unknown time (no similar run has finished here, and none is shipped)")
-    text = ", ".join(counts) + ("" if to_run else "; nothing is left to do")
+        parts.append(f"{unknown} of unknown time (no similar run has finished here, and none is shipped)")
+    text = ", ".join(parts) + ("" if to_run else "; nothing is left to do")
     if means := [fmean(group) for group in to_run.values() if group]:
         concurrency = min(workers, len(to_run))
         text += f"; about {seconds(sum(means) / concurrency)} by mean times, {concurrency} at a time"

@@ -218,6 +218,8 @@ def test_similar_runs_have_the_same_task_renderer_and_scale_and_ended_by_themsel
     assert times_of([*other, *unlike, *broken, *odd]) == ([], len([*unlike, *broken, *odd]))
     assert times_of([*other, run(2.0), run(3.0, status="timeout")]) == ([2.0, 3.0], 2)
     assert times_of([run(2.0), run(3.0, method="dist/mask")], method="dist/mask") == ([3.0], 1)
+    longer = {"scale": {"name": "smoke"}, "task": {"optimiser": {"iterations": 4}}}
+    assert times_of([run(2.0, config=longer)]) == ([0.5], 1)  # per iteration
 
 
 def test_a_plan_names_the_file_of_a_dataset(tmp_path, capsys):
