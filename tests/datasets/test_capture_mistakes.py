@@ -24,11 +24,11 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 NAMES = [f"{i}.png" for i in range(11)]  # 10 comes before 2 in string order
 
 
-def seen(seed: int) -> Views:
-    """Cameras around five spheres without symmetry, and their masks."""
+def seen(seed: int, offset: float = 1.0) -> Views:
+    """Cameras around five spheres without symmetry, and their masks; `offset` moves the principal point."""
     random = np.random.default_rng(seed)
     focal = random.uniform(0.8, 1.8) * SIZE[1]
-    intrinsics = np.array([[focal, 0, SIZE[1] / 2 + 1], [0, focal, SIZE[0] / 2 - 1], [0, 0, 1]])
+    intrinsics = np.array([[focal, 0, SIZE[1] / 2 + offset], [0, focal, SIZE[0] / 2 - offset], [0, 0, 1]])
     centres, radii = random.uniform(-0.4, 0.4, (5, 3)), random.uniform(0.1, 0.3, 5)
     poses, masks = [], []
     rows, columns = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
@@ -191,3 +191,11 @@ def test_intrinsics_that_are_no_pixels_are_refused_without_masks(tmp_path):
     nerf(tmp_path, MISTAKES["shares"][1](seen(1)))
     with pytest.raises(BadInput, match="shares"):
         read_capture(tmp_path, replace(READ, masks=False))
+
+
+@pytest.mark.parametrize("words, change", [
+    ("cx and cy", lambda k: np.add(k, [[0, 0, -SIZE[1] / 6], [0, 0, SIZE[0] / 6], [0, 0, 0]])),
+    ("no shares", lambda k: np.array([[2 / SIZE[0], 0, 0], [0, 2 / SIZE[0], 0], [0, 0, 1]]) * k),  # sides from -1 to 1
+])  # fmt: skip
+def test_other_intrinsics_are_named_if_the_middle_is_the_principal_point(words, change):
+    assert words in mistake_in(scaled(change)(seen(1, offset=0.0)))

@@ -133,17 +133,25 @@ def _in_mask(
 
 
 def _intrinsics_corrections(views: Views, frames: Sequence[Frame], fault: str) -> Iterator[tuple[str, Views]]:
-    """Intrinsics in pixels, instead of those that have a fault: shares times the size, or another focal length."""
+    """Intrinsics in pixels, instead of those that have a fault, or a principal point in the middle.
+
+    Without a fault, the focal length stays. With a fault, the numbers are shares of the image, or of an unknown unit.
+    """
     sizes = np.array([mask.shape[::-1] for mask in views.masks])
     stated, centres = np.stack([frame.intrinsics[:2] for frame in frames]), views.intrinsics[:, :2, 2] / sizes
     if (np.abs(centres - 0.5) > MAX_CENTRE_OFFSET).any():
         centres = np.full_like(centres, 0.5)
-    options = [(stated[:, [0, 1], [0, 1]], stated[:, :, 2] - shift) for shift in (0, PIXEL_CENTRE)]
-    options += [(ratio * sizes[:, :1] / sizes, centres) for ratio in FOCAL_TO_WIDTH]
-    for focal_shares, centre_shares in options if fault else ():
+    options = [(fault, stated[:, [0, 1], [0, 1]], stated[:, :, 2] - shift) for shift in (0, PIXEL_CENTRE)]
+    no_share, is_share, _ = fault.partition(", but shares")  # which are of another length, if only a search fits
+    searched = f"{no_share}, and no shares of its sides: store pixels" if is_share else fault
+    options += [(searched, ratio * sizes[:, :1] / sizes, centres) for ratio in FOCAL_TO_WIDTH]
+    if not fault:
+        text = "the principal point is another: check that cx and cy are not exchanged; the image's middle fits better"
+        options = [(text, views.intrinsics[:, [0, 1], [0, 1]] / sizes, np.full_like(centres, 0.5))]
+    for text, focal_shares, centre_shares in options:
         intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))
         intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2] = focal_shares * sizes, centre_shares * sizes
-        yield fault, replace(views, intrinsics=intrinsics)
+        yield text, replace(views, intrinsics=intrinsics)
 
 
 def _pose_corrections(views: Views, axes: str) -> Iterator[tuple[str, Views]]:

@@ -144,7 +144,7 @@ def _downscale(
         colours = colours * opacity + ALPHA_BACKGROUND * (1 - opacity)
     if mask is None:
         return colours, opacity
-    stored = load_image(mask, upright=upright)
+    stored = load_image(mask, upright=upright, white=white_level([mask]))
     if stored.size != image.size:
         tag_ignored = not upright and exif_orientation(image) != EXIF_UPRIGHT
         tag = "; the image's tag of orientation (EXIF) is not applied" if tag_ignored else ""
