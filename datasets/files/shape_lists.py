@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from datasets.files.readers.text import decode
+from datasets.files.readers.text import decode, wrong_kind_message
 from datasets.scene import Split
 
 SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
@@ -21,7 +21,7 @@ SPLIT_WORDS = {Split.TRAIN: "train", Split.VALIDATION: "val", Split.TEST: "test"
 SPLITS = {word: split for split, word in SPLIT_WORDS.items()}
 SPLITS |= {"training": Split.TRAIN, "valid": Split.VALIDATION, "validation": Split.VALIDATION, "testing": Split.TEST}
 SYNSET_PATTERN = re.compile(r"\d{7,8}")  # a spreadsheet removes the leading 0
-SEPARATORS = re.compile(r"[\s,;/\\\"]+")
+SEPARATORS = re.compile(r"[\s,;:/\\\"]+")
 ID_HEADINGS, SPLIT_HEADINGS = {"id", "modelid", "model_id", "synsetid", "synset", "fullid"}, {"split", "set", "subset"}
 PARTS_OF_PATHS = {"models", "model", "model_normalized"}
 
@@ -71,6 +71,8 @@ def _split_files(file: Path) -> dict[Split, Path]:
 def _entries(file: Path, ids: Collection[str]) -> list[Entry]:
     content = file.read_bytes()
     try:
+        if fault := wrong_kind_message(file):
+            raise ValueError(fault)
         rows = _json_rows(json.loads(decode(content)), [], ids) if file.suffix == ".json" else _text_rows(content)
         return [entry for words in rows if (entry := _entry(words, ids))]
     except (ValueError, TypeError, RecursionError) as error:
@@ -90,9 +92,12 @@ def _entry(words: list[str], ids: Collection[str]) -> Entry | None:
 
 
 def _text_rows(content: bytes) -> Iterator[list[str]]:
-    """The words of each line; if a heading names the column of the split, only its word is a split."""
+    """The words of each line, with those of the last line that has only a split, as a heading of the lines below it.
+
+    If a first line names the column of the split, only the words of this column are splits.
+    """
     lines = [line for line in decode(content).split("\n") if line.strip()]
-    column = None
+    column, section = None, list[str]()
     for i, line in enumerate(lines):
         words = SEPARATORS.split(line.strip(' "\t'))
         headings = [word.lower() for word in words]
@@ -101,8 +106,10 @@ def _text_rows(content: bytes) -> Iterator[list[str]]:
         elif column is not None and column < len(words):
             others = [word for k, word in enumerate(words) if k != column and word.lower() not in SPLITS]
             yield [*others, words[column]]
+        elif (stated := [word for word in words if word]) and stated[0].lower() in SPLITS and len(stated) == 1:
+            section = stated
         else:
-            yield words
+            yield [*section, *words]
 
 
 def _json_rows(node: Any, path: list[str], ids: Collection[str]) -> Iterator[list[str]]:

@@ -70,6 +70,10 @@ FORMS: dict[str, Write] = {
     "files.lst": table("", "{split}/{s}/{i}/models/model_normalized.obj", ","),
     "windows.lst": table("", "{split}\\{s}\\{i}.obj", ","),
 }
+FORMS["sections.txt"] = lambda classes: "".join(
+    f"{split}:\n" + "".join(f"- {s}/{name}\n" for s, splits in classes.items() for name in splits[split])
+    for split in SPLITS
+)
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16")
 
 
