@@ -14,6 +14,7 @@ from torch import Tensor
 from datasets.files.captures.depth import check_object_depths, missing_note, read_depths
 from datasets.files.captures.frames import AXES, Frame, homogeneous_matrix
 from datasets.files.captures.mask import is_inverted, load_mask
+from datasets.files.coincidence import compare_surfaces, samples_of, settled
 from datasets.files.meshes import load_mesh
 from datasets.files.range_scans import join_neighbours
 from datasets.mesh import Mesh
@@ -34,7 +35,6 @@ MAX_UP_COMPONENT = 0.09  # upwards, of the camera axis that points down in the i
 LEVEL_TOLERANCE = 0.005  # vertical part of the axis to the right, for a camera that is level
 MIN_VERTICAL_COMPONENT = 0.3  # less: the camera looks straight down or up
 MAX_PORTRAIT_COMPONENT = 0.99  # upwards, of the axis to the right; a camera turned to portrait format has more
-MAX_TRUTH_DISTANCE = 0.15  # scene units; median distance of the visible surface from the truth
 MATRIX_SYNTAX = "write [fx,fy,cx,cy] or [[fx,0,cx],[0,fy,cy],[0,0,1]], and [4, 4] numbers for a rigid motion"
 DEPTH_KINDS = ("z", "ray")
 Z_UP_TO_Y_UP = "[[1,0,0,0],[0,0,1,0],[0,-1,0,0],[0,0,0,1]]"
@@ -54,6 +54,7 @@ class DepthImage:
             forward. None: the world's axes are the camera's axes.
         axes: "stated", as above, or "flipped": the camera's y points up and its z backward, as in OpenGL.
         truth: a mesh in the file's world, the ground truth of results; None: the visible surface is the truth.
+        unchecked: use a truth that lies elsewhere, with a note.
     """
 
     path: str
@@ -64,6 +65,7 @@ class DepthImage:
     camera_to_world: list[Any] | None
     axes: str
     truth: str | None
+    unchecked: bool
 
     def __post_init__(self) -> None:
         check_positive("dataset.scale", self.scale, "0.001 is of a PNG in millimetres, where the world is in metres")
@@ -138,14 +140,15 @@ class DepthImage:
             mesh = join_neighbours(np.argwhere(measured)[:, ::-1] * (1, -1), points)  # faces look at the camera
             truth_note = "judged by what is seen, since there is no dataset.truth"
         else:
-            mesh, truth_note = load_mesh(self.truth).moved(np.linalg.inv(to_world)), f"the true shape is '{self.truth}'"
-            gap = float(np.median(Truth(mesh).distance(points)))
-            if gap > MAX_TRUTH_DISTANCE:
-                raise BadInput(
-                    f"what {self.path} shows lies {gap / OBJECT_RADIUS:.2g} of its radius from dataset.truth (median): "
-                    "give both in one world, by dataset.camera_to_world, dataset.axes and dataset.scale, and check "
-                    "dataset.intrinsics"
-                )
+            mesh, truth_note = load_mesh(self.truth), f"the true shape is '{self.truth}'"
+            visible_points = points @ to_world[:3, :3].T + to_world[:3, 3]
+            comparison = compare_surfaces(samples_of(mesh), visible_points, is_partial=True)
+            doubt = (
+                f"{comparison.text('dataset.truth', f'what {self.path} shows')}: give both in one world, by "
+                "dataset.camera_to_world, dataset.axes and dataset.scale, and check dataset.intrinsics"
+            )
+            notes += settled(comparison, doubt, unchecked=self.unchecked)
+            mesh = mesh.moved(np.linalg.inv(to_world))
         surface = see(Truth(mesh, closed=False), camera)
         view = View(camera, surface.depth, surface.normals, torch.from_numpy(mask))
         mesh = replace(mesh, repairs=(*filter(None, (truth_note, *notes)), *mesh.repairs))

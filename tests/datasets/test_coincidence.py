@@ -1,0 +1,86 @@
+"""Two things that must coincide: the change of axes, units and origin that fits, and what must not be refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datasets.files.coincidence import IDENTITY, Change, compare_outlines, compare_surfaces, samples_of, settled, turns
+from datasets.files.own_photographs import read_capture
+from datasets.mesh import Mesh
+from renderers.checks import BadInput
+from tests.looped import each
+from tests.made_dtu import ball
+from tests.made_photographs import CENTRE, RADIUS, READ, nerf
+
+FACTORS = {1.0: "", 10.0: "millimetres", 2.54: "inches", 1000.0: "millimetres", 0.01: "metres", 0.5: ""}
+
+
+def solid() -> Mesh:
+    """An ellipsoid with a knob, without any symmetry."""
+    ellipsoid, knob = ball(1.0, (0, 0, 0)), ball(0.25, (0.6, 0.35, 0.2))
+    vertices = np.concatenate([ellipsoid.vertices * (1.0, 0.6, 0.35), knob.vertices])
+    return Mesh(vertices, np.concatenate([ellipsoid.faces, knob.faces + len(ellipsoid.vertices)]))
+
+
+POINTS = samples_of(solid())
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(st.integers(0, 47), st.sampled_from(sorted(FACTORS)), st.sampled_from([0.0, 4.0]), st.booleans())
+def test_the_change_that_was_made_is_undone(rank, factor, shift, is_partial):
+    if (rank, factor, shift) == (0, 1.0, 0.0):
+        return
+    change = Change(turns()[rank], factor, np.array([shift, 0, -shift]))
+    reference = change.apply(POINTS[POINTS[:, 2] > -0.1] if is_partial else POINTS)
+    comparison = compare_surfaces(POINTS, reference, is_partial=is_partial)
+    assert not comparison.coincides and np.array_equal(comparison.change.turn, change.turn)
+    assert comparison.change.factor == pytest.approx(factor, rel=0.03)
+    moved = comparison.change.apply(POINTS) - change.apply(POINTS)
+    assert np.abs(moved).max() < 0.06 * factor
+    text = comparison.text("dataset.truth", "the mesh")
+    assert FACTORS[factor] in text and ("times as large" in text or "smaller" in text) == (factor != 1)
+    with pytest.raises(BadInput, match=r"dataset.unchecked=true"):
+        settled(comparison, text, unchecked=False)
+    assert settled(comparison, text, unchecked=True) == (text,)
+
+
+def test_there_are_24_rotations_and_24_mirrors_and_the_commonest_is_first():
+    assert len({tuple(turn.flat) for turn in turns()}) == 48 and np.array_equal(turns()[0], IDENTITY.turn)
+    assert [round(np.linalg.det(turn)) for turn in turns()] == [1] * 24 + [-1] * 24
+    assert all("about x (z up against y up?)" in str(Change(turns()[i], 1.0, np.zeros(3))) for i in (1, 2))
+
+
+@each("spoil", [
+    lambda p: p + 0.05 * np.random.default_rng(1).normal(size=p.shape), lambda p: p[p[:, 0] > 0], lambda p: 0.8 * p,
+    lambda p: 0.6 * p / np.linalg.norm(p, axis=1, keepdims=True), lambda p: p + 0.1, lambda p: p * (1, 1, 0.6),
+])  # fmt: skip
+def test_a_poor_or_partial_surface_is_no_other_frame(spoil):
+    for is_partial in (False, True):
+        assert not compare_surfaces(spoil(POINTS), POINTS, is_partial=is_partial).is_other_frame
+        assert not compare_surfaces(POINTS, spoil(POINTS), is_partial=is_partial).is_other_frame
+
+
+@each("turn", [turns()[1], turns()[7], turns()[30]])
+def test_a_turned_symmetrical_shape_coincides(turn):
+    sphere = samples_of(ball(1.0, (0, 0, 0)))
+    assert compare_surfaces(Change(turn, 1.0, np.zeros(3)).apply(sphere), sphere, is_partial=False).coincides
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photographs")
+    nerf(folder)
+    return read_capture(folder, READ)
+
+
+def test_the_outline_of_a_truth_fits_the_masks_or_names_its_units(capture):
+    points = samples_of(ball(RADIUS, CENTRE))
+    assert compare_outlines(points, capture.shots, capture.to_world).coincides
+    for factor, words in ((0.01, "100 times as large (metres against centimetres?)"), (2.54, "2.54 times smaller")):
+        comparison = compare_outlines(factor * points, capture.shots, capture.to_world)
+        assert not comparison.coincides and words in comparison.text("dataset.truth", "the masks")
+    shifted = compare_outlines(np.add(points, (0.3, 0, 0)), capture.shots, capture.to_world)
+    assert shifted.change.shift == pytest.approx([-0.3, 0, 0], abs=0.05)
+    half = compare_outlines(points[points[:, 1] > CENTRE[1]], capture.shots, capture.to_world)
+    assert not half.is_other_frame
