@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from datasets.files.captures.depth import missing_numbers
+from datasets.files.coincidence import DISTANCE, IDENTITY, compare_surfaces, samples_of, settled
 from datasets.files.meshes import load_mesh
 from datasets.files.readers.ply import read_ply
 from datasets.files.readers.text import wrong_kind_message
@@ -59,13 +60,27 @@ class Scan:
             raise BadInput(f"scan '{self.file}' has no points: none of {len(points)} is finite; copy the file again")
         return points[measured], int((~measured).sum())
 
+    @property
+    def other_rotations(self) -> dict[str, Rotation]:
+        """Rotations that files of another convention may mean, and how the file must then be changed."""
+        scalar_last = Rotation.from_quat(np.roll(self.quaternion, -1))
+        return {
+            "its quaternion is that of the inverse rotation: negate qx, qy and qz": self.rotation.inv(),
+            "its quaternion begins with qw: write qx qy qz qw": scalar_last.inv(),
+            "its quaternion begins with qw and is that of the inverse rotation": scalar_last,
+        }
+
+    def in_world(self, rotation: Rotation) -> Float[np.ndarray, "n 3"]:
+        """The measured points in world coordinates, by a rotation in place of the stated one."""
+        return rotation.apply(self.points[0]) + self.translation
+
     def surface(self) -> Mesh:
         """The scan as an open surface in world coordinates; neighbours in the scanner's view are joined.
 
         Raises: as `points`.
         """
         points, _ = self.points
-        return replace(join_neighbours(points[:, :2], points), vertices=self.rotation.apply(points) + self.translation)
+        return replace(join_neighbours(points[:, :2], points), vertices=self.in_world(self.rotation))
 
 
 @dataclass(frozen=True)
@@ -78,11 +93,13 @@ class RangeScans:
         path: a folder with the scans, the mesh, and one `.conf` file with lines `bmesh FILE tx ty tz qx qy qz qw`.
         truth: the mesh's file in the folder; None takes the largest `.ply` file that is no scan.
         radius: of the sphere about the origin that contains the mesh.
+        unchecked: use scans that do not lie on the mesh, with a note.
     """
 
     path: str
     truth: str | None
     radius: float
+    unchecked: bool = False
 
     def __post_init__(self) -> None:
         check_fraction("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
@@ -131,16 +148,29 @@ class RangeScans:
         """The object, the same for each index; its `repairs` state what was repaired in the file.
 
         Raises:
-            BadInput: no scan has this index, or `split` is the training split.
+            BadInput: no scan has this index, it does not lie on the mesh, or `split` is the training split.
         """
         if split is Split.TRAIN:
             raise BadInput(
                 "scans show one object, of which there is no prior: take task=completion field=auto split=test"
             )
-        _, missing = self._scan(index).points
-        notes = (f"{missing} points of '{self._scan(index).file.name}' are no measurements, and are left out",)
-        mesh = normalise(self._read, self.radius)
-        return replace(mesh, repairs=(*mesh.repairs, *notes)) if missing else mesh
+        scan, mesh = self._scan(index), normalise(self._read, self.radius)
+        _, missing = scan.points
+        notes = [f"{missing} points of '{scan.file.name}' are no measurements, and are left out"] if missing else []
+        return replace(mesh, repairs=(*mesh.repairs, *notes, *self._pose_notes(scan)))
+
+    def _pose_notes(self, scan: Scan) -> tuple[str, ...]:
+        """A note on a scan that does not lie on the mesh; raises BadInput without `unchecked`."""
+        mesh, thing, reference = samples_of(self._read), f"'{self.reference.name}'", f"scan '{scan.file.name}'"
+        comparison = compare_surfaces(mesh, scan.in_world(scan.rotation), is_partial=True)
+        doubt = comparison.text(thing, reference)
+        if not comparison.coincides:
+            for remedy, rotation in scan.other_rotations.items():
+                other = compare_surfaces(mesh, scan.in_world(rotation), is_partial=True)
+                if other.misfit < min(comparison.changed_misfit, DISTANCE.good):
+                    doubt = f"{replace(comparison, change=IDENTITY).text(thing, reference)}, and fits if {remedy}"
+        doubt += ": give scans and mesh in one unit, and poses x_world = R^T x + t in the .conf file"
+        return settled(comparison, doubt, unchecked=self.unchecked, override="+dataset.unchecked=true")
 
     def towards_scanner(self, index: int) -> Float[Tensor, "3"]:
         """See `Scanned`."""

@@ -14,6 +14,7 @@ from datasets.files.repair import repair
 from datasets.mesh import Mesh
 from datasets.scene import Split, make_scene, sample_surface
 from datasets.views import ViewSampler
+from renderers.checks import BadInput
 from tests.looped import each
 from tests.made_scans import RADIUS, TURNS, write_scans
 from tests.runner.driving import SMALLEST, command, record_of
@@ -116,6 +117,19 @@ def test_points_that_are_no_measurements_are_left_out_and_noted(tmp_path_factory
     assert np.array_equal(scans(folder).scans[0].surface().vertices, complete.vertices)
     assert "3 points of 'scan_0.ply' are no measurements" in scans(folder).mesh(Split.TEST, 0).repairs[-1]
     assert "measurements" not in str(scans(folder).mesh(Split.TEST, 1).repairs)
+
+
+@each("spoil, message", [
+    (lambda words: [*words[:5], *(str(-float(word)) for word in words[5:8]), words[8]], "negate qx, qy and qz"),
+    (lambda words: [*words[:2], "0.8", *words[3:]], "moved by"),
+])  # fmt: skip
+def test_scans_that_do_not_lie_on_the_mesh_are_refused_with_the_cause(tmp_path_factory, spoil, message):
+    folder = write_scans(tmp_path_factory.mktemp("ball"))
+    *others, last = (folder / "ball.conf").read_text().splitlines()
+    (folder / "ball.conf").write_text("\n".join([*others, " ".join(spoil(last.split()))]))
+    with pytest.raises(BadInput, match=f"{message}.*dataset.unchecked=true"):
+        scans(folder).mesh(Split.TEST, 2)
+    assert "lies" in replace(scans(folder), unchecked=True).mesh(Split.TEST, 2).repairs[-1]
 
 
 def test_the_ground_truth_may_be_set_and_is_noted(tmp_path):
