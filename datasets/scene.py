@@ -129,8 +129,7 @@ class Truth:
             raise ValueError("directions: must be finite and not zero, found some that are not; drop these rays")
         rays = np.concatenate([origins, directions / lengths], axis=-1, dtype=np.float32)
         hits = self._scene.cast_rays(self._tensor(rays))
-        distance = hits["t_hit"].numpy()
-        normals = hits["primitive_normals"].numpy()
+        distance, normals = hits["t_hit"].numpy(), hits["primitive_normals"].numpy()
         face = hits["primitive_ids"].numpy().astype(np.int64)
         return Hits(distance=distance, normals=normals, hit=np.isfinite(distance), face=face)
 
@@ -309,6 +308,7 @@ class Photographed(Protocol):
     """A dataset of one object with photographs, and perhaps a file of its surface, `truth`; see `OwnPhotographs`."""
 
     truth: str | None
+    unchecked: bool
 
     @property
     def dtu_scan(self) -> int | None:

@@ -77,7 +77,7 @@ class OwnPhotographs:
         masks: False ignores masks.
         axes: "stated", as in the format, or "flipped": y and z of each camera are reversed.
         images: the folder of COLMAP's images; None for the usual folders in `path`.
-        unchecked: use photographs although cameras hardly fit masks or sizes.
+        unchecked: use photographs and a truth although cameras hardly fit masks, sizes or the truth.
         truth: a mesh or a cloud of points in the cameras' world, or DTU's folder; None without ground truth.
         scan: number of the scan of DTU's folder; None takes the number at the end of the photographs' folder.
     """

@@ -16,6 +16,7 @@ from bench.solve.solve import save_in_world
 from bench.tasks.reconstruction.dtu import DEFINITIONS as DTU_DEFINITIONS
 from bench.tasks.reconstruction.dtu import DtuScan, dtu_metrics, published_results, read_scan
 from datasets.files.captures.hull import hull_mesh
+from datasets.files.coincidence import compare_outlines, samples_of, settled
 from datasets.files.meshes import read_pieces, read_points
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.photographs import Photography
@@ -195,7 +196,7 @@ class PhotographTask(ABC):
         if inputs.photographed is not None:
             capture = inputs.photographed.capture(self.longest, self.held_out)
             shots, seed, to_world = capture.shots, inputs.seed, capture.to_world
-            truth, points, truth_notes = load_truth(inputs.photographed, to_world)
+            truth, points, truth_notes = load_truth(inputs.photographed, shots, to_world)
             summary = "; ".join([capture.summary, *capture.notes])
         else:
             scene = inputs.scene
@@ -215,22 +216,25 @@ class PhotographTask(ABC):
 
 
 def load_truth(
-    dataset: Photographed, to_world: Float[np.ndarray, "4 4"]
+    dataset: Photographed, shots: Sequence[Shot], to_world: Float[np.ndarray, "4 4"]
 ) -> tuple[Mesh | None, DtuScan | Float[np.ndarray, "n 3"] | None, list[str]]:
     """Reads the surface in the unit sphere or the points from the file or folder `dataset.truth`; also gives notes.
 
     Raises:
-        BadInput: if it cannot be read, or lies completely outside of the unit sphere.
+        BadInput: if it cannot be read, lies completely outside of the unit sphere, or does not fit the masks.
     """
     if dataset.truth is None:
         return None, None, []
     if (number := dataset.dtu_scan) is not None:
-        return None, read_scan(Path(dataset.truth), number), published_results(number)
+        scan = read_scan(Path(dataset.truth), number)
+        notes = outline_notes(dataset, scan.points_above_plane(), shots, to_world)
+        return None, scan, [*notes, *published_results(number)]
     mesh, points = None, None if Path(dataset.truth).is_dir() else read_points(dataset.truth)
-    if points is None:
-        full_mesh = read_pieces(dataset.truth).moved(np.linalg.inv(to_world))
-        mesh = full_mesh.cut_off()
-        fraction = mesh.area / full_mesh.area if mesh else 0.0
+    full_mesh = read_pieces(dataset.truth) if points is None else None
+    notes = outline_notes(dataset, points if full_mesh is None else samples_of(full_mesh), shots, to_world)
+    if full_mesh is not None:
+        mesh = full_mesh.moved(np.linalg.inv(to_world)).cut_off()
+        fraction = mesh.moved(to_world).area / full_mesh.area if mesh else 0.0
     else:
         point_count, points = len(points), points_in_sphere(points, to_world)
         fraction = len(points) / point_count
@@ -240,7 +244,21 @@ def load_truth(
             "world of their cameras"
         )
     note = f"{fraction:.0%} of {dataset.truth} lies in the unit sphere, and is the truth"
-    return mesh, points, [note] if fraction < 1 else []
+    return mesh, points, [*notes, note] if fraction < 1 else notes
+
+
+def outline_notes(
+    dataset: Photographed, points: Float[np.ndarray, "n 3"], shots: Sequence[Shot], to_world: Float[np.ndarray, "4 4"]
+) -> list[str]:
+    """A note on a true surface whose outline does not fit the masks; raises BadInput without `dataset.unchecked`."""
+    if any(shot.mask is None for shot in shots):
+        return []
+    comparison = compare_outlines(points, shots, to_world)
+    doubt = (
+        f"{comparison.text(f'dataset.truth={dataset.truth}', 'the masks')}: give the object alone, in the world and "
+        "the units of the cameras"
+    )
+    return [*settled(comparison, doubt, unchecked=dataset.unchecked)]
 
 
 def points_in_sphere(points: Float[np.ndarray, "n 3"], to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "m 3"]:
