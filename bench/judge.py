@@ -27,6 +27,7 @@ from bench.records.results import check_links
 from bench.report.write.html import write_index
 from bench.tables import choice
 from bench.tasks.reconstruction import dtu, tanks
+from datasets.files import coincidence
 from datasets.files.meshes import find_meshes, read_mesh, read_points
 from datasets.files.own_photographs import Capture, ReadSettings, read_capture, scan_number
 from datasets.mesh import Mesh, fit_in_sphere
@@ -36,10 +37,6 @@ from renderers.checks import BadInput
 SURFACE_POINTS = choice("scale", "desk")["points"]  # as in runs
 SPHERE_RADIUS = choice("dataset", "mesh")["radius"]  # runs move a mesh into this sphere
 DEFAULT_THRESHOLD = "1%"  # runs have 0.02, for shapes about 2 across
-# Maximum size ratio and minimum overlap of boxes; see `_mismatch_warnings`. A mesh may have more than was scanned.
-SCAN_LIMITS = (10.0, 0.0)
-SHAPE_LIMITS = (1.2, 0.5)
-BOX_MARGIN_FRACTION = 0.02  # boxes are enlarged by it on each side, so that the box of a plate has a volume
 MAX_CULLING_PIXELS = 800  # longer side of a photograph whose mask culls a mesh
 UNIT_SUFFIXES = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None, "normal_consistency": None}
 WORLD_MESH_FILE = "mesh_world.ply"  # the mesh of a run on photographs, in the world of their cameras
@@ -70,7 +67,8 @@ class Item:
 class Verdict:
     """The metrics of a mesh, and notes. If judging failed, `failure` is the reason, with the worst metrics.
 
-    `draw` writes a picture of the distances, with a title, to a path.
+    `draw` writes a picture of the distances, with a title, to a path. `is_other_frame`: the mesh fits its truth far
+    better after a change of axes, units or origin.
     """
 
     name: str
@@ -79,6 +77,7 @@ class Verdict:
     failure: str = ""
     mesh: Mesh | None = None
     draw: Callable[[str, Path], None] | None = None
+    is_other_frame: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,8 @@ class Judge:
         if isinstance(item.truth, Path):
             return self._by_surface(item.name, mesh, item.truth)
         scan = dtu.read_scan(self.folder or Path(), item.truth)
-        notes = [*_mismatch_warnings(mesh, scan.points_above_plane(), *SCAN_LIMITS), *dtu.published_results(item.truth)]
+        notes, is_other_frame = _frame_check(mesh, scan.points_above_plane(), is_partial=True)
+        notes += dtu.published_results(item.truth)
         distances = dtu.dtu_distances(mesh, scan, seed=self.seed)
         metrics = dtu.metrics_of(distances)
         if metrics["dtu_accuracy"] == inf:
@@ -144,7 +144,9 @@ class Judge:
                 "unit sphere"
             )
         notes.append(f"how: {dtu.PROTOCOL}")
-        return Verdict(item.name, metrics, notes, mesh=mesh, draw=partial(draw_distances, distances))
+        return Verdict(
+            item.name, metrics, notes, mesh=mesh, draw=partial(draw_distances, distances), is_other_frame=is_other_frame
+        )
 
     def _by_scene(self, name: str, file: Path, scene_name: str) -> Verdict:
         """The metrics of Tanks and Temples. The file may have points only, as results there do."""
@@ -176,7 +178,8 @@ class Judge:
         cloud = read_points(truth)
         surface = None if cloud is not None else read_mesh(truth)
         truth_points = surface.used_vertices if surface is not None else cloud
-        notes = _mismatch_warnings(mesh, truth_points, *SHAPE_LIMITS)
+        all_points = truth_points if surface is None else coincidence.samples_of(surface)
+        notes, is_other_frame = _frame_check(mesh, all_points, is_partial=False)
         if self.unit_sphere:
             centre, factor = fit_in_sphere(truth_points, SPHERE_RADIUS)
             mesh, surface = (old and replace(old, vertices=(old.vertices - centre) * factor) for old in (mesh, surface))
@@ -203,12 +206,12 @@ class Judge:
             metrics = cloud_metrics(
                 predicted_samples, subsample(truth_points, self.points, self.seed), threshold=threshold
             )
-            return Verdict(name, metrics, notes, mesh=mesh, draw=draw)
+            return Verdict(name, metrics, notes, mesh=mesh, draw=draw, is_other_frame=is_other_frame)
         true_samples, repeated_samples = (sample_surface(surface, self.points, self.seed + offset) for offset in (0, 2))
         sampling_error = surface_metrics(repeated_samples, true_samples, threshold=threshold)
         notes.append(f"two samplings of the truth have chamfer_l1 {sampling_error['chamfer_l1']:.4g}")
         metrics = surface_metrics(predicted_samples, true_samples, threshold=threshold)
-        return Verdict(name, metrics, notes, mesh=mesh, draw=draw)
+        return Verdict(name, metrics, notes, mesh=mesh, draw=draw, is_other_frame=is_other_frame)
 
 
 @cache
@@ -216,25 +219,18 @@ def _photographs(folder: Path) -> Capture:
     return read_capture(folder, ReadSettings(MAX_CULLING_PIXELS, unchecked=True))
 
 
-def _mismatch_warnings(mesh: Mesh, truth: Float[np.ndarray, "n 3"], max_ratio: float, min_overlap: float) -> list[str]:
-    """A warning if a mesh is probably in another world or in other units than its truth.
+def _frame_check(mesh: Mesh, truth: Float[np.ndarray, "n 3"], *, is_partial: bool) -> tuple[list[str], bool]:
+    """A warning if a mesh is probably in another world or in other units than its truth; whether a change fits.
 
     Args:
-        max_ratio: largest ratio of the sizes without a warning.
-        min_overlap: smallest intersection over union of the boxes without a warning.
+        is_partial: whether the mesh may have more than was scanned.
     """
-    extent = float(np.linalg.norm(np.ptp(truth, axis=0)))
-    ratio, margin = mesh.diagonal / max(extent, 1e-300), BOX_MARGIN_FRACTION * max(mesh.diagonal, extent)
-    boxes = [(points.min(axis=0) - margin, points.max(axis=0) + margin) for points in (mesh.used_vertices, truth)]
-    low, high = np.stack(boxes, axis=1)
-    common_volume = (high.min(axis=0) - low.max(axis=0)).clip(0).prod()
-    overlap = common_volume / ((high - low).prod(axis=1).sum() - common_volume)
-    if 1 / max_ratio <= ratio <= max_ratio and overlap >= min_overlap:
-        return []
-    return [
-        f"warning: the mesh is {ratio:.3g} times as large as the truth, and their boxes overlap by {overlap:.0%}: are "
-        "both in the same world and units? The mesh of a run is in its unit sphere"
-    ]
+    comparison = coincidence.compare_surfaces(coincidence.samples_of(mesh), truth, is_partial=is_partial)
+    warning = (
+        f"warning: {comparison.text('the mesh', 'the truth')}: are both in the same world and units? The mesh of a run "
+        "is in its unit sphere"
+    )
+    return [] if comparison.coincides else [warning], comparison.is_other_frame
 
 
 def items_of(mesh: Path, truth: Path | None, truth_of: Callable[[str], int | str]) -> list[Item]:
@@ -354,6 +350,7 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--picture", type=Path, metavar="PNG", help=picture)
     parser.add_argument("--into", type=Path, metavar="RESULTS", help="write rows into a results folder")
     parser.add_argument("--method", help="the name of these rows")
+    parser.add_argument("--unchecked", action="store_true", help="write rows although another frame fits far better")
     parser.add_argument("--like", type=Path, metavar="RUN", help="a run whose problem the meshes answer")
     return parser.parse_args(arguments)
 
@@ -404,6 +401,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         check_options(options)
         items, verdicts = items_of(options.mesh, options.truth, partial(truth_of, options)), list[Verdict]()
+        withheld = list[tuple[Verdict, Item, int]]()  # rows, until some mesh of a folder is in the frame of its truth
         for index, item in enumerate(items):
             try:
                 verdict = judge.verdict(item)
@@ -416,11 +414,17 @@ def main(arguments: list[str] | None = None) -> int:
             if picture is not None:
                 picture.parent.mkdir(parents=True, exist_ok=True)
                 verdict.draw(f"{item.name}: distance of each point to the other surface", picture)
-            if options.into is not None:
+            if options.into is not None and verdict.is_other_frame and not options.unchecked:
+                withheld.append((verdict, item, index))
+            elif options.into is not None:
                 write_row(verdict, item, index, judge, options)
             verdicts.append(replace(verdict, mesh=None, draw=None))  # a folder may have many
         print_verdicts(verdicts, metric_units(judge))
         if options.into is not None:
+            if withheld and len(withheld) == sum(not verdict.failure for verdict in verdicts):
+                raise ValueError("the warning names a change of frame, so no row is written: add --unchecked to do so")
+            for verdict, item, index in withheld:
+                write_row(verdict, item, index, judge, options)
             print(write_index(options.into))
     except (OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

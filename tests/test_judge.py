@@ -115,31 +115,42 @@ def test_the_best_possible_distance_is_that_of_two_independent_samplings_of_the_
     assert distance == pytest.approx(0.5 * (4 * np.pi * 2.0**2 / 4000) ** 0.5, rel=0.15)
 
 
-def test_a_mesh_of_another_size_or_place_than_its_truth_is_a_likely_mistake(files, capsys):
-    def warned(radius: float, centre: tuple) -> list[str]:
-        ball(radius, centre).save(files / "mesh.ply")
-        notes = judged(capsys, files / "mesh.ply", "--truth", files / "truth.ply", *FEW)["notes"]
-        return [note for note in notes if note.startswith("warning")]
-
-    ball(2.0, (0, 0, 0)).save(files / "truth.ply")
-    for radius, shift in ((2.0, 1.35), (2.36, 0.0), (1.69, 0.0)):  # overlaps of 2.9 / 5.6, and of .61
-        assert warned(radius, (shift, 0, 0)) == warned(radius, (0, shift, 0)) == []
-    for radius, shift, words in (
-        (2.0, 1.45, "1 times as large as the truth, and their boxes overlap by 49%"),  # 2.83 / 5.73
-        (2.0, 9.0, "1 times as large as the truth, and their boxes overlap by 0%"),
-        (2.44, 0.0, "1.22 times as large as the truth"),
-        (1.64, 0.0, "0.82 times as large as the truth"),
-        (2000.0, 0.0, "1e+03 times as large as the truth"),
-    ):
-        (warning,) = warned(radius, (0, 0, shift))
-        assert words in warning and warning.endswith("The mesh of a run is in its unit sphere")
+def solid() -> Mesh:
+    """An ellipsoid with a knob, without any symmetry."""
+    ellipsoid, knob = ball(1.0, (0, 0, 0)), ball(0.25, (0.6, 0.35, 0.2))
+    vertices = np.concatenate([ellipsoid.vertices * (1.0, 0.6, 0.35), knob.vertices])
+    return Mesh(vertices, np.concatenate([ellipsoid.faces, knob.faces + len(ellipsoid.vertices)]))
 
 
-def test_a_plate_is_compared_by_its_box_though_it_has_no_volume(files, capsys):
-    for height, count in ((0.0, 0), (0.05, 0), (1.0, 1)):
-        plate(height).save(files / "found/plate.ply")
-        notes = judged(capsys, *pair(files, "plate"))["notes"]
-        assert sum(note.startswith("warning") for note in notes) == count
+def test_a_mesh_in_another_frame_than_its_truth_has_a_warning_with_the_change(files, capsys):
+    """The changes themselves are in `tests/datasets/test_coincidence.py`."""
+    mesh, rows = solid(), ("--method", "mine", "--into", files / "results")
+    mesh.save(files / "truth.ply")
+    y_up = np.eye(4)[[0, 2, 1, 3]] * np.array([[1], [-1], [1], [1]])
+    for motion, words in ((np.diag([10, 10, 10, 1]), "(centimetres against millimetres?)"), (y_up, "about x (z up")):
+        mesh.moved(motion).save(files / "mesh.ply")
+        command = (files / "mesh.ply", "--truth", files / "truth.ply", *FEW)
+        (warning,) = [note for note in judged(capsys, *command)["notes"] if note.startswith("warning")]
+        assert words in warning.replace("millimetres against centimetres", "centimetres against millimetres")
+        assert "add --unchecked" in refused(capsys, *command, *rows) and not (files / "results").exists()
+    judged(capsys, *command, *rows, "--unchecked")
+    assert (files / "results/index.html").is_file()
+
+
+def test_a_poor_reconstruction_is_judged_and_its_row_is_written(files, capsys):
+    mesh, draw = solid(), np.random.default_rng(0)
+    mesh.save(files / "truth.ply")
+    noise = 0.08 * draw.normal(size=mesh.vertices.shape)
+    blob, shrunk, noisy = (
+        ball(0.6, (0, 0, 0)),
+        mesh.moved(np.diag([0.75, 0.75, 0.75, 1])),
+        Mesh(mesh.vertices + noise, mesh.faces),
+    )
+    for name, poor in (("blob", blob), ("shrunk", shrunk), ("noisy", noisy)):
+        poor.save(files / f"{name}.ply")
+        command = (files / f"{name}.ply", "--truth", files / "truth.ply", *FEW)
+        notes = judged(capsys, *command, "--method", name, "--into", files / "results")["notes"]
+        assert not any(note.startswith("warning") for note in notes)
 
 
 def test_a_folder_has_a_row_for_each_truth_and_medians(files, capsys):
