@@ -29,6 +29,7 @@ UNIT_RATIO_TOLERANCE = 1.02  # as a factor
 SIZE_RATIO_TOLERANCE, REFINED_RATIO_TOLERANCE = 1.4, 1.06  # as factors: one size may be incomplete
 REFINED_TURNS, REFINING_STEPS, FIRST_STEP = 2, 120, 0.1
 FAST_GAIN, FAST_MISFIT, MAX_COMPARED = 1.5, 0.04, 16  # changes that are compared without approximation
+MIN_OUTLINE_SIDE = 8  # pixels
 OUTLINE_DETAIL, FAST_OUTLINE_DETAIL, HULL_SAMPLES = (8, 8000, 64), (4, 1000, 24), 48  # views, points, pixels; per axis
 
 
@@ -223,7 +224,8 @@ def compare_outlines(
 
     def seen_by(count: int, samples: int, side: int) -> Misfit:
         chosen = [shots[i] for i in np.linspace(0, len(shots) - 1, min(count, len(shots))).round().astype(int)]
-        views = [_small_view(shot, side) for shot in chosen]
+        fine_enough = int(min(samples, len(points)) ** 0.5)  # so that points leave no gaps in an outline
+        views = [_small_view(shot, min(side, max(fine_enough, MIN_OUTLINE_SIDE))) for shot in chosen]
 
         def misfit(change: Change) -> float:
             moved = change.apply(points[:samples]) @ to_sphere[:3, :3].T + to_sphere[:3, 3]

@@ -76,7 +76,8 @@ def capture(tmp_path_factory):
 
 def test_the_outline_of_a_truth_fits_the_masks_or_names_its_units(capture):
     points = samples_of(ball(RADIUS, CENTRE))
-    assert compare_outlines(points, capture.shots, capture.to_world).coincides
+    for few in (1, len(points) // 400):  # also of a sparse cloud
+        assert compare_outlines(points[::few], capture.shots, capture.to_world).misfit < 0.3
     for factor, words in ((0.01, "100 times as large (metres against centimetres?)"), (2.54, "2.54 times smaller")):
         comparison = compare_outlines(factor * points, capture.shots, capture.to_world)
         assert not comparison.coincides and words in comparison.text("dataset.truth", "the masks")
