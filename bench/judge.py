@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bench.evaluate.distances import measure_distances
 from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, subsample, surface_metrics
-from bench.pictures.distances import compare_surfaces, draw_distances
+from bench.pictures.distances import draw_distances
 from bench.records.read import is_plain_name
 from bench.records.record import Record, RunStatus, digest, now, read_record
 from bench.records.results import check_links
@@ -199,7 +200,7 @@ class Judge:
             pair = mesh, truth_points if surface is None else surface
             settings = {"seed": self.seed, "threshold": threshold, "unit": unit}
             counts = self.points, max(self.points, PICTURE_POINTS)
-            measured, dense = (compare_surfaces(*pair, count=count, **settings) for count in counts)
+            measured, dense = (measure_distances(*pair, count=count, **settings) for count in counts)
             draw_distances(measured, title, path, dense)
 
         if surface is None:
@@ -422,7 +423,9 @@ def main(arguments: list[str] | None = None) -> int:
         print_verdicts(verdicts, metric_units(judge))
         if options.into is not None:
             if withheld and len(withheld) == sum(not verdict.failure for verdict in verdicts):
-                raise ValueError("the warning names a change of frame, so no row is written: add --unchecked to do so")
+                raise ValueError(
+                    "no row is written, since the mesh is in another frame (see the warning): add --unchecked"
+                )
             for verdict, item, index in withheld:
                 write_row(verdict, item, index, judge, options)
             print(write_index(options.into))

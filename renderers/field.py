@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import lru_cache, partial
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -218,6 +218,7 @@ class Wrapper(ABC):
     """A Field that evaluates the field `inner`, has its properties, and does something more."""
 
     inner: Field
+    keeps_values: ClassVar[bool] = False  # whether its values are those of `inner`
 
     @property
     def kind(self) -> Kind:
@@ -248,6 +249,7 @@ class Meter(Wrapper):
 
     inner: Field
     counts: Counts = field(default_factory=Counts)
+    keeps_values: ClassVar[bool] = True
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         values = self.inner(points)

@@ -39,7 +39,8 @@ DATA_LAYER = (
 )  # fmt: skip
 STUDIES_LAYER = (
     "bench.report", "bench.studies", "bench.pictures", "renderers.later", "renderers.newton",
-    "bench.evaluate.along_ray", "bench.evaluate.colours", "bench.evaluate.ray_derivatives", "bench.evaluate.ray_scene",
+    "bench.evaluate.along_ray", "bench.evaluate.colours", "bench.evaluate.distances", "bench.evaluate.ray_derivatives",
+    "bench.evaluate.ray_scene",
     "bench.records.names", "bench.records.published", "bench.records.read", "bench.runner.library",
     "bench.setup.auto", "bench.setup.colour_codes",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import asin, degrees
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ class Recorder(Wrapper):
     rays: Rays
     calls: list[list[float]] = field(default_factory=list)
     positions: set[float] = field(default_factory=set)
+    keeps_values: ClassVar[bool] = True
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         self._note(points)

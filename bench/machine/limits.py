@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -68,6 +69,7 @@ class Watched(Wrapper):
     where: str
     spent: int = 0
     memory_checked: float = 0.0
+    keeps_values: ClassVar[bool] = True
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         self._spend(points.numel() // 3)

@@ -1,8 +1,7 @@
-"""The distances between a mesh and its truth: as colours on both, and as shares of points over the distance."""
+"""Pictures of the distances between a mesh and its truth: as colours on both, and shares of points over distance."""
 
 import csv
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,9 @@ from matplotlib.figure import Figure
 from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
 from scipy.spatial import cKDTree
 
-from bench.evaluate.evaluate import subsample
+from bench.evaluate.distances import Distances
 from bench.pictures.style import SCREEN, bare, save
-from datasets.mesh import Mesh
-from datasets.scene import sample_surface
 
-SURFACE_UP = np.array([0.0, 1.0, 0.0])
-COLOUR_END = 3.0  # distance of the last colour, as a multiple of the threshold
 PIXELS = 420  # side of a view
 MAX_POINTS_PER_SURFACE = 400_000
 FRAME_MARGIN = 1.1  # the frame is larger than the truth by this factor
@@ -36,55 +31,6 @@ CURVE_STEPS = 300
 COLOUR_POWER = 0.5  # small distances have more colours than large ones
 COLOUR_TICKS = (0, 0.02, 0.1, 0.33, 0.66, 1)  # fractions of the last colour's distance
 COLOURS = colormaps["turbo"].with_extremes(over="#5a5a5a")
-
-
-@dataclass(frozen=True)
-class Distances:
-    """The points at which a mesh and its truth are compared, with their distances to the other surface.
-
-    Args:
-        mesh: points of the mesh that count.
-        mesh_to_truth: distance of each; infinite where a protocol leaves it out.
-        truth: points of the truth that count.
-        truth_to_mesh: distance of each.
-        unit: of all lengths, such as mm.
-        threshold: of precision, recall and F-score; None without one.
-        up: upright axis of pictures, of any length.
-        colour_end: distance of the last colour.
-    """
-
-    mesh: Float[np.ndarray, "m 3"]
-    mesh_to_truth: Float[np.ndarray, " m"]
-    truth: Float[np.ndarray, "n 3"]
-    truth_to_mesh: Float[np.ndarray, " n"]
-    unit: str
-    threshold: float | None
-    up: Float[np.ndarray, "3"]
-    colour_end: float
-
-    @property
-    def extent(self) -> float:
-        """The diagonal of the box of the truth's points."""
-        return float(np.linalg.norm(np.ptp(self.truth, axis=0)))
-
-    def shares(self, limits: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], ...]:
-        """Precision and recall, the shares of points closer than each limit, and the F-score, from 0 to 1."""
-        precision, recall = (
-            np.searchsorted(np.sort(values), limits) / max(len(values), 1)
-            for values in (self.mesh_to_truth, self.truth_to_mesh)
-        )
-        both = precision + recall
-        return precision, recall, 2 * precision * recall / np.where(both > 0, both, 1)
-
-
-def compare_surfaces(
-    mesh: Mesh, truth: Mesh | Float[np.ndarray, "k 3"], *, count: int, seed: int, threshold: float, unit: str
-) -> Distances:
-    """The distances between random points of a mesh and those of a true mesh, or of a cloud of true points."""
-    predicted = sample_surface(mesh, count, seed + 1).points
-    true = sample_surface(truth, count, seed).points if isinstance(truth, Mesh) else subsample(truth, count, seed)
-    to_truth, to_mesh = cKDTree(true).query(predicted)[0], cKDTree(predicted).query(true)[0]
-    return Distances(predicted, to_truth, true, to_mesh, unit, threshold, SURFACE_UP, COLOUR_END * threshold)
 
 
 @rc_context(SCREEN)

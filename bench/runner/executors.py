@@ -19,6 +19,7 @@ from bench.config import find_class
 from bench.progress import notice
 from bench.records.results import Plan, PlannedRun
 from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed
+from bench.tables import names
 from datasets.extras import install_command
 
 Make = Callable[[PlannedRun], list[str]]  # runs a cell; returns messages if it leaves no record
@@ -32,7 +33,7 @@ class Launcher(ABC):
 
     Args:
         name: the name of the choice.
-        settings: `hydra.launcher`; its `executor` is a key of `LAUNCHERS`, or the dotted name of another launcher.
+        settings: `hydra.launcher`; its `executor` is the dotted name of the class, and none of them is `InTurn`.
         variables: environment variables for runs.
     """
 
@@ -81,11 +82,17 @@ def launcher_of(config: DictConfig) -> Launcher:
     """The launcher of a composed configuration.
 
     Raises:
-        ValueError: if its executor is unknown, or needs a package that is not installed.
+        ValueError: if its executor is no launcher, or needs a package that is not installed.
     """
     settings: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
-    executor = str(settings.get("executor", InTurn.executor))
-    cls = LAUNCHERS.get(executor) or find_class(executor, "hydra.launcher", (), Launcher)
+    cls: type[Launcher] = InTurn
+    if (executor := settings.get("executor")) is not None:  # Hydra's own launcher, `basic`, has no such key
+        try:
+            cls = find_class(executor, "hydra.launcher", config.packages, Launcher)
+        except ValueError as error:
+            choices = ", ".join(["basic", *names("hydra/launcher")])
+            text = f"hydra.launcher.executor={executor}: choose hydra/launcher={choices}, or a class: {error}"
+            raise ValueError(text) from error
     if cls.extra:
         try:
             import_module(cls.extra)
@@ -127,8 +134,6 @@ def run_in_turn(make: Make, cells: Iterable[PlannedRun]) -> Messages:
 
 class InTurn(Launcher):
     """Runs cells in this process, one after another; also those that are reused, in their order."""
-
-    executor: ClassVar[str] = "basic"  # Hydra's name; its launcher has no key `executor`
 
     def jobs(self, plan: Plan, reused: set[str]) -> list[list[PlannedRun]]:
         return [[cell] for cell in plan.cells]
@@ -185,6 +190,3 @@ def _worker_main(make: Make, channel: Connection) -> None:
             channel.send(make(cell))
     except (KeyboardInterrupt, EOFError):
         return
-
-
-LAUNCHERS: dict[str, type[Launcher]] = {InTurn.executor: InTurn, "workers": Workers}

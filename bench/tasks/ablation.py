@@ -11,7 +11,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from math import ceil
 from statistics import median
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -279,6 +279,7 @@ class SignCounter(Wrapper):
     inner: Field
     evaluated: int = 0
     negative: int = 0
+    keeps_values: ClassVar[bool] = True
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return self._counted(self.inner(points))

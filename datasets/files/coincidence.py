@@ -1,4 +1,4 @@
-"""Whether two things that must coincide do so, and else the change of one of them that fits: axes, units or origin."""
+"""Compares two things that must share a frame, and finds the change of axes, units or origin with which they fit."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -135,7 +135,7 @@ class Comparison:
         misfit: without a change.
         change: the simplest change among those that fit best; `IDENTITY` if no change fits much better.
         changed_misfit: with the change.
-        is_other_frame: whether the change is that of another frame: a poor result cannot be the cause.
+        is_other_frame: whether the change shows that the two frames differ; a poor result alone would not need it.
     """
 
     measure: Measure
@@ -307,44 +307,51 @@ def _search(
         centre, new_centre: before and after the change.
         sizes: before and after the change.
     """
-    ratio = sizes[1] / sizes[0]
-
-    def centred(turn: Float[np.ndarray, "3 3"], factor: float, target: Float[np.ndarray, "3"]) -> Change:
-        return Change(turn, factor, target - factor * turn @ centre)
 
     def measured(changes: Iterable[Change]) -> list[tuple[float, Change]]:
         return sorted(((misfit(change), change) for change in changes), key=lambda trial: trial[0])
 
-    def refined(start: Change) -> Iterator[Change]:
-        """The change after optimising its factor and shift, and the same with fewer components."""
-        target = start.apply(centre[None])[0]
-
-        def stepped(step: Float[np.ndarray, "4"]) -> Change:
-            return centred(start.turn, start.factor * exp(step[0]), target + step[1:] * sizes[1])
-
-        simplex = FIRST_STEP * np.concatenate([np.zeros((1, 4)), np.eye(4)])
-        options = {"initial_simplex": simplex, "maxfev": REFINING_STEPS}
-        step = minimize(lambda step: misfit(stepped(step)), np.zeros(4), method="Nelder-Mead", options=options).x
-        change = stepped(step)
-        for factor in (1.0, change.factor, *_unit_ratios(change.factor, REFINED_RATIO_TOLERANCE)):
-            yield Change(change.turn, factor, IDENTITY.shift)
-            yield centred(change.turn, factor, change.apply(centre[None])[0])
-
+    ratio = sizes[1] / sizes[0]
+    in_place_factors = (1.0, ratio, *_unit_ratios(ratio, SIZE_RATIO_TOLERANCE))
     trials_by_turn = [
         measured(
-            [
-                Change(turn, factor, IDENTITY.shift)
-                for factor in (1.0, ratio, *_unit_ratios(ratio, SIZE_RATIO_TOLERANCE))
-            ]
-            + [centred(turn, factor, new_centre) for factor in (1.0, ratio)]
+            [Change(turn, factor, IDENTITY.shift) for factor in in_place_factors]
+            + [_centred(turn, factor, centre, new_centre) for factor in (1.0, ratio)]
         )
         for turn in turns()
     ]
     unturned, *turned = trials_by_turn
     best_turned = sorted(turned, key=lambda trials: trials[0][0])[:REFINED_TURNS]
     starts = [trials[0][1] for trials in (unturned, *best_turned)]
-    refined_trials = measured(change for start in starts for change in refined(start))
-    trials = [*chain(*trials_by_turn), *refined_trials]
+    refined = measured(change for start in starts for change in _refined(start, misfit, centre, sizes[1]))
+    trials = [*chain(*trials_by_turn), *refined]
     limit = FAST_GAIN * min(value for value, _ in trials) + FAST_MISFIT
     similar = sorted((change for value, change in trials if value <= limit), key=lambda change: change.complexity)
-    return [*similar[:MAX_COMPARED], *(change for _, change in refined_trials)]
+    return [*similar[:MAX_COMPARED], *(change for _, change in refined)]
+
+
+def _centred(
+    turn: Float[np.ndarray, "3 3"], factor: float, centre: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
+) -> Change:
+    """The change that moves a centre to a target."""
+    return Change(turn, factor, target - factor * turn @ centre)
+
+
+def _refined(start: Change, misfit: Misfit, centre: Float[np.ndarray, "3"], size: float) -> Iterator[Change]:
+    """A change after optimising its factor and shift, and the same with fewer components.
+
+    Args:
+        size: after the change.
+    """
+    target = start.apply(centre[None])[0]
+
+    def stepped(step: Float[np.ndarray, "4"]) -> Change:
+        return _centred(start.turn, start.factor * exp(step[0]), centre, target + step[1:] * size)
+
+    simplex = FIRST_STEP * np.concatenate([np.zeros((1, 4)), np.eye(4)])
+    options = {"initial_simplex": simplex, "maxfev": REFINING_STEPS}
+    step = minimize(lambda step: misfit(stepped(step)), np.zeros(4), method="Nelder-Mead", options=options).x
+    change = stepped(step)
+    for factor in (1.0, change.factor, *_unit_ratios(change.factor, REFINED_RATIO_TOLERANCE)):
+        yield Change(change.turn, factor, IDENTITY.shift)
+        yield _centred(change.turn, factor, centre, change.apply(centre[None])[0])

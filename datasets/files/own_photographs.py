@@ -267,7 +267,8 @@ def _check_fit(capture: Capture, layout: Layout, settings: ReadSettings) -> tupl
     fit = capture.fit
     if fit is None:
         has_no_size = None in [frame.size for frame in layout.frames]
-        doubt = intrinsics_fault(layout.frames[0]) or (has_no_size and likely_cause(capture.shots))
+        fault = intrinsics_fault(layout.frames[0])
+        doubt = fault.text if fault else has_no_size and likely_cause(capture.shots)
         return replace(capture, notes=(*capture.notes, *filter(None, [layout.doubt]))), [doubt] if doubt else []
     overlap, shown = float(np.median(fit.overlaps)), float(np.median(fit.shown))
     text = f"the visual hull of the masks overlaps with them by {overlap:.0%} (median)"
@@ -281,7 +282,8 @@ def _check_fit(capture: Capture, layout: Layout, settings: ReadSettings) -> tupl
     notes = [text for text, fraction in fractions_by_text.items() if REFUSE_BELOW <= fraction < WARN_BELOW]
     refused = [text for text, fraction in fractions_by_text.items() if fraction < REFUSE_BELOW]
     if layout.doubt and overlap < GOOD_OVERLAP:
-        (refused or notes).insert(0, layout.doubt)
+        messages = refused or notes
+        messages.insert(0, layout.doubt)
     return replace(capture, notes=(*capture.notes, *notes)), refused
 
 
@@ -289,13 +291,13 @@ def _cause(layout: Layout, settings: ReadSettings) -> str:
     """The likely cause why cameras do not fit, with the remedy; "" if it is unknown."""
     fault = intrinsics_fault(layout.frames[0])
     scale = float(np.linalg.norm(layout.world[:3, 0]))
-    from_file = np.diag([scale, scale, scale, 1.0]), np.linalg.inv(layout.world)
+    resize, to_world = np.diag([scale, scale, scale, 1.0]), np.linalg.inv(layout.world)
     frames = [
-        replace(frame, world_to_camera=from_file[0] @ AXES[settings.axes] @ frame.world_to_camera @ from_file[1])
+        replace(frame, world_to_camera=resize @ AXES[settings.axes] @ frame.world_to_camera @ to_world)
         for frame in layout.frames
     ]
     shots, _ = read_shots(frames, MISTAKE_PIXELS)
     if not settings.masks or any(shot.mask is None or not bool(shot.mask.any()) for shot in shots):
-        return fault
+        return fault.text if fault else ""
     cause = "" if fault else likely_cause(shots)
-    return cause or likely_mistake(shots, frames, settings.axes) or fault
+    return cause or likely_mistake(shots, frames, settings.axes) or (fault.text if fault else "")

@@ -1,7 +1,7 @@
 """A decoder of shapes with colours, and its field at one code."""
 
 from dataclasses import dataclass
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 from jaxtyping import Float
@@ -44,6 +44,7 @@ class TexturedShape(Wrapper):
 
     inner: Field
     texture: BoundDecoder
+    keeps_values: ClassVar[bool] = True
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return self.inner(points)

@@ -32,6 +32,8 @@ def field_bounds(field: Field) -> Bounds | None:
         return partial(segment_bounds, field.hidden, field.last, field.skip)
     if not isinstance(field, Wrapper | Adjusted):
         return getattr(field, "bounds", None)
+    if not isinstance(field, Moved | Adjusted) and not field.keeps_values:
+        return None
     inner = field_bounds(field.inner)
     return None if inner is None else partial(_wrapped_bounds, field, inner)
 

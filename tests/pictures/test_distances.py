@@ -6,15 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from bench.pictures.distances import (
-    PIXELS,
-    Distances,
-    _brightness,
-    _camera_axes,
-    _splat,
-    compare_surfaces,
-    draw_distances,
-)
+from bench.evaluate.distances import Distances, measure_distances
+from bench.pictures.distances import PIXELS, _brightness, _camera_axes, _splat, draw_distances
 from tests.tiny import icosphere
 
 
@@ -33,11 +26,11 @@ def test_shares_are_of_points_closer_than_a_limit():
 
 def test_surfaces_are_compared_in_both_directions():
     small, large = icosphere(1.0, np.zeros(3), 4), icosphere(1.3, np.zeros(3), 4)
-    distances = compare_surfaces(small, large, count=4000, seed=0, threshold=0.2, unit="m")
+    distances = measure_distances(small, large, count=4000, seed=0, threshold=0.2, unit="m")
     assert (
         np.median(distances.mesh_to_truth) == pytest.approx(0.3, abs=0.01) and distances.shares(np.array([0.2]))[0] == 0
     )
-    cloud = compare_surfaces(small, large.vertices, count=4000, seed=0, threshold=0.2, unit="m")
+    cloud = measure_distances(small, large.vertices, count=4000, seed=0, threshold=0.2, unit="m")
     assert {*map(tuple, cloud.truth)} <= {*map(tuple, large.vertices)}
 
 

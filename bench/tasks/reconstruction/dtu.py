@@ -18,7 +18,7 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 from scipy.spatial import cKDTree
 
-from bench.pictures.distances import Distances
+from bench.evaluate.distances import Distances
 from bench.records.published import DVR_SCANS, DVR_TABLE2
 from bench.tasks.reconstruction.stereo import allowed_by_mask
 from datasets.files.meshes import read_points

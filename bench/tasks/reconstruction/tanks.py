@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from bench.pictures.distances import COLOUR_END, Distances
+from bench.evaluate.distances import COLOUR_END, Distances
 from bench.tasks.reconstruction.dtu import sample_mesh
 from datasets.files.meshes import read_points
 from datasets.mesh import Mesh

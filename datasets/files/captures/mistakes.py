@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -36,23 +37,28 @@ class Views:
     masks: tuple[Bool[np.ndarray, "_ _"], ...]
 
 
-def intrinsics_fault(frame: Frame, min_focal_to_width: float = IMPOSSIBLE_FOCAL_TO_WIDTH) -> str:
-    """What intrinsics are, if they cannot be pixels of the image, with the remedy; "" for others."""
+class IntrinsicsFault(NamedTuple):
+    """Why intrinsics are no pixels of their image, with the remedy: as they seem, and if they are no shares either."""
+
+    text: str
+    text_without_shares: str
+
+
+def intrinsics_fault(frame: Frame, min_focal_to_width: float = IMPOSSIBLE_FOCAL_TO_WIDTH) -> IntrinsicsFault | None:
+    """What intrinsics are, if they cannot be pixels of the image; None for others."""
     (fx, _, cx), (_, fy, cy), _ = frame.intrinsics
     height, width = frame.size or image_size(frame.image)[::-1]
     if min(fx / width, fy / height) >= min_focal_to_width:
-        return ""
+        return None
     if np.allclose((fx, fy), 1) and max(cx, cy) <= MAX_CENTRE_SHARE:
-        return "the focal length is 1 pixel, as without intrinsics: write K @ [R | t], not [R | t]"
+        text = "the focal length is 1 pixel, as without intrinsics: write K @ [R | t], not [R | t]"
+        return IntrinsicsFault(text, text)
     if max(fx, fy) < MAX_FOCAL_SHARE and max(cx, cy) <= MAX_CENTRE_SHARE:
-        return (
-            f"the intrinsics (fx={fx:.4g}, fy={fy:.4g}, cx={cx:.4g}, cy={cy:.4g}) are no pixels, but shares of the "
-            f"image: multiply fx and cx by {width}, fy and cy by {height}"
-        )
-    return (
-        f"the focal length ({fx:.4g}) is short for {width} pixels, as one in millimetres: multiply it by {width} / the "
-        "sensor's width"
-    )
+        text = f"the intrinsics (fx={fx:.4g}, fy={fy:.4g}, cx={cx:.4g}, cy={cy:.4g}) are no pixels"
+        shares = f"but shares of the image: multiply fx and cx by {width}, fy and cy by {height}"
+        return IntrinsicsFault(f"{text}, {shares}", f"{text}, and no shares of its sides: store pixels")
+    text = f"the focal length ({fx:.4g}) is short for {width} pixels, as one in millimetres: multiply it by {width} / "
+    return IntrinsicsFault(f"{text}the sensor's width", f"{text}the sensor's width")
 
 
 def likely_mistake(shots: Sequence[Shot], frames: Sequence[Frame], axes: str) -> str:
@@ -132,7 +138,9 @@ def _in_mask(
     return is_ahead & (mask[rows, columns] | ~is_shown), is_shown
 
 
-def _intrinsics_corrections(views: Views, frames: Sequence[Frame], fault: str) -> Iterator[tuple[str, Views]]:
+def _intrinsics_corrections(
+    views: Views, frames: Sequence[Frame], fault: IntrinsicsFault | None
+) -> Iterator[tuple[str, Views]]:
     """Intrinsics in pixels, instead of those that have a fault, or a principal point in the middle.
 
     Without a fault, the focal length stays. With a fault, the numbers are shares of the image, or of an unknown unit.
@@ -141,12 +149,11 @@ def _intrinsics_corrections(views: Views, frames: Sequence[Frame], fault: str) -
     stated, centres = np.stack([frame.intrinsics[:2] for frame in frames]), views.intrinsics[:, :2, 2] / sizes
     if (np.abs(centres - 0.5) > MAX_CENTRE_OFFSET).any():
         centres = np.full_like(centres, 0.5)
-    options = [(fault, stated[:, [0, 1], [0, 1]], stated[:, :, 2] - shift) for shift in (0, PIXEL_CENTRE)]
-    no_share, is_share, _ = fault.partition(", but shares")  # which are of another length, if only a search fits
-    searched = f"{no_share}, and no shares of its sides: store pixels" if is_share else fault
-    options += [(searched, ratio * sizes[:, :1] / sizes, centres) for ratio in FOCAL_TO_WIDTH]
-    if not fault:
-        text = "the principal point is another: check that cx and cy are not exchanged; the image's middle fits better"
+    if fault is not None:
+        options = [(fault.text, stated[:, [0, 1], [0, 1]], stated[:, :, 2] - shift) for shift in (0, PIXEL_CENTRE)]
+        options += [(fault.text_without_shares, ratio * sizes[:, :1] / sizes, centres) for ratio in FOCAL_TO_WIDTH]
+    else:
+        text = "the principal point is wrong: check that cx and cy are not exchanged; the image's middle fits better"
         options = [(text, views.intrinsics[:, [0, 1], [0, 1]] / sizes, np.full_like(centres, 0.5))]
     for text, focal_shares, centre_shares in options:
         intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))

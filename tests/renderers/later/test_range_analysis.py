@@ -13,6 +13,7 @@ from renderers.field import Counts, Kind, Meter, Moved, estimate_lipschitz
 from renderers.fields.analytic import Shape, box, sphere
 from renderers.fields.mlp import BoundDecoder, Decoder
 from renderers.later.affine import field_bounds, segment_bounds
+from renderers.newton.tracer import normalise_slope
 from renderers.rendering import Status
 from renderers.tracing.reference import trace
 from tests.looped import each
@@ -119,6 +120,7 @@ def test_a_wrapped_network_is_cast_by_the_same_bounds():
     limits = Limits(values=10**9, memory=64)
     for wrapped in (Meter(field), limits.watch(field, torch.device("cpu")), still, Meter(still)):
         torch.testing.assert_close(RENDERER.render(wrapped, rays).distance, plain.distance, rtol=0, atol=1e-9)
+    assert field_bounds(normalise_slope(field, 2.0)) is None  # its values are others
     moved = Moved(field, vector((0.1, -0.2, 0.3, 0.05, 0.1, -0.1, -0.7)))
     middle, half_segment = segments(200, 0.1)
     low, high = field_bounds(moved)(middle, half_segment)

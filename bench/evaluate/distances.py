@@ -1,0 +1,63 @@
+"""The distances between the points of a mesh and those of its truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from bench.evaluate.evaluate import subsample
+from datasets.mesh import Mesh
+from datasets.scene import sample_surface
+
+SURFACE_UP = np.array([0.0, 1.0, 0.0])
+COLOUR_END = 3.0  # distance of the last colour of pictures, as a multiple of the threshold
+
+
+@dataclass(frozen=True)
+class Distances:
+    """The points at which a mesh and its truth are compared, with their distances to the other surface.
+
+    Args:
+        mesh: points of the mesh that count.
+        mesh_to_truth: distance of each; infinite where a protocol leaves it out.
+        truth: points of the truth that count.
+        truth_to_mesh: distance of each.
+        unit: of all lengths, such as mm.
+        threshold: of precision, recall and F-score; None without one.
+        up: upright axis of pictures, of any length.
+        colour_end: distance of the last colour.
+    """
+
+    mesh: Float[np.ndarray, "m 3"]
+    mesh_to_truth: Float[np.ndarray, " m"]
+    truth: Float[np.ndarray, "n 3"]
+    truth_to_mesh: Float[np.ndarray, " n"]
+    unit: str
+    threshold: float | None
+    up: Float[np.ndarray, "3"]
+    colour_end: float
+
+    @property
+    def extent(self) -> float:
+        """The diagonal of the box of the truth's points."""
+        return float(np.linalg.norm(np.ptp(self.truth, axis=0)))
+
+    def shares(self, limits: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], ...]:
+        """Precision and recall, the shares of points closer than each limit, and the F-score, from 0 to 1."""
+        precision, recall = (
+            np.searchsorted(np.sort(values), limits) / max(len(values), 1)
+            for values in (self.mesh_to_truth, self.truth_to_mesh)
+        )
+        both = precision + recall
+        return precision, recall, 2 * precision * recall / np.where(both > 0, both, 1)
+
+
+def measure_distances(
+    mesh: Mesh, truth: Mesh | Float[np.ndarray, "k 3"], *, count: int, seed: int, threshold: float, unit: str
+) -> Distances:
+    """The distances between random points of a mesh and those of a true mesh, or of a cloud of true points."""
+    predicted = sample_surface(mesh, count, seed + 1).points
+    true = sample_surface(truth, count, seed).points if isinstance(truth, Mesh) else subsample(truth, count, seed)
+    to_truth, to_mesh = cKDTree(true).query(predicted)[0], cKDTree(predicted).query(true)[0]
+    return Distances(predicted, to_truth, true, to_mesh, unit, threshold, SURFACE_UP, COLOUR_END * threshold)
