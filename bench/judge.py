@@ -42,7 +42,7 @@ MAX_CULLING_PIXELS = 800  # longer side of a photograph whose mask culls a mesh
 UNIT_SUFFIXES = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None, "normal_consistency": None}
 WORLD_MESH_FILE = "mesh_world.ply"  # the mesh of a run on photographs, in the world of their cameras
 ROW_PICTURE_FILE = "distances.png"
-PICTURE_POINTS = 300_000  # per surface, so that the samples are not seen in the picture
+PICTURE_POINTS = 150_000  # per surface, so that the samples are not seen in the picture
 SURFACE_SAMPLING = "random points on each surface, uniform by area; distances to the nearest point of the other surface"
 SURFACE_MEANS = (
     "accuracy, completeness: mean distance from mesh to truth, from truth to mesh; chamfer_l1: their mean; "
@@ -199,8 +199,9 @@ class Judge:
         def draw(title: str, path: Path) -> None:
             pair = mesh, truth_points if surface is None else surface
             settings = {"seed": self.seed, "threshold": threshold, "unit": unit}
-            counts = self.points, max(self.points, PICTURE_POINTS)
-            measured, dense = (measure_distances(*pair, count=count, **settings) for count in counts)
+            measured = measure_distances(*pair, count=self.points, **settings)
+            count, limit = max(self.points, PICTURE_POINTS), 1.01 * measured.colour_end  # larger ones have one colour
+            dense = measure_distances(*pair, count=count, limit=limit, **settings)
             draw_distances(measured, title, path, dense)
 
         if surface is None:

@@ -49,7 +49,7 @@ STUDIES_LAYER = (
     "bench.tune", "bench.turntable", "bench.verify",
 )  # fmt: skip
 LISTS = ("bench", "bench.__main__", "renderers")  # import from all layers, to list what there is
-MAX_CORE_LINES = 12_850
+MAX_CORE_LINES = 13_000
 CORE_MAY = {  # the libraries of the core
     "torch", "jaxtyping", "safetensors", "numpy", "scipy", "skimage", "trimesh", "open3d", "matplotlib", "PIL", "hydra",
     "omegaconf", "yaml", "rich", "filelock", "psutil",

@@ -1,6 +1,7 @@
 """The distances between the points of a mesh and those of its truth."""
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 from jaxtyping import Float
@@ -54,10 +55,25 @@ class Distances:
 
 
 def measure_distances(
-    mesh: Mesh, truth: Mesh | Float[np.ndarray, "k 3"], *, count: int, seed: int, threshold: float, unit: str
+    mesh: Mesh,
+    truth: Mesh | Float[np.ndarray, "k 3"],
+    *,
+    count: int,
+    seed: int,
+    threshold: float,
+    unit: str,
+    limit: float = inf,
 ) -> Distances:
-    """The distances between random points of a mesh and those of a true mesh, or of a cloud of true points."""
+    """The distances between random points of a mesh and those of a true mesh, or of a cloud of true points.
+
+    Args:
+        limit: larger distances are taken as this one, which is faster: far surfaces have many points as near as each
+            other.
+    """
     predicted = sample_surface(mesh, count, seed + 1).points
     true = sample_surface(truth, count, seed).points if isinstance(truth, Mesh) else subsample(truth, count, seed)
-    to_truth, to_mesh = cKDTree(true).query(predicted)[0], cKDTree(predicted).query(true)[0]
+    to_truth, to_mesh = (
+        np.minimum(cKDTree(points).query(queries, distance_upper_bound=limit)[0], limit)
+        for points, queries in ((true, predicted), (predicted, true))
+    )
     return Distances(predicted, to_truth, true, to_mesh, unit, threshold, SURFACE_UP, COLOUR_END * threshold)

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datasets.files import coincidence
 from datasets.files.coincidence import IDENTITY, Change, compare_outlines, compare_surfaces, samples_of, settled, turns
 from datasets.files.own_photographs import read_capture
 from datasets.mesh import Mesh
@@ -55,7 +56,8 @@ def test_there_are_24_rotations_and_24_mirrors_and_the_commonest_is_first():
     lambda p: p + 0.05 * np.random.default_rng(1).normal(size=p.shape), lambda p: p[p[:, 0] > 0], lambda p: 0.8 * p,
     lambda p: 0.6 * p / np.linalg.norm(p, axis=1, keepdims=True), lambda p: p + 0.1, lambda p: p * (1, 1, 0.6),
 ])  # fmt: skip
-def test_a_poor_or_partial_surface_is_no_other_frame(spoil):
+def test_a_poor_or_partial_surface_is_no_other_frame(spoil, monkeypatch):
+    monkeypatch.setattr(coincidence, "SAMPLES", (10_000, 300))  # faster
     for is_partial in (False, True):
         assert not compare_surfaces(spoil(POINTS), POINTS, is_partial=is_partial).is_other_frame
         assert not compare_surfaces(POINTS, spoil(POINTS), is_partial=is_partial).is_other_frame
