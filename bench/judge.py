@@ -109,8 +109,8 @@ class Judge:
     tanks_settings: tanks.TanksSettings = tanks.PUBLISHED
 
     def __post_init__(self) -> None:
-        if self.folder is not None and self.unit_sphere:
-            raise ValueError("--unit-sphere is for --truth, and DTU's distances are in mm: leave it out")
+        if self.folder is not None and (self.unit_sphere or self.threshold != DEFAULT_THRESHOLD):
+            raise ValueError("--unit-sphere and --threshold are for --truth: --dtu has mm and no F-score")
         if self.tanks_folder is not None and (self.unit_sphere or self.threshold != DEFAULT_THRESHOLD):
             raise ValueError("--unit-sphere and --threshold are for --truth: --tnt has metres and a scene's threshold")
         if self.tanks_folder is None and self.tanks_settings != tanks.PUBLISHED:

@@ -185,7 +185,8 @@ def test_what_is_no_mesh_is_refused_by_its_cause(files, capsys):
     assert "is a folder, and" in refused(capsys, truth, "--truth", files / "truth")
     assert "--points must be at least 1" in refused(capsys, truth, "--truth", truth, "--points", 0)
     assert "add --method NAME" in refused(capsys, truth, "--truth", truth, "--into", files / "results")
-    assert "--unit-sphere is for --truth" in refused(capsys, truth, "--dtu", files, "--unit-sphere")
+    for option in (["--unit-sphere"], ["--threshold", "2"]):
+        assert "are for --truth: --dtu has mm" in refused(capsys, truth, "--dtu", files, *option)
     assert "does not end in the number of a scan" in refused(capsys, truth, "--dtu", files)
 
 

@@ -92,9 +92,12 @@ def _entry(words: list[str], ids: Collection[str]) -> Entry | None:
 
 
 def _text_rows(content: bytes) -> Iterator[list[str]]:
-    """The words of each line, with those of the last line that has only a split, as a heading of the lines below it.
+    """The words of each line. A line with only a split, such as `train`, is a heading: its word joins those below it.
 
     If a first line names the column of the split, only the words of this column are splits.
+
+    Raises:
+        ValueError: the column of the split has another word.
     """
     lines = [line for line in decode(content).split("\n") if line.strip()]
     column, section = None, list[str]()
@@ -104,10 +107,12 @@ def _text_rows(content: bytes) -> Iterator[list[str]]:
         if i == 0 and ID_HEADINGS & {*headings}:
             column = next((k for k, heading in enumerate(headings) if heading in SPLIT_HEADINGS), None)
         elif column is not None and column < len(words):
+            if words[column].lower() not in SPLITS:
+                raise ValueError(f"its column of splits has {words[column]!r}: write train, val or test")
             others = [word for k, word in enumerate(words) if k != column and word.lower() not in SPLITS]
             yield [*others, words[column]]
-        elif (stated := [word for word in words if word]) and stated[0].lower() in SPLITS and len(stated) == 1:
-            section = stated
+        elif [word.lower() for word in words if word] in [[word] for word in SPLITS]:
+            section = [word for word in words if word]
         else:
             yield [*section, *words]
 
@@ -120,7 +125,8 @@ def _json_rows(node: Any, path: list[str], ids: Collection[str]) -> Iterator[lis
     if isinstance(node, dict):
         texts = [value for key, value in node.items() if isinstance(value, str) and key not in ids]
         is_record = all(isinstance(value, str) and key not in ids for key, value in node.items())
-        yield from [[*path, *chain.from_iterable(map(SEPARATORS.split, texts))]] if is_record and node else ()
+        if is_record and node:
+            yield [*path, *chain.from_iterable(map(SEPARATORS.split, texts))]
         for key, value in node.items():
             words = [*path, *texts, *SEPARATORS.split(key)]
             if key in ids and isinstance(value, str):

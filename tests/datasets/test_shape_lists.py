@@ -114,6 +114,12 @@ def test_other_json_is_refused(tmp_path, text):
         read_lists(tmp_path / "split.json", CAR, IDS)
 
 
+def test_a_column_of_splits_with_numbers_is_refused(tmp_path):
+    (tmp_path / "all.csv").write_text("modelId,split\n" + "".join(f"{name},{i % 2}\n" for i, name in enumerate(IDS)))
+    with pytest.raises(ValueError, match="has '0': write train, val or test"):
+        read_lists(tmp_path / "all.csv", CAR, IDS)
+
+
 def test_no_shape_is_lost_or_in_two_splits_and_the_counts_are_noted(tmp_path):
     for i, name in enumerate(IDS):
         write_shape(tmp_path, CAR, name, version=1 + (i < 6))
