@@ -4,6 +4,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -44,11 +45,16 @@ def shape_numbers(mesh: Mesh) -> Float[np.ndarray, "12"]:
     return np.concatenate([(high - low) / mesh.diagonal, weights @ sums / 3, moments[np.triu_indices(3)] / 12])
 
 
+@lru_cache
+def _code() -> bytes:
+    """The code on which the numbers of a file depend, that of its readers too."""
+    return b"\0".join(file.read_bytes() for file in sorted(Path(__file__).parent.rglob("*.py")))
+
+
 def _cached_numbers(file: Path, cache: Path) -> Float[np.ndarray, "12"] | None:
     """See `shape_numbers`; None for a file that cannot be read."""
-    code = Path(__file__).read_bytes()
-    content = file.read_bytes()
-    entry = cache / f"{hashlib.sha256(b'%b%b%b' % (code, file.suffix.lower().encode(), content)).hexdigest()[:16]}.npy"
+    key = hashlib.sha256(b"\0".join([_code(), file.suffix.lower().encode(), file.read_bytes()]))
+    entry = cache / f"{key.hexdigest()[:16]}.npy"
     with suppress(OSError, EOFError, ValueError):
         return np.load(entry)
     try:
