@@ -15,7 +15,7 @@ from bench.records.format import plural
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
 from bench.records.results import Plan, PlannedRun
 from bench.runner.executors import Jobs, Launcher, Make, Messages
-from bench.runner.plan import duration_group, durations_of_similar_runs, iterations
+from bench.runner.plan import duration_group, durations_of_similar_runs
 from bench.runner.process import catch_signals, stop_signal
 
 CLUSTERS = ("slurm", "local")
@@ -75,8 +75,8 @@ class Slurm(Launcher):
         cells = [cell for cell in plan.cells if cell.id not in reused]
         expected = []
         for cell in cells:
-            times = measured[duration_group(vars(cell))]
-            duration = iterations(cell.config) * median(times) if times else default
+            times = [run.scaled(cell.config) for run in measured[duration_group(vars(cell))]]
+            duration = median(times) if times else default
             expected.append(min(duration, cell.config["time_limit"] or inf))
         groups = group_by_duration(expected, 60 * settings["minutes_per_job"] * settings["tasks_per_node"])
         return [[cells[index] for index in group] for group in groups]

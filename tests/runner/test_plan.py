@@ -205,7 +205,8 @@ def times_of(tmp_path, monkeypatch):
         )
         record = run(**like)
         cells = [PlannedRun("c", [], record["task"], record["renderer"], "sofa", 0, record["config"], record["method"])]
-        return durations_of_similar_runs(Plan("p", tmp_path, cells), set())[duration_group(record)], len(read)
+        durations = durations_of_similar_runs(Plan("p", tmp_path, cells), set())[duration_group(record)]
+        return [duration.scaled(record["config"]) for duration in durations], len(read)
 
     return similar_times
 
@@ -219,7 +220,8 @@ def test_similar_runs_have_the_same_task_renderer_and_scale_and_ended_by_themsel
     assert times_of([*other, run(2.0), run(3.0, status="timeout")]) == ([2.0, 3.0], 2)
     assert times_of([run(2.0), run(3.0, method="dist/mask")], method="dist/mask") == ([3.0], 1)
     longer = {"scale": {"name": "smoke"}, "task": {"optimiser": {"iterations": 4}}}
-    assert times_of([run(2.0, config=longer)]) == ([0.5], 1)  # per iteration
+    phases = {"total": 2.0, "forward": 1.0, "backward": 0.6}  # the loop of four iterations takes 1.6 of 2 seconds
+    assert times_of([run(config=longer, seconds=phases)]) == ([pytest.approx(0.8)], 1)
 
 
 def test_a_plan_names_the_file_of_a_dataset(tmp_path, capsys):
