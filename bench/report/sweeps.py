@@ -339,6 +339,9 @@ def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict
     values = {row: metric.factor * interval.value for row, interval in interval_by_row.items()}
     shapes = format.plural(len({records.solid(run) for run in sweep.runs.records}), "shape")
     verdict = [extremes(f"Median {metric.label}", values, shapes, largest_first=is_higher_better)]
+    question = f"Which has the {'highest' if is_higher_better else 'lowest'} {metric.label.split(' (')[0]}?"
+    if not verdict[0]:  # half of the runs of every row failed
+        return {"question": question}
     best = dict[str, str]()
     for dataset in sweep.datasets:
         intervals = {line["row"]: line[_on(lead, dataset)] for line in lines}
@@ -346,17 +349,27 @@ def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict
         best |= {dataset: (max if is_higher_better else min)(medians, key=medians.__getitem__)} if medians else {}
     if len({*best.values()}) > 1:
         verdict.append(f"Best by data set: {', '.join(f'{dataset} {row}' for dataset, row in best.items())}.")
-    if not any(interval.has_ends for interval in interval_by_row.values()):
-        verdict.append(f"With {FEW}, the order is not certain.")
-    costs = {line["row"]: line["evaluations_cost"] for line in lines if line["evaluations_cost"]}
-    if len({*costs.values()}) > 1:
-        ordered = sorted(costs, key=lambda row: costs[row])
-        low, high = (f"{format.count(costs[row])} ({row})" for row in (ordered[0], ordered[-1]))
-        verdict.append(f"Field evaluations: {low} to {high}.")
-    return {
-        "question": f"Which has the {'highest' if is_higher_better else 'lowest'} {metric.label.split(' (')[0]}?",
-        "verdict": " ".join(filter(None, verdict)),
-    }
+    verdict.append(_doubt(sweep, interval_by_row, is_higher_better=is_higher_better))
+    costs = {line["row"]: line["evaluations_cost"] for line in lines if line["evaluations_cost"] and not line["failed"]}
+    ordered = sorted(costs, key=lambda row: costs[row])
+    if len(texts := {row: f"{format.count(costs[row])} ({row})" for row in ordered}) > 1:
+        low, high = texts[ordered[0]], texts[ordered[-1]]
+        verdict.append(f"Field evaluations: {low} to {high}." if low.split()[0] != high.split()[0] else "")
+    return {"question": question, "verdict": " ".join(filter(None, verdict))}
+
+
+def _doubt(sweep: Sweep, intervals: dict[str, Interval], *, is_higher_better: bool) -> str:
+    """Why the order of the rows is not certain; empty if the best interval overlaps with no other."""
+    rows = grouped(sweep.runs.records, itemgetter("row"))
+    if len({frozenset(map(records.solid, rows[name])) for name in intervals}) > 1:
+        return "The rows have different shapes, so their medians do not compare."
+    if not all(interval.has_ends for interval in intervals.values()):
+        return f"With {FEW}, the order is not certain."
+    best, *others = sorted(intervals, key=lambda row: intervals[row].value, reverse=is_higher_better)
+    overlaps = [
+        r for r in others if intervals[r].low <= intervals[best].high and intervals[best].low <= intervals[r].high
+    ]
+    return f"The interval of {best} overlaps with those of {', '.join(overlaps)}." if overlaps else ""
 
 
 def _failed(line: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ import pytest
 from bench.records.read import read_plans, read_records
 from bench.records.results import Plan, PlannedRun
 from bench.report.__main__ import main as report
-from bench.report.sweeps import COST, RUNTIME, lines, of_plan, write_sweep, write_sweeps
+from bench.report.sweeps import COST, RUNTIME, lines, of_plan, table_of, write_sweep, write_sweeps
 from bench.report.write.html import ASSETS
 from bench.report.write.paper import find_sweeps
 from tests.report.test_report import record, write_run
@@ -92,7 +92,7 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     assert shown.question == "Which has the lowest Chamfer?"
     assert shown.verdict == (
         "Median Chamfer (x1000): *2.50* (DIST) to 3.00 (DVR); n = 3 shapes. Best by data set: sofa DIST, plane DVR. "
-        "With fewer than six shapes, the order is not certain."
+        "The rows have different shapes, so their medians do not compare."
     )
     assert "n = 5 runs (3 shapes, 1 seed); fewer than six shapes: no interval." in shown.caption
     panels = shown.chart["panels"]
@@ -116,6 +116,23 @@ def test_a_sweep_of_renderings_has_the_errors_and_costs_of_table_1(tmp_path):
     header = (tmp_path / "sweeps" / "completion-1" / "table.md").read_text()
     titles = ("wrong pixels", "missed pixels", "spurious pixels", "median depth error (x1000)", "rendering (ms)")
     assert all(title in header for title in titles) and "queries |" not in header
+
+
+@pytest.mark.parametrize(("errors", "answer"), [
+    ({"dist": [1.0, 2.0], "dvr": [3.0, 3.0]}, "With fewer than six shapes, the order is not certain."),
+    ({"dist": [1.0, 2.0, 9.0], "dvr": [3.0]}, "The rows have different shapes, so their medians do not compare."),
+    ({"dist": [1, 2, 3, 4, 5, 6], "dvr": [1, 2, 3, 4, 5, 7]}, "The interval of DIST overlaps with those of DVR."),
+    ({"dist": [1.0, 1.1, 1.2, 1.3, 1.4, 1.5], "dvr": [9.0] * 6}, "n = 6 shapes."),
+    ({"dist": [None, None], "dvr": [None, None]}, ""),
+])  # fmt: skip
+def test_the_answer_of_a_sweep_says_whether_its_order_is_certain(tmp_path, errors, answer):
+    cells = [(cell(name, index=i), error) for name, values in errors.items() for i, error in enumerate(values)]
+    swept(tmp_path, [planned for planned, _ in cells])
+    for planned, error in cells:
+        ran(tmp_path, planned, error)
+    sweep = of_plan(read_plans(tmp_path)[0][0], {r["folder"]: r for r in read_records(tmp_path)[0]})
+    verdict = table_of(sweep).verdict
+    assert verdict.endswith(answer) and bool(verdict) == bool(answer)
 
 
 def test_a_row_of_which_every_run_failed_is_in_the_table_and_the_chart(tmp_path):
