@@ -1,6 +1,7 @@
 """Lists of shapes in the forms that are published: no shape is lost, and none is in two splits."""
 
 import json
+import shutil
 from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
@@ -11,9 +12,12 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from datasets.files.duplicates import SAME_SHAPE_TOLERANCE, same_shape, shape_numbers
 from datasets.files.local import LocalMeshes
+from datasets.files.meshes import read_mesh
 from datasets.files.shape_lists import read_lists
 from datasets.files.shapenet import ShapeNet
+from datasets.mesh import Mesh
 from datasets.scene import Split
 from tests.datasets.test_shapenet import write_shape
 
@@ -154,3 +158,35 @@ def test_files_with_the_same_shape_are_one_shape(tmp_path):
     (tmp_path / "9.obj").write_text("no mesh")  # it is an error only where it is used
     boxes[0].apply_transform(np.diag([1, 1, 1.01, 1])).export(tmp_path / "8.obj")
     assert len(LocalMeshes(str(tmp_path), 0.97, 1.0)._meshes) == 8
+
+
+def test_other_shapes_with_the_same_moments_are_kept(tmp_path):
+    bar, ball, stud = trimesh.creation.box((0.3, 0.3, 1)), trimesh.creation.icosphere(3), trimesh.creation.icosphere(1)
+    for _ in range(3):
+        bar = bar.subdivide()
+    for name, turn in (("left", -1.0), ("right", 1.0)):
+        twisted, angles = bar.copy(), turn * bar.vertices[:, 2]
+        x, y, z = bar.vertices.T
+        twisted.vertices = np.stack(
+            [x * np.cos(angles) - y * np.sin(angles), x * np.sin(angles) + y * np.cos(angles), z], axis=1
+        )
+        twisted.export(tmp_path / f"{name}.ply")
+    ball.export(tmp_path / "ball.stl")
+    (ball + stud.apply_scale(0.02).apply_translation((0.7, 0.7, 0.7))).export(tmp_path / "stud.obj")
+    for first, second in (("left.ply", "right.ply"), ("ball.stl", "stud.obj")):
+        numbers = [shape_numbers(read_mesh(tmp_path / name)) for name in (first, second)]
+        assert np.abs(numbers[0] - numbers[1]).max() < SAME_SHAPE_TOLERANCE
+    dataset = LocalMeshes(str(tmp_path), 0.97, 1.0)
+    assert len(dataset._meshes) == 4 == len(LocalMeshes(str(tmp_path), 0.97, 1.0)._meshes)  # then from the cache
+    shutil.copy(tmp_path / "left.ply", tmp_path / "left (1).ply")
+    (ball + stud).apply_scale(9).export(tmp_path / "stud (1).ply")
+    assert len(LocalMeshes(str(tmp_path), 0.97, 1.0)._meshes) == 4
+
+
+def test_the_same_surface_in_other_colours_is_another_shape():
+    box = trimesh.creation.box()
+    red, blue, dark_red, plain = (
+        Mesh(box.vertices * size, box.faces, colours=None if colour is None else np.tile(colour, (8, 1)))
+        for size, colour in ((1, (1, 0, 0)), (2, (0, 0, 1)), (3, (0.99, 0, 0)), (4, None))
+    )
+    assert [same_shape(red, other) for other in (blue, dark_red, plain)] == [False, True, True]
