@@ -1,5 +1,6 @@
 """Lists of shapes: the ids of a class in each split, from JSON, CSV or lines of text."""
 
+import csv
 import json
 import re
 from collections.abc import Collection, Iterator
@@ -8,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from datasets.files.readers.text import decode, wrong_kind_message
+from datasets.files.readers.text import decode, decode_with_comments, wrong_kind_message
 from datasets.scene import Split
 
 SYNSETS = {  # the classes of Choy et al. 2016, of which DeepSDF takes five
@@ -75,7 +76,7 @@ def _entries(file: Path, ids: Collection[str]) -> list[Entry]:
             raise ValueError(fault)
         rows = _json_rows(json.loads(decode(content)), [], ids) if file.suffix == ".json" else _text_rows(content)
         return [entry for words in rows if (entry := _entry(words, ids))]
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, RecursionError, csv.Error) as error:
         raise ValueError(f"dataset.split: '{file}' cannot be read as a split of DeepSDF or a list: {error}") from None
 
 
@@ -94,27 +95,46 @@ def _entry(words: list[str], ids: Collection[str]) -> Entry | None:
 def _text_rows(content: bytes) -> Iterator[list[str]]:
     """The words of each line. A line with only a split, such as `train`, is a heading: its word joins those below it.
 
-    If a first line names the column of the split, only the words of this column are splits.
-
-    Raises:
-        ValueError: the column of the split has another word.
+    If the first line has headings of ids and splits, the file is a table; see `_table_rows`.
     """
     lines = [line for line in decode(content).split("\n") if line.strip()]
-    column, section = None, list[str]()
-    for i, line in enumerate(lines):
+    headings = {*SEPARATORS.split("".join(lines[:1]).lower().strip(' "\t'))}
+    has_ids, has_splits = bool(headings & ID_HEADINGS), bool(headings & SPLIT_HEADINGS)
+    if has_ids and has_splits:
+        yield from _table_rows(decode_with_comments(content))
+        return
+    section = list[str]()
+    for line in lines[has_ids:]:
         words = SEPARATORS.split(line.strip(' "\t'))
-        headings = [word.lower() for word in words]
-        if i == 0 and ID_HEADINGS & {*headings}:
-            column = next((k for k, heading in enumerate(headings) if heading in SPLIT_HEADINGS), None)
-        elif column is not None and column < len(words):
-            if words[column].lower() not in SPLITS:
-                raise ValueError(f"its column of splits has {words[column]!r}: write train, val or test")
-            others = [word for k, word in enumerate(words) if k != column and word.lower() not in SPLITS]
-            yield [*others, words[column]]
-        elif [word.lower() for word in words if word] in [[word] for word in SPLITS]:
+        if [word.lower() for word in words if word] in [[word] for word in SPLITS]:
             section = [word for word in words if word]
         else:
             yield [*section, *words]
+
+
+def _table_rows(text: str) -> Iterator[list[str]]:
+    """The words of each row: of the columns of ids after other columns, and at last the split, from its column.
+
+    Raises:
+        ValueError: the column of the split has another word.
+        csv.Error: a quotation mark is not closed.
+    """
+    lines = [line for line in text.split("\n") if line.strip() and not line.lstrip().startswith("#")]
+    delimiter = next((mark for mark in ",;\t" if mark in lines[0]), " ")
+    first, *rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
+    headings = [SEPARATORS.split(cell.strip().lower()) for cell in first]
+    columns = sorted(range(len(headings)), key=lambda k: bool(ID_HEADINGS & {*headings[k]}))
+    column = min((k for k in columns if SPLIT_HEADINGS & {*headings[k]}), key=lambda k: len(headings[k]))
+    columns.remove(column)
+    for row in rows:
+        cells = [cell.strip() for cell in row] + [""] * (len(headings) - len(row))
+        split = cells[column].partition("#")[0].strip()
+        if split.lower() in SPLITS:
+            words = [(word, cells[k]) for k in columns for word in SEPARATORS.split(cells[k])]
+            words = [word for word, cell in words if not (word in SYNSETS and " " in cell)]  # "office chair" is a name
+            yield [*(word for word in words if word.lower() not in SPLITS), split]
+        elif any(cells):
+            raise ValueError(f"its column of splits has {split!r}: write train, val or test")
 
 
 def _json_rows(node: Any, path: list[str], ids: Collection[str]) -> Iterator[list[str]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from datasets.files.duplicates import SAME_SHAPE_TOLERANCE, same_shape, shape_numbers
@@ -69,6 +69,12 @@ FORMS: dict[str, Write] = {
     "all.csv": table("id,synsetId,subSynsetId,modelId,split", "{n:06d},{s},{s},{i},{split}", ","),
     "quoted.csv": table('"split","synsetId","modelId"', '"{split}","{s}","{i}"', ","),
     "names.csv": table("modelId,set,category,synsetId", "{i},{split},train,{s}", ","),
+    "with_paths.csv": table("model_id,path,split", "{i},{s}/{i}/models/model_normalized.obj,{split}", ","),
+    "with_names.csv": table("split,modelId,name,synsetId", '{split},{i},"a blue, office #{n} chair",{s}', ","),
+    "unquoted_names.csv": table("modelId;synset;name;set", "{i};{s};police car;{split}", ";"),
+    "empty_cells.csv": table("synsetId,modelId,subSynsetId,tags,split", "{s},{i},,,{split}", ","),
+    "empty_cells.tsv": table("synsetId,modelId,subSynsetId,split", "{s},{i},,{split}", "\t"),
+    "spaces.txt": table("synsetId modelId split", "{s}  {i} {split}", ","),
     "tabs.txt": table("", "{s},{i},{split}", "\t"),
     "semicolons.txt": table("", "{split},{s},{i}", "; "),
     "files.lst": table("", "{split}/{s}/{i}/models/model_normalized.obj", ","),
@@ -94,6 +100,10 @@ def names_of(dataset: ShapeNet) -> dict[str, list[str]]:
 @given(
     st.sampled_from([*FORMS]), st.sampled_from(ENCODINGS), st.sampled_from(["\n", "\r\n"]), st.booleans(), st.booleans()
 )
+@example(form="with_paths.csv", encoding="utf-8", line_end="\n", no_zero=False, on_disk=False)
+@example(form="with_names.csv", encoding="utf-8", line_end="\n", no_zero=False, on_disk=False)
+@example(form="unquoted_names.csv", encoding="utf-8", line_end="\n", no_zero=False, on_disk=False)
+@example(form="empty_cells.csv", encoding="utf-8", line_end="\n", no_zero=False, on_disk=False)
 def test_each_form_gives_all_shapes_of_each_split(tmp_path, form, encoding, line_end, no_zero, on_disk):
     number = CAR.lstrip("0") if no_zero else CAR  # as a spreadsheet stores it
     text = FORMS[form]({CHAIR: OTHERS, number: SPLITS})
@@ -121,6 +131,13 @@ def test_other_json_is_refused(tmp_path, text):
 def test_a_column_of_splits_with_numbers_is_refused(tmp_path):
     (tmp_path / "all.csv").write_text("modelId,split\n" + "".join(f"{name},{i % 2}\n" for i, name in enumerate(IDS)))
     with pytest.raises(ValueError, match="has '0': write train, val or test"):
+        read_lists(tmp_path / "all.csv", CAR, IDS)
+
+
+@pytest.mark.parametrize("line", ['a1,"office,train', "a1,office", "a1,office,", "a1,train,office"])
+def test_a_row_without_a_split_in_its_column_is_refused(tmp_path, line):
+    (tmp_path / "all.csv").write_text(f"modelId,name,split\n{line}\na2,chair,test\n")
+    with pytest.raises(ValueError, match=r"all.csv' cannot be read as a split .*: (its column|unexp)"):
         read_lists(tmp_path / "all.csv", CAR, IDS)
 
 

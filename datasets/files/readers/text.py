@@ -162,16 +162,18 @@ def wrong_kind_message(path: Path) -> str:
     return next((what for start, what in OTHER_FILE_SIGNATURES.items() if begins.startswith(start)), "")
 
 
+def decode_with_comments(content: bytes) -> str:
+    """The text of a file with line ends \\n and without byte-order mark."""
+    text = content.decode("utf-16" if content.startswith(UTF16_MARKS) else "utf-8-sig", "replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
 def decode(content: bytes) -> str:
     """The text of a file with line ends \\n, without comments and without byte-order mark.
 
     A `#` in the name of a material or of its image does not begin a comment.
     """
-    text = (
-        content.decode("utf-16" if content.startswith(UTF16_MARKS) else "utf-8-sig", "replace")
-        .replace("\r\n", "\n")
-        .replace("\r", "\n")
-    )
+    text = decode_with_comments(content)
 
     def keep_names(comment: re.Match) -> str:
         return comment[0] if LINE_WITH_NAME.match(text, text.rfind("\n", 0, comment.start()) + 1) else ""
