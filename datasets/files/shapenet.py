@@ -75,7 +75,8 @@ class ShapeNet:
         file = self._file(split, index)
         mesh, notes = _load(file, self.normalised), [f"the shape is {_id(file)}"]
         if missing := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
-            text = f"{len(missing)} shapes of the list are not on disk, and left out, such as {min(missing)}"
+            count = _counted(len(missing), "shape of the list is", "shapes of the list are")
+            text = f"{count} not on disk, and left out, such as {min(missing)}"
             notes.append(f"warning: {text}")
         return replace(mesh, repairs=(*notes, *self._counts, *mesh.repairs))
 
@@ -84,11 +85,13 @@ class ShapeNet:
         """Notes on the numbers of shapes: on disk, in each split, in several lists, and of each release."""
         on_disk, counts = [*_shapes(self.folder).values()], {split: len({*self.files[split]}) for split in Split}
         listed = ", ".join(f"{count} {split}" for split, count in counts.items())
-        yield f"{len(on_disk)} shapes on disk, {len({*chain(*self.files.values())})} used: {listed}"
+        used = len({*chain(*self.files.values())})
+        yield f"{_counted(len(on_disk), 'shape', 'shapes')} on disk, {used} used: {listed}"
         if repeated := sum(map(len, self.lists.values())) - len({*chain(*self.lists.values())}):
-            yield f"warning: {repeated} shapes are in several lists, and only used in the last: train, validation, test"
+            count = _counted(repeated, "shape is", "shapes are")
+            yield f"warning: {count} in several lists, and only used in the last: train, validation, test"
         if 0 < (first := sum(file.parent.name != "models" for file in on_disk)) < len(on_disk):
-            yield f"{len(on_disk) - first} shapes are of ShapeNetCore v2, and {first} of v1"
+            yield f"{_counted(len(on_disk) - first, 'shape is', 'shapes are')} of ShapeNetCore v2, and {first} of v1"
 
     def texture(self, split: Split, index: int) -> Texture:
         """The colours of a shape from its file; see `Textured`."""
@@ -109,7 +112,8 @@ class ShapeNet:
             if split is not Split.TEST:
                 what = "and a prior is trained on some: put their list beside dataset.split, unpack more shapes, "
                 what += "or set prior=deepsdf prior.path=FOLDER"
-            raise BadInput(f"{self.name} has {len(files)} {split} shapes in '{self.folder}', {what}")
+            count = _counted(len(files), f"{split} shape", f"{split} shapes")
+            raise BadInput(f"{self.name} has {count} in '{self.folder}', {what}")
         return files[index % len(files)]
 
     @cached_property
@@ -147,6 +151,10 @@ class ShapeNet:
         shapes = hashlib.sha256(json.dumps(names).encode()).hexdigest()
         renders = {} if self.renders is None else {"renders": self.renders}
         return {"name": self.name, "version": VERSION, "shapes": shapes, "normalised": self.normalised} | renders
+
+
+def _counted(count: int, singular: str, plural: str) -> str:
+    return f"{count} {singular if count == 1 else plural}"
 
 
 def _id(file: Path) -> str:

@@ -142,8 +142,16 @@ def test_a_row_without_a_split_in_its_column_is_refused(tmp_path, line):
 
 
 def test_no_shape_is_lost_or_in_two_splits_and_the_counts_are_noted(tmp_path):
+    write_shape(tmp_path, CAR, IDS[0])
+    assert (
+        "1 shape on disk, 1 used: 0 train, 0 validation, 1 test" in shapenet(tmp_path, None).mesh(Split.TEST, 0).repairs
+    )
+    write_shape(tmp_path, CAR, IDS[6], version=1)
+    notes = shapenet(tmp_path, None).mesh(Split.TEST, 0).repairs
+    assert "1 shape is of ShapeNetCore v2, and 1 of v1" in notes
     for i, name in enumerate(IDS):
-        write_shape(tmp_path, CAR, name, version=1 + (i < 6))
+        if i not in (0, 6):
+            write_shape(tmp_path, CAR, name, version=1 + (i < 6))
     dataset = shapenet(tmp_path, None)
     assert sorted(chain(*names_of(dataset).values())) == IDS
     notes = " ".join(dataset.mesh(Split.TEST, 0).repairs)
@@ -154,7 +162,7 @@ def test_no_shape_is_lost_or_in_two_splits_and_the_counts_are_noted(tmp_path):
     dataset = shapenet(tmp_path, tmp_path / "splits.json")
     assert names_of(dataset) == {"train": IDS[:3], "val": IDS[5:6], "test": IDS[6:]}
     notes = " ".join(dataset.mesh(Split.TEST, 0).repairs)
-    assert "8 shapes on disk, 6 used: 3 train, 1 validation, 2 test" in notes and "1 shapes are in several" in notes
+    assert "8 shapes on disk, 6 used: 3 train, 1 validation, 2 test" in notes and "1 shape is in several" in notes
 
 
 def test_files_with_the_same_shape_are_one_shape(tmp_path):

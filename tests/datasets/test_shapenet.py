@@ -137,7 +137,7 @@ def test_a_prior_may_take_a_shape_twice_and_a_test_may_not(v2):
     dataset = shapenet(v2)
     first, again = (dataset.mesh(Split.TRAIN, index) for index in (0, len(dataset.files[Split.TRAIN])))
     assert first.repairs == again.repairs
-    with pytest.raises(ValueError, match=r"shapenet_sofa has 1 test shapes in .*, and none of number 1: set a smaller"):
+    with pytest.raises(ValueError, match=r"shapenet_sofa has 1 test shape in .*, and none of number 1: set a smaller"):
         dataset.mesh(Split.TEST, 1)
     with pytest.raises(ValueError, match="shapenet_table has 0 train shapes"):
         shapenet(v2, synset="table").mesh(Split.TRAIN, 0)
@@ -156,6 +156,8 @@ def test_shapes_that_are_not_on_disk_are_counted_and_left_out(v2, tmp_path):
     assert ids(dataset, Split.TEST) == [IDS[1], IDS[4]]
     assert "2 shapes of the list are not on disk, and left out, such as 0bad" in dataset.mesh(Split.TEST, 1).repairs[1]
     assert not any("left out" in note for note in dataset.mesh(Split.TRAIN, 0).repairs)
+    write_split(split, ["0dead", IDS[1]])
+    assert "1 shape of the list is not on disk" in shapenet(v2, split).mesh(Split.TEST, 0).repairs[1]
 
 
 @pytest.mark.parametrize(("settings", "message"), [
