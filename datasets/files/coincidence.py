@@ -22,6 +22,7 @@ SAMPLES, FAST_SAMPLES = (50_000, 500), (5_000, 150)  # points to measure distanc
 COUNTED_FRACTION = 0.9  # the nearest points; others may be outliers
 RADIUS_QUANTILE = 0.99
 MIN_GAIN = 3.0  # a change must fit so many times better
+MAX_GAIN = 100  # a larger gain is no more exact
 ROUNDING_GAIN = 1.5  # a simpler change may fit so many times worse than the best change
 MIN_FRAME_FACTOR, MIN_FRAME_SHIFT = 1.5, 0.5  # less of a factor, or of a shift over the radius, may be a poor result
 UNIT_METRES = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "metres": 1.0}
@@ -122,7 +123,7 @@ class Measure:
     text: str
 
 
-DISTANCE = Measure(0.2, 0.05, 0.005, "{thing} lies {misfit:.2g} of its radius from {reference}")
+DISTANCE = Measure(0.2, 0.05, 0.005, "{thing} lies {misfit:.2g} times the radius of {reference} from it")
 OUTLINE = Measure(0.5, 0.2, 0.03, "the outline of {thing} overlaps with {reference} by {overlap:.0%} (median)")
 
 
@@ -155,7 +156,8 @@ class Comparison:
         if self.change is IDENTITY:
             return misfit
         gain = self.misfit / max(self.changed_misfit, self.measure.error)
-        return f"{misfit}, and fits {gain:.0f} times better if it is {self.change}"
+        gain_text = f"over {MAX_GAIN}" if gain > MAX_GAIN else f"{gain:.0f}"
+        return f"{misfit}, and fits {gain_text} times better if it is {self.change}"
 
 
 def settled(

@@ -1,12 +1,24 @@
 """Two things that must coincide: the change of axes, units and origin that fits, and what must not be refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datasets.files import coincidence
-from datasets.files.coincidence import IDENTITY, Change, compare_outlines, compare_surfaces, samples_of, settled, turns
+from datasets.files.coincidence import (
+    DISTANCE,
+    IDENTITY,
+    Change,
+    Comparison,
+    compare_outlines,
+    compare_surfaces,
+    samples_of,
+    settled,
+    turns,
+)
 from datasets.files.own_photographs import read_capture
 from datasets.mesh import Mesh
 from renderers.checks import BadInput
@@ -64,6 +76,13 @@ def test_a_poor_or_partial_surface_is_no_other_frame(spoil, monkeypatch):
 
 
 @each("turn", [turns()[1], turns()[7], turns()[30]])
+def test_the_text_names_the_radius_and_caps_the_gain():
+    comparison = Comparison(DISTANCE, 0.6, Change(turns()[1], 1.0, np.zeros(3)), 0.02, True)
+    text = comparison.text("the mesh", "the truth")
+    assert text.startswith("the mesh lies 0.6 times the radius of the truth from it, and fits 30 times better")
+    assert "fits over 100 times better" in replace(comparison, misfit=4e5).text("the mesh", "the truth")
+
+
 def test_a_turned_symmetrical_shape_coincides(turn):
     sphere = samples_of(ball(1.0, (0, 0, 0)))
     assert compare_surfaces(Change(turn, 1.0, np.zeros(3)).apply(sphere), sphere, is_partial=False).coincides
