@@ -227,7 +227,7 @@ def _frame_check(mesh: Mesh, truth: Float[np.ndarray, "n 3"], *, is_partial: boo
     Args:
         is_partial: whether the mesh may have more than was scanned.
     """
-    comparison = coincidence.compare_surfaces(coincidence.samples_of(mesh), truth, is_partial=is_partial)
+    comparison = coincidence.compare_surfaces(mesh, truth, is_partial=is_partial)
     warning = (
         f"warning: {comparison.text('the mesh', 'the truth')}: are both in the same world and units? The mesh of a run "
         "is in its unit sphere"

@@ -1,7 +1,7 @@
 """Compares two things that must share a frame, and finds the change of axes, units or origin with which they fit."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain, permutations, product
 from math import exp, inf, log
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from datasets.files.captures.hull import hull_mesh
 from datasets.mesh import Mesh
-from datasets.scene import sample_surface
+from datasets.scene import Truth, sample_surface
 from datasets.shot import Shot, mask_iou
 from renderers.checks import BadInput
 
@@ -184,24 +184,29 @@ def samples_of(mesh: Mesh) -> Float[np.ndarray, "n 3"]:
 
 
 def compare_surfaces(
-    points: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"], *, is_partial: bool
+    shape: Mesh | Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"], *, is_partial: bool
 ) -> Comparison:
-    """Compares points on two surfaces by distances, relative to the radius of the reference.
+    """Compares two surfaces by distances, relative to the radius of the reference.
 
     Args:
-        points: of the surface that may be changed.
+        shape: the surface that may be changed, or points on it.
         reference: points of the other surface.
-        is_partial: whether the reference is a part of the surface, so that other points may be far from it.
+        is_partial: whether the reference is a part of the shape, so that other points may be far from it. The misfit
+            of an unchanged mesh is then exact, since a large mesh has few samples near a small reference.
     """
+    points = samples_of(shape) if isinstance(shape, Mesh) else shape
     points, reference = (drawn[np.random.default_rng(0).permutation(len(drawn))] for drawn in (points, reference))
-    radius = _centre_and_radius(reference)[1]
+    centre, radius = _centre_and_radius(reference)
 
     def sampled(samples: int, queries: int, limit: float) -> Misfit:
         tree, reference_tree = cKDTree(points[:samples]), cKDTree(reference[:samples])
 
         def misfit(change: Change) -> float:
-            inverse = change.undo(reference[:queries])
-            distances = [change.factor * tree.query(inverse, distance_upper_bound=limit / change.factor)[0]]
+            if change is IDENTITY and is_partial and isinstance(shape, Mesh):
+                distances = [_exact_distances(shape, reference[:queries], centre, radius)]
+            else:
+                inverse = change.undo(reference[:queries])
+                distances = [change.factor * tree.query(inverse, distance_upper_bound=limit / change.factor)[0]]
             if not is_partial:
                 distances.append(reference_tree.query(change.apply(points[:queries]), distance_upper_bound=limit)[0])
             counted = [np.sort(values)[: int(np.ceil(COUNTED_FRACTION * len(values)))] for values in distances]
@@ -210,6 +215,14 @@ def compare_surfaces(
         return misfit
 
     return _compare(DISTANCE, sampled(*SAMPLES, inf), sampled(*FAST_SAMPLES, radius), points, reference)
+
+
+def _exact_distances(
+    mesh: Mesh, points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, "3"], radius: float
+) -> Float[np.ndarray, " n"]:
+    """Distances of points to a mesh; `centre` and `radius` are of a frame in which float32 suffices."""
+    truth = Truth(replace(mesh, vertices=(mesh.vertices - centre) / radius), closed=False)
+    return radius * truth.distance((points - centre) / radius)
 
 
 def compare_outlines(

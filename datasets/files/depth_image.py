@@ -14,7 +14,7 @@ from torch import Tensor
 from datasets.files.captures.depth import check_object_depths, missing_note, read_depths
 from datasets.files.captures.frames import AXES, Frame, homogeneous_matrix
 from datasets.files.captures.mask import is_inverted, load_mask
-from datasets.files.coincidence import compare_surfaces, samples_of, settled
+from datasets.files.coincidence import compare_surfaces, settled
 from datasets.files.meshes import load_mesh
 from datasets.files.range_scans import join_neighbours
 from datasets.mesh import Mesh
@@ -142,7 +142,7 @@ class DepthImage:
         else:
             mesh, truth_note = load_mesh(self.truth), f"the true shape is '{self.truth}'"
             visible_points = points @ to_world[:3, :3].T + to_world[:3, 3]
-            comparison = compare_surfaces(samples_of(mesh), visible_points, is_partial=True)
+            comparison = compare_surfaces(mesh, visible_points, is_partial=True)
             doubt = (
                 f"{comparison.text('dataset.truth', f'what {self.path} shows')}: give both in one world, by "
                 "dataset.camera_to_world, dataset.axes and dataset.scale, and check dataset.intrinsics"

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from datasets.files.captures.depth import missing_numbers
-from datasets.files.coincidence import DISTANCE, IDENTITY, compare_surfaces, samples_of, settled
+from datasets.files.coincidence import DISTANCE, IDENTITY, compare_surfaces, settled
 from datasets.files.meshes import load_mesh
 from datasets.files.readers.ply import read_ply
 from datasets.files.readers.text import wrong_kind_message
@@ -161,12 +161,12 @@ class RangeScans:
 
     def _pose_notes(self, scan: Scan) -> tuple[str, ...]:
         """A note on a scan that does not lie on the mesh; raises BadInput without `unchecked`."""
-        mesh, thing, reference = samples_of(self._read), f"'{self.reference.name}'", f"scan '{scan.file.name}'"
-        comparison = compare_surfaces(mesh, scan.in_world(scan.rotation), is_partial=True)
+        thing, reference = f"'{self.reference.name}'", f"scan '{scan.file.name}'"
+        comparison = compare_surfaces(self._read, scan.in_world(scan.rotation), is_partial=True)
         doubt = comparison.text(thing, reference)
         if not comparison.coincides:
             for remedy, rotation in scan.other_rotations.items():
-                other = compare_surfaces(mesh, scan.in_world(rotation), is_partial=True)
+                other = compare_surfaces(self._read, scan.in_world(rotation), is_partial=True)
                 if other.misfit < min(comparison.changed_misfit, DISTANCE.good):
                     doubt = f"{replace(comparison, change=IDENTITY).text(thing, reference)}, and fits if {remedy}"
         doubt += ": give scans and mesh in one unit, and poses x_world = R^T x + t in the .conf file"

@@ -21,6 +21,7 @@ from datasets.files.coincidence import (
 )
 from datasets.files.own_photographs import read_capture
 from datasets.mesh import Mesh
+from datasets.scene import sample_surface
 from renderers.checks import BadInput
 from tests.looped import each
 from tests.made_dtu import ball
@@ -75,7 +76,18 @@ def test_a_poor_or_partial_surface_is_no_other_frame(spoil, monkeypatch):
         assert not compare_surfaces(POINTS, spoil(POINTS), is_partial=is_partial).is_other_frame
 
 
-@each("turn", [turns()[1], turns()[7], turns()[30]])
+def test_a_small_part_of_a_large_mesh_fits_exactly_and_no_change_is_searched(monkeypatch):
+    monkeypatch.setattr(coincidence, "_search", None)
+    for offset in (0.0, 4e5):  # as of maps, in metres
+        floor = 6.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        sphere = ball(0.1, (2.0, 1.0, 0.1))
+        vertices = np.concatenate([floor, sphere.vertices]) + offset
+        mesh = Mesh(vertices, np.concatenate([[[0, 1, 2], [0, 2, 3]], sphere.faces + 4]))
+        seen = sample_surface(sphere, 3000, seed=1).points + offset
+        for reference in (seen, seen[seen[:, 2] > offset + 0.15]):
+            assert compare_surfaces(mesh, reference, is_partial=True).misfit < 1e-4
+
+
 def test_the_text_names_the_radius_and_caps_the_gain():
     comparison = Comparison(DISTANCE, 0.6, Change(turns()[1], 1.0, np.zeros(3)), 0.02, True)
     text = comparison.text("the mesh", "the truth")
@@ -83,6 +95,7 @@ def test_the_text_names_the_radius_and_caps_the_gain():
     assert "fits over 100 times better" in replace(comparison, misfit=4e5).text("the mesh", "the truth")
 
 
+@each("turn", [turns()[1], turns()[7], turns()[30]])
 def test_a_turned_symmetrical_shape_coincides(turn):
     sphere = samples_of(ball(1.0, (0, 0, 0)))
     assert compare_surfaces(Change(turn, 1.0, np.zeros(3)).apply(sphere), sphere, is_partial=False).coincides
