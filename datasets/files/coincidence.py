@@ -226,26 +226,41 @@ def _exact_distances(
 
 
 def compare_outlines(
-    points: Float[np.ndarray, "n 3"], shots: Sequence[Shot], to_world: Float[np.ndarray, "4 4"]
+    shape: Mesh | Float[np.ndarray, "n 3"], shots: Sequence[Shot], to_world: Float[np.ndarray, "4 4"]
 ) -> Comparison:
     """Compares the outlines of points on a surface with the masks of photographs.
 
     Args:
-        points: that may be changed, in the world of a file.
+        shape: the surface that may be changed, or points on it, in the world of a file. An unchanged mesh is cut off at
+            the unit sphere before points are drawn, so that a large background leaves enough points on the object.
         shots: photographs with masks, of the unit sphere; points outside of it are left out.
         to_world: from the unit sphere to the world of the file.
     """
-    to_sphere, points = np.linalg.inv(to_world), points[np.random.default_rng(0).permutation(len(points))]
+    to_sphere, points = np.linalg.inv(to_world), samples_of(shape) if isinstance(shape, Mesh) else shape
+    points = points[np.random.default_rng(0).permutation(len(points))]
+
+    def inside(world_points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+        moved = world_points @ to_sphere[:3, :3].T + to_sphere[:3, 3]
+        return moved[np.linalg.norm(moved, axis=1) <= 1]
+
+    cut = shape.moved(to_sphere).cut_off() if isinstance(shape, Mesh) else None
+    unchanged = inside(points) if cut is None or not cut.area else samples_of(cut)
 
     def seen_by(count: int, samples: int, side: int) -> Misfit:
         chosen = [shots[i] for i in np.linspace(0, len(shots) - 1, min(count, len(shots))).round().astype(int)]
-        fine_enough = int(min(samples, len(points)) ** 0.5)  # so that points leave no gaps in an outline
-        views = [_small_view(shot, min(side, max(fine_enough, MIN_OUTLINE_SIDE))) for shot in chosen]
+
+        def views(point_count: int) -> list[tuple[Float[np.ndarray, "3 4"], Bool[np.ndarray, "h w"]]]:
+            fine_enough = int(point_count**0.5)  # so that points leave no gaps in an outline
+            return [_small_view(shot, min(side, max(fine_enough, MIN_OUTLINE_SIDE))) for shot in chosen]
+
+        changed_views = views(min(samples, len(points)))
 
         def misfit(change: Change) -> float:
-            moved = change.apply(points[:samples]) @ to_sphere[:3, :3].T + to_sphere[:3, 3]
-            moved = moved[np.linalg.norm(moved, axis=1) <= 1]
-            return 1 - float(np.median([mask_iou(_outline(moved, *view), view[1]) for view in views]))
+            moved, compared = inside(change.apply(points[:samples])), changed_views
+            if change is IDENTITY:
+                moved = unchanged[:samples]
+                compared = views(len(moved))
+            return 1 - float(np.median([mask_iou(_outline(moved, *view), view[1]) for view in compared]))
 
         return misfit
 

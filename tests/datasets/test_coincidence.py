@@ -119,3 +119,16 @@ def test_the_outline_of_a_truth_fits_the_masks_or_names_its_units(capture):
     assert shifted.change.shift == pytest.approx([-0.3, 0, 0], abs=0.05)
     half = compare_outlines(points[points[:, 1] > CENTRE[1]], capture.shots, capture.to_world)
     assert not half.is_other_frame
+
+
+def test_a_large_background_in_the_file_of_a_truth_hides_no_fit(capture):
+    truth, far = ball(RADIUS, CENTRE), ball(60.0, CENTRE + 200)
+    mesh = Mesh(
+        np.concatenate([truth.vertices, far.vertices]), np.concatenate([truth.faces, far.faces + len(truth.vertices)])
+    )
+    cloud = np.concatenate([samples_of(truth)[:2000], samples_of(far)])
+    for shape in (mesh, cloud):
+        comparison = compare_outlines(shape, capture.shots, capture.to_world)
+        assert comparison.coincides and comparison.misfit < 0.2
+    shifted = compare_outlines(replace(mesh, vertices=mesh.vertices + 0.5), capture.shots, capture.to_world)
+    assert not shifted.coincides

@@ -16,7 +16,7 @@ from bench.solve.solve import save_in_world
 from bench.tasks.reconstruction.dtu import DEFINITIONS as DTU_DEFINITIONS
 from bench.tasks.reconstruction.dtu import DtuScan, dtu_metrics, published_results, read_scan
 from datasets.files.captures.hull import hull_mesh
-from datasets.files.coincidence import compare_outlines, samples_of, settled
+from datasets.files.coincidence import compare_outlines, settled
 from datasets.files.meshes import read_pieces, read_points
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.photographs import Photography
@@ -231,7 +231,7 @@ def load_truth(
         return None, scan, [*notes, *published_results(number)]
     mesh, points = None, None if Path(dataset.truth).is_dir() else read_points(dataset.truth)
     full_mesh = read_pieces(dataset.truth) if points is None else None
-    notes = outline_notes(dataset, points if full_mesh is None else samples_of(full_mesh), shots, to_world)
+    notes = outline_notes(dataset, points if full_mesh is None else full_mesh, shots, to_world)
     if full_mesh is not None:
         mesh = full_mesh.moved(np.linalg.inv(to_world)).cut_off()
         fraction = mesh.moved(to_world).area / full_mesh.area if mesh else 0.0
@@ -248,12 +248,15 @@ def load_truth(
 
 
 def outline_notes(
-    dataset: Photographed, points: Float[np.ndarray, "n 3"], shots: Sequence[Shot], to_world: Float[np.ndarray, "4 4"]
+    dataset: Photographed,
+    shape: Mesh | Float[np.ndarray, "n 3"],
+    shots: Sequence[Shot],
+    to_world: Float[np.ndarray, "4 4"],
 ) -> list[str]:
     """A note on a true surface whose outline does not fit the masks; raises BadInput without `dataset.unchecked`."""
     if any(shot.mask is None for shot in shots):
         return []
-    comparison = compare_outlines(points, shots, to_world)
+    comparison = compare_outlines(shape, shots, to_world)
     doubt = (
         f"{comparison.text(f'dataset.truth={dataset.truth}', 'the masks')}: give the object alone, in the world and "
         "the units of the cameras"
