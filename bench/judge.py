@@ -162,6 +162,13 @@ class Judge:
         metrics = tanks.tanks_metrics(distances, scene.threshold)
         return Verdict(name, metrics, notes, mesh=mesh, draw=partial(draw_distances, distances))
 
+    def row_settings(self, truth: Path | int | str) -> dict[str, Any]:
+        """The settings on which the metrics of a mesh depend, except the seed, and the name of its truth."""
+        settings = {"points": self.points, "threshold": self.threshold, "unit_sphere": self.unit_sphere}
+        settings |= {"truth": truth.name if isinstance(truth, Path) else truth, "to_world": self.to_world}
+        settings |= {"cull": self.cull} | vars(self.tanks_settings)
+        return {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
+
     def prepare(self, mesh: Mesh) -> Mesh:
         """The mesh after the movement and the culling of the settings."""
         if self.to_world is not None:
@@ -300,13 +307,15 @@ def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: a
         options: the command line: `into`, `method`, `picture`, and `like`, a run with the same problem.
     """
     method = re.sub(r"[^a-z0-9]+", "_", options.method.lower()).strip("_")
+    settings = judge.row_settings(item.truth)
     if options.like is not None:
         like = read_record(options.like)
         fields: dict[str, Any] = {name: like[name] for name in ("task", "dataset", "seed", "scene", "config")}
     else:
-        truth = str(options.truth or options.dtu or options.tnt)
-        config = {"task": {"points": judge.points}, "dataset": {"path": truth}, "index": index, "split": "test"}
-        fields = {"task": JUDGE_TASK, "dataset": JUDGE_TASK, "seed": judge.seed, "scene": item.name, "config": config}
+        scene = f"scan{item.truth}" if isinstance(item.truth, int) else item.truth
+        path, scene = (options.truth, item.name) if options.truth else ((options.dtu or options.tnt) / scene, scene)
+        config = {"task": settings, "dataset": {"path": str(path)}, "index": index, "split": "test"}
+        fields = {"task": JUDGE_TASK, "dataset": JUDGE_TASK, "seed": judge.seed, "scene": scene, "config": config}
     fields["config"] |= {"label": options.method, "renderer": {}, "silhouette": None, "results_dir": str(options.into)}
     key = digest([method, fields["task"], fields["config"], fields["seed"], item.name])
     record = Record(f"{fields['task']}-{method}-{key}", renderer=method, **fields)

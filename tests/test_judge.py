@@ -9,9 +9,11 @@ import trimesh
 
 import bench
 from bench.evaluate.evaluate import DEFINITIONS, surface_metrics
-from bench.judge import Judge, main, metric_units
+from bench.judge import Item, Judge, Verdict, main, metric_units, parse_arguments, write_row
 from bench.merge import merge
 from bench.records.record import Record, read_record
+from bench.report.data.records import family
+from bench.tasks.reconstruction import dtu, tanks
 from bench.tasks.reconstruction.dtu import METRIC_NAMES, dtu_metrics, read_scan
 from datasets.files.meshes import read_mesh
 from datasets.files.own_photographs import ReadSettings, read_capture
@@ -249,6 +251,35 @@ def test_records_join_those_of_runs_and_are_merged(files, capsys):
     assert runs.status.to_dict() == {"small": "ok", "plate": "ok", "large": "empty"}
     assert runs.chamfer_l1["large"] == np.inf and "no mesh is named 'large'" in runs.reason["large"]
     assert "My net" in "".join(file.read_text() for file in (results / "page" / "data" / "list").rglob("*.js"))
+
+
+def test_rows_of_other_truths_and_settings_are_other_rows(files, capsys):
+    results, common = files / "results", ("--method", "Mine", "--into", files / "results")
+    for name in ("small", "large"):
+        (files / name).mkdir()
+        ball(2.0 if name == "small" else 4.0).save(files / name / "mesh.ply")
+        judged(capsys, files / name / "mesh.ply", "--truth", files / f"truth/{name}.ply", *FEW, *common)
+    for more in (["--threshold", "2%"], ["--unit-sphere"], ["--threshold", "2%"]):
+        judged(capsys, files / "small/mesh.ply", "--truth", files / "truth/small.ply", *FEW, *common, *more)
+    tasks = [read_record(folder)["config"]["task"] for folder in (results / "runs").iterdir()]
+    settings = sorted((task["truth"], task["threshold"], task["unit_sphere"]) for task in tasks)
+    small = [("small.ply", "1%", False), ("small.ply", "1%", True), ("small.ply", "2%", False)]
+    assert settings == [("large.ply", "1%", False), *small]
+
+
+def test_rows_of_scenes_and_scans_have_their_names(files):
+    name, common = "mesh", ["mesh.ply", "--method", "Mine", "--into", str(files)]
+    for truth, more in (("Barn", []), ("Truck", []), ("Barn", ["--surface"]), ("Barn", ["--no-icp"])):
+        options = parse_arguments([*common, "--tnt", "TNT", *more])
+        settings = tanks.TanksSettings(None, options.icp, options.surface)
+        judge = Judge(None, "1%", 1, 0, False, None, None, options.tnt, settings)
+        write_row(Verdict(name, dict(tanks.WORST)), Item(name, options.mesh, truth), 0, judge, options)
+    options = parse_arguments([*common, "--dtu", "DTU"])
+    judge = Judge(options.dtu, "1%", 1, 0, False, None, None)
+    write_row(Verdict(name, dict(dtu.WORST)), Item(name, options.mesh, 65), 0, judge, options)
+    records = [read_record(folder) for folder in (files / "runs").iterdir()]
+    assert sorted(record["scene"] for record in records) == ["Barn"] * 3 + ["Truck", "scan65"]
+    assert {family(record) for record in records} == {"TNT/Barn", "TNT/Truck", "DTU/scan65"}
 
 
 def test_a_record_may_name_the_problem_of_a_run(files, capsys):
