@@ -317,7 +317,7 @@ def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: a
         config = {"task": settings, "dataset": {"path": str(path)}, "index": index, "split": "test"}
         fields = {"task": JUDGE_TASK, "dataset": JUDGE_TASK, "seed": judge.seed, "scene": scene, "config": config}
     fields["config"] |= {"label": options.method, "renderer": {}, "silhouette": None, "results_dir": str(options.into)}
-    key = digest([method, fields["task"], fields["config"], fields["seed"], item.name])
+    key = digest([method, fields["task"], fields["config"], fields["seed"], item.name, settings])
     record = Record(f"{fields['task']}-{method}-{key}", renderer=method, **fields)
     record.status, record.reason = (RunStatus.EMPTY, verdict.failure) if verdict.failure else (RunStatus.OK, "")
     record.metrics, record.notes = dict(verdict.metrics), [f"judged from {item.mesh}", *verdict.notes]
@@ -412,7 +412,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         check_options(options)
         items, verdicts = items_of(options.mesh, options.truth, partial(truth_of, options)), list[Verdict]()
-        withheld = list[tuple[Verdict, Item, int]]()  # rows, until some mesh of a folder is in the frame of its truth
+        rows, fits = list[tuple[Verdict, Item, int]](), options.unchecked  # rows wait for a mesh in its truth's frame
         for index, item in enumerate(items):
             try:
                 verdict = judge.verdict(item)
@@ -425,19 +425,20 @@ def main(arguments: list[str] | None = None) -> int:
             if picture is not None:
                 picture.parent.mkdir(parents=True, exist_ok=True)
                 verdict.draw(f"{item.name}: distance of each point to the other surface", picture)
-            if options.into is not None and verdict.is_other_frame and not options.unchecked:
-                withheld.append((verdict, item, index))
-            elif options.into is not None:
-                write_row(verdict, item, index, judge, options)
+            fits = fits or not (verdict.failure or verdict.is_other_frame)
+            if options.into is not None:
+                rows.append((verdict, item, index))
+            while fits and rows:
+                write_row(*rows.pop(0), judge, options)
             verdicts.append(replace(verdict, mesh=None, draw=None))  # a folder may have many
         print_verdicts(verdicts, metric_units(judge))
         if options.into is not None:
-            if withheld and len(withheld) == sum(not verdict.failure for verdict in verdicts):
+            if any(verdict.is_other_frame for verdict, _, _ in rows):
                 raise ValueError(
-                    "no row is written, since the mesh is in another frame (see the warning): add --unchecked"
+                    "no row is written, since no mesh is in its truth's frame (see above): add --unchecked"
                 )
-            for verdict, item, index in withheld:
-                write_row(verdict, item, index, judge, options)
+            for row in rows:
+                write_row(*row, judge, options)
             print(write_index(options.into))
     except (OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -282,6 +282,18 @@ def test_rows_of_scenes_and_scans_have_their_names(files):
     assert {family(record) for record in records} == {"TNT/Barn", "TNT/Truck", "DTU/scan65"}
 
 
+def test_a_failed_mesh_in_a_folder_has_no_row_if_the_others_are_in_another_frame(files, capsys):
+    (files / "found/large.ply").unlink()  # judged first
+    (files / "found/plate.ply").unlink()
+    solid().save(files / "truth/small.ply")
+    solid().moved(np.diag([10, 10, 10, 1])).save(files / "found/small.ply")
+    command = (files / "found", "--truth", files / "truth", *FEW, "--method", "Mine", "--into", files / "results")
+    assert main([*map(str, command)]) == 2
+    assert "error: no row is written" in capsys.readouterr().err and not (files / "results").exists()
+    judged(capsys, *command, "--unchecked", code=1)
+    assert len([*(files / "results/runs").iterdir()]) == 3
+
+
 def test_a_record_may_name_the_problem_of_a_run(files, capsys):
     config = {"dataset": {"path": "photos"}, "index": 0, "task": {"longest": 96}, "renderer": {"_label_": "Newton"}}
     config |= {"silhouette": {"_label_": "hinge"}}
