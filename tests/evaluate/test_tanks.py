@@ -141,6 +141,17 @@ def test_the_trajectory_of_a_video_is_mapped_to_the_images(folder, mesh, tmp_pat
         metrics_of(mesh, copy, settings)
 
 
+def test_a_matrix_with_a_shear_or_with_several_scales_is_no_alignment(folder, mesh, tmp_path):
+    shear = np.eye(4)
+    shear[0, 1] = 0.01
+    for matrix in (np.diag([1.0, 1, 2, 1]), shear):
+        np.savetxt(tmp_path / "matrix.txt", matrix)
+        with pytest.raises(BadInput, match=r"a similarity, a rotation times one scale, found .*: align again with one"):
+            metrics_of(mesh, folder, TanksSettings(tmp_path / "matrix.txt"))
+    np.savetxt(tmp_path / "matrix.txt", MESH_TO_SCAN, fmt="%.4f")  # rounded
+    metrics_of(mesh.moved(TO_MESH), folder, TanksSettings(tmp_path / "matrix.txt", refine=False))
+
+
 def test_points_of_faces_count_where_vertices_are_sparse(folder):
     coarse, scene = faulty(3), read_scene(folder, NAME)
     notes = tanks_distances(coarse, scene, EXACT, seed=0)[1]

@@ -36,6 +36,7 @@ VOXEL_FRACTION = 0.5
 MAX_CAMERA_SHIFT_METRES = 0.2  # between a camera and its pair, if it agrees with an alignment
 CAMERAS_PER_ATTEMPT, ALIGNMENT_ATTEMPTS = 6, 100_000
 VIDEO_FRAMES = 1600  # a longer trajectory is that of a video, with a mapping to the images
+SIMILARITY_TOLERANCE = 1e-3  # relative difference of the scales in any two directions
 TRUST_FRACTION = 0.1  # below it, few of the mesh's points have a true point near them after ICP
 METRIC_NAMES = ("tnt_precision", "tnt_recall", "tnt_fscore")
 _COUNTED = "closer than the scene's threshold, in its crop volume, after averaging in voxels of half the threshold"
@@ -300,6 +301,12 @@ def _read_matrix(file: Path) -> Float[np.ndarray, "4 4"]:
         raise BadInput(
             f"{file} must be a similarity, 4 x 4 numbers whose last row is 0 0 0 1, without a reflection, found shape "
             f"{list(matrix.shape)}: from the mesh's world to the scan's"
+        )
+    scales = np.linalg.svd(linear, compute_uv=False)
+    if scales[0] > (1 + SIMILARITY_TOLERANCE) * scales[-1]:
+        raise BadInput(
+            f"{file} must be a similarity, a rotation times one scale, found scales from {scales[-1]:.5g} to "
+            f"{scales[0]:.5g}, depending on the direction: align again with one scale for all axes"
         )
     return matrix
 
