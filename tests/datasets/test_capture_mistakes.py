@@ -80,6 +80,10 @@ MISTAKES = {
     "world_to_camera of OpenCV in transforms.json": ("inverse", opengl(lambda poses: OPENGL @ inverse(poses))),
     "axes": ("dataset.axes=flipped", posed(lambda poses: OPENGL @ poses)),
     "rolled": ("180 degrees", posed(lambda poses: ROLLED @ poses)),
+    "images turned": (
+        "180 degrees",
+        lambda views: replace(views, masks=tuple(mask[::-1, ::-1] for mask in views.masks)),
+    ),
     "rotations of the inverse": ("transposed", posed(lambda poses: mixed(inverse(poses), poses))),
     "rotations of the inverse, OpenGL": ("transposed", opengl(lambda poses: mixed(inverse(poses), poses))),
     "centres as translations": ("camera's position", posed(lambda poses: mixed(poses, inverse(poses)))),
@@ -199,3 +203,11 @@ def test_intrinsics_that_are_no_pixels_are_refused_without_masks(tmp_path):
 ])  # fmt: skip
 def test_other_intrinsics_are_named_if_the_middle_is_the_principal_point(words, change):
     assert words in mistake_in(scaled(change)(seen(1, offset=0.0)))
+
+
+def test_turned_images_are_named_wherever_the_principal_point_is():
+    for offset in (0.0, 1.0, 4.0):
+        for axes in (np.eye(4), OPENGL):
+            views = MISTAKES["images turned"][1](seen(2, offset))
+            text = mistake_in(replace(views, world_to_camera=axes @ views.world_to_camera))
+            assert text.startswith(f"the {'images' if offset else 'cameras'} are turned by 180 degrees")

@@ -76,7 +76,7 @@ def likely_mistake(shots: Sequence[Shot], frames: Sequence[Frame], axes: str) ->
     )
     fault = intrinsics_fault(frames[0], SHORT_FOCAL_TO_WIDTH)
     corrections = [*_intrinsics_corrections(views, frames, fault), *_pose_corrections(views, axes), *_mirrored(views)]
-    corrections += _order_corrections(views, [shot.name for shot in shots])
+    corrections += [*_turned(views), *_order_corrections(views, [shot.name for shot in shots])]
     fits = [(text, hull_fit(corrected)) for text, corrected in corrections]
     best = max(fit for _, fit in fits)
     if best < max(MIN_FIT, hull_fit(views) + MIN_GAIN):
@@ -195,6 +195,14 @@ def _mirrored(views: Views) -> Iterator[tuple[str, Views]]:
     for turn in (np.eye(4), OPENGL, ROLLED, OPENGL @ ROLLED):
         for intrinsics in (views.intrinsics, mirrored):
             yield text, Views(intrinsics, turn @ views.world_to_camera, masks)
+
+
+def _turned(views: Views) -> Iterator[tuple[str, Views]]:
+    """Images turned by 180 degrees: their principal points are mirrored too, unlike those of turned cameras."""
+    text = "the images are turned by 180 degrees: turn them back"
+    masks = tuple(mask[::-1, ::-1] for mask in views.masks)
+    for turn in (np.eye(4), OPENGL):
+        yield text, Views(views.intrinsics, turn @ views.world_to_camera, masks)
 
 
 def _order_corrections(views: Views, names: Sequence[str]) -> Iterator[tuple[str, Views]]:
