@@ -211,7 +211,9 @@ def test_other_shapes_with_the_same_moments_are_kept(tmp_path):
 def test_the_same_surface_in_other_colours_is_another_shape():
     box = trimesh.creation.box()
     red, blue, dark_red, plain = (
-        Mesh(box.vertices * size, box.faces, colours=None if colour is None else np.tile(colour, (8, 1)))
+        Mesh(
+            box.vertices * size, box.faces, colours=None if colour is None else np.tile(np.array(colour, float), (8, 1))
+        )
         for size, colour in ((1, (1, 0, 0)), (2, (0, 0, 1)), (3, (0.99, 0, 0)), (4, None))
     )
     assert [same_shape(red, other) for other in (blue, dark_red, plain)] == [False, True, True]
