@@ -44,6 +44,10 @@ WORLD_MESH_FILE = "mesh_world.ply"  # the mesh of a run on photographs, in the w
 ROW_PICTURE_FILE = "distances.png"
 PICTURE_POINTS = 150_000  # per surface, so that the samples are not seen in the picture
 SURFACE_SAMPLING = "random points on each surface, uniform by area; distances to the nearest point of the other surface"
+CLOUD_SAMPLING = (
+    "random points of the mesh, uniform by area, and at most as many of the truth's points; distances to the nearest "
+    "point of the other; no normals, since the truth has no faces"
+)
 SURFACE_MEANS = (
     "accuracy, completeness: mean distance from mesh to truth, from truth to mesh; chamfer_l1: their mean; "
     "chamfer_l2: sum of the two means of squared distances; chamfer_gt_to_pred: the mean from truth to mesh alone"
@@ -118,7 +122,7 @@ class Judge:
         if self.points < 1:
             raise ValueError(f"--points must be at least 1, found {self.points}")
         if not re.fullmatch(r"[\d.eE+-]+%?", self.threshold) or not float(self.threshold.rstrip("%")) > 0:
-            raise ValueError(f"--threshold must be a positive number, or one with %, found {self.threshold}: 1%")
+            raise ValueError(f"--threshold must be a positive number, such as 0.02 or 1%, not {self.threshold}")
 
     def verdict(self, item: Item) -> Verdict:
         """Judges a mesh.
@@ -196,7 +200,7 @@ class Judge:
         threshold = float(self.threshold.rstrip("%")) * (extent / 100 if self.threshold.endswith("%") else 1)
         threshold_text = f"{threshold:.4g}, {threshold / extent:.2%} of the truth's extent"
         notes += [
-            f"how: {self.points} {SURFACE_SAMPLING}",
+            f"how: {self.points} {SURFACE_SAMPLING if cloud is None else CLOUD_SAMPLING}",
             f"how: {SURFACE_MEANS}",
             f"{SURFACE_SHARES} {threshold_text}",
         ]
@@ -403,7 +407,7 @@ def truth_of(options: argparse.Namespace, name: str) -> int | str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Judges the meshes of the command line; returns 0 for success, 1 if some could not be judged, 2 if none could."""
-    options = parse_arguments(arguments)
+    options, items, verdicts = parse_arguments(arguments), list[Item](), list[Verdict]()
     try:
         judge = Judge(
             *(options.dtu, options.threshold, options.points, options.seed),
@@ -411,7 +415,7 @@ def main(arguments: list[str] | None = None) -> int:
             *(options.tnt, tanks.TanksSettings(options.align, options.icp, options.surface)),
         )
         check_options(options)
-        items, verdicts = items_of(options.mesh, options.truth, partial(truth_of, options)), list[Verdict]()
+        items = items_of(options.mesh, options.truth, partial(truth_of, options))
         rows, fits = list[tuple[Verdict, Item, int]](), options.unchecked  # rows wait for a mesh in its truth's frame
         for index, item in enumerate(items):
             try:
@@ -440,6 +444,9 @@ def main(arguments: list[str] | None = None) -> int:
             for row in rows:
                 write_row(*row, judge, options)
             print(write_index(options.into))
+    except KeyboardInterrupt:
+        print(f"interrupted: {len(verdicts)} of {len(items)} judged; --into has the rows of these", file=sys.stderr)
+        return 130
     except (OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

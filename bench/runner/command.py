@@ -189,7 +189,8 @@ def quote_text(argument: str) -> str:
     is_path = setting is not None and setting[2].endswith("path")
     if setting is None or not (is_path or type_of(setting[2]) in (str, str | None)):
         return argument
-    text = str(Path(setting[3]).expanduser()) if is_path and setting[3].startswith("~") else setting[3]
+    in_home = re.fullmatch(r"""(["']?)(~.*)\1""", setting[3]) if is_path else None
+    text = str(Path(in_home[2]).expanduser()) if in_home else setting[3]
     try:
         values = [(word, parse_override(f"text={word}").value()) for word in text.split(",")]
     except HydraException:  # a comma within quotes or brackets, no value, or a text that Hydra cannot read

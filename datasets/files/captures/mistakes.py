@@ -166,7 +166,10 @@ def _pose_corrections(views: Views, axes: str) -> Iterator[tuple[str, Views]]:
     stated, identity = views.world_to_camera, np.eye(4)
     other_axes = next(name for name in AXES if name != axes)
     poses = [(f"the cameras have other axes: set dataset.axes={other_axes}", OPENGL @ stated)]
-    inverse = "the poses are inverse (world_to_camera for camera_to_world, or the reverse): store the inverses"
+    inverse = (
+        "the poses are inverse (world_to_camera for camera_to_world, or the reverse): store the inverses, with the "
+        "other dataset.axes if they need it"
+    )
     poses += [(inverse, turn @ np.linalg.inv(stated)) for turn in (identity, OPENGL)]
     rolled = "the cameras are turned by 180 degrees about their viewing direction: reverse their axes x and y"
     poses += [(rolled, turn @ stated) for turn in (ROLLED, OPENGL @ ROLLED)]
