@@ -171,7 +171,7 @@ def test_a_path_is_the_text_that_was_typed(tmp_path, monkeypatch):
 
     for text in ("1e5", "true", "李明.obj", "a b/chair (1).obj", "it's.obj"):
         assert paths(text) == [text]
-    assert paths("null") == [None] and paths("~/chair.obj") == ["/home/me/chair.obj"]
+    assert paths("null") == [None] and paths("~/chair.obj") == paths("'~/chair.obj'") == ["/home/me/chair.obj"]
     assert paths("a,b.obj") == ["a", "b.obj"]
     Path("a,b.obj").touch()
     assert paths("a,b.obj") == ["a,b.obj"]
