@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bench.evaluate.distances import measure_distances
+from bench.evaluate.distances import measure_distances, surface_protocol
 from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, subsample, surface_metrics
 from bench.pictures.distances import draw_distances
 from bench.records.read import is_plain_name
@@ -43,16 +43,6 @@ UNIT_SUFFIXES = {"chamfer_l2": "²", "chamfer_gt_to_pred": "²", "fscore": None,
 WORLD_MESH_FILE = "mesh_world.ply"  # the mesh of a run on photographs, in the world of their cameras
 ROW_PICTURE_FILE = "distances.png"
 PICTURE_POINTS = 150_000  # per surface, so that the samples are not seen in the picture
-SURFACE_SAMPLING = "random points on each surface, uniform by area; distances to the nearest point of the other surface"
-CLOUD_SAMPLING = (
-    "random points of the mesh, uniform by area, and at most as many of the truth's points; distances to the nearest "
-    "point of the other; no normals, since the truth has no faces"
-)
-SURFACE_MEANS = (
-    "accuracy, completeness: mean distance from mesh to truth, from truth to mesh; chamfer_l1: their mean; "
-    "chamfer_l2: sum of the two means of squared distances; chamfer_gt_to_pred: the mean from truth to mesh alone"
-)
-SURFACE_SHARES = "how: fscore: harmonic mean of the shares of points, per surface, whose distance is below"
 JUDGE_TASK = "judge"  # the task of rows without --like
 
 
@@ -90,7 +80,7 @@ class Judge:
     """The settings for judging meshes.
 
     Args:
-        folder: the folder of DTU; None compares with surfaces.
+        dtu_folder: the folder of DTU; None for other truths.
         threshold: threshold of the F-score, in units or, with %, in per cent of the truth's extent.
         points: number of points sampled on each surface.
         seed: seed of the samples.
@@ -102,7 +92,7 @@ class Judge:
         tanks_settings: how its scans are compared.
     """
 
-    folder: Path | None
+    dtu_folder: Path | None
     threshold: str
     points: int
     seed: int
@@ -113,7 +103,7 @@ class Judge:
     tanks_settings: tanks.TanksSettings = tanks.PUBLISHED
 
     def __post_init__(self) -> None:
-        if self.folder is not None and (self.unit_sphere or self.threshold != DEFAULT_THRESHOLD):
+        if self.dtu_folder is not None and (self.unit_sphere or self.threshold != DEFAULT_THRESHOLD):
             raise ValueError("--unit-sphere and --threshold are for --truth: --dtu has mm and no F-score")
         if self.tanks_folder is not None and (self.unit_sphere or self.threshold != DEFAULT_THRESHOLD):
             raise ValueError("--unit-sphere and --threshold are for --truth: --tnt has metres and a scene's threshold")
@@ -137,7 +127,7 @@ class Judge:
         mesh = self.prepare(read_mesh(item.mesh))
         if isinstance(item.truth, Path):
             return self._by_surface(item.name, mesh, item.truth)
-        scan = dtu.read_scan(self.folder or Path(), item.truth)
+        scan = dtu.read_scan(self.dtu_folder or Path(), item.truth)
         notes, is_other_frame = _frame_check(mesh, scan.points_above_plane(), is_partial=True)
         notes += dtu.published_results(item.truth)
         distances = dtu.dtu_distances(mesh, scan, seed=self.seed)
@@ -199,11 +189,8 @@ class Judge:
         extent = float(np.linalg.norm(np.ptp(truth_points, axis=0)))
         threshold = float(self.threshold.rstrip("%")) * (extent / 100 if self.threshold.endswith("%") else 1)
         threshold_text = f"{threshold:.4g}, {threshold / extent:.2%} of the truth's extent"
-        notes += [
-            f"how: {self.points} {SURFACE_SAMPLING if cloud is None else CLOUD_SAMPLING}",
-            f"how: {SURFACE_MEANS}",
-            f"{SURFACE_SHARES} {threshold_text}",
-        ]
+        protocol = surface_protocol(self.points, threshold_text, has_faces=surface is not None)
+        notes += [f"how: {text}" for text in protocol]
         predicted_samples = sample_surface(mesh, self.points, self.seed + 1)
         unit = "scene units" if self.unit_sphere else "units"
 
@@ -216,14 +203,13 @@ class Judge:
             draw_distances(measured, title, path, dense)
 
         if surface is None:
-            metrics = cloud_metrics(
-                predicted_samples, subsample(truth_points, self.points, self.seed), threshold=threshold
-            )
-            return Verdict(name, metrics, notes, mesh=mesh, draw=draw, is_other_frame=is_other_frame)
-        true_samples, repeated_samples = (sample_surface(surface, self.points, self.seed + offset) for offset in (0, 2))
-        sampling_error = surface_metrics(repeated_samples, true_samples, threshold=threshold)
-        notes.append(f"two samplings of the truth have chamfer_l1 {sampling_error['chamfer_l1']:.4g}")
-        metrics = surface_metrics(predicted_samples, true_samples, threshold=threshold)
+            true_points = subsample(truth_points, self.points, self.seed)
+            metrics = cloud_metrics(predicted_samples, true_points, threshold=threshold)
+        else:
+            true_samples, repeated = (sample_surface(surface, self.points, self.seed + offset) for offset in (0, 2))
+            sampling_error = surface_metrics(repeated, true_samples, threshold=threshold)
+            notes.append(f"two samplings of the truth have chamfer_l1 {sampling_error['chamfer_l1']:.4g}")
+            metrics = surface_metrics(predicted_samples, true_samples, threshold=threshold)
         return Verdict(name, metrics, notes, mesh=mesh, draw=draw, is_other_frame=is_other_frame)
 
 
@@ -273,7 +259,7 @@ def items_of(mesh: Path, truth: Path | None, truth_of: Callable[[str], int | str
 
 def metric_units(judge: Judge) -> dict[str, str]:
     """The unit of each metric."""
-    if judge.folder is not None:
+    if judge.dtu_folder is not None:
         return dict.fromkeys(dtu.METRIC_NAMES, "mm")
     if judge.tanks_folder is not None:
         return dict.fromkeys(tanks.METRIC_NAMES, "")
@@ -408,6 +394,7 @@ def truth_of(options: argparse.Namespace, name: str) -> int | str:
 def main(arguments: list[str] | None = None) -> int:
     """Judges the meshes of the command line; returns 0 for success, 1 if some could not be judged, 2 if none could."""
     options, items, verdicts = parse_arguments(arguments), list[Item](), list[Verdict]()
+    rows = list[tuple[Verdict, Item, int]]()  # they wait for a mesh in its truth's frame
     try:
         judge = Judge(
             *(options.dtu, options.threshold, options.points, options.seed),
@@ -416,7 +403,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         check_options(options)
         items = items_of(options.mesh, options.truth, partial(truth_of, options))
-        rows, fits = list[tuple[Verdict, Item, int]](), options.unchecked  # rows wait for a mesh in its truth's frame
+        fits = options.unchecked
         for index, item in enumerate(items):
             try:
                 verdict = judge.verdict(item)
@@ -445,7 +432,8 @@ def main(arguments: list[str] | None = None) -> int:
                 write_row(*row, judge, options)
             print(write_index(options.into))
     except KeyboardInterrupt:
-        print(f"interrupted: {len(verdicts)} of {len(items)} judged; --into has the rows of these", file=sys.stderr)
+        written = f", rows of {max(len(verdicts) - len(rows), 0)} written" if options.into else ""
+        print(f"interrupted: {len(verdicts)} of {len(items)} judged{written}", file=sys.stderr)
         return 130
     except (OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

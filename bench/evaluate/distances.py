@@ -54,6 +54,28 @@ class Distances:
         return precision, recall, 2 * precision * recall / np.where(both > 0, both, 1)
 
 
+def surface_protocol(points: int, threshold: str, *, has_faces: bool) -> list[str]:
+    """How the metrics against a true surface, or a cloud of its points, are computed, in words.
+
+    Args:
+        points: sampled on each surface.
+        threshold: of the F-score, in words.
+        has_faces: whether the truth is a surface.
+    """
+    sampling = (
+        "random points on each surface, uniform by area; distances to the nearest point of the other surface"
+        if has_faces
+        else "random points of the mesh, uniform by area, and at most as many of the truth's points; distances to the "
+        "nearest point of the other; no normals, since the truth has no faces"
+    )
+    return [
+        f"{points} {sampling}",
+        "accuracy, completeness: mean distance from mesh to truth, from truth to mesh; chamfer_l1: their mean; "
+        "chamfer_l2: sum of the two means of squared distances; chamfer_gt_to_pred: the mean from truth to mesh alone",
+        f"fscore: harmonic mean of the shares of points, per surface, whose distance is below {threshold}",
+    ]
+
+
 def measure_distances(
     mesh: Mesh,
     truth: Mesh | Float[np.ndarray, "k 3"],

@@ -234,10 +234,8 @@ def table_of(sweep: Sweep) -> Result:
     rows = sum(map(bool, panels))
     panels, height = [*chain(*panels)], PANEL_HEIGHT_INCHES * rows + LEGEND_HEIGHT_INCHES
     series = [each for panel in panels for each in panel["series"]]
-    notes = {
-        CROSS: any(math.inf in each["y"] for each in series),
-        FRONT: any(each["name"] == "front" for each in series),
-    }
+    note = POINTS + CROSS * any(math.inf in each["y"] for each in series)
+    note += FRONT * any(each["name"] == "front" for each in series)
     return Result(
         sweep.runs,
         f"Sweep over {', '.join(sweep.swept)}, {sweep.name}." if sweep.swept else f"Sweep {sweep.name}.",
@@ -250,9 +248,7 @@ def table_of(sweep: Sweep) -> Result:
         n=f"{len(sweep.runs.records)} runs" if stress else "",
         interval="; ".join(filter(None, kinds)) if headings else "",
         figure=chart.draw(panels, height, rows, legend=3) if panels else None,
-        chart={"panels": panels, "note": POINTS + "".join(text for text, holds in notes.items() if holds)}
-        if panels
-        else None,
+        chart={"panels": panels, "note": note} if panels else None,
         remarks=(
             SMALL_POINTS if panels else "",
             FAILURE,
@@ -311,14 +307,8 @@ def _panel(
     for name, field, dash in (("initial", "metrics_start", "--"), ("best possible", "metrics_best", ":")):
         value = _shared_median([run.get(field, {}).get(key) for run in row] for row in of_rows)
         if curves and value and math.isfinite(value):
-            fronts.append(
-                chart.level(
-                    f"{name} {'error' if metric.better == LOWER else 'value'}, median",
-                    span,
-                    metric.factor * value,
-                    dash=dash,
-                )
-            )
+            line = f"{name} {'error' if metric.better == LOWER else 'value'}, median"
+            fronts.append(chart.level(line, span, metric.factor * value, dash=dash))
     return chart.panel_data(dataset, title, metric.label, [*fronts, *curves])
 
 
@@ -352,9 +342,9 @@ def _answer(sweep: Sweep, lines: list[dict[str, Any]], lead: str, headings: dict
     verdict.append(_doubt(sweep, interval_by_row, is_higher_better=is_higher_better))
     costs = {line["row"]: line["evaluations_cost"] for line in lines if line["evaluations_cost"] and not line["failed"]}
     ordered = sorted(costs, key=lambda row: costs[row])
-    if len(texts := {row: f"{format.count(costs[row])} ({row})" for row in ordered}) > 1:
-        low, high = texts[ordered[0]], texts[ordered[-1]]
-        verdict.append(f"Field evaluations: {low} to {high}." if low.split()[0] != high.split()[0] else "")
+    counts = [format.count(costs[row]) for row in ordered]
+    if len({*counts}) > 1:
+        verdict.append(f"Field evaluations: {counts[0]} ({ordered[0]}) to {counts[-1]} ({ordered[-1]}).")
     return {"question": question, "verdict": " ".join(filter(None, verdict))}
 
 
@@ -366,9 +356,8 @@ def _doubt(sweep: Sweep, intervals: dict[str, Interval], *, is_higher_better: bo
     if not all(interval.has_ends for interval in intervals.values()):
         return f"With {FEW}, the order is not certain."
     best, *others = sorted(intervals, key=lambda row: intervals[row].value, reverse=is_higher_better)
-    overlaps = [
-        r for r in others if intervals[r].low <= intervals[best].high and intervals[best].low <= intervals[r].high
-    ]
+    low, high = intervals[best].low, intervals[best].high
+    overlaps = [row for row in others if intervals[row].low <= high and low <= intervals[row].high]
     return f"The interval of {best} overlaps with those of {', '.join(overlaps)}." if overlaps else ""
 
 
