@@ -84,14 +84,15 @@ def _normalised(mesh: Mesh) -> Mesh:
 
 
 @lru_cache
-def _code() -> bytes:
-    """The code on which the numbers of a file depend, that of its readers too."""
+def readers_code() -> bytes:
+    """The code of this folder: what is read from a file, and cached, depends on it."""
     return b"\0".join(file.read_bytes() for file in sorted(Path(__file__).parent.rglob("*.py")))
 
 
 def _key(file: Path) -> str:
     """The same for files with the same content and format."""
-    return hashlib.sha256(b"\0".join([_code(), file.suffix.lower().encode(), file.read_bytes()])).hexdigest()[:16]
+    content = readers_code(), file.suffix.lower().encode(), file.read_bytes()
+    return hashlib.sha256(b"\0".join(content)).hexdigest()[:16]
 
 
 def _cached(path: Path, compute: Callable[[], np.ndarray]) -> np.ndarray:

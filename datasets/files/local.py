@@ -16,7 +16,7 @@ import numpy as np
 from datasets.extras import referenced_files, version
 from datasets.files.colours import FileColours
 from datasets.files.deform import Deformation
-from datasets.files.duplicates import first_of_each_shape
+from datasets.files.duplicates import first_of_each_shape, readers_code
 from datasets.files.meshes import find_meshes, load_mesh
 from datasets.mesh import Mesh, normalise
 from datasets.scene import Split, seed_of
@@ -135,8 +135,7 @@ def load_repaired(path: Path) -> Mesh:
 
     The cache key covers this code, PyMeshLab's version and the file: if one changes, the mesh is repaired again.
     """
-    code = sorted(Path(__file__).parent.rglob("*.py"))
-    fingerprint = b"\0".join([str(version("pymeshlab")).encode(), *(file.read_bytes() for file in (*code, path))])
+    fingerprint = b"\0".join([str(version("pymeshlab")).encode(), readers_code(), path.read_bytes()])
     folder = cache_folder("meshes")
     entry = folder / f"{hashlib.sha256(fingerprint).hexdigest()[:16]}.npz"
     with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), entry.open("rb") as file, np.load(file) as data:
