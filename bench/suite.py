@@ -13,7 +13,6 @@ Any other KEY=VALUE is passed to `python -m bench`.
 """
 
 import re
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -44,6 +43,10 @@ from bench.report.suite.standing import KEY, Standing, units
 from bench.report.write import paper
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
+from bench.runner.command import command_line
+from bench.runner.run import run_one
+from bench.runner.summary import print_statuses
+from bench.runner.sweep import run_sweep
 from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 
 PAGE = "suite"  # its file name in the folder `paper`
@@ -201,12 +204,9 @@ def _chosen(node: dict[str, Any]) -> dict[str, str]:
 
 
 def _sweep(keys: list[str]) -> int:
-    command = [sys.executable, "-m", "bench", "-m", *keys]
-    with subprocess.Popen(command) as sweep:
-        try:
-            return sweep.wait()
-        except KeyboardInterrupt:  # the sweep received Ctrl-C too, and prints its summary
-            return sweep.wait()
+    """Makes the runs of a sweep like `python -m bench -m`, in this process, without a page; returns the exit status."""
+    sys.argv[1:] = ["-m", *keys]
+    return command_line(run_one, lambda composer, config: run_sweep(composer, config, print_statuses))
 
 
 def print_standing(results_dir: Path) -> int:

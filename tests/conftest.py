@@ -146,18 +146,10 @@ def cached_compositions() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_pages() -> Iterator[None]:
-    """Reads each shipped file of attempts once, and draws figures of few pixels; their PDF files subset no font."""
+    """Draws figures of few pixels; their PDF files subset no font."""
     from bench.pictures import figure_style
-    from bench.records.shipped import SHIPPED
-    from bench.report.suite import attempts
-
-    read, read_once = attempts._read_lines, cache(attempts._read_lines)
-
-    def read_lines(path: Path) -> list[Any]:
-        return [*read_once(path)] if path.is_relative_to(SHIPPED) else read(path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(attempts, "_read_lines", read_lines)
         patch.setitem(figure_style.RC, "savefig.dpi", 60)
         patch.setitem(figure_style.RC, "pdf.fonttype", 3)
         yield

@@ -104,12 +104,12 @@ def _compose_and_run(arguments: list[str], work: Work, sweep: Sweep | None) -> b
             return True
         if sweep is None and config.plan:
             raise ValueError("plan=true lists runs, and this command starts none: remove it")
+        os.environ |= {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
         if options.multirun or config.hydra.mode == RunMode.MULTIRUN:
             if sweep is not None:
                 return all(status == "ok" for status in sweep(composer, config))
             return work_per_cell(composer, config, work)
         params = OmegaConf.select(config, "hydra.sweeper.params")
-        os.environ |= {str(key): str(value) for key, value in config.hydra.job.env_set.items()}
         run = composer.single_run(config)
     if params and sweep is not None:
         notice("note: this is one run; with -m in the command it is all runs of the table")

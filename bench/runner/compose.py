@@ -35,6 +35,7 @@ from bench.runner.messages import OPTIONAL_GROUPS
 from bench.tables import CONF, folders, group_choices, nearest, register_resolvers, register_rows
 
 NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")
+SETTING_TYPES = (OverrideType.CHANGE, OverrideType.FORCE_ADD)
 INDEX_OR_SEED_REFERENCE = re.compile(r"\$\{[^}]*(index|seed)")
 
 
@@ -129,11 +130,13 @@ def combinations(texts: Sequence[str]) -> list[list[str]]:
 
 
 def sets_value(override: Override) -> bool:
-    """Whether an override sets an existing key. Hydra applies the others, which choose, add or remove."""
+    """Whether an override sets a key, with `++` also a new one. Hydra applies those that choose, add or remove."""
     key = override.key_or_group
     is_group = group_choices(key) and not isinstance(override.value(), dict)
     chooses = override.package is not None or "/" in key or is_group
-    return override.type == OverrideType.CHANGE and not chooses and key != "hydra.searchpath"
+    if is_group and isinstance(override.value(), list):
+        raise ValueError(f"{override.input_line}: {key} has one choice: write {key}=NAME, or -m {key}=NAME,NAME")
+    return override.type in SETTING_TYPES and not chooses and key != "hydra.searchpath"
 
 
 def set_value(override: Override, config: DictConfig) -> bool:
@@ -144,7 +147,7 @@ def set_value(override: Override, config: DictConfig) -> bool:
     """
     key, value = override.key_or_group, override.value()
     try:
-        OmegaConf.update(config, key, value, merge=True)
+        OmegaConf.update(config, key, value, merge=True, force_add=override.type == OverrideType.FORCE_ADD)
     except (ConfigAttributeError, ConfigKeyError) as error:
         if isinstance(value, dict) and OmegaConf.select(config, key) is not None:
             raise unknown_key(str(error.full_key), config) from error

@@ -7,7 +7,8 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from multiprocessing.connection import Connection
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 import torch
@@ -23,15 +24,11 @@ from renderers.rendering import Unsupported
 PROGRESS_INTERVAL_SECONDS = 0.05
 
 
-def main(record: Record, channel: Connection, parent: Connection) -> None:
-    """Makes the run of a record in the process of that run; its output goes to `log.txt`.
-
-    Args:
-        parent: the reading end of a pipe that only the parent holds open, and never writes to.
-    """
+def main(record: Record, channel: Connection) -> None:
+    """Makes the run of a record in the process of that run; its output goes to `log.txt`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
     signal.signal(signal.SIGTERM, _stop)
-    _exit_with_parent(parent)
+    _exit_with_parent()
     _redirect_output(record.folder / "log.txt")
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
@@ -105,13 +102,16 @@ def _stop(number: int, frame: object) -> None:
     raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
 
 
-def _exit_with_parent(parent: Connection) -> None:
-    """Makes the system end this process when the pipe's other end closes, also during native code."""
+def _exit_with_parent() -> None:
+    """Makes the system end this process when its parent ends, also during native code."""
+    parent = parent_process()
+    assert parent is not None
+    end = parent.sentinel  # the reading end of a pipe that only the parent holds open
     signal.signal(signal.SIGIO, signal.SIG_DFL)
-    fcntl.fcntl(parent.fileno(), fcntl.F_SETOWN, os.getpid())
-    flags = fcntl.fcntl(parent.fileno(), fcntl.F_GETFL)
-    fcntl.fcntl(parent.fileno(), fcntl.F_SETFL, flags | os.O_ASYNC)
-    if parent.poll():  # closed before the signal was set up
+    fcntl.fcntl(end, fcntl.F_SETOWN, os.getpid())
+    flags = fcntl.fcntl(end, fcntl.F_GETFL)
+    fcntl.fcntl(end, fcntl.F_SETFL, flags | os.O_ASYNC)
+    if wait([end], 0):  # ended before the signal was set up
         os._exit(1)
 
 

@@ -8,7 +8,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain
-from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, ClassVar
@@ -18,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import find_class
 from bench.progress import notice
 from bench.records.results import Plan, PlannedRun
-from bench.runner.process import catch_signals, raise_if_stopped, signals_delayed
+from bench.runner.process import catch_signals, fork_runs, raise_if_stopped, signals_delayed, warm_up
 from bench.tables import names
 from datasets.extras import install_command
 
@@ -111,7 +110,6 @@ def execute(make: Make, jobs: Jobs, launcher: Launcher) -> bool:
     """
     if not jobs:
         return True
-    os.environ |= launcher.variables
     with closing(launcher.run(make, jobs)) as results:
         return print_errors(results)
 
@@ -171,8 +169,8 @@ class Workers(Launcher):
 
 
 def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
-    """Starts a worker; returns the connection to it, and its process."""
-    context = get_context("spawn")
+    """Starts a worker from the server of processes; returns the connection to it, and its process."""
+    context = warm_up()
     parent_end, child_end = context.Pipe()
     process = context.Process(target=_worker_main, args=(make, child_end))
     with signals_delayed():
@@ -184,6 +182,7 @@ def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
 def _worker_main(make: Make, channel: Connection) -> None:
     """Runs the cells that the channel sends, until it sends None or a signal comes."""
     catch_signals()
+    fork_runs()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent passes it on
     try:
         while (cell := channel.recv()) is not None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import ForkServerContext
+from multiprocessing.context import ForkContext, ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from pkgutil import walk_packages
@@ -33,6 +33,7 @@ EXTERNAL_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP
 # A signal is also stored, because an interrupted library may swallow or replace the exception.
 _stopped = ""  # the signal that stopped this command, in words
 _delayed = False  # within `signals_delayed`
+_is_worker = False
 
 
 @dataclass
@@ -71,14 +72,12 @@ def run_isolated(run: RunInProgress) -> Failure | None:
     """Makes a run in a child process, within its limits; returns how it ended if it sent no final record, else None."""
     context = warm_up()
     channel, child_channel = context.Pipe()
-    child_lifeline, lifeline = context.Pipe(duplex=False)  # closes whenever this process ends, and the child notices
-    process = context.Process(target=_run, args=(run.record, child_channel, child_lifeline))
-    with channel, lifeline:
+    process = context.Process(target=_run, args=(run.record, child_channel))
+    with channel:
         try:
             with signals_delayed():  # an interrupted start would end the fork server
                 process.start()
                 child_channel.close()
-                child_lifeline.close()
             failure = _watch(process, channel, run)
             process.join(TERMINATION_GRACE_SECONDS if failure is None else 0.0)
             return failure
@@ -101,11 +100,19 @@ def fork_server() -> ForkServerContext:
     return context
 
 
-def warm_up() -> ForkServerContext:
+def fork_runs() -> None:
+    """From now on, runs are forked from this process, a launcher's worker, which the server has forked."""
+    global _is_worker
+    _is_worker = True
+
+
+def warm_up() -> ForkServerContext | ForkContext:
     """Starts the fork server, which imports the slow modules while this process does something else.
 
     The server and its children never receive Ctrl-C: their parent does, and ends them.
     """
+    if _is_worker:
+        return multiprocessing.get_context("fork")
     context = fork_server()
     resource_tracker.ensure_running()  # here, because it unblocks the signal that is blocked below
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a new process inherits the mask
@@ -140,13 +147,13 @@ def _send_result(work: Callable[[Any], Any], argument: Any, sender: Connection) 
     sender.send(work(argument))
 
 
-def _run(record: Record, channel: Connection, lifeline: Connection) -> None:
+def _run(record: Record, channel: Connection) -> None:
     for module in preloaded_modules():  # before `Started`, so that the run's time excludes it
         with suppress(ImportError):
             import_module(module)
     from bench.runner.execute import main
 
-    main(record, channel, lifeline)
+    main(record, channel)
 
 
 def _watch(process: BaseProcess, channel: Connection, run: RunInProgress) -> Failure | None:

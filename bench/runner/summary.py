@@ -50,6 +50,17 @@ def print_sweep_summary(plan: Plan, index: Path, tables: Sequence[str] = ()) -> 
     Args:
         tables: lines on the sweep's tables.
     """
+    statuses = print_statuses(plan)
+    print(*tables, f"report: {index}", sep="\n")
+    records = filter(None, map(plan.record, plan.cells))
+    _print_contract_test(index.parent / "runs", [record for record in records if not record["reused"]])
+    _print_report_command(index.parent)
+    print(plan.folder)
+    return statuses
+
+
+def print_statuses(plan: Plan) -> list[str]:
+    """Prints the number of planned cells of each status, and the first failure; returns the status of every cell."""
     records = [plan.record(cell) for cell in plan.cells]
     statuses = [record["status"] if record else NOT_RUN for record in records]
     counts = ", ".join(f"{count} {status}" for status, count in Counter(statuses).most_common())
@@ -57,11 +68,8 @@ def print_sweep_summary(plan: Plan, index: Path, tables: Sequence[str] = ()) -> 
     if set(statuses) - {"ok", "unsupported"}:
         print("the same command runs what was not run or was killed; with rerun=failed, also the cells that failed")
     for record in [record for record in records if record and record["status"] != "ok"][:1]:
-        print(f"first failure: {index.parent / 'runs' / record['folder']} ({record['status']}: {record['reason']})")
-    print(*tables, f"report: {index}", sep="\n")
-    _print_contract_test(index.parent / "runs", [record for record in records if record and not record["reused"]])
-    _print_report_command(index.parent)
-    print(plan.folder)
+        folder = plan.results_dir / "runs" / record["folder"]
+        print(f"first failure: {folder} ({record['status']}: {record['reason']})")
     return statuses
 
 

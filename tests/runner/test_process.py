@@ -91,7 +91,7 @@ def test_modules_that_the_server_lacks_are_loaded_before_the_run_begins(monkeypa
     calls = []
     monkeypatch.setattr(process, "import_module", calls.append)
     monkeypatch.setattr("bench.runner.execute.main", lambda *_: calls.append("main"))
-    process._run(Record("id", "task", "renderer", "dataset", 0, {}), *Pipe())
+    process._run(Record("id", "task", "renderer", "dataset", 0, {}), Pipe()[0])
     assert calls == [*process.preloaded_modules(), "main"] and "open3d" in calls
 
 

@@ -29,6 +29,17 @@ def p_values(differences: np.ndarray) -> np.ndarray:
     return (np.abs(signs(len(differences)) @ differences) >= sums - 1e-12).mean(axis=0)
 
 
+def any_at_most(differences: np.ndarray, p_value: float) -> bool:
+    """Whether the p value of any pair is at most `p_value`; pairs that fewer flips already refuse are not completed."""
+    flips, sums = signs(len(differences)), np.abs(differences.sum(axis=0))
+    counts = np.zeros(len(sums), int)
+    for block in np.array_split(flips, 16):
+        counts += (np.abs(block @ differences) >= sums - 1e-12).sum(axis=0)
+        left = counts <= p_value * len(flips)
+        differences, sums, counts = differences[:, left], sums[left], counts[left]
+    return len(sums) > 0
+
+
 def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
     """The smallest and largest end of simultaneous confidence intervals of the means of values [units, columns].
 

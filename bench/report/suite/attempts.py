@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cache
+from functools import cache, lru_cache
 from io import StringIO
 from itertools import product
 from math import inf, isnan
@@ -286,12 +286,15 @@ def _write_lines(path: Path, attempts: list[Attempt]) -> Path:
     return path
 
 
-def _read_lines(path: Path) -> list[Attempt]:
-    """Reads the attempts of a file; one of `READ_ERRORS` if it is damaged, or its columns are not those of today."""
+@lru_cache(256)
+def _read_lines(path: Path, changed: int) -> list[Attempt]:
+    """Reads the attempts of a file, once per time of its change.
+
+    Raises one of `READ_ERRORS` if it is damaged, its columns are not those of today, or its numbers make no sense.
+    """
     with path.open(encoding="utf-8", newline="") as file:
-        return [
-            Attempt(**{f.name: _value(line[f.name], f.type) for f in fields(Attempt)}) for line in csv.DictReader(file)
-        ]
+        lines = [{f.name: _value(line[f.name], f.type) for f in fields(Attempt)} for line in csv.DictReader(file)]
+    return [_checked(Attempt(**line)) for line in lines]
 
 
 def _value(cell: str, kind: Any) -> Any:
@@ -303,7 +306,7 @@ def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
     attempts, problems = list[Attempt](), list[str]()
     for path in (path for folder in folders for path in sorted(attempts_folder(folder).glob("[!.]*.csv"))):
         try:
-            attempts += [*map(_checked, _read_lines(path))]
+            attempts += _read_lines(path, path.stat().st_mtime_ns)
         except READ_ERRORS as error:
             problems.append(f"{path.name}: {error!r}")
     return attempts, problems
