@@ -106,7 +106,8 @@ def check_results(results_dir: Path) -> None:
     """Checks that a results folder exists, and that no link leads writes out of it.
 
     Raises:
-        ValueError: if `results_dir` is not a folder, or one of its folders or files is a link that leads out of it.
+        ValueError: if `results_dir` is not a folder or lies within a results folder, or one of its folders or files is
+            a link that leads out of it.
     """
     if results_dir.is_file():
         raise ValueError(f"results_dir={results_dir} is a file: name the folder that has runs")
@@ -115,6 +116,9 @@ def check_results(results_dir: Path) -> None:
             f"results_dir={results_dir}: there is no such folder; name one that has runs, or make a run: "
             f"python -m bench results_dir={results_dir}"
         )
+    for records, folder in (("record.json", results_dir.parent.parent), ("*/record.json", results_dir.parent)):
+        if any(results_dir.glob(records)):
+            raise ValueError(f"results_dir={results_dir} lies in the results folder {folder}: name that folder")
     check_links(results_dir)
 
 

@@ -106,12 +106,18 @@ def plot(runs: pd.DataFrame, *, error: str = "", cost: str = "", width: float = 
     Raises:
         ValueError: the runs are of several tasks or scales, or none has the error and the cost.
     """
+    if runs.empty:
+        raise ValueError("there are no runs to draw")
+    if lacking := [column for column in ("task", "scale", "name", "renderer", "status") if column not in runs]:
+        raise ValueError(f"the table has no column {lacking[0]!r}: select rows of bench.load(), and keep its columns")
     for column in ("task", "scale"):
         if len(values := sorted({*runs[column].dropna().astype(str)})) > 1:
             raise ValueError(f"the runs have several values of {column}: {', '.join(values)}; select one")
     error = error or next((name for name in TABLE_METRICS if name in runs and runs[name].notna().any()), "")
     cost = cost or next((name for name in COSTS if name in runs and runs[name].notna().any()), "")
     for what, name in (("error", error), ("cost", cost)):
+        if not name:
+            raise ValueError(f"no run has a default {what}: name a column, {what}=COLUMN")
         if name not in runs or not is_numeric_dtype(runs[name]) or not runs[name].notna().any():
             raise ValueError(f"no run has the {what} {name!r}{'' if name in runs else nearest(name, [*runs.columns])}")
     metric, is_higher_better = TABLE_METRICS.get(error, Metric(error)), better_direction(error) == "higher"

@@ -60,5 +60,20 @@ def test_a_chart_of_several_tasks_or_without_the_error_is_refused(tmp_path):
     runs = bench.load(tmp_path)
     with pytest.raises(ValueError, match="several values of task: completion, pose; select one"):
         bench.plot(runs)
+    pose = runs[runs.task == "pose"]
     with pytest.raises(ValueError, match="no run has the error 'chamfer_l3': did you mean chamfer_l2"):
-        bench.plot(runs[runs.task == "pose"], error="chamfer_l3")
+        bench.plot(pose, error="chamfer_l3")
+    with pytest.raises(ValueError, match="no run has a default cost: name a column, cost=COLUMN"):
+        bench.plot(pose.drop(columns="evaluations_cost"))
+    with pytest.raises(ValueError, match="no column 'task'"):
+        bench.plot(pose.drop(columns="task"))
+    with pytest.raises(ValueError, match="there are no runs to draw"):
+        bench.plot(runs[:0])
+
+
+def test_a_folder_within_a_results_folder_is_refused_with_the_right_one(tmp_path):
+    ran(tmp_path, cell("dist"), 0.001)
+    runs = next((tmp_path / "runs").iterdir())
+    for within in (tmp_path / "runs", runs):
+        with pytest.raises(ValueError, match=f"lies in the results folder {tmp_path}: name that folder"):
+            bench.load(within)
