@@ -32,7 +32,7 @@ GROUP_OF_TABLE = {
     **{"methods": METHOD, "tuned": TUNED, "variants": "renderer", "stresses": "stress"},
     **{"losses": "silhouette", "supervision": "supervision", "shapes": "dataset"},
 }
-METHOD_ROW_GROUPS = ("task", "renderer", "dataset", "stress", "silhouette", "supervision", "prior", "scale")
+METHOD_ROW_GROUPS = ("task", "renderer", "dataset", "stress", "silhouette", "supervision", "prior", "scale", "effort")
 LOOK_KEY = "_look_"  # key of a renderer or a method: its colour, marker and line in figures
 TABLE_KEYS = ("base", "space", "chosen")  # keys of a row that are not part of its content
 LABEL_KEY = "_label_"  # key of a renderer: its name in tables

@@ -14,6 +14,7 @@ from bench.evaluate.evaluate import CHECKPOINT_METRICS, Evaluation, chamfer_only
 from bench.evaluate.state import State
 from bench.shape_prior import Prior
 from bench.solve.optimise import CannotContinue, Starts, StartSettings
+from bench.solve.pixel_draw import PixelDraw
 from renderers.checks import check_at_least, check_choice
 from renderers.field import Counts, Field, Meter, Moved
 
@@ -60,7 +61,7 @@ class CodeProblem:
         penalty: on the code.
         compare: returns the weighted terms of the loss of a field at an iteration.
         observed: pixels of the scene's view whose depth is observed.
-        rays_per_iteration: number of rays.
+        rays: number of rays of an iteration; with `draw`, of a drawn pixel.
         device: of all tensors.
         initial: codes, one per start; None is code zero, the mean shape.
         initial_similarities: one per start, see `renderers.field.Moved`; None does not move the shape.
@@ -68,13 +69,15 @@ class CodeProblem:
         photographs: the observed photographs, for pictures.
         progress_measure: returns the number of a field that must decrease; None: the loss must.
         mask, coloured: whether a mask and colours are observed, for pictures.
+        draw: the pixels that each iteration compares.
+        held_out: returns the weighted terms of the loss of a field on the held-out pixels of `draw`.
     """
 
     prior: Prior
     penalty: CodePenalty
     compare: Callable[[Field, int], Terms]
     observed: Bool[Tensor, "height width"]
-    rays_per_iteration: int
+    rays: int
     device: torch.device
     initial: Float[Tensor, "starts code_length"] | None = None
     initial_similarities: Float[Tensor, "starts 7"] | None = None
@@ -83,6 +86,8 @@ class CodeProblem:
     progress_measure: Callable[[Field], float] | None = None
     mask: bool = True
     coloured: bool = False
+    draw: PixelDraw | None = None
+    held_out: Callable[[Field], Terms] | None = None
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = CHECKPOINT_METRICS
@@ -132,6 +137,22 @@ class CodeProblem:
                 raise
             terms = {"code": nan * penalty["code"]}  # this start takes no step
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    @property
+    def rays_per_iteration(self) -> int:
+        """The mean number of rays of an iteration."""
+        return self.rays if self.draw is None else self.rays * self.draw.per_iteration
+
+    @torch.no_grad()
+    def held_out_loss(self) -> float:
+        """The loss of the held-out pixels."""
+        assert self.held_out is not None
+        terms = self.held_out(Meter(self._shape(self.starts.best()), self.counts))
+        return float(torch.stack([*terms.values()]).sum())
+
+    def refine(self) -> bool:
+        """Compares a pixel of each smaller block from now on; returns False if blocks are as small as can be."""
+        return self.draw is not None and self.draw.refine()
 
     @torch.no_grad()
     def objective(self) -> float | None:

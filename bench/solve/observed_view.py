@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.solve.latent_code import Terms
+from bench.solve.pixel_draw import PixelDraw
 from datasets.scene import View
 from renderers.boundary import render_checked
 from renderers.camera import Rays
@@ -18,11 +19,6 @@ from renderers.silhouette import SilhouetteLoss
 
 DEPTH, POINTS = "depth", "points"  # errors averaged by a depth loss; see `bench.tasks.completion.Completion`
 DEPTH_LOSSES = (DEPTH, POINTS)
-
-
-def generator_of(seed: int, iteration: int) -> torch.Generator:
-    """The generator of an iteration's random draws, on the CPU."""
-    return torch.Generator().manual_seed(seed * 1_000_003 + iteration)
 
 
 def depth_error(
@@ -142,6 +138,12 @@ class ObservedView:
     def drawn(self, rays: Int[Tensor, " n"]) -> "ObservedView":
         """The observations of drawn rays in one row; terms have the same weights on average as among all rays."""
         return replace(self.select(rays), expected_observed=expected_in_draw(self.observed, len(rays)))
+
+    def compare_drawn(self, draw: PixelDraw, field: Field, iteration: int) -> Terms:
+        """The terms of `compare`, of the pixels that an iteration draws."""
+        pixels = draw.pixels(iteration)
+        drawn = self if pixels is None else self.flat().drawn(pixels.to(self.observed.device))
+        return drawn.compare(field, iteration)
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted loss terms of DIST, Eq. 5."""

@@ -25,7 +25,9 @@ from renderers.schedule import Iteration, schedule_position
 DIVERGENCE_FACTOR = 100.0  # times the first loss, or `least_reference` if larger: a loss above it has diverged
 HALVING_FACTOR = 4  # one start of four is kept after each round (successive halving, Jamieson and Talwalkar 2016)
 SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of a round, since each sees other views
-ITERATIONS, BUDGET = "iterations", "budget"  # what ends a loop
+ITERATIONS, BUDGET, HELD_OUT = "iterations", "budget", "held_out"  # what ends a loop
+HELD_OUT_INTERVAL = 5  # iterations between two measurements of the loss of held-out pixels
+HELD_OUT_PATIENCE, HELD_OUT_GAIN = 2, 0.02  # it has stopped falling if so many measurements gain less than this
 AFFORDED_ITERATIONS = 40  # for which `with_affordable_rays` chooses the rays
 BLOCKS = (1, 2, 4, 8)  # pixels per side of a block of which an iteration has one ray
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
@@ -48,7 +50,8 @@ class OptimiserSettings:
             zero over the first tenth, for a start that is almost correct; "steps": falls to a fifth twice.
         budget: largest cost, see `renderers.field.Counts.cost`; the step that reaches it is the last.
         ends: "iterations", the number of steps, with the budget as a limit; "budget": whatever the number of steps, and
-            schedules over `iterations` follow the spent fraction of the budget.
+            schedules over `iterations` follow the spent fraction of the budget; "held_out": when the loss of held-out
+            pixels stops falling, see `HeldOut`, after `iterations` at most.
         start_noise: standard deviation of normal noise in all initial parameters, for the run-to-run spread.
     """
 
@@ -65,14 +68,14 @@ class OptimiserSettings:
         check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
         if self.budget is not None:
             check_positive("task.optimiser.budget", self.budget, "the suite has 2.5e5 to 1e7, null is none")
-        check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET))
+        check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET, HELD_OUT))
         check_at_least("task.optimiser.start_noise", self.start_noise, 0, "1e-6 shows the run-to-run spread")
         if self.ends == BUDGET and self.budget is None:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
 
     def at(self, index: int, cost: float) -> int:
         """The index, with the position in schedules that follows from the cost spent before it."""
-        if self.ends == ITERATIONS or self.budget is None:
+        if self.ends != BUDGET or self.budget is None:
             return index
         return Iteration(index, min(int(self.iterations * cost / self.budget), self.iterations - 1))
 
@@ -101,6 +104,37 @@ class Optimisable(Protocol):
     def loss(self, iteration: int) -> dict[str, Tensor]:
         """The loss of an iteration, counted from 0, under "total", and its weighted terms."""
         ...
+
+
+@runtime_checkable
+class HeldOut(Protocol):
+    """A problem that holds out pixels. When their loss stops falling, it compares more pixels, and then ends."""
+
+    def held_out_loss(self) -> float:
+        """The loss of the held-out pixels, whose cost is counted."""
+        ...
+
+    def refine(self) -> bool:
+        """Compares more pixels from now on; returns False if it compares all."""
+        ...
+
+
+@dataclass
+class _Patience:
+    """Ends a loop by the losses of held-out pixels, which it measures every `HELD_OUT_INTERVAL` iterations."""
+
+    problem: Any
+    losses: list[float] = field(default_factory=list)  # since the last refinement
+
+    def is_over(self, index: int) -> bool:
+        if (index + 1) % HELD_OUT_INTERVAL:
+            return False
+        self.losses.append(self.problem.held_out_loss())
+        before, latest = self.losses[:-HELD_OUT_PATIENCE], self.losses[-HELD_OUT_PATIENCE:]
+        if not before or min(latest) <= (1 - HELD_OUT_GAIN) * min(before):
+            return False
+        self.losses = latest[-1:]
+        return not self.problem.refine()
 
 
 @runtime_checkable
@@ -172,7 +206,7 @@ def optimise(
     """
     _add_noise(problem.parameters, settings.start_noise)
     optimiser, own_starts = _Adam(problem.parameters), getattr(problem, "starts", None)
-    starts = own_starts or Starts(StartSettings(1, 1))
+    starts, patience = own_starts or Starts(StartSettings(1, 1)), _Patience(problem)
     loss_of = problem.loss if own_starts else lambda step, start: problem.loss(step)
     stopwatch = Stopwatch(device)
     start, step = starts.assignment(0)
@@ -180,7 +214,7 @@ def optimise(
     history.seconds["warmup"] = stopwatch.seconds()
     before = replace(problem.counts)
     memory = MemoryPeak(device)
-    for index in range(settings.iterations) if settings.ends == ITERATIONS else count():
+    for index in count() if settings.ends == BUDGET else range(settings.iterations):
         optimiser.forget_gradients()
         start, step = starts.assignment(index)
         iteration = settings.at(step, history.counts.cost)
@@ -198,6 +232,9 @@ def optimise(
             else:
                 failure = f"the gradient is not finite at iteration {index}"
             history.seconds["backward"] += stopwatch.seconds()
+        stopwatch = Stopwatch(device)
+        is_over = settings.ends == HELD_OUT and patience.is_over(index)
+        history.seconds["forward"] += stopwatch.seconds() if settings.ends == HELD_OUT else 0.0
         first_loss = starts.first_loss(start)
         if starts.is_alone and failure:
             history.status, history.reason = RunStatus.NAN, failure
@@ -223,7 +260,7 @@ def optimise(
         if history.status is RunStatus.OK and settings.ends == BUDGET:
             history.reason = _budget_problem(history.curve, is_spent)
             history.status = RunStatus.NOT_REACHED if history.reason else RunStatus.OK
-        if is_spent or history.status is not RunStatus.OK:
+        if is_over or is_spent or history.status is not RunStatus.OK:
             break
 
 
@@ -327,7 +364,7 @@ class StartSettings:
 
     def check(self, settings: OptimiserSettings) -> None:
         """Raises ValueError if the rounds would use up the iterations, or if their number is not known."""
-        if self.count > 1 and settings.ends == BUDGET:
+        if self.count > 1 and settings.ends != ITERATIONS:
             raise ValueError(f"{self.count} starts share a number of iterations: set task.optimiser.ends=iterations")
         if self.trials >= settings.iterations:
             raise ValueError(

@@ -1,6 +1,5 @@
 """Shape completion: optimises a latent code to match a sparse depth image and a mask (DIST, Sec. 4.2.1)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -10,12 +9,13 @@ import torch
 from bench.config import extension
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
-from bench.solve.observed_view import DEPTH_LOSSES, ObservedView, generator_of
-from bench.solve.optimise import OptimiserSettings, StartSettings, with_affordable_rays
+from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
+from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
+from bench.solve.optimise import HELD_OUT, OptimiserSettings, StartSettings, with_affordable_rays
+from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
 from datasets.scene import OneView, Scene, unshaded_image
-from datasets.views import observed_pixels, parse_amount, pixel_of_each_block
+from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Field
 from renderers.rendering import Renderer
@@ -119,27 +119,20 @@ class Completion:
             return with_affordable_rays(self, lambda task: task.problem(scene, prior, renderer, **of_scene))
         observed_view = self._observed_view(scene, renderer, seed=seed, device=device)
         compared = observed_view.observed & (self.depth_weight > 0)
-        rays = len(pixel_of_each_block(*compared.shape, self.pixel_block, torch.Generator()))
-        compare, all_pixels = observed_view.compare, None
-        if self.pixel_block > 1:
-            compare = self._compare_blocks(observed_view, scene.seed(seed))
-            all_pixels = partial(_loss_of_all_pixels, observed_view, self.optimiser.iterations)
-        problem = partial(CodeProblem, prior, self.code, compare, compared, rays, device, progress_measure=all_pixels)
+        holds_out, last = self.optimiser.ends == HELD_OUT, self.optimiser.iterations
+        draw = PixelDraw(observed_view.observed, self.pixel_block, scene.seed(seed), holds_out=holds_out)
+        compare = partial(observed_view.compare_drawn, draw)
+        problem = partial(CodeProblem, prior, self.code, compare, compared, 1, device, draw=draw)
+        if holds_out or self.pixel_block > 1:
+            problem = partial(problem, progress_measure=partial(_loss_of_all_pixels, observed_view, last))
+        if holds_out:
+            held_out = observed_view.flat().drawn(draw.held_out.to(device))
+            problem = partial(problem, held_out=lambda field: held_out.compare(field, last))
         problem = partial(problem, mask=observed_view.mask is not None, coloured=self.colour_weight > 0)
         if not self.similarity:
             return problem()
         codes = torch.zeros(self.rotations, prior.decoder.code_length)
         return problem(initial=codes, initial_similarities=initial_rotations(self.rotations), trial=self.trial)
-
-    def _compare_blocks(self, view: ObservedView, seed: int) -> Callable[[Field, int], Terms]:
-        """Compares a random pixel of each block, drawn anew in each iteration."""
-        (height, width), flat = view.observed.shape, view.flat()
-
-        def compare(field: Field, iteration: int) -> Terms:
-            pixels = pixel_of_each_block(height, width, self.pixel_block, generator_of(seed, iteration))
-            return flat.drawn(pixels.to(view.observed.device)).compare(field, iteration)
-
-        return compare
 
     def _observed_view(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:
         """The observed part of a scene's view."""

@@ -13,13 +13,12 @@ from torch import Tensor
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
-from bench.solve.observed_view import generator_of
-from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
+from bench.solve.optimise import HELD_OUT, CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
+from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, metric_definitions, solve_and_draw
 from datasets.photographs import Photography
 from datasets.scene import Scene
 from datasets.shot import Shot
-from datasets.views import pixel_of_each_block
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_positive
@@ -178,7 +177,7 @@ class Multiview:
             self.code,
             photometric_loss.compare,
             observed,
-            2 * photometric_loss.per_step * len(photometric_loss.pixels(0)),
+            2 * photometric_loss.per_step,
             photometric_loss.colours.device,
             initial=codes,
             initial_similarities=initial_rotations(self.starts)
@@ -187,11 +186,15 @@ class Multiview:
             trial=self.trial,
             photographs=photometric_loss.colours.cpu().numpy(),
             progress_measure=partial(self._loss_of_all_pixels, photometric_loss),
+            draw=photometric_loss.draw,
+            held_out=lambda field: photometric_loss.compare_at(
+                field, self.optimiser.iterations, photometric_loss.draw.held_out
+            ),
         )
 
     def _loss_of_all_pixels(self, photometric_loss: "PhotometricLoss", field: Field) -> float:
         """The loss without the code's penalty, of images that are no longer blurred."""
-        terms = photometric_loss.compare(field, self.optimiser.iterations, every_pixel=True)
+        terms = photometric_loss.compare_at(field, self.optimiser.iterations)
         return float(torch.stack(list(terms.values())).sum())
 
     def _initial_similarity(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
@@ -237,6 +240,8 @@ class PhotometricLoss:
             nearest = torch.cdist(centres, centres).argsort(dim=1)  # the first is the view itself
             self.neighbours = nearest[:, min(settings.neighbour, count - 1)].tolist()
         self.masks = torch.stack(masks).to(device) if masks else None
+        pixels, holds_out = torch.ones(self.colours.shape[1:3], dtype=torch.bool), settings.optimiser.ends == HELD_OUT
+        self.draw = PixelDraw(pixels, settings.pixel_block, seed, holds_out=holds_out)  # the same in each view
 
     def pairs(self, iteration: int) -> list[tuple[int, int]]:
         """The views that an iteration compares, evenly spaced, each paired with its neighbour; they shift by one."""
@@ -244,13 +249,17 @@ class PhotometricLoss:
         views = [(iteration + round(k * count / self.per_step)) % count for k in range(self.per_step)]
         return [(view, self.neighbours[view]) for view in views]
 
-    def compare(self, field: Field, iteration: int, *, every_pixel: bool = False) -> Terms:
+    def compare(self, field: Field, iteration: int) -> Terms:
+        """The terms of the pixels that an iteration draws; see `compare_at`."""
+        return self.compare_at(field, iteration, self.draw.pixels(iteration))
+
+    def compare_at(self, field: Field, iteration: int, drawn: Int[Tensor, " n"] | None = None) -> Terms:
         """The weighted mean absolute difference of colours over the pixels that both views see (Eq. 6).
 
         Of drawn pixels, it is 0 if both views see none of them.
 
         Args:
-            every_pixel: whether all pixels are compared, although each iteration draws some.
+            drawn: pixels of each view, by rows; None: all.
 
         Raises:
             CannotContinue: if no pixel is visible in both views, of all pixels.
@@ -258,9 +267,9 @@ class PhotometricLoss:
         renderer, images = at_iteration(self.renderer, iteration), self.images_at(iteration)
         views, neighbours = map(list, zip(*self.pairs(iteration), strict=True))
         rays, observed = self._stack_rays(views), images[views]
-        is_drawn = self.settings.pixel_block > 1 and not every_pixel
+        is_drawn = drawn is not None
         if is_drawn:
-            drawn = self.pixels(iteration)
+            drawn = drawn.to(self.colours.device)
             rays = Rays(rays.origins.flatten(1, 2)[:, drawn], rays.directions.flatten(1, 2)[:, drawn])
             observed = observed.flatten(1, 2)[:, drawn]
         rendering = render_checked(renderer, field, rays)
@@ -281,11 +290,6 @@ class PhotometricLoss:
             silhouette = self.settings.silhouette(renderer, field, rays, rendering, observation)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
-
-    def pixels(self, iteration: int) -> Int[Tensor, " n"]:
-        """The pixels of each view that an iteration compares, by rows."""
-        block, generator = self.settings.pixel_block, generator_of(self.seed, iteration)
-        return pixel_of_each_block(*self.colours.shape[1:3], block, generator).to(self.colours.device)
 
     @torch.no_grad()
     def _visible(

@@ -26,14 +26,13 @@ from bench.solve.observed_view import (
     DEPTH_LOSSES,
     depth_error,
     expected_in_draw,
-    generator_of,
     normal_error,
     observed_hits,
 )
-from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
+from bench.solve.optimise import HELD_OUT, OptimiserSettings, Starts, StartSettings, with_affordable_rays
+from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import solve_and_draw
 from datasets.scene import Scene, View, see
-from datasets.views import pixel_of_each_block
 from renderers.boundary import render_checked
 from renderers.camera import Camera
 from renderers.checks import check_at_least, check_choice, check_positive
@@ -218,8 +217,8 @@ class PoseProblem:
         self.starts = Starts(StartSettings(len(self.cameras), self.settings.trial))
         self.depth, self.observed = self.view.depth.to(self.device), self.view.mask.to(self.device)
         self.depth_per_distance = self.cameras[0].depth(torch.ones_like(self.depth))  # all starts have its lens
-        blocks = pixel_of_each_block(*self.depth.shape, self.settings.pixel_block, torch.Generator())
-        self.rays_per_iteration = len(blocks)
+        holds_out = self.settings.optimiser.ends == HELD_OUT
+        self.draw = PixelDraw(self.observed, self.settings.pixel_block, self.seed, holds_out=holds_out)
         self.normals = in_camera_axes(self.view.normals.to(self.device), self.view.camera.to(self.device))
 
     def field(self) -> Field:
@@ -229,9 +228,24 @@ class PoseProblem:
     @torch.no_grad()
     def objective(self) -> float | None:
         """The loss of all pixels, not counted as cost; None if each iteration has them and its loss is comparable."""
-        if self.settings.pixel_block == 1:
+        if self.settings.pixel_block == 1 and not len(self.draw.held_out):
             return None
         return float(self._compare(self.shape_field, self.settings.optimiser.iterations, self.starts.best())["total"])
+
+    @property
+    def rays_per_iteration(self) -> int:
+        """The mean number of rays of an iteration."""
+        return self.draw.per_iteration
+
+    @torch.no_grad()
+    def held_out_loss(self) -> float:
+        """The loss of the held-out pixels."""
+        step, metered = self.settings.optimiser.iterations, Meter(self.shape_field, self.counts)
+        return float(self._compare(metered, step, self.starts.best(), self.draw.held_out)["total"])
+
+    def refine(self) -> bool:
+        """Compares a pixel of each smaller block from now on; returns False if blocks are as small as can be."""
+        return self.draw.refine()
 
     def evaluate(self, state: State) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""
@@ -251,9 +265,7 @@ class PoseProblem:
 
     def loss(self, step: int, start: int = 0) -> dict[str, Tensor]:
         """The weighted terms, and their sum."""
-        side, metered = self.settings.pixel_block, Meter(self.shape_field, self.counts)
-        pixels = pixel_of_each_block(*self.depth.shape, side, generator_of(self.seed, step)) if side > 1 else None
-        return self._compare(metered, step, start, pixels)
+        return self._compare(Meter(self.shape_field, self.counts), step, start, self.draw.pixels(step))
 
     def _compare(self, shape: Field, step: int, start: int, pixels: Tensor | None = None) -> dict[str, Tensor]:
         """The weighted terms of a start at the pixels [n] of an image by rows, or at all, and their sum."""

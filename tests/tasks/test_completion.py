@@ -110,9 +110,9 @@ def test_depth_is_compared_where_it_is_given_and_hit(problem_of):
 
 def test_normals_are_compared_where_they_are_asked_for(problem_of, scene):
     """See tests/solve/test_observed_view.py for the term itself."""
-    assert problem_of().compare.__self__.normals is None
+    assert problem_of().compare.func.__self__.normals is None
     problem = problem_of(normal_weight=3.0)
-    terms, view = values(problem), problem.compare.__self__
+    terms, view = values(problem), problem.compare.func.__self__
     assert (view.normal_weight, view.normal_width) == (3.0, 0.02) and torch.equal(view.normals, scene.view.normals)
     assert terms["total"] == pytest.approx(sum(terms[name] for name in terms if name != "total"))
 

@@ -70,7 +70,7 @@ def test_masks_are_compared_where_their_loss_has_a_weight_and_hold_what_a_shape_
 def test_drawn_pixels_are_compared_as_among_all(scene):
     """A neighbour's depths are interpolated as among all pixels, but only the needed pixels are rendered."""
     everything, drawn = overrides(scene), overrides(scene, pixel_block=2, silhouette_weight=10.0)
-    assert drawn.pixels(0).tolist() != drawn.pixels(1).tolist() and len(drawn.pixels(0)) == 8 * 8
+    assert drawn.draw.pixels(0).tolist() != drawn.draw.pixels(1).tolist() and len(drawn.draw.pixels(0)) == 8 * 8
     errors = [drawn.compare(sphere(0.5), iteration)["photometric"].item() for iteration in range(0, 32, 8)]
     whole = [everything.compare(sphere(0.5), iteration)["photometric"].item() for iteration in range(0, 32, 8)]
     assert np.mean(errors) == pytest.approx(np.mean(whole), rel=0.3)
@@ -90,15 +90,15 @@ def test_a_draw_that_both_views_see_nowhere_is_no_failure(scene):
     drawn, small = overrides(scene, pixel_block=8), sphere(0.3)
     losses = [drawn.compare(small, iteration)["photometric"].item() for iteration in range(20)]
     assert losses.count(0.0) > 5 and np.isfinite(losses).all()
-    assert drawn.compare(small, 0, every_pixel=True)["photometric"] > 0
+    assert drawn.compare_at(small, 0)["photometric"] > 0
     with pytest.raises(CannotContinue):
-        drawn.compare(sphere(0.001).translate((0.9, 0.9, 0.0)), 0, every_pixel=True)
+        drawn.compare_at(sphere(0.001).translate((0.9, 0.9, 0.0)), 0)
 
 
 def test_drawn_pixels_are_seen_by_the_neighbour_as_among_all(scene):
     drawn = overrides(scene, pixel_block=2)
     views, neighbours = map(list, zip(*drawn.pairs(0), strict=True))
-    image, pixels = drawn._stack_rays(views), drawn.pixels(0)
+    image, pixels = drawn._stack_rays(views), drawn.draw.pixels(0)
     sparse = Rays(image.origins.flatten(1, 2)[:, pixels], image.directions.flatten(1, 2)[:, pixels])
     fields = sphere(0.5), sphere(0.5) | sphere(0.2).translate((0.5, 0.2, 0.5))
     for field in fields:

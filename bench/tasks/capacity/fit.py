@@ -13,8 +13,9 @@ from torch import Tensor
 from bench.records.record import RunStatus
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import generator_of, gradients_at
+from bench.solve.observed_view import gradients_at
 from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
+from bench.solve.pixel_draw import generator_of
 from bench.tasks.capacity.candidates import primitive_candidate
 from bench.tasks.capacity.model import Candidate, Evidence, Model, StartInputs
 from bench.tasks.capacity.observations import RayObservations

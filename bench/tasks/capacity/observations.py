@@ -11,7 +11,8 @@ from torch import Tensor
 
 from bench.setup.auto import footprint
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import ObservedView, ViewLossSettings, generator_of
+from bench.solve.observed_view import ObservedView, ViewLossSettings
+from bench.solve.pixel_draw import generator_of
 from bench.tasks.capacity.held_out import HeldOut, HeldOutError
 from bench.tasks.capacity.settings import ViewSettings
 from datasets.scene import Truth, see

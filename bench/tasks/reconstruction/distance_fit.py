@@ -7,7 +7,7 @@ import torch
 from bench.setup.inputs import RunContext
 from bench.shape_prior import near_surface_first, sample_distances
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import generator_of
+from bench.solve.pixel_draw import generator_of
 from bench.tasks.reconstruction.problem import ReconstructionProblem
 from bench.tasks.reconstruction.subject import Subject
 from bench.tasks.reconstruction.task import Reconstruction

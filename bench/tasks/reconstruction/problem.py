@@ -14,7 +14,7 @@ from bench.evaluate.evaluate import Evaluation
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
-from bench.solve.observed_view import generator_of
+from bench.solve.pixel_draw import generator_of
 from bench.tasks.reconstruction.judge import field_scores, judge, surface_scores
 from bench.tasks.reconstruction.losses import Losses
 from bench.tasks.reconstruction.pictures import draw_reconstruction

@@ -1,0 +1,71 @@
+"""The pixels that an iteration compares, those held out, and the end of a loop by their loss."""
+
+import pytest
+import torch
+
+from bench.solve.optimise import HELD_OUT, HELD_OUT_INTERVAL, History, OptimiserSettings, optimise
+from bench.solve.pixel_draw import PixelDraw
+from renderers.field import Counts
+
+CPU = torch.device("cpu")
+
+
+def test_all_pixels_are_compared_without_blocks_and_without_held_out_ones():
+    draw = PixelDraw(torch.ones(6, 5, dtype=torch.bool), 1, 0, holds_out=False)
+    assert draw.pixels(0) is None and draw.per_iteration == 30 and not draw.refine()
+
+
+def test_held_out_pixels_are_never_compared_and_blocks_shrink_to_all_others():
+    observed = torch.zeros(40, 20, dtype=torch.bool)
+    observed[:10] = True
+    draw = PixelDraw(observed, 1, 3, holds_out=True)
+    assert observed.flatten()[draw.held_out].sum() == 20 and len(draw.held_out) == 80  # a tenth of each kind
+    counts = []
+    while True:
+        pixels = draw.pixels(len(counts))
+        assert not set(pixels.tolist()) & set(draw.held_out.tolist())
+        counts.append(len(pixels))
+        if not draw.refine():
+            break
+    assert 35 <= counts[0] <= 50 and 160 <= counts[1] <= 200 and counts[2] == 720
+    assert draw.per_iteration == round(sum(counts) / 3)
+
+
+class Falling:
+    """A problem whose held-out loss falls over the first `falls` measurements of each block."""
+
+    def __init__(self, falls: int) -> None:
+        self.parameters, self.counts = [torch.ones(1, requires_grad=True)], Counts()
+        self.falls, self.measured, self.refined = falls, 0, 0
+
+    def loss(self, iteration: int) -> dict[str, torch.Tensor]:
+        self.counts.value += 10
+        return {"total": self.parameters[0].square().sum()}
+
+    def held_out_loss(self) -> float:
+        self.counts.value += 1
+        self.measured += 1
+        return 0.1**self.refined / min(self.measured, self.falls)
+
+    def refine(self) -> bool:
+        self.measured, self.refined = 0, self.refined + 1
+        return self.refined < 3
+
+
+def test_a_loop_ends_when_the_held_out_loss_stops_falling_at_each_block():
+    problem, history = Falling(falls=3), History()
+    settings = OptimiserSettings(1000, 1e-3, "constant", ends=HELD_OUT)
+    optimise(problem, settings, CPU, history=history, on_step=lambda line: None)
+    measurements = 3 * (3 + 2)  # for each size of blocks, three that fall and two that do not
+    assert len(history.curve) == measurements * HELD_OUT_INTERVAL and problem.refined == 3
+    assert history.counts.value == 10 * len(history.curve) + measurements  # the measurements are counted
+    short = History()
+    optimise(Falling(falls=3), OptimiserSettings(20, 1e-3, "constant", ends=HELD_OUT), CPU, history=short, on_step=id)
+    assert len(short.curve) == 20
+
+
+def test_several_starts_share_a_fixed_number_of_iterations():
+    from bench.solve.optimise import StartSettings
+
+    with pytest.raises(ValueError, match="set task.optimiser.ends=iterations"):
+        StartSettings(4, 5).check(OptimiserSettings(100, 1e-2, "constant", ends=HELD_OUT))
