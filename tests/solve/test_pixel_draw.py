@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bench.solve.optimise import HELD_OUT, HELD_OUT_INTERVAL, History, OptimiserSettings, optimise
+from bench.solve.optimise import HELD_OUT, HELD_OUT_INTERVAL, History, OptimiserSettings, StartSettings, optimise
 from bench.solve.pixel_draw import PixelDraw
 from renderers.field import Counts
 
@@ -65,7 +65,5 @@ def test_a_loop_ends_when_the_held_out_loss_stops_falling_at_each_block():
 
 
 def test_several_starts_share_a_fixed_number_of_iterations():
-    from bench.solve.optimise import StartSettings
-
-    with pytest.raises(ValueError, match="set task.optimiser.ends=iterations"):
+    with pytest.raises(ValueError, match=r"set task\.optimiser\.ends=iterations"):
         StartSettings(4, 5).check(OptimiserSettings(100, 1e-2, "constant", ends=HELD_OUT))
