@@ -1,8 +1,9 @@
 """Reads the candidates of a capacity run from its metrics, and draws their errors over their costs."""
 
 from dataclasses import dataclass
+from math import log10
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib import rc_context
@@ -17,7 +18,7 @@ KINDS = {  # from the beginning of a candidate's name to label, colour and marke
     "": ("one part", "#d55e00", "o"),
 }
 FLOPS = "flops_per_query"
-AXES = {"stored": "stored numbers", "free": "free numbers", "bytes": "bytes", FLOPS: "FLOPs per query"}
+AXES = {"stored": "stored numbers", "free": "free numbers", "bytes": "bytes", FLOPS: "FLOPs per evaluation"}
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,15 @@ class CandidateResult:
     def error(self) -> float | None:
         """The error on held-out rays, in scene units."""
         return self.numbers.get("error")
+
+    @property
+    def is_falling(self) -> bool:
+        """Whether its fit was stopped while its error still fell."""
+        return bool(self.numbers.get("falling"))
+
+    def held(self, *, by_pixel: bool) -> float | None:
+        """The fraction of draws of further views on which it suffices, under half a pixel or as good as the best."""
+        return self.numbers.get("held_enough" if by_pixel else "held_within")
 
     @property
     def kind(self) -> str:
@@ -60,6 +70,25 @@ class Candidates:
     best: CandidateResult | None
     measure: str
     footprint: float | None
+    MIN_HELD: ClassVar[float] = 0.8  # fraction of the draws of further views that confirm a choice
+
+    def smallest(self, measure: str, *, by_pixel: bool) -> CandidateResult | None:
+        """The candidate with the least `measure` of those that suffice and that further views confirm; None if none.
+
+        Args:
+            by_pixel: whether an error under half a pixel suffices; else one standard error above the least one.
+        """
+        if self.best is None or self.footprint is None:
+            return None
+        limit = self.footprint if by_pixel else self.best.numbers["error"] + self.best.numbers["standard_error"]
+        sufficient = [result for result in self.results if result.error is not None and result.error <= limit]
+        for result in (ordered := sorted(sufficient, key=lambda result: (result.numbers[measure], result.error))):
+            held = result.held(by_pixel=by_pixel)
+            if held is None:  # a record without checks of this candidate
+                return result if result is ordered[0] else None
+            if held >= self.MIN_HELD:
+                return result
+        return None
 
     @staticmethod
     def of(metrics: dict[str, Any]) -> "Candidates":
@@ -73,8 +102,16 @@ class Candidates:
             for name in names
         }
         chosen, best = (results.get(metrics.get(f"{which}_field", "")) for which in ("recommended", "best"))
+        if chosen is not None:  # records of older versions have only the check of this candidate
+            for key, older in (("held_enough", "held_out_seeds_held"), ("held_within", "held_out_seeds_within")):
+                chosen.numbers.setdefault(key, metrics.get(older))
         measure, footprint = metrics.get("recommended_by", "stored"), metrics.get("footprint")
         return Candidates(list(results.values()), chosen, best, measure, footprint)
+
+
+def marker_points(stored: int) -> float:
+    """The diameter of a marker in points, linear in the logarithm of the stored numbers."""
+    return 2.5 + 1.1 * log10(max(stored, 1))
 
 
 @rc_context(style.SCREEN)

@@ -1,70 +1,105 @@
-"""The smallest field that is sufficient for a scene."""
+"""The fields that are sufficient for a scene, by error, stored numbers and FLOPs."""
 
+from collections.abc import Iterable
+from itertools import groupby
+from pathlib import PurePosixPath
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from bench.pictures.size_chart import AXES, FLOPS, KINDS, Candidates
+from bench.pictures.size_chart import AXES, FLOPS, KINDS, CandidateResult, Candidates, marker_points
 from bench.report.study import Result, Runs, Selection, chart, figure_style, format, medians, records, table
 
 PLACE = 160
-READS = (Selection("parsimony", setup=("scenes", "pixels", "machine"), alike=("models", "task")),)
+READS = (
+    Selection(
+        "parsimony",
+        conditions=("view.resolution",),
+        setup=("scenes", "pixels", "machine"),
+        alike=("models", "task"),
+    ),
+)
 COSTS = ("seconds", "flops", "evaluations")
+CHOICES = {  # the metric that a choice minimises, whether half a pixel suffices, heading, marker and size of its ring
+    "by_numbers": ("stored", True, "fewest numbers under half a pixel", "o", 10),
+    "by_flops": (FLOPS, True, "fewest FLOPs under half a pixel", "s", 10),
+    "by_best": ("stored", False, "fewest numbers as good as the best", "D", 10),
+}
+RING_COLOUR, PIXEL_COLOUR = "#111111", "#47684f"
+COLUMNS_OF_PANELS = 2
+LEGEND_LABELS = {label for label, *_ in KINDS.values()} | {heading for _, _, heading, *_ in CHOICES.values()}
+MARKER_EXAMPLES = (10, 10_000, 1_000_000)  # stored numbers
 NOTES = (
-    "All candidates are fitted to depth and silhouettes of the same views with the same rays. Rounds end when the "
-    "error decreases by no more than its noise; costs are of all rounds. The error is the mean distance along the "
-    "normal over held-out rays, most of them of other views.",
-    "Recommended: the smallest candidate by {size} whose error is within one standard error (s.e.) of the best "
-    "candidate's error, or under half a pixel at the nearest distance. The figure shows such candidates filled.",
-    "Seeds held: the percentage of draws of further views for which the recommended candidate is within one standard "
-    "error of the best candidate, or under half a pixel.",
-    "Saved: the papers' network (8 layers of 512, without a code) relative to the recommended candidate. Overhead: the "
-    "seconds of all candidates that field=auto tried, relative to its final fit.",
-    "Pixel precision: the recommended candidate fitted again with renderer.epsilon=auto, renderer.steps=auto and rays "
-    "that follow the loss, relative to its plain fit.",
+    "All candidates are fitted to depth and silhouettes of the same views with the same rays, in rounds until a round "
+    "no longer reduces the held-out error by more than its noise. The error is the mean distance along the normal over "
+    "held-out rays, most of them of other views.",
+    "A field under half a pixel at the nearest distance suffices for these pixels. A field within one standard error "
+    "of the least error is as good as the best: it suffices for the scene, as far as these candidates show.",
+    "A candidate is chosen only if it also suffices on {held:.0f} % or more of random draws of further views. "
+    "Unchecked: the run has no such draws of this candidate.",
+    "Overhead: the seconds of all candidates that field=auto tried, relative to its final fit. Pixel precision: the "
+    "recommended candidate fitted again with renderer.epsilon=auto, renderer.steps=auto and rays that follow the loss, "
+    "relative to its plain fit.",
+)
+POINT = (
+    "The larger a marker, the more numbers its field stores. Hollow markers: the last round still reduced the error. "
+    "Rings mark the choices of the table."
 )
 Line = dict[str, Any]  # a run
+Labels = dict[tuple[float, float], str]  # the name of a candidate by its position
 
 
 def make(runs: Runs) -> Result:
-    """A line per scene: its recommended candidate, the reason, and the savings."""
-    lines, size = scenes(runs)
+    """A line per scene and resolution: the sufficient candidates, each the smallest by another quantity."""
+    lines = scenes(runs)
+    drawn = [_panel(list(group)) for _, group in groupby(lines, key=lambda line: line["scene"])]
+    panels, labels = [panel for panel, _ in drawn], [names for _, names in drawn]
     return Result(
         runs,
-        f"The smallest sufficient field for each scene, by {AXES[size]}.",
-        f"{AXES[size].capitalize()} of each candidate, by which one is recommended; filled candidates suffice.",
+        "The sufficient fields for each scene, by error, numbers and FLOPs.",
+        "Held-out error of each candidate over its FLOPs per evaluation; the larger the marker, the more numbers.",
         question="How small can the model of a shape be?",
         verdict=_verdict([line for line in lines if line["ok"]]),
-        interval="± is one standard error, by the jackknife over views",
-        remarks=[*(note.format(size=AXES[size]) for note in NOTES), _falling(lines)],
+        interval="± and bars are one standard error, by the jackknife over views",
+        remarks=[*(note.format(held=100 * Candidates.MIN_HELD) for note in NOTES), _falling(lines)],
         data=table.to_data(CANDIDATES, [line | candidate for line in lines for candidate in _candidates(line)]),
         columns=COLUMNS,
         lines=lines,
-        figure=draw(lines, size),
+        figure=draw(panels, labels),
+        chart={"panels": panels, "note": POINT},
     )
 
 
-def scenes(runs: Runs) -> tuple[list[Line], str]:
-    """A line per run, the smallest recommended field first, failed runs last; and the measure of size."""
+def scenes(runs: Runs) -> list[Line]:
+    """A line per run: the scenes by their smallest sufficient field, each by resolution, failed runs last."""
     lines = [_scene(record, medians.scene_of(record)) for record in runs.records]
-    size = next((line["candidates"].measure for line in lines if line["ok"]), "stored")
-    return sorted(lines, key=lambda line: (not line["ok"], line.get(f"recommended_{size}") or 0, line["scene"])), size
+    fewest: dict[str, float] = {}
+    for line in lines:
+        stored = line["recommended_stored"] if line["ok"] else float("inf")
+        fewest[line["scene"]] = min(stored, fewest.get(line["scene"], stored))
+    return sorted(lines, key=lambda line: (fewest[line["scene"]], line["scene"], line["pixels"] or 0))
 
 
 def _scene(record: records.Record, name: str) -> Line:
-    """The run's identity, metrics, and recommended and best candidate; `problem` says why these are missing."""
+    """The run's identity, metrics and choices; `problem` says why these are missing."""
     metrics = record["metrics"] if record["status"] == "ok" else {}
     candidates = Candidates.of(metrics)
-    line = {"scene": name, "candidates": candidates} | {column.key: column.of(record) for column in table.IDENTITY}
+    path = PurePosixPath(name)
+    line = {"scene": path.stem if path.suffix else name, "candidates": candidates}
+    line |= {"pixels": records.setting(record["config"], "view", "resolution")}
+    line |= {column.key: column.of(record) for column in table.IDENTITY}
     if candidates.chosen is None or candidates.best is None:
         status = record["status"].replace("_", " ") if record["status"] != "ok" else "no field recommended"
-        return line | {"ok": False, "problem": status, "lost": format.MISSING}
-    for role, candidate in (("chosen", candidates.chosen), ("best", candidates.best)):
-        line |= {f"{role}.name": candidate.label} | {f"{role}.{key}": value for key, value in candidate.numbers.items()}
+        return line | {"ok": False, "problem": status, "lost": format.MISSING, "stopped": format.MISSING}
+    for choice, (cost, by_pixel, *_) in CHOICES.items():
+        line[choice] = candidates.smallest(cost, by_pixel=by_pixel)
     frugal, plain = metrics.get("frugal.evaluations"), candidates.chosen.numbers.get("evaluations")
     fitted = metrics.get("frugal.error") is not None and frugal is not None and plain
-    lost = sum(candidate.error is None for candidate in candidates.results)
-    line |= {"frugal_evaluations": frugal / plain if fitted else None, "lost": f"{lost} of {len(candidates.results)}"}
+    count = len(candidates.results)
+    line |= {"frugal_evaluations": frugal / plain if fitted else None}
+    line |= {"lost": f"{sum(candidate.error is None for candidate in candidates.results)} of {count}"}
+    line |= {"stopped": f"{sum(candidate.is_falling for candidate in candidates.results)} of {count}"}
     return line | metrics | {"ok": True, "problem": ""}
 
 
@@ -74,106 +109,157 @@ def _candidates(line: Line) -> list[Line]:
     return [
         {**candidate.numbers, "rung": candidate.name, "kind": KINDS[candidate.kind][0]}
         | {"recommended": candidate is candidates.chosen, "best": candidate is candidates.best}
+        | {choice: candidate is line[choice] for choice in CHOICES}
         for candidate in (candidates.results if line["ok"] else ())
     ] or [{}]
 
 
 def _falling(lines: list[Line]) -> str:
-    """A sentence on the fits that still improved at their end, with their scenes."""
-    fits = [(candidate, line["scene"]) for line in lines for candidate in line["candidates"].results]
-    names = [f"{candidate.label} ({scene})" for candidate, scene in fits if candidate.numbers.get("falling")]
-    return f"Not converged (the last round still reduced the error): {', '.join(names)}." if names else ""
+    """A sentence on the fits that were stopped while their error still fell."""
+    labels = [candidate.label for line in lines for candidate in line["candidates"].results if candidate.is_falling]
+    counts = ", ".join(f"{label} in {labels.count(label)}" for label in dict.fromkeys(labels))
+    return f"Not converged (the last round still reduced the error), in runs: {counts}." if labels else ""
 
 
 def _verdict(lines: list[Line]) -> str:
-    """What suffices for how many scenes; empty where no run ended ok."""
+    """Whether a single field is best by all quantities, and which kinds are; empty without runs that ended ok."""
     if not lines:
         return ""
-    most = max(lines, key=lambda line: line["chosen.stored"])
-    single = sum(line["candidates"].chosen.kind == "" for line in lines)
+    fewest, quickest = ([line[choice] for line in lines] for choice in ("by_numbers", "by_flops"))
+    best = [line["candidates"].best for line in lines]
+    same = sum(a is not None and a is b is c for a, b, c in zip(fewest, quickest, best, strict=True))
+    sample = "scenes" if len({line["scene"] for line in lines}) == len(lines) else "scenes and resolutions"
     return (
-        f"A single part suffices for *{single} of {len(lines)}* scenes. The largest field needed is "
-        f"{most['chosen.name']} with {most['chosen.stored']:,.0f} stored numbers, for {most['scene']}."
+        f"The choice is a front: one field has the fewest numbers, the fewest FLOPs and the least error in *{same} of "
+        f"{len(lines)}* {sample}. Fewest numbers under half a pixel: {_kinds(fewest)}. Fewest FLOPs: "
+        f"{_kinds(quickest)}. Least error: {_kinds(best)}."
     )
 
 
+def _kinds(results: Iterable[CandidateResult | None]) -> str:
+    """How often each kind occurs, the most frequent first, such as networks in 3, unions of boxes in 1."""
+    names = ["no confirmed field" if result is None else KINDS[result.kind][0] for result in results]
+    counts = sorted({name: names.count(name) for name in names}.items(), key=lambda pair: -pair[1])
+    return ", ".join(f"{name} in {count}" for name, count in counts)
+
+
+def _panel(lines: list[Line]) -> tuple[chart.Panel, Labels]:
+    """The candidates of a scene at its finest resolution, the front of each resolution, and the choices.
+
+    Also returns the names of the chosen candidates by their positions.
+    """
+    lines = [line for line in lines if line["ok"]] or lines
+    *coarser, line = lines
+    drawn, labels = list[chart.Series](), Labels()
+    for dash, each in zip(("-", "--", "-."), (line, *reversed(coarser)), strict=False):
+        drawn += _front(each, dash, several=bool(coarser))
+    drawn += [_point(line, candidate) for candidate in line["candidates"].results]
+    for choice, (*_, heading, marker, size) in CHOICES.items():
+        if candidate := line.get(choice):
+            ring = {"colour": RING_COLOUR, "symbol": marker, "hollow": True, "size": 2 * size}
+            drawn.append(chart.series(heading, "", *_position(candidate), text=[[candidate.label]]) | ring)
+            labels[candidate.numbers[FLOPS], 1000 * candidate.numbers["error"]] = candidate.label
+    title = f"{line['scene']} ({line['problem']})" if line["problem"] else line["scene"]
+    return chart.panel_data(title, AXES[FLOPS], "held-out error × 1000", drawn), labels
+
+
+def _position(candidate: CandidateResult) -> tuple[list[float], list[float]]:
+    error = float("inf") if candidate.error is None else 1000 * candidate.error
+    return [candidate.numbers[FLOPS]], [error]
+
+
+def _front(line: Line, dash: str, *, several: bool) -> list[chart.Series]:
+    """The front of error over FLOPs, with the resolution in its name if there are several, and half a pixel."""
+    points = [_position(candidate) for candidate in line["candidates"].results]
+    if not points:
+        return []
+    x, y = ([value for (value,) in values] for values in zip(*points, strict=True))
+    suffix = f" at {line['pixels']} pixels" if several else ""
+    front = chart.front(x, y) | {"name": f"front{suffix}", "dash": dash, "quiet": False}
+    level = chart.level("half a pixel", x, 1000 * line["footprint"], colour=PIXEL_COLOUR, dash=":")
+    return [front, level]
+
+
+def _point(line: Line, candidate: CandidateResult) -> chart.Series:
+    """A candidate: its marker grows with its numbers, and is hollow if its error still fell."""
+    label, colour, marker = KINDS[candidate.kind]
+    x, y = _position(candidate)
+    text = [candidate.label, f"{candidate.numbers['stored']:,} numbers, error × 1000 {format.number(y[0])}"]
+    look = {"colour": colour, "symbol": marker, "size": 2 * marker_points(candidate.numbers["stored"])}
+    if candidate.error is not None:
+        spread = 1000 * candidate.numbers["standard_error"]
+        look |= {"low": [y[0] - spread], "high": [y[0] + spread]}
+    hollow = {"hollow": True} if candidate.is_falling else {}
+    return chart.series(label, "", x, y, text=[text], **hollow) | look
+
+
 @figure_style.styled
-def draw(lines: list[Line], size: str) -> Figure:
-    """Draws the candidates of each scene over their size: filled if sufficient, with a ring if recommended."""
-    figure, ((axis,),) = chart.sheet(0.26 * len(lines) + 1.2)
-    ring = {"ms": 10, "mfc": "none", "mec": "#111111", "mew": 1.2, "ls": "none"}
-    for index, line in enumerate(lines):
-        if not line["ok"]:
-            continue
-        max_error = max(line["best.error"] + line["best.standard_error"], line["footprint"])
-        for candidate in line["candidates"].results:
-            _, colour, marker = KINDS[candidate.kind]
-            fill = colour if candidate.error is not None and candidate.error <= max_error else "none"
-            marker = "x" if candidate.error is None else marker
-            axis.plot(candidate.numbers[size], index, marker, color=colour, mfc=fill, ms=5, mew=1)
-        axis.plot(line[f"chosen.{size}"], index, "o", **ring)
-    for label, colour, marker in KINDS.values():
-        axis.plot([], [], marker, color=colour, label=label)
-    how = {"ls": "none", "color": "#666666"}
-    axis.plot([], [], "s", mfc="none", label="does not suffice", **how)
-    axis.plot([], [], "x", label="failed fit", **how)
-    axis.plot([], [], "o", label="recommended", **ring)
-    axis.set(xscale="log", xlabel=AXES[size], ylim=(len(lines) - 0.5, -0.5))
-    names = [f"{line['scene']} ({line['problem']})" if line["problem"] else line["scene"] for line in lines]
-    axis.set_yticks(range(len(lines)), names)
-    figure_style.legend_below(figure, axis, columns=4)
+def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
+    """Draws a panel per scene, with the names of the chosen candidates; the legend also has sizes of markers."""
+    rows = -(-len(panels) // COLUMNS_OF_PANELS)
+    figure = chart.draw(panels, 2.0 * rows + 1.1, rows, legend=0, sharey=True, sharex=True)
+    for axis, names in zip(figure.axes, labels, strict=False):
+        for (x, y), label in names.items():
+            axis.annotate(label, (x, y), (0, -14), textcoords="offset points", ha="center", fontsize=6.5)
+        axis.margins(y=0.16)
+    axis = figure.axes[0]
+    axis.plot([], [], "s", mfc="none", color="#666666", label="error still fell")
+    for stored in MARKER_EXAMPLES:
+        axis.plot([], [], "o", ms=marker_points(stored), color="#bbbbbb", label=f"{stored:,} numbers")
+    figure_style.legend_below(figure, *figure.axes, columns=4)
+    for handle in figure.legends[0].legend_handles:
+        if isinstance(handle, Line2D) and handle.get_label() in LEGEND_LABELS:
+            is_ring = handle.get_color() == RING_COLOUR
+            handle.set(markersize=7 if is_ring else 5, markerfacecolor="none" if is_ring else handle.get_color())
     return figure
 
 
+def _chosen(line: Line, choice: str) -> str:
+    """A choice with its cost and its error times 1000; or whether it was not checked on further views."""
+    cost, by_pixel, *_ = CHOICES[choice]
+    candidate = line.get(choice)
+    if candidate is None:
+        return "none confirmed" if line["ok"] else format.MISSING
+    unit = "FLOPs" if cost == FLOPS else "numbers"
+    unchecked = ", unchecked" if candidate.held(by_pixel=by_pixel) is None else ""
+    return f"{candidate.label}{unchecked}: {candidate.numbers[cost]:,} {unit}, {table.thousandfold(candidate.error)}"
+
+
+def _best(line: Line) -> str:
+    """The candidate of the least error with its numbers, or the problem of the run."""
+    if not line["ok"]:
+        return line["problem"]
+    best = line["candidates"].best
+    error, spread = (table.thousandfold(best.numbers[name]) for name in ("error", "standard_error"))
+    return f"{best.label}: {best.numbers['stored']:,} numbers, {error} ± {spread}"
+
+
 def _factor(x: float | None) -> str:
-    """A ratio as text, such as 0.43× or 184k×."""
-    if x is None:
-        return format.MISSING
-    return f"{format.count(x) if abs(x) >= 1000 else format.number(x)}×"
-
-
-def _whole(count: int | None) -> str:
-    return format.MISSING if count is None else f"{count:,}"
-
-
-def _label(line: Line, role: str) -> str:
-    """The name of the recommended or best candidate; without a recommended one, the problem."""
-    return line.get(f"{role}.name") or (line["problem"] if role == "chosen" else format.MISSING)
-
-
-def _spread(line: Line, role: str) -> str:
-    """The mean error of a candidate with its standard error, times 1000."""
-    if f"{role}.error" not in line:
-        return format.MISSING
-    return " ± ".join(table.thousandfold(line[f"{role}.{name}"]) for name in ("error", "standard_error"))
-
-
-def _why(line: Line) -> str:
-    within, enough = (line.get(f"recommended_{name}") for name in ("within", "enough"))
-    return ("both" if enough else "within 1 s.e.") if within else "under half a pixel" if enough else format.MISSING
+    """A ratio as text, such as 0.43×."""
+    return format.MISSING if x is None else f"{format.number(x)}×"
 
 
 SIZES = ("stored", "free", "bytes")
 SCENE = (table.text("scene", "Scene"), *(table.text(column.key) for column in table.IDENTITY))
+PIXELS = table.Column("pixels", "Pixels", show=table.integer)
 CANDIDATES = (  # a line is a run and a candidate
     *SCENE,
-    *table.raw("footprint", "chamfer_l2", "recommended_within", "recommended_enough"),
-    *table.raw("held_out_seeds", "held_out_seeds_within", "held_out_seeds_held"),
-    *table.raw(*(f"saved_{name}" for name in (*SIZES, FLOPS, "seconds")), "rung", "kind", "recommended", "best"),
+    table.Column("pixels"),
+    *table.raw("footprint", "chamfer_l2", "recommended_within", "recommended_enough", "held_out_seeds"),
+    *table.raw("rung", "kind", "recommended", "best", *CHOICES),
     *table.raw(*SIZES, "sparse_bytes", FLOPS, "error", "standard_error", *COSTS, "iterations", "falling", "failed"),
-    *table.raw(*(f"{cost}_at_auto" for cost in COSTS)),
+    *table.raw("held_enough", "held_within", *(f"{cost}_at_auto" for cost in COSTS)),
 )
 COLUMNS = (  # a line is a run
     SCENE[0],
-    table.shown("Recommended", lambda line: _label(line, "chosen")),
-    *table.columns(_whole, **{"chosen.stored": "Stored numbers", "chosen.free": "Free numbers"}),
-    table.Column("chosen.bytes", "Size of the file", show=table.size),
-    table.shown("Error × 1000", lambda line: _spread(line, "chosen")),
-    *(*table.columns(table.thousandfold, footprint="Half a pixel × 1000"), table.shown("Why", _why)),
-    table.shown("Best candidate", lambda line: _label(line, "best")),
-    table.shown("Best error × 1000", lambda line: _spread(line, "best")),
-    *table.columns(table.percent, held_out_seeds_held="Seeds held"),
-    *table.columns(_factor, saved_stored="Saved stored numbers", saved_seconds="Saved fit seconds"),
+    PIXELS,
+    table.Column("footprint", "Half a pixel × 1000", show=table.thousandfold),
+    *(
+        table.shown(f"F{heading[1:]}, error × 1000", lambda line, choice=choice: _chosen(line, choice))
+        for choice, (_, _, heading, *_) in CHOICES.items()
+    ),
+    table.shown("Least error × 1000", _best),
+    table.text("stopped", "Error still fell"),
     table.Column("auto.overhead", "Overhead of field=auto"),
     *table.columns(_factor, frugal_evaluations="Evaluations at pixel precision"),
     table.text("lost", "Failed candidates"),

@@ -14,7 +14,7 @@ VIEWS = {"fitted": 12, "held_out": 8, "share": 0.1}
 CONFIG = {"task": {"checks": {"seeds": 20, "drawn": 8}}, "models": {"views": VIEWS, "fit": {"iterations": 100}}}
 
 
-def climbed(results, scene, errors, *, needs, failed=(), status="ok", **metrics) -> None:
+def climbed(results, scene, errors, *, needs, failed=(), status="ok", pixels=None, **metrics) -> None:
     """A run whose candidates have these errors in half pixels of 0.02."""
     known = {"footprint": 0.02, "chamfer_l2": 0.001, "held_out_seeds": 20, "held_out_seeds_within": 0.6}
     known |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": 1}
@@ -34,10 +34,9 @@ def climbed(results, scene, errors, *, needs, failed=(), status="ok", **metrics)
     known |= {"frugal.seconds": 1.0} | metrics
     known = {name: value for name, value in known.items() if value is not ...}
     changed = {"status": status, "reason": "" if status == "ok" else "why", "metrics": known if status == "ok" else {}}
-    write_run(
-        *(results, "parsimony", None),
-        **{"task": "capacity", "dataset": scene, "scene": f"{scene} test 0", "settings": CONFIG, **changed},
-    )
+    settings = CONFIG if pixels is None else {**CONFIG, "view": {"resolution": pixels}}
+    identity = {"task": "capacity", "dataset": scene, "scene": f"{scene} test 0", "settings": settings}
+    write_run(results, "parsimony", None, **identity, **changed)
 
 
 @pytest.fixture(scope="module")
@@ -59,26 +58,42 @@ def page(four):
 
 def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
     assert list(page.table["Scene"]) == ["ball 0", "box 0", "car 0", "torus 0"]
-    assert list(page.table.iloc[3])[1:] == ["crashed"] + ["–"] * (len(parsimony.COLUMNS) - 2)
-    assert list(page.table["Why"][:3]) == ["both", "under half a pixel", "under half a pixel"]
+    empty = list(page.table.iloc[3])[2:]
+    assert set(empty) == {"crashed", "–"} and len(empty) == len(parsimony.COLUMNS) - 2
     lost = page.data[page.data["scene"] == "torus 0"]
     assert (lost["status"].item(), lost["reason"].item()) == ("crashed", "why")
-    assert "1 of 4 runs did not end ok: dist, torus: crashed (why)." in told(page)
-    most = "The largest field needed is grid 24 with 13,824 stored numbers, for car 0."
-    assert page.verdict == f"A single part suffices for *2 of 3* scenes. {most}"
+    assert "1 of 4 runs did not end ok: dist, 64 resolution, torus: crashed (why)." in told(page)
+    assert page.verdict.startswith("The choice is a front: one field has") and "*2 of 3* scenes" in page.verdict
 
 
-def test_a_row_tells_the_need_and_what_it_saves(page):
+def test_a_row_has_a_choice_by_each_quantity(page):
     table = page.table.set_index("Scene")
-    cells, grid = table.loc["box 0"], table.loc["car 0"]
-    assert cells["Recommended"] == "box"
-    assert (cells["Stored numbers"], cells["Free numbers"], cells["Size of the file"]) == ("9", "9", "36 B")
-    assert (grid["Stored numbers"], grid["Free numbers"], grid["Size of the file"]) == ("13,824", "3,000", "55.3 kB")
-    assert (cells["Error × 1000"], cells["Half a pixel × 1000"]) == ("10.0 ± 1.00", "20.0")
-    assert (cells["Best candidate"], cells["Best error × 1000"]) == ("grid 24", "4.00 ± 1.00")
-    assert (cells["Seeds held"], cells["Saved stored numbers"]) == ("95 %", "204k×")
-    assert grid["Saved stored numbers"] == "133×"
-    assert r"10.0 $\pm$ 1.00" in latex(page.shown(), "parsimony")
+    cells, headings = table.loc["box 0"], [choice[2] for choice in parsimony.CHOICES.values()]
+    shown = [cells[next(name for name in table if name.startswith(f"F{heading[1:]}"))] for heading in headings]
+    assert shown == ["box: 9 numbers, 10.0", "box: 18 FLOPs, 10.0", "grid 24, unchecked: 13,824 numbers, 4.00"]
+    best = "grid 24: 13,824 numbers, 4.00 ± 1.00"
+    assert (cells["Half a pixel × 1000"], cells["Least error × 1000"]) == ("20.0", best)
+    assert r"4.00 $\pm$ 1.00" in latex(page.shown(), "parsimony")
+
+
+@pytest.mark.parametrize(("held", "choice"), [
+    ({"box.held_enough": 0.5, "union_3.held_enough": 0.85}, "union 3: 30 numbers, 16.0"),
+    ({"box.held_enough": 0.5, "union_3.held_enough": 0.5, "grid_24.held_enough": 0.5}, "none confirmed"),
+    ({"held_out_seeds_held": 0.25}, "none confirmed"),  # a record with the check of the recommended candidate only
+])  # fmt: skip
+def test_a_choice_that_further_views_do_not_confirm_is_not_made(tmp_path, held, choice):
+    climbed(tmp_path, "car", {"sphere": 8, "box": 0.9, "union_3": 0.8, "grid_24": 0.2}, needs="box", **held)
+    assert page_of(tmp_path, "parsimony").table.filter(like="Fewest numbers under").iloc[0].item() == choice
+
+
+def test_resolutions_are_lines_of_a_scene_and_fronts_of_its_panel(tmp_path):
+    for pixels, errors in ((96, {"sphere": 8, "box": 1.5}), (48, {"sphere": 8, "box": 0.7})):
+        climbed(tmp_path, "car", errors, needs="box", pixels=pixels)
+    page = page_of(tmp_path, "parsimony")
+    assert list(page.table["Pixels"]) == ["48", "96"] and len(page.chart["panels"]) == 1
+    fronts = [each["name"] for each in page.chart["panels"][0]["series"] if each.get("step")]
+    assert fronts == ["front at 96 pixels", "front at 48 pixels"]
+    assert page.verdict.count("scenes and resolutions") == 1
 
 
 def test_candidates_stand_as_csv_a_line_each(page):
@@ -88,30 +103,25 @@ def test_candidates_stand_as_csv_a_line_each(page):
     assert list(data["error"].dropna())[:3] == pytest.approx([2e-4, 0.1, 4e-3])
 
 
-def test_what_suffices_is_filled_and_the_recommended_is_ringed(page):
-    axis = page.figure.axes[0]
-    assert [label.get_text() for label in axis.get_yticklabels()] == ["ball 0", "box 0", "car 0", "torus 0 (crashed)"]
-    drawn = [(*(float(x[0]) for x in line.get_data()), line) for line in axis.lines if len(line.get_xdata())]
-    rings = [(x, y) for x, y, line in drawn if line.get_markersize() == 10]
-    assert rings == [(4, 0), (9, 1), (13_824, 2)]
-    hollow = [(x, y) for x, y, line in drawn if line.get_markersize() < 10 and line.get_markerfacecolor() == "none"]
-    assert hollow == [(9, 0), (4, 1), (4, 2), (30, 2)]
+def test_choices_have_rings_and_the_front_and_half_a_pixel_are_drawn(page):
+    panel = next(panel for panel in page.chart["panels"] if panel["title"] == "car 0")
+    rings = {each["name"]: (each["x"], each["y"]) for each in panel["series"] if each["colour"] == "#111111"}
+    assert set(map(str, rings.values())) == {"([6000.0], [18.0])"} and len(rings) == 2
+    lines = {each["name"]: each["y"] for each in panel["series"] if "dash" in each}
+    assert lines == {"front": [160, 40, 18], "half a pixel": [20, 20]}
+    small, large = (each["size"] for each in panel["series"] if each["name"] in ("one part", "narrow-band grid"))
+    assert small < large and len(page.figure.axes) == 4
 
 
-def test_a_candidate_that_failed_is_counted_and_crossed(tmp_path):
-    climbed(tmp_path, "car", {"sphere": 8, "box": 1, "grid_24": 0.2}, needs="grid_24", failed=("box",))
+def test_a_candidate_that_failed_is_counted_and_crossed_and_one_that_was_stopped_is_hollow(tmp_path):
+    errors = {"sphere": 8, "box": 1, "grid_24": 0.2}
+    climbed(tmp_path, "car", errors, needs="grid_24", failed=("box",), **{"sphere.falling": True})
     page = page_of(tmp_path, "parsimony")
-    assert page.table["Failed candidates"].item() == "1 of 3"
+    assert (page.table["Failed candidates"].item(), page.table["Error still fell"].item()) == ("1 of 3", "1 of 3")
     assert page.data.set_index("rung").loc["box", "failed"] == "nan: why"
     crosses = [line for line in page.figure.axes[0].lines if line.get_marker() == "x" and len(line.get_xdata())]
-    assert [list(line.get_xdata()) for line in crosses] == [[9]]
-
-
-def test_pages_say_by_which_size_the_choice_is(page, tmp_path):
-    climbed(tmp_path, "car", {"box": 8, "grid_24": 0.5}, needs="grid_24", recommended_by="free")
-    other = page_of(tmp_path, "parsimony")
-    assert "free numbers" in other.title and other.figure.axes[0].get_xlabel() == "free numbers"
-    assert "the smallest candidate by stored numbers whose error" in told(page)
+    assert [list(line.get_xdata()) for line in crosses] == [[18]]
+    assert next(each["x"] for each in page.chart["panels"][0]["series"] if each.get("hollow")) == [8]
 
 
 def test_field_auto_and_pixel_precision_stand_beside(page, tmp_path):
@@ -124,4 +134,4 @@ def test_field_auto_and_pixel_precision_stand_beside(page, tmp_path):
 def test_a_page_is_made_even_where_all_runs_failed(tmp_path):
     climbed(tmp_path, "car", {"sphere": 8}, needs="sphere", status="timeout")
     page = page_of(tmp_path, "parsimony")
-    assert page.table["Recommended"].tolist() == ["timeout"] and page.verdict == ""
+    assert page.table["Least error × 1000"].tolist() == ["timeout"] and page.verdict == ""
