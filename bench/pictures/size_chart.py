@@ -13,6 +13,8 @@ from bench.pictures import figure_style, style
 
 KINDS = {  # from the beginning of a candidate's name to label, colour and marker
     "network": ("networks", "#0072b2", "s"),
+    "fourier": ("Fourier features", "#56b4e9", "D"),
+    "hash": ("hash grids", "#cc79a7", "^"),
     "grid": ("narrow-band grid", "#9a6a1f", "v"),
     "union": ("unions of boxes", "#009e73", "P"),
     "": ("one part", "#d55e00", "o"),

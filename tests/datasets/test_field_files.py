@@ -26,6 +26,7 @@ from renderers.fields.networks.coloured import (
     ColouredOccupancy,
     ScaledOccupancyOf,
 )
+from renderers.fields.networks.encoded import EncodedNetwork, FourierFeatures, HashGrid
 from renderers.fields.networks.network import Coded, Published
 from renderers.fields.networks.occupancy import OccupancyNetwork
 from renderers.fields.networks.published import Layered
@@ -57,6 +58,12 @@ FIELDS = {
     "published": published,
     "grid": lambda: Grid(numbers(6, 6, 6).permute(2, 1, 0), 1.05),
     "coloured": lambda: ColouredDistance(layers=2, width=8, octaves=1, radius=0.5, directional=True),
+    "fourier": lambda: EncodedNetwork(
+        FourierFeatures(numbers(4, 3)), ((numbers(5, 11), numbers(5)), (numbers(1, 5), numbers(1)))
+    ),
+    "hash": lambda: EncodedNetwork(
+        HashGrid(numbers(2, 16, 2), (2, 4), 1.05), ((numbers(5, 7), numbers(5)), (numbers(1, 5), numbers(1)))
+    ),
     "textured": lambda: TexturedDecoder(layers=2, width=8, code_length=4, skip=1, narrow=False).at(numbers(4)),
     "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
     "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,

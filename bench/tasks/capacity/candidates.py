@@ -1,10 +1,12 @@
-"""The candidates: primitives with a formula, unions of them, networks of one shape, and grids fitted near the surface.
+"""The candidates: primitives with a formula, unions of them, networks of points or of their encoding, and grids.
 
 Every primitive has a pose; sizes are logarithms.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
+from math import pi, sqrt
 
 import numpy as np
 import torch
@@ -21,6 +23,7 @@ from renderers.field import Flops
 from renderers.fields.analytic import Shape
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import BoundDecoder, Decoder
+from renderers.fields.networks.encoded import EncodedNetwork, Encoding, FourierFeatures, HashGrid
 from renderers.fields.parts import formula
 
 PRIMITIVE_RATE = 0.01  # Adam's rate: the change per step in scene units, radians or fractions of a size
@@ -32,6 +35,10 @@ ROUND_LOGIT, EDGED_LOGIT = 0.0, -1.5  # initial rounding of a box: logit of radi
 MIN_SKIP_LAYERS = 8  # deeper networks feed the points in again half-way, as DeepSDF does
 MAX_RATE, RATE_TIMES_WIDTH = 2e-3, 0.4  # Adam's rate: at most 2e-3, inversely as the width (Yang et al. 2021)
 INITIAL_SPHERE_RADIUS = 0.5  # scene units: a network is initialised to this sphere
+FOURIER_STD = 1.0  # cycles per scene unit, of each coordinate of the random frequencies
+HASH_FEATURES, HASH_LAYERS, HASH_WIDTH = 2, 1, 32  # numbers of an entry; the network of its features
+HASH_COARSEST, HASH_FINEST = 4, 64  # cells per axis of the first and the last level
+HASH_INITIAL = 1e-4  # features are drawn between -1e-4 and 1e-4 (Mueller et al. 2022)
 BAND_CELLS = 2.0  # grid samples within so many cells of the surface are fitted
 GRID_RATE = 2e-3  # scene units
 
@@ -125,6 +132,69 @@ def network(name: str, layers: int, width: int) -> Candidate:
     return Candidate(name, stored, bound(parameters).flops.value, starts, follows=True)
 
 
+def fourier(name: str, layers: int, width: int) -> Candidate:
+    """A network of Fourier features, as many as a layer has neurons; the frequencies are drawn, and not fitted."""
+
+    def encoding(draw: torch.Generator) -> tuple[list[Tensor], Callable[[list[Tensor]], Encoding]]:
+        frequencies = FOURIER_STD * torch.randn(width // 2, 3, generator=draw)
+        return [], lambda free: FourierFeatures(frequencies.to(free[0].device))
+
+    return _encoded(name, encoding, [3 + 2 * (width // 2), *[width] * layers], fixed_count=3 * (width // 2))
+
+
+def hash_grid(name: str, levels: int, log2_entries: int) -> Candidate:
+    """A hash grid with a small network; the cells of its levels grow geometrically."""
+    ratio = (HASH_FINEST / HASH_COARSEST) ** (1 / (levels - 1))
+    cells = tuple(round(HASH_COARSEST * ratio**level) for level in range(levels))
+
+    def encoding(draw: torch.Generator) -> tuple[list[Tensor], Callable[[list[Tensor]], Encoding]]:
+        drawn = torch.rand(levels, 2**log2_entries, HASH_FEATURES, generator=draw)
+        return [HASH_INITIAL * (2 * drawn - 1)], lambda free: HashGrid(free[0], cells, REACH)
+
+    return _encoded(name, encoding, [3 + HASH_FEATURES * levels, *[HASH_WIDTH] * HASH_LAYERS])
+
+
+def _encoded(
+    name: str,
+    encoding: Callable[[torch.Generator], tuple[list[Tensor], Callable[[list[Tensor]], Encoding]]],
+    sizes: list[int],
+    fixed_count: int = 0,
+) -> Candidate:
+    """A network of encoded points, initialised near the distance of a sphere (SAL, Atzmon and Lipman 2020).
+
+    Args:
+        encoding: draws the free numbers of the encoding, and returns them with a function that makes it of all of them.
+        sizes: inputs of each layer; the first are the point and its features.
+        fixed_count: numbers of the encoding that are stored and not fitted.
+    """
+
+    def new(seed: int) -> tuple[list[Tensor], Callable[[list[Tensor]], EncodedNetwork]]:
+        draw = torch.Generator().manual_seed(seed)
+        encoded, make = encoding(draw)
+        weights = [torch.randn(o, i, generator=draw) * sqrt(2 / o) for i, o in pairwise(sizes)]
+        if not encoded:  # features of a hash grid are about 0 at the start
+            weights[0][:, 3:] = 0.0
+        last = torch.full((1, sizes[-1]), sqrt(pi / sizes[-1])), torch.full((1,), -INITIAL_SPHERE_RADIUS)
+        layers = [tensor for weight in weights for tensor in (weight, torch.zeros(len(weight)))]
+
+        def field(free: list[Tensor]) -> EncodedNetwork:
+            of_layers = free[len(encoded) :]
+            return EncodedNetwork(make(free), tuple(zip(of_layers[::2], of_layers[1::2], strict=True)))
+
+        return [*encoded, *layers, *last], field
+
+    def starts(inputs: StartInputs) -> list[Model]:
+        numbers, field = new(inputs.seed)
+        free = [tensor.to(inputs.device).requires_grad_() for tensor in numbers]
+        return [
+            Model(name, free, field, min(MAX_RATE, RATE_TIMES_WIDTH / sizes[-1]), metric=False, fixed_count=fixed_count)
+        ]
+
+    numbers, field = new(0)
+    stored = fixed_count + sum(tensor.numel() for tensor in numbers)
+    return Candidate(name, stored, field(numbers).flops.value, starts, follows=True)
+
+
 def narrow_band(name: str, resolution: int) -> Candidate:
     """A grid of distances: samples near the surface are fitted, the others keep the values of the previous field."""
     stored = resolution**3  # samples that are not fitted are stored too
@@ -151,7 +221,9 @@ def narrow_band(name: str, resolution: int) -> Candidate:
     return Candidate(name, stored, FLOPS.value, starts, follows=True)
 
 
-BUILDERS: dict[str, Callable[..., Candidate]] = {"union": union_candidate, "network": network, "grid": narrow_band}
+BUILDERS: dict[str, Callable[..., Candidate]] = {
+    **{"union": union_candidate, "network": network, "fourier": fourier, "hash": hash_grid, "grid": narrow_band}
+}
 PAPER_NETWORK = "network_8x512"  # the network of DeepSDF and DIST without a code
 
 

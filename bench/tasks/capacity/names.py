@@ -8,9 +8,10 @@ from renderers.checks import check_at_least
 
 PRIMITIVES = ("sphere", "ellipsoid", "box", "rounded_box", "superquadric")
 # The text after the underscore.
-SIZE_PATTERNS = {"union": "[0-9]+", "network": "[0-9]+x[0-9]+", "grid": "[0-9]+", "occupancy": "[0-9]+"}
-EXAMPLES = ("union_3", "network_4x64", "grid_32", AUTO, PRIOR_FIELD)
-NAME_FORMS = "union_K, network_LAYERSxWIDTH, grid_N, occupancy_WIDTH"
+SIZE_PATTERNS = {"union": "[0-9]+", "grid": "[0-9]+", "occupancy": "[0-9]+"}
+SIZE_PATTERNS |= {"network": "[0-9]+x[0-9]+", "fourier": "[0-9]+x[0-9]+", "hash": "[0-9]+x[0-9]+"}
+EXAMPLES = ("union_3", "network_4x64", "fourier_4x64", "hash_8x10", "grid_32", AUTO, PRIOR_FIELD)
+NAME_FORMS = "union_K, network_LAYERSxWIDTH, fourier_LAYERSxWIDTH, hash_LEVELSxLOG2ENTRIES, grid_N, occupancy_WIDTH"
 MAX_GRID_SAMPLES = 256  # per axis: 64 MiB of values
 
 
@@ -33,6 +34,11 @@ def parse_field_name(name: str) -> tuple[str, tuple[int, ...]]:
     if kind == "network":
         check_at_least("network layers", sizes[0], 1, "network_1x16 is small")
         check_at_least("network width", sizes[1], 4, "network_1x16 is small")
+    if kind == "fourier":
+        check_at_least("fourier layers", sizes[0], 1, "fourier_4x64 suits one shape")
+        check_at_least("fourier width", sizes[1], 4, "fourier_4x64 suits one shape")
+    if kind == "hash" and not (2 <= sizes[0] <= 16 and 4 <= sizes[1] <= 19):
+        raise ValueError(f"{name}: a hash grid has 2 to 16 levels, and 2^4 to 2^19 entries in each: hash_8x10")
     if kind == "grid" and not 8 <= sizes[0] <= MAX_GRID_SAMPLES:
         raise ValueError(f"N of grid_N must lie between 8 and {MAX_GRID_SAMPLES}, not {sizes[0]}: grid_32")
     return kind, sizes
