@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from math import log10
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -19,6 +19,7 @@ KINDS = {  # from the beginning of a candidate's name to label, colour and marke
     "union": ("unions of boxes", "#009e73", "P"),
     "": ("one part", "#d55e00", "o"),
 }
+CONFIRMED_FROM = 0.8  # fraction of the draws of further views on which a chosen candidate must suffice
 FLOPS = "flops_per_query"
 AXES = {"stored": "stored numbers", "free": "free numbers", "bytes": "bytes", FLOPS: "FLOPs per evaluation"}
 
@@ -72,7 +73,6 @@ class Candidates:
     best: CandidateResult | None
     measure: str
     footprint: float | None
-    MIN_HELD: ClassVar[float] = 0.8  # fraction of the draws of further views that confirm a choice
 
     def smallest(self, measure: str, *, by_pixel: bool) -> CandidateResult | None:
         """The candidate with the least `measure` of those that suffice and that further views confirm; None if none.
@@ -88,7 +88,7 @@ class Candidates:
             held = result.held(by_pixel=by_pixel)
             if held is None:  # a record without checks of this candidate
                 return result if result is ordered[0] else None
-            if held >= self.MIN_HELD:
+            if held >= CONFIRMED_FROM:
                 return result
         return None
 

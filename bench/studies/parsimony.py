@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from bench.pictures.size_chart import AXES, FLOPS, KINDS, CandidateResult, Candidates, marker_points
+from bench.pictures.size_chart import AXES, CONFIRMED_FROM, FLOPS, KINDS, CandidateResult, Candidates, marker_points
 from bench.report.study import Result, Runs, Selection, chart, figure_style, format, medians, records, table
 
 PLACE = 160
@@ -31,9 +31,9 @@ COLUMNS_OF_PANELS = 2
 LEGEND_LABELS = {label for label, *_ in KINDS.values()} | {heading for _, _, heading, *_ in CHOICES.values()}
 MARKER_EXAMPLES = (10, 10_000, 1_000_000)  # stored numbers
 NOTES = (
-    "All candidates are fitted to depth and silhouettes of the same views with the same rays, in rounds until a round "
-    "no longer reduces the held-out error by more than its noise. The error is the mean distance along the normal over "
-    "held-out rays, most of them of other views.",
+    "All candidates are fitted to depth and silhouettes of the same views with the same rays, until a doubling of "
+    "the iterations no longer reduces the held-out error by more than its noise. The error is the mean distance along "
+    "the normal over held-out rays, most of them of other views.",
     "A field under half a pixel at the nearest distance suffices for these pixels. A field within one standard error "
     "of the least error is as good as the best: it suffices for the scene, as far as these candidates show.",
     "A candidate is chosen only if it also suffices on {held:.0f} % or more of random draws of further views. "
@@ -62,7 +62,7 @@ def make(runs: Runs) -> Result:
         question="How small can the model of a shape be?",
         verdict=_verdict([line for line in lines if line["ok"]]),
         interval="± and bars are one standard error, by the jackknife over views",
-        remarks=[*(note.format(held=100 * Candidates.MIN_HELD) for note in NOTES), _falling(lines)],
+        remarks=[*(note.format(held=100 * CONFIRMED_FROM) for note in NOTES), _falling(lines)],
         data=table.to_data(CANDIDATES, [line | candidate for line in lines for candidate in _candidates(line)]),
         columns=COLUMNS,
         lines=lines,

@@ -64,7 +64,13 @@ def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     assert metrics["auto.field"] == "rounded_box" and metrics["auto.overhead"] > 1
     assert metrics["auto.evaluations"] > metrics["rounded_box.evaluations"]
     assert metrics["frugal.evaluations"] < metrics["rounded_box.evaluations"]
-    assert 0 <= metrics["held_out_seeds_within"] <= metrics["held_out_seeds_held"] == 1
+    assert (
+        metrics["rounded_box.held_within"]
+        == metrics["rounded_box.held_enough"]
+        == 1
+        == metrics["recommended_confirmed"]
+    )
+    assert metrics["sphere.held_within"] == metrics["sphere.held_enough"] == 0
     assert metrics["chamfer_l2"] < 0.01
     assert any(
         "needs rounded_box, 10 numbers, the smallest by stored numbers: held-out" in note for note in record.notes
@@ -120,10 +126,9 @@ def test_a_choice_is_checked_by_the_best_candidate_of_each_draw():
     off = {"chosen": [0.01, 0.03, 0.03, 0.03], "other": [0.03, 0.01, 0.01, 0.01]}
     chosen, other = (HeldOutError(np.array([[10 * mean, 10, 0, 10] for mean in means]), 0.1) for means in off.values())
     settings = CheckSettings(views=4, seeds=40, drawn=2)
-    checked = shares(chosen, [chosen, other], settings, footprint=0.001, seed=0)
-    assert 0.2 < checked["held_out_seeds_within"] < 0.8  # of six pairs of views, three are those with the first one
-    assert checked["held_out_seeds_held"] == checked["held_out_seeds_within"]
-    assert shares(chosen, [chosen, other], settings, footprint=0.04, seed=0)["held_out_seeds_held"] == 1
+    within, enough = shares(chosen, [chosen, other], settings, footprint=0.001, seed=0)
+    assert 0.2 < within < 0.8 and enough == 0  # of six pairs of views, three are those with the first one
+    assert shares(chosen, [chosen, other], settings, footprint=0.04, seed=0) == (within, 1.0)
 
 
 def test_hits_off_the_surface_are_noted_once_of_all_candidates(compose_config, tmp_path):
@@ -155,4 +160,4 @@ def test_invalid_settings_are_told_with_their_reason(compose_config, tmp_path):
     record = run(tmp_path, compose_config, "task=gradients", "+experiment=fitted", "field=auto")
     assert record.status == "refused" and "does not take field=auto: remove it" in record.reason
     with pytest.raises(ValueError, match="frugal_rays must be above 0"):
-        Capacity("depth", 10.0, Own(), 10.0, 1, 0.0, CheckSettings(4, 2, 2))
+        Capacity("depth", 10.0, Own(), 10.0, 1, 100, 0.0, CheckSettings(4, 2, 2))

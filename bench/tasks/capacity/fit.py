@@ -122,10 +122,12 @@ class Fitter:
         self._evaluate(fitted)
 
     def finish(self, fitted: Fitted, rounds: int) -> None:
-        """Fits a candidate in rounds, until a round lowers its held-out error by less than one standard error.
+        """Fits a candidate in rounds that double its iterations, until one lowers its error by at most its noise.
 
-        The first round is not tested, since a warm start imitates a field that may be better. A later round that raises
-        the error or fails is undone; its cost counts. `evidence.falling` is true if the last round lowered the error.
+        The error is that of held-out rays, and its noise one standard error of the difference. Rounds of equal length
+        would gain less and less, and end slow fits early. The first round is not tested, since a warm start imitates a
+        field that may be better. A later round that raises the error or fails is undone; its cost counts.
+        `evidence.falling` is true if the last of all rounds lowered the error: the fit had not ended.
         """
         evidence = fitted.evidence
         self.fit(fitted, self.settings.iterations, checkpoints=True)
@@ -134,7 +136,7 @@ class Fitter:
             if earlier is None:
                 return
             saved = [parameter.detach().clone() for parameter in fitted.model.parameters]
-            self.fit(fitted, self.settings.iterations, checkpoints=True)
+            self.fit(fitted, iterations, checkpoints=True)
             gain = earlier.mean - evidence.mean
             evidence.falling = evidence.error is not None and gain > evidence.error.noise_of_difference(earlier)
             if not evidence.falling:

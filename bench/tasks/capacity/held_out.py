@@ -1,6 +1,6 @@
 """The error of a field on held-out rays, without the ground truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -75,6 +75,16 @@ class HeldOut:
     mask: Bool[Tensor, " n"]
     group: Int[Tensor, " n"]
     footprint: float
+
+    def thinned(self, per_group: int, seed: int) -> "HeldOut":
+        """At most `per_group` random rays of each group, in their order."""
+        order = torch.randperm(len(self.group), generator=torch.Generator().manual_seed(seed)).to(self.group.device)
+        by_group = order[self.group[order].argsort(stable=True)]
+        counts = torch.bincount(self.group)
+        rank = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[self.group[by_group]]
+        kept = by_group[rank < per_group].sort().values
+        tensors = {name: getattr(self, name)[kept] for name in ("distance", "observed", "mask", "group")}
+        return replace(self, rays=self.rays[kept], **tensors)
 
     @torch.no_grad()
     def error(self, field: Field, renderer: Renderer) -> HeldOutError:

@@ -136,6 +136,8 @@ class Evidence:
         seconds, evaluations, gradients, flops: of the fit with its warm start, without checkpoints.
         iterations: of the fit, without its warm start and without an undone round; see `Fitter.finish`.
         falling: whether the last of several rounds lowered the error.
+        held_within, held_enough: the fractions of draws of further views on which the candidate is within one standard
+            error of the best one, and under the footprint; None if they were not checked.
         checkpoints: seconds, evaluations, gradients, flops and error at each checkpoint.
     """
 
@@ -151,6 +153,8 @@ class Evidence:
     flops: int = 0
     iterations: int = 0
     falling: bool = False
+    held_within: float | None = None
+    held_enough: float | None = None
     checkpoints: list[dict[str, float]] = field(default_factory=list)
 
     @property

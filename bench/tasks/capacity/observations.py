@@ -132,7 +132,11 @@ def hold_out(
 
 @dataclass(frozen=True)
 class Views:
-    """Makes views of a shape from all around, by cameras at the distance and field of view of `sampler`."""
+    """Makes views of a shape from all around, by cameras at the distance and field of view of `sampler`.
+
+    At most `held_out_rays` random rays of each held-out group are kept, so that an error costs the same at every
+    resolution.
+    """
 
     truth: Truth
     sampler: ViewSampler
@@ -140,6 +144,7 @@ class Views:
     weights: ViewLossSettings
     renderer: Renderer
     device: torch.device
+    held_out_rays: int
 
     @property
     def footprint(self) -> float:
@@ -154,14 +159,16 @@ class Views:
         cameras += self._spread(settings.held_out, turn + GOLDEN_ANGLE_DEGREES / 2)
         entire, (view, group) = tuple(range(settings.fitted, len(cameras))), self._observe(cameras)
         held = hold_out(view, group, share=settings.share, entire=entire, footprint=self.footprint, seed=seed)
-        return replace(held, rays=settings.rays)
+        return replace(held, held_out=held.held_out.thinned(self.held_out_rays, seed), rays=settings.rays)
 
     def further(self, count: int, seed: int) -> HeldOut:
         """`count` further random views, not used by any choice."""
         draw, highest = np.random.default_rng([seed, 3]), sin(radians(self.settings.elevation))
         angles = [(draw.uniform(0, 360), degrees(asin(draw.uniform(-highest, highest)))) for _ in range(count)]
         view, group = self._observe([self.sampler.camera(*pair) for pair in angles])
-        return held_out_rays(view, torch.ones_like(view.observed), group, self.footprint)
+        return held_out_rays(view, torch.ones_like(view.observed), group, self.footprint).thinned(
+            self.held_out_rays, seed
+        )
 
     def _spread(self, count: int, turn: float) -> list[Camera]:
         """Cameras spread evenly over the belt of a sphere between the largest elevations (a Fibonacci lattice)."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bench.pictures.size_chart import CONFIRMED_FROM
 from bench.tasks.capacity.fit import Fitted, Fitter
 from bench.tasks.capacity.held_out import HeldOutError
 from bench.tasks.capacity.model import Candidate, Evidence
@@ -38,6 +39,7 @@ class Choice:
 
     chosen: Evidence
     best: Evidence
+    confirmed: bool  # it suffices on further views too; if no candidate does, the best one is chosen
     measure: str  # the measure of size
     within: bool  # the error is within one standard error of the best
     enough: bool  # the error is below the footprint
@@ -54,11 +56,14 @@ def fit_all(fitter: Fitter, candidates: list[Candidate], rounds: int = 1) -> Ite
         yield fitted
 
 
-def check(chosen: Fitted, fits: list[Fitted], views: Views, settings: CheckSettings, *, seed: int) -> dict[str, float]:
-    """The fraction of random draws of further views on which the choice holds; see `shares`."""
+def check(fits: list[Fitted], views: Views, settings: CheckSettings, *, seed: int) -> None:
+    """Adds to the evidence of each fit the fractions of draws of further views on which it suffices; see `shares`."""
     further = views.further(settings.views, seed)
-    errors = {fit: further.error(fit.model.frozen(), views.renderer) for fit in fits if not fit.failed}
-    return shares(errors[chosen], list(errors.values()), settings, footprint=views.footprint, seed=seed)
+    fitted = [fit for fit in fits if not fit.failed]
+    errors = [further.error(fit.model.frozen(), views.renderer) for fit in fitted]
+    for fit, error in zip(fitted, errors, strict=True):
+        within, enough = shares(error, errors, settings, footprint=views.footprint, seed=seed)
+        fit.evidence.held_within, fit.evidence.held_enough = within, enough
 
 
 def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: float) -> Evidence:
@@ -70,8 +75,10 @@ def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: fl
     observations = fitter.observations.with_renderer(renderer)
     frugal = replace(fitter, settings=settings, observations=observations, stage="frugal", spent={})
     fitted = frugal.begin(chosen.candidate, chosen.previous, evaluate=False)
-    for _ in range(chosen.evidence.iterations // settings.iterations):
-        frugal.fit(fitted, settings.iterations, checkpoints=False)
+    done = 0
+    while done < chosen.evidence.iterations:  # the rounds of `Fitter.finish`
+        frugal.fit(fitted, max(done, settings.iterations), checkpoints=False)
+        done += max(done, settings.iterations)
     if not fitted.failed:
         fitted.evidence.error = fitter.observations.error(fitted.model.frozen())
     return fitted.evidence
@@ -79,27 +86,26 @@ def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: fl
 
 def shares(
     chosen: HeldOutError, candidates: list[HeldOutError], settings: CheckSettings, *, footprint: float, seed: int
-) -> dict[str, float]:
-    """The fractions of random draws of views on which a choice is as good as the draw's best candidate, and holds.
+) -> tuple[float, float]:
+    """The fractions of random draws of views on which a candidate is as good as the best, and below the footprint.
 
     Args:
-        footprint: half a pixel, in scene units; a choice with an error below it also holds.
+        footprint: half a pixel, in scene units.
     """
-    draw, within, holding = np.random.default_rng([seed, 4]), 0, 0
+    draw, within, enough = np.random.default_rng([seed, 4]), 0, 0
     for _ in range(settings.seeds):
         drawn = draw.choice(settings.views, settings.drawn, replace=False)
         best = min((error.select(drawn) for error in candidates), key=lambda error: error.mean)
-        as_good = is_as_good(chosen.select(drawn), best)
-        within += as_good
-        holding += as_good or chosen.select(drawn).mean <= footprint
-    fractions = {"held_out_seeds_within": within / settings.seeds, "held_out_seeds_held": holding / settings.seeds}
-    return {"held_out_seeds": settings.seeds, **fractions}
+        within += is_as_good(chosen.select(drawn), best)
+        enough += chosen.select(drawn).mean <= footprint
+    return within / settings.seeds, enough / settings.seeds
 
 
 def choose(evidence: list[Evidence], footprint: float, measure: str) -> Choice:
     """The smallest candidate within one standard error of the best (Breiman et al. 1984), or below the footprint.
 
-    The footprint is half a pixel (DIST, Eq. 10), in scene units; `measure` is a measure of `models.size`.
+    The rule must also hold on `CONFIRMED_FROM` of the draws of further views, if these were checked. The footprint is
+    half a pixel (DIST, Eq. 10), in scene units; `measure` is a measure of `models.size`.
 
     Raises:
         ValueError: all fits failed.
@@ -111,8 +117,17 @@ def choose(evidence: list[Evidence], footprint: float, measure: str) -> Choice:
         )
     best = min(successful, key=lambda candidate: candidate.mean)
     sufficient = [fit for fit in successful if is_as_good(fit.error, best.error) or fit.mean <= footprint]
-    chosen = min(sufficient, key=lambda candidate: (candidate.size.by(measure), candidate.mean))
-    return Choice(chosen, best, measure, is_as_good(chosen.error, best.error), chosen.mean <= footprint)
+    confirmed = [fit for fit in sufficient if is_confirmed(fit, best, footprint)]
+    chosen = min(confirmed or [best], key=lambda candidate: (candidate.size.by(measure), candidate.mean))
+    within, enough = is_as_good(chosen.error, best.error), chosen.mean <= footprint
+    return Choice(chosen, best, bool(confirmed), measure, within, enough)
+
+
+def is_confirmed(fit: Evidence, best: Evidence, footprint: float) -> bool:
+    """Whether a rule that a candidate fulfils also holds on further views; true if these were not checked."""
+    held = [fit.held_enough] if fit.mean <= footprint else []
+    held += [fit.held_within] if is_as_good(fit.error, best.error) else []
+    return any(fraction is None or fraction >= CONFIRMED_FROM for fraction in held)
 
 
 def is_as_good(error: HeldOutError, best: HeldOutError) -> bool:

@@ -42,7 +42,7 @@ CHOICE_DEFINITIONS = {
     "NAME.sparse_bytes": "of a grid: size of a file with the fitted samples, a bit per sample that tells which they "
     "are, and the previous field, from which the other samples can be computed; no choice uses it",
     "NAME.iterations, NAME.falling": "of its fit, without a round that was taken back; whether the error still fell in "
-    "the last of task.rounds",
+    "the last of task.rounds, each of which doubles the iterations",
     "NAME.flops_per_query": "floating-point operations per value, an estimate for formulas",
     "NAME.seconds, NAME.evaluations, NAME.flops": "of its fit, with finding its start and the warm start, "
     "without checkpoints",
@@ -53,9 +53,11 @@ CHOICE_DEFINITIONS = {
     "auto.overhead": "seconds of all fits of early growth over those of its final candidate's, without checkpoints",
     "frugal....": "the recommended candidate fitted again at pixel precision: renderer.epsilon=auto, "
     "renderer.steps=auto and the rays of an iteration from the loss",
-    "held_out_seeds": "random draws of views that no choice has used",
-    "held_out_seeds_within, held_out_seeds_held": "share of the draws on which the recommended candidate is within "
-    "one standard error of the draw's best one; on which it is that or under the footprint",
+    "held_out_seeds": "random draws of views that no fit has used",
+    "NAME.held_within, NAME.held_enough": "share of these draws on which the candidate is within one standard error of "
+    "the draw's best one; on which its error is under the footprint",
+    "recommended_confirmed": "1 where a rule of the recommended candidate holds on four fifths of the draws; 0 where "
+    "that is true of no candidate, and the best one is recommended",
 }
 
 
@@ -65,7 +67,9 @@ class Capacity:
 
     Args:
         depth_loss, depth_weight, silhouette, silhouette_weight: see `bench.tasks.completion.Completion`.
-        rounds: maximum rounds of `models.fit.iterations` in a fit; see `bench.tasks.capacity.fit.Fitter.finish`.
+        rounds: maximum rounds of a fit, of which the first has `models.fit.iterations`; see
+            `bench.tasks.capacity.fit.Fitter.finish`.
+        held_out_rays: maximum number of rays of each view that measure an error.
         frugal_rays: initial fraction of the rays in the recommended candidate's fit at pixel precision.
         checks: settings of the checks of the choice on further views.
     """
@@ -75,11 +79,13 @@ class Capacity:
     silhouette: SilhouetteLoss
     silhouette_weight: float
     rounds: int
+    held_out_rays: int
     frugal_rays: float
     checks: CheckSettings
 
     def __post_init__(self) -> None:
-        check_at_least("task.rounds", self.rounds, 1, "1 fits once, 4 as long as the error falls")
+        check_at_least("task.rounds", self.rounds, 1, "1 fits once, 5 up to 16 times as long")
+        check_at_least("task.held_out_rays", self.held_out_rays, 100, "2304 are 48 x 48")
         check_fraction("task.frugal_rays", self.frugal_rays, "0.125 begins with an eighth of the rays")
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
         for name in ("depth_weight", "silhouette_weight"):
@@ -91,8 +97,9 @@ class Capacity:
         check_field_gradient(inputs.renderer)
         record.definitions = DEFINITIONS | COST_DEFINITIONS | CHOICE_DEFINITIONS
         models, filmstrip = inputs.field.models, Filmstrip(inputs, "by candidate")
-        views = Views(inputs.scene.raycaster, inputs.views, models.views, self, inputs.renderer, inputs.device)
-        max_iterations = self.rounds * models.fit.iterations
+        settings = (models.views, self, inputs.renderer, inputs.device, self.held_out_rays)
+        views = Views(inputs.scene.raycaster, inputs.views, *settings)
+        max_iterations = 2 ** (self.rounds - 1) * models.fit.iterations
         with curve_file(run.folder) as write_line:
 
             def on_line(name: str, line: dict[str, Any]) -> None:
@@ -111,13 +118,14 @@ class Capacity:
                 run.progress("fitting all candidates", len(fits), len(candidates), fitted.evidence.mean)
             evidence = [fitted.evidence for fitted in fits]
             note_fits(record, [*growth.tried, *evidence], fitter)
+            check(fits, views, self.checks, seed=inputs.seed)
             choice = choose(evidence, views.footprint, models.size)
             chosen = next(fitted for fitted in fits if fitted.evidence is choice.chosen)
-            checked = check(chosen, fits, views, self.checks, seed=inputs.seed)
             frugal = refit(chosen, fitter, renderer, fewest_rays=self.frugal_rays)
-            metrics = choice_metrics(choice, evidence, growth) | checked | costs("frugal", frugal)
+            metrics = choice_metrics(choice, evidence, growth) | costs("frugal", frugal)
         evaluation, name = evaluate(State(chosen.model.frozen(), inputs)), chosen.candidate.name
-        metrics = evaluation.metrics | {"footprint": views.footprint} | metrics
+        checks = {"footprint": views.footprint, "held_out_seeds": self.checks.seeds}
+        metrics = evaluation.metrics | checks | metrics
         comments = [f"pixel precision: {note}" for note in (*settings_notes, precision_text(frugal, chosen.evidence))]
         notes = summary(choice, growth), *final_notes(chosen.renderer), *comments, *evaluation.notes
         note_result(run, replace(evaluation, metrics=metrics, notes=notes))
@@ -136,6 +144,8 @@ def costs(name: str, evidence: Evidence) -> dict[str, Any]:
     error = evidence.error
     failure = {"failed": f"{evidence.status}: {evidence.reason}"} if error is None else {}
     errors = {} if error is None else {"error": error.mean, "standard_error": error.standard_error}
+    held = {key: getattr(evidence, key) for key in ("held_within", "held_enough")}
+    errors |= {key: fraction for key, fraction in held.items() if fraction is not None}
     return {f"{name}.{key}": value for key, value in {**sizes, **fit_costs, **errors, **failure}.items()}
 
 
@@ -149,6 +159,7 @@ def choice_metrics(choice: Choice, evidence: list[Evidence], growth: Growth) -> 
         "recommended_error": chosen.mean,
         "recommended_within": int(choice.within),
         "recommended_enough": int(choice.enough),
+        "recommended_confirmed": int(choice.confirmed),
         "best_field": choice.best.candidate,
     }
     for fit in evidence:

@@ -62,7 +62,7 @@ def shape_of(name: str) -> Truth:
 
 
 def views_of(name: str, renderer=DIST) -> Views:
-    return Views(shape_of(name), SAMPLER, VIEWS, WEIGHTS, renderer, CPU)
+    return Views(shape_of(name), SAMPLER, VIEWS, WEIGHTS, renderer, CPU, held_out_rays=576)
 
 
 def fitter_of(name: str, renderer=DIST, seed: int = 0, **changed) -> Fitter:
@@ -225,7 +225,27 @@ def test_the_choice_is(case):
     ladder = [evidence_of(str(size), size, an_error(mean, 0.0015)) for size, mean in candidates]  # s.e. about 0.00097
     choice = choose([evidence_of("failed", 1, None), *ladder], footprint, "stored")
     assert (choice.chosen.size.stored, choice.within, choice.enough) == (chosen, within, enough)
-    assert choice.best.mean == pytest.approx(min(mean for _, mean in candidates))
+    assert choice.best.mean == pytest.approx(min(mean for _, mean in candidates)) and choice.confirmed
+
+
+@each("enough, within, chosen, confirmed", [
+    ((0.9, 1.0), (0.0, 0.0), 4, True), ((0.7, 1.0), (0.0, 0.0), 10, True),
+    ((0.7, 0.0), (0.9, 0.9), 10, True), ((0.7, 0.0), (0.9, 0.7), 10, False),
+])  # fmt: skip
+def test_a_choice_must_hold_on_further_views(enough, within, chosen, confirmed):
+    small, large = (evidence_of(str(size), size, an_error(mean, 0.0015)) for size, mean in ((4, 0.019), (10, 0.010)))
+    for fit, *held in zip((small, large), enough, within, strict=True):
+        fit.held_enough, fit.held_within = held
+    choice = choose([small, large], 0.02, "stored")
+    assert (choice.chosen.size.stored, choice.confirmed) == (chosen, confirmed)
+
+
+def test_an_error_has_as_many_random_rays_of_each_view():
+    held = views_of("ball").further(3, 0)
+    few = held.thinned(50, 1)
+    assert (held.group.bincount().tolist(), few.group.bincount().tolist()) == ([576] * 3, [50] * 3)
+    assert len(few.rays.directions.unique(dim=0)) == 150
+    assert float(few.observed.double().mean()) == pytest.approx(float(held.observed.double().mean()), abs=0.15)
 
 
 def test_a_warm_start_alone_finds_a_sphere_and_a_box():
@@ -428,7 +448,7 @@ def test_a_fit_continues_while_its_error_falls_and_states_if_it_was_stopped(shap
     fitter = fitter_of(shape, iterations=8, warm_iterations=20)
     fitted = fitter.begin(candidate(name), None)
     fitter.finish(fitted, rounds)
-    assert fitted.evidence.falling is falling is (fitted.evidence.iterations == 8 * rounds)
+    assert fitted.evidence.falling is falling is (fitted.evidence.iterations == 8 * 2 ** (rounds - 1))
     left = fitter.observations.error(fitted.model.frozen())
     assert left.mean == pytest.approx(fitted.evidence.mean)
 
