@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from math import ceil
+from math import ceil, inf
 from typing import TypeVar
 
 from bench.tasks.capacity.fit import EIKONAL_POINTS, SCREENING, Fitted, Fitter
@@ -28,7 +28,7 @@ class Trials:
 
     tried: list[Evidence] = field(default_factory=list)
     kept: list[Evidence] = field(default_factory=list)
-    without_gain: int = 0  # trials since the last kept one
+    without_gain: int = 0  # ended trials in a row that did not lower the least error
 
 
 def climb(
@@ -39,10 +39,14 @@ def climb(
     A candidate is better if its held-out error is lower by more than the standard error of the difference over the
     same groups of rays or pixels. This covers the noise of the held-out data, not of the start.
 
+    Growth does not end while the held-out error still falls. A candidate with the least error so far begins the count
+    of `patience` again, although it is not kept within the noise. A candidate whose error still falls at the end of its
+    trial does not count: larger networks learn more slowly, so a short trial does not show that they are no better.
+
     Args:
         candidates: the smallest first.
         trial: returns the result of a candidate's trial, from the earlier trials; None skips the candidate.
-        patience: successive candidates that may be tried without gain.
+        patience: successive candidates whose trials ended and did not lower the error; then growth ends.
         footprint: no larger candidate is tried below this error.
     """
     trials = Trials()
@@ -52,11 +56,11 @@ def climb(
         evidence = trial(candidate, trials)
         if evidence is None:
             continue
+        is_least = evidence.mean < min((trial.mean for trial in trials.tried), default=inf)
         trials.tried.append(evidence)
-        trials.without_gain += 1
         if not trials.kept or _is_better(evidence, trials.kept[-1]):
             trials.kept.append(evidence)
-            trials.without_gain = 0
+        trials.without_gain = 0 if is_least else trials.without_gain + (not evidence.falling)
     return trials
 
 

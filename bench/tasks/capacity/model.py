@@ -135,7 +135,7 @@ class Evidence:
         status, reason: of the end of the fit.
         seconds, evaluations, gradients, flops: of the fit with its warm start, without checkpoints.
         iterations: of the fit, without its warm start and without an undone round; see `Fitter.finish`.
-        falling: whether the last of several rounds lowered the error.
+        falling: whether the last of several rounds, or the second half of a trial, lowered the error.
         held_within, held_enough: the fractions of draws of further views on which the candidate is within one standard
             error of the best one, and under the footprint; None if they were not checked.
         checkpoints: seconds, evaluations, gradients, flops and error at each checkpoint.

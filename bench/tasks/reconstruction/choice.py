@@ -105,8 +105,9 @@ class AutoField:
     ) -> "Choice":
         """Tries candidates from the smallest to larger ones, and chooses by `bench.tasks.capacity.growth.climb`.
 
-        Errors are measured on input photographs that the trials do not learn from, in groups of tiles. A trial whose
-        optimisation fails has no error.
+        Errors are measured on input photographs that the trials do not learn from, in groups of tiles: at the end of a
+        trial, and after half of it, which shows whether the error still falls. A trial whose optimisation fails has no
+        error.
 
         Args:
             make: builds the problem of a candidate and photographs.
@@ -117,23 +118,32 @@ class AutoField:
         validation, device = subject.input_shots[::VALIDATION_STEP], run.inputs.device
         fitted = tuple(shot for index, shot in enumerate(subject.input_shots) if index % VALIDATION_STEP)
         trial_subject = replace(subject, input_shots=fitted)
+        pixels = Stack.build(validation, None, device).pixels
         iterations, budget = max(round(self.trial * settings.iterations), 1), settings.budget
         trial_settings = replace(settings, iterations=iterations, budget=budget and self.trial * budget)
 
         def trial(name: str, trials: Trials) -> Evidence:
             torch.manual_seed(run.inputs.seed)  # each trial starts as it would alone
             problem, history = make(name, trial_subject), History()
+            halfway: list[HeldOutError] = []
+
+            def error() -> HeldOutError:
+                return tiled(problem.colour_errors(pixels).cpu(), validation)
 
             def on_step(line: dict[str, Any]) -> None:
                 run.progress(f"trying {name}", line["iteration"] + 1, trial_settings.iterations, line["total"])
+                if line["iteration"] + 1 == iterations // 2:
+                    halfway.append(error())
 
             optimise(problem, trial_settings, device, history=history, on_step=on_step)
             evidence = Evidence(name, Size(sizes[name], sizes[name]), status=history.status)
             evidence.seconds = history.seconds["forward"] + history.seconds["backward"]
             evidence.evaluations = history.counts.value
             if history.status is RunStatus.OK:
-                pixels = Stack.build(validation, None, device).pixels
-                evidence.error = tiled(problem.colour_errors(pixels).cpu(), validation)
+                evidence.error = error()
+                evidence.falling = any(
+                    half.mean - evidence.mean > evidence.error.noise_of_difference(half) for half in halfway
+                )
             return evidence
 
         ordered = sorted(self.candidates, key=lambda name: sizes[name])

@@ -1,6 +1,6 @@
 """The choice of `field=auto`, with candidates whose errors are set by the test."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.solve.optimise import OptimiserSettings
-from bench.tasks.capacity.growth import _is_better
+from bench.tasks.capacity.growth import _is_better, climb
 from bench.tasks.capacity.model import Evidence, Size
 from bench.tasks.capacity.observations import TILES_PER_SIDE
 from bench.tasks.reconstruction.choice import AutoField, Choice, tiled
@@ -23,11 +23,15 @@ SETTINGS = OptimiserSettings(40, 0.1, "constant")
 
 @dataclass
 class FixedError:
-    """A problem with `free` parameters and a fixed error on validation photographs; it records its loss calls."""
+    """A problem with `free` parameters and a fixed error on validation photographs; it records its loss calls.
+
+    Half-way through the ten iterations of a trial, the error is larger by `falls`.
+    """
 
     free: int
     wrong: float
     failing: bool = False
+    falls: float = 0.0
     counts: Counts = field(default_factory=Counts)
     calls: list[int] = field(default_factory=list)
 
@@ -40,7 +44,8 @@ class FixedError:
         return {"total": self.parameters[0].square().sum() + (torch.nan if self.failing else 1.0)}
 
     def colour_errors(self, pixels: Any) -> torch.Tensor:
-        return torch.full((len(pixels.depth_per_distance),), self.wrong)
+        error = self.wrong + (self.falls if len(self.calls) < 8 else 0.0)
+        return torch.full((len(pixels.depth_per_distance),), error)
 
 
 def shot(name: str) -> Shot:
@@ -89,6 +94,17 @@ def test_candidates_that_are_no_better_are_skipped_until_patience_ends(tmp_path)
     choice, _ = chosen(problems, tmp_path, patience=2)
     assert choice.kept.candidate == "a"
     assert [trial.candidate for trial in choice.trials.tried] == ["a", "b", "c"]
+
+
+def test_the_search_does_not_end_while_the_error_falls(tmp_path):
+    """Neither where a trial ends before the fit does, nor at the candidate with the least error so far."""
+    problems = {"a": FixedError(1, 0.3), "b": FixedError(2, 0.4, falls=0.1), "c": FixedError(3, 0.4, falls=0.1)}
+    problems |= {"d": FixedError(4, 0.35), "e": FixedError(5, 0.1)}
+    assert chosen(problems, tmp_path)[0].kept.candidate == "e"
+    means = (np.repeat([0.1, 0.5], 8), np.repeat([0.2, 0.5], 8), np.tile([0.05, 0.54], 8), np.tile([0.2, 0.5], 8))
+    noisy = [replace(of_tiles(mean), candidate=str(n)) for n, mean in enumerate((*means, np.full(16, 0.1)))]
+    trials = climb(range(5), lambda n, _: noisy[n], patience=2)
+    assert [trial.candidate for trial in trials.kept] == ["0", "4"]  # the third one is better, but within the noise
 
 
 def test_a_failed_trial_is_worse_than_any_error(tmp_path):
