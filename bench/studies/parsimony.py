@@ -27,7 +27,7 @@ CHOICES = {  # the metric that a choice minimises, whether half a pixel suffices
     "by_best": ("stored", False, "fewest numbers as good as the best", "D", 10),
 }
 RING_COLOUR, PIXEL_COLOUR = "#111111", "#47684f"
-MAX_WIDE_PANELS = 6  # of more panels, three are next to each other
+MAX_PANELS_IN_TWO_COLUMNS = 6
 LEGEND_LABELS = {label for label, *_ in KINDS.values()} | {heading for _, _, heading, *_ in CHOICES.values()}
 MARKER_EXAMPLES = (10, 10_000, 1_000_000)  # stored numbers
 NOTES = (
@@ -196,7 +196,7 @@ def _point(line: Line, candidate: CandidateResult) -> chart.Series:
 @figure_style.styled
 def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
     """Draws a panel per scene, with the names of the chosen candidates; the legend also has sizes of markers."""
-    rows = -(-len(panels) // (2 if len(panels) <= MAX_WIDE_PANELS else 3))
+    rows = -(-len(panels) // (2 if len(panels) <= MAX_PANELS_IN_TWO_COLUMNS else 3))
     figure = chart.draw(panels, 2.0 * rows + 1.1, rows, legend=0, sharey=True, sharex=True)
     for axis, names in zip(figure.axes, labels, strict=False):
         for (x, y), label in names.items():

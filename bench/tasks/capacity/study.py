@@ -75,10 +75,10 @@ def refit(chosen: Fitted, fitter: Fitter, renderer: Renderer, *, fewest_rays: fl
     observations = fitter.observations.with_renderer(renderer)
     frugal = replace(fitter, settings=settings, observations=observations, stage="frugal", spent={})
     fitted = frugal.begin(chosen.candidate, chosen.previous, evaluate=False)
-    done = 0
-    while done < chosen.evidence.iterations:  # the rounds of `Fitter.finish`
-        frugal.fit(fitted, max(done, settings.iterations), checkpoints=False)
-        done += max(done, settings.iterations)
+    fitted_iterations = 0
+    while fitted_iterations < chosen.evidence.iterations:  # the rounds of `Fitter.finish`
+        frugal.fit(fitted, max(fitted_iterations, settings.iterations), checkpoints=False)
+        fitted_iterations += max(fitted_iterations, settings.iterations)
     if not fitted.failed:
         fitted.evidence.error = fitter.observations.error(fitted.model.frozen())
     return fitted.evidence
