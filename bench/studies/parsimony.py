@@ -31,9 +31,9 @@ MAX_PANELS_IN_TWO_COLUMNS = 6
 LEGEND_LABELS = {label for label, *_ in KINDS.values()} | {heading for _, _, heading, *_ in CHOICES.values()}
 MARKER_EXAMPLES = (10, 10_000, 1_000_000)  # stored numbers
 NOTES = (
-    "All candidates are fitted to depth and silhouettes of the same views with the same rays, until a doubling of "
-    "the iterations no longer reduces the held-out error by more than its noise. The error is the mean distance along "
-    "the normal over held-out rays, most of them of other views.",
+    "All candidates are fitted to depth and silhouettes of the same views with the same rays, in rounds until a round "
+    "no longer reduces the held-out error by more than its noise. The error is the mean distance along the normal over "
+    "held-out rays, most of them of other views.",
     "A field under half a pixel at the nearest distance suffices for these pixels. A field within one standard error "
     "of the least error is as good as the best: it suffices for the scene, as far as these candidates show.",
     "A candidate is chosen only if it also suffices on {held:.0f} % or more of random draws of further views. "
