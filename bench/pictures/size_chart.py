@@ -126,7 +126,7 @@ def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
 
 
 def _panels(axes: np.ndarray, candidates: Candidates) -> None:
-    """Draws errors over size and over FLOPs per evaluation, with standard errors, half a pixel and the recommendation."""
+    """Draws errors over size and FLOPs, with standard errors, half a pixel and the recommendation."""
     fitted = [result for result in candidates.results if result.error is not None]
     for axis, key in zip(axes, (candidates.measure, FLOPS), strict=True):
         for kind, (label, colour, marker) in KINDS.items():
