@@ -1,242 +1,86 @@
-"""The breakdown of each renderer on each axis of the stress test: as an atlas, over cost, and as curves."""
+"""What breaks each renderer first: a heat map of renderers and axes.
+
+An axis is a kind of stress. Its level is 0 at the mildest severity of its sweep and 1 at the severest.
+"""
 
 import math
 import shlex
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from bench.records.results import curve_lines
 from bench.report.study import (
     NoFolder,
     Result,
     Runs,
-    Selection,
+    breakdowns,
     chart,
     figure_style,
     format,
     records,
-    statistics,
     table,
 )
 
 PLACE = 120
-READS = (Selection("stability", ("task.stress",), setup=("machine",), alike=("task",)),)
+READS = (breakdowns.SELECTION,)
 DEFAULT_SCALE = "desk"
 FAILED = "failed_"  # prefix of the metrics that count failed trials by kind
-ENDS = ("mild", "severe")
-COST_AXES = ("field evaluations per ray at the mildest severity, median", "mean rank over axes (1 is best)")
+SURVIVED = LinearSegmentedColormap.from_list("survived", ["#fbf4e6", "#c9d7e2", "#7ba0bd", "#2f6690", "#0b2f4f"])
+AT_ONCE_COLOUR, MARK_COLOUR = "#b3261e", "#8a8a8a"
+MARKS = {
+    "×": "breaks at the mildest",
+    "↑": "fails at the mildest, survives the severest",
+    "–": "lacks the setting, or refuses the field",
+}
+GROUP_GAP_COLUMNS = 0.7
+LINE_INCHES, LABEL_INCHES = 0.155, 1.15  # the height of a renderer, and of the labels above the heat map
 NOTES = (
-    "The adaptive search makes {share:.0f} % of the trials of a full grid. Every renderer gets the same trials at a "
-    "severity. Renderings have {resolution}×{resolution} pixels.",
-    "“At once”: breaks at the mildest severity. “None”: does not break at the severest. Both have the failed trials "
-    "and the interval of their fraction (Clopper and Pearson). “–”: the renderer lacks that setting.",
-    "“Rises”: more trials succeed at the severest than at the mildest severity, so there is no breakdown. “One trial”: "
-    "repeats cannot differ, and the breakdown is between two neighbouring severities.",
-    "If a disturbance moves the surface, the moved surface is the ground truth. The CSV has the distance, and the "
-    "kinds of failed trials.",
-    "Success: {hits:g} of the true hits lie within the footprint of a pixel, and spurious hits are at most "
-    "{false_hits:g} of them. A gradient has a cosine of at least {cosine:g} and a relative length within {scale:g} of "
-    "1. A fit is within {surface_error:g} scene units of the surface.",
-)
-COST_NOTES = (
-    "An axis is a kind of stress. The axes are those of renderings, without settings that some renderer lacks. Rank 1 "
-    "is the best, and equal breakdowns share their mean rank. A failed or missing run has the worst rank, and so has a "
-    "renderer that refuses the field.",
-    "Intervals are 95 % bootstrap intervals over axes. Two renderers cannot be distinguished if the interval of the "
-    "difference of their ranks contains 0. Each renderer has one preset; the page “stability” has all presets.",
-    "At once: axes on which it breaks at the mildest severity. None: axes on which it does not break at the severest.",
-)
-CURVE_NOTES = (
-    "The CSV has the trials and successes at each severity. If repeats can differ, it also has the interval of the "
-    "success rate (Clopper and Pearson).",
-    "On the interactive page, a cell of the atlas opens the curves of its axis.",
-)
-TARGET = ("renderer", "_target_")
-CRITERIA = ("hits", "false_hits", "cosine", "scale", "surface_error")
-NUMBERS = (
-    *("level", "breakdown", "breakdown_low", "breakdown_high", "trials", "grid_trials", "evaluations_per_ray"),
-    *(f"{end}_{name}" for end in ENDS for name in ("successes", "trials")),
-)
-SHARE_COLUMNS = ("level", "severity", "successes", "trials", "share", "low", "high")
-COST_COLUMNS = (
-    *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
-    *table.columns(table.word, at_once="At once", never="None"),
-    *(table.Column("cost", "Field evaluations per ray"), table.PRESET),
+    "Severity is a share of the axis: 0 % is the mildest severity, 100 % the severest. A darker cell survives harder "
+    "cases.",
+    "“Breaks first” and “Then” are the axes with the lowest breakdowns. Of equal ones, they are those with the highest "
+    "median of all renderers. “Best on” is the axis with the largest distance above that median. Settings of renderers "
+    "are left out. “At once” and “none”: at the mildest and at the severest severity, with the failed trials.",
+    "Intervals are those of the shown axis. They do not cover the choice of the axis. The mean rank is over the "
+    "{ranked_axes} axes that judge renderings, with its bootstrap interval over axes.",
+    "Each renderer has one preset. The page “stability_axes” has all presets and all numbers.",
 )
 
 
 def make(runs: Runs) -> Result:
-    """A line per axis and a column per renderer."""
+    """A line per renderer: the axes on which it breaks first, the axis on which it is best, and its mean rank."""
     runs = runs.of_newest_scene()
-    cells = cells_of(runs)
-    axes, rows = axes_of(cells), list(cells["row"].unique())
-    task, trials = runs.requested().get("task"), cells["trials"].sum()
-    settings = {name: float(records.setting(task, "criteria", name) or math.nan) for name in CRITERIA}
-    settings["resolution"] = records.setting(task, "resolution")
-    settings["share"] = 100 * trials / max(cells["grid_trials"].sum(), 1)
-    words = _grid(cells, axes, "words").fillna("").reset_index(drop=True)
-    words.insert(0, "Axis", [title(axis) for axis in axes.index])
-    words.insert(1, "Unit", list(axes["unit"]))
+    cells = breakdowns.cells_of(runs)
+    cells = cells.assign(ray=_rays(runs, cells))
+    axes, ranked = breakdowns.axes_of(cells), cells[cells["row"].isin(breakdowns.ranked_rows(runs))]
+    ranks, shared = breakdowns.ranks_of(ranked)
+    rows = sorted(ranks, key=lambda row: (math.isnan(ranks[row].value), ranks[row].value))
+    compared = ranked[ranked["is_measured"] & ~ranked["is_setting"] & ~ranked["rises"]]
+    medians = compared.groupby("axis")["shade"].median()
+    compared = compared.assign(median=compared["axis"].map(medians))
+    lines = [_extremes_of(compared[compared["row"] == row]) | {"row": row, "rank": ranks[row]} for row in rows]
     return Result(
         runs,
-        "The severity at which each renderer breaks.",
-        "The severity at which half of the trials succeed, on each axis (kind of stress).",
-        question="At which severity of stress does each renderer break?",
-        verdict=table.extremes(
-            "Axes on which a renderer does not break",
-            cells.groupby("row", sort=False)["never"].sum().to_dict(),
-            f"{trials:.0f} trials on {len(axes)} axes",
-            show=table.integer,
-            largest_first=True,
-        ),
-        n=f"{trials:.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
-        interval="95 % credible intervals, the milder end first",
-        remarks=[note.format(**settings) for note in NOTES],
+        "What breaks each renderer first.",
+        "Per renderer and axis (kind of stress), the severity at which half of the trials succeed.",
+        question="What breaks each renderer first?",
+        verdict=_hardest_axis(compared, len(rows)),
+        n=f"{ranked['trials'].sum():.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
+        interval="95 % credible intervals of breakdowns",
+        remarks=[note.format(ranked_axes=shared["axis"].nunique()) for note in NOTES],
         data=_data(runs, cells, axes),
-        columns=[table.text(name, name) for name in words],
-        lines=words.to_dict("records"),
-        figure=draw(cells, axes),
-        atlas=_atlas(cells.assign(ray=_rays(runs, cells)), axes),
+        columns=FIRST_COLUMNS,
+        lines=lines,
+        figure=draw(ranked, axes, rows),
+        atlas=_atlas(ranked, axes, rows),
     )
-
-
-def make_cost(runs: Runs) -> Result:
-    """A line and a point per renderer: its mean rank over the axes, and its field values per ray."""
-    runs = runs.of_newest_scene()
-    cells = cells_of(runs)
-    cells = cells[cells["row"].isin(_ranked(runs))]
-    rendered = cells[cells["measure"] == "rendering"]
-    unsupported = set(rendered.loc[(rendered["status"] == "unsupported") & rendered["is_setting"], "axis"])
-    shared = rendered[~rendered["axis"].isin(unsupported)]
-    # A failed, missing or unsupported run has no shade, so it ranks last.
-    shades = shared.pivot(index="axis", columns="row", values="shade").reindex(columns=cells["row"].unique())
-    ranks = statistics.rank({str(row): (1.0 - row_shades).to_dict() for row, row_shades in shades.items()})
-    lines = pd.DataFrame([_cost(shared[shared["row"] == row], row, ranks[row]) for row in shades])
-    lines["preset"] = list(cells.drop_duplicates("row")["preset"])
-    means = lines["rank"].map(lambda rank: rank.value)
-    lines["behind"] = lines.groupby(["cost", means]).cumcount()  # points at the same position are drawn smaller
-    points = [
-        chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
-        for line in lines[lines["cost"].notna() & means.notna()].itertuples()
-    ]
-    costs = [f"{line.row}, {format.number(line.cost)}" for line in lines.itertuples()]
-    title = "Mean rank (1 is best) and field evaluations per ray"
-    ends = table.extremes(title, dict(zip(costs, means, strict=True)), f"{len(shades)} axes")
-    panel = chart.panel_data("", *COST_AXES, points, height=420)
-    panel["y"] = {"title": COST_AXES[1], "log": False, "reversed": True}
-    return Result(
-        runs,
-        "Robustness over cost.",
-        "Mean rank of a renderer's breakdowns, over its median of field evaluations per ray at the mildest severity.",
-        question="Do robust renderers cost more field evaluations?",
-        verdict=f"{ends} {_alike(ranks)}".strip(),
-        n=f"{len(shades)} axes and {len(lines)} renderers",
-        remarks=COST_NOTES,
-        columns=COST_COLUMNS,
-        lines=lines.to_dict("records"),
-        figure=chart.draw([panel], 3.6),
-        chart={"panels": [panel]},
-    )
-
-
-def make_curves(runs: Runs) -> Result:
-    """The fraction of successes at each severity; a panel of the page's atlas per axis."""
-    runs = runs.of_newest_scene()
-    cells = cells_of(runs)
-    shares = [_shares(runs, record, cell) for record, cell in zip(runs.records, cells.to_dict("records"), strict=True)]
-    data = pd.concat(shares, ignore_index=True)
-    panels = []
-    for axis, axis_data in data.groupby("axis", sort=False):
-        lines = []
-        for (row, preset), points in axis_data.groupby(["row", "preset"], sort=False):
-            texts = [
-                f"{x.successes:.0f} of {x.trials:.0f} succeed at {format.number(x.severity)}"
-                for x in points.itertuples()
-            ]
-            lines.append(chart.curve(row, preset, points["severity"], 100 * points["share"], size=5, text=texts))
-        panels.append(chart.panel_data(title(axis), "severity", "successes (%)", lines, height=300, axis=axis))
-    return Result(
-        runs,
-        "Probability of success over severity.",
-        "The fraction of successful trials at each severity, in the CSV and on the interactive page.",
-        n=f"{cells['axis'].nunique()} axes and {cells['row'].nunique()} renderers",
-        interval="95 % intervals (Clopper and Pearson)",
-        remarks=CURVE_NOTES,
-        data=data,
-        chart={"panels": panels},
-    )
-
-
-def title(axis: str) -> str:
-    return axis.replace("_", " ")
-
-
-def cells_of(runs: Runs) -> pd.DataFrame:
-    """A line per run: axis, row, whether its search finished, and its breakdown as number, shade and text.
-
-    A level is 0 at the mild end of the sweep and 1 at the severe end; the shade is the level clipped to 0 and 1.
-    """
-    cells = runs.frame[["row", "preset"]].assign(
-        axis=runs.frame["dataset"].astype(object),
-        **{key: [record[key] for record in runs.records] for key in ("status", "reason", "folder")},
-        **{key: runs.setting(f"task.stress.{key}") for key in ("group", "measure")},
-        unit=runs.setting("task.stress.sweep.unit"),
-        is_setting=runs.setting("task.stress.setting").ne(""),
-        one_trial=runs.setting("task.stress.repeats") == "1",
-        **{key: runs.number(key) for key in NUMBERS},
-    )
-    level = cells["level"]
-    is_measured = cells["status"].eq("ok") & level.notna() & cells["unit"].ne("")
-    mild, severe = ((cells[f"{end}_successes"] / cells[f"{end}_trials"]).fillna(0) for end in ENDS)
-    cells = cells.assign(is_measured=is_measured, at_once=is_measured & (level < 0), never=is_measured & (level > 1))
-    cells = cells.assign(shade=level.clip(0, 1).where(is_measured), rises=is_measured & (severe > mild))
-    return cells.assign(
-        short=[_breakdown_texts(cell, "")[0] for cell in cells.itertuples()],
-        words=[_breakdown_texts(cell, "")[1] for cell in cells.itertuples()],
-        full=[_breakdown_texts(cell, f" {cell.unit}")[1] for cell in cells.itertuples()],
-    )
-
-
-def axes_of(cells: pd.DataFrame) -> pd.DataFrame:
-    """The axes as index, with their group, measure and unit; groups in the order of their runs."""
-    axes = cells.drop_duplicates("axis").set_index("axis")
-    groups = list(axes["group"].unique())
-    return axes.iloc[np.argsort([groups.index(group) for group in axes["group"]], kind="stable")]
-
-
-def _breakdown_texts(cell: Any, unit: str) -> tuple[str, str]:
-    """The breakdown as a short text, and as a text with its interval or the failures at an end of the sweep."""
-    mild, severe = (_failures(cell, end) for end in ENDS)
-    low, high = ("" if math.isnan(end) else format.number(end) for end in (cell.breakdown_low, cell.breakdown_high))
-    if not cell.is_measured:
-        return (format.MISSING if cell.status == "unsupported" else cell.status,) * 2
-    if cell.rises:
-        return "rises", f"success rises with severity (mild: {mild}; severe: {severe})"
-    if cell.at_once:
-        return "at once", f"at once ({mild}{f', up to {high}{unit}' if high else ''})"
-    if cell.never:
-        return "none", f"none ({severe}{f', from {low}{unit}' if low else ''})"
-    short = format.number(cell.breakdown)
-    interval = "one trial" if cell.one_trial else f"{low or 'beyond'} to {high or 'beyond'}"
-    return short, f"{short}{unit} ({interval})"
-
-
-def _failures(cell: Any, end: str) -> str:
-    """The number of failed trials at an end of the sweep; with repeats, the interval of their fraction too."""
-    successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
-    if not trials > 0:
-        return "not tried"
-    rate = statistics.clopper_pearson(1 - successes / trials, trials)
-    share = "" if cell.one_trial else f", {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
-    return f"{trials - successes:.0f} of {trials:.0f} failed{share}"
-
-
-def _grid(cells: pd.DataFrame, axes: pd.DataFrame, values: str) -> pd.DataFrame:
-    """A column of the cells as a table of axes and rows; missing for rows that were not run."""
-    return cells.pivot(index="axis", columns="row", values=values).reindex(axes.index, columns=cells["row"].unique())
 
 
 def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
@@ -257,15 +101,16 @@ def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
     return data.iloc[order].reset_index(drop=True)
 
 
-def _atlas(cells: pd.DataFrame, axes: pd.DataFrame) -> dict[str, Any]:
-    """The grid for the page: axes, rows, and each cell's breakdown as text, shade and run."""
-    rows = list(cells["row"].unique())
-    shown = cells[["short", "full", "status", "reason", "shade", "folder", "ray"]].astype({"shade": object})
+def _atlas(cells: pd.DataFrame, axes: pd.DataFrame, rows: list[str]) -> dict[str, Any]:
+    """The heat map for the page: axes, rows, and each cell's breakdown as text, mark, shade and run."""
+    shown = cells[["full", "mark", "status", "reason", "shade", "folder", "ray"]].astype({"shade": object})
     shown["shade"] = shown["shade"].where(shown["shade"].notna(), None)
     cell_data = dict(zip(zip(cells["axis"], cells["row"], strict=True), shown.to_dict("records"), strict=True))
     return {
         "axes": [
-            {"axis": a.Index, "title": title(a.Index), "group": a.group, "unit": a.unit} for a in axes.itertuples()
+            {"axis": a.Index, "title": breakdowns.title(a.Index), "group": breakdowns.group_title(a.group)}
+            | {"unit": a.unit}
+            for a in axes.itertuples()
         ],
         "rows": rows,
         "cells": [[cell_data.get((axis, row)) for row in rows] for axis in axes.index],
@@ -291,7 +136,7 @@ def _rays(runs: Runs, cells: pd.DataFrame) -> list[dict[str, Any] | None]:
 def first_trials(runs: Runs, record: records.Record) -> dict[float, bool]:
     """Levels of which the outcome of the first trial is certain, which is the trial that bench.ray shows."""
     metrics, tried = record["metrics"], dict[float, bool]()
-    for level, end in zip((0.0, 1.0), ENDS, strict=True):
+    for level, end in zip((0.0, 1.0), breakdowns.ENDS, strict=True):
         successes, trials = (metrics.get(f"{end}_{name}") for name in ("successes", "trials"))
         if trials and successes in (0, trials):
             tried[level] = successes == trials
@@ -316,77 +161,112 @@ def _ray_command(record: records.Record) -> str:
 
 
 @figure_style.styled
-def draw(cells: pd.DataFrame, axes: pd.DataFrame) -> Figure:
-    """Draws the heat map: red if a renderer breaks at a mild severity, blue if it does not break."""
-    shades, words = (_grid(cells, axes, name) for name in ("shade", "short"))
-    rows, n = list(shades.columns), len(axes)
-    width = max(figure_style.WIDTH, 0.39 * len(rows) + 2.2)  # inches: a number has room in its cell
-    figure, ((panel,),) = chart.sheet(0.19 * n + 1.7, width=width)
-    image = panel.imshow(np.ma.masked_invalid(shades.to_numpy(float)), cmap="RdYlBu", vmin=0, vmax=1, aspect="auto")
-    panel.set_facecolor("#f2f2f2")
-    for line, column in np.argwhere((words.notna() & ~words.isin(["at once", "none"])).to_numpy()):
-        text, shade = words.iloc[line, column], shades.iloc[line, column]
-        how = {"color": "white" if shade < 0.1 or shade > 0.9 else "black", "fontsize": 5.5 if len(text) < 8 else 4.5}
-        panel.text(column, line, text, ha="center", va="center", **how)
-    panel.set_xticks(range(len(rows)), rows, rotation=35, ha="left", rotation_mode="anchor")
-    panel.xaxis.tick_top()
-    panel.set_yticks(range(n), [f"{title(axis.Index)} ({axis.unit})" for axis in axes.itertuples()])
-    panel.tick_params(length=0, labelsize=6)
-    panel.grid(False)
-    for line in np.flatnonzero(axes["group"].to_numpy()[1:] != axes["group"].to_numpy()[:-1]):
-        panel.axhline(line + 0.5, color="#222222", lw=0.8)
-    bar = figure.colorbar(image, ax=panel, location="bottom", shrink=0.5, aspect=40, pad=0.02)
-    bar.set_ticks([0, 1], labels=["at once: breaks at the mildest", "none: not at the severest"])
+def draw(cells: pd.DataFrame, axes: pd.DataFrame, rows: list[str]) -> Figure:
+    """Draws the heat map, a line per renderer and a column per axis, in two blocks; darker survives harder cases."""
+    shades, marks = (breakdowns.grid(cells, axes, name).reindex(columns=rows) for name in ("shade", "mark"))
+    blocks = _in_two([list(names) for names in axes.groupby("group", sort=False).groups.values()])
+    widest = max(sum(map(len, block)) + GROUP_GAP_COLUMNS * (len(block) - 1) for block in blocks)
+    figure, panels = chart.sheet(len(blocks) * (LINE_INCHES * len(rows) + LABEL_INCHES) + 0.5, lines=len(blocks))
+    for panel, block in zip(panels[:, 0], blocks, strict=True):
+        _draw_block(panel, block, shades, marks)
+        panel.set(xlim=(-0.5, widest - 0.5), ylim=(len(rows) + 0.6, -0.5))
+        for name, x in _group_titles(block, axes["group"]):
+            panel.text(x, len(rows) - 0.2, name, ha="center", va="top", fontsize=7, fontweight="bold")
+    bar = figure.colorbar(ScalarMappable(cmap=SURVIVED), ax=panels, location="bottom", shrink=0.4, aspect=30, pad=0.02)
+    bar.set_ticks([0.0, 1.0], labels=["breaks at the mildest", "survives the severest"])
+    bar.ax.tick_params(length=0)
+    shown = [mark for mark in MARKS if marks.eq(mark).any(axis=None)]
+    handles = [Line2D([], [], ls="none", marker=f"${mark}$", color=_mark_colour(mark, 0), ms=5) for mark in shown]
+    figure.legend(handles, [MARKS[mark] for mark in shown], loc="outside lower center", ncols=len(handles) or 1)
     return figure
 
 
-def _ranked(runs: Runs) -> list[str]:
-    """One row of each renderer of this project, by its default preset or else the first; all rows of the user's."""
-    firsts = [records_of_row[0] for records_of_row in runs.rows().values()]
-    is_ours = {
-        record["row"]: str(records.setting(record["config"], *TARGET)).startswith(records.OURS) for record in firsts
-    }
-    of_renderer = records.grouped([record for record in firsts if is_ours[record["row"]]], records.base_renderer)
-    chosen = [
-        next((record for record in group if record["renderer"].replace("_", "") == renderer), group[0])["row"]
-        for renderer, group in of_renderer.items()
-    ]
-    return [name for name, is_our_row in is_ours.items() if not is_our_row or name in chosen]
+def _draw_block(panel: Axes, groups: list[list[str]], shades: pd.DataFrame, marks: pd.DataFrame) -> None:
+    """Draws groups of axes side by side, with the names of axes above and those of renderers on the left."""
+    start, positions = 0.0, []
+    for names in groups:
+        image = np.ma.masked_invalid(shades.loc[names].to_numpy(float).T)
+        edges = np.arange(len(names) + 1) + start - 0.5
+        lines = np.arange(image.shape[0] + 1) - 0.5
+        panel.pcolormesh(edges, lines, image, cmap=SURVIVED, vmin=0, vmax=1, edgecolors="white", linewidth=0.8)
+        for column, line in np.argwhere(marks.loc[names].fillna("").ne("").to_numpy()):
+            mark, shade = marks.loc[names[column]].iloc[line], shades.loc[names[column]].iloc[line]
+            how = {"color": _mark_colour(mark, shade), "fontsize": 7, "fontweight": "bold" if mark == "×" else "normal"}
+            panel.text(start + column, line, mark, ha="center", va="center_baseline", **how)
+        positions += [start + column for column in range(len(names))]
+        start += len(names) + GROUP_GAP_COLUMNS
+    panel.set_xticks(positions, [breakdowns.title(name) for names in groups for name in names], rotation=48, ha="left")
+    panel.set_xticks(panel.get_xticks(), panel.get_xticklabels(), rotation_mode="anchor")
+    panel.xaxis.tick_top()
+    panel.set_yticks(range(shades.shape[1]), list(shades))
+    panel.tick_params(length=0, labelsize=6.5, pad=2)
+    panel.grid(False)
+    panel.spines[:].set_visible(False)
 
 
-def _alike(ranks: dict[str, statistics.Interval]) -> str:
-    """A sentence on the rows that cannot be distinguished from the best rank; empty without intervals."""
-    best = min(ranks, key=lambda row: ranks[row].value)
-    if not ranks[best].has_ends:
+def _mark_colour(mark: str, shade: float) -> str:
+    if mark == "×":
+        return AT_ONCE_COLOUR
+    return "white" if shade > 0.6 else MARK_COLOUR
+
+
+def _in_two(groups: list[list[str]]) -> list[list[list[str]]]:
+    """The groups in two blocks of similar widths, in their order; one block for few axes."""
+    total = sum(map(len, groups))
+    if total < 12 or len(groups) < 2:
+        return [groups]
+    split = min(range(len(groups) - 1, 0, -1), key=lambda i: abs(2 * sum(map(len, groups[:i])) - total))
+    return [groups[:split], groups[split:]]
+
+
+def _group_titles(groups: list[list[str]], group_of: pd.Series) -> list[tuple[str, float]]:
+    """The title of each group of a block, and the position of its middle."""
+    starts = np.cumsum([0.0, *(len(names) + GROUP_GAP_COLUMNS for names in groups)])
+    keys = [str(group_of[names[0]]) for names in groups]
+    middles = [start + (len(names) - 1) / 2 for start, names in zip(starts, groups, strict=False)]
+    return [(breakdowns.group_title(key), middle) for key, middle in zip(keys, middles, strict=True)]
+
+
+def _extremes_of(cells: pd.DataFrame) -> dict[str, Any]:
+    """The two axes on which a renderer breaks first, and the one on which it is best, each with its cell or None."""
+    breaking = cells[~cells["never"]].sort_values(["shade", "median"], ascending=[True, False])
+    first, second, *_ = [*breaking.itertuples(), None, None]
+    lead = cells.assign(lead=cells["shade"] - cells["median"]).sort_values(["lead", "shade"], ascending=False)
+    return {"first": first, "then": second, "best": next(lead.itertuples(), None)}
+
+
+def _share_words(key: str) -> Callable[[dict[str, Any]], str]:
+    """A function that writes the axis of a line's cell, and its breakdown as a share of the axis with its interval."""
+
+    def words(line: dict[str, Any]) -> str:
+        if (cell := line[key]) is None:
+            return format.MISSING
+        if cell.at_once or cell.never:
+            return f"{breakdowns.title(cell.axis)}, {cell.words}"
+        low, high = (100 * min(max(end, 0.0), 1.0) for end in (cell.level_low, cell.level_high))
+        interval = "(one trial)" if cell.one_trial else f"[{low:.0f}, {high:.0f}]"
+        return f"{breakdowns.title(cell.axis)}, {100 * cell.shade:.0f} % {interval}"
+
+    return words
+
+
+FIRST_COLUMNS = (
+    table.text("row", "Renderer"),
+    table.shown("Breaks first", _share_words("first")),
+    table.shown("Then", _share_words("then")),
+    table.shown("Best on", _share_words("best")),
+    *table.estimate("rank", "Mean rank"),
+)
+
+
+def _hardest_axis(cells: pd.DataFrame, renderers: int) -> str:
+    """A sentence on the axis on which most renderers break at the mildest severity; empty if none does."""
+    counts = cells[cells["at_once"]].groupby("axis").size().sort_values(ascending=False, kind="stable")
+    if counts.empty:
         return ""
-    similar = statistics.tied_with_best(ranks, best)
-    if not similar:
-        return f"All others can be distinguished from {best}."
-    listed = f"*{len(similar)}* of the {len(ranks) - 1} others ({'; '.join(similar)})"
-    return f"Also, {listed} cannot be distinguished from {best}."
+    hardest = " and ".join(breakdowns.title(str(axis)) for axis in counts.index[counts == counts.iloc[0]])
+    axes, most = cells["axis"].nunique(), counts.iloc[0]
+    return f"The hardest of {axes} axes: {hardest}, at whose mildest severity *{most}* of {renderers} renderers break."
 
 
-def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:
-    """The line of a renderer on the shared axes. Its cost leaves out axes on which it breaks at once."""
-    ends = {name: int(cells[name].sum()) for name in ("at_once", "never")}
-    cost = cells["evaluations_per_ray"][~cells["at_once"]].median()
-    return {"row": row, "axes": len(cells), "rank": rank, **ends, "cost": cost}
-
-
-def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.DataFrame:
-    """The successes, trials, their ratio and its interval at each level of a finished search, mild to severe."""
-    lines = curve_lines(runs.folder(record)) if cell["is_measured"] else None
-    tried = pd.DataFrame(lines or [], columns=["level", "severity", "success"])
-    numbers = tried[["level", "severity"]].apply(pd.to_numeric, errors="coerce").astype(float)
-    tried = numbers.assign(success=tried["success"].eq(True))
-    levels = tried[np.isfinite(tried["level"] + tried["severity"])].groupby("level", as_index=False)
-    counts = levels.agg(severity=("severity", "first"), successes=("success", "sum"), trials=("success", "size"))
-    rates = [statistics.clopper_pearson(k / n, n) for k, n in zip(counts["successes"], counts["trials"], strict=True)]
-    ends = {end: [math.nan if cell["one_trial"] else getattr(rate, end) for rate in rates] for end in ("low", "high")}
-    counts = counts.assign(
-        axis=cell["axis"], row=cell["row"], preset=cell["preset"], share=[rate.value for rate in rates]
-    )
-    return counts.assign(**ends)[["axis", "row", "preset", *SHARE_COLUMNS]]
-
-
-PAGES = {"stability": make, "stability_cost": make_cost, "stability_curves": make_curves}
+PAGES = {"stability": make}

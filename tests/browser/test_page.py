@@ -74,10 +74,10 @@ def write_tables(results):
     (folder / "speed_front.json").write_text(json.dumps(front))
     (folder / "speed_front.csv").write_text("setting,time\nslow,12\n")
     axes = [{"axis": name, "title": name, "group": "geometry", "unit": "units"} for name in ("wires", "gap")]
-    cell = {"short": "0.1", "full": "0.1 (0.05 to 0.2)", "shade": 0.4, "status": "ok", "reason": ""}
+    cell = {"mark": "", "full": "0.1 (0.05 to 0.2)", "shade": 0.4, "status": "ok", "reason": ""}
     ray = {"command": "python -m bench.ray task=stability stress=wires renderer=dist", "breaks": 0.5, "works": None}
     cell |= {"folder": "completion-0002", "ray": ray}
-    lost = cell | {"short": "unsupported", "shade": None, "status": "unsupported", "folder": "gone"}
+    lost = cell | {"mark": "–", "shade": None, "status": "unsupported", "folder": "gone"}
     lost |= {"reason": "no alpha"}
     atlas = {"axes": axes, "rows": ["dist", "dvr"], "cells": [[cell, lost], [cell, None]]}
     where = {"place": 2, "title": "Where it breaks.", "columns": ["Axis", "dist"], "rows": [["wires", "0.1"]]}

@@ -96,7 +96,7 @@ def write_tables(results):
     chart = {
         "panels": [{"title": MALICE, "x": axis, "y": axis, "series": [series], "images": [{"source": ATTACKS[7]}]}]
     }
-    cell = {"short": MALICE, "full": MALICE, "shade": 0.5, "status": MALICE, "reason": MALICE, "folder": MALICE}
+    cell = {"mark": MALICE, "full": MALICE, "shade": 0.5, "status": MALICE, "reason": MALICE, "folder": MALICE}
     cell["ray"] = {"command": MALICE, "breaks": 0.5, "works": MALICE}
     atlas = {
         "axes": [{name: MALICE for name in ("axis", "title", "group", "unit")}],

@@ -4,9 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from bench.report.data.kept import FROM_RUNS_CSV
+from bench.records.shipped import SHIPPED
+from bench.report import breakdowns
+from bench.report.data.kept import FROM_RUNS_CSV, read_rows
 from bench.report.data.records import row_of
-from bench.report.data.runs import Runs, named_rows, shared_loss
+from bench.report.data.runs import Runs, choose, named_rows, shared_loss
+from bench.report.write.paper import studies
 from bench.studies.stability import READS, first_trials
 from tests.report.test_report_paper import page_of, told, write_lines, write_run
 
@@ -50,14 +53,43 @@ def broke(results, axis, label, level, *, status="ok", measure="rendering", crit
 def test_a_breakdown_stands_with_its_interval(tmp_path):
     broke(tmp_path, "wires", "DIST", 0.5)
     broke(tmp_path, "wires", "DVR", 1.1)
-    page = page_of(tmp_path, "stability")
-    assert page.table.iloc[0].tolist()[:3] == ["wires", "scene units", "0.100 (0.126 to 0.0794)"]
-    assert page.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"
-    assert page.data["failures"].tolist() == ["1 false; 3 lost"] * 2
+    page = page_of(tmp_path, "stability_axes")
+    assert page.table.iloc[0].tolist()[:3] == ["thin wires", "scene units", "0.100 (0.126 to 0.0794)"]
     assert page.verdict.endswith("does not break: *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes.")
     assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of the trials" in told(page)
-    dist, dvr = page.atlas["cells"][0]
-    assert dist["shade"] == 0.5 and (dvr["shade"], dvr["short"]) == (1.0, "none")
+    first = page_of(tmp_path, "stability")
+    assert first.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"
+    assert first.data["failures"].tolist() == ["1 false; 3 lost"] * 2
+    assert [(cell["shade"], cell["mark"]) for cell in first.atlas["cells"][0]] == [(0.5, ""), (1.0, "")]
+
+
+def test_a_renderer_has_the_axes_on_which_it_breaks_first_and_the_one_on_which_it_is_best(tmp_path):
+    levels = {"wires": (0.5, 0.9), "gap": (-0.1, 0.5), "bumps": (0.2, 0.4), "thin_plate": (1.1, 0.3)}
+    for axis, (dist, dvr) in levels.items():
+        broke(tmp_path, axis, "DIST", dist)
+        broke(tmp_path, axis, "DVR", dvr)
+    broke(tmp_path, "alpha", "DIST", 0.01)  # a setting of the renderer is not compared
+    page = page_of(tmp_path, "stability")
+    rows = page.table.set_index("Renderer")
+    at_once, never = "narrow gap, at once (5 of 5 failed, 48-100 %)", "thin plate, none (0 of 5 failed, 0-52 %)"
+    assert rows.loc["DIST"].tolist()[:3] == [at_once, "fine bumps, 20 % [15, 25]", never]
+    firsts = ["thin plate, 30 % [25, 35]", "fine bumps, 40 % [35, 45]"]
+    assert rows.loc["DVR"].tolist()[:3] == [*firsts, "narrow gap, 50 % [45, 55]"]
+    assert "narrow gap, at whose mildest severity *1* of 2 renderers break." in page.verdict
+    labels = [label.get_text() for label in page.figure.axes[0].get_xticklabels()]
+    assert labels == ["large alpha", "narrow gap", "fine bumps", "thin plate", "thin wires"]
+
+
+def test_the_shipped_heat_map_has_a_line_per_renderer_and_marks_what_breaks_at_once(tmp_path):
+    rows = read_rows(SHIPPED / "paper", "stability")
+    cells = breakdowns.cells_of(choose(rows, READS[0], SHIPPED))
+    figure = next(study for study in studies() if "stability" in study.pages).results(rows, SHIPPED)["stability"].figure
+    panels = figure.axes[:2]
+    assert all(len(panel.get_yticklabels()) == 11 for panel in panels)
+    assert sum(len(panel.get_xticklabels()) for panel in panels) == cells["axis"].nunique()
+    shown = {label.get_text() for label in panels[0].get_yticklabels()}
+    crosses = [text for panel in panels for text in panel.texts if text.get_text() == "×"]
+    assert len(crosses) == (cells["at_once"] & ~cells["rises"] & cells["row"].isin(shown)).sum() > 0
 
 
 def test_a_cell_has_the_command_of_a_ray_and_the_levels_around_the_breakdown(tmp_path):
@@ -65,7 +97,9 @@ def test_a_cell_has_the_command_of_a_ray_and_the_levels_around_the_breakdown(tmp
     broke(tmp_path, "wires", "DVR", 1.1)
     broke(tmp_path, "alpha", "DIST", 0.45)
     broke(tmp_path, "depth_noise", "DIST", 0.45, measure="fit")
-    (dist, dvr), *others = page_of(tmp_path, "stability").atlas["cells"]
+    cells = page_of(tmp_path, "stability").atlas["cells"]
+    ((dist, dvr),) = [line for line in cells if None not in line]
+    others = [line for line in cells if None in line]
     command = "python -m bench.ray task=stability stress=wires renderer=dist renderer.steps=20"
     assert dist["ray"] == {"command": command, "breaks": 0.5, "works": 0.4}
     assert (dvr["ray"]["breaks"], dvr["ray"]["works"]) == (None, 1.0)  # it does not break
@@ -84,7 +118,10 @@ def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):
     broke(tmp_path, "camera_inside", "DIST", 0.5, repeats=1)
     broke(tmp_path, "camera_inside", "DVR", -0.1, repeats=1)
     result = page_of(tmp_path, "stability")
-    assert result.table.loc[0, ["DIST", "DVR"]].tolist() == ["0.100 (one trial)", "at once (1 of 1 failed)"]
+    assert page_of(tmp_path, "stability_axes").table.loc[0, ["DIST", "DVR"]].tolist() == [
+        "0.100 (one trial)",
+        "at once (1 of 1 failed)",
+    ]
     assert result.data[["breakdown_low", "breakdown_high", "level_low", "level_high"]].isna().all(axis=None)
     curves = page_of(tmp_path, "stability_curves").data
     assert curves["share"].notna().all() and curves[["low", "high"]].isna().all(axis=None)
@@ -105,7 +142,7 @@ def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):
     broke(tmp_path, "wires", "DIST", -0.1)
     broke(tmp_path, "wires", "DVR", 1.1)
     broke(tmp_path, "wires", "IDR", 0.5, mild_successes=1, severe_successes=4)
-    row = page_of(tmp_path, "stability").table.iloc[0]
+    row = page_of(tmp_path, "stability_axes").table.iloc[0]
     assert row["DIST"] == "at once (5 of 5 failed, 48-100 %)"
     assert row["DVR"] == "none (0 of 5 failed, 0-52 %)"  # 0 of 5 still allows 52 %: 1 - 0.025^(1/5)
     assert row["IDR"].startswith("success rises with severity (mild: 4 of 5 failed")
@@ -117,7 +154,8 @@ def test_what_did_not_end_ok_keeps_its_cell(tmp_path):
     broke(tmp_path, "alpha", "DIST", 0.5)
     broke(tmp_path, "alpha", "DVR", 0.5, status="unsupported")
     result = page_of(tmp_path, "stability")
-    assert list(result.table["DVR"]) == ["crashed", "–"]
+    assert list(page_of(tmp_path, "stability_axes").table["DVR"]) == ["crashed", "–"]
+    assert [cell["mark"] for line in result.atlas["cells"] for cell in line] == ["", "?", "", "–"]
     assert "2 of 4 runs did not end ok: DVR, wires: crashed (why); DVR, alpha: unsupported (why)." in told(result)
     assert [cell["shade"] for line in result.atlas["cells"] for cell in line] == [0.5, None, 0.5, None]
 
@@ -153,7 +191,8 @@ def test_the_ranking_has_one_row_a_renderer(tmp_path):
     assert set(page.data["row"]) == {"DIST, our default", "VolSDF, 136 samples", "Mine", "Mine, slow"}
     assert "4 renderers" in page.caption and "(Mine, slow, 4.00)" in page.verdict
     assert "All others can be distinguished from Mine, slow." in page.verdict
-    assert "+ capped" in page_of(tmp_path, "stability").table
+    assert "+ capped" in page_of(tmp_path, "stability_axes").table
+    assert "+ capped" not in page_of(tmp_path, "stability").table["Renderer"].tolist()
 
 
 @pytest.mark.parametrize("status", ["timeout", "missing"])
@@ -165,13 +204,15 @@ def test_a_run_that_failed_or_is_missing_has_the_worst_rank(tmp_path, status):
     broke(tmp_path, "thin_plate", "DVR", 0.1)
     rows = page_of(tmp_path, "stability_cost").data.set_index("row")
     assert rows["rank"].to_dict() == {"DIST": 1.75, "DVR": 1.25}
-    assert page_of(tmp_path, "stability").table["DIST"].tolist()[1] == ("" if status == "missing" else status)
+    assert page_of(tmp_path, "stability_axes").table.set_index("Axis").loc["thin plate", "DIST"] == (
+        "" if status == "missing" else status
+    )
 
 
 def test_rows_of_other_criteria_are_not_compared(tmp_path):
     broke(tmp_path, "wires", "DIST", 0.5, criteria={"hits": 0.5})
     broke(tmp_path, "wires", "DVR", 0.5, criteria={"hits": 0.99})
-    result = page_of(tmp_path, "stability")
+    result = page_of(tmp_path, "stability_axes")
     assert list(result.table.columns) == ["Axis", "Unit", "DVR"]
     assert "Success: 0.99 of the true hits" in told(result) and "Not shown: 1 run" in told(result)
 

@@ -3,7 +3,7 @@
   "use strict";
 
   const {element, fill, soft, later, copied} = bench.dom;
-  const SHADES = ["#8c2d04", "#cc6a1a", "#f0b46a", "#f3ead8", "#a9cfe3", "#4a90c2", "#0b4f8a"]; // from at once to never
+  const SHADES = ["#fbf4e6", "#dbe0e3", "#b4c9d8", "#7ba0bd", "#4f7fa4", "#255a82", "#0b2f4f"]; // from at once to never
 
   function atlas(data) {
     const opened = element("div.opened", {"aria-live": "polite"});
@@ -15,8 +15,9 @@
       return [first && group(axis.group, data.rows.length), element("tr", null, title, cells)];
     });
     const swatches = SHADES.map((colour) => painted(element("span", {"aria-hidden": "true"}), colour));
+    const after = "survives the severest. × breaks at the mildest, ↑ fails only at the mildest, – lacks the setting or refuses the field. Choose a cell: its numbers, curve and pictures open.";
     return element("div.atlas", null,
-      element("div.key", null, "breaks at the mildest severity", element("span", null, swatches), "does not break at the severest. Choose a cell: its curve and its first failure open."),
+      element("div.key", null, "breaks at the mildest severity", element("span", null, swatches), after),
       element("div.wide", {tabindex: 0, role: "region", "aria-label": "Breakdowns by axis and renderer"},
         element("table.heat", null,
           element("thead", null, element("tr", null, element("th.words", {scope: "col"}, "Axis"), names)),
@@ -45,10 +46,10 @@
       currentTarget.scrollIntoView({block: "nearest", inline: "nearest"}); // of a table that has become narrower
     };
     const label = `${data.axes[line].title}, ${data.rows[index]}: ${words(result)}`;
-    const button = element("button.cell", {type: "button", "aria-label": label, click}, result.short);
+    const button = element("button.cell", {type: "button", "aria-label": label, click}, result.mark);
     if (result.shade === null) return button;
     const step = Math.min(SHADES.length - 1, Math.floor(result.shade * SHADES.length));
-    return painted(button, SHADES[step], step < 2 || step > 4 ? "#fff" : "#1c2430");
+    return painted(button, SHADES[step], result.mark === "×" ? "#b3261e" : step > 3 ? "#fff" : "#1c2430");
   }
 
   /* Arrow keys go from cell to cell. */
