@@ -3,7 +3,7 @@
 A distortion takes the cube, a severity in the units of conf/stresses.yaml, and a random generator. It returns the
 field, which still claims to be a distance, and the truth. The truth is the cube, or the moved surface, solved in
 float64, so that a renderer is judged by the surface of its field. The distortion of a network takes the network, whose
-weights it changes, and a latent code. It returns the code.
+weights it changes, and a latent code. It returns the code. `CHANGES_OF_VALUES` change the values of a network instead.
 """
 
 from collections.abc import Callable
@@ -114,4 +114,14 @@ def far_code(network: Decoder | Published, code: Tensor, severity: float, draw: 
     return severity * code
 
 
-NETWORK_DISTORTIONS = {change.__name__: change for change in (noisy_weights, coarse_weights, far_code)}
+def truncated_network(network: Decoder | Published, code: Tensor, severity: float, draw: np.random.Generator) -> Tensor:
+    """Truncates the values of a network, as in DeepSDF's training (Eq. 4: at 0.1); see `CHANGES_OF_VALUES`."""
+    return code
+
+
+NETWORK_DISTORTIONS = {
+    change.__name__: change for change in (noisy_weights, coarse_weights, far_code, truncated_network)
+}
+CHANGES_OF_VALUES: dict[str, Callable[[Tensor, float], Tensor]] = {
+    truncated_network.__name__: lambda values, limit: values.clamp(-limit, limit)
+}

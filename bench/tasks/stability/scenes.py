@@ -31,7 +31,10 @@ ALL_AROUND = (0.0, 360.0)
 CORNER_VIEW = {"azimuth": (37.0, 53.0), "elevation": (27.0, 43.0)}  # three sides of a cube, none of them grazing
 NETWORK_ELEVATION_DEGREES = (15.0, 35.0)  # as in conf/config.yaml
 # A network with a smaller fraction of these points inside has lost its shape, and is drawn again.
-MAX_NETWORK_DRAWS, INSIDE_TEST_POINTS, MIN_INSIDE_FRACTION = 20, 4096, 0.01
+MAX_NETWORK_DRAWS, INSIDE_TEST_POINTS, MIN_INSIDE_FRACTION = 20, 1024, 0.01
+NETWORK_SLOPE_POINTS = 4096
+# A network costs much per ray: its pictures have a quarter of the pixels per side, and show the middle of the shape.
+NETWORK_PICTURE_SHARE, NETWORK_FIELD_OF_VIEW_DEGREES = 4, 30.0
 CUBE_FIELD_OF_VIEW_DEGREES = 44.0  # the cube fills the picture
 GRAZING_VIEW_RATIO = 0.1  # half the picture's height over its distance, divided by the sine of the angle
 GRAZING_SHIFT, GRAZING_ROLL_DEGREES = 0.1, 10.0  # largest shift along the plane, in scene units, and largest roll
@@ -193,7 +196,9 @@ def _distortion_scene(distortion: distortions.Distortion) -> Scene:
 
 
 def network_scene(name: str, network: Decoder | Published, codes: Float[Tensor, "shapes code_length"]) -> Scene:
-    """A trained network at one of its codes, distorted; the truth is the distorted network in float64.
+    """A trained network at one of its codes, distorted; the truth is the distorted network, traced by safe steps.
+
+    The truth is traced in float32. Its rounding of about 1e-6 is far below the footprint of a pixel.
 
     Args:
         name: of `distortions.NETWORK_DISTORTIONS`.
@@ -205,13 +210,27 @@ def network_scene(name: str, network: Decoder | Published, codes: Float[Tensor, 
         for _ in range(MAX_NETWORK_DRAWS):
             changed = deepcopy(network)
             code = distortions.NETWORK_DISTORTIONS[name](changed, codes[draw.integers(len(codes))], severity, draw)
-            exact = deepcopy(changed).cpu().double().at(code.cpu().double())
-            if (exact(points_in_sphere(INSIDE_TEST_POINTS)) < 0).double().mean() > MIN_INSIDE_FRACTION:
+            rounded = deepcopy(changed).cpu().at(code.cpu())
+            if (rounded(test_points) < 0).float().mean() > MIN_INSIDE_FRACTION:
                 break
-        truth = ReferenceTruth(exact, estimate_lipschitz(exact, radius=1.0), MIN_RESOLVED_THICKNESS)
-        return StressCase(changed.at(code), _draw_camera(draw, resolution, elevation=NETWORK_ELEVATION_DEGREES), truth)
+        exact = deepcopy(changed).cpu().double().at(code.cpu().double())
+        with torch.enable_grad():
+            slope = estimate_lipschitz(rounded, radius=1.0, samples=NETWORK_SLOPE_POINTS, like=test_points)
+        change = distortions.CHANGES_OF_VALUES.get(name)
+        # A change of values keeps the surface, so the truth is the unchanged network.
+        truth = ReferenceTruth(exact, slope, MIN_RESOLVED_THICKNESS, rounded)
+        field = changed.at(code)
+        view = {"elevation": NETWORK_ELEVATION_DEGREES, "field_of_view": NETWORK_FIELD_OF_VIEW_DEGREES}
+        camera = _draw_camera(draw, max(resolution // NETWORK_PICTURE_SHARE, 8), **view)
+        return StressCase(field if change is None else _changed_values(field, change, severity), camera, truth)
 
+    test_points = points_in_sphere(INSIDE_TEST_POINTS).float()
     return scene
+
+
+def _changed_values(field: Field, change: Callable[[Tensor, float], Tensor], severity: float) -> Shape:
+    """The field with other values and the same surface."""
+    return Shape(lambda points: change(field(points), severity), field.kind, field.lipschitz)
 
 
 def _cube_view_scene(view: Callable[[float], dict[str, float]]) -> Scene:

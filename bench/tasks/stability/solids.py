@@ -166,17 +166,24 @@ class ReferenceTruth:
     Args:
         field: evaluated in float64.
         lipschitz: an upper bound of the norm of its gradient.
+        rounded: the same field in float32, traced in place of it; for networks, of which float64 values are slow.
         thinnest: parts thinner than this along a ray may be missed, in scene units.
     """
 
     field: Field
     lipschitz: float
     thinnest: float
+    rounded: Field | None = None
 
     def trace(self, rays: Rays) -> FirstHit:
         """The first hits of flat rays [n]; without gradient."""
-        rendering = reference.trace(self.field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
+        field = self.field if self.rounded is None else self._in_float32
+        rendering = reference.trace(field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
         return FirstHit(rendering.distance, rendering.hit, rendering.status == Status.STARTED_INSIDE)
+
+    def _in_float32(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        assert self.rounded is not None
+        return self.rounded(points.float()).double()
 
 
 Truth = Solid | ReferenceTruth  # a field whose first hits are known

@@ -98,6 +98,13 @@ def test_every_stress_has_the_same_trial_for_every_renderer(name):
     assert torch.equal(first.hit, again.hit)
 
 
+def test_a_truncated_network_stops_a_march_before_its_surface():
+    scene = stress_named("truncated_network")
+    for severity, succeeds in ((scene.sweep.mild, True), (scene.sweep.severe, False)):
+        exam = scene.exam_generator(conditions(64))(severity, drawn(), 64)
+        assert judge_rendering(exam, load("renderer", "dist"), conditions()).success == succeeds
+
+
 def test_a_floater_is_hit_by_samples_and_missed_by_a_march():
     """A sphere of radius 0.9 x 0.03 in front of a cube covers 0.09 of the image."""
     exam = SCENES["floaters"](0.03, drawn(), 48)
