@@ -13,7 +13,9 @@ from bench.records import format
 from bench.report.data import records, statistics
 from bench.report.data.runs import Runs, Selection
 
-SELECTION = Selection("stability", ("task.stress",), setup=("machine",), alike=("task",))
+# Settings of fits change no rendering, so that these are read together.
+CONDITIONS = ("task.stress", "task.fit", "task.fit_search")
+SELECTION = Selection("stability", CONDITIONS, setup=("machine",), alike=("task",))
 GROUP_TITLES = {
     "geometry": "shape", "viewing": "camera", "field": "field", "network": "network", "fit": "fitted shape",
     "observation": "observations", "optimisation": "settings",

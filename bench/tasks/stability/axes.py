@@ -18,7 +18,7 @@ from bench.tasks.stability.trial import Conditions, Failure, Outcome
 from renderers.checks import check_choice
 from renderers.rendering import Renderer, Unsupported
 
-GROUPS = ("geometry", "viewing", "field", "network", "observation", "optimisation")
+GROUPS = ("geometry", "viewing", "field", "network", "fit", "observation", "optimisation")
 MEASURES = ("rendering", "gradient", "fit")
 
 
@@ -105,8 +105,8 @@ class Stress:
 
     @property
     def needs_prior(self) -> bool:
-        """Whether the scenes are those of a prior's network."""
-        return self.scene in NETWORK_DISTORTIONS
+        """Whether the scenes are those of a prior's network, or fits of its codes."""
+        return self.measure == "fit" or self.scene in NETWORK_DISTORTIONS
 
     def trial_seed(self, level: float, repeat: int) -> int:
         """The seed of trial number `repeat` at a level."""

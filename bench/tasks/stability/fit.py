@@ -1,7 +1,7 @@
-"""Stress tests of an inverse problem: a sphere is fitted to one depth image and its silhouette.
+"""Stress tests of an inverse problem: the code of a trained prior is fitted to a depth image and its silhouette.
 
-Its four parameters are the centre and the logarithm of the radius. The observations are disturbed, or the start or the
-optimiser is made worse.
+The ground truth is the shape of a training code. The observations are disturbed, the start or the optimiser is made
+worse, or the shapes become harder.
 """
 
 from collections.abc import Callable
@@ -14,21 +14,28 @@ from torch import Tensor
 
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
+from bench.shape_prior import Prior
 from bench.solve.observed_view import ObservedView
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import check_field_gradient
-from bench.tasks.stability.solids import Solid, sphere_solid
-from bench.tasks.stability.trial import Conditions, Failure, Outcome
+from bench.tasks.stability.distortions import MIN_RESOLVED_THICKNESS
+from bench.tasks.stability.solids import ReferenceTruth
+from bench.tasks.stability.trial import Conditions, Failure, FitSettings, Outcome
 from datasets.scene import View
 from datasets.views import ViewSampler
 from renderers.camera import Camera
-from renderers.field import Counts, Field, Meter
+from renderers.field import Counts, Field, Meter, estimate_lipschitz
+from renderers.fields.analytic import Shape
 from renderers.rendering import Renderer
 
-TRUE_RADII, INITIAL_RADIUS_FACTORS = (0.35, 0.55), (0.75, 1.3)  # the factors are the initial radius over the true one
-SURFACE_SAMPLES = 2000
+SLOPE_POINTS = 4096
+HOLE_RADIUS = 0.3  # scene units
+AZIMUTHS, ELEVATIONS = (0.0, 360.0), (15.0, 35.0)  # degrees
+SPREAD_VIEWS, ALL_SIDES_DEGREES = 3, 240.0
 DEFINITIONS = {
-    "surface_error": "mean magnitude of the fitted sphere's distance at points of the true surface, in scene units",
+    "surface_error": "mean magnitude of the fitted field at the points of the true surface that the view shows, in "
+    "scene units; on the axis one_sided_views, at those that three sides show; on the axis new_hole, the error of the "
+    "hole's radius",
     "evaluations_per_ray": "field values computed, divided by rays times iterations",
 }
 
@@ -89,94 +96,193 @@ DISTURBANCES: dict[str, Disturb] = {
         depth_noise, depth_outliers, depth_steps, missing_depth, mask_errors, wrong_focal_length, wrong_pose,
     )
 }  # fmt: skip
+
+
+def thin_parts(shape: Field, severity: float) -> Field:
+    """A shape whose surface is moved inwards by a distance, so that its parts become thin (DIST, A.4)."""
+    return Shape(lambda points: shape(points) + severity, shape.kind, shape.lipschitz)
+
+
+def outside_family(shape: Field, severity: float) -> Field:
+    """A shape that is twisted about the vertical axis, in degrees a scene unit: outside of the family (DIST, 4.2)."""
+
+    def value(points: Tensor) -> Tensor:
+        x, y, z = points.unbind(-1)
+        angle = np.radians(severity) * y
+        return shape(torch.stack([x * angle.cos() - z * angle.sin(), y, x * angle.sin() + z * angle.cos()], dim=-1))
+
+    return Shape(value, shape.kind, shape.lipschitz)
+
+
+def growing_slope(shape: Field, severity: float) -> Field:
+    """A field that stops being a distance: its values are multiplied (IGR, Gropp 2020; IDR, Yariv 2020)."""
+    return Shape(lambda points: severity * shape(points), shape.kind, shape.lipschitz)
+
+
+OF_BOTH = {"thin_parts": thin_parts}
+OF_TRUTH = {"outside_family": outside_family}
+DURING_FIT = {"growing_slope": growing_slope}  # the severity grows from 1 over the fit
 FIT_SETTINGS = {"far_start": "offset", "learning_rate": "learning_rate"}  # the severity replaces these settings
-FITS = (*DISTURBANCES, *FIT_SETTINGS, "a_ball")  # the last has no disturbance: the severity is a renderer's setting
+# The last has no disturbance: the severity is a renderer's setting.
+FITS = (*DISTURBANCES, *OF_BOTH, *OF_TRUTH, *DURING_FIT, *FIT_SETTINGS, "new_hole", "one_sided_views", "a_code")
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A straight hole of unknown radius through a shape; a negative radius is no hole."""
+
+    start: Float[Tensor, "3"]
+    direction: Float[Tensor, "3"]
+
+    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """The distance from the axis."""
+        return torch.linalg.vector_norm(
+            torch.linalg.cross(points - self.start, self.direction.expand_as(points)), dim=-1
+        )
+
+    def through(self, shape: Field, radius: Float[Tensor, ""] | float) -> Field:
+        return Shape(lambda points: torch.maximum(shape(points), radius - self.distance(points)), shape.kind, None)
+
+
+@dataclass
+class CodeFit:
+    """The problem of finding a code, and the radius of any hole; see `bench.solve.optimise.Optimisable`."""
+
+    fit: str
+    severity: float
+    prior: Prior
+    code: Float[Tensor, " code_length"]
+    radius: Float[Tensor, ""]
+    hole: Hole | None
+    views: list[ObservedView]
+    limits: Limits
+    iterations: int
+    counts: Counts = field(default_factory=Counts)
+
+    def __post_init__(self) -> None:
+        self.parameters = [self.code] if self.hole is None else [self.code, self.radius]
+        self.watched = self.limits.watch(self.field(0.0), self.code.device)  # the limit is on the whole fit
+
+    def loss(self, iteration: int) -> dict[str, Tensor]:
+        self.watched.inner = self.field((iteration + 1) / self.iterations)
+        metered = Meter(self.watched, self.counts)
+        of_views = [view.compare(metered, iteration) for view in self.views]
+        terms = {name: torch.stack([each[name] for each in of_views]).mean() for name in of_views[0]}
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    def field(self, progress: float) -> Field:
+        """The fitted field after a fraction of the fit."""
+        shape: Field = self.prior.decoder.at(self.code)
+        if self.fit in OF_BOTH:
+            shape = OF_BOTH[self.fit](shape, self.severity)
+        if self.fit in DURING_FIT and progress > 0:
+            shape = DURING_FIT[self.fit](shape, 1 + progress * (self.severity - 1))
+        return shape if self.hole is None else self.hole.through(shape, self.radius)
 
 
 def judge_fit(
     name: str, severity: float, draw: np.random.Generator, *, renderer: Renderer, conditions: Conditions
 ) -> Outcome:
-    """Fits a sphere to observations. The severity controls a disturbance or one of the fit's settings.
+    """Fits a code to observations. The severity controls a disturbance, the shapes or one of the fit's settings.
 
     Args:
         name: the fit, one of `FITS`.
-        draw: generator of spheres, camera and disturbance.
+        draw: generator of codes, cameras and disturbance.
 
     Raises:
         Unsupported: if the renderer has no gradient for the field.
         LimitReached: if the fit exceeds its limit of field evaluations or memory.
     """
     check_field_gradient(renderer)
-    fit = conditions.fit
+    fit, prior, device = conditions.fit, conditions.prior, conditions.device
+    assert prior is not None
     if name in FIT_SETTINGS:
         fit = replace(fit, **{FIT_SETTINGS[name]: severity})
-    true_parameters, initial = _draw_parameters(draw, fit.offset)
-    observation = _observe(_sphere(true_parameters), fit.resolution, draw)
+    code, initial = _draw_codes(prior, draw, fit.offset)
+    true: Field = prior.decoder.at(code)
+    if name in OF_BOTH or name in OF_TRUTH:
+        true = (OF_BOTH | OF_TRUTH)[name](true, severity)
+    direction = draw.uniform(*AZIMUTHS), draw.uniform(*ELEVATIONS)
+    is_spread = name == "one_sided_views"
+    cameras = _cameras(direction, fit.resolution, severity if is_spread else None)
+    observations = [_observe(true, camera) for camera in cameras]
+    hole = None
+    if (
+        name == "new_hole"
+    ):  # the initial radius is that far below half of it (Mehta et al. 2022, on the topology of level sets)
+        hole = _hole(observations[0])
+        true = hole.through(true, HOLE_RADIUS)
+        observations = [_observe(true, camera) for camera in cameras]
+    sides = _cameras(direction, fit.resolution, ALL_SIDES_DEGREES) if is_spread else []
+    points = _seen_points([_observe(true, camera) for camera in sides] or observations).to(device)
     if name in DISTURBANCES:
-        observation = DISTURBANCES[name](observation, severity, draw)
-    depth, mask, device = observation.depth, observation.mask, conditions.device
-    view = View(observation.camera, depth, torch.zeros(*depth.shape, 3), mask)
-    observed_view = ObservedView.of(view, fit, renderer, observed=observation.observed, mask=mask, device=device)
-    problem = SphereProblem(initial.to(device).requires_grad_(), observed_view, conditions.limits)
+        observations = [DISTURBANCES[name](each, severity, draw) for each in observations]
+    problem = CodeFit(
+        *(name, severity, prior, initial.to(device).requires_grad_()),
+        radius=torch.tensor(HOLE_RADIUS / 2 - severity, device=device, requires_grad=True),
+        hole=hole,
+        views=[_view(each, fit, renderer, device) for each in observations],
+        limits=conditions.limits,
+        iterations=fit.iterations,
+    )
     history = History()
     settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
     optimise(problem, settings, device, history=history, on_step=lambda line: None)
-    error = float(problem.field()(_surface_points(true_parameters, draw).to(device)).abs().mean())
-    evaluations_per_ray = history.counts.value / observation.observed.numel() / max(len(history.curve), 1)
+    with torch.no_grad():
+        off = problem.field(0.0)(points).abs().mean() if hole is None else (problem.radius - HOLE_RADIUS).abs()
+        error = float(off)
+    rays = sum(each.observed.numel() for each in observations)
+    evaluations_per_ray = history.counts.value / rays / max(len(history.curve), 1)
     return Outcome(
         _failure(history, error, conditions.criteria.surface_error),
         {"surface_error": error, "evaluations_per_ray": evaluations_per_ray},
     )
 
 
-@dataclass
-class SphereProblem:
-    """The problem of finding a sphere's four parameters; see `bench.solve.optimise.Optimisable`."""
-
-    sphere: Float[Tensor, "4"]
-    view: ObservedView
-    limits: Limits
-    counts: Counts = field(default_factory=Counts)
-
-    def __post_init__(self) -> None:
-        self.parameters = [self.sphere]
-        self.watched = self.limits.watch(self.field(), self.sphere.device)  # the limit is on the whole fit
-
-    def loss(self, iteration: int) -> dict[str, Tensor]:
-        self.watched.inner = _sphere(self.sphere).field
-        terms = self.view.compare(Meter(self.watched, self.counts), iteration)
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
-
-    def field(self) -> Field:
-        return _sphere(self.sphere.detach()).field
+def _draw_codes(prior: Prior, draw: np.random.Generator, offset: float) -> tuple[Tensor, Tensor]:
+    """A training code, and an initial code whose distance from it is `offset` times its length: 1 is the mean shape."""
+    code = prior.codes[draw.integers(len(prior.codes))]
+    return code, (1 - offset) * code
 
 
-def _draw_parameters(draw: np.random.Generator, offset: float) -> tuple[Tensor, Tensor]:
-    """The four true parameters, and the initial ones."""
-    true = np.append(draw.uniform(-0.05, 0.05, 3), np.log(draw.uniform(*TRUE_RADII)))
-    direction = draw.normal(size=3)
-    offsets = np.append(offset * direction / np.linalg.norm(direction), np.log(draw.uniform(*INITIAL_RADIUS_FACTORS)))
-    return torch.from_numpy(true).float(), torch.from_numpy(true + offsets).float()
+def _cameras(direction: tuple[float, float], resolution: int, spread: float | None) -> list[Camera]:
+    """The camera at an azimuth and elevation; with a spread, three in an arc of that many degrees about it."""
+    sampler = ViewSampler(2.5, 50.0, AZIMUTHS, ELEVATIONS, resolution)
+    azimuth, elevation = direction
+    turns = [0.0] if spread is None else np.linspace(-spread / 2, spread / 2, SPREAD_VIEWS).tolist()
+    return [sampler.camera(azimuth + turn, elevation) for turn in turns]
 
 
-def _sphere(parameters: Float[Tensor, "4"]) -> Solid:
-    return sphere_solid(parameters[3].exp()).moved(parameters[:3])
-
-
-def _observe(solid: Solid, resolution: int, draw: np.random.Generator) -> Observation:
-    """Exact depth and silhouette, from a random camera."""
-    sampler = ViewSampler(2.5, 50.0, (0.0, 360.0), (15.0, 35.0), resolution)
-    camera = sampler.camera(draw.uniform(*sampler.azimuth), draw.uniform(*sampler.elevation))
-    first = solid.trace(camera.double().rays().flat())
+def _observe(shape: Field, camera: Camera) -> Observation:
+    """Depth and silhouette by safe steps, in float32: its rounding is far below a pixel."""
+    slope = estimate_lipschitz(shape, radius=1.0, samples=SLOPE_POINTS, like=torch.zeros(1))
+    with torch.no_grad():
+        truth = ReferenceTruth(shape, slope, MIN_RESOLVED_THICKNESS, rounded=shape)
+        first = truth.trace(camera.double().rays().flat())
     mask = first.hit.view(camera.height, camera.width)
     depth = camera.depth(first.distance.view_as(mask).float()) * mask
     return Observation(camera, depth, mask, mask)
 
 
-def _surface_points(parameters: Float[Tensor, "4"], draw: np.random.Generator) -> Float[Tensor, "n 3"]:
-    """Random points on the true sphere, uniform over its area."""
-    directions = torch.nn.functional.normalize(torch.from_numpy(draw.normal(size=(SURFACE_SAMPLES, 3))).float(), dim=-1)
-    return parameters[3].exp() * directions + parameters[:3]
+def _view(observation: Observation, fit: FitSettings, renderer: Renderer, device: torch.device) -> ObservedView:
+    depth, mask = observation.depth, observation.mask
+    view = View(observation.camera, depth, torch.zeros(*depth.shape, 3), mask)
+    return ObservedView.of(view, fit, renderer, observed=observation.observed, mask=mask, device=device)
+
+
+def _hole(observation: Observation) -> Hole:
+    """A hole from the camera through the middle of the visible surface."""
+    camera, hit = observation.camera, observation.mask.flatten()
+    rays = camera.rays().flat()
+    middle = rays.directions[hit].mean(dim=0) if hit.any() else rays.directions.mean(dim=0)
+    return Hole(camera.center.float(), torch.nn.functional.normalize(middle, dim=0))
+
+
+def _seen_points(observations: list[Observation]) -> Float[Tensor, "n 3"]:
+    """The points of the true surface that undisturbed observations show; the origin if there are none."""
+    shown = [each.camera.rays().at(each.camera.distance(each.depth))[each.mask] for each in observations]
+    points = torch.cat(shown)
+    return points if len(points) else torch.zeros(1, 3)
 
 
 def _failure(history: History, error: float, max_error: float) -> Failure:

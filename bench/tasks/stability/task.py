@@ -74,7 +74,7 @@ class Stability:
     def execute(self, run: RunContext) -> None:
         """Searches; fills the record, writes a line per trial to curve.jsonl, and draws the mildest failure."""
         record, renderer = run.record, run.inputs.renderer
-        prior = run.inputs.prior if self.stress.scene in NETWORK_DISTORTIONS else None
+        prior = run.inputs.prior if self.stress.needs_prior else None
         conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device, prior)
         record.definitions = DEFINITIONS | MEASURE_DEFINITIONS[self.stress.measure]
         record.scene = record.dataset.replace("_", " ")

@@ -47,7 +47,7 @@ class FitSettings:
         resolution: height and width of the image, in pixels.
         iterations, learning_rate: settings of Adam; the rate falls to zero along half a cosine.
         depth_loss, depth_weight, silhouette, silhouette_weight: as in completion.
-        offset: initial distance of the sphere's centre from the true one, in scene units.
+        offset: distance of the initial code from the true one, over the length of the true one.
     """
 
     resolution: int
@@ -60,9 +60,9 @@ class FitSettings:
     offset: float
 
     def __post_init__(self) -> None:
-        check_at_least("task.fit.resolution", self.resolution, 4, "32 suits a sphere")
+        check_at_least("task.fit.resolution", self.resolution, 4, "20 takes seconds")
         check_choice("task.fit.depth_loss", self.depth_loss, DEPTH_LOSSES)
-        check_positive("task.fit.offset", self.offset, "0.1 is an easy start")
+        check_positive("task.fit.offset", self.offset, "1 is as far as the mean shape")
         OptimiserSettings(self.iterations, self.learning_rate, "cosine")
 
 

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from safetensors.torch import load_file
 
 from bench.config import build, load
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
+from bench.shape_prior import SHIPPED, Prior
 from bench.solve.optimise import History
 from bench.tables import choice, names
 from bench.tasks.stability import fit
@@ -21,6 +23,7 @@ from bench.tasks.stability.search import Bisection, Search, SearchSettings
 from bench.tasks.stability.solids import box, half_space, rod, sphere_solid
 from bench.tasks.stability.trial import Conditions, Criteria, Failure, FitSettings
 from renderers.camera import Rays
+from renderers.fields.mlp import Decoder
 from renderers.rendering import Status, Unsupported
 from renderers.silhouette import Own
 from renderers.tracing import reference
@@ -29,7 +32,7 @@ from tests.tiny import CPU, Blind, ball_prior, camera_of
 
 CRITERIA = Criteria(hits=0.99, false_hits=0.01, cosine=0.99, scale=0.1, surface_error=0.02)
 LIMITS = Limits(1e8, 8)
-FIT = FitSettings(24, 60, 0.03, "depth", 10.0, Own(), 10.0, 0.1)
+FIT = FitSettings(12, 30, 0.02, "depth", 10.0, Own(), 10.0, 1.0)
 BALL = ball_prior()
 NAMES = [name for name in names("stress") if name != "none"]
 
@@ -40,6 +43,15 @@ def stress_named(name: str) -> Stress:
 
 def conditions(resolution: int = 32) -> Conditions:
     return Conditions(resolution, FIT, CRITERIA, LIMITS, CPU, BALL)
+
+
+def sofa_prior() -> Prior:
+    """The shipped prior of sofas."""
+    tensors = load_file(SHIPPED / "sofa-9f2350f923ef.safetensors")
+    codes = tensors.pop("codes")
+    decoder = Decoder(layers=4, width=128, code_length=64, skip=2, narrow=False)
+    decoder.load_state_dict(tensors)
+    return Prior(decoder.requires_grad_(False), codes)
 
 
 def drawn(seed: int = 0) -> np.random.Generator:
@@ -234,6 +246,17 @@ def test_a_disturbed_fit_ends_further_off(scene):
     assert mild.success and severe.numbers["surface_error"] > mild.numbers["surface_error"]
 
 
+@each("name", ["growing_slope", "new_hole", "outside_family", "thin_parts", "one_sided_views"])
+def test_a_fit_of_a_code_succeeds_at_the_mild_end_and_fails_at_the_severe_one(name):
+    stress = stress_named(name)
+    held = replace(
+        conditions(), prior=sofa_prior(), fit=replace(FIT, resolution=20, silhouette=load("silhouette", "hinge"))
+    )
+    mild, severe = (stress.trial(load("renderer", "dist"), level, 0, held) for level in (0.0, 1.0))
+    assert mild.success and severe.numbers["surface_error"] > 2 * mild.numbers["surface_error"]
+    assert not severe.success
+
+
 def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
     held = replace(conditions(), limits=Limits(1, 8))
     assert stress_named("thin_plate").trial(load("renderer", "idr"), 0.0, 0, held).failure is Failure.TIMEOUT
@@ -241,7 +264,7 @@ def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
 
     def spent(limits: Limits) -> float:
         held = replace(conditions(), limits=limits, fit=fit)
-        fitted = judge_fit("a_ball", 0.0, drawn(), renderer=load("renderer", "dist"), conditions=held)
+        fitted = judge_fit("a_code", 0.0, drawn(), renderer=load("renderer", "dist"), conditions=held)
         return fitted.numbers["evaluations_per_ray"] * fit.resolution**2
 
     one_in_five = Limits(int(spent(LIMITS) * fit.iterations / 5), 8)
