@@ -144,7 +144,8 @@ def test_errors_of_a_mask_are_of_both_kinds():
 def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
     """The numbers that decide the success of a trial."""
     renderer = load("renderer", "dvr" if stress.setting == "n_ray_samples" else "dist")
-    tiny = replace(conditions(), fit=replace(FIT, resolution=8, iterations=1))
+    resolution = 128 if stress.group == "network" else 32  # networks are rendered at a quarter of it
+    tiny = replace(conditions(resolution), fit=replace(FIT, resolution=8, iterations=1))
     numbers = stress.trial(renderer, level, repeat, tiny).numbers
     if stress.measure == "fit":
         return numbers
