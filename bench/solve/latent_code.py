@@ -150,10 +150,6 @@ class CodeProblem:
         terms = self.held_out(Meter(self._shape(self.starts.best()), self.counts))
         return float(torch.stack([*terms.values()]).sum())
 
-    def refine(self) -> bool:
-        """Compares a pixel of each smaller block from now on; returns False if blocks are as small as can be."""
-        return self.draw is not None and self.draw.refine()
-
     @torch.no_grad()
     def objective(self) -> float | None:
         """The current shape's `progress_measure`, not counted as cost; None without it."""

@@ -51,7 +51,7 @@ class OptimiserSettings:
         budget: largest cost, see `renderers.field.Counts.cost`; the step that reaches it is the last.
         ends: "iterations", the number of steps, with the budget as a limit; "budget": whatever the number of steps, and
             schedules over `iterations` follow the spent fraction of the budget; "held_out": when the loss of held-out
-            pixels stops falling, see `HeldOut`, after `iterations` at most.
+            pixels stops falling, see `_Patience`, after `iterations` at most.
         start_noise: standard deviation of normal noise in all initial parameters, for the run-to-run spread.
     """
 
@@ -106,24 +106,14 @@ class Optimisable(Protocol):
         ...
 
 
-@runtime_checkable
-class HeldOut(Protocol):
-    """A problem that holds out pixels. When their loss stops falling, it compares more pixels, and then ends."""
-
-    def held_out_loss(self) -> float:
-        """The loss of the held-out pixels, whose cost is counted."""
-        ...
-
-    def refine(self) -> bool:
-        """Compares more pixels from now on; returns False if it compares all."""
-        ...
-
-
 @dataclass
 class _Patience:
-    """Ends a loop by the losses of held-out pixels, which it measures every `HELD_OUT_INTERVAL` iterations."""
+    """Ends a loop by the losses of held-out pixels, which it measures every `HELD_OUT_INTERVAL` iterations.
 
-    problem: Any
+    When they stop falling, the problem compares more pixels, until it compares all that are not held out.
+    """
+
+    problem: Any  # with `held_out_loss`, whose cost is counted, and `draw`, a `PixelDraw`
     losses: list[float] = field(default_factory=list)  # since the last refinement
 
     def is_over(self, index: int) -> bool:
@@ -134,7 +124,7 @@ class _Patience:
         if not before or min(latest) <= (1 - HELD_OUT_GAIN) * min(before):
             return False
         self.losses = latest[-1:]
-        return not self.problem.refine()
+        return not self.problem.draw.refine()
 
 
 @runtime_checkable

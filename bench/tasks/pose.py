@@ -243,10 +243,6 @@ class PoseProblem:
         step, metered = self.settings.optimiser.iterations, Meter(self.shape_field, self.counts)
         return float(self._compare(metered, step, self.starts.best(), self.draw.held_out)["total"])
 
-    def refine(self) -> bool:
-        """Compares a pixel of each smaller block from now on; returns False if blocks are as small as can be."""
-        return self.draw.refine()
-
     def evaluate(self, state: State) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""
         view = render_view(self.shape_field, self.camera(), state.inputs)

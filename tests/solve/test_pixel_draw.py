@@ -36,7 +36,7 @@ class Falling:
 
     def __init__(self, falls: int) -> None:
         self.parameters, self.counts = [torch.ones(1, requires_grad=True)], Counts()
-        self.falls, self.measured, self.refined = falls, 0, 0
+        self.falls, self.measured, self.refined, self.draw = falls, 0, 0, self
 
     def loss(self, iteration: int) -> dict[str, torch.Tensor]:
         self.counts.value += 10
