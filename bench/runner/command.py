@@ -24,7 +24,7 @@ from bench.tables import names, nearest
 
 DANGLING_COMMA = re.compile(r"[=,]\s*,|,\s*$")
 SETTING_PATTERN = re.compile(r"(\+*([\w.]+))=(.+)", re.DOTALL)  # groups: plus signs and key, key, value
-LISTED_GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale")
+LISTED_GROUPS = ("task", "renderer", "dataset", "stress", "method", "experiment", "scale", "effort")
 HELP = """
     python -m bench task=completion renderer=dist                          one run
     python -m bench -m renderer=dist,dvr,newton seed=0,1,2 dataset=sofa,plane     a sweep: every combination
