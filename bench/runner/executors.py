@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import find_class
 from bench.progress import notice
 from bench.records.results import Plan, PlannedRun
-from bench.runner.process import catch_signals, fork_runs, raise_if_stopped, signals_delayed, warm_up
+from bench.runner.process import WORKER, catch_signals, raise_if_stopped, signals_delayed, warm_up
 from bench.tables import names
 from datasets.extras import install_command
 
@@ -172,7 +172,7 @@ def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
     """Starts a worker from the server of processes; returns the connection to it, and its process."""
     context = warm_up()
     parent_end, child_end = context.Pipe()
-    process = context.Process(target=_worker_main, args=(make, child_end))
+    process = context.Process(target=_worker_main, args=(make, child_end), name=WORKER)
     with signals_delayed():
         process.start()
         child_end.close()
@@ -182,7 +182,6 @@ def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
 def _worker_main(make: Make, channel: Connection) -> None:
     """Runs the cells that the channel sends, until it sends None or a signal comes."""
     catch_signals()
-    fork_runs()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent passes it on
     try:
         while (cell := channel.recv()) is not None:

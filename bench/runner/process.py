@@ -27,13 +27,13 @@ POLL_INTERVAL_SECONDS = 0.05
 TERMINATION_GRACE_SECONDS = 0.5  # for a child to send its record after SIGTERM
 STARTUP_TIMEOUT_SECONDS = 120.0  # long, because a cold disk is slow
 GIB = 2**30
+WORKER = "worker"  # the name of a launcher's processes, which the server has forked, and which fork their runs
 Failure = tuple[RunStatus, str]  # the status and reason of a child that ended without a final record
 # Signals from outside: from a user, a batch system, or the operating system when memory runs out.
 EXTERNAL_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 # A signal is also stored, because an interrupted library may swallow or replace the exception.
 _stopped = ""  # the signal that stopped this command, in words
 _delayed = False  # within `signals_delayed`
-_is_worker = False
 
 
 @dataclass
@@ -100,18 +100,12 @@ def fork_server() -> ForkServerContext:
     return context
 
 
-def fork_runs() -> None:
-    """From now on, runs are forked from this process, a launcher's worker, which the server has forked."""
-    global _is_worker
-    _is_worker = True
-
-
 def warm_up() -> ForkServerContext | ForkContext:
     """Starts the fork server, which imports the slow modules while this process does something else.
 
     The server and its children never receive Ctrl-C: their parent does, and ends them.
     """
-    if _is_worker:
+    if multiprocessing.current_process().name == WORKER:
         return multiprocessing.get_context("fork")
     context = fork_server()
     resource_tracker.ensure_running()  # here, because it unblocks the signal that is blocked below

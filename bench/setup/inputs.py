@@ -265,7 +265,7 @@ class _Builder:
     def renderer(self, requested: Node) -> RendererWithNotes:
         """A renderer from its node with a number for each `auto`, and notes on these numbers."""
         view, auto = self.parts("view", "auto")
-        node, notes = auto.resolve(requested, view) if AUTO in requested.values() else (requested, [])
+        node, notes = auto.resolve(requested, view)
         (renderer,) = self.parts(renderer=node)
         if not isinstance(renderer, Renderer):
             lacking = f"renderer {type(renderer).__name__} lacks capabilities, render or silhouette_loss"

@@ -22,6 +22,11 @@ Terms = dict[str, Tensor]
 INITIAL_SCALE = 0.8  # if the size is unknown too: below 1, so that the shape can grow and move
 
 
+def total(terms: Terms) -> Float[Tensor, ""]:
+    """The sum of weighted terms."""
+    return torch.stack([*terms.values()]).sum()
+
+
 @dataclass(frozen=True)
 class CodePenalty:
     """The penalty on a code (DeepSDF, Eq. 10; DIST, B.4).
@@ -136,7 +141,7 @@ class CodeProblem:
             if self.starts.is_alone:
                 raise
             terms = {"code": nan * penalty["code"]}  # this start takes no step
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+        return {"total": total(terms), **terms}
 
     @property
     def rays_per_iteration(self) -> int:
@@ -147,8 +152,7 @@ class CodeProblem:
     def held_out_loss(self) -> float:
         """The loss of the held-out pixels."""
         assert self.held_out is not None
-        terms = self.held_out(Meter(self._shape(self.starts.best()), self.counts))
-        return float(torch.stack([*terms.values()]).sum())
+        return float(total(self.held_out(Meter(self._shape(self.starts.best()), self.counts))))
 
     @torch.no_grad()
     def objective(self) -> float | None:

@@ -28,6 +28,7 @@ SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of
 ITERATIONS, BUDGET, HELD_OUT = "iterations", "budget", "held_out"  # what ends a loop
 HELD_OUT_INTERVAL = 5  # iterations between two measurements of the loss of held-out pixels
 HELD_OUT_PATIENCE, HELD_OUT_GAIN = 2, 0.02  # it has stopped falling if so many measurements gain less than this
+FINAL_ITERATIONS = 10  # of all pixels, also the held-out ones
 AFFORDED_ITERATIONS = 40  # for which `with_affordable_rays` chooses the rays
 BLOCKS = (1, 2, 4, 8)  # pixels per side of a block of which an iteration has one ray
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
@@ -110,21 +111,30 @@ class Optimisable(Protocol):
 class _Patience:
     """Ends a loop by the losses of held-out pixels, which it measures every `HELD_OUT_INTERVAL` iterations.
 
-    When they stop falling, the problem compares more pixels, until it compares all that are not held out.
+    When they stop falling, the problem compares more pixels; after the smallest blocks, all pixels of the image for the
+    last `FINAL_ITERATIONS`.
     """
 
     problem: Any  # with `held_out_loss`, whose cost is counted, and `draw`, a `PixelDraw`
+    end: int  # the number of iterations
     losses: list[float] = field(default_factory=list)  # since the last refinement
 
     def is_over(self, index: int) -> bool:
+        left = self.end - 1 - index
+        draw = self.problem.draw
+        if left == FINAL_ITERATIONS or (left > FINAL_ITERATIONS and self._is_still(index) and not draw.refine()):
+            draw.release()
+            self.end = index + 1 + FINAL_ITERATIONS
+        return index + 1 >= self.end
+
+    def _is_still(self, index: int) -> bool:
         if (index + 1) % HELD_OUT_INTERVAL:
             return False
         self.losses.append(self.problem.held_out_loss())
         before, latest = self.losses[:-HELD_OUT_PATIENCE], self.losses[-HELD_OUT_PATIENCE:]
-        if not before or min(latest) <= (1 - HELD_OUT_GAIN) * min(before):
-            return False
-        self.losses = latest[-1:]
-        return not self.problem.draw.refine()
+        is_still = bool(before) and min(latest) > (1 - HELD_OUT_GAIN) * min(before)
+        self.losses = latest[-1:] if is_still else self.losses
+        return is_still
 
 
 @runtime_checkable
@@ -196,7 +206,7 @@ def optimise(
     """
     _add_noise(problem.parameters, settings.start_noise)
     optimiser, own_starts = _Adam(problem.parameters), getattr(problem, "starts", None)
-    starts, patience = own_starts or Starts(StartSettings(1, 1)), _Patience(problem)
+    starts, patience = own_starts or Starts(StartSettings(1, 1)), _Patience(problem, settings.iterations)
     loss_of = problem.loss if own_starts else lambda step, start: problem.loss(step)
     stopwatch = Stopwatch(device)
     start, step = starts.assignment(0)

@@ -53,6 +53,11 @@ class PixelDraw:
         self.blocks = self.blocks[has_smaller:]
         return has_smaller
 
+    def release(self) -> None:
+        """From now on, all pixels are compared, also the held-out ones."""
+        self.is_held_out[:] = False
+        self.blocks, self.kept = [1], torch.arange(len(self.is_held_out))
+
     @property
     def per_iteration(self) -> int:
         """The mean number of pixels over the iterations so far; before the first, the number of the last blocks."""

@@ -9,7 +9,7 @@ import torch
 from bench.config import extension
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations
+from bench.solve.latent_code import CodePenalty, CodeProblem, initial_rotations, total
 from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import HELD_OUT, OptimiserSettings, StartSettings, with_affordable_rays
 from bench.solve.pixel_draw import PixelDraw
@@ -17,7 +17,6 @@ from bench.solve.solve import check_field_gradient, save_in_world, solve_task
 from datasets.scene import OneView, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
-from renderers.field import Field
 from renderers.rendering import Renderer
 from renderers.silhouette import SilhouetteLoss
 
@@ -124,7 +123,7 @@ class Completion:
         compare = partial(observed_view.compare_drawn, draw)
         problem = partial(CodeProblem, prior, self.code, compare, compared, 1, device, draw=draw)
         if holds_out or self.pixel_block > 1:
-            problem = partial(problem, progress_measure=partial(_loss_of_all_pixels, observed_view, last))
+            problem = partial(problem, progress_measure=lambda field: float(total(observed_view.compare(field, last))))
         if holds_out:
             held_out = observed_view.flat().drawn(draw.held_out.to(device))
             problem = partial(problem, held_out=lambda field: held_out.compare(field, last))
@@ -147,7 +146,3 @@ class Completion:
             image = unshaded_image(view, scene.texture).where(view.mask[..., None], torch.nan)
             observed_view = replace(observed_view, colours=image.to(device), colour_weight=self.colour_weight)
         return observed_view
-
-
-def _loss_of_all_pixels(view: ObservedView, iteration: int, field: Field) -> float:
-    return float(torch.stack([*view.compare(field, iteration).values()]).sum())

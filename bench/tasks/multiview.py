@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from math import radians
 from typing import Protocol, runtime_checkable
 
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
-from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations
+from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations, total
 from bench.solve.optimise import HELD_OUT, CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, metric_definitions, solve_and_draw
@@ -172,6 +171,7 @@ class Multiview:
         codes = code_std * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
         misplaced = self._initial_similarity(generator) if self.optimises_similarity else None
         observed = torch.zeros(photometric_loss.colours.shape[1:3], dtype=torch.bool, device="cpu")
+        last = self.optimiser.iterations  # when images are no longer blurred
         return CodeProblem(
             prior,
             self.code,
@@ -185,17 +185,10 @@ class Multiview:
             else misplaced,
             trial=self.trial,
             photographs=photometric_loss.colours.cpu().numpy(),
-            progress_measure=partial(self._loss_of_all_pixels, photometric_loss),
+            progress_measure=lambda field: float(total(photometric_loss.compare_at(field, last))),
             draw=photometric_loss.draw,
-            held_out=lambda field: photometric_loss.compare_at(
-                field, self.optimiser.iterations, photometric_loss.draw.held_out
-            ),
+            held_out=lambda field: photometric_loss.compare_at(field, last, photometric_loss.draw.held_out),
         )
-
-    def _loss_of_all_pixels(self, photometric_loss: "PhotometricLoss", field: Field) -> float:
-        """The loss without the code's penalty, of images that are no longer blurred."""
-        terms = photometric_loss.compare_at(field, self.optimiser.iterations)
-        return float(torch.stack(list(terms.values())).sum())
 
     def _initial_similarity(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
         """A similarity transform of the set magnitude in random directions, the same for all starts."""

@@ -1,9 +1,19 @@
 """The pixels that an iteration compares, those held out, and the end of a loop by their loss."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from bench.solve.optimise import HELD_OUT, HELD_OUT_INTERVAL, History, OptimiserSettings, StartSettings, optimise
+from bench.solve.optimise import (
+    FINAL_ITERATIONS,
+    HELD_OUT,
+    HELD_OUT_INTERVAL,
+    History,
+    OptimiserSettings,
+    StartSettings,
+    optimise,
+)
 from bench.solve.pixel_draw import PixelDraw
 from renderers.field import Counts
 
@@ -27,8 +37,10 @@ def test_held_out_pixels_are_never_compared_and_blocks_shrink_to_all_others():
         counts.append(len(pixels))
         if not draw.refine():
             break
+    draw.release()
+    assert draw.pixels(9) is None
     assert 35 <= counts[0] <= 50 and 160 <= counts[1] <= 200 and counts[2] == 720
-    assert draw.per_iteration == round(sum(counts) / 3)
+    assert draw.per_iteration == round((sum(counts) + 800) / 4)
 
 
 class Falling:
@@ -36,7 +48,8 @@ class Falling:
 
     def __init__(self, falls: int) -> None:
         self.parameters, self.counts = [torch.ones(1, requires_grad=True)], Counts()
-        self.falls, self.measured, self.refined, self.draw = falls, 0, 0, self
+        self.falls, self.measured, self.refined, self.released = falls, 0, 0, 0
+        self.draw = self
 
     def loss(self, iteration: int) -> dict[str, torch.Tensor]:
         self.counts.value += 10
@@ -51,17 +64,20 @@ class Falling:
         self.measured, self.refined = 0, self.refined + 1
         return self.refined < 3
 
+    def release(self) -> None:
+        self.released = self.counts.value
+
 
 def test_a_loop_ends_when_the_held_out_loss_stops_falling_at_each_block():
     problem, history = Falling(falls=3), History()
     settings = OptimiserSettings(1000, 1e-3, "constant", ends=HELD_OUT)
     optimise(problem, settings, CPU, history=history, on_step=lambda line: None)
     measurements = 3 * (3 + 2)  # for each size of blocks, three that fall and two that do not
-    assert len(history.curve) == measurements * HELD_OUT_INTERVAL and problem.refined == 3
+    assert len(history.curve) == measurements * HELD_OUT_INTERVAL + FINAL_ITERATIONS and problem.refined == 3
     assert history.counts.value == 10 * len(history.curve) + measurements  # the measurements are counted
-    short = History()
-    optimise(Falling(falls=3), OptimiserSettings(20, 1e-3, "constant", ends=HELD_OUT), CPU, history=short, on_step=id)
-    assert len(short.curve) == 20
+    short, problem = History(), Falling(falls=3)
+    optimise(problem, replace(settings, iterations=20), CPU, history=short, on_step=lambda line: None)
+    assert len(short.curve) == 20 and problem.released == short.counts.value - 10 * (FINAL_ITERATIONS - 1)
 
 
 def test_several_starts_share_a_fixed_number_of_iterations():
