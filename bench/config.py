@@ -33,7 +33,8 @@ CLASS_PACKAGE_KEY = "_package_"  # key of the node `renderer`: the package of th
 PRIOR_DATASET_KEY = "of"  # key of the node `prior`: the dataset that it was trained on
 # Keys of a dataset or a task that other nodes refer to.
 FOLLOWED_KEYS = ("_prior_", "_field_", "_multiview_", "_similarity_", "_iterations_", "_silhouette_weight_")
-MARKS = (CLASS_PACKAGE_KEY, *FOLLOWED_KEYS, PRIOR_DATASET_KEY, LABEL_KEY, ROWS_KEY, LOOK_KEY)
+EPSILON_KEY = "_epsilon_"  # key of the node `task`, which renderers refer to; set by effort=needed
+MARKS = (CLASS_PACKAGE_KEY, *FOLLOWED_KEYS, EPSILON_KEY, PRIOR_DATASET_KEY, LABEL_KEY, ROWS_KEY, LOOK_KEY)
 # All keys of a node except these and `_target_` are arguments.
 ROLE_OF_NODE = {  # the protocol or base class that the class of a node must have
     "task": "bench.setup.inputs.Task",

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import parent_process
 from typing import Protocol, runtime_checkable
 
 from rich.console import Console
@@ -76,7 +77,7 @@ def display() -> Iterator[Progress]:
     with Progress(
         *columns(console.width),
         console=console,
-        disable=not console.is_terminal,
+        disable=not console.is_terminal or parent_process() is not None,  # a worker's lines would mix with others
         refresh_per_second=5,
         speed_estimate_period=SPEED_WINDOW_SECONDS,
         transient=True,

@@ -52,7 +52,7 @@ from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
 PAGE = "suite"  # its file name in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
 TUNED_LABEL = f"label='${{renderer._label_}}{TUNED_SUFFIX}'"
-STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models'])})(\W|$)|dataset\.)"
+STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models', 'effort'])})(\W|$)|dataset\.)"
 AXES = (*(key for key, _, _ in PROBLEM_SETTINGS.values()), NOISE_KEY)  # may be typed: some problems, a second start
 SETUP_AND_EVALUATION_SECONDS = 2.0  # per run
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one

@@ -1,14 +1,12 @@
 """Executes one run, in its own process or in that of the command; every failure is recorded with its reason."""
 
-import fcntl
 import os
 import signal
 import sys
 import time
 import traceback
 from collections.abc import Callable
-from multiprocessing import parent_process
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
@@ -16,7 +14,7 @@ import torch
 from bench.machine import environment
 from bench.progress import notices_to
 from bench.records.record import Record, RunStatus, append_to_log, now
-from bench.runner.messages import Message, Notice, Started, Step, reason_of
+from bench.runner.messages import Message, Notice, Started, Step, exit_with_parent, reason_of
 from bench.setup.inputs import RunContext, prepare_run
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
@@ -28,7 +26,7 @@ def main(record: Record, channel: Connection) -> None:
     """Makes the run of a record in the process of that run; its output goes to `log.txt`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
     signal.signal(signal.SIGTERM, _stop)
-    _exit_with_parent()
+    exit_with_parent()
     _redirect_output(record.folder / "log.txt")
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
@@ -100,19 +98,6 @@ class _Progress:
 def _stop(number: int, frame: object) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second signal must not interrupt the handling of the first
     raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
-
-
-def _exit_with_parent() -> None:
-    """Makes the system end this process when its parent ends, also during native code."""
-    parent = parent_process()
-    assert parent is not None
-    end = parent.sentinel  # the reading end of a pipe that only the parent holds open
-    signal.signal(signal.SIGIO, signal.SIG_DFL)
-    fcntl.fcntl(end, fcntl.F_SETOWN, os.getpid())
-    flags = fcntl.fcntl(end, fcntl.F_GETFL)
-    fcntl.fcntl(end, fcntl.F_SETFL, flags | os.O_ASYNC)
-    if wait([end], 0):  # ended before the signal was set up
-        os._exit(1)
 
 
 def _redirect_output(path: Path) -> None:

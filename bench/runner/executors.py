@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import find_class
 from bench.progress import notice
 from bench.records.results import Plan, PlannedRun
+from bench.runner.messages import exit_with_parent
 from bench.runner.process import WORKER, catch_signals, raise_if_stopped, signals_delayed, warm_up
 from bench.tables import names
 from datasets.extras import install_command
@@ -182,6 +183,7 @@ def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
 def _worker_main(make: Make, channel: Connection) -> None:
     """Runs the cells that the channel sends, until it sends None or a signal comes."""
     catch_signals()
+    exit_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent passes it on
     try:
         while (cell := channel.recv()) is not None:

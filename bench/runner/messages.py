@@ -1,8 +1,13 @@
-"""The messages between the process of a run and its parent, the texts of errors, and texts in overrides."""
+"""The messages between the process of a run and its parent, its end with the parent, and the texts of errors."""
 
 import errno
+import fcntl
+import os
 import re
+import signal
 from dataclasses import dataclass
+from multiprocessing import parent_process
+from multiprocessing.connection import wait
 from pathlib import Path
 
 from bench.records.record import Record
@@ -65,3 +70,16 @@ def quoted(text: str) -> str:
     """A text in quotes as Hydra reads it."""
     escaped = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + match[2].replace("'", "\\'"), text)
     return f"'{escaped}'"
+
+
+def exit_with_parent() -> None:
+    """Makes the system end this process when its parent ends, also during native code."""
+    parent = parent_process()
+    assert parent is not None
+    end = parent.sentinel  # the reading end of a pipe that only the parent holds open
+    signal.signal(signal.SIGIO, signal.SIG_DFL)
+    fcntl.fcntl(end, fcntl.F_SETOWN, os.getpid())
+    flags = fcntl.fcntl(end, fcntl.F_GETFL)
+    fcntl.fcntl(end, fcntl.F_SETFL, flags | os.O_ASYNC)
+    if wait([end], 0):  # ended before the signal was set up
+        os._exit(1)

@@ -68,8 +68,7 @@ def print_statuses(plan: Plan) -> list[str]:
     if set(statuses) - {"ok", "unsupported"}:
         print("the same command runs what was not run or was killed; with rerun=failed, also the cells that failed")
     for record in [record for record in records if record and record["status"] != "ok"][:1]:
-        folder = plan.results_dir / "runs" / record["folder"]
-        print(f"first failure: {folder} ({record['status']}: {record['reason']})")
+        print(f"first failure: {plan.results_dir}/runs/{record['folder']} ({record['status']}: {record['reason']})")
     return statuses
 
 

@@ -24,13 +24,11 @@ class AutoSettings:
         grazing: smallest angle between a ray and a surface, in degrees, at which a ray must still converge.
         spurious: largest fraction of spurious hits around outlines.
         area_over_perimeter: of the narrowest silhouette that meets `spurious`, in scene units.
-        precision: whether a renderer with an epsilon has `auto` for it; set by effort=needed.
     """
 
     grazing: float
     spurious: float
     area_over_perimeter: float
-    precision: bool = False
 
     def __post_init__(self) -> None:
         check_positive("auto.grazing", self.grazing, "DIST, A.1, takes 10")
@@ -46,8 +44,7 @@ class AutoSettings:
         Raises:
             ValueError: a setting without an equation is `auto`.
         """
-        is_coarse = self.precision and "epsilon" in renderer
-        requested = [name for name, value in renderer.items() if value == AUTO or (name == "epsilon" and is_coarse)]
+        requested = [name for name, value in renderer.items() if value == AUTO]
         for name in requested:
             if name not in FORMULAS:
                 names = ", ".join(FORMULAS)

@@ -265,7 +265,7 @@ class _Builder:
     def renderer(self, requested: Node) -> RendererWithNotes:
         """A renderer from its node with a number for each `auto`, and notes on these numbers."""
         view, auto = self.parts("view", "auto")
-        node, notes = auto.resolve(requested, view)
+        node, notes = auto.resolve(requested, view) if AUTO in requested.values() else (requested, [])
         (renderer,) = self.parts(renderer=node)
         if not isinstance(renderer, Renderer):
             lacking = f"renderer {type(renderer).__name__} lacks capabilities, render or silhouette_loss"
@@ -309,5 +309,8 @@ def _check(task: Task, inputs: RunInputs, index: int) -> None:
         raise ValueError(f"the task {name} needs a true shape, and one view has none: set task=completion")
     if not inputs.field.of_prior and not getattr(task, "takes_field", False):
         raise ValueError(f"the task {name} does not take field={inputs.field.name}: remove it")
+    holds_out = getattr(getattr(task, "optimiser", None), "ends", "") == "held_out"
+    if holds_out and not (getattr(task, "takes_one_view", False) and inputs.field.of_prior):
+        raise ValueError("effort=needed is only for task=completion with field=prior: set effort=full")
     if isinstance(task, ValidatesInputs):
         task.check(inputs)

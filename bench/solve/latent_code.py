@@ -151,7 +151,8 @@ class CodeProblem:
     @torch.no_grad()
     def held_out_loss(self) -> float:
         """The loss of the held-out pixels."""
-        assert self.held_out is not None
+        assert self.held_out is not None and self.draw is not None
+        self.draw.drawn += len(self.draw.held_out)
         return float(total(self.held_out(Meter(self._shape(self.starts.best()), self.counts))))
 
     @torch.no_grad()

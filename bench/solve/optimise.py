@@ -28,7 +28,7 @@ SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of
 ITERATIONS, BUDGET, HELD_OUT = "iterations", "budget", "held_out"  # what ends a loop
 HELD_OUT_INTERVAL = 5  # iterations between two measurements of the loss of held-out pixels
 HELD_OUT_PATIENCE, HELD_OUT_GAIN = 2, 0.02  # it has stopped falling if so many measurements gain less than this
-FINAL_ITERATIONS = 10  # of all pixels, also the held-out ones
+FINAL_ITERATIONS = 10
 AFFORDED_ITERATIONS = 40  # for which `with_affordable_rays` chooses the rays
 BLOCKS = (1, 2, 4, 8)  # pixels per side of a block of which an iteration has one ray
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
@@ -52,7 +52,7 @@ class OptimiserSettings:
         budget: largest cost, see `renderers.field.Counts.cost`; the step that reaches it is the last.
         ends: "iterations", the number of steps, with the budget as a limit; "budget": whatever the number of steps, and
             schedules over `iterations` follow the spent fraction of the budget; "held_out": when the loss of held-out
-            pixels stops falling, see `_Patience`, after `iterations` at most.
+            pixels stops falling, see `_Patience`, after `iterations` at most; schedules then end early.
         start_noise: standard deviation of normal noise in all initial parameters, for the run-to-run spread.
     """
 
@@ -71,6 +71,8 @@ class OptimiserSettings:
             check_positive("task.optimiser.budget", self.budget, "the suite has 2.5e5 to 1e7, null is none")
         check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET, HELD_OUT))
         check_at_least("task.optimiser.start_noise", self.start_noise, 0, "1e-6 shows the run-to-run spread")
+        if self.ends == HELD_OUT and self.schedule != "constant":
+            raise ValueError("task.optimiser.ends=held_out may end early: set task.optimiser.schedule=constant")
         if self.ends == BUDGET and self.budget is None:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
 
@@ -132,21 +134,13 @@ class _Patience:
             return False
         self.losses.append(self.problem.held_out_loss())
         before, latest = self.losses[:-HELD_OUT_PATIENCE], self.losses[-HELD_OUT_PATIENCE:]
-        is_still = bool(before) and min(latest) > (1 - HELD_OUT_GAIN) * min(before)
+        is_still = bool(before) and not min(latest) < (1 - HELD_OUT_GAIN) * min(before)  # also if it is 0 or NaN
         self.losses = latest[-1:] if is_still else self.losses
         return is_still
 
 
-@runtime_checkable
-class SampledTask(Protocol):
-    """A task of which an iteration compares one pixel of each block of `pixel_block` x `pixel_block`."""
-
-    optimiser: OptimiserSettings
-    pixel_block: int
-
-
-def with_affordable_rays(task: SampledTask, make_problem: Callable[[Any], Any]) -> Any:
-    """Makes the problem of a task.
+def with_affordable_rays(task: Any, make_problem: Callable[[Any], Any]) -> Any:
+    """Makes the problem of a task with settings `optimiser` and `pixel_block`, the pixels per side of a block.
 
     If `pixel_block` is 0, it becomes the smallest of `BLOCKS` with which the budget pays for `AFFORDED_ITERATIONS`,
     else the largest. One uncounted iteration measures the cost, with the initial parameters and the final values of

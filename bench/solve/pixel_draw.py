@@ -5,9 +5,10 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from datasets.views import pixel_of_each_block
+from renderers.checks import BadInput
 
 COARSE_BLOCKS = (4, 2)  # pixels per side of the first blocks, if pixels are held out
-HELD_OUT_FRACTION = 0.1  # of the observed and of the other pixels
+HELD_OUT_FRACTION = 0.1
 
 
 def generator_of(seed: int, iteration: int) -> torch.Generator:
@@ -21,12 +22,15 @@ class PixelDraw:
     If pixels are held out, blocks of 4 and 2 pixels per side come before those of `block`; see `refine`.
     """
 
-    def __init__(self, observed: Bool[Tensor, "height width"], block: int, seed: int, *, holds_out: bool) -> None:
+    def __init__(self, observed: Bool[Tensor, "height width"], block: int, seed: int, *, holds_out: bool = False):
         """Draws the pixels to hold out, a tenth of the observed and of the other pixels.
 
         Args:
             block: pixels per side of a block; 1 compares all pixels.
             holds_out: whether pixels are held out.
+
+        Raises:
+            BadInput: a tenth of the observed pixels is less than one.
         """
         (self.height, self.width), self.seed = observed.shape, seed
         self.blocks = [*(side for side in COARSE_BLOCKS if holds_out and side > block), block]
@@ -35,6 +39,9 @@ class PixelDraw:
             pixels = group.nonzero().squeeze(-1)
             drawn = torch.randperm(len(pixels), generator=generator)[: int(HELD_OUT_FRACTION * len(pixels))]
             self.is_held_out[pixels[drawn]] = True
+        if holds_out and not (self.is_held_out & observed.flatten().cpu()).any():
+            few = f"{int(observed.sum())} pixels with depth have no tenth to hold out"
+            raise BadInput(f"{few}: set task.optimiser.ends=iterations or effort=full, or give task.points=10 or more")
         self.held_out, self.kept = (mask.nonzero().squeeze(-1) for mask in (self.is_held_out, ~self.is_held_out))
         self.drawn, self.iterations = 0, 0  # numbers of pixels and calls of `pixels`
 
@@ -49,9 +56,7 @@ class PixelDraw:
 
     def refine(self) -> bool:
         """Goes on to smaller blocks; returns False if there are none."""
-        has_smaller = len(self.blocks) > 1
-        self.blocks = self.blocks[has_smaller:]
-        return has_smaller
+        return len(self.blocks) > 1 and bool(self.blocks.pop(0))
 
     def release(self) -> None:
         """From now on, all pixels are compared, also the held-out ones."""

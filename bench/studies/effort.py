@@ -11,8 +11,8 @@ NOTES = (
     compare.ERROR,
     f"{compare.RATIO} {compare.FAILURE}",
     "`effort=needed` holds out a tenth of the pixels. Each iteration compares a random pixel of blocks of 4 x 4 "
-    "pixels, then of 2 x 2, then all: the next, and then the end, when the loss of the held-out pixels stops falling. "
-    "The true shape is not used. A renderer with an epsilon has half a pixel (`renderer.epsilon=auto`).",
+    "pixels, then of 2 x 2, then all others: the next when the loss of the held-out pixels stops falling. The last ten "
+    "iterations compare all pixels. The true shape is not used. A renderer with an epsilon has half a pixel.",
     "`ends=held_out` and `epsilon=auto` are the two parts of it. The other rows have all pixels in each of 100 "
     "iterations, or of 60.",
     "Field evaluations are of points whose value was computed, also of the held-out pixels. In the verdict, a gradient "
@@ -20,7 +20,11 @@ NOTES = (
 )
 
 
-PAIRS = {"dist_needed": "dist_all_pixels", "newton_needed": "newton_mask", "idr_needed": "idr_mask"}  # with less effort
+PAIRS = {
+    "dist_needed": "dist_all_pixels",
+    "newton_needed": "newton_mask",
+    "idr_needed": "idr_mask",
+}  # rows with effort=needed, and with effort=full
 
 
 def make(runs: Runs) -> Result:
@@ -37,19 +41,22 @@ def make(runs: Runs) -> Result:
 
 def _verdict(compared: compare.Compared) -> str:
     """The ratios of errors and of field evaluations that `effort=needed` has for each renderer."""
-    rows = {row.preset: row for row in compared.rows}
-    present = [pair for pair in PAIRS.items() if rows.keys() >= {*pair}]
-    gaps = [compared.gap(compare.ALL_FAMILIES, rows[less], rows[more]) for less, more in present]
-    ratios = [gap.ratio for gap in gaps if gap is not None]
+    rows, parts = {row.preset: row for row in compared.rows}, []
+    gaps = {
+        less: compared.gap(compare.ALL_FAMILIES, rows[less], rows[more])
+        for less, more in PAIRS.items()
+        if rows.keys() >= {less, more}
+    }
+    ratios = {less: gap.ratio for less, gap in gaps.items() if gap is not None}
     words = {statistics.Verdict.DIFFERS: ", a significant difference", statistics.Verdict.NOT_DECIDABLE: ", undecided"}
-    parts = []
-    for pair, ratio, verdict in zip(present, ratios, statistics.ratio_verdicts(ratios), strict=True):
-        costs = [compared.runs.number("evaluations_cost")[compared.runs.frame.preset == preset] for preset in pair]
-        cost = number(costs[0].median() / costs[1].median())
-        name = rows[pair[1]].name.removesuffix(" with mask")
-        parts.append(f"{name} needs *{cost} times* the field evaluations, error {ratio} times{words.get(verdict, '')}")
-    shapes = f"; n = {len(ratios[0].points)} shapes. An error ratio above 1 is worse." if ratios else ""
-    return f"With `effort=needed`, {'; '.join(parts)}{shapes}" if parts else ""
+    costs = compared.runs.frame.assign(cost=compared.runs.number("evaluations_cost"))
+    costs = costs[costs.status == "ok"].pivot_table(index=["family", "solid", "seed"], columns="preset", values="cost")
+    for (less, ratio), verdict in zip(ratios.items(), statistics.ratio_verdicts([*ratios.values()]), strict=True):
+        cost, shapes = number((costs[less] / costs[PAIRS[less]]).median()), len(ratio.points)
+        name = rows[PAIRS[less]].name.removesuffix(" with mask")
+        text = f"{name} needs *{cost} times* the field evaluations, error {ratio} times (n = {shapes} shapes)"
+        parts.append(f"{text}{words.get(verdict, '')}")
+    return f"With `effort=needed`, {'; '.join(parts)}. An error ratio above 1 is worse." if parts else ""
 
 
 PAGES = {"effort": make}

@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations, total
-from bench.solve.optimise import HELD_OUT, CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
+from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, metric_definitions, solve_and_draw
 from datasets.photographs import Photography
@@ -187,7 +187,6 @@ class Multiview:
             photographs=photometric_loss.colours.cpu().numpy(),
             progress_measure=lambda field: float(total(photometric_loss.compare_at(field, last))),
             draw=photometric_loss.draw,
-            held_out=lambda field: photometric_loss.compare_at(field, last, photometric_loss.draw.held_out),
         )
 
     def _initial_similarity(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
@@ -233,8 +232,8 @@ class PhotometricLoss:
             nearest = torch.cdist(centres, centres).argsort(dim=1)  # the first is the view itself
             self.neighbours = nearest[:, min(settings.neighbour, count - 1)].tolist()
         self.masks = torch.stack(masks).to(device) if masks else None
-        pixels, holds_out = torch.ones(self.colours.shape[1:3], dtype=torch.bool), settings.optimiser.ends == HELD_OUT
-        self.draw = PixelDraw(pixels, settings.pixel_block, seed, holds_out=holds_out)  # the same in each view
+        pixels = torch.ones(self.colours.shape[1:3], dtype=torch.bool)
+        self.draw = PixelDraw(pixels, settings.pixel_block, seed)  # the same in each view
 
     def pairs(self, iteration: int) -> list[tuple[int, int]]:
         """The views that an iteration compares, evenly spaced, each paired with its neighbour; they shift by one."""

@@ -29,7 +29,7 @@ from bench.solve.observed_view import (
     normal_error,
     observed_hits,
 )
-from bench.solve.optimise import HELD_OUT, OptimiserSettings, Starts, StartSettings, with_affordable_rays
+from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import solve_and_draw
 from datasets.scene import Scene, View, see
@@ -217,8 +217,8 @@ class PoseProblem:
         self.starts = Starts(StartSettings(len(self.cameras), self.settings.trial))
         self.depth, self.observed = self.view.depth.to(self.device), self.view.mask.to(self.device)
         self.depth_per_distance = self.cameras[0].depth(torch.ones_like(self.depth))  # all starts have its lens
-        holds_out = self.settings.optimiser.ends == HELD_OUT
-        self.draw = PixelDraw(self.observed, self.settings.pixel_block, self.seed, holds_out=holds_out)
+        self.draw = PixelDraw(self.observed, self.settings.pixel_block, self.seed)
+        self.rays_per_iteration = self.draw.per_iteration
         self.normals = in_camera_axes(self.view.normals.to(self.device), self.view.camera.to(self.device))
 
     def field(self) -> Field:
@@ -228,20 +228,9 @@ class PoseProblem:
     @torch.no_grad()
     def objective(self) -> float | None:
         """The loss of all pixels, not counted as cost; None if each iteration has them and its loss is comparable."""
-        if self.settings.pixel_block == 1 and not len(self.draw.held_out):
+        if self.settings.pixel_block == 1:
             return None
         return float(self._compare(self.shape_field, self.settings.optimiser.iterations, self.starts.best())["total"])
-
-    @property
-    def rays_per_iteration(self) -> int:
-        """The mean number of rays of an iteration."""
-        return self.draw.per_iteration
-
-    @torch.no_grad()
-    def held_out_loss(self) -> float:
-        """The loss of the held-out pixels."""
-        step, metered = self.settings.optimiser.iterations, Meter(self.shape_field, self.counts)
-        return float(self._compare(metered, step, self.starts.best(), self.draw.held_out)["total"])
 
     def evaluate(self, state: State) -> Evaluation:
         """The errors of the current camera, and of its view against the given one."""

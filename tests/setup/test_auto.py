@@ -128,9 +128,3 @@ def test_epsilon_auto_holds_on_the_families(family):
 def test_no_more_precision_than_a_pixel():
     far = replace(VIEW, resolution=4096)
     assert epsilon(far, {}, TEN) == footprint(far.focal_length, far.distance) < 7e-4
-
-
-def test_with_precision_a_renderer_with_an_epsilon_gets_half_a_pixel_and_no_other_setting():
-    precise = replace(TEN, precision=True)
-    assert precise.resolve({"epsilon": 5e-5, "steps": 50}, VIEW)[0] == {"epsilon": epsilon(VIEW, {}, TEN), "steps": 50}
-    assert precise.resolve({"steps": 50}, VIEW) == ({"steps": 50}, []) == TEN.resolve({"steps": 50}, VIEW)

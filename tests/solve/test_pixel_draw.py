@@ -15,7 +15,9 @@ from bench.solve.optimise import (
     optimise,
 )
 from bench.solve.pixel_draw import PixelDraw
+from renderers.checks import BadInput
 from renderers.field import Counts
+from tests.runner.driving import record_of
 
 CPU = torch.device("cpu")
 
@@ -46,10 +48,10 @@ def test_held_out_pixels_are_never_compared_and_blocks_shrink_to_all_others():
 class Falling:
     """A problem whose held-out loss falls over the first `falls` measurements of each block."""
 
-    def __init__(self, falls: int) -> None:
+    def __init__(self, falls: int, constant: float | None = None) -> None:
         self.parameters, self.counts = [torch.ones(1, requires_grad=True)], Counts()
         self.falls, self.measured, self.refined, self.released = falls, 0, 0, 0
-        self.draw = self
+        self.draw, self.constant = self, constant
 
     def loss(self, iteration: int) -> dict[str, torch.Tensor]:
         self.counts.value += 10
@@ -58,6 +60,8 @@ class Falling:
     def held_out_loss(self) -> float:
         self.counts.value += 1
         self.measured += 1
+        if self.constant is not None:
+            return self.constant
         return 0.1**self.refined / min(self.measured, self.falls)
 
     def refine(self) -> bool:
@@ -83,3 +87,40 @@ def test_a_loop_ends_when_the_held_out_loss_stops_falling_at_each_block():
 def test_several_starts_share_a_fixed_number_of_iterations():
     with pytest.raises(ValueError, match=r"set task\.optimiser\.ends=iterations"):
         StartSettings(4, 5).check(OptimiserSettings(100, 1e-2, "constant", ends=HELD_OUT))
+
+
+@pytest.mark.parametrize("constant", [0.0, float("inf"), float("nan")])
+def test_a_held_out_loss_that_cannot_fall_ends_each_block(constant):
+    problem, history = Falling(1, constant), History()
+    settings = OptimiserSettings(1000, 1e-3, "constant", ends=HELD_OUT)
+    optimise(problem, settings, CPU, history=history, on_step=lambda line: None)
+    assert problem.refined == 3 and len(history.curve) < 100
+
+
+def test_observations_of_which_no_tenth_can_be_held_out_are_refused():
+    observed = torch.zeros(20, 20, dtype=torch.bool)
+    observed[0, :9] = True
+    with pytest.raises(BadInput, match="9 pixels with depth have no tenth to hold out"):
+        PixelDraw(observed, 1, 0, holds_out=True)
+
+
+SMOKE = ("task=completion", "dataset=sofa", "scale=smoke", "evaluation.grid=16", "evaluation.picture=null")
+
+
+def test_a_completion_with_no_more_effort_than_needed(isolated):
+    """Half a pixel, fewer rays, and the same errors before; a typed precision stays."""
+    changes = (), ("effort=needed",), ("effort=needed", "renderer.epsilon=1e-5")
+    outputs = [isolated(*SMOKE, *change, "task.optimiser.iterations=12") for change in changes]
+    assert [code for code, *_ in outputs] == [0, 0, 0]
+    full, needed, typed = (record_of(out) for _, out, _ in outputs)
+    assert any("renderer.epsilon=auto is 0.0007" in note for note in needed["notes"])
+    assert not any("auto" in note for note in full["notes"] + typed["notes"])
+    assert needed["metrics_start"]["chamfer_l2"] == full["metrics_start"]["chamfer_l2"]
+    assert needed["evaluations"]["rays_per_iteration"] < full["evaluations"]["rays_per_iteration"]
+    assert needed["evaluations"]["cost"] < full["evaluations"]["cost"]
+
+
+@pytest.mark.parametrize("changes", [("task=pose",), ("task=multiview",), ("field=grid_8",)])
+def test_effort_is_refused_where_nothing_is_held_out(isolated, changes):
+    code, _, err = isolated(*SMOKE, *changes, "effort=needed", "task.optimiser.schedule=constant")
+    assert code == 2 and "effort=needed is only for task=completion with field=prior: set effort=full" in err

@@ -5,6 +5,7 @@ worse, or the shapes become harder.
 """
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -137,7 +138,7 @@ class Hole:
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """The distance from the axis."""
         return torch.linalg.vector_norm(
-            torch.linalg.cross(points - self.start, self.direction.expand_as(points)), dim=-1
+            torch.linalg.cross(points - self.start.to(points), self.direction.to(points).expand_as(points)), dim=-1
         )
 
     def through(self, shape: Field, radius: Float[Tensor, ""] | float) -> Field:
@@ -207,9 +208,8 @@ def judge_fit(
     cameras = _cameras(direction, fit.resolution, severity if is_spread else None)
     observations = [_observe(true, camera) for camera in cameras]
     hole = None
-    if (
-        name == "new_hole"
-    ):  # the initial radius is that far below half of it (Mehta et al. 2022, on the topology of level sets)
+    if name == "new_hole":
+        # The initial radius is that far below half of it (Mehta et al. 2022, on the topology of level sets).
         hole = _hole(observations[0])
         true = hole.through(true, HOLE_RADIUS)
         observations = [_observe(true, camera) for camera in cameras]
@@ -217,8 +217,9 @@ def judge_fit(
     points = _seen_points([_observe(true, camera) for camera in sides] or observations).to(device)
     if name in DISTURBANCES:
         observations = [DISTURBANCES[name](each, severity, draw) for each in observations]
+    fitted = replace(prior, decoder=deepcopy(prior.decoder).to(device))
     problem = CodeFit(
-        *(name, severity, prior, initial.to(device).requires_grad_()),
+        *(name, severity, fitted, initial.to(device).requires_grad_()),
         radius=torch.tensor(HOLE_RADIUS / 2 - severity, device=device, requires_grad=True),
         hole=hole,
         views=[_view(each, fit, renderer, device) for each in observations],

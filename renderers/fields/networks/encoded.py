@@ -77,7 +77,7 @@ class HashGrid:
 
     def _level(self, level: int, position: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
         """The features of a level at positions in units of its cells."""
-        low = position.detach().floor().clamp(0, self.cells[level] - 1)
+        low = position.detach().nan_to_num().floor().clamp(0, self.cells[level] - 1)
         corners = torch.cartesian_prod(*[torch.arange(2, device=position.device)] * 3)  # [8, 3]
         offset = (position - low)[:, None]
         weights = torch.where(corners.bool(), offset, 1 - offset).prod(dim=-1)
