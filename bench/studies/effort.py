@@ -56,7 +56,7 @@ def _verdict(compared: compare.Compared) -> str:
         name = rows[PAIRS[less]].name.removesuffix(" with mask")
         text = f"{name} needs *{cost} times* the field evaluations, error {ratio} times (n = {shapes} shapes)"
         parts.append(f"{text}{words.get(verdict, '')}")
-    return f"With `effort=needed`, {'; '.join(parts)}. An error ratio above 1 is worse." if parts else ""
+    return f"With effort=needed, {'; '.join(parts)}. An error ratio above 1 is worse." if parts else ""
 
 
 PAGES = {"effort": make}
