@@ -134,8 +134,8 @@ def sets_value(override: Override) -> bool:
     key = override.key_or_group
     is_group = group_choices(key) and not isinstance(override.value(), dict)
     chooses = override.package is not None or "/" in key or is_group
-    if is_group and isinstance(override.value(), list):
-        raise ValueError(f"{override.input_line}: {key} has one choice: write {key}=NAME, or -m {key}=NAME,NAME")
+    if is_group and isinstance(override.value(), list) and not all(isinstance(name, str) for name in override.value()):
+        raise ValueError(f"{override.input_line}: {key} is chosen by a name: write {key}=NAME")
     return override.type in SETTING_TYPES and not chooses and key != "hydra.searchpath"
 
 

@@ -283,7 +283,7 @@ def verdict(made: Standing) -> str:
         if ranked.decidable:
             pairs = f"{len(ranked.better) or 'None'} of {ranked.pairs} pairs"
             when = f"At {_when(made, budget)}"
-            parts.append(f"{leaders(ranked, when)} {pairs} differ significantly.")
+            parts.append(f"{leaders(ranked, when)} {pairs} differ.")
         else:
             scenes = format.plural(ranked.scenes, "scene")
             rows = f"{len(ranked.progress)} renderers" + ("" if ranked.level else ", whatever their results")
@@ -300,9 +300,12 @@ def leaders(ranked: Ranking, when: str) -> str:
         more = f"significantly more progress than the {format.plural(len(beaten), 'other')}"
         if len(first) == 1:
             return f"{when}, {rows[0]} makes {more}."
-        return f"{when}, {', '.join(rows[:-1])} and {rows[-1]} make {more}. These {len(rows)} cannot be distinguished."
+        return f"{when}, {', '.join(rows[:-1])} and {rows[-1]} make {more}."
     behind = [row for row in ranked.progress if (first[0], row) in ranked.better]
+    tied = [row for row in ranked.progress if row not in (first[0], *behind)]
     less = f"{format.plural(len(behind), 'other')}: {'; '.join(behind)}"
+    if len(behind) > len(tied) > 0:
+        return f"{when}, {rows[0]} makes significantly more progress than all but {'; '.join(tied)}."
     than = f"significantly more than {less}" if behind else "and cannot be distinguished from any other"
     return f"{when}, {rows[0]} makes the most progress, {than}."
 
@@ -315,10 +318,10 @@ def failures(made: Standing) -> str:
     if most.empty:
         return f"{failed or 'None'} of {runs} runs failed."
     names = [
-        f"{row} failed in {line.failed} of {line.runs} problems of {name} at {units(budget)}"
+        f"{row} failed in {name} at {units(budget)} ({line.failed} of {line.runs})"
         for (row, budget, name), line in most.iterrows()
     ]
-    return f"{'; '.join(names)}; {failed or 'none'} of the other {runs} runs failed."
+    return f"{'; '.join(names)}; {failed or 'none'} of {runs} other runs failed."
 
 
 def _first_of_sets(made: Standing) -> str:

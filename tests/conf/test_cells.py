@@ -26,7 +26,7 @@ FILE = Path(__file__).with_name("cells.json")
 EXPERIMENTS = [name for name in names("experiment") if not name.startswith("_")]
 SINGLE_RUN_EXPERIMENTS = {"fitted"}  # without a table or figure
 # The experiments that share the table or figure of another name.
-JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10"}
+JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10", "parsimony_resolutions": "parsimony"}
 # An experiment that sweeps over rows that several experiments share.
 SHARED_ROWS = {"speed_accuracy": "speed_completion", "core": "core_complete"}
 COMPARING = {

@@ -87,7 +87,7 @@ def test_every_yaml_is_in_a_folder_that_is_searched():
         *GROUP_OF_TABLE,
     }
     folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")} - {"."}
-    files = {"task", "renderer", "dataset", "prior", "scale", "tracker", "experiment", "hydra/launcher"}
+    files = {"task", "renderer", "dataset", "prior", "scale", "tracker", "experiment", "effort", "hydra/launcher"}
     assert folders <= files | {*GROUP_OF_TABLE.values(), "method/space"}
 
 

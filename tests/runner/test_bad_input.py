@@ -72,7 +72,7 @@ def assert_one_line(err: str, *words: str) -> None:
     ("renderer=custom renderer.steps=3", ("+renderer.steps=VALUE",)),
     ("renderer._target_=mypkg.Mine", ("packages=[mypkg]", "is renderer=custom renderer._target_=mypkg.Mine")),
     ("renderer._target_=tests.user_renderer.Mine packages=[tests]", ("has no key 'epsilon'", "is renderer=custom")),
-    ("task=[1,2]", ("task=[1,2]: task has one choice: write task=NAME",)),
+    ("task=[1,2]", ("task=[1,2]: task is chosen by a name: write task=NAME",)),
     ("+scale=smoke", ("scale is chosen by default: write scale=NAME, without a plus",)),
     ("++renderer=dvr", ("write renderer=NAME, without a plus",)),
     ("task=multiview silhouette=hinge", ("silhouette is read only by task=capacity, completion",)),
