@@ -13,8 +13,8 @@ NOTES = (
     "`effort=needed` holds out a tenth of the pixels. Each iteration compares a random pixel of blocks of 4 x 4 "
     "pixels, then of 2 x 2, then all others: the next when the loss of the held-out pixels stops falling. The last ten "
     "iterations compare all pixels. The true shape is not used. A renderer with an epsilon has half a pixel.",
-    "Two rows have its two parts: `epsilon=auto`, and `effort=needed` with the default epsilon. The other rows have all pixels in each of 100 "
-    "iterations, or of 60.",
+    "Two rows have its two parts: `epsilon=auto`, and `effort=needed` with the default epsilon. The other rows compare "
+    "all pixels in each of 100 iterations, or of 60.",
     "Field evaluations are of points whose value was computed, also of the held-out pixels. In the verdict, a gradient "
     "counts as two.",
 )

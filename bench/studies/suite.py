@@ -297,7 +297,7 @@ def leaders(ranked: Ranking, when: str) -> str:
     first = [row for row in ranked.progress if row not in beaten]
     rows = [f"{row} (*{percent(ranked.progress[row])}*)" for row in first]
     if beaten and all((row, other) in ranked.better for row in first for other in beaten):
-        more = f"significantly more progress than the {format.plural(len(beaten), 'other')}"
+        more = f"significantly more progress than {format.plural(len(beaten), 'other')}"
         if len(first) == 1:
             return f"{when}, {rows[0]} makes {more}."
         return f"{when}, {', '.join(rows[:-1])} and {rows[-1]} make {more}."
@@ -321,7 +321,7 @@ def failures(made: Standing) -> str:
         f"{row} failed in {name} at {units(budget)} ({line.failed} of {line.runs})"
         for (row, budget, name), line in most.iterrows()
     ]
-    return f"{'; '.join(names)}; {failed or 'none'} of {runs} other runs failed."
+    return f"{'; '.join(names)}; {failed or 'none'} of {runs} others failed."
 
 
 def _first_of_sets(made: Standing) -> str:

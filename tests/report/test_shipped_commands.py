@@ -28,6 +28,8 @@ EXPERIMENTS = sorted(path.name.removesuffix(SUFFIX) for path in (SHIPPED / FOLDE
 def described(config: dict[str, Any], dataset: str, renderer: str) -> tuple[tuple[str, ...], dict[str, str]]:
     path = config["dataset"].get("path")
     settings = {key: str(value) for key, value in flat(config, "").items() if not IGNORED.match(key)}
+    if settings.get("task.stress.measure", "fit") != "fit":  # renderings and gradients do not read the settings of fits
+        settings = {key: "" if key.startswith("task.fit.") else value for key, value in settings.items()}
     return (row_name(config, renderer), Path(path).stem if path and dataset == "mesh" else dataset), settings
 
 

@@ -250,7 +250,7 @@ def simulated_level(runs: pd.DataFrame, draws: int = 200) -> float:
 def _simulated_level(content: bytes, scenes: int, draws: int) -> float:
     scores = np.frombuffer(content).reshape(scenes, -1)
     rng, significant, (first, second) = np.random.default_rng(1), 0, np.triu_indices(scores.shape[1], 1)
-    for _ in range(draws):
+    for _ in range(draws if len(first) else 0):
         drawn = scores[rng.integers(scenes, size=scenes)]
         significant += flips.any_at_most(drawn[:, first] - drawn[:, second], ALPHA / len(first))
     return significant / draws
