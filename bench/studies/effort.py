@@ -33,7 +33,7 @@ def make(runs: Runs) -> Result:
         title="Depth completion with no more effort than a scene needs.",
         question="Does a completion need all pixels, 100 iterations and the default precision?",
         reference="dist_all_pixels",
-        name="DIST",
+        name="DIST, effort=full",
         notes=lambda _: NOTES,
     )
     return replace(page(runs), verdict=_verdict(compare.Compared(runs, page.reference)))
@@ -53,7 +53,7 @@ def _verdict(compared: compare.Compared) -> str:
     costs = costs[costs.status == "ok"].pivot_table(index=["family", "solid", "seed"], columns="preset", values="cost")
     for (less, ratio), verdict in zip(ratios.items(), statistics.ratio_verdicts([*ratios.values()]), strict=True):
         cost, shapes = number((costs[less] / costs[PAIRS[less]]).median()), len(ratio.points)
-        name = rows[PAIRS[less]].name.removesuffix(" with mask")
+        name = rows[PAIRS[less]].name.removesuffix(" with mask").removesuffix(", effort=full")
         text = f"{name} needs *{cost} times* the field evaluations, error {ratio} times (n = {shapes} shapes)"
         parts.append(f"{text}{words.get(verdict, '')}")
     return f"With effort=needed, {'; '.join(parts)}. An error ratio above 1 is worse." if parts else ""
