@@ -43,6 +43,7 @@ MARKS = {
 GROUP_GAP_COLUMNS = 0.7
 LINE_INCHES, LABEL_INCHES = 0.155, 1.15  # the height of a renderer, and of the labels above the heat map
 NOTES = (
+    "An empty cell was not run.",
     "Severity is a share of the axis: 0 % is the mildest severity, 100 % the severest. A darker cell survives harder "
     "cases.",
     "“Breaks first” and “Then” are the axes with the lowest breakdowns. Of equal ones, they are those with the highest "
