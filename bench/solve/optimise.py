@@ -226,9 +226,11 @@ def optimise(
             else:
                 failure = f"the gradient is not finite at iteration {index}"
             history.seconds["backward"] += stopwatch.seconds()
-        stopwatch = Stopwatch(device)
-        is_over = settings.ends == HELD_OUT and patience.is_over(index)
-        history.seconds["forward"] += stopwatch.seconds() if settings.ends == HELD_OUT else 0.0
+        is_over = False
+        if settings.ends == HELD_OUT:  # else a GPU would be synchronised for nothing
+            stopwatch = Stopwatch(device)
+            is_over = patience.is_over(index)
+            history.seconds["forward"] += stopwatch.seconds()
         first_loss = starts.first_loss(start)
         if starts.is_alone and failure:
             history.status, history.reason = RunStatus.NAN, failure

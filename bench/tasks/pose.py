@@ -22,6 +22,7 @@ from bench.evaluate.state import REACH, State
 from bench.records.record import digest
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import load_or_make
+from bench.solve.latent_code import total
 from bench.solve.observed_view import (
     DEPTH_LOSSES,
     depth_error,
@@ -276,7 +277,7 @@ class PoseProblem:
         if self.settings.normal_weight:
             rendered_normals = in_camera_axes(autograd_normals(shape, rendering.points[compared].detach()), camera)
             terms["normals"] = self.settings.normal_weight * normal_error(rendered_normals, normals[compared])
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+        return {"total": total(terms), **terms}
 
 
 def in_camera_axes(normals: Float[Tensor, "*batch 3"], camera: Camera) -> Float[Tensor, "*batch 3"]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bench.records.record import RunStatus
 from bench.shape_prior import near_surface_first
-from bench.solve.latent_code import Terms
+from bench.solve.latent_code import Terms, total
 from bench.solve.observed_view import gradients_at
 from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
 from bench.solve.pixel_draw import generator_of
@@ -212,7 +212,7 @@ class FitProblem:
             points = scatter_points(self.observations.points, EIKONAL_POINTS, generator_of(EIKONAL_SEED, step))
             norms = torch.linalg.vector_norm(gradients_at(metered, points), dim=-1)
             terms["eikonal"] = settings.eikonal_weight * (norms - 1).square().mean()
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+        return {"total": total(terms), **terms}
 
 
 @dataclass

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.solve.latent_code import Terms
+from bench.solve.latent_code import Terms, total
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, normal_error
 from bench.tasks.reconstruction.pixels import Pixels
 from renderers.boundary import render_checked
@@ -104,7 +104,7 @@ class Losses:
             terms["eikonal"] = self.eikonal * sum((slope - 1).square().sum() / max(len(slope), 1) for slope in slopes)
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+        return {"total": total(terms), **terms}
 
 
 def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:

@@ -16,6 +16,7 @@ from torch import Tensor
 from bench.machine.limits import Limits
 from bench.records.record import RunStatus
 from bench.shape_prior import Prior
+from bench.solve.latent_code import total
 from bench.solve.observed_view import ObservedView
 from bench.solve.optimise import History, OptimiserSettings, optimise
 from bench.solve.solve import check_field_gradient
@@ -169,7 +170,7 @@ class CodeFit:
         metered = Meter(self.watched, self.counts)
         of_views = [view.compare(metered, iteration) for view in self.views]
         terms = {name: torch.stack([each[name] for each in of_views]).mean() for name in of_views[0]}
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+        return {"total": total(terms), **terms}
 
     def field(self, progress: float) -> Field:
         """The fitted field after a fraction of the fit."""
