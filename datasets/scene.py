@@ -208,6 +208,7 @@ class Scene:
         to_world: the similarity from the scene's world to the world of a file; None if no file defines one.
         is_partial: whether `mesh` is an open surface: the part of an unknown shape that the view shows.
         texture: the colours of the shape; None without colours.
+        rays_per_pixel: see `datasets.views.ViewSampler`.
     """
 
     name: str
@@ -217,6 +218,7 @@ class Scene:
     to_world: Float[np.ndarray, "4 4"] | None = None
     is_partial: bool = False
     texture: Texture | None = None
+    rays_per_pixel: int = 1
 
     @cached_property
     def raycaster(self) -> Truth:
@@ -338,7 +340,8 @@ def make_scene(dataset: Dataset, views: ViewSampler, *, split: Split, index: int
         problem = f"the camera sees nothing of {dataset.name} {index}{repaired}"
         raise BadInput(f"{problem}: widen view.field_of_view or distance")
     measured = see(Truth(scanned.seen(index), closed=False), camera).depth if scanned else None
-    return Scene(scene_name(dataset, split, index), mesh, view, measured)
+    name = scene_name(dataset, split, index)
+    return Scene(name, mesh, view, measured, rays_per_pixel=views.rays_per_pixel)
 
 
 def scene_name(dataset: Dataset, split: Split, index: int) -> str:
@@ -355,6 +358,23 @@ def see(truth: Truth, camera: Camera) -> View:
     distance = torch.from_numpy(np.where(hits.hit, hits.distance, 0.0).astype(np.float32)).view(rays.shape)
     normals = torch.from_numpy(np.where(hits.hit[:, None], hits.normals, 0.0).astype(np.float32))
     return View(camera, camera.depth(distance), normals.view(*rays.shape, 3), mask)
+
+
+def see_area(
+    truth: Truth, camera: Camera, side: int = 8
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """The fraction of each pixel that a mesh covers, and its mean camera z there; 0 without any.
+
+    Args:
+        side: of the regular grid of rays in each pixel.
+    """
+    offsets = torch.cartesian_prod(*[(torch.arange(side) + 0.5) / side - 0.5] * 2)
+    rays = camera.rays(offsets.expand(camera.height, camera.width, -1, 2))
+    flat = rays.flat()
+    hits = truth.cast(flat.origins.double().numpy(), flat.directions.double().numpy())
+    hit = torch.from_numpy(hits.hit).view(rays.shape)
+    distance = torch.from_numpy(hits.distance).view(rays.shape).where(hit, 0.0)
+    return hit.float().mean(-1), (distance * camera.cosine(rays)).sum(-1) / hit.sum(-1).clamp_min(1)
 
 
 def unshaded_image(view: View, texture: Texture) -> Float[Tensor, "height width 3"]:

@@ -1,7 +1,7 @@
 """Positions of cameras, and the choice of pixels whose depth is observed."""
 
 from dataclasses import dataclass
-from math import asin, atan2, degrees, inf, nan, radians, tan
+from math import asin, atan2, degrees, inf, isqrt, nan, radians, tan
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ class ViewSampler:
         field_of_view: full angle of the image's height, in degrees.
         azimuth, elevation: least and largest angle, in degrees; azimuth 0 looks along -z, elevation 0 is level.
         resolution: height and width of the image, in pixels.
+        rays_per_pixel: a square number of rays that a loss compares in each pixel; see `bench.solve.pixel_area`.
     """
 
     distance: float
@@ -36,6 +37,7 @@ class ViewSampler:
     azimuth: tuple[float, float]
     elevation: tuple[float, float]
     resolution: int
+    rays_per_pixel: int = 1
 
     def __post_init__(self) -> None:
         check_positive("distance", self.distance, "2.5 sees the whole unit sphere at 50 degrees")
@@ -45,6 +47,8 @@ class ViewSampler:
         if not -inf < self.azimuth[0] <= self.azimuth[1] < inf:
             raise ValueError(f"azimuth must rise and be finite, in degrees, not {list(self.azimuth)}")
         check_elevation("elevation", self.elevation)
+        if self.rays_per_pixel < 1 or isqrt(self.rays_per_pixel) ** 2 != self.rays_per_pixel:
+            raise ValueError(f"view.rays_per_pixel must be 1, 4, 9, 16, ..., not {self.rays_per_pixel}")
 
     @property
     def focal_length(self) -> float:

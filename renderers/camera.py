@@ -159,10 +159,19 @@ class Camera:
         """The same camera in float64."""
         return Camera(self.intrinsics.double(), self.world_to_camera.double(), self.height, self.width)
 
-    def rays(self) -> Rays:
-        """The rays [height, width] through the pixel centres; gradients flow to both matrices."""
-        directions = torch.nn.functional.normalize(self._pixel_directions() @ self.camera_to_world[:3, :3].T, dim=-1)
-        return Rays(self.center.expand_as(directions), directions, image=True)
+    def rays(self, offsets: Float[Tensor, "height width n 2"] | None = None) -> Rays:
+        """The rays [height, width] through the pixel centres; gradients flow to both matrices.
+
+        Args:
+            offsets: of several rays [height, width, n] from the centre of their pixel, right and down, in pixels.
+        """
+        in_camera = self._pixel_directions(offsets) @ self.camera_to_world[:3, :3].T
+        directions = torch.nn.functional.normalize(in_camera, dim=-1)
+        return Rays(self.center.expand_as(directions), directions, image=offsets is None)
+
+    def cosine(self, rays: Rays) -> Float[Tensor, "*rays"]:
+        """Between rays and the camera's axis: camera z of the points at distance 1."""
+        return rays.directions @ self.world_to_camera[2, :3]
 
     def depth(self, distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
         """Camera z of the points at `distance` along each pixel's ray (DIST, Eq. 2)."""
@@ -191,13 +200,15 @@ class Camera:
         size = torch.tensor([self.width, self.height], device=points.device)
         return (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
 
-    def _pixel_directions(self) -> Float[Tensor, "height width 3"]:
-        """Camera coordinates of the pixel centres on the plane z = 1."""
+    def _pixel_directions(self, offsets: Float[Tensor, "height width n 2"] | None = None) -> Float[Tensor, "*rays 3"]:
+        """Camera coordinates of the pixel centres, or of points at offsets from them, on the plane z = 1."""
         like = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
         rows, columns = torch.meshgrid(
             torch.arange(self.height, **like) + 0.5, torch.arange(self.width, **like) + 0.5, indexing="ij"
         )
         pixels = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
+        if offsets is not None:
+            pixels = pixels[..., None, :] + torch.nn.functional.pad(offsets, (0, 1))
         return pixels @ torch.linalg.inv(self.intrinsics).T
 
 

@@ -123,10 +123,12 @@ class RayObservation:
     Args:
         mask: true on the foreground.
         distance: along each ray to the observed surface, in scene units; NaN if unknown. None if unknown on all rays.
+        covered: if the rays are several in each pixel, [*pixels, n]: the fraction of the pixel on the foreground.
     """
 
     mask: Bool[Tensor, "*rays"]
     distance: Float[Tensor, "*rays"] | None = None
+    covered: Float[Tensor, "*pixels"] | None = None
 
     def __post_init__(self) -> None:
         if self.mask.dtype != torch.bool:

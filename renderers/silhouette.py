@@ -1,4 +1,4 @@
-"""Silhouette losses: one per paper, for the rendering of any renderer, so that all renderers can use the same loss.
+"""Silhouette losses for the rendering of any renderer, so that all renderers can use the same loss.
 
 `Own` is the renderer's own loss. The other three use what every renderer returns: `hit`, `distance` and `closest`.
 Their gradient is the gradient of the renderer's `closest`; the hinge uses it only on wrong rays. On a hit,
@@ -18,7 +18,15 @@ from renderers import boundary
 from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_choice, check_positive
 from renderers.field import Field, occupancy_logits
-from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, RayObservation, Renderer, Rendering, closest_values
+from renderers.rendering import (
+    DISTANCE_CAPABILITIES,
+    Capabilities,
+    RayObservation,
+    Renderer,
+    Rendering,
+    Unsupported,
+    closest_values,
+)
 
 RANDOM, DEPTH = "random", "depth"
 OCCUPANCY_POINTS = (RANDOM, DEPTH)  # choices of `occupied_at`; see `Occupancy`
@@ -154,6 +162,33 @@ class CrossEntropy:
         entropy = softplus(torch.where(mask, -logits, logits))
         total = (entropy * ~(mask & rendering.hit)).sum()
         return self.weight * total / (self.sharpness * max(mask.numel(), 1))
+
+
+@dataclass(frozen=True)
+class Area:
+    """The mean squared difference between a pixel's opacity and the fraction of it on the foreground.
+
+    The opacity is the mean over the pixel's rays (Wang et al. 2024, Sec. 3). With one ray per pixel, the fraction is 0
+    or 1, and a renderer of surfaces has no gradient on rays inside of the outline.
+
+    Args:
+        weight: of the loss.
+    """
+
+    weight: float
+
+    def __post_init__(self) -> None:
+        check_at_least("weight", self.weight, 0, "0 switches the loss off")
+
+    def __call__(
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
+    ) -> Float[Tensor, ""]:
+        if rendering.volume is None:
+            name = type(renderer).__name__
+            raise Unsupported(f"{name} has no opacity with a gradient, which silhouette=area needs: set silhouette=own")
+        if observed.covered is None:
+            return self.weight * (rendering.opacity - observed.mask.to(rays.origins.dtype)).square().mean()
+        return self.weight * (rendering.opacity.mean(-1) - observed.covered).square().mean()
 
 
 @dataclass(frozen=True, kw_only=True)

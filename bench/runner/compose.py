@@ -36,6 +36,8 @@ from bench.tables import CONF, folders, group_choices, nearest, register_resolve
 
 NUMBER_OVERRIDE = re.compile(r"(index|seed)=(0|[1-9]\d*)")
 SETTING_TYPES = (OverrideType.CHANGE, OverrideType.FORCE_ADD)
+# Arguments with a default that no YAML has: there, they would change the hashes of all runs.
+OPTIONAL_KEYS = ("view.rays_per_pixel", "task.pixel_block", "task.optimiser.ends", "task.optimiser.start_noise")
 INDEX_OR_SEED_REFERENCE = re.compile(r"\$\{[^}]*(index|seed)")
 
 
@@ -194,8 +196,8 @@ def unknown_choice(group: str, name: str, options: Sequence[str]) -> ValueError:
 
 def unknown_key(key: str, config: DictConfig) -> ValueError:
     """The error for a key that a configuration lacks, with similar keys."""
-    if key.startswith("renderer.") and CLASS_PACKAGE_KEY in (config.get("renderer") or ()):
-        return ValueError(f"unknown key {key!r}: an argument of your class is set by +{key}=VALUE, with a plus")
+    if key in OPTIONAL_KEYS or (key.startswith("renderer.") and CLASS_PACKAGE_KEY in (config.get("renderer") or ())):
+        return ValueError(f"the YAML does not have the key {key!r}: it is set by +{key}=VALUE, with a plus")
     names = dotted_keys(config.hydra, "hydra.") if key.startswith("hydra.") else dotted_keys(config)
     return ValueError(f"unknown key {key!r}{nearest(key, names)}")
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -9,10 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bench.solve.latent_code import Terms
+from bench.solve.pixel_area import mean_depth, observation_of, random_rays
 from bench.solve.pixel_draw import PixelDraw
-from datasets.scene import View
+from datasets.scene import Scene, View, see_area
 from renderers.boundary import render_checked
-from renderers.camera import Rays
+from renderers.camera import Camera, Rays
 from renderers.field import Field, Meter
 from renderers.rendering import RayObservation, Renderer, Rendering, at_iteration
 from renderers.silhouette import SilhouetteLoss
@@ -86,7 +88,10 @@ class ViewLossSettings(Protocol):
 
 @dataclass(frozen=True)
 class ObservedView:
-    """The observations of a view, or of rays of any leading shape; `compare` renders a field and compares it."""
+    """The observations of a view, or of rays of any leading shape; `compare` renders a field and compares it.
+
+    With several rays per pixel, the rays have one more dimension than the observations, which are of pixels.
+    """
 
     settings: ViewLossSettings
     renderer: Renderer
@@ -101,6 +106,9 @@ class ObservedView:
     colours: Float[Tensor, "*rays 3"] | None = None  # of an image; NaN outside of the shape
     colour_weight: float = 0.0  # of the mean absolute error of colours; the field then has `paint`
     expected_observed: float | None = None  # of drawn rays, see `observed_hits`
+    covered: Float[Tensor, "*rays"] | None = None  # fraction of each pixel; None with one ray per pixel
+    camera: Camera | None = None  # of several rays per pixel
+    rays_at: Callable[[int], Rays] | None = None  # several rays [height, width, n] of each pixel, by iteration
 
     @staticmethod
     def of(
@@ -123,13 +131,30 @@ class ObservedView:
             mask=mask,
         ).to(device)
 
+    def with_area(self, scene: Scene, camera: Camera, seed: int) -> "ObservedView":
+        """The observations of the area of pixels, of the scene's true mesh, if the scene has several rays per pixel."""
+        if scene.rays_per_pixel == 1:
+            return self
+        device = self.depth.device
+        covered, depth = (image.to(device) for image in see_area(scene.raycaster, camera))
+        camera = camera.to(device)
+        rays_at = partial(random_rays, camera, scene.rays_per_pixel, seed)
+        area = replace(self, depth=torch.where(self.observed, depth, 0.0), covered=covered)
+        return replace(area, camera=camera, rays=rays_at(-1), rays_at=rays_at)
+
     def to(self, device: torch.device) -> "ObservedView":
         """The same observations on a device."""
         return self._map_tensors(lambda tensor: tensor.to(device))
 
     def flat(self) -> "ObservedView":
         """The same observations in one row."""
-        return self._map_tensors(lambda each: each.flat() if isinstance(each, Rays) else each.flatten(0, 1))
+        return self._map_tensors(
+            lambda each: (
+                Rays(each.origins.flatten(0, 1), each.directions.flatten(0, 1))
+                if isinstance(each, Rays)
+                else each.flatten(0, 1)
+            )
+        )
 
     def select(self, rays: Int[Tensor, " n"]) -> "ObservedView":
         """The observations of the rays with these indices, for rays in one row."""
@@ -142,17 +167,21 @@ class ObservedView:
     def compare_drawn(self, draw: PixelDraw, field: Field, iteration: int) -> Terms:
         """The terms of `compare`, of the pixels that an iteration draws."""
         pixels = draw.pixels(iteration)
-        drawn = self if pixels is None else self.flat().drawn(pixels.to(self.observed.device))
+        view = self if self.rays_at is None else replace(self, rays=self.rays_at(iteration))
+        drawn = view if pixels is None else view.flat().drawn(pixels.to(self.observed.device))
         return drawn.compare(field, iteration)
 
     def compare(self, field: Field, iteration: int) -> Terms:
         """The weighted loss terms of DIST, Eq. 5."""
         renderer = at_iteration(self.renderer, iteration)
         rendering = render_checked(renderer, field, self.rays)
-        compared = self.observed & rendering.hit
-        depth = rendering.distance * self.depth_per_distance
+        if self.camera is None:
+            depth, hit = rendering.distance * self.depth_per_distance, rendering.hit
+        else:
+            depth, hit = mean_depth(rendering, self.camera.cosine(self.rays))
+        compared = self.observed & hit
         error = depth_error(self.settings.depth_loss, depth, self.depth, self.depth_per_distance)
-        count = observed_hits(rendering.hit, self.observed, self.expected_observed)
+        count = observed_hits(hit, self.observed, self.expected_observed)
         terms = {"depth": self.settings.depth_weight * (error * compared).sum() / count}
         if self.normals is not None:
             gradients = central_differences(field, rendering.points[compared], self.normal_width)
@@ -162,9 +191,12 @@ class ObservedView:
             terms["colour"] = self.colour_weight * self._colour_error(field, rendering)
         if self.mask is not None:
             distance = torch.where(self.observed, self.depth / self.depth_per_distance, torch.nan)
-            silhouette = self.settings.silhouette(
-                renderer, field, self.rays, rendering, RayObservation(self.mask, distance)
+            observed = (
+                RayObservation(self.mask, distance)
+                if self.covered is None
+                else observation_of(self.covered, distance, rendering)
             )
+            silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, observed)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
 
@@ -177,5 +209,5 @@ class ObservedView:
 
     def _map_tensors(self, change: Callable[[Any], Any]) -> "ObservedView":
         """Applies a function to the rays and to each tensor that is not None."""
-        names = ("rays", "depth", "depth_per_distance", "observed", "mask", "normals", "colours")
+        names = ("rays", "depth", "depth_per_distance", "observed", "mask", "normals", "colours", "covered")
         return replace(self, **{name: change(tensor) for name in names if (tensor := getattr(self, name)) is not None})

@@ -70,6 +70,8 @@ class Completion:
 
     takes_field: ClassVar[bool] = True
     takes_one_view: ClassVar[bool] = True
+    takes_rays_per_pixel: ClassVar[bool] = True
+    problem_class: ClassVar[type[CodeProblem]] = CodeProblem
 
     def __post_init__(self) -> None:
         parse_amount(self.points)
@@ -87,6 +89,13 @@ class Completion:
         """Raises BadInput if the settings need a prior, or one with colours, and there is none."""
         if inputs.field.of_prior:
             inputs.check_prior()
+        if inputs.views.rays_per_pixel > 1 and (
+            self.normal_weight or self.colour_weight or not inputs.field.of_prior or isinstance(inputs.dataset, OneView)
+        ):
+            raise BadInput(
+                "several rays per pixel compare depths and masks of a true mesh by field=prior: remove "
+                "view.rays_per_pixel, or set task.normal_weight=0 task.colour_weight=0 field=prior"
+            )
         if self.colour_weight and not (inputs.prior_choice.coloured and inputs.field.of_prior):
             raise BadInput("task.colour_weight needs codes of shape and colour: set prior=textured field=prior")
         if self.colour_weight and (self.similarity or isinstance(inputs.dataset, OneView)):
@@ -121,8 +130,10 @@ class Completion:
         holds_out, last = self.optimiser.ends == HELD_OUT, self.optimiser.iterations
         draw = PixelDraw(observed_view.observed, self.pixel_block, scene.seed(seed), holds_out=holds_out)
         compare = partial(observed_view.compare_drawn, draw)
-        problem = partial(CodeProblem, prior, self.code, compare, compared, 1, device, draw=draw)
-        if holds_out or self.pixel_block > 1:
+        problem = partial(
+            self.problem_class, prior, self.code, compare, compared, scene.rays_per_pixel, device, draw=draw
+        )
+        if holds_out or self.pixel_block > 1 or scene.rays_per_pixel > 1:
             problem = partial(problem, progress_measure=lambda field: float(total(observed_view.compare(field, last))))
         if holds_out:
             held_out = observed_view.flat().drawn(draw.held_out.to(device))
@@ -145,4 +156,4 @@ class Completion:
         if self.colour_weight:
             image = unshaded_image(view, scene.texture).where(view.mask[..., None], torch.nan)
             observed_view = replace(observed_view, colours=image.to(device), colour_weight=self.colour_weight)
-        return observed_view
+        return observed_view.with_area(scene, view.camera, scene.seed(seed))

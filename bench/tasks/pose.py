@@ -31,12 +31,13 @@ from bench.solve.observed_view import (
     observed_hits,
 )
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
+from bench.solve.pixel_area import mean_depth, observation_of, random_rays
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import solve_and_draw
-from datasets.scene import Scene, View, see
+from datasets.scene import Scene, View, see, see_area
 from renderers.boundary import render_checked
-from renderers.camera import Camera
-from renderers.checks import check_at_least, check_choice, check_positive
+from renderers.camera import Camera, Rays
+from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
 from renderers.rendering import RayObservation, Renderer, Unsupported, at_iteration
@@ -148,6 +149,8 @@ class Pose(PoseTask):
     optimiser: OptimiserSettings
     pixel_block: int = 1
 
+    takes_rays_per_pixel: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_at_least("task.pixel_block", self.pixel_block, 0, "2 compares a quarter of the pixels")
         check_choice("task.depth_loss", self.depth_loss, DEPTH_LOSSES)
@@ -160,6 +163,8 @@ class Pose(PoseTask):
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput if the known shape should be a network, but none was fitted to it."""
+        if inputs.views.rays_per_pixel > 1 and self.normal_weight:
+            raise BadInput("normals are compared with one ray per pixel: set task.normal_weight=0")
         if self.shape == "prior":
             inputs.check_fitted()
 
@@ -178,7 +183,10 @@ class Pose(PoseTask):
 
         def problem() -> PoseProblem:
             args = inputs.renderer, shape_field, view, cameras, inputs.device, inputs.scene.seed(inputs.seed)
-            return with_affordable_rays(self, lambda task: PoseProblem(task, *args))
+            several = inputs.scene.rays_per_pixel > 1
+            area = see_area(inputs.scene.raycaster, view.camera) if several else None
+            more = {"rays_per_pixel": inputs.scene.rays_per_pixel, "area": area}
+            return with_affordable_rays(self, lambda task: PoseProblem(task, *args, **more))
 
         solve_and_draw(problem, self.optimiser, run, MESH_VIEW_DEFINITIONS | RENDERER_DEFINITIONS)
 
@@ -208,6 +216,8 @@ class PoseProblem:
     cameras: list[Camera]  # one per start
     device: torch.device
     seed: int = 0
+    rays_per_pixel: int = 1
+    area: tuple[Tensor, Tensor] | None = None  # of several rays per pixel, see `datasets.scene.see_area`
     counts: Counts = field(default_factory=Counts)
 
     tracked: ClassVar[tuple[str, ...]] = TRACKED
@@ -219,7 +229,11 @@ class PoseProblem:
         self.depth, self.observed = self.view.depth.to(self.device), self.view.mask.to(self.device)
         self.depth_per_distance = self.cameras[0].depth(torch.ones_like(self.depth))  # all starts have its lens
         self.draw = PixelDraw(self.observed, self.settings.pixel_block, self.seed)
-        self.rays_per_iteration = self.draw.per_iteration
+        self.rays_per_iteration = self.draw.per_iteration * self.rays_per_pixel
+        self.covered = self.observed.to(self.depth.dtype)
+        if self.area is not None:
+            self.covered, depth = (image.to(self.device) for image in self.area)
+            self.depth = torch.where(self.observed, depth, 0.0)
         self.normals = in_camera_axes(self.view.normals.to(self.device), self.view.camera.to(self.device))
 
     def field(self) -> Field:
@@ -229,7 +243,7 @@ class PoseProblem:
     @torch.no_grad()
     def objective(self) -> float | None:
         """The loss of all pixels, not counted as cost; None if each iteration has them and its loss is comparable."""
-        if self.settings.pixel_block == 1:
+        if self.settings.pixel_block == 1 and self.rays_per_pixel == 1:
             return None
         return float(self._compare(self.shape_field, self.settings.optimiser.iterations, self.starts.best())["total"])
 
@@ -256,19 +270,25 @@ class PoseProblem:
     def _compare(self, shape: Field, step: int, start: int, pixels: Tensor | None = None) -> dict[str, Tensor]:
         """The weighted terms of a start at the pixels [n] of an image by rows, or at all, and their sum."""
         camera = self.cameras[start].with_object_moved(self.parameters[start])
-        renderer, rays = at_iteration(self.renderer, step), camera.rays()
-        observations = self.depth, self.depth_per_distance, self.observed, self.normals
+        renderer, rays = at_iteration(self.renderer, step), random_rays(camera, self.rays_per_pixel, self.seed, step)
+        observations = self.depth, self.depth_per_distance, self.observed, self.normals, self.covered
         if pixels is not None:
-            rays = rays.flat()[pixels.to(self.device)]
-            observations = [tensor.flatten(0, 1)[pixels.to(self.device)] for tensor in observations]
-        depth, depth_per_distance, observed, normals = observations
+            pixels = pixels.to(self.device)
+            rays = Rays(rays.origins.flatten(0, 1)[pixels], rays.directions.flatten(0, 1)[pixels])
+            observations = [tensor.flatten(0, 1)[pixels] for tensor in observations]
+        depth, depth_per_distance, observed, normals, covered = observations
         rendering = render_checked(renderer, shape, rays)
-        compared = observed & rendering.hit
+        distance = torch.where(observed, depth / depth_per_distance, torch.nan)
+        if self.area is None:
+            rendered, hit = rendering.distance * depth_per_distance, rendering.hit
+            observation = RayObservation(observed, distance)
+        else:
+            rendered, hit = mean_depth(rendering, camera.cosine(rays))
+            observation = observation_of(covered, distance, rendering)
+        compared = observed & hit
         expected = None if pixels is None else expected_in_draw(self.observed, len(pixels))
-        count = observed_hits(rendering.hit, observed, expected)
-        rendered = rendering.distance * depth_per_distance
+        count = observed_hits(hit, observed, expected)
         error = depth_error(self.settings.depth_loss, rendered, depth, depth_per_distance)
-        observation = RayObservation(observed, torch.where(observed, depth / depth_per_distance, torch.nan))
         silhouette = self.settings.silhouette(renderer, shape, rays, rendering, observation)
         terms = {
             "depth": self.settings.depth_weight * (error * compared).sum() / count,

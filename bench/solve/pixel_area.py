@@ -1,0 +1,50 @@
+"""Several rays per pixel: random rays in its area, and what they predict of the pixel."""
+
+from math import isqrt
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bench.solve.pixel_draw import generator_of
+from renderers.camera import Camera, Rays
+from renderers.rendering import RayObservation, Rendering
+
+SEED_OF_RAYS = 7  # added to seeds, so that the rays of pixels do not follow the draw of the pixels
+
+
+def random_rays(camera: Camera, count: int, seed: int, iteration: int) -> Rays:
+    """The rays of an iteration: of each pixel, a random one in each of `count` equal squares; with 1, its centre's.
+
+    Their shape is [height, width, count], with 1 [height, width].
+    """
+    if count == 1:
+        return camera.rays()
+    side, shape = isqrt(count), (camera.height, camera.width, count, 2)
+    corner = torch.cartesian_prod(torch.arange(side), torch.arange(side))
+    inside = torch.rand(shape, generator=generator_of(seed + SEED_OF_RAYS, iteration))
+    return camera.rays(((corner + inside) / side - 0.5).to(camera.intrinsics))
+
+
+def mean_depth(
+    rendering: Rendering, cosine: Float[Tensor, "*pixels rays"]
+) -> tuple[Float[Tensor, "*pixels"], Bool[Tensor, "*pixels"]]:
+    """The mean camera z of each pixel's hits, and whether it has any."""
+    count = rendering.hit.sum(-1)
+    return (rendering.distance * cosine * rendering.hit).sum(-1) / count.clamp_min(1), count > 0
+
+
+def observation_of(
+    covered: Float[Tensor, "*pixels"], distance: Float[Tensor, "*pixels"], rendering: Rendering
+) -> RayObservation:
+    """The observation of each ray [*pixels, rays] that changes fewest rays.
+
+    Losses of single rays need a mask. In a pixel that is covered by a fraction k of n rays, the foreground is the k
+    rays whose `closest` is smallest. Rays that hit are the first of them, so that the mask has no wrong ray if the
+    right number hits.
+    """
+    rays = rendering.closest.shape[-1]
+    order = torch.where(rendering.hit, -torch.inf, rendering.closest.detach())
+    rank = order.argsort(-1).argsort(-1)
+    mask = rank < (covered * rays).round()[..., None]
+    return RayObservation(mask, distance[..., None].expand_as(mask), covered)

@@ -1,0 +1,102 @@
+"""Several rays per pixel: where they lie, what is observed of a pixel, and the gradient of the covered area."""
+
+from math import pi, sqrt
+
+import pytest
+import torch
+import trimesh
+
+from bench.config import load
+from bench.solve.pixel_area import mean_depth, observation_of, random_rays
+from datasets.mesh import Mesh
+from datasets.scene import Truth, see_area
+from renderers.fields.analytic import sphere
+from renderers.rendering import RayObservation, Unsupported
+from renderers.silhouette import Area
+from tests.looped import each
+from tests.tiny import camera_of
+
+RADIUS = 0.5
+CAMERA = camera_of(24, field_of_view=40.0)
+DISTANCE = float(CAMERA.center.norm())
+
+
+def true_area(radius: float) -> float:
+    """The area of a sphere's outline in pixels, for a camera that looks at its centre."""
+    focal = CAMERA.intrinsics[0, 0].item()
+    return pi * (focal * radius / sqrt(DISTANCE**2 - radius**2)) ** 2
+
+
+@each("count", [4, 16])
+def test_a_ray_lies_in_each_square_of_each_pixel_and_moves_with_the_iteration(count):
+    rays, side = random_rays(CAMERA, count, 3, 0), round(sqrt(count))
+    pixels, _ = CAMERA.project(rays.at(torch.ones(rays.shape)))
+    rows, columns = torch.meshgrid(torch.arange(24), torch.arange(24), indexing="ij")
+    corner = torch.stack([columns, rows], dim=-1)[:, :, None]
+    cells = ((pixels - corner) * side).clamp(0, side - 1e-4).floor().long()
+    assert float((pixels - corner).min()) > -1e-3 and float((pixels - corner).max()) < 1 + 1e-3
+    assert ((cells[..., 0] * side + cells[..., 1]).sort(-1).values == torch.arange(count)).float().mean() > 0.999
+    assert torch.equal(rays.directions, random_rays(CAMERA, count, 3, 0).directions)
+    assert not torch.equal(rays.directions, random_rays(CAMERA, count, 3, 1).directions)
+
+
+def test_true_fractions_sum_to_the_area_of_a_sphere_and_depths_are_of_the_covered_part():
+    ball = trimesh.creation.icosphere(5, RADIUS)
+    covered, depth = see_area(Truth(Mesh(ball.vertices, ball.faces)), CAMERA)
+    assert float(covered.sum()) == pytest.approx(true_area(RADIUS), rel=0.01)
+    assert ((covered > 0) & (covered < 1)).any()
+    assert (depth[covered > 0] > DISTANCE - RADIUS - 1e-3).all() and (depth[covered > 0] < DISTANCE).all()
+    assert (depth[covered == 0] == 0).all()
+
+
+def test_a_mask_of_single_rays_changes_as_few_rays_as_the_fraction_allows():
+    rays = random_rays(CAMERA, 16, 0, 0)
+    rendering = load("renderer", "dist").render(sphere(RADIUS), rays)
+    share = rendering.hit.float().mean(-1)
+    right = observation_of(share, torch.zeros(24, 24), rendering)
+    assert torch.equal(right.mask, rendering.hit)
+    more = observation_of((share + 2 / 16).clamp_max(1), torch.zeros(24, 24), rendering).mask
+    assert (more | ~rendering.hit).all()  # no hit is taken away
+    added = more & ~rendering.hit
+    left = ~more
+    nearest = torch.where(added, rendering.closest, -torch.inf).amax(-1)
+    assert (nearest <= torch.where(left, rendering.closest, torch.inf).amin(-1)).all()
+
+
+@each("name", ["relaxed_boundary", "neus"])
+def test_the_gradient_of_the_area_is_that_of_the_outline_with_16_rays(name):
+    renderer = load("renderer", name).with_blur(0.02)
+    radius = torch.tensor(RADIUS, requires_grad=True)
+    slopes = []
+    for iteration in range(4):
+        rays = random_rays(CAMERA, 16, 0, iteration)
+        opacity = renderer.render(sphere(radius), rays).opacity.mean(-1)
+        slopes.append(torch.autograd.grad(opacity.sum(), radius)[0])
+    expected = (true_area(RADIUS + 1e-3) - true_area(RADIUS - 1e-3)) / 2e-3
+    assert float(torch.stack(slopes).mean()) == pytest.approx(expected, rel=0.1)
+
+
+def test_the_area_loss_falls_to_zero_at_the_true_fraction_and_needs_an_opacity():
+    rays = random_rays(CAMERA, 4, 0, 0)
+    rendering = load("renderer", "relaxed_boundary").render(sphere(RADIUS), rays)
+    covered = rendering.hit.float().mean(-1)
+    observed = RayObservation(rendering.hit, None, covered)
+    loss = Area(2.0)(load("renderer", "relaxed_boundary"), sphere(RADIUS), rays, rendering, observed)
+    assert float(loss) == pytest.approx(0, abs=1e-12)
+    wrong = RayObservation(rendering.hit, None, covered + 0.5)
+    assert float(
+        Area(2.0)(load("renderer", "relaxed_boundary"), sphere(RADIUS), rays, rendering, wrong)
+    ) == pytest.approx(0.5)
+    dist = load("renderer", "dist")
+    with pytest.raises(Unsupported, match="DIST has no opacity"):
+        Area(1.0)(dist, sphere(RADIUS), rays, dist.render(sphere(RADIUS), rays), observed)
+
+
+def test_a_pixels_depth_is_the_mean_of_its_hits():
+    rays = random_rays(CAMERA, 4, 0, 0)
+    rendering = load("renderer", "dist").render(sphere(RADIUS), rays)
+    depth, hit = mean_depth(rendering, CAMERA.cosine(rays))
+    pixel = (rendering.hit.sum(-1) == 3).nonzero()[0]
+    expected = CAMERA.project(rendering.points[tuple(pixel)])[1][rendering.hit[tuple(pixel)]].mean()
+    assert float(depth[tuple(pixel)]) == pytest.approx(float(expected), rel=1e-5)
+    assert torch.equal(hit, rendering.hit.any(-1))
