@@ -1,4 +1,7 @@
-"""Runs the cells of a sweep on a cluster: in Slurm jobs of several runs each, or by Ray; see conf/hydra/launcher."""
+"""Runs the cells of a sweep in worker processes, in Slurm jobs of several runs each, or by Ray.
+
+conf/hydra/launcher has their settings.
+"""
 
 import os
 import signal
@@ -6,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from math import ceil, inf
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from shutil import which
 from statistics import median
@@ -14,9 +19,10 @@ from typing import Any, ClassVar
 from bench.records.format import plural
 from bench.records.record import CONCURRENT_RUNS_VARIABLE
 from bench.records.results import Plan, PlannedRun
+from bench.runner.durations import duration_group, durations_of_similar_runs
 from bench.runner.executors import Jobs, Launcher, Make, Messages
-from bench.runner.plan import duration_group, durations_of_similar_runs
-from bench.runner.process import catch_signals, stop_signal
+from bench.runner.messages import exit_with_parent
+from bench.runner.process import WORKER, catch_signals, signals_delayed, stop_signal, warm_up
 
 CLUSTERS = ("slurm", "local")
 POSITIVE_KEYS = ("minutes_per_job", "minutes_per_run", "array_size", "tasks_per_node", "timeout_min")
@@ -27,6 +33,57 @@ OUR_SETTINGS = (
 COMMON_SETTINGS = (
     *("timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes", "name", "stderr_to_stdout"),
 )
+
+
+class Workers(Launcher):
+    """Runs cells in processes of this machine, each one cell at a time."""
+
+    def run(self, make: Make, jobs: Jobs) -> Messages:
+        cells = [*chain.from_iterable(jobs)]
+        remaining = iter(cells)
+        workers = dict(_start_worker(make) for _ in range(min(self.concurrency, len(cells))))
+        try:
+            for channel in workers:
+                channel.send(next(remaining))
+            while workers:
+                for channel in wait([*workers]):
+                    assert isinstance(channel, Connection)
+                    try:
+                        yield channel.recv()
+                        channel.send(next(remaining, None))
+                    except (EOFError, ConnectionError):  # the worker has received None, or is lost
+                        process = workers.pop(channel)
+                        process.join()
+                        if process.exitcode:
+                            raise RuntimeError(f"a worker ended with exit status {process.exitcode}") from None
+        finally:
+            for process in workers.values():
+                process.terminate()
+            for process in workers.values():
+                process.join()
+
+
+def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
+    """Starts a worker from the server of processes; returns the connection to it, and its process."""
+    context = warm_up()
+    parent_end, child_end = context.Pipe()
+    process = context.Process(target=_worker_main, args=(make, child_end), name=WORKER)
+    with signals_delayed():
+        process.start()
+        child_end.close()
+    return parent_end, process
+
+
+def _worker_main(make: Make, channel: Connection) -> None:
+    """Runs the cells that the channel sends, until it sends None or a signal comes."""
+    catch_signals()
+    exit_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent passes it on
+    try:
+        while (cell := channel.recv()) is not None:
+            channel.send(make(cell))
+    except (KeyboardInterrupt, EOFError):
+        return
 
 
 class Slurm(Launcher):

@@ -35,7 +35,7 @@ COMMANDS = (
 # Three layers: a file imports only from its layer and the layers below. Files that are not listed are the core.
 DATA_LAYER = (
     "datasets.files", "renderers.fields.networks", "renderers.fields.parts", "renderers.fields.textured",
-    "bench.clusters", "bench.exports",
+    "bench.clusters", "bench.exports", "bench.runner.durations",
 )  # fmt: skip
 STUDIES_LAYER = (
     "bench.report", "bench.studies", "bench.pictures", "renderers.later", "renderers.newton",

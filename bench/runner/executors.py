@@ -1,15 +1,12 @@
-"""Runs the cells of a sweep by `hydra/launcher`: in this process or in local workers; see also `clusters`."""
+"""Runs the cells of a sweep by `hydra/launcher`, by default in this process; `clusters` has other launchers."""
 
 import os
-import signal
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from typing import Any, ClassVar
 
 from omegaconf import DictConfig, OmegaConf
@@ -17,8 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.config import find_class
 from bench.progress import notice
 from bench.records.results import Plan, PlannedRun
-from bench.runner.messages import exit_with_parent
-from bench.runner.process import WORKER, catch_signals, raise_if_stopped, signals_delayed, warm_up
+from bench.runner.process import raise_if_stopped
 from bench.tables import names
 from datasets.extras import install_command
 
@@ -139,54 +135,3 @@ class InTurn(Launcher):
 
     def run(self, make: Make, jobs: Jobs) -> Messages:
         return run_in_turn(make, chain.from_iterable(jobs))
-
-
-class Workers(Launcher):
-    """Runs cells in processes of this machine, each one cell at a time."""
-
-    def run(self, make: Make, jobs: Jobs) -> Messages:
-        cells = [*chain.from_iterable(jobs)]
-        remaining = iter(cells)
-        workers = dict(_start_worker(make) for _ in range(min(self.concurrency, len(cells))))
-        try:
-            for channel in workers:
-                channel.send(next(remaining))
-            while workers:
-                for channel in wait([*workers]):
-                    assert isinstance(channel, Connection)
-                    try:
-                        yield channel.recv()
-                        channel.send(next(remaining, None))
-                    except (EOFError, ConnectionError):  # the worker has received None, or is lost
-                        process = workers.pop(channel)
-                        process.join()
-                        if process.exitcode:
-                            raise RuntimeError(f"a worker ended with exit status {process.exitcode}") from None
-        finally:
-            for process in workers.values():
-                process.terminate()
-            for process in workers.values():
-                process.join()
-
-
-def _start_worker(make: Make) -> tuple[Connection, BaseProcess]:
-    """Starts a worker from the server of processes; returns the connection to it, and its process."""
-    context = warm_up()
-    parent_end, child_end = context.Pipe()
-    process = context.Process(target=_worker_main, args=(make, child_end), name=WORKER)
-    with signals_delayed():
-        process.start()
-        child_end.close()
-    return parent_end, process
-
-
-def _worker_main(make: Make, channel: Connection) -> None:
-    """Runs the cells that the channel sends, until it sends None or a signal comes."""
-    catch_signals()
-    exit_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent passes it on
-    try:
-        while (cell := channel.recv()) is not None:
-            channel.send(make(cell))
-    except (KeyboardInterrupt, EOFError):
-        return

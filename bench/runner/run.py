@@ -8,13 +8,13 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from bench.config import Isolation, build
+from bench.config import Isolation, build, extension
 from bench.progress import run_progress
 from bench.records.folder import code_hash, config_hash, free_reserve, locked_folder
 from bench.records.record import Record, RunStatus, append_to_log, now, read_record, write_text
 from bench.records.results import Plan, PlannedRun, ended_record
 from bench.runner.messages import Interrupted, reason_of, write_error_message
-from bench.runner.plan import refusal_reasons, reused_ids, show_plan
+from bench.runner.plan import refusal_reasons, reused_ids
 from bench.runner.process import RunInProgress, run_isolated, signals_delayed, stopped_by
 from bench.runner.summary import log_lines, print_run_summary
 from bench.trackers import Nothing, Tracker
@@ -44,7 +44,7 @@ def run_one(run: PlannedRun) -> str:
         if not reused and (reason := refusal_reasons([config])[0]):
             raise ValueError(reason)
     if config["plan"]:
-        show_plan(Plan("", Path(config["results_dir"]), [run]), reused, 1)
+        extension("show_plan")(Plan("", Path(config["results_dir"]), [run]), reused, 1)
         return RunStatus.OK
     try:
         record = make_or_reuse(run)

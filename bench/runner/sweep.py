@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from bench.config import Isolation
+from bench.config import Isolation, extension
 from bench.progress import display, notice
 from bench.records.format import number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
@@ -19,7 +19,7 @@ from bench.records.results import Plan, PlannedRun
 from bench.runner.compose import Composer
 from bench.runner.executors import Launcher, execute, launcher_of, print_errors, run_in_turn
 from bench.runner.messages import Interrupted, reason_of
-from bench.runner.plan import check_plan, plan_of, reused_ids, show_plan
+from bench.runner.plan import check_plan, plan_of, reused_ids
 from bench.runner.process import stopped_by, warm_up
 from bench.runner.run import run_cell
 
@@ -81,7 +81,7 @@ def _print_partial_overrides(overrides: list[str], plan: Plan) -> None:
 def _print_plan(plan: Plan, reused: set[str], launcher: Launcher) -> None:
     """Prints the cells, and the number of jobs if the launcher has jobs."""
     jobs = launcher.jobs(plan, reused)
-    show_plan(plan, reused, min(launcher.concurrency, len(jobs) * launcher.runs_per_job))
+    extension("show_plan")(plan, reused, min(launcher.concurrency, len(jobs) * launcher.runs_per_job))
     if jobs and (text := launcher.describe(jobs)):
         print(text)
 

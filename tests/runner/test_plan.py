@@ -12,17 +12,12 @@ from bench.records import shipped
 from bench.records.folder import code_hash, config_hash, planned_run, resolve_config
 from bench.records.record import Record, RunStatus
 from bench.records.results import Plan, PlannedRun
-from bench.runner import plan as plan_module
+from bench.runner import durations as durations_module
 from bench.runner import run as run_module
 from bench.runner import sweep
 from bench.runner.compose import Composer, composing, without_hydra
-from bench.runner.plan import (
-    check_plan,
-    duration_group,
-    durations_of_similar_runs,
-    refusal_reason,
-    refusal_reasons,
-)
+from bench.runner.durations import duration_group, durations_of_similar_runs
+from bench.runner.plan import check_plan, refusal_reason, refusal_reasons
 from bench.train import main as train_main
 from tests import tiny
 from tests.composing import cells_of
@@ -50,7 +45,7 @@ def results(tmp_path, monkeypatch) -> Path:
 def planned(results: Path, *arguments: str) -> list[PlannedRun]:
     plans = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "show_plan", lambda plan, *_: plans.append(plan))
+        patch.setattr(durations_module, "show_plan", lambda plan, *_: plans.append(plan))
         assert command(*(arguments or SWEEP), "plan=true", f"results_dir={results}").code == 0
     return plans[0].cells
 
@@ -199,9 +194,9 @@ def times_of(tmp_path, monkeypatch):
         for number, record in enumerate(runs):
             named = [record["task"], record["renderer"], "sofa", record["method"].replace("/", "_")]
             folders["-".join([*filter(None, named), f"{number:012x}"])] = record
-        monkeypatch.setattr(plan_module, "run_folders", lambda _: [tmp_path / name for name in folders])
+        monkeypatch.setattr(durations_module, "run_folders", lambda _: [tmp_path / name for name in folders])
         monkeypatch.setattr(
-            plan_module, "read_run", lambda folder, _: (read.append(folder), (folders[folder.name], ""))[1]
+            durations_module, "read_run", lambda folder, _: (read.append(folder), (folders[folder.name], ""))[1]
         )
         record = run(**like)
         cells = [PlannedRun("c", [], record["task"], record["renderer"], "sofa", 0, record["config"], record["method"])]
@@ -226,14 +221,14 @@ def test_similar_runs_have_the_same_task_renderer_and_scale_and_ended_by_themsel
 
 def test_a_plan_names_the_file_of_a_dataset(tmp_path, capsys):
     cell = PlannedRun("c", [], "ablation", "dist", "module", 0, {"dataset": {"path": "mine/net.pth"}})
-    plan_module.show_plan(Plan("p", tmp_path, [cell]), {"c"}, 1)
+    durations_module.show_plan(Plan("p", tmp_path, [cell]), {"c"}, 1)
     assert "ablation, dist, module net.pth  reused" in capsys.readouterr().out
 
 
 def test_only_some_of_many_similar_runs_are_read(times_of):
     many = [run(1.0, scale="desk")] * 50 + [run(2.0)] * 200
-    assert times_of(many) == ([2.0] * plan_module.MAX_SIMILAR_RUNS, 50 + plan_module.MAX_SIMILAR_RUNS)
-    assert times_of([run(1.0, scale="desk")] * 900) == ([], plan_module.MAX_RECORDS_READ)
+    assert times_of(many) == ([2.0] * durations_module.MAX_SIMILAR_RUNS, 50 + durations_module.MAX_SIMILAR_RUNS)
+    assert times_of([run(1.0, scale="desk")] * 900) == ([], durations_module.MAX_RECORDS_READ)
 
 
 def test_a_sweep_of_priors_has_no_plan_and_a_prior_is_of_the_dataset_in_the_command(tmp_path):

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from bench.clusters import Workers
 from bench.records.record import Record, RunStatus
 from bench.records.results import RESULTS, Plan
 from bench.runner import sweep
-from bench.runner.executors import Workers
 from bench.runner.summary import log_lines, print_run_summary, print_sweep_summary
 from tests.looped import each
 from tests.runner.driving import ROOT, planned
