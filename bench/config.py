@@ -14,7 +14,8 @@ from typing import Any, Protocol, Union, cast, get_args, get_origin, get_type_hi
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.tables import CONF, LABEL_KEY, LOOK_KEY, ROWS_KEY, choice, names, nearest, read_yaml, register_resolvers
+from bench.tables import LABEL_KEY, LOOK_KEY, ROWS_KEY, choice, extensions, names, nearest, register_resolvers
+from bench.tables import extension as extension
 
 MIN_VALUES = {
     **{"seed": 0, "index": 0, "draw": 0, "threads": 1, "evaluation.grid": 8, "evaluation.points": 1},
@@ -281,17 +282,6 @@ def _role_fault(cls: type, role: type) -> str:
 def class_of_node(name: str) -> str:
     """The class of a node without a `_target_`; empty if it needs one."""
     return CLASS_OF_NODE.get(name) or extensions().get(name, "")
-
-
-def extensions() -> dict[str, str]:
-    """The classes and functions of the layers above the core by their purpose: conf/extensions.yaml."""
-    return read_yaml(CONF / "extensions.yaml")
-
-
-def extension(purpose: str) -> Any:
-    """A class or function of `extensions`, imported at its use."""
-    module, _, name = extensions()[purpose].rpartition(".")
-    return getattr(import_module(module), name)
 
 
 def build_once(nodes: Mapping[str, Any], packages: Sequence[str], built: dict[str, Any]) -> list[Any]:

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bench.evaluate.distances import measure_distances, surface_protocol
-from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, cloud_metrics, subsample, surface_metrics
+from bench.evaluate.distances import cloud_metrics, measure_distances, subsample, surface_protocol
+from bench.evaluate.evaluate import DEFINITIONS, WORST_SURFACE, surface_metrics
 from bench.pictures.distances import draw_distances
 from bench.records.read import is_plain_name
 from bench.records.record import Record, RunStatus, digest, now, read_record

@@ -19,10 +19,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from bench.config import build, extensions
+from bench.config import build
 from bench.machine.environment import describe
 from bench.progress import Report, notice
 from bench.records.record import digest, file_lock, to_json, write_text
+from bench.tables import extension, extensions
 from datasets.mesh import Mesh
 from datasets.scene import Dataset, Split, Truth, sample_surface
 from renderers.checks import check_at_least, check_positive
@@ -31,10 +32,8 @@ from renderers.fields.mlp import Decoder
 
 SHIPPED = Path(__file__).resolve().parents[1] / "datasets" / "priors"
 VERSION = 1  # raise it when training changes, so that no prior of the old training is used for a new one
-VALIDATION_SHAPES = 8  # a new prior is evaluated on so many
 NEAR_SAMPLE_STD, FAR_SAMPLE_STD = 0.01, 0.08  # scene units, from the surface: of half and of a third of the samples
 SAMPLE_SPHERE_RADIUS = 1.1  # scene units: the other samples fill this sphere; rays start on the unit sphere
-EVALUATED_DISTANCE = 0.02  # scene units: a prior is evaluated at samples this close to the surface
 
 
 @dataclass(frozen=True)
@@ -212,43 +211,6 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
     return Prior(decoder.cpu().requires_grad_(False), codes.detach().cpu())
 
 
-def fit_error(decoder: LatentDecoder, samples: DistanceSamples, truncation: float | None, *, steps: int = 200) -> float:
-    """The `surface_error` with codes fitted to the samples from zero.
-
-    Args:
-        decoder: is not changed.
-        samples: of training or other shapes.
-        truncation: see `PriorSettings`.
-        steps: of Adam, with a rate that falls to zero; 0 evaluates the mean shape.
-    """
-    shapes, count = samples.distances.shape
-    codes = torch.zeros(shapes, decoder.code_length, requires_grad=True)
-    optimiser = torch.optim.Adam([codes], lr=1e-2)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1))
-    rows = torch.arange(shapes)[:, None]
-    for _ in range(steps):
-        indices = torch.randint(count, (shapes, min(count, 256)))
-        field = truncated(decoder.at(codes)(samples.points[rows, indices]), truncation)
-        error = (field - truncated(samples.distances[rows, indices], truncation)).abs()
-        optimiser.zero_grad()
-        error.mean().backward()
-        optimiser.step()
-        schedule.step()
-    return surface_error(decoder, codes, samples)
-
-
-@torch.no_grad()
-def surface_error(
-    decoder: LatentDecoder, codes: Float[Tensor, "shapes code_length"], samples: DistanceSamples
-) -> float:
-    """Mean error of the distance within `EVALUATED_DISTANCE` of the surface, in scene units, at given codes."""
-    errors = []
-    for code, points, distances in zip(codes, samples.points, samples.distances, strict=True):
-        close = distances.abs() < EVALUATED_DISTANCE
-        errors.append((decoder.at(code)(points[close]) - distances[close]).abs())
-    return torch.cat(errors).mean().item()
-
-
 @torch.no_grad()
 def initialise_to_sphere(decoder: Decoder, radius: float) -> None:
     """Sets the weights so that the field is near the distance of a sphere (SAL, Atzmon and Lipman 2020)."""
@@ -321,7 +283,7 @@ def make_prior(dataset: Dataset, settings: PriorSettings, folder: Path, device: 
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": {"sampling": sampled - started, "training": trained - sampled},
         "parameters": sum(p.numel() for p in prior.decoder.parameters()),
-        "surface_error": _surface_errors(prior, dataset, samples, settings, progress),
+        "surface_error": extension("prior_errors")(prior, dataset, samples, settings, progress),
         "probe": probe(dataset),
         "environment": describe(device),
     }
@@ -355,22 +317,3 @@ def probe(dataset: Dataset) -> list[float]:
     """Area and volume of the first two training shapes; a test uses them to detect a change of the sampler."""
     meshes = [dataset.mesh(Split.TRAIN, index) for index in range(2)]
     return [number for mesh in meshes for number in (mesh.area, mesh.volume)]
-
-
-def _surface_errors(
-    prior: Prior, dataset: Dataset, samples: DistanceSamples, settings: PriorSettings, progress: Report
-) -> dict[str, float]:
-    """Mean error near the surface, in scene units, of training and held-out shapes, with newly fitted codes.
-
-    A network of one shape is evaluated at its code.
-    """
-    if settings.of_one_shape:
-        return {"training": surface_error(prior.decoder, prior.codes, samples)}
-    count, delta = VALIDATION_SHAPES, settings.truncation
-    validation = distance_samples(dataset, Split.VALIDATION, settings, count, progress)
-    training = DistanceSamples(samples.points[:count], samples.distances[:count])
-    return {
-        "training": fit_error(prior.decoder, training, delta),
-        "validation": fit_error(prior.decoder, validation, delta),
-        "mean_shape": fit_error(prior.decoder, validation, delta, steps=0),
-    }

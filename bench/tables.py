@@ -8,9 +8,7 @@ A renderer (a file or a row) may have keys that are not arguments: `_rows_` maps
 renderer's row in its table, and `_label_` names the row. A renderer without `_rows_` has a row in each such
 experiment, after the others. An experiment sweeps over these renderers by `renderer: ${rows:EXPERIMENT}`.
 
-A choice of `method/space` declares the settings of a method that may be tuned: `${drawn:DIMENSION,LOW,HIGH}` is the
-coordinate, in that dimension, of the Sobol point with the number `draw`. An experiment sweeps over all spaces except
-the named ones by `+method: ${spaces:NAME,...}`.
+A choice of `method/space` declares the settings of a method that may be tuned; see `bench.setup.spaces`.
 """
 
 import re
@@ -19,6 +17,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
+from importlib import import_module
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -37,8 +36,6 @@ LOOK_KEY = "_look_"  # key of a renderer or a method: its colour, marker and lin
 TABLE_KEYS = ("base", "space", "chosen")  # keys of a row that are not part of its content
 LABEL_KEY = "_label_"  # key of a renderer: its name in tables
 ROWS_KEY = "_rows_"  # key of a renderer: the rank of its row in the table of each experiment
-SOBOL_DRAWS, SOBOL_DIMENSIONS = 64, 8
-SOBOL_SEED = 1610  # with it, no two of the first five dimensions correlate by 0.1 over the first 16 points
 PACKAGE_LINE = re.compile(r"\s*#\s*@package\s+(\S+)")  # the first line of a file whose keys belong to another node
 MAX_NAMES_WITH_VARIANTS = 20  # with more names, a message leaves out variants
 MAX_NAMES_LISTED = 100
@@ -162,6 +159,17 @@ def read_yaml(path: Path) -> Node:
     return _parse_mapping(path, _read_text(path))
 
 
+def extensions() -> dict[str, str]:
+    """The classes and functions of the layers above the core by their purpose: conf/extensions.yaml."""
+    return read_yaml(CONF / "extensions.yaml")
+
+
+def extension(purpose: str) -> Any:
+    """A class or function of `extensions`, imported at its use."""
+    module, _, name = extensions()[purpose].rpartition(".")
+    return getattr(import_module(module), name)
+
+
 def _read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
@@ -242,8 +250,8 @@ def nearest(word: str, options: list[str]) -> str:
 def register_resolvers() -> None:
     """Registers the resolvers that values of the configuration use, such as `${rows:table1}`."""
     OmegaConf.register_new_resolver("rows", _rows, replace=True)
-    OmegaConf.register_new_resolver("spaces", _spaces, replace=True)
-    OmegaConf.register_new_resolver("drawn", _drawn_value, replace=True)
+    OmegaConf.register_new_resolver("spaces", lambda *without: extension("spaces")(*without), replace=True)
+    OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
     OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
     OmegaConf.register_new_resolver("stem_of", _stem_of, replace=True)
     OmegaConf.register_new_resolver("prior_kind", _prior_kind, replace=True)
@@ -278,19 +286,8 @@ def _rows(experiment: str, *, _root_: DictConfig) -> str:
     return ",".join(renderers_of(experiment))
 
 
-def _spaces(*without: str) -> str:
-    """The search spaces of all methods that have one, as a list for a sweep.
-
-    Args:
-        without: names of methods that are left out.
-
-    Raises:
-        ValueError: if such a method has no search space.
-    """
-    spaces = group_choices(SPACE)
-    if unknown := {*without} - {*spaces}:
-        raise ValueError(f"${{spaces:...}} leaves out {', '.join(sorted(unknown))}: not in method/space")
-    return ",".join(f"space/{name}" for name in sorted(spaces) if name not in without)
+def _drawn(dimension: int, low: float, high: float, *, _root_: DictConfig) -> float | int:
+    return extension("drawn")(_root_.draw, dimension, low, high)
 
 
 def _prior_kind(dataset: str | None, default: str) -> str:
@@ -305,29 +302,3 @@ def _stem_of(path: str | None) -> str:
     if path is None:
         return "no file"  # the task refuses it
     return Path(path).stem
-
-
-def _drawn_value(dimension: int, low: float, high: float, *, _root_: DictConfig) -> float | int:
-    """The value of draw `_root_.draw` in a logarithmic range: an integer if both ends are, else with 3 digits.
-
-    Raises:
-        ValueError: if the draw is missing or out of range, or the range or dimension is invalid.
-    """
-    draw = _root_.draw
-    if draw is None or not 0 <= draw < SOBOL_DRAWS:
-        raise ValueError(f"a method of method/space needs draw=0 to draw={SOBOL_DRAWS - 1}, found {draw}")
-    if not (0 < low < high and 0 <= dimension < SOBOL_DIMENSIONS):
-        raise ValueError(
-            f"${{drawn:{dimension},{low},{high}}} must have a dimension from 0 to {SOBOL_DIMENSIONS - 1} "
-            "and ends above 0"
-        )
-    value = low * (high / low) ** sobol_points()[draw][dimension]
-    return round(value) if isinstance(low, int) and isinstance(high, int) else float(f"{value:.3g}")
-
-
-@cache
-def sobol_points() -> list[list[float]]:
-    """Points [SOBOL_DRAWS, SOBOL_DIMENSIONS] of a scrambled Sobol sequence in the unit cube, shared by all methods."""
-    from scipy.stats import qmc  # here, because the import takes a second
-
-    return qmc.Sobol(SOBOL_DIMENSIONS, scramble=True, rng=SOBOL_SEED).random(SOBOL_DRAWS).tolist()

@@ -1,9 +1,8 @@
 """A photograph with its camera, rendered or real."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -42,15 +41,3 @@ class Shot:
             image = getattr(self, name)
             if image is not None and tuple(image.shape[:2]) != size:
                 raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(image.shape[:2])}")
-
-    def in_world(self, to_world: Float[np.ndarray, "4 4"]) -> "Shot":
-        """The photograph in another world, in single precision; `to_world` maps from there to the present world."""
-        depth = None if self.depth is None else self.depth / float(np.linalg.norm(to_world[:3, 0]))
-        return replace(self, camera=camera_in_world(self.camera, to_world), depth=depth)
-
-
-def camera_in_world(camera: Camera, to_world: Float[np.ndarray, "4 4"]) -> Camera:
-    """The camera in another world, in single precision; the similarity `to_world` maps from there to its world."""
-    motion = camera.world_to_camera.double() @ torch.from_numpy(to_world)
-    motion[:3] /= float(np.linalg.norm(to_world[:3, 0]))
-    return replace(camera, intrinsics=camera.intrinsics.float(), world_to_camera=motion.float())

@@ -20,7 +20,7 @@ from bench.config import build, check_names
 from bench.records.results import PlannedRun
 from bench.report.__main__ import main as report
 from bench.report.write import paper
-from bench.runner.command import config_dirs, expand_field_file, options_of
+from bench.runner.command import config_dirs, options_of, overrides_of
 from bench.runner.compose import Composer, composing
 from tests import documentation
 from tests.documentation import FILES, ROOT, Command, anchors, code_of, filled, links, text_of
@@ -62,7 +62,7 @@ def first_cell(arguments: list[str]) -> PlannedRun:
     """The first cell of a command."""
     options = options_of(arguments)
     with composing(*config_dirs(options)):
-        composer = Composer(expand_field_file(options.overrides))
+        composer = Composer(overrides_of(options))
         config = composer.shared_config()
         if config.hydra.mode != RunMode.MULTIRUN and not options.multirun:
             return composer.single_run(config)

@@ -40,9 +40,10 @@ DATA_LAYER = (
 STUDIES_LAYER = (
     "bench.report", "bench.studies", "bench.pictures", "renderers.later", "renderers.newton",
     "bench.evaluate.along_ray", "bench.evaluate.colours", "bench.evaluate.distances", "bench.evaluate.ray_derivatives",
+    "bench.evaluate.prior_errors", "bench.evaluate.refined",
     "bench.evaluate.ray_scene",
     "bench.records.names", "bench.records.published", "bench.records.read", "bench.runner.library",
-    "bench.setup.auto", "bench.setup.colour_codes",
+    "bench.setup.auto", "bench.setup.colour_codes", "bench.setup.spaces",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",
     "bench.tasks.single_view", "bench.tasks.stability",
     "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.ray", "bench.suite", "bench.train",

@@ -8,6 +8,8 @@ import torch
 import trimesh
 
 from bench import shape_prior as prior_store
+from bench.evaluate import prior_errors
+from bench.evaluate.prior_errors import fit_error
 from bench.setup.colour_codes import ColourSettings
 from bench.shape_prior import (
     SHIPPED,
@@ -16,7 +18,6 @@ from bench.shape_prior import (
     PriorSettings,
     distance_samples,
     find_prior,
-    fit_error,
     make_prior,
     prior_for,
     prior_key,
@@ -123,7 +124,7 @@ def test_a_prior_is_kept_with_its_record(cached_prior):
 
 
 def test_a_prior_of_one_shape_is_evaluated_on_that_shape_at_its_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(prior_store, "fit_error", never)
+    monkeypatch.setattr(prior_errors, "fit_error", never)
     settings = replace(SETTINGS, shapes=1, shapes_per_step=1)
     path = make_prior(Boxes(), settings, tmp_path, CPU, silent)
     record = json.loads(path.with_suffix(".json").read_text())

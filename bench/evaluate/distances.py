@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from bench.evaluate.evaluate import subsample
+from bench.evaluate.evaluate import surface_metrics
 from datasets.mesh import Mesh
-from datasets.scene import sample_surface
+from datasets.scene import Surface, sample_surface
 
 SURFACE_UP = np.array([0.0, 1.0, 0.0])
 COLOUR_END = 3.0  # distance of the last colour of pictures, as a multiple of the threshold
@@ -52,6 +52,18 @@ class Distances:
         )
         both = precision + recall
         return precision, recall, 2 * precision * recall / np.where(both > 0, both, 1)
+
+
+def cloud_metrics(predicted: Surface | None, points: Float[np.ndarray, "n 3"], *, threshold: float) -> dict[str, float]:
+    """The metrics of `surface_metrics` that need no normals, for a truth that is a point cloud."""
+    metrics = surface_metrics(predicted, Surface(points, np.zeros_like(points)), threshold=threshold)
+    del metrics["normal_consistency"]
+    return metrics
+
+
+def subsample(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
+    """At most `count` random points of a cloud."""
+    return points if len(points) <= count else np.random.default_rng(seed).choice(points, count, replace=False)
 
 
 def surface_protocol(points: int, threshold: str, *, has_faces: bool) -> list[str]:

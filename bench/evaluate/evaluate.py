@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from bench.config import extension
 from bench.evaluate.state import State
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
+from bench.tables import extension
 from datasets.mesh import Mesh
 from datasets.scene import Surface, View, sample_surface
 from datasets.shot import mask_iou
@@ -94,18 +94,6 @@ def surface_metrics(predicted: Surface | None, truth: Surface, *, threshold: flo
         "fscore": 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
         "normal_consistency": float(np.mean(cosine_to_truth) + np.mean(cosine_to_predicted)) / 2,
     }
-
-
-def cloud_metrics(predicted: Surface | None, points: Float[np.ndarray, "n 3"], *, threshold: float) -> dict[str, float]:
-    """The metrics of `surface_metrics` that need no normals, for a truth that is a point cloud."""
-    metrics = surface_metrics(predicted, Surface(points, np.zeros_like(points)), threshold=threshold)
-    del metrics["normal_consistency"]
-    return metrics
-
-
-def subsample(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
-    """At most `count` random points of a cloud."""
-    return points if len(points) <= count else np.random.default_rng(seed).choice(points, count, replace=False)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from bench.evaluate.colours import colours_in_view
+from bench.evaluate.refined import refined_view
 from bench.evaluate.state import State
 from bench.pictures.run_figures import at_size, enlarged, in_size, normals_image, true_view, window
 from bench.pictures.style import SCREEN, bare, save, silhouette_image
@@ -78,7 +79,7 @@ class Filmstrip:
         """
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
-            view = state.refined_view(at_size(camera, self.inputs.evaluation.picture))
+            view = refined_view(state, at_size(camera, self.inputs.evaluation.picture))
             self.frames[name] = Shown(view, colours_in_view(state, view))
 
     @rc_context(SCREEN)

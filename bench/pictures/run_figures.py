@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+from bench.evaluate.refined import refined_view
 from bench.evaluate.state import State, empty_view
 from bench.pictures import style
 from bench.pictures.style import MISSED, SCREEN, SPURIOUS, bare, save, silhouette_image
@@ -83,7 +84,9 @@ def draw_run(
     scene, (front, back) = inputs.scene, _cameras(inputs, inputs.evaluation.picture)
     pairs = (
         *(
-            ViewPair(name, state.refined_view(front), state.refined_view(back), state.view_from(scene.view.camera).mask)
+            ViewPair(
+                name, refined_view(state, front), refined_view(state, back), state.view_from(scene.view.camera).mask
+            )
             for name, state in zip(("before", "after"), states, strict=True)
         ),
         ViewPair(

@@ -13,11 +13,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import AUTO, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references, extensions
+from bench.config import AUTO, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_references
 from bench.records.imports import ROOT, imported_files
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.records.results import PlannedRun
-from bench.tables import without_row_keys
+from bench.tables import extensions, without_row_keys
 from datasets.extras import referenced_files, version
 
 NO_STRESS = "none"

@@ -20,7 +20,7 @@ from bench.runner.compose import Composer, composing, parse_override, without_hy
 from bench.runner.messages import OPTIONAL_GROUPS, Interrupted, quoted, write_error_message
 from bench.runner.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.runner.sweep import LauncherStopped, work_per_cell
-from bench.tables import names, nearest
+from bench.tables import extension, names, nearest
 
 DANGLING_COMMA = re.compile(r"[=,]\s*,|,\s*$")
 SETTING_PATTERN = re.compile(r"(\+*([\w.]+))=(.+)", re.DOTALL)  # groups: plus signs and key, key, value
@@ -40,9 +40,8 @@ Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, t
 --cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML."""
 EXIT_FAILURE, EXIT_USAGE = 1, 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
-# With field=file, messages name the keys that the user typed; see `expand_field_file`.
-FIELD_FILE_ALIASES = {"dataset.path: ": "field_path: ", "dataset.module.": "field."}
 KERNELS_VARIABLE = "IMPLICIT_BENCH_KERNELS"  # defined in renderers/kernels/library.py, which imports torch
+FIELD_FILE_OVERRIDES = ("field=file", "field_path=")
 SWEEP_OPTIONS = ("--multirun", "-m")
 OPTIONS = (*SWEEP_OPTIONS, "--config-dir", "-cd", "--cfg", "-c", "--resolve", "--help", "-h")
 Work = Callable[[PlannedRun], object]  # of one configuration; returns the status if that is a run
@@ -69,8 +68,7 @@ def command_line(work: Work, sweep: Sweep | None = None) -> int:
         return 0 if all_ok else EXIT_FAILURE
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is also an OSError
         text = message_of(error)
-        for key, alias in FIELD_FILE_ALIASES.items() if "field=file" in sys.argv else ():
-            text = text.replace(key, alias)
+        text = extension("typed_field_keys")(text) if "field=file" in sys.argv else text
         return _print_error(_add_file(text), EXIT_USAGE)
     except BrokenPipeError:  # `| head` reads only a part
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -96,7 +94,7 @@ def _compose_and_run(arguments: list[str], work: Work, sweep: Sweep | None) -> b
     if (kernels := os.environ.get(KERNELS_VARIABLE)) not in (None, "", "torch", "compiled"):
         raise ValueError(f"{KERNELS_VARIABLE} must be torch or compiled, not {kernels!r}: unset it for compiled")
     with composing(*config_dirs(options)):
-        composer = Composer([quote_text(text) for text in expand_field_file(options.overrides)])
+        composer = Composer([quote_text(text) for text in overrides_of(options)])
         config = composer.shared_config()
         if options.cfg:
             composer.check_keys()
@@ -155,28 +153,10 @@ def config_dirs(options: Namespace) -> list[Path]:
     return [Path(options.config_dir)] if options.config_dir else []
 
 
-def expand_field_file(arguments: list[str]) -> list[str]:
-    """Replaces `field=file field_path=PATH`, a network file as the scene's field, by the arguments of its dataset.
-
-    `field._target_=PACKAGE.CLASS` names the network's class, and other keys of `field` are arguments of the class.
-
-    Raises:
-        ValueError: if one of the two is missing, or another dataset is chosen.
-    """
-    keys = [argument.partition("=")[0] for argument in arguments]
-    if "field=file" not in arguments and "field_path" not in keys:
-        return arguments
-    if "field=file" not in arguments or "field_path" not in keys:
-        raise ValueError("a network's file is the scene's field by field=file field_path=PATH: type both")
-    if "dataset" in keys:
-        raise ValueError("with field=file the network's own surface is the shape: remove dataset")
-    has_class = "field._target_" in keys
-    replacements = {"^field=file$": f"dataset={'module' if has_class else 'network'}", "^field_path=": "dataset.path="}
-    if has_class:
-        replacements |= {r"^field\._target_=": "dataset.module._target_=", r"^field\.": "+dataset.module."}
-    for pattern, text in replacements.items():
-        arguments = [re.sub(pattern, text, argument) for argument in arguments]
-    return arguments
+def overrides_of(options: Namespace) -> list[str]:
+    """The overrides of a command line, with those of a dataset in place of `field=file field_path=PATH`."""
+    names_file = any(text.startswith(FIELD_FILE_OVERRIDES) for text in options.overrides)
+    return extension("field_file")(options.overrides) if names_file else options.overrides
 
 
 def quote_text(argument: str) -> str:

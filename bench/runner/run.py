@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from bench.config import Isolation, build, extension
+from bench.config import Isolation, build
 from bench.progress import run_progress
 from bench.records.folder import code_hash, config_hash, free_reserve, locked_folder
 from bench.records.record import Record, RunStatus, append_to_log, now, read_record, write_text
@@ -17,6 +17,7 @@ from bench.runner.messages import Interrupted, reason_of, write_error_message
 from bench.runner.plan import refusal_reasons, reused_ids
 from bench.runner.process import RunInProgress, run_isolated, signals_delayed, stopped_by
 from bench.runner.summary import log_lines, print_run_summary
+from bench.tables import extension
 from bench.trackers import Nothing, Tracker
 
 LOG_TAIL_LINES, LOG_TAIL_BYTES = 80, 16_384  # limits of the log in the record of a failed run

@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from bench.config import Isolation, extension
+from bench.config import Isolation
 from bench.progress import display, notice
 from bench.records.format import number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
@@ -22,6 +22,7 @@ from bench.runner.messages import Interrupted, reason_of
 from bench.runner.plan import check_plan, plan_of, reused_ids
 from bench.runner.process import stopped_by, warm_up
 from bench.runner.run import run_cell
+from bench.tables import extension
 
 CELL_LINE_METRICS = {
     "recommended_field": Metric("recommended"),

@@ -13,12 +13,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from bench.config import AUTO, PRIOR_DATASET_KEY, PRIOR_FIELD, EvaluationSettings, build_once, extension
+from bench.config import AUTO, PRIOR_DATASET_KEY, PRIOR_FIELD, EvaluationSettings, build_once
 from bench.machine.environment import pick_device
 from bench.progress import Report
 from bench.records.record import Record
 from bench.setup.priors import PriorChoice, prior_keys_in_errors, training_dataset
 from bench.shape_prior import Prior, PriorSettings
+from bench.tables import extension
 from datasets.scene import (
     SPLIT_STRIDE,
     Dataset,

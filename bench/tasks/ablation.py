@@ -17,13 +17,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench.config import extension, load
+from bench.config import load
 from bench.evaluate.reference import Reference, reference_for
 from bench.machine.environment import Stopwatch, gemm_peak, seconds_at_peak, using_threads
 from bench.machine.limits import LimitReached, Limits
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import check_field_gradient, evaluation_counts
+from bench.tables import extension
 from datasets.scene import View
 from renderers.boundary import render_checked, silhouette_loss
 from renderers.camera import Camera, Rays

@@ -14,12 +14,12 @@ from torch import Tensor
 from datasets.files.captures.depth import check_object_depths, missing_note, read_depths
 from datasets.files.captures.frames import AXES, Frame, homogeneous_matrix
 from datasets.files.captures.mask import is_inverted, load_mask
+from datasets.files.captures.sphere import camera_in_world
 from datasets.files.coincidence import compare_surfaces, settled
 from datasets.files.meshes import load_mesh
 from datasets.files.range_scans import join_neighbours
 from datasets.mesh import Mesh
 from datasets.scene import Scene, Split, Truth, View, see
-from datasets.shot import camera_in_world
 from datasets.views import look_at
 from renderers.camera import Camera
 from renderers.checks import BadInput, check_choice, check_positive

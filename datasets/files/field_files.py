@@ -1,9 +1,10 @@
-"""Loads the final field of a run; see `datasets.saved_field`.
+"""Loads the final field of a run; see `datasets.saved_field`. Reads `field=file`, a network file as the scene's field.
 
 Only objects of the classes in `CLASSES` with plain values are loaded, and nothing in a file is executed.
 """
 
 import json
+import re
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -37,6 +38,8 @@ CLASSES: dict[str, type] = {
     )
 }
 PRIVATE_ATTRIBUTES = ("_size",)  # the only one allowed; nn.ParameterList has it
+# With field=file, messages name the keys that the user typed; see `expand_field_file`.
+FIELD_FILE_ALIASES = {"dataset.path: ": "field_path: ", "dataset.module.": "field."}
 ASSUMED_WIDTH = 256  # neurons per layer of a field of unknown structure; sets the points per pass
 
 
@@ -151,3 +154,34 @@ def _read(run: Path) -> tuple[Any, dict[str, Tensor]]:
         return json.loads(metadata["field"]), tensors
     except (KeyError, ValueError, RecursionError) as error:
         raise BadInput(f"{path} holds no field: {error!r}") from error
+
+
+def expand_field_file(arguments: list[str]) -> list[str]:
+    """Replaces `field=file field_path=PATH`, a network file as the scene's field, by the arguments of its dataset.
+
+    `field._target_=PACKAGE.CLASS` names the network's class, and other keys of `field` are arguments of the class.
+
+    Raises:
+        ValueError: if one of the two is missing, or another dataset is chosen.
+    """
+    keys = [argument.partition("=")[0] for argument in arguments]
+    if "field=file" not in arguments and "field_path" not in keys:
+        return arguments
+    if "field=file" not in arguments or "field_path" not in keys:
+        raise ValueError("a network's file is the scene's field by field=file field_path=PATH: type both")
+    if "dataset" in keys:
+        raise ValueError("with field=file the network's own surface is the shape: remove dataset")
+    has_class = "field._target_" in keys
+    replacements = {"^field=file$": f"dataset={'module' if has_class else 'network'}", "^field_path=": "dataset.path="}
+    if has_class:
+        replacements |= {r"^field\._target_=": "dataset.module._target_=", r"^field\.": "+dataset.module."}
+    for pattern, text in replacements.items():
+        arguments = [re.sub(pattern, text, argument) for argument in arguments]
+    return arguments
+
+
+def typed_field_keys(message: str) -> str:
+    """A message with the keys of `field=file` that the user typed, in place of those of its dataset."""
+    for key, alias in FIELD_FILE_ALIASES.items():
+        message = message.replace(key, alias)
+    return message

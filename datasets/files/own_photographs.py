@@ -13,7 +13,7 @@ from datasets.files.captures.frames import AXES, Frame, Layout, nearest_rigid_ma
 from datasets.files.captures.hull import MaskFit, measure_mask_fit
 from datasets.files.captures.layouts import find_layout
 from datasets.files.captures.mistakes import intrinsics_fault, likely_mistake
-from datasets.files.captures.sphere import Sphere, UnfitCameras, hull_sphere, likely_cause, viewed_sphere
+from datasets.files.captures.sphere import Sphere, UnfitCameras, hull_sphere, in_world, likely_cause, viewed_sphere
 from datasets.files.captures.take import exif_notes, read_shots
 from datasets.mesh import Mesh
 from datasets.scene import Split
@@ -202,7 +202,7 @@ def _capture(layout: Layout, settings: ReadSettings) -> Capture:
     source = "files" if frames[0].mask is not None else "the alpha channel"
     to_world = np.diag([*[sphere.radius] * 3, 1.0])
     to_world[:3, 3] = sphere.centre
-    unit_shots = tuple(shot.in_world(to_world) for shot in shots)
+    unit_shots = tuple(in_world(shot, to_world) for shot in shots)
     to_world[:3, 3] += origin
     return Capture(
         layout.format,

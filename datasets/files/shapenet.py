@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from datasets.files.captures.layouts import find_layout
+from datasets.files.captures.sphere import in_world
 from datasets.files.captures.take import read_shot
 from datasets.files.colours import FileColours
 from datasets.files.local import VERSION, load_repaired, split_files
@@ -103,7 +104,7 @@ class ShapeNet:
         if self.renders is None:
             return None
         folder = Path(self.renders) / self.folder.name / _id(self._file(split, index))
-        return tuple(read_shot(frame, longest).in_world(np.eye(4)) for frame in find_layout(folder).frames)
+        return tuple(in_world(read_shot(frame, longest), np.eye(4)) for frame in find_layout(folder).frames)
 
     def _file(self, split: Split, index: int) -> Path:
         files = self.files[split]

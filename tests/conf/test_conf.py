@@ -13,11 +13,11 @@ import trimesh
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
-from bench.config import build, check_references, class_of_node, extension, extensions, load
+from bench.config import build, check_references, class_of_node, load
 from bench.pictures import figure_style
 from bench.pictures.figure_style import look
 from bench.setup.inputs import Task
-from bench.tables import CONF, GROUP_OF_TABLE, choice, names, read_yaml
+from bench.tables import CONF, GROUP_OF_TABLE, choice, extension, extensions, names, read_yaml
 from datasets.scene import Dataset
 from renderers import DIST, Naive
 from renderers.rendering import Renderer

@@ -9,7 +9,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from bench.config import build
-from bench.tables import SOBOL_DIMENSIONS, SOBOL_DRAWS, choice, names, register_resolvers, sobol_points
+from bench.setup.spaces import SOBOL_DIMENSIONS, SOBOL_DRAWS, sobol_points
+from bench.tables import choice, names, register_resolvers
 from tests.composing import composed
 from tests.looped import each
 

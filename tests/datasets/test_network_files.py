@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.runner.command import expand_field_file
 from bench.setup.inputs import RunInputs
+from datasets.files.field_files import expand_field_file
 from datasets.files.network_files import NetworkFile
 from datasets.scene import Split
 from renderers.checks import BadInput

@@ -24,7 +24,8 @@ from bench.evaluate.evaluate import (
     missed_parts_note,
     render_view,
 )
-from bench.evaluate.state import REACH, State, newton_step
+from bench.evaluate.refined import newton_step, refined_view
+from bench.evaluate.state import REACH, State
 from bench.setup.inputs import RunInputs
 from bench.solve.solve import note_result
 from datasets.scene import Truth, sample_surface
@@ -157,7 +158,7 @@ def test_a_state_is_extracted_once_and_its_pictures_ask_for_a_value_per_hit(inpu
     state = State(meter, inputs)
     evaluate(state)
     asked = meter.counts.value
-    view = state.refined_view(inputs.scene.view.camera)
+    view = refined_view(state, inputs.scene.view.camera)
     assert meter.counts.value - asked == view.mask.sum() == inputs.scene.view.mask.sum()
 
 
@@ -173,7 +174,7 @@ def test_the_truth_is_sampled_once_in_a_run(inputs, monkeypatch):
 def test_pictures_are_of_the_fields_own_surface_also_where_it_is_no_distance(inputs, scale):
     squares = Shape(lambda p: scale * (p.square().sum(-1) - RADIUS**2), Kind.LEVEL)
     camera = inputs.scene.view.camera
-    view, on_mesh = State(squares, inputs).refined_view(camera), State(squares, inputs).view_from(camera)
+    view, on_mesh = refined_view(State(squares, inputs), camera), State(squares, inputs).view_from(camera)
     points = camera.rays().at(camera.distance(view.depth))[view.mask]
     off = [
         (camera.rays().at(camera.distance(seen.depth))[seen.mask].norm(dim=-1) - RADIUS).abs()
@@ -205,7 +206,7 @@ def test_a_part_that_the_renderer_misses_is_in_the_picture_and_in_the_record(inp
     state = State(dipped((0.8, 0.3, 0.1), 0.03), fine)
     result = evaluate(state)
     assert state.mesh.parts.max() == 1
-    floating = state.refined_view(camera).mask & ~scene.view.mask
+    floating = refined_view(state, camera).mask & ~scene.view.mask
     assert floating.sum() > 8
     assert not (render_view(state.field, camera, fine).mask & floating).any()
     (note,) = result.notes

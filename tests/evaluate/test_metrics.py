@@ -6,12 +6,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.evaluate.distances import subsample
 from bench.evaluate.evaluate import (
     DEFINITIONS,
     IMAGE_DEFINITIONS,
     RENDERER_DEFINITIONS,
     WORST_SURFACE,
-    subsample,
     surface_metrics,
     view_metrics,
 )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from bench.evaluate.evaluate import surface_metrics
+from bench.evaluate.refined import refined_view
 from bench.pictures.run_figures import save_images
 from bench.setup.inputs import RunContext
 from bench.shape_prior import Prior, near_surface_first, sample_distances
@@ -73,7 +74,7 @@ class PriorFit:
         }
         size = inputs.evaluation.picture or inputs.scene.view.camera.height
         camera = inputs.scene.view.camera.resized(size, size)
-        predicted, true = state.refined_view(camera), see(inputs.scene.raycaster, camera)
+        predicted, true = refined_view(state, camera), see(inputs.scene.raycaster, camera)
         save_images(run.folder, predicted, true)
 
     def problem(

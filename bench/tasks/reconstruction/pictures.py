@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from bench.evaluate.colours import colours_in_view
+from bench.evaluate.refined import refined_view
 from bench.evaluate.state import State
 from bench.pictures.colours import RenderColours, view_arrays
 from bench.pictures.run_figures import at_size, draw_curve, normals_image, save_arrays
@@ -40,7 +41,7 @@ def draw_reconstruction(folder: Path, state: State, subject: Subject, curve: lis
         draw_curve(folder / "curve.png", curve)
 
     def render(camera: Camera) -> tuple[View, Float[Tensor, "height width 3"]]:
-        view = state.refined_view(camera)
+        view = refined_view(state, camera)
         return view, colours_in_view(state, view)
 
     _save(folder, render, state.inputs, subject, title)

@@ -10,12 +10,13 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from bench.evaluate.evaluate import cloud_metrics, subsample
+from bench.evaluate.distances import cloud_metrics, subsample
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.solve import save_in_world
 from bench.tasks.reconstruction.dtu import DEFINITIONS as DTU_DEFINITIONS
 from bench.tasks.reconstruction.dtu import DtuScan, dtu_metrics, published_results, read_scan
 from datasets.files.captures.hull import hull_mesh
+from datasets.files.captures.sphere import in_world
 from datasets.files.coincidence import compare_outlines, settled
 from datasets.files.meshes import read_pieces, read_points
 from datasets.mesh import Mesh, fit_in_sphere
@@ -134,8 +135,8 @@ def upright(subject: Subject) -> Subject:
     to_old[:3, :3] = radius * Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()
     return replace(
         subject,
-        input_shots=tuple(shot.in_world(to_old) for shot in subject.input_shots),
-        held_out=tuple(shot.in_world(to_old) for shot in subject.held_out),
+        input_shots=tuple(in_world(shot, to_old) for shot in subject.input_shots),
+        held_out=tuple(in_world(shot, to_old) for shot in subject.held_out),
         truth=None if subject.truth is None else subject.truth.moved(np.linalg.inv(to_old)).cut_off(),
         summary=f"{subject.summary}; set upright for the prior, its unit sphere {radius:.3g} times as large",
         to_world=None if subject.to_world is None else subject.to_world @ to_old,

@@ -1,7 +1,7 @@
 """The sphere about the object that becomes the unit sphere: about the masks' hull, or about what the cameras view."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,6 +32,19 @@ class Sphere:
     centre: Float[np.ndarray, "3"]
     radius: float
     source: str
+
+
+def in_world(shot: Shot, to_world: Float[np.ndarray, "4 4"]) -> Shot:
+    """The photograph in another world, in single precision; `to_world` maps from there to its world."""
+    depth = None if shot.depth is None else shot.depth / float(np.linalg.norm(to_world[:3, 0]))
+    return replace(shot, camera=camera_in_world(shot.camera, to_world), depth=depth)
+
+
+def camera_in_world(camera: Camera, to_world: Float[np.ndarray, "4 4"]) -> Camera:
+    """The camera in another world, in single precision; the similarity `to_world` maps from there to its world."""
+    motion = camera.world_to_camera.double() @ torch.from_numpy(to_world)
+    motion[:3] /= float(np.linalg.norm(to_world[:3, 0]))
+    return replace(camera, intrinsics=camera.intrinsics.float(), world_to_camera=motion.float())
 
 
 def hull_sphere(shots: Sequence[Shot], start: Sphere) -> Sphere:

@@ -11,6 +11,7 @@ import torch
 from bench.tasks.reconstruction import stereo
 from bench.tasks.reconstruction.stereo import Cloud, Matching, stereo_clouds
 from datasets.extras import install_command
+from datasets.files.captures.sphere import in_world
 from datasets.scene import Truth
 from datasets.shot import Shot
 from renderers.checks import BadInput
@@ -107,7 +108,7 @@ def test_points_outside_of_a_mask_are_left_out(sphere):
 
 def test_points_outside_of_the_unit_sphere_are_left_out(sphere):
     """In a world that is half as large, the same photographs show a sphere of radius 1.4."""
-    shots = [shot.in_world(np.diag([0.5, 0.5, 0.5, 1.0])) for shot in taken(sphere, (0.0, 0.0), (15.0, 0.0))]
+    shots = [in_world(shot, np.diag([0.5, 0.5, 0.5, 1.0])) for shot in taken(sphere, (0.0, 0.0), (15.0, 0.0))]
     assert all((np.linalg.norm(cloud.points, axis=1) < 1).all() for cloud in stereo_clouds(shots, ALL))
 
 
