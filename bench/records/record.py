@@ -23,12 +23,10 @@ from bench.records.metrics import TABLE_METRICS, metric_fault
 
 SCHEMA = 1
 # Keys of a configuration that change no result. Its hash leaves them out.
-NEUTRAL_KEYS = frozenset(
-    (
-        *("results_dir", "priors_dir", "sizes", "verbose", "isolation", "time_limit", "memory_limit", "rerun"),
-        *("tracker", "plan"),
-    )
-)
+NEUTRAL_KEYS = {
+    *("results_dir", "priors_dir", "sizes", "verbose", "isolation", "time_limit", "memory_limit", "rerun"),
+    *("tracker", "plan"),
+}
 CONCURRENT_RUNS_VARIABLE = "IMPLICIT_BENCH_BESIDE"  # environment variable: number of runs at a time in a cluster job
 MAX_SETTINGS_DEPTH = 20
 MIN_BUDGET_ITERATIONS = 10  # with fewer, a run that its budget ends has no result

@@ -22,9 +22,8 @@ from bench.records.record import (
 RESULTS = "results/local"  # the default results folder; conf/config.yaml has the same
 PLAN_FILE = "plan.json"
 NON_FINITE_STRINGS = ('"inf"', '"-inf"', '"nan"')
-CURVE_COST_KEYS = ("iteration", "seconds", "value_evaluations", "gradient_evaluations", "cost")
 NOT_LOSS_TERMS = (
-    *CURVE_COST_KEYS,
+    *("iteration", "seconds", "value_evaluations", "gradient_evaluations", "cost"),
     *("chamfer_l1", "chamfer_l2", "psnr", "seen_chamfer_l1", "rotation_error_deg", "translation_error", "success"),
 )
 PAGE_FOLDERS = ("page", "base", "parts", "views", "data", "list", "run", "mesh")

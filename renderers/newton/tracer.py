@@ -1,6 +1,7 @@
 """Finds the surface along rays for `newton.Newton`: a march across it, Newton steps, and a search for the rest."""
 
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -140,7 +141,7 @@ class Tracer:
         second = self._crossings(field, doubtful, restarted).reindexed(index)
         table.replace_rays(index, restarted)
         table.path_clearance = table.path_clearance - error
-        return first.select(certain[first.index]).concatenate(second)
+        return concatenate(first.select(certain[first.index]), second)
 
     def _solve_near_hits(self, field: Field, rays: Rays, table: RayTable) -> "Crossings":
         """The crossings of the flat rays that stopped close to a surface."""
@@ -160,10 +161,10 @@ class Tracer:
             searched = ((unsolved & ~crossed) | table.stopped(Stop.MARCHING)).nonzero().squeeze(-1)
             hits, bracket = self._search(field, rays, table, searched)
             retried = torch.cat([bracketed, searched[hits]])
-            bracket = table.select(bracketed).bracket().concatenate(bracket)
+            bracket = concatenate(table.select(bracketed).bracket(), bracket)
             guess, _ = refine(field, rays[retried], bracket, method="secant", steps=self.search_steps)
         second = self.solve(field, rays, table, retried, guess)
-        return first.select(first.converged).concatenate(second)
+        return concatenate(first.select(first.converged), second)
 
     def solve(
         self,
@@ -232,7 +233,9 @@ class Tracer:
         low, high = torch.maximum(nearest - spacing, start), torch.minimum(nearest + spacing, searched.leave)
         distance, value = self._samples(field, rays[index[resampled]], low[resampled], high[resampled])
         crosses_resampled, closer = first_crossing(distance, value)
-        bracket = bracket.replace_where(resampled, crosses_resampled, closer)
+        pairs = zip(bracket.columns, closer.columns, strict=True)
+        merged = [(old, torch.where(crosses_resampled, new, old[resampled])) for old, new in pairs]
+        bracket = Bracket(*(old.index_put((resampled,), new) for old, new in merged))
         hits = (crosses.index_put((resampled,), crosses[resampled] | crosses_resampled) & ~inside).nonzero().squeeze(-1)
         return hits, bracket.select(hits)
 
@@ -305,9 +308,13 @@ class Crossings:
         """The same crossings, for rays that were selected by `index`: their index counts all rays."""
         return replace(self, index=index[self.index])
 
-    def concatenate(self, other: "Crossings") -> "Crossings":
-        """These crossings, followed by the others."""
-        return Crossings(*(torch.cat(pair) for pair in zip(self.columns, other.columns, strict=True)))
+
+Columns = TypeVar("Columns", Bracket, Crossings)
+
+
+def concatenate(first: Columns, second: Columns) -> Columns:
+    """The first ones, followed by the second ones."""
+    return type(first)(*(torch.cat(pair) for pair in zip(first.columns, second.columns, strict=True)))
 
 
 @dataclass(frozen=True)

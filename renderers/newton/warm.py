@@ -21,7 +21,7 @@ from torch import Tensor
 from renderers.camera import Rays
 from renderers.field import Field
 from renderers.newton.packed_march import CLEARANCE_THRESHOLD, MAX_OVERSTEP, RayTable
-from renderers.newton.tracer import Crossings, Tracer, normalise_slope
+from renderers.newton.tracer import Crossings, Tracer, concatenate, normalise_slope
 from renderers.rendering import Rendering
 
 MOVEMENT_SAFETY_FACTOR = 2.0  # elsewhere the field may have moved further than at the samples
@@ -210,7 +210,7 @@ def _solve_cached(tracer: Tracer, memory: Memory, field: Field, rays: Rays, cach
         table.replace_rays(index, marching)
         marched_at = cache.movement_when_marched
         marched_at[index] = torch.where(resumes[index], marched_at[index], cache.total_movement)
-    return solved.select((certain & ~audited)[solved.index]).concatenate(marched)
+    return concatenate(solved.select((certain & ~audited)[solved.index]), marched)
 
 
 def _probe(field: Field, rays: Rays, table: RayTable) -> Float[Tensor, " m"]:

@@ -44,15 +44,6 @@ class Bracket:
         """The brackets of the rays in `index`."""
         return Bracket(*(column.index_select(0, index) for column in self.columns))
 
-    def replace_where(self, index: Int[Tensor, " m"], chosen: Bool[Tensor, " m"], others: "Bracket") -> "Bracket":
-        """The brackets, with those of the `chosen` rays among `index` replaced by the others."""
-        pairs = zip(self.columns, others.columns, strict=True)
-        return Bracket(*(mine.index_put((index,), torch.where(chosen, other, mine[index])) for mine, other in pairs))
-
-    def concatenate(self, other: "Bracket") -> "Bracket":
-        """These brackets, followed by the others."""
-        return Bracket(*(torch.cat(pair) for pair in zip(self.columns, other.columns, strict=True)))
-
 
 def equally_spaced(start: Float[Tensor, " n"], end: Float[Tensor, " n"], count: int) -> Float[Tensor, "n count"]:
     """Equally spaced distances along n rays, `start` and `end` included."""
